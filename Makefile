@@ -1,0 +1,54 @@
+# Every target sets up what it needs in .venv. A stamp per set of extras remembers that it was installed; a change of
+# pyproject.toml makes the stamps stale and pip brings the environment up to date. `rm -r .venv` starts afresh.
+PYTHON ?= python3
+WORKERS ?= 2
+
+VENV := .venv
+BIN := $(VENV)/bin
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS)
+
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+.PHONY: help venv demo test test-all lint types bench notebooks clean
+
+help:  ## print the targets
+	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
+
+venv: $(VENV)/.installed-dev  ## the environment for development
+
+demo: $(VENV)/.installed-plot  ## simulate, check and plot a first example
+	$(BIN)/python -m jaxdyn.demo
+
+test: $(VENV)/.installed-test  ## the tests, without the slow ones
+	$(PYTEST) -m "not slow"
+
+test-all: $(VENV)/.installed-test  ## every test, on every robot
+	$(PYTEST) --all-robots
+
+lint: $(VENV)/.installed-dev  ## style and formatting
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.installed-dev  ## static types
+	$(BIN)/pyright
+
+bench: $(VENV)/.installed-bench  ## the benchmarks, into out/
+	$(BIN)/python -m benchmarks
+
+notebooks: $(VENV)/.installed-notebook  ## run the notebooks, into out/notebooks
+	$(BIN)/python -m nbconvert --to notebook --execute --output-dir out/notebooks notebooks/*.ipynb
+
+clean:  ## remove outputs and caches, keep .venv
+	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis
+	find jaxdyn tests $(wildcard benchmarks notebooks) -name __pycache__ -prune -exec rm -rf {} +
+
+# An interpreter without pip is what a failed set-up leaves behind, so it is removed.
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(None if v >= (3, 11) else \
+	  f"jaxdyn needs Python 3.11 or newer, $(PYTHON) is {v.major}.{v.minor}: make PYTHON=python3.11 ...")'
+	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
+
+$(VENV)/.installed-%: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	@touch $@

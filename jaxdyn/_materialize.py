@@ -1,0 +1,77 @@
+"""`materialize`: an identity that makes XLA:CPU write its operands to memory once instead of recomputing them.
+
+XLA:CPU fuses elementwise producers into each of their consumers and recomputes them there. In a recursion over bodies
+every level has several consumers, so the work grows exponentially with depth. XLA duplicates a producer only if it can be
+fused into all of its consumers, so one consumer that cannot be fused keeps it whole. `lax.optimization_barrier` is removed
+before fusion and does not serve.
+
+The consumer used here is an `if` whose branch sends the values to the host. The branch never runs: its condition, that
+this partition has number 2^32 - 1, is false in every program, whatever the data (NaN and inf included), but the compiler
+does not know that, and may not delete a branch with a side effect. Its cost is one test of a flag per call.
+
+The primitive is the identity in every other respect: it batches, differentiates forward and in reverse (tangents and
+cotangents are kept as well) and lowers to nothing on other platforms and for single numbers. Were a later XLA to fold the
+condition, results would stay right and become slow; a test counts the fusions of a compiled recursion.
+"""
+
+import jax
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+try:  # the dialect bindings have no public address
+    from jax._src.lib.mlir import ir
+    from jax._src.lib.mlir.dialects import hlo
+except ImportError:  # pragma: no cover - a jax without them still gives right results
+    ir = hlo = None
+
+_materialize_p = Primitive("materialize")
+_materialize_p.multiple_results = True
+
+
+def materialize(*values):
+    """The same values, each computed once (see the module's text). Entries that are plain Python numbers pass through."""
+    arrays = [i for i, value in enumerate(values) if isinstance(value, jax.Array)]
+    kept = list(values)
+    if arrays:
+        for i, value in zip(arrays, _materialize_p.bind(*[values[i] for i in arrays]), strict=True):
+            kept[i] = value
+    return kept
+
+
+def _identity_lowering(ctx, *values):
+    return list(values)
+
+
+def _cpu_lowering(ctx, *values):
+    worth = [value for value, aval in zip(values, ctx.avals_in, strict=True) if aval.size > 1]
+    if worth and hlo is not None:
+        never = hlo.CompareOp(
+            hlo.PartitionIdOp().result,
+            mlir.ir_constant(np.uint32(0xFFFFFFFF)),
+            hlo.ComparisonDirectionAttr.get("EQ"),
+            compare_type=hlo.ComparisonTypeAttr.get("UNSIGNED"),
+        )
+        branches = hlo.IfOp([], never.result)
+        with ir.InsertionPoint(branches.regions[0].blocks.append()):
+            hlo.OutfeedOp(worth, hlo.CreateTokenOp().result, outfeed_config=ir.StringAttr.get(""))
+            hlo.ReturnOp([])
+        with ir.InsertionPoint(branches.regions[1].blocks.append()):
+            hlo.ReturnOp([])
+    return list(values)
+
+
+def _on_nonzero(values):
+    """Apply the primitive to the entries that are not symbolic zeros."""
+    live = [value for value in values if type(value) is not ad.Zero]
+    kept = iter(_materialize_p.bind(*live) if live else ())
+    return [value if type(value) is ad.Zero else next(kept) for value in values]
+
+
+_materialize_p.def_impl(lambda *values: list(values))
+_materialize_p.def_abstract_eval(lambda *avals: list(avals))
+mlir.register_lowering(_materialize_p, _identity_lowering)
+mlir.register_lowering(_materialize_p, _cpu_lowering, platform="cpu")
+batching.primitive_batchers[_materialize_p] = lambda values, axes: (_materialize_p.bind(*values), axes)
+ad.primitive_jvps[_materialize_p] = lambda values, tangents: (_materialize_p.bind(*values), _on_nonzero(tangents))
+ad.primitive_transposes[_materialize_p] = lambda cotangents, *values: _on_nonzero(cotangents)

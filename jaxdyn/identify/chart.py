@@ -1,0 +1,173 @@
+"""Coordinates of all feasible models around a nominal one: what the fits search through, and what they return.
+
+A body's pseudo-inertia is P = U0 (U U^T) U0^T with U0 the factor of the nominal body and U = log_cholesky_factor(theta): the
+nominal body, stretched, sheared, shifted and made heavier. Every theta is a physical body, theta = 0 the nominal one, and
+theta has no units. Viscous, Coulomb and rotor terms are scale s^2, so that they cannot become negative; offsets scale s.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn import _float64 as _f64
+from jaxdyn import inertia as _inertia
+from jaxdyn.identify.friction import POSITIVE, TERMS, Friction, check_terms
+from jaxdyn.model import Model
+
+INERTIA = ("full", "mass", "fixed")
+
+
+class Coordinates(eqx.Module):
+    """A point in the chart: `theta` (bodies, 10) or (bodies, 1), `s` (terms, nv). A pytree, for optax and `jax.grad`."""
+
+    theta: Float[Array, "bodies coordinates"]
+    s: Float[Array, "terms nv"]
+
+
+class Chart(eqx.Module):
+    """Map from unconstrained coordinates to feasible parameters, models and friction.
+
+    - `factors` (bodies, 4, 4): upper-triangular U0 of the nominal pseudo-inertias of the bodies that have mass. Massless
+      bodies stay massless.
+    - `origin` (bodies, 4, 4): upper-triangular; U is origin @ log_cholesky_factor(theta), so the chart can be moved to where
+      a fit has come to. The identity at first.
+    - `scale` (terms, nv): torque-sized units of the terms.
+    """
+
+    model: Model
+    factors: Float[Array, "bodies 4 4"]
+    origin: Float[Array, "bodies 4 4"]
+    scale: Float[Array, "terms nv"]
+    v_s: Float[Array, ""]
+    bodies: tuple[int, ...] = eqx.field(static=True)
+    terms: tuple[str, ...] = eqx.field(static=True)
+    inertia: str = eqx.field(static=True)
+
+    def relative_factors(self, theta: Float[Array, "bodies n"]) -> Float[Array, "bodies 4 4"]:
+        """U of every body, relative to the nominal one."""
+        fill = jnp.zeros((theta.shape[0], 10 - theta.shape[1]), theta.dtype)  # "mass": alpha alone moves
+        steps = jax.vmap(_inertia.log_cholesky_factor)(jnp.concatenate([theta, fill], axis=1))
+        return jnp.einsum("bij,bjk->bik", self.origin, steps)
+
+    def inertias(self, theta: Float[Array, "bodies n"]) -> Float[Array, "nb 10"]:
+        """The ten numbers of every body."""
+        if not self.bodies:
+            return self.model.inertias
+        upper = jnp.einsum("bij,bjk->bik", self.factors, self.relative_factors(theta))
+        fitted = jax.vmap(_inertia.parameters_from_pseudo)(jnp.einsum("bij,bkj->bik", upper, upper))
+        return self.model.inertias.at[np.array(self.bodies)].set(fitted)
+
+    def term_values(self, s: Float[Array, "terms nv"]) -> Float[Array, "4 nv"]:
+        """Values of all `TERMS`: those fitted at s, the others at the model's value."""
+        fitted = self.scale * jnp.where(positive_terms(self.terms), s * s, s)
+        own = _own_terms(self.model)
+        return jnp.stack([fitted[self.terms.index(term)] if term in self.terms else own[term] for term in TERMS])
+
+    def parameters(self, point: Coordinates) -> Float[Array, " p"]:
+        """x (10 nb + 4 nv,), in the order of `parameter_names`."""
+        return jnp.concatenate([self.inertias(point.theta).reshape(-1), self.term_values(point.s).reshape(-1)])
+
+    def fitted(self, point: Coordinates) -> tuple[Model, Friction]:
+        """The model, with its inertias, armature, damping and friction, and the friction law with its offset."""
+        viscous, coulomb, offset, armature = self.term_values(point.s)
+        old = self.model
+        # A leaf that is absent and not fitted stays absent.
+        model = old.replace(
+            inertias=self.inertias(point.theta),
+            armature=None if old.armature is None and "armature" not in self.terms else armature,
+            damping=None if old.damping is None and "viscous" not in self.terms else viscous,
+            friction=None if old.friction is None and "coulomb" not in self.terms else coulomb,
+        )
+        return model, Friction(viscous, coulomb, offset, self.v_s)
+
+    def divergence(self, theta: Float[Array, "bodies n"]) -> Float[Array, ""]:
+        """Log-det divergence of all bodies from the nominal ones, sum of tr(P0^-1 P) - log det(P0^-1 P) - 4.
+
+        With P = U0 U U^T U0^T it is |U|^2 - 2 sum log U_ii - 4: the same in every frame and unit.
+        """
+        upper = self.relative_factors(theta)
+        diagonal = jnp.diagonal(upper, axis1=1, axis2=2)
+        return jnp.sum(upper**2) - 2 * jnp.sum(jnp.log(diagonal)) - 4.0 * len(self.bodies)
+
+    def settled(self, point: Coordinates) -> Coordinates:
+        """The point with terms that came to a billionth of their unit at zero, which s^2 approaches without end."""
+        tiny = positive_terms(self.terms) & (point.s**2 < 1e-9)
+        return Coordinates(point.theta, jnp.where(tiny, jnp.zeros_like(point.s), point.s))
+
+    def moved(self, theta: Float[Array, "bodies n"]) -> "Chart":
+        """The same chart around the bodies at theta: its zero is where theta was."""
+        return eqx.tree_at(lambda chart: chart.origin, self, self.relative_factors(theta))
+
+
+def make_chart(model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_scale) -> tuple[Chart, Coordinates]:
+    """Chart around a model, and the point to start from: the model's own numbers, a tenth of a unit where it has none.
+
+    Units are a tenth of the torque, that torque over the velocity and over the acceleration (root mean squares, (nv,)).
+
+    **Raises:** ValueError for unknown terms or `inertia`, and for bodies whose nominal parameters are not strictly feasible.
+    """
+    terms = check_terms(terms, v_s)
+    if inertia not in INERTIA:
+        raise ValueError(f"inertia is {inertia!r}; take one of {INERTIA}")
+    dtype = np.dtype(model.home.dtype)
+    numbers = np.asarray(model.inertias, np.float64)
+    bodies = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()
+    matrices = [_pseudo_inertia(numbers[i]) for i in bodies]
+    bad = [model.body_names[i] for i, P in zip(bodies, matrices, strict=True) if not _positive_definite(P)]
+    if bad:
+        raise ValueError(
+            f"inertia of {', '.join(bad)} is not that of a solid body (pseudo-inertia not positive definite): a feasible fit "
+            "cannot start there; repair it first with jd.repair_inertias(model), or give rods and points some thickness"
+        )
+    factors = np.array([np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1] for P in matrices]).reshape(-1, 4, 4)
+    unit = 0.1 * np.asarray(tau_scale, np.float64)
+    unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
+    per = {"viscous": v_scale, "coulomb": np.ones(model.nv), "offset": np.ones(model.nv), "armature": a_scale}
+    scale = np.array([unit / np.where(np.asarray(per[t]) > 0, per[t], 1.0) for t in terms]).reshape(
+        len(terms), model.nv
+    )
+    own = np.array([np.asarray(_own_terms(model)[term], np.float64) for term in terms]).reshape(len(terms), model.nv)
+    if np.any(own < 0):
+        row, column = np.argwhere(own < 0)[0]
+        raise ValueError(
+            f"{terms[row]} of coordinate {column} is {own[row, column]} in the model; it must not be negative"
+        )
+    # Zero is a stationary point of s^2: start beside it.
+    s = np.where(positive_terms(terms), np.sqrt(np.where(own > 0, own / scale, 0.1)), 0.0)
+    size = {"full": 10, "mass": 1, "fixed": 0}[inertia]
+    chart = Chart(
+        model,
+        jnp.asarray(factors, dtype),
+        jnp.asarray(np.broadcast_to(np.eye(4), factors.shape), dtype),
+        jnp.asarray(scale, dtype),
+        jnp.asarray(v_s, dtype),
+        bodies,
+        terms,
+        inertia,
+    )
+    return chart, Coordinates(jnp.zeros((len(bodies), size), dtype), jnp.asarray(s, dtype))
+
+
+def _own_terms(model: Model) -> dict[str, Array]:
+    own = {"viscous": model.damping, "coulomb": model.friction, "offset": None, "armature": model.armature}
+    zero = jnp.zeros((model.nv,), model.home.dtype)
+    return {term: zero if value is None else value for term, value in own.items()}
+
+
+def positive_terms(terms) -> np.ndarray:
+    """(terms, 1) of bool: which terms are zero or above."""
+    return np.array([[term in POSITIVE] for term in terms], bool).reshape(len(terms), 1)
+
+
+def _pseudo_inertia(numbers: np.ndarray) -> np.ndarray:
+    """`inertia.pseudo_inertia` in float64: factors of float32 models keep their digits."""
+    rotational = _f64.rotational_inertia(numbers)
+    sigma = 0.5 * np.trace(rotational) * np.eye(3) - rotational
+    return np.block([[sigma, numbers[1:4, None]], [numbers[None, 1:4], numbers[:1, None]]])
+
+
+def _positive_definite(matrix: np.ndarray) -> bool:
+    values = np.linalg.eigvalsh(matrix)
+    return bool(values[0] > 1e-14 * values[-1])

@@ -1,0 +1,224 @@
+"""Physically feasible inertias and friction by torque error."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxdyn import inertia as _inertia
+from jaxdyn.identify.chart import Chart, Coordinates, make_chart, positive_terms
+from jaxdyn.identify.friction import TERMS, check_terms
+from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.identify.minimise import METHODS, minimise
+from jaxdyn.identify.regression import Condensed, condense, noise_level
+from jaxdyn.identify.result import Fit
+from jaxdyn.model import Model
+
+# A fit is never trusted beyond this share of the torque: rounding and noise-free logs stay well posed.
+_FINEST = 1e-6
+_STEPS = {"newton": 100, "lbfgs": 3000, "adam": 10000}
+
+
+class Problem(eqx.Module):
+    """The torque loss of a log, |R x - d|^2 + rest condensed, over the variance, plus the prior."""
+
+    chart: Chart
+    R: Float[Array, "p p"]
+    d: Float[Array, " p"]
+    rest: Float[Array, ""]
+    prior: Float[Array, ""]
+
+
+def torque_loss(point: Coordinates, problem: Problem) -> Float[Array, ""]:
+    """1/2 |W x(point) - tau|^2 / sigma^2 + prior * log-det divergence from the nominal bodies."""
+    residual = problem.R @ problem.chart.parameters(point) - problem.d
+    return 0.5 * (residual @ residual + problem.rest) + problem.prior * problem.chart.divergence(point.theta)
+
+
+def fit_torques(
+    model: Model,
+    log: Log,
+    terms=TERMS,
+    *,
+    v_s: float = 0.01,
+    inertia: str = "full",
+    weights=None,
+    prior: float = 1.0,
+    sigma: float | None = None,
+    method: Any = "newton",
+    steps: int | None = None,
+    learning_rate: float = 0.01,
+    tolerance: float = 1e-6,
+    callback: Callable[[int, float, Model], None] | None = None,
+) -> Fit:
+    """Physically feasible inertias, friction and rotor inertia by the error of the joint torques along a log.
+
+    Minimises 1/2 |weights (W x - tau)|^2 / sigma^2 + prior * sum over bodies of D(P, P0), where W is the regressor and
+    D(P, P0) = tr(P0^-1 P) - log det(P0^-1 P) - 4 the log-det (entropic) divergence of a body's pseudo-inertia from the
+    nominal one. It settles what the torques leave open, is the same in every frame and unit, and grows without bound
+    towards bodies that do not exist. x is searched in coordinates in which every point is a feasible body with friction
+    that takes energy (`Chart`), so no iterate can be infeasible. The log is condensed once: a step costs the same for any log.
+
+    **Arguments:**
+
+    - `model`: nominal model, where the fit starts; `log` with v and a.
+    - `terms`: fitted beside the links, tau_f = viscous v + coulomb tanh(v / v_s) + offset, and armature a; viscous,
+      coulomb and armature stay at or above zero. A term left out keeps the model's value.
+    - `inertia`: "full", all ten numbers of each body; "mass", its density alone; "fixed".
+    - `weights` (nv,): one over the noise of each joint's torque, relative to the others; ones by default.
+    - `prior`: weight of the divergence; 1 counts it like one observation of each body. `sigma`: torque noise (N m);
+      by default the residual of the unconstrained least squares.
+    - `method`: "newton" (the loss is convex in x, and this finds its one minimum in some tens of steps), "lbfgs" or "adam"
+      (optax), or any optax.GradientTransformation. `steps`: the most steps. `learning_rate`: of adam. `tolerance`: newton
+      stops when the loss is within this of its minimum; lbfgs at this relative change in ten steps.
+    - `callback(step, loss, model)`: called before every step with the model at that point.
+
+    **Returns:** `Fit`.
+
+    **Raises:** ValueError when log and model do not fit together, for nominal bodies that are not feasible, and for
+    arguments out of range.
+
+    Source: Rucker & Wensing (2022), log-Cholesky coordinates; Lee, Wensing & Park (2020), "Geometric robot dynamic
+    identification: a convex programming approach", divergence and convexity.
+    """
+    check_log(log, model)
+    terms = check_terms(terms, v_s)
+    if not prior > 0:
+        raise ValueError(f"prior is {prior}; it must be positive: torques alone do not determine single bodies")
+    problem, point, sigma = _problem(model, log, terms, v_s, inertia, weights, prior, sigma)
+    chart = problem.chart
+    if method != "newton" and isinstance(method, str) and method not in METHODS:
+        raise ValueError(f"method is {method!r}; take one of {('newton', *METHODS)} or an optax.GradientTransformation")
+    limit = _STEPS.get(method, _STEPS["adam"]) if isinstance(method, str) else _STEPS["adam"]
+    steps = limit if steps is None else steps
+    if isinstance(method, str) and method == "newton":
+        chart, point, history, result = _newton(problem, point, steps, tolerance, callback)
+    else:
+        start, scaling = _whitening(problem, point)
+        _, unflatten = ravel_pytree(point)
+
+        def report(step, value, y):
+            if callback is not None:
+                callback(step, value, chart.fitted(unflatten(start + scaling @ y))[0])
+
+        y, history, result = minimise(
+            _flat_loss,
+            jnp.zeros_like(start),
+            (problem, point, start, scaling),
+            method=method,
+            steps=steps,
+            learning_rate=learning_rate,
+            tolerance=tolerance,
+            callback=report,
+        )
+        point = unflatten(start + scaling @ y)
+    fitted, friction = chart.fitted(chart.settled(point))
+    name = method if isinstance(method, str) else type(method).__name__
+    return Fit(fitted, friction, model, history, result, f"torque fit by {name}", terms, sigma)
+
+
+def _problem(model, log, terms, v_s, inertia, weights, prior, sigma):
+    condensed = condense(model, log, v_s=v_s, weights=weights)
+    tau = np.asarray(log.tau, np.float64)
+    rms = [np.sqrt(np.mean(np.asarray(x, np.float64) ** 2, axis=0)) for x in (tau, log.v, log.a)]
+    if sigma is None:
+        sigma = max(noise_level(condensed), _FINEST * float(np.sqrt(np.mean(tau**2))))
+    if not sigma > 0:
+        raise ValueError(f"sigma is {sigma}; the torque noise must be positive (all torques of the log may be zero)")
+    chart, point = make_chart(model, terms, v_s, inertia, *rms)
+    dtype = np.dtype(model.home.dtype)
+    numbers = (condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, prior)
+    return Problem(chart, *(jnp.asarray(x, dtype) for x in numbers)), point, float(sigma)
+
+
+def _newton(problem: Problem, point: Coordinates, steps: int, tolerance: float, callback):
+    """Newton's method on the bodies, each step taken in the chart around where it starts: (chart, point, history, result)."""
+    history, result = [], "max_steps"
+    for step in range(steps + 1):
+        value, decrement, next_chart, next_point = _newton_step(problem, point)
+        history.append(float(value))
+        if callback is not None:
+            callback(step, float(value), problem.chart.fitted(point)[0])
+        if not np.isfinite(history[-1] + float(decrement)):
+            result = "not_finite"
+            break
+        # Rounding of the loss limits how small a decrease can be seen.
+        resolution = 10 * float(jnp.finfo(problem.R.dtype).eps) * abs(history[-1])
+        if float(decrement) / 2 <= max(tolerance, resolution):
+            result = "converged"
+            break
+        if step < steps:
+            problem = eqx.tree_at(lambda p: p.chart, problem, next_chart)
+            point = next_point
+    return problem.chart, point, np.array(history), result
+
+
+@eqx.filter_jit
+def _newton_step(problem: Problem, point: Coordinates):
+    """Loss, Newton decrement, and the chart and point after one step.
+
+    The Hessian is that of the loss in x, which is convex, carried to the chart: positive definite everywhere. A term at zero
+    whose gradient pushes it below stays there (its curvature in s is that gradient). The step is halved until the loss falls.
+    """
+    chart = problem.chart
+    value = torque_loss(point, problem)
+    y, unflatten = ravel_pytree(point)
+    gradient, _ = ravel_pytree(jax.grad(torque_loss)(point, problem))
+    rows = problem.R @ jax.jacfwd(lambda y: chart.parameters(unflatten(y)))(y)
+    slope = problem.R.T @ (problem.R @ chart.parameters(point) - problem.d)
+    slope = slope[-len(TERMS) * chart.model.nv :].reshape(len(TERMS), -1)[
+        np.array([TERMS.index(t) for t in chart.terms], int)
+    ]
+    pressed = jnp.where(positive_terms(chart.terms), 2 * chart.scale * jnp.maximum(slope, 0), jnp.zeros_like(slope))
+    curvature = jnp.kron(
+        jnp.eye(len(chart.bodies), dtype=y.dtype), problem.prior * _metric(point.theta.shape[1], y.dtype)
+    )
+    hessian = rows.T @ rows + jax.scipy.linalg.block_diag(curvature, jnp.diag(pressed.reshape(-1)))
+
+    diagonal = jnp.diagonal(hessian)
+    unit = jnp.sqrt(jnp.where(diagonal > 0, diagonal, jnp.ones_like(diagonal)))
+    damping = 4 * jnp.finfo(y.dtype).eps * jnp.eye(y.size, dtype=y.dtype)
+    factor = jax.scipy.linalg.cho_factor(hessian / (unit[:, None] * unit[None, :]) + damping)
+    direction = -jax.scipy.linalg.cho_solve(factor, gradient / unit) / unit
+    decrement = -(gradient @ direction)
+
+    lengths = 0.5 ** jnp.arange(40, dtype=y.dtype)
+    losses = jax.vmap(lambda h: torque_loss(unflatten(y + h * direction), problem))(lengths)
+    accepted = losses <= value - 1e-4 * lengths * decrement
+    length = jnp.where(jnp.any(accepted), lengths[jnp.argmax(accepted)], jnp.zeros((), y.dtype))
+    following = unflatten(y + length * direction)
+    moved = Coordinates(jnp.zeros_like(following.theta), following.s)
+    return value, decrement, chart.moved(following.theta), moved
+
+
+def _metric(size: int, dtype):
+    """Second derivative of -log det of a pseudo-inertia U U^T at theta = 0, the same for every body: |dU + dU^T|^2."""
+
+    def pseudo(theta):
+        upper = _inertia.log_cholesky_factor(jnp.concatenate([theta, jnp.zeros((10 - size,), dtype)]))
+        return (upper @ upper.T).reshape(-1)
+
+    jacobian = jax.jacfwd(pseudo)(jnp.zeros((size,), dtype))
+    return jacobian.T @ jacobian
+
+
+def _whitening(problem: Problem, point: Coordinates):
+    """Flat start and a matrix with which optax sees a loss of about unit curvature and a way to go of about one."""
+    y, unflatten = ravel_pytree(point)
+    rows = problem.R @ jax.jacfwd(lambda y: problem.chart.parameters(unflatten(y)))(y)
+    values, vectors = jnp.linalg.eigh(rows.T @ rows)
+    # Nothing is stretched so far that one unit leaves the neighbourhood in which exponentials behave.
+    fall = 2 * torque_loss(point, problem)
+    values = jnp.maximum(values, fall)
+    return y, vectors * jnp.sqrt(fall / values)[None, :]
+
+
+def _flat_loss(y, args):
+    problem, point, start, scaling = args
+    _, unflatten = ravel_pytree(point)
+    return torque_loss(unflatten(start + scaling @ y), problem)

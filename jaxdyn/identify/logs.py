@@ -1,0 +1,198 @@
+"""Logs: measured motion and torque with names and checks, and the signal preparation that makes one from raw samples."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class Log(eqx.Module):
+    """Samples of one motion: time, configuration, velocity, acceleration and joint torque, one row per sample.
+
+    - `t` (n,), strictly increasing (s); `q` (n, nq) (rad, m); `v`, `a` (n, nv) (rad/s, rad/s^2; m/s, m/s^2), or None when
+      they were not measured; `tau` (n, nv) (N m; N).
+    - `joint_names`: names of the columns of tau, when the file gave them.
+
+    Numpy arrays are kept as they are (a log is data of the host; float64 time stamps do not become float32); anything
+    else is converted to float64. The arrays are leaves, so a log passes through `jax.vmap` and `jax.jit`.
+
+    **Raises:** ValueError for wrong shapes, unequal lengths, the first NaN or infinity (signal, row and column) and the
+    first step back in time (row and both times).
+    """
+
+    t: Float[Array | np.ndarray, " n"]
+    q: Float[Array | np.ndarray, "n nq"]
+    v: Float[Array | np.ndarray, "n nv"] | None
+    a: Float[Array | np.ndarray, "n nv"] | None
+    tau: Float[Array | np.ndarray, "n nv"]
+    joint_names: tuple[str, ...] | None = eqx.field(static=True)
+
+    def __init__(self, t, q, v=None, a=None, tau=None, *, joint_names=None):
+        if tau is None:
+            raise ValueError("Log: tau is missing; give the measured joint torques, zeros for a free motion")
+        for name, value in (("t", t), ("q", q), ("v", v), ("a", a), ("tau", tau)):
+            setattr(self, name, _as_array(value))
+        self.joint_names = None if joint_names is None else tuple(joint_names)
+
+    def __check_init__(self):
+        _check_signals({name: getattr(self, name) for name in ("t", "q", "v", "a", "tau")})
+        if self.joint_names is not None and len(self.joint_names) != np.shape(self.tau)[1]:
+            raise ValueError(f"joint_names has {len(self.joint_names)} names, tau has {np.shape(self.tau)[1]} columns")
+
+    @property
+    def nv(self) -> int:
+        """Number of torque columns."""
+        return self.tau.shape[1]
+
+    def __len__(self) -> int:
+        return self.t.shape[0]
+
+    def __getitem__(self, rows: slice) -> "Log":
+        """The samples of a slice, as a log."""
+        if not isinstance(rows, slice):
+            raise ValueError(f"a log is indexed by slices, got {rows!r}; one sample is log.q[i], log.v[i], ...")
+        return _select(self, rows)
+
+
+def split(log: Log, fraction: float = 0.7) -> tuple[Log, Log]:
+    """The first `fraction` of the samples and the rest: train and test without a shared sample.
+
+    **Raises:** ValueError when the fraction is not between 0 and 1, or one part would have no sample.
+    """
+    cut = int(fraction * len(log))
+    if not 0 < fraction < 1 or not 0 < cut < len(log):
+        raise ValueError(f"fraction={fraction} of {len(log)} samples leaves one part empty; take one between 0 and 1")
+    return log[:cut], log[cut:]
+
+
+def check_log(log: Log, model, *, needs=("v", "a")) -> None:
+    """Raise a ValueError unless the log has the model's joints, in the model's order, and the signals named in `needs`."""
+    for name in ("q", "v", "a", "tau"):
+        value = getattr(log, name)
+        if value is None:
+            if name in needs:
+                raise ValueError(f"the log has no {name}; measure it, or make it from q with jd.identify.from_raw")
+            continue
+        want = model.nq if name == "q" else model.nv
+        if value.shape[1] != want:
+            raise ValueError(
+                f"the log has {value.shape[1]} columns of {name}, model {model.name!r} has {want} "
+                f"(joints {', '.join(model.joint_names)}); lock the joints that were not logged"
+            )
+    if log.joint_names is not None and model.nv == model.nb and log.joint_names != model.joint_names:
+        raise ValueError(
+            f"the log's joints are {', '.join(log.joint_names)}, those of model {model.name!r} "
+            f"{', '.join(model.joint_names)}; read the log with read_log(path, joint_names=model.joint_names)"
+        )
+
+
+def from_raw(
+    t, q, tau, *, cutoff: float = 8.0, order: int = 4, trim: int = 200, every: int = 8, joint_names=None
+) -> Log:
+    """A log for torque fits from raw positions and torques: uniform time, low-pass without delay, numerical rates.
+
+    The samples are interpolated linearly to a uniform grid of as many samples. q is low-passed forward and backward
+    (Butterworth, zero phase); v is its numerical gradient, low-passed again; a the gradient of v, low-passed again; tau is
+    low-passed the same way, so that both sides of the equation of motion went through the same filter. The filter's
+    transients at both ends are dropped, and as the signals hold nothing above the cut-off, only every few samples are kept.
+
+    **Arguments:**
+
+    - `t` (n,) s, strictly increasing, jitter allowed; `q`, `tau` (n, nv): one coordinate per joint.
+    - `cutoff`: Hz, half-power frequency of one pass. `order`: of the filter. `trim`: samples dropped at each end.
+      `every`: keep every so-many-th sample.
+
+    **Returns:** `Log` with t, q, v, a, tau.
+
+    **Raises:** ValueError for all that `Log` refuses; too few samples for the filter and the trimming; a cut-off above
+    half the sampling rate; a gap in time longer than half a period of the cut-off, which interpolation would invent.
+
+    Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
+    """
+    from scipy.signal import butter, filtfilt
+
+    raw = Log(t, q, tau=tau, joint_names=joint_names)
+    t, q, tau = np.asarray(raw.t, np.float64), np.asarray(raw.q, np.float64), np.asarray(raw.tau, np.float64)
+    if q.shape[1] != tau.shape[1]:
+        raise ValueError(
+            f"q has {q.shape[1]} columns and tau {tau.shape[1]}: rates by differences need one coordinate per joint; "
+            "give v and a of quaternion joints to Log directly"
+        )
+    n = len(t)
+    need = max(2 * trim + every + 1, 3 * (order + 1) + 1)
+    if n < need:
+        raise ValueError(
+            f"{n} samples are too few for the filter: at least {need} (order={order}, trim={trim}, every={every})"
+        )
+    rate = (n - 1) / (t[-1] - t[0])
+    if not 0 < cutoff < rate / 2:
+        raise ValueError(f"cutoff={cutoff} Hz must lie between 0 and half the sampling rate, {rate / 2:.4g} Hz")
+    widest = int(np.argmax(np.diff(t)))
+    if t[widest + 1] - t[widest] > 0.5 / cutoff:
+        raise ValueError(
+            f"gap of {t[widest + 1] - t[widest]:.4g} s after row {widest} (t={t[widest]:.6g} s), longer than half a period of "
+            f"cutoff={cutoff} Hz; cut the log there or lower the cut-off"
+        )
+    grid = np.linspace(t[0], t[-1], n)
+    numerator, denominator = butter(order, 2 * cutoff / rate)
+
+    def uniform(x):
+        return np.stack([np.interp(grid, t, column) for column in x.T], axis=1)
+
+    def low(x):
+        return filtfilt(numerator, denominator, x, axis=0)
+
+    q = low(uniform(q))
+    v = low(np.gradient(q, grid, axis=0))
+    a = low(np.gradient(v, grid, axis=0))
+    tau = low(uniform(tau))
+    keep = slice(trim, n - trim, every)
+    return Log(grid[keep], q[keep], v[keep], a[keep], tau[keep], joint_names=raw.joint_names)
+
+
+def _as_array(value):
+    if value is None or isinstance(value, jax.Array):
+        return value
+    value = np.asarray(value)
+    return value if value.dtype in (np.float32, np.float64) else value.astype(np.float64)
+
+
+def _check_signals(signals: dict) -> None:
+    signals = {name: value for name, value in signals.items() if value is not None}
+    for name, value in signals.items():
+        want = 1 if name == "t" else 2
+        if value.ndim != want:
+            raise ValueError(f"{name} has shape {value.shape}, expected {'(n,)' if name == 't' else '(n, columns)'}")
+    lengths = {name: value.shape[0] for name, value in signals.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"unequal lengths: {', '.join(f'{name} has {k} rows' for name, k in lengths.items())}")
+    if lengths["t"] == 0:
+        raise ValueError("the log has no samples")
+    for name in ("v", "a"):
+        if name in signals and signals[name].shape[1] != signals["tau"].shape[1]:
+            raise ValueError(f"{name} has {signals[name].shape[1]} columns, tau has {signals['tau'].shape[1]}")
+    if any(isinstance(value, jax.core.Tracer) for value in signals.values()):
+        return
+    for name, value in signals.items():
+        bad = np.argwhere(~np.isfinite(np.asarray(value)))
+        if len(bad):
+            row = bad[0][0]
+            column = "" if name == "t" else f", column {bad[0][1] + 1}"
+            raise ValueError(
+                f"{name} is {np.asarray(value)[tuple(bad[0])]} at row {row}{column} ({len(bad)} such values)"
+            )
+    t = np.asarray(signals["t"])
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if len(back):
+        i = int(back[0])
+        raise ValueError(
+            f"time does not increase at row {i + 1}: t[{i}]={t[i]:.9g} s, t[{i + 1}]={t[i + 1]:.9g} s "
+            f"({len(back)} such rows); sort the log or drop repeated rows"
+        )
+
+
+def _select(log: Log, rows) -> Log:
+    values = {f.name: getattr(log, f.name) for f in dataclasses.fields(log) if f.name != "joint_names"}
+    return Log(**{k: None if x is None else x[rows] for k, x in values.items()}, joint_names=log.joint_names)

@@ -1,0 +1,361 @@
+"""Torques are linear in the parameters: the stacked regressor, what it can identify, and linear least squares."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn import dynamics
+from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
+from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.joints import KINDS
+from jaxdyn.model import Model, random_configuration
+
+_NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+# The numbers that stay when a body's ten are grouped, for a joint about z: Khalil & Dombre keep them and put m, m cz and
+# Iyy into the body before. About other axes the elimination finds others by itself.
+_KEPT_FIRST = (9, 1, 2, 4, 5, 7, 8)
+_KEPT_LAST = (6, 3, 0)
+_BLOCK = 256
+
+
+class Condensed(NamedTuple):
+    """Weighted stacked regressor and torques of a log, W x = w, condensed by QR without loss: |W x - w|^2 = |R x - d|^2 + rest.
+
+    `R` (p, p) upper triangular, `d` (p,), `rest` a number, `rows` the number of rows of W. Taking R instead of the normal
+    matrix W^T W = R^T R keeps the condition number from being squared.
+    """
+
+    R: np.ndarray
+    d: np.ndarray
+    rest: float
+    rows: int
+
+
+def parameter_names(model: Model, terms=TERMS) -> tuple[str, ...]:
+    """Names of the parameters x: the ten numbers of each body (`body.m`, `body.mcx`, ...), then each term (`joint.viscous`)."""
+    joints = []
+    for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
+        n = KINDS[kind].nv
+        joints += [name] if n == 1 else [f"{name}[{i}]" for i in range(n)]
+    bodies = [f"{body}.{number}" for body in model.body_names for number in _NUMBERS]
+    return tuple(bodies + [f"{joint}.{term}" for term in terms for joint in joints])
+
+
+def nominal_parameters(model: Model) -> np.ndarray:
+    """The model's own x (10 nb + 4 nv,): its inertias, damping, friction, no offset, armature; zero where it has none."""
+    leaves = {"viscous": model.damping, "coulomb": model.friction, "armature": model.armature, "offset": None}
+    parts = [np.asarray(model.inertias, np.float64).reshape(-1)]
+    parts += [np.zeros(model.nv) if leaves[term] is None else np.asarray(leaves[term], np.float64) for term in TERMS]
+    return np.concatenate(parts)
+
+
+def free_columns(model: Model, terms) -> np.ndarray:
+    """Positions in x of the inertial parameters and of the terms given."""
+    start, nv = 10 * model.nb, model.nv
+    blocks = [start + nv * TERMS.index(term) + np.arange(nv) for term in terms]
+    return np.concatenate([np.arange(start), *blocks]).astype(int)
+
+
+def regressor(model: Model, q, v, a, *, v_s=0.01) -> np.ndarray:
+    """Rows [Y(q, v, a), friction and rotor columns] for samples (n, nq), (n, nv), (n, nv): (n, nv, 10 nb + 4 nv).
+
+    Computed in the model's dtype in blocks of equal size (one compilation for logs of any length), returned in float64.
+    """
+    q, v, a = (np.asarray(x, model.home.dtype) for x in (q, v, a))
+    n = len(q)
+    parts = []
+    for start in range(0, n, _BLOCK):
+        rows = np.minimum(np.arange(start, start + _BLOCK), n - 1)  # the last block repeats the last sample
+        part = _regressor_block(model, q[rows], v[rows], a[rows], jnp.asarray(v_s, model.home.dtype))
+        parts.append(np.asarray(part, np.float64)[: n - start])
+    return np.concatenate(parts)
+
+
+@eqx.filter_jit
+def _regressor_block(model, q, v, a, v_s):
+    def one(q, v, a):
+        return jnp.concatenate(
+            [dynamics.torque_regressor(model, q, v, a), friction_regressor(v, a, TERMS, v_s)], axis=1
+        )
+
+    return jax.vmap(one)(q, v, a)
+
+
+def condense(model: Model, log: Log, *, v_s=0.01, weights=None) -> Condensed:
+    """Stack the regressor (all terms) over a log and condense it by QR, block by block: memory does not grow with the log."""
+    weights = _check_weights(weights, model.nv)
+    p = 10 * model.nb + model.nv * len(TERMS)
+    triangle = np.zeros((0, p + 1))
+    for start in range(0, len(log), 4 * _BLOCK):
+        part = log[start : start + 4 * _BLOCK]
+        rows = regressor(model, part.q, part.v, part.a, v_s=v_s)
+        stacked = np.concatenate([rows, np.asarray(part.tau, np.float64)[:, :, None]], axis=2) * weights[:, None]
+        triangle = np.linalg.qr(np.concatenate([triangle, stacked.reshape(-1, p + 1)]), mode="r")
+    triangle = np.concatenate([triangle, np.zeros((max(p + 1 - len(triangle), 0), p + 1))])
+    return Condensed(triangle[:p, :p], triangle[:p, p], float(triangle[p, p] ** 2), len(log) * model.nv)
+
+
+class BaseParameters(eqx.Module):
+    """The linear combinations of the parameters that joint torques can tell apart: base = matrix @ x.
+
+    - `matrix` (nbase, p): grouping matrix; the columns of `independent` are the identity.
+    - `independent` (nbase,): positions of the parameters that stand first in each combination.
+    - `parameter_names` (p,): names of all the parameters x; `names` (nbase,): of the independent ones.
+    """
+
+    matrix: np.ndarray
+    independent: np.ndarray
+    parameter_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return len(self.independent)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters that stand first in each combination."""
+        return tuple(self.parameter_names[i] for i in self.independent)
+
+    @property
+    def expressions(self) -> tuple[str, ...]:
+        """Each combination in words, e.g. `link2.Izz + 1 link3.Iyy - 0.4 link3.mcz`."""
+        lines = []
+        for i, row in zip(self.independent, self.matrix, strict=True):
+            rest = [
+                (c, name) for k, (c, name) in enumerate(zip(row, self.parameter_names, strict=True)) if k != i and c
+            ]
+            lines.append(
+                "".join(
+                    [self.parameter_names[i]] + [f" {'-' if c < 0 else '+'} {abs(c):.4g} {name}" for c, name in rest]
+                )
+            )
+        return tuple(lines)
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """Parameters that no torque depends on, alone or in a combination."""
+        used = np.any(self.matrix != 0, axis=0)
+        return tuple(name for name, u in zip(self.parameter_names, used, strict=True) if not u)
+
+    def values(self, parameters) -> np.ndarray:
+        """Values (nbase,) of the combinations for parameters x (p,)."""
+        return self.matrix @ np.asarray(parameters, np.float64).reshape(-1)
+
+
+def base_parameters(model: Model, terms=(), *, v_s: float = 0.01, seed: int = 0) -> BaseParameters:
+    """Base inertial parameters: the smallest set of combinations that determines every joint torque of the model.
+
+    The regressor is stacked over random states. A column that depends linearly on the columns before it is grouped into
+    them: W_D = W_I beta, so that W x = W_I (x_I + beta x_D). Columns go from the base to the tip, and within a body in
+    the order in which Khalil & Dombre keep them.
+
+    **Arguments:** `model`; `terms`, the friction and rotor terms to consider beside the links (of `TERMS`); `seed` of
+    the random states.
+
+    **Returns:** `BaseParameters`. The iiwa's 70 numbers give 43.
+
+    **Raises:** ValueError when the rank is not clear in the model's precision (use a float64 model).
+
+    Source: Gautier (1991), "Numerical calculation of the base inertial parameters"; Khalil & Dombre (2002), chapter 9.
+    """
+    terms = check_terms(terms, v_s)
+    names = parameter_names(model, terms)
+    p = len(names)
+    count = max(2 * p // max(model.nv, 1) + 1, 30)
+    generator = np.random.default_rng(seed)
+    keys = jax.random.split(jax.random.key(seed), count)
+    q = eqx.filter_jit(jax.vmap(random_configuration, (None, 0)))(model, keys)
+    v, a = generator.normal(size=(2, count, model.nv))
+    W = regressor(model, q, v, a, v_s=v_s)[:, :, free_columns(model, terms)].reshape(-1, p)
+    scale = np.linalg.norm(W, axis=0)
+    # A column of rounding errors is zero too.
+    noise = np.finfo(np.dtype(model.home.dtype)).eps
+    scale[scale < 1e3 * noise * scale.max(initial=0.0)] = np.inf
+
+    order = np.array(
+        [10 * body + k for kept in (_KEPT_FIRST, _KEPT_LAST) for body in range(model.nb) for k in kept]
+        + list(range(10 * model.nb, p)),
+        int,
+    )
+    pivots = np.abs(np.diag(np.linalg.qr((W / scale)[:, order], mode="r")))
+    tolerance = np.sqrt(noise) if noise < 1e-10 else 10 * np.sqrt(noise)
+    kept = pivots > tolerance
+    independent = np.sort(order[kept])
+    scaled = (W / scale)[:, independent]
+    singular = np.linalg.svd(W / scale, compute_uv=False)
+    rank = int(np.sum(singular > tolerance * singular.max(initial=0.0)))
+    if rank != len(independent):
+        raise ValueError(
+            f"base parameters of {model.name!r} are not clear in {model.home.dtype}: {len(independent)} by elimination, {rank} "
+            "by singular values; use a float64 model (jax_enable_x64) or check for joints that coincide"
+        )
+    dependent = np.setdiff1d(np.arange(p), independent)
+    beta = np.linalg.lstsq(scaled, (W / scale)[:, dependent], rcond=None)[0]
+    beta[np.abs(beta) < 10 * tolerance] = 0.0
+    matrix = np.zeros((len(independent), p))
+    matrix[np.arange(len(independent)), independent] = 1.0
+    finite = np.isfinite(scale[dependent])
+    factor = np.where(finite, scale[dependent], 0.0)
+    matrix[:, dependent] = beta * factor / scale[independent][:, None]
+    return BaseParameters(matrix, independent, names)
+
+
+class LeastSquares(eqx.Module):
+    """Result of `least_squares`: base parameters with standard deviations. Unconstrained: the body it describes may not exist.
+
+    - `base`: which combinations; `values`, `std`, `nominal` (nbase,): fitted, standard deviation, of the model given.
+    - `parameters` (10 nb + 4 nv,): one x with these values, the one nearest to the model's; its numbers mean nothing alone.
+    - `sigma`: root mean square of the (weighted) residual; `condition`: of the regressor with columns of unit length;
+      `rank`: combinations that the log excites, at most nbase.
+    - `covariance` (nbase, nbase).
+    """
+
+    base: BaseParameters
+    values: np.ndarray
+    std: np.ndarray
+    nominal: np.ndarray
+    parameters: np.ndarray
+    covariance: np.ndarray
+    sigma: float
+    condition: float
+    rank: int
+    model: Model
+    terms: tuple[str, ...] = eqx.field(static=True)
+    v_s: float = eqx.field(static=True)
+
+    def torques(self, log: Log) -> np.ndarray:
+        """Torques (n, nv) that the fit predicts along a log."""
+        check_log(log, self.model)
+        return regressor(self.model, log.q, log.v, log.a, v_s=self.v_s) @ self.parameters
+
+    def error(self, log: Log) -> float:
+        """Torque error along a log, in per cent of the measured torque: 100 |tau_fit - tau| / |tau| over all joints."""
+        return torque_error(self.torques(log), log.tau)
+
+    def table(self) -> list[tuple[str, float, float, float]]:
+        """Rows (combination, nominal, fitted, standard deviation)."""
+        return list(zip(self.base.names, self.nominal.tolist(), self.values.tolist(), self.std.tolist(), strict=True))
+
+    def summary(self) -> str:
+        """The fit in words and a table."""
+        unknown = len(self.values) - self.rank
+        lines = [
+            f"linear least squares, {self.model.name}: {len(self.values)} combinations of {len(self.parameters)} parameters, "
+            f"rank {self.rank}, condition {self.condition:.4g}, residual {self.sigma:.4g} N m",
+        ]
+        if unknown:
+            lines.append(
+                f"the log does not excite {unknown} combinations: they keep the nominal value where std is infinite"
+            )
+        width = max(map(len, self.base.names), default=0)
+        lines.append(f"{'combination':{width}}  {'nominal':>12}  {'fitted':>12}  {'std':>12}")
+        lines += [f"{name:{width}}  {x0:12.5g}  {x:12.5g}  {s:12.3g}" for name, x0, x, s in self.table()]
+        return "\n".join(lines)
+
+
+def least_squares(
+    model: Model, log: Log, terms=TERMS, *, v_s: float = 0.01, weights=None, rcond: float = 1e-6
+) -> LeastSquares:
+    """Base parameters, friction and rotor inertia by linear least squares on the torques: min |weights (W x - tau)|^2.
+
+    **Arguments:**
+
+    - `model`: geometry and nominal parameters; `log` with v and a.
+    - `terms`: what is fitted beside the links: tau_f = viscous v + coulomb tanh(v / v_s) + offset, and armature a.
+    - `weights` (nv,): one over the noise of each joint's torque; ones by default.
+    - `rcond`: directions whose singular value is below this times the largest are not excited by the log; along them the
+      model's values stay.
+
+    **Returns:** `LeastSquares`. Standard deviations hold for white noise on the torques; filtered samples are
+    correlated, and the true ones are then larger by about the root of the correlation length in samples.
+
+    **Raises:** ValueError when log and model do not fit together or the log has fewer rows than combinations.
+
+    Source: Atkeson, An & Hollerbach (1986); Gautier (1991).
+    """
+    terms = check_terms(terms, v_s)
+    check_log(log, model)
+    base = base_parameters(model, terms, v_s=v_s)
+    condensed = condense(model, log, v_s=v_s, weights=weights)
+    if condensed.rows <= len(base):
+        raise ValueError(f"the log has {len(log)} samples of {model.nv} torques, too few for {len(base)} combinations")
+    x0 = nominal_parameters(model)
+    columns = free_columns(model, terms)
+    # What is not fitted (friction terms left out) stays at the model's value, on the other side.
+    residual = condensed.d - condensed.R @ x0
+    fit = _truncated(condensed.R[:, columns[base.independent]], residual, rcond)
+    rest = condensed.rest + fit.rest
+    sigma = float(np.sqrt(rest / (condensed.rows - fit.rank)))
+    covariance = sigma**2 * fit.half @ fit.half.T
+    std = np.where(fit.unknown, np.inf, np.sqrt(np.diag(covariance)))
+    nominal = base.values(x0[columns])
+    parameters = x0.copy()
+    parameters[columns] += np.linalg.pinv(base.matrix) @ fit.change
+    return LeastSquares(
+        base=base,
+        values=nominal + fit.change,
+        std=std,
+        nominal=nominal,
+        parameters=parameters,
+        covariance=covariance,
+        sigma=sigma,
+        condition=fit.condition,
+        rank=fit.rank,
+        model=model,
+        terms=terms,
+        v_s=float(v_s),
+    )
+
+
+def noise_level(condensed: Condensed, *, rcond: float = 1e-9) -> float:
+    """Root mean square residual of the unconstrained least squares, the torque noise of a condensed log.
+
+    **Raises:** ValueError when the log has no more rows than the regressor's rank: then nothing is left to tell the noise.
+    """
+    fit = _truncated(condensed.R, condensed.d, rcond)
+    if condensed.rows <= fit.rank:
+        raise ValueError(
+            f"the log has {condensed.rows} torques for {fit.rank} unknowns; log more, or give sigma yourself"
+        )
+    return float(np.sqrt((condensed.rest + fit.rest) / (condensed.rows - fit.rank)))
+
+
+class _Truncated(NamedTuple):
+    """min |A change - b| with columns scaled to unit length and directions below rcond left at zero."""
+
+    change: np.ndarray
+    rest: float
+    half: np.ndarray
+    unknown: np.ndarray
+    condition: float
+    rank: int
+
+
+def _truncated(A: np.ndarray, b: np.ndarray, rcond: float) -> _Truncated:
+    scale = np.linalg.norm(A, axis=0)
+    scale[scale == 0] = 1.0
+    U, s, Vt = np.linalg.svd(A / scale, full_matrices=False)
+    rank = int(np.sum(s > rcond * s.max(initial=0.0)))
+    change = (Vt[:rank].T @ ((U[:, :rank].T @ b) / s[:rank])) / scale
+    half = (Vt[:rank].T / s[:rank]) / scale[:, None]
+    # Any share in a direction that is not excited leaves a parameter unknown.
+    unknown = np.sum(Vt[rank:] ** 2, axis=0) > 1e-12
+    condition = float(s[0] / s[rank - 1]) if rank else np.inf
+    return _Truncated(change, float(np.sum((b - A @ change) ** 2)), half, unknown, condition, rank)
+
+
+def torque_error(predicted, measured) -> float:
+    """100 |predicted - measured| / |measured| over all samples and joints (Frobenius norms), in per cent."""
+    measured = np.asarray(measured, np.float64)
+    return float(100 * np.linalg.norm(np.asarray(predicted, np.float64) - measured) / np.linalg.norm(measured))
+
+
+def _check_weights(weights, nv: int) -> np.ndarray:
+    if weights is None:
+        return np.ones(nv)
+    weights = np.asarray(weights, np.float64)
+    if weights.shape != (nv,) or not np.all(weights > 0):
+        raise ValueError(f"weights is {weights.tolist()}; give {nv} positive numbers, one over the noise of each joint")
+    return weights

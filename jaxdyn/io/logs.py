@@ -1,0 +1,152 @@
+"""Logs as files: CSV or NPZ with named columns t, q1.., v1.., a1.., tau1.. (or q_<joint name> ...)."""
+
+import csv
+import pathlib
+
+import numpy as np
+
+from jaxdyn.identify.logs import Log
+
+_SIGNALS = ("q", "v", "a", "tau")
+
+
+def read_log(path, *, joint_names=None) -> Log:
+    """Read a log from a CSV file with one header line, or from an NPZ archive.
+
+    Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1, ...`
+    torques. The numbers may be replaced by joint names: `q_shoulder, tau_shoulder`. In an NPZ archive each column is an
+    array (n,), or a signal is one array (n, columns) named `q`, `v`, `a`, `tau`. Columns of other names are ignored.
+
+    **Arguments:** `path`; `joint_names`: order of the joints in the result for columns with joint names (a model's
+    `joint_names`); columns of other joints are left out. Without it the order of the file's tau columns.
+
+    **Returns:** `jd.identify.Log`; v and a are None when the file has none. Make them with `jd.identify.from_raw`.
+
+    **Raises:** FileNotFoundError; ValueError, with the path, for another file type, a cell that is no number (line and
+    column), missing or repeated columns, and all that `Log` refuses (NaN, unequal lengths, time running backwards).
+    """
+    path = pathlib.Path(path)
+    readers = {".csv": _read_csv, ".npz": _read_npz}
+    if path.suffix.lower() not in readers:
+        raise ValueError(f"{path}: log files are .csv or .npz, not {path.suffix!r}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such log file")
+    columns = readers[path.suffix.lower()](path)
+    try:
+        return _assemble(columns, None if joint_names is None else tuple(joint_names))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def write_log(path, log: Log) -> None:
+    """Write a log as CSV (every number at full precision) or NPZ, with columns as `read_log` reads them.
+
+    Columns carry joint names when the log knows them and has one coordinate per joint, else numbers.
+
+    **Raises:** ValueError for another file type.
+    """
+    path = pathlib.Path(path)
+    columns = {"t": np.asarray(log.t)}
+    named = log.joint_names if log.q.shape[1] == log.nv else None
+    for signal in _SIGNALS:
+        value = getattr(log, signal)
+        for i in range(0 if value is None else value.shape[1]):
+            columns[f"{signal}_{named[i]}" if named else f"{signal}{i + 1}"] = np.asarray(value[:, i])
+    if path.suffix.lower() == ".npz":
+        np.savez_compressed(path, **columns)
+    elif path.suffix.lower() == ".csv":
+        with path.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(columns)
+            writer.writerows([repr(float(x)) for x in row] for row in zip(*columns.values(), strict=True))
+    else:
+        raise ValueError(f"{path}: log files are .csv or .npz, not {path.suffix!r}")
+
+
+def _read_csv(path) -> dict[str, np.ndarray]:
+    with path.open(newline="") as file:
+        reader = csv.reader(file)
+        header = [name.strip().lstrip("\ufeff") for name in next(reader, [])]
+        if not header:
+            raise ValueError(f"{path}: the file is empty; the first line names the columns t, q1, ..., tau1, ...")
+        repeated = sorted({name for name in header if header.count(name) > 1})
+        if repeated:
+            raise ValueError(f"{path}: repeated columns {', '.join(repeated)}")
+        rows = []
+        for cells in reader:
+            if not cells:
+                continue
+            if len(cells) != len(header):
+                raise ValueError(f"{path}: line {reader.line_num} has {len(cells)} cells, the header {len(header)}")
+            try:
+                rows.append([float(cell) for cell in cells])
+            except ValueError:
+                name, cell = next((n, c) for n, c in zip(header, cells, strict=True) if not _is_number(c))
+                raise ValueError(f"{path}: line {reader.line_num}, column {name}: {cell!r} is no number") from None
+    table = np.array(rows).reshape(len(rows), len(header))
+    return {name: table[:, i] for i, name in enumerate(header)}
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_npz(path) -> dict[str, np.ndarray]:
+    columns = {}
+    with np.load(path, allow_pickle=False) as archive:
+        for name in archive.files:
+            value = archive[name]
+            if name in _SIGNALS:
+                if value.ndim != 2:
+                    raise ValueError(f"{path}: {name} has shape {value.shape}, expected (n, columns)")
+                columns.update({f"{name}{i + 1}": value[:, i] for i in range(value.shape[1])})
+            else:
+                columns[name] = value
+    return columns
+
+
+def _assemble(columns: dict[str, np.ndarray], joint_names) -> Log:
+    if "t" not in columns:
+        raise ValueError(f"missing column t; the file has {', '.join(columns) or 'none'}")
+    found = {signal: _signal_columns(columns, signal) for signal in _SIGNALS}
+    for signal in ("q", "tau"):
+        if not found[signal]:
+            raise ValueError(f"missing columns {signal}1, {signal}2, ...; the file has {', '.join(columns)}")
+    labels = list(found["tau"])
+    by_number = all(label.isdecimal() for label in labels)
+    if not by_number:
+        labels = list(joint_names) if joint_names is not None else labels
+    missing = []
+    arrays = {}
+    for signal in _SIGNALS:
+        if not found[signal]:
+            arrays[signal] = None
+            continue
+        # Numbered configurations may be longer than the torques (quaternions); their count is the largest number.
+        wanted = [str(i + 1) for i in range(max(map(int, found[signal])))] if by_number else labels
+        missing += [f"{signal}{'' if by_number else '_'}{label}" for label in wanted if label not in found[signal]]
+        arrays[signal] = [columns[found[signal][label]] for label in wanted if label in found[signal]]
+    if missing:
+        raise ValueError(f"missing columns {', '.join(missing)}; the file has {', '.join(columns)}")
+    lengths = {len(column) for group in arrays.values() if group for column in group}
+    if len(lengths) > 1:
+        sizes = {name: len(column) for name, column in columns.items()}
+        raise ValueError(f"unequal lengths: {', '.join(f'{name} has {n} rows' for name, n in sizes.items())}")
+    stacked = {signal: None if group is None else np.stack(group, axis=1) for signal, group in arrays.items()}
+    return Log(columns["t"], **stacked, joint_names=None if by_number else labels)
+
+
+def _signal_columns(columns, signal: str) -> dict[str, str]:
+    """Label (number or joint name) to column name, for one signal; mixing both kinds is refused."""
+    numbered = {
+        name[len(signal) :]: name for name in columns if name.startswith(signal) and name[len(signal) :].isdecimal()
+    }
+    named = {name[len(signal) + 1 :]: name for name in columns if name.startswith(signal + "_")}
+    if numbered and named:
+        raise ValueError(f"columns of {signal} are both numbered ({', '.join(numbered.values())}) and named "
+                         f"({', '.join(named.values())}); use one kind")  # fmt: skip
+    return numbered or named

@@ -1,0 +1,384 @@
+"""Reading URDF files.
+
+A file is read strictly first: XML, structure, references and numbers, each fault with its line. yourdfpy then turns the
+links and joints into typed objects (it fills gaps with defaults and mends broken XML without a word, which is why it is
+not asked first). Meshes and all that is only seen are never looked at.
+"""
+
+import io
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdyn import _float64 as f64
+from jaxdyn.building import GRAVITY, ModelBuilder, inertia_problems, unknown
+from jaxdyn.joints import KINDS, SCREW_KINDS, joint_neutral
+from jaxdyn.model import Model
+
+# URDF has no number for "no limit", and its readers take no "inf"; `save_urdf` writes the largest double.
+NO_LIMIT = float(np.finfo(np.float64).max)
+ROOT_JOINT = "root_joint"
+_Z = np.array([0.0, 0.0, 1.0])
+_KINDS = {"floating": "free", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar", "fixed")}}
+# Attributes that must hold so many finite numbers where they are given. The model needs no others.
+_NUMBERS = {
+    "origin": {"xyz": 3, "rpy": 3},
+    "axis": {"xyz": 3},
+    "mass": {"value": 1},
+    "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 1),
+    "limit": dict.fromkeys(("lower", "upper", "velocity", "effort"), 1),
+    "dynamics": dict.fromkeys(("damping", "friction", "armature"), 1),
+    "mimic": {"multiplier": 1, "offset": 1},
+}
+_REQUIRED = {"mass": ("value",), "inertia": tuple(_NUMBERS["inertia"]), "parent": ("link",), "child": ("link",)}
+_REQUIRED["mimic"] = ("joint",)
+
+
+class _Description(NamedTuple):
+    name: str
+    links: dict[str, Any]
+    joints: dict[str, Any]  # by name, in the file's order
+    children: dict[str, list[str]]  # link -> names of the joints it carries
+    root: str
+    armature: dict[str, float]
+    places: dict[str, str]  # "joint NAME" and "link NAME" -> file:line
+
+
+def load_urdf(
+    path: str | os.PathLike,
+    *,
+    floating_base: bool = False,
+    lock: Iterable[str] | Mapping[str, Any] = (),
+    mimic: str = "ignore",
+    gravity=GRAVITY,
+    dtype=None,
+) -> Model:
+    """The mechanism of a URDF file. Meshes are not read.
+
+    Links joined by fixed joints are merged; every link keeps a frame of its name. Joints stand in Pinocchio's order.
+    The inertias are those of the file, physical or not (`urdf_inertia_report`, `repair_inertias`). `damping` and
+    `friction` of `<dynamics>` become leaves; so does `armature`, the rotor inertia seen at the joint, an attribute that
+    is no part of URDF and that `save_urdf` writes. A planar joint moves in the plane normal to its axis, as URDF has it
+    (Pinocchio moves it in the x-y plane of its frame whatever the axis); where that axis is not z, the moving body is
+    called LINK_plane, has its z along the axis, and carries LINK.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `floating_base`: whether the root link moves freely, by a first joint "root_joint"; else it is fixed to the world.
+    - `lock`: joints to hold, at neutral (names) or at given coordinates (name -> number or (nq of the joint,)).
+      They become fixed and their links are merged.
+    - `mimic`: what to do with joints that follow others. "ignore" leaves them free, "couple" leaves them free and
+      records the couplings for a scene to impose (and holds those that follow a locked joint), "error" refuses them.
+    - `gravity`, `dtype`: as for `ModelBuilder`.
+
+    **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, links that are not a tree,
+    an unknown joint type, a bad number, a negative mass, a zero axis; for names in `lock` that are not movable joints;
+    for a joint that moves no inertia. ImportError without yourdfpy.
+    """
+    if mimic not in ("ignore", "couple", "error"):
+        raise ValueError(f"mimic is {mimic!r}; give 'ignore', 'couple' or 'error'")
+    urdf = _read(path)
+    root_joint = ROOT_JOINT
+    while root_joint in urdf.joints:
+        root_joint = f"_{root_joint}"
+    kinds = {name: _KINDS[joint.type] for name, joint in urdf.joints.items()}
+    held = _held({root_joint: "free", **kinds} if floating_base else kinds, lock, path)
+    couplings = {name: joint.mimic for name, joint in urdf.joints.items() if joint.mimic and kinds[name] != "fixed"}
+    if mimic == "error" and couplings:
+        listed = ", ".join(f"{name} (follows {coupling.joint})" for name, coupling in couplings.items())
+        raise ValueError(f"{path}: joints that follow others: {listed}; pass mimic='couple' or mimic='ignore'")
+    if mimic == "couple":
+        couplings = _settle(couplings, kinds, held, urdf.places)
+
+    builder = ModelBuilder(urdf.name, gravity=gravity, dtype=dtype)
+    free = floating_base and root_joint not in held
+    base = f64.joint_pose("free", np.zeros(6), held[root_joint]) if root_joint in held else None
+    inertia = _inertia(urdf, urdf.root)
+    builder.add_body(urdf.root, None, "free" if free else "fixed", inertia, joint_name=root_joint, pose=base)
+    stack = list(reversed(urdf.children[urdf.root]))
+    while stack:
+        joint = urdf.joints[stack.pop()]
+        stack.extend(reversed(urdf.children[joint.child]))
+        try:
+            _add_joint(builder, joint, urdf, held)
+        except ValueError as error:
+            raise ValueError(f"{urdf.places[f'joint {joint.name}']}: {error}") from error
+    if mimic == "couple":
+        for name, coupling in couplings.items():
+            builder.add_coupling(name, coupling.joint, coupling.multiplier, coupling.offset)
+    try:
+        return builder.build()
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def urdf_inertia_report(path: str | os.PathLike) -> list[tuple[str, str]]:
+    """What is unphysical in the inertias that a URDF file states, as (link, problem), before links are merged.
+
+    Links without `<inertial>` are listed only where a joint moves them: a fixed one is a mere frame.
+
+    **Raises:** ValueError as `load_urdf` does for a file that cannot be understood.
+    """
+    urdf = _read(path)
+    moved = {joint.child for joint in urdf.joints.values() if joint.type != "fixed"}
+    report = []
+    for name, link in urdf.links.items():
+        if link.inertial is None:
+            report += [(name, "massless: no <inertial>")] if name in moved else []
+            continue
+        report += [(name, problem) for problem in inertia_problems(_inertia(urdf, name))]
+    return report
+
+
+def _add_joint(builder: ModelBuilder, joint, urdf: _Description, held: dict[str, np.ndarray]) -> None:
+    kind, name, inertia = _KINDS[joint.type], joint.child, _inertia(urdf, joint.child)
+    pose = np.eye(4) if joint.origin is None else joint.origin
+    parent, axis, turn = joint.parent, _Z, np.eye(4)
+    if kind in SCREW_KINDS or kind == "planar":
+        axis = f64.unit(joint.axis, f"joint {joint.name!r}: axis")
+    if kind == "planar":
+        turn, axis = _turn_from_z(axis), _Z
+    if joint.name in held:
+        screw = np.concatenate([axis, np.zeros(3)] if kind == "prismatic" else [np.zeros(3), axis])
+        pose = pose @ turn @ f64.joint_pose(kind, screw, held[joint.name]) @ f64.inverse(turn)
+        kind, axis, turn = "fixed", _Z, np.eye(4)
+    leaves = {} if kind == "fixed" else _leaves(joint, kind, urdf.armature.get(joint.name))
+    if not np.array_equal(turn, np.eye(4)):
+        carrier = f"{name}_plane"
+        builder.add_body(carrier, parent, kind, joint_name=joint.name, pose=pose @ turn, **leaves)
+        builder.add_body(name, carrier, "fixed", inertia, joint_name=f"{joint.name}_plane", pose=f64.inverse(turn))
+        return
+    builder.add_body(name, parent, kind, inertia, joint_name=joint.name, pose=pose, axis=axis, **leaves)
+
+
+def _leaves(joint, kind: str, armature: float | None) -> dict[str, Any]:
+    leaves: dict[str, Any] = {"armature": armature}
+    if joint.dynamics is not None:
+        for key in ("damping", "friction"):
+            value = getattr(joint.dynamics, key)
+            leaves[key] = None if value is None else float(value)
+    if joint.limit is not None:
+        leaves |= {"velocity_limit": joint.limit.velocity, "effort_limit": joint.limit.effort}
+        if kind in ("revolute", "prismatic"):
+            # The format's default for a bound that is left out is zero.
+            leaves |= {"lower": joint.limit.lower or 0.0, "upper": joint.limit.upper or 0.0}
+        for key in ("velocity_limit", "effort_limit", "lower", "upper"):
+            if leaves.get(key) is not None and abs(leaves[key]) >= NO_LIMIT:
+                leaves[key] = np.copysign(np.inf, leaves[key])
+    return leaves
+
+
+def _inertia(urdf: _Description, link: str) -> np.ndarray:
+    inertial = urdf.links[link].inertial
+    if inertial is None:
+        return np.zeros(10)
+    # A missing <mass> or <inertia> inside <inertial> is none at all.
+    parts = (inertial.mass or 0.0, np.zeros(3), np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia)
+    try:
+        parameters = f64.inertia_numbers(parts, f"link {link!r}")
+    except ValueError as error:
+        raise ValueError(f"{urdf.places[f'link {link}']}: {error}") from error
+    return parameters if inertial.origin is None else f64.move_inertia(inertial.origin, parameters)
+
+
+def _turn_from_z(axis: np.ndarray) -> np.ndarray:
+    """Rotation (4, 4) by the shortest way that takes z to a unit axis; half a turn about x for -z."""
+    turn = np.eye(4)
+    across = np.array([-axis[1], axis[0], 0.0])
+    sine = np.linalg.norm(across)
+    if sine > 0:
+        turn[:3, :3] = f64.rotation_matrix(across / sine, np.arctan2(sine, axis[2]))
+    elif axis[2] < 0:
+        turn[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    return turn
+
+
+def _held(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:
+    """Coordinates at which each locked joint is held."""
+    if isinstance(lock, str):
+        raise ValueError(f"lock is {lock!r}; give a list of joint names or a mapping of name to value")
+    values = dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(lock)
+    held = {}
+    for name, value in values.items():
+        if name not in kinds or kinds[name] == "fixed":
+            fault = f"joint {name!r} is fixed already" if name in kinds else unknown("joint", name, kinds)
+            raise ValueError(f"lock: {fault} in {path}; leave it out")
+        nq = KINDS[kinds[name]].nq
+        if value is None:
+            held[name] = joint_neutral(kinds[name])
+            continue
+        shapes = {(nq,): f"({nq},)"} | ({(): "a number"} if nq == 1 else {})
+        held[name] = f64.numbers(value, shapes, f"lock: value of joint {name!r}").reshape(nq)
+        if kinds[name] == "free" and not held[name][3:].any():
+            raise ValueError(f"lock: value of joint {name!r} is {value!r}; its quaternion (qw, qx, qy, qz) is zero")
+    return held
+
+
+def _settle(couplings: dict, kinds: dict[str, str], held: dict[str, np.ndarray], places: dict[str, str]) -> dict:
+    """The couplings that are left once joints that follow held ones are held too (added to `held`)."""
+    left = dict(couplings)
+    for name, coupling in couplings.items():
+        where = places[f"joint {name}"]
+        for joint in (name, coupling.joint):
+            if joint not in kinds:
+                raise ValueError(
+                    f"{where}: joint {name!r} follows {joint!r}, which is not a joint of the file; mend <mimic>"
+                )
+            if kinds[joint] not in SCREW_KINDS:
+                fault = f"joint {name!r} follows {coupling.joint!r}, but {joint!r} is {kinds[joint]}"
+                raise ValueError(f"{where}: {fault}; couple joints of one degree of freedom, or pass mimic='ignore'")
+    settled = False
+    while not settled:
+        settled = True
+        for name, coupling in list(left.items()):
+            if coupling.joint not in held:
+                continue
+            value = coupling.multiplier * held[coupling.joint] + coupling.offset
+            if not np.allclose(held.setdefault(name, value), value, rtol=1e-9, atol=1e-9):
+                raise ValueError(
+                    f"lock: joint {name!r} is held at {held[name]}, but follows {coupling.joint!r} to {value}"
+                )
+            del left[name]
+            settled = False
+    for name, coupling in left.items():
+        if name in held:
+            raise ValueError(f"lock: joint {name!r} follows {coupling.joint!r}; lock that one instead")
+    return left
+
+
+def _read(path) -> _Description:
+    etree, yourdfpy = _libraries()
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise ValueError(f"URDF file {str(path)!r} cannot be read ({error.strerror}); check the path") from error
+    # Undeclared namespace prefixes are common and harmless; all other faults that the parser can mend are errors.
+    parser = etree.XMLParser(
+        recover=True, remove_comments=True, remove_pis=True, resolve_entities=False, no_network=True
+    )
+    try:
+        root = etree.fromstring(data, parser)
+    except etree.XMLSyntaxError:
+        root = None
+    for entry in parser.error_log:
+        if entry.domain_name != "NAMESPACE":
+            raise ValueError(f"{path}:{entry.line}: malformed XML: {entry.message}")
+    if root is None:
+        raise ValueError(f"{path}:1: malformed XML: there is no element in the file")
+    elements, places = _check(root, path)
+    kept = etree.Element("robot", name=root.get("name"))
+    for element in elements:
+        copy = etree.SubElement(kept, element.tag, dict(element.attrib))
+        copy.extend(part for part in element if part.tag in (*_NUMBERS, *_REQUIRED, "inertial"))
+    robot = yourdfpy.URDF.load(io.BytesIO(etree.tostring(kept)), build_scene_graph=False, load_meshes=False).robot
+    armature = {
+        joint.get("name"): float(dynamics.get("armature"))
+        for joint in kept.findall("joint")
+        if (dynamics := joint.find("dynamics")) is not None and dynamics.get("armature") is not None
+    }
+    links = {link.name: link for link in robot.links}
+    joints = {joint.name: joint for joint in robot.joints}
+    children: dict[str, list[str]] = {name: [] for name in links}
+    for joint in joints.values():
+        children[joint.parent].append(joint.name)
+    return _Description(robot.name, links, joints, children, _root(joints, links, places, path), armature, places)
+
+
+def _libraries():
+    try:
+        import yourdfpy
+        from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]  # a requirement of yourdfpy
+    except ImportError as error:
+        raise ImportError("reading URDF files needs yourdfpy: pip install jaxdyn[urdf]") from error
+    return etree, yourdfpy
+
+
+def _check(root, path) -> tuple[list, dict[str, str]]:
+    """The link and joint elements, once names, references and numbers are found in order; file:line of each."""
+
+    def fault(element, text) -> ValueError:
+        return ValueError(f"{path}:{element.sourceline}: {text}")
+
+    if root.tag != "robot":
+        raise fault(root, f"the root element is <{root.tag}>, expected <robot>; this is not a URDF file")
+    elements = [element for element in root if element.tag in ("link", "joint")]
+    if not elements or not root.get("name"):
+        missing = "name" if elements else "<link>"
+        hint = "; expand this xacro file first: xacro IN > OUT" if "xacro" in root.nsmap else ""
+        raise fault(root, f"the robot has no {missing}{hint}")
+    places: dict[str, str] = {}
+    for element in elements:
+        tag, name = element.tag, element.get("name")
+        if not name:
+            raise fault(element, f"a <{tag}> has no name")
+        if f"{tag} {name}" in places:
+            raise fault(element, f"the {tag} name {name!r} is taken at {places[f'{tag} {name}']}; rename one")
+        places[f"{tag} {name}"] = f"{path}:{element.sourceline}"
+        for part in element.iter(*_NUMBERS, *_REQUIRED):
+            if part.getparent().tag in ("visual", "collision"):
+                continue
+            for key in _REQUIRED.get(part.tag, ()):
+                if part.get(key) is None:
+                    raise fault(part, f"<{part.tag}> of {tag} {name!r} has no {key}")
+            if part.get("quat_xyzw") is not None:
+                raise fault(part, f"<{part.tag}> of {tag} {name!r} has quat_xyzw, which is not read; write it as rpy")
+            for key, count in _NUMBERS.get(part.tag, {}).items():
+                if (text := part.get(key)) is not None and not _are_numbers(text, count):
+                    what = "a finite number" if count == 1 else f"{count} finite numbers"
+                    raise fault(part, f"{key} of <{part.tag}> of {tag} {name!r} is {text!r}, expected {what}")
+    for element in elements:
+        if element.tag == "link":
+            continue
+        name = element.get("name")
+        if element.get("type") not in _KINDS:
+            kinds = ", ".join(_KINDS)
+            raise fault(
+                element, f"joint {name!r} has type {element.get('type')!r}, which is unknown; types are {kinds}"
+            )
+        for end in ("parent", "child"):
+            if (part := element.find(end)) is None:
+                raise fault(element, f"joint {name!r} has no <{end}>")
+            if f"link {part.get('link')}" not in places:
+                raise fault(part, f"joint {name!r}: the {end} link {part.get('link')!r} is not in the file")
+    return elements, places
+
+
+def _are_numbers(text: str, count: int) -> bool:
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        return False
+    return len(values) == count and bool(np.all(np.isfinite(values)))
+
+
+def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str], path) -> str:
+    """The one link that no joint moves. Raises unless the links form one tree."""
+    moved_by: dict[str, str] = {}
+    for joint in joints.values():
+        if joint.child in moved_by:
+            where, other = places[f"joint {joint.name}"], moved_by[joint.child]
+            fault = f"link {joint.child!r} is the child of joints {other!r} and {joint.name!r}"
+            raise ValueError(f"{where}: {fault}; a URDF is a tree, close loops with a constraint")
+        moved_by[joint.child] = joint.name
+    roots = [name for name in links if name not in moved_by]
+    if len(roots) > 1:
+        raise ValueError(f"{path}: there are {len(roots)} root links: {', '.join(roots)}; join them by a joint")
+    # From every link the way to the parent leads to the root, unless it runs in a circle.
+    sound = set(roots)
+    for start in links:
+        way, link = [], start
+        while link not in sound:
+            if link in way:
+                circle = way[way.index(link) :]
+                where = places[f"joint {moved_by[link]}"]
+                raise ValueError(
+                    f"{where}: the links {', '.join(circle)} form a cycle; a URDF is a tree, remove a joint"
+                )
+            way.append(link)
+            link = joints[moved_by[link]].parent
+        sound.update(way)
+    return roots[0]

@@ -1,0 +1,206 @@
+"""Writing models as URDF files that read back as the same model."""
+
+import os
+import xml.etree.ElementTree as ET
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdyn import _float64 as f64
+from jaxdyn.io.urdf import NO_LIMIT, ROOT_JOINT
+from jaxdyn.model import Model
+
+_TYPES = {"free": "floating", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar")}}
+
+
+class _Edge(NamedTuple):
+    """A joint to be written: of body `body`, or a fixed one that carries a frame (None)."""
+
+    joint: str
+    parent: str
+    child: str
+    pose: np.ndarray
+    body: int | None
+
+
+def save_urdf(model: Model, path: str | os.PathLike) -> None:
+    """Write a model as a URDF file; `load_urdf` gives the same model back, to rounding.
+
+    Bodies become links, other frames become links on fixed joints; what was merged stays merged. A single root body on
+    a free joint "root_joint" becomes the root link (load it with `floating_base=True`); otherwise the root is a frame
+    that coincides with the world's, or a new link "world". Siblings that do not stand in the order of their joint names
+    hang on frames of their parent, or on added ones "..._carrier". Couplings become `<mimic>` (load with
+    `mimic="couple"`), armature an attribute of `<dynamics>`; gravity has no place in the file. Infinite limits are
+    written as the largest double, because readers of URDF take no "inf".
+
+    **Raises:** ValueError naming the joint or body for what URDF cannot express: helical and spherical joints, axes
+    that miss the origin of the body frame, limits of planar and free joints, friction or armature that differs between
+    the directions of one joint, first moments without mass. OSError when the file cannot be written.
+    """
+    root, edges = _edges(model)
+    inertias = dict(zip(model.body_names, np.asarray(model.inertias, np.float64), strict=True))
+    robot = ET.Element("robot", name=model.name)
+    for link in (root, *(edge.child for edge in edges)):
+        _write_link(robot, link, inertias.get(link))
+    for edge in edges:
+        _write_joint(robot, model, edge)
+    ET.indent(robot)
+    ET.ElementTree(robot).write(path, encoding="utf-8", xml_declaration=True)
+
+
+def _edges(model: Model) -> tuple[str, list[_Edge]]:
+    """The root link, and joints whose depth-first order with siblings sorted by name is the model's order."""
+    topology = model.topology
+    home, poses = np.asarray(model.home, np.float64), np.asarray(model.frame_poses, np.float64)
+    links, joints = set(topology.frame_names), set(topology.joint_names)
+    children: dict[int, list[int]] = {i: [] for i in range(-1, model.nb)}
+    frames: dict[int, list[int]] = {i: [] for i in range(-1, model.nb)}
+    for i, parent in enumerate(topology.parents):
+        children[parent].append(i)
+    for k, body in enumerate(topology.frame_bodies[model.nb :], model.nb):
+        frames[body].append(k)
+    names = {i: name for i, name in enumerate(topology.body_names)}
+    if _has_floating_base(model):
+        children[-1] = []
+    else:
+        at_world = [k for k in frames[-1] if np.array_equal(poses[k], np.eye(4))]
+        names[-1] = topology.frame_names[at_world[0]] if at_world else _fresh("world", links)
+        frames[-1] = [k for k in frames[-1] if k not in at_world[:1]]
+
+    edges = []
+    for carrier, name in sorted(names.items()):
+        runs = _sorted_runs([topology.joint_names[i] for i in children[carrier]])
+        last = max((topology.joint_names[i] for i in children[carrier]), default="")
+        holders = [(name, np.eye(4))]
+        for n in range(max(len(frames[carrier]), len(runs) - 1)):
+            k = frames[carrier][n] if n < len(frames[carrier]) else None
+            link, pose = (
+                (_fresh(f"{name}_carrier", links), np.eye(4)) if k is None else (topology.frame_names[k], poses[k])
+            )
+            # What hangs on a holder is read when the holder's joint comes up: after all joints named before it.
+            joint = f"{last}~{n:03d}" if n + 1 < len(runs) else f"{link}_fixed"
+            edges.append(_Edge(_fresh(joint, joints), name, link, pose, None))
+            holders.append((link, pose))
+        for (link, pose), run in zip(holders, runs, strict=False):
+            for i in (topology.joint_names.index(joint) for joint in run):
+                edges.append(
+                    _Edge(topology.joint_names[i], link, topology.body_names[i], f64.inverse(pose) @ home[i], i)
+                )
+    return names[min(names)], edges
+
+
+def _has_floating_base(model: Model) -> bool:
+    topology = model.topology
+    return (
+        topology.parents.count(-1) == 1
+        and topology.kinds[0] == "free"
+        and topology.joint_names[0] == ROOT_JOINT
+        and -1 not in topology.frame_bodies
+        and np.array_equal(model.home[0], np.eye(4))
+    )
+
+
+def _sorted_runs(names: list[str]) -> list[list[str]]:
+    """The names cut where one is smaller than the one before it."""
+    runs: list[list[str]] = []
+    for name in names:
+        if runs and name > runs[-1][-1]:
+            runs[-1].append(name)
+        else:
+            runs.append([name])
+    return runs
+
+
+def _fresh(name: str, taken: set[str]) -> str:
+    """The name, with underscores until nothing else has it; it counts as taken from now on."""
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    return name
+
+
+def _write_link(robot: ET.Element, name: str, parameters: np.ndarray | None) -> None:
+    link = ET.SubElement(robot, "link", name=name)
+    if parameters is None or not parameters.any():
+        return
+    mass, com, inertia = f64.about_com(parameters)
+    if mass == 0 and parameters[1:4].any():
+        raise ValueError(
+            f"body {name!r} has first moments {parameters[1:4].tolist()} kg m without mass; URDF cannot say so"
+        )
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=_text(com), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=_text([mass]))
+    rows = {f"i{a}{b}": _text([inertia[i, j]]) for i, a in enumerate("xyz") for j, b in enumerate("xyz") if i <= j}
+    ET.SubElement(inertial, "inertia", rows)
+
+
+def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
+    kind = "fixed" if edge.body is None else model.topology.kinds[edge.body]
+    joint = ET.SubElement(robot, "joint", name=edge.joint, type="floating" if kind == "free" else kind)
+    rpy = f64.rpy_from_rotation(edge.pose[:3, :3])
+    ET.SubElement(joint, "origin", xyz=_text(edge.pose[:3, 3]), rpy=_text(rpy))
+    ET.SubElement(joint, "parent", link=edge.parent)
+    ET.SubElement(joint, "child", link=edge.child)
+    if edge.body is None:
+        return
+    what = f"joint {edge.joint!r}"
+    if kind in ("helical", "spherical"):
+        raise ValueError(f"{what} is {kind}; URDF has no such joint")
+    if kind != "free":
+        ET.SubElement(joint, "axis", xyz=_text(_axis(np.asarray(model.screws[edge.body], np.float64), kind, what)))
+    _write_limits(joint, model, edge.body, what)
+    given = {key: getattr(model, key) for key in ("damping", "friction", "armature")}
+    dynamics = {}
+    for key, values in given.items():
+        if values is not None:
+            own = np.asarray(values, np.float64)[model.topology.v_slices[edge.body]]
+            if np.any(own != own[0]):
+                raise ValueError(
+                    f"{what}: {key} {own.tolist()} differs between directions; URDF holds one number per joint"
+                )
+            dynamics[key] = _text(own[:1])
+    if dynamics:
+        ET.SubElement(joint, "dynamics", dynamics)
+    for n, (i, source) in enumerate(model.topology.couplings):
+        if i == edge.body and model.coupling_values is not None:
+            multiplier, offset = np.asarray(model.coupling_values[n], np.float64)
+            values = {"joint": model.joint_names[source], "multiplier": _text([multiplier]), "offset": _text([offset])}
+            ET.SubElement(joint, "mimic", values)
+
+
+def _axis(screw: np.ndarray, kind: str, what: str) -> np.ndarray:
+    if kind == "planar":
+        return np.array([0.0, 0.0, 1.0])
+    if kind == "prismatic":
+        return screw[:3]
+    if screw[:3].any():
+        raise ValueError(f"{what}: its screw {screw.tolist()} misses the origin of the body frame; URDF cannot say so")
+    return screw[3:]
+
+
+def _write_limits(joint: ET.Element, model: Model, body: int, what: str) -> None:
+    kind = model.topology.kinds[body]
+    place, rates = model.topology.q_slices[body], model.topology.v_slices[body]
+    limits = {
+        "lower": np.asarray(model.lower, np.float64)[place],
+        "upper": np.asarray(model.upper, np.float64)[place],
+        "velocity": np.asarray(model.velocity_limit, np.float64)[rates],
+        "effort": np.asarray(model.effort_limit, np.float64)[rates],
+    }
+    if kind == "continuous":
+        del limits["lower"], limits["upper"]
+    finite = [key for key, values in limits.items() if np.isfinite(values).any()]
+    if kind in ("planar", "free"):
+        if finite:
+            raise ValueError(f"{what} is {kind} and has limits ({', '.join(finite)}); URDF cannot say so")
+        return
+    if finite or kind != "continuous":
+        ET.SubElement(
+            joint, "limit", {key: _text(np.clip(values, -NO_LIMIT, NO_LIMIT)) for key, values in limits.items()}
+        )
+
+
+def _text(values) -> str:
+    # repr is the shortest text that reads back as the same double.
+    return " ".join(repr(float(value)) for value in values)

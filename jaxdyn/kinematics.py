@@ -1,0 +1,242 @@
+"""Kinematics of trees: products of exponentials, Jacobians of named frames and their rates.
+
+Body i stands at T_i = (product over its ancestors j, root first, of home_j exp(hat(S_j) q_j)), the product of exponentials
+of Murray, Li & Sastry (1994), eq. 3.3, with body frames in place of base-frame screws. The product along the tree is
+taken by pointer jumping: after step k every body holds the product of its last 2^k joints, so log2(depth) batched 4x4
+products give all poses and the program stays short however many bodies there are.
+
+Everything that is summed over bodies lives in one *tree frame*: axes parallel to the world's, origin at the origin of
+the tree's root body. Positions in it are built without ever adding the root's own position, so a robot far from the
+world's origin is computed exactly as one at home.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn import se3
+from jaxdyn.joints import KINDS, SCREW_KINDS, joint_transform
+from jaxdyn.model import Model, Topology, check_shapes, frame_index, geometry
+from jaxdyn.so3 import _product
+
+
+class TreeFrame(NamedTuple):
+    """A configuration seen from the tree frames (one per root body).
+
+    - `pose` (nb, 4, 4): body frame in its tree frame (m).
+    - `origin` (nb, 3): world position of the tree frame's origin, for each body (m).
+    - `subspace` (nv, 6): row k is the twist, in the tree frame, of the motion with v_k = 1 alone. As a twist of the fixed
+      frame that coincides with the tree frame at this instant it does not depend on where the root body is.
+    """
+
+    pose: Float[Array, "nb 4 4"]
+    origin: Float[Array, "nb 3"]
+    subspace: Float[Array, "nv 6"]
+
+
+def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
+    """Pose of each body frame in its parent body frame (the world's for roots), home @ exp(hat(S) q)."""
+    topology = model.topology
+    home, screws = geometry(model)
+    order, transforms = [], []
+    for kind, bodies in _groups(topology):
+        if kind in SCREW_KINDS:
+            coordinates = np.array([topology.q_slices[i].start for i in bodies])
+            twists = take(screws, bodies) * take(q, coordinates)[:, None]
+            transforms.append(jax.vmap(se3.exp)(twists))
+        else:
+            coordinates = np.array([np.arange(topology.nq)[topology.q_slices[i]] for i in bodies])
+            # The screw is not read by these kinds.
+            transforms.append(jax.vmap(lambda qj, kind=kind: joint_transform(kind, screws[0], qj))(q[coordinates]))
+        order.extend(bodies)
+    if not transforms:
+        return home
+    moved = transforms[0] if len(transforms) == 1 else jnp.concatenate(transforms)
+    return _product(home, take(moved, np.argsort(order)))
+
+
+def body_subspace(model: Model) -> Float[Array, "nv 6"]:
+    """Motion subspace of every joint in its own body frame, one row per velocity coordinate."""
+    topology = model.topology
+    fixed = np.zeros((topology.nv, 6))
+    is_screw = np.zeros(topology.nv, bool)
+    for kind, place in zip(topology.kinds, topology.v_slices, strict=True):
+        if kind in SCREW_KINDS:
+            is_screw[place] = True
+        else:
+            fixed[place] = np.eye(6)[list(KINDS[kind].columns)]
+    constant = jnp.asarray(fixed, model.screws.dtype)
+    if not is_screw.any():
+        return constant
+    screws = take(geometry(model)[1], topology.dof_body)
+    return screws if is_screw.all() else jnp.where(is_screw[:, None], screws, constant)
+
+
+def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
+    """Poses and motion subspace in the tree frames (see `TreeFrame`)."""
+    topology = model.topology
+    local = relative_poses(model, q)
+    is_root = np.array([parent < 0 for parent in topology.parents], bool)
+    origin = take(local[:, :3, 3], topology.roots)
+    # A root's own translation is replaced by zero before the product, not subtracted after it.
+    keep = np.ones((topology.nb, 4, 4), bool)
+    keep[is_root, :3, 3] = False
+    pose = jnp.where(keep, local, jnp.zeros_like(local))
+    world = jnp.eye(4, dtype=pose.dtype)[None]
+    for table in topology.jumps:
+        pose = _product(jnp.concatenate([pose, world])[table], pose)
+    subspace = jax.vmap(se3.Ad_apply)(take(pose, topology.dof_body), body_subspace(model))
+    return TreeFrame(pose, origin, subspace)
+
+
+def body_twists(model: Model, frame: TreeFrame, v: Float[Array, " nv"]) -> Float[Array, "nb 6"]:
+    """Twist of every body in its tree frame: V_i = sum of S_k v_k over the coordinates k that move body i."""
+    return sum_to_bodies(model, frame.subspace * v[:, None])
+
+
+def subspace_rate(model: Model, frame: TreeFrame, twists: Float[Array, "nb 6"]) -> Float[Array, "nv 6"]:
+    """Rate of the motion subspace: dS_k/dt = ad_V S_k, V the twist of the body that carries S_k with it."""
+    return jax.vmap(se3.ad_apply)(take(twists, model.topology.dof_body), frame.subspace)
+
+
+def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
+    """G rows: for each body the sum of the rows of the coordinates that move it."""
+    return _product(jnp.asarray(model.topology.dof_ancestors, rows.dtype), rows)
+
+
+def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
+    """G^T rows: for each velocity coordinate the sum of the rows of the bodies that it moves."""
+    return _product(jnp.asarray(model.topology.dof_ancestors.T, rows.dtype), rows)
+
+
+def forward_kinematics(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
+    """Pose of every body frame in the world, T_i = product of home_j exp(hat(S_j) q_j) over the joints above body i.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (nb, 4, 4) in the order of `model.body_names`; maps body coordinates to world coordinates (m).
+
+    **Raises:** ValueError when the shape of q does not fit the model.
+
+    Source: Murray, Li & Sastry (1994), eq. 3.3; EQUATIONS section 2.
+    """
+    check_shapes(model, q=q)
+    frame = tree_frame(model, q)
+    return frame.pose.at[:, :3, 3].add(frame.origin)
+
+
+def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[Array, "4 4"]:
+    """Pose of a named frame in the world.
+
+    **Arguments:** `q` (nq,); `name`, one of `model.frame_names` (None: the world itself).
+
+    **Returns:** (4, 4), maps frame coordinates to world coordinates (m).
+
+    **Raises:** ValueError for an unknown name (near names are listed) or a q that does not fit.
+    """
+    check_shapes(model, q=q)
+    body, offset = _named_frame(model, name)
+    if body < 0:
+        return offset
+    frame = tree_frame(model, q)
+    return _product(frame.pose[body], offset).at[:3, 3].add(frame.origin[body])
+
+
+def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
+    """Body Jacobian of a named frame: J v is the frame's body twist, hat(J v) = T^-1 dT/dt.
+
+    **Arguments:** `q` (nq,); `frame`, one of `model.frame_names` (None: the world, J = 0).
+
+    **Returns:** (6, nv): linear then angular velocity of the frame, at its origin and in its own axes (m/s, rad/s per
+    unit of v). Its transpose maps a wrench at that origin, in those axes, to generalised forces.
+
+    **Raises:** ValueError for an unknown name or a q that does not fit.
+
+    Source: Murray, Li & Sastry (1994), eq. 3.55; EQUATIONS section 2.
+    """
+    check_shapes(model, q=q)
+    body, offset = _named_frame(model, frame)
+    tree = tree_frame(model, q)
+    return _body_twist_columns(model, tree, body, offset, tree.subspace).T
+
+
+def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
+    """Spatial Jacobian of a named frame: J v is the frame's spatial twist, hat(J v) = (dT/dt) T^-1.
+
+    **Arguments:** `q` (nq,); `frame`, one of `model.frame_names` (None: the world, J = 0).
+
+    **Returns:** (6, nv): velocity of the point of the body that is now at the world's origin, and angular velocity, in
+    world axes. Loses accuracy with the distance from the world's origin; `body_jacobian` does not.
+
+    **Raises:** ValueError for an unknown name or a q that does not fit.
+
+    Source: Murray, Li & Sastry (1994), eq. 3.54.
+    """
+    check_shapes(model, q=q)
+    body, _ = _named_frame(model, frame)
+    tree = tree_frame(model, q)
+    if body < 0:
+        return jnp.zeros((6, model.nv), model.home.dtype)
+    shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), tree.origin[body])
+    return jax.vmap(se3.Ad_apply, (None, 0), 1)(shift, _moving(model, body, tree.subspace))
+
+
+def jacobian_dot_v(
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], frame: str | None
+) -> Float[Array, "6"]:
+    """Velocity-dependent part of a frame's body acceleration: (d/dt J_b) v, with J_b the body Jacobian.
+
+    The body twist V_b = J_b v has the rate dV_b/dt = J_b a + (d/dt J_b) v. In a fixed frame the second part is the sum
+    of (ad_V S_k) v_k over the coordinates that move the frame, carried into it by Ad^-1.
+
+    **Arguments:** `q` (nq,); `v` (nv,); `frame`, one of `model.frame_names` (None: the world, zero).
+
+    **Returns:** (6,), linear then angular, in the frame's axes (m/s^2, rad/s^2). It is the rate of the body twist, not the
+    acceleration of the origin: that is its linear part plus omega x v.
+
+    **Raises:** ValueError for an unknown name or shapes that do not fit.
+    """
+    check_shapes(model, q=q, v=v)
+    body, offset = _named_frame(model, frame)
+    tree = tree_frame(model, q)
+    rate = subspace_rate(model, tree, body_twists(model, tree, v)) * v[:, None]
+    return jnp.sum(_body_twist_columns(model, tree, body, offset, rate), axis=0)
+
+
+def take(rows: Array, index: np.ndarray) -> Array:
+    """`rows[index]` for a constant index; no operation when the index lists all rows in order."""
+    index = np.asarray(index)
+    if len(index) == rows.shape[0] and (index == np.arange(len(index))).all():
+        return rows
+    return rows[index]
+
+
+def _groups(topology: Topology) -> list[tuple[str, np.ndarray]]:
+    # All screw kinds share one exponential, every other kind has its own transform.
+    labels = np.array(["revolute" if kind in SCREW_KINDS else kind for kind in topology.kinds], str)
+    return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]
+
+
+def _named_frame(model: Model, name: str | None) -> tuple[int, Float[Array, "4 4"]]:
+    """Body that carries a frame (-1: the world) and the frame's pose in it."""
+    if name is None:
+        return -1, jnp.eye(4, dtype=model.home.dtype)
+    index = frame_index(model, name)
+    return model.topology.frame_bodies[index], model.frame_poses[index]
+
+
+def _moving(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:
+    """Rows of the coordinates that move a body, the others zero."""
+    moves = model.topology.dof_ancestors[body] if body >= 0 else np.zeros(model.nv, bool)
+    return jnp.where(moves[:, None], rows, jnp.zeros_like(rows))
+
+
+def _body_twist_columns(model: Model, tree: TreeFrame, body: int, offset: Array, rows: Array) -> Float[Array, "nv 6"]:
+    """Twists of the tree frame (one per coordinate) seen from a frame that stands at `offset` in a body."""
+    if body < 0:
+        return jnp.zeros_like(rows)
+    pose = _product(tree.pose[body], offset)
+    return jax.vmap(se3.Ad_inv_apply, (None, 0))(pose, _moving(model, body, rows))

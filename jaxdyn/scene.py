@@ -1,0 +1,95 @@
+"""A scene: one system, the constraints on it and the forces in it. What it lists is all that is compiled."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class _Static(eqx.Module):
+    """A plain function as a pytree without leaves, so that what holds it can pass through `jax.jit` and `jax.vmap`."""
+
+    function: Callable = eqx.field(static=True)
+
+    def __call__(self, *args):
+        return self.function(*args)
+
+
+def as_pytree(function: Callable, argument: str) -> Callable:
+    """The callable itself if it is a pytree (an equinox Module, a `jax.tree_util.Partial`), else a static wrapper of
+    it.
+
+    A plain function is compared by identity: the same one gives the same compiled program, a lambda written anew in
+    every call gives a new one.
+
+    **Raises:** ValueError when `function` cannot be called; `argument` says where it came from.
+    """
+    if not callable(function):
+        raise ValueError(f"{argument} is {function!r}, which cannot be called; pass a function or a callable Module")
+    return _Static(function) if jax.tree_util.all_leaves([function]) else function
+
+
+class Scene(eqx.Module):
+    """A system with the constraints and the forces that act on it: M a + h = tau + forces + A^T lam.
+
+    **Arguments:**
+
+    - `system`: a `Model`, or any other system with `nq` and `nv`.
+    - `constraints`: sequence of constraints; empty by default.
+    - `forces`: sequence of `f(system, q, v, t) -> (nv,)`, generalised forces (N m or N) that are added to tau. Those of
+      the library (`JointDamping`, `JointSpring`, ...) and your own equinox Modules hold numbers as leaves, which
+      `jax.grad` and `jax.vmap` reach. A plain function is static: define it once, outside of loops, and let it hold
+      no arrays.
+
+    **Raises:** ValueError when `system` is no system, or `constraints` or `forces` is not a sequence of callables.
+    """
+
+    system: Any
+    constraints: tuple = ()
+    forces: tuple = ()
+
+    def __init__(self, system, constraints=(), forces=()):
+        if not (hasattr(system, "nq") and hasattr(system, "nv")):
+            raise ValueError(
+                f"system is a {type(system).__name__}, which has no nq and nv; pass a Model or another system"
+            )
+        self.system = system
+        self.constraints = _sequence(constraints, "constraints")
+        self.forces = tuple(as_pytree(f, f"forces[{i}]") for i, f in enumerate(_sequence(forces, "forces")))
+
+    @property
+    def nq(self) -> int:
+        """Number of configuration coordinates."""
+        return self.system.nq
+
+    @property
+    def nv(self) -> int:
+        """Number of velocity coordinates."""
+        return self.system.nv
+
+    def applied_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"] | None:
+        """Sum of the scene's forces (nv,) in N m or N, or None when it lists none.
+
+        **Raises:** ValueError that names a force whose result is not (nv,).
+        """
+        total = None
+        for i, force in enumerate(self.forces):
+            value = checked_force(force(self.system, q, v, t), q, self.nv, f"forces[{i}]")
+            total = value if total is None else total + value
+        return total
+
+
+def checked_force(value, q: Float[Array, " nq"], nv: int, argument: str) -> Float[Array, " nv"]:
+    """What a force or control callback returned, checked to be (nv,), in the dtype of q."""
+    if jnp.shape(value) != (nv,):
+        raise ValueError(f"{argument} returned shape {jnp.shape(value)}, expected {(nv,)} = (nv,)")
+    return jnp.asarray(value, q.dtype)
+
+
+def _sequence(items, argument: str) -> tuple:
+    if not isinstance(items, (tuple, list)):
+        raise ValueError(f"{argument} is a {type(items).__name__}; pass a tuple or a list, e.g. {argument}=(item,)")
+    return tuple(items)

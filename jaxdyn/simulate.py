@@ -1,0 +1,376 @@
+"""Motion of a scene in time: `simulate` integrates it with any diffrax method and reports what went wrong, if anything.
+
+The state is (q, v) with dq/dt = H(q) v and dv/dt from the dynamics. Quaternions in q are integrated as four numbers and
+returned to unit length at the end of every step (`ProjectedSolver`), which keeps the order of the method. A model
+without quaternions gets no projection at all.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float
+
+from jaxdyn.dynamics import forward_dynamics, kinetic_energy, potential_energy
+from jaxdyn.kinematics import frame_pose
+from jaxdyn.model import Model, configuration_rate, frame_index, neutral, normalize
+from jaxdyn.scene import Scene, as_pytree, checked_force
+from jaxdyn.solvers import ProjectedSolver
+from jaxdyn.solvers.choice import (
+    checked_adjoint,
+    checked_method,
+    checked_step_limit,
+    is_concrete,
+    is_fixed,
+    progress_meter,
+    stepping,
+)
+
+_OUTPUTS = ("energy", "power", "work", "acceleration")
+_POSE = "pose:"
+_COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
+
+
+class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How a simulation ended: diffrax's codes and two more."""
+
+    nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
+    nonfinite_state = "The state became NaN or infinite."
+
+
+_ADVICE = {
+    "max_steps_reached": "raise max_steps (now {max_steps}), loosen rtol and atol, or take an implicit solver if stiff",
+    "dt_min_reached": "the acceleration is NaN or grows without bound: look for a singular mass matrix (a joint that "
+    "moves no inertia) or a force or control that is not finite there; or rtol and atol are below the rounding error",
+    "nonfinite_start": "give finite q0 and v0 and unit quaternions",
+    "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+}
+
+
+class Solution(eqx.Module):
+    """A simulated motion; every row belongs to one save point. Rows not reached are NaN.
+
+    - `ts` (nt,) in s, as given; `q` (nt, nq); `v` (nt, nv), body-fixed.
+    - `result`, a `RESULTS` code; `success` tells whether all went well.
+    - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
+    - What `outputs` asked for, else None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
+      scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `poses`, one array
+      (nt, 4, 4) by name for each frame asked for as "pose:<frame>".
+    """
+
+    ts: Float[Array, " nt"]
+    q: Float[Array, "nt nq"]
+    v: Float[Array, "nt nv"]
+    result: Any
+    stats: dict[str, Array]
+    energy: Float[Array, " nt"] | None = None
+    power: Float[Array, " nt"] | None = None
+    work: Float[Array, " nt"] | None = None
+    acceleration: Float[Array, "nt nv"] | None = None
+    poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
+
+    @property
+    def success(self) -> Bool[Array, "..."]:
+        """Whether the motion was computed to its end."""
+        return self.result == RESULTS.successful
+
+
+def simulate(
+    scene: Any,
+    q0: Any,
+    v0: Any,
+    ts: Any,
+    *,
+    control: Callable | None = None,
+    method: str = "auto",
+    solver: diffrax.AbstractSolver | None = None,
+    stepsize: Any = None,
+    rtol: Any = 1e-8,
+    atol: Any = 1e-8,
+    adjoint: str | diffrax.AbstractAdjoint | None = None,
+    outputs: Sequence[str] = (),
+    progress: bool = False,
+    max_steps: int | None = None,
+    throw: bool | None = None,
+) -> Solution:
+    """Integrate M(q) a + C(q, v) v + N(q) = tau + forces, dq/dt = H(q) v, from (q0, v0) and save it at the times `ts`.
+
+    One sample; batch states, controls and the scene's leaves with `jax.vmap`. Computed in the dtype of the model.
+    Called outside of `jax.jit` it compiles once per shape, whatever the numbers. Inside your own `jax.jit`, a model
+    that is closed over is known to the compiler and runs faster; one that is an argument serves for other numbers
+    too.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`, or a `Model` to which no forces apply.
+    - `q0` (nq,), `v0` (nv,): state at `ts[0]`. Quaternions up to 0.1 % from unit length are normalised.
+    - `ts` (nt,): strictly increasing times (s), nt >= 2; the first is the start.
+    - `control(q, v, t) -> (nv,)`: tau (N m or N); q comes with unit quaternions. An equinox Module or a
+      `jax.tree_util.Partial` carries leaves that can be differentiated and batched; a plain function is static: define
+      it once.
+    - `method`: "auto" or "free", the dynamics without constraints.
+    - `solver`: any diffrax method of an `ODETerm`. Default `Dopri8` for adaptive steps, `RK4` for fixed ones.
+    - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
+    - `rtol`, `atol`: local error of a step, relative to and besides the size of each entry of (q, v). Values below ten
+      times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
+    - `adjoint`: "reverse" (default) for reverse mode with checkpoints; "forward" for jvp, jacfwd and Hessians by
+      forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
+      continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
+    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" and
+      "pose:<frame>". They are computed only if asked for.
+    - `progress`: show a meter (tqdm if installed, else lines of text).
+    - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
+      4096 with "direct".
+    - `throw`: raise when the integration fails. Default: yes if all inputs are concrete, else see `Solution.result`.
+
+    **Returns:** a `Solution`. Save points between steps come from the method's dense output. Where that is less
+    accurate than the steps (Kvaerno5), adaptive steps end on every save point.
+
+    **Raises:** ValueError for wrong shapes, NaN, times that do not increase, quaternions far from unit length, unknown
+    options, with names and values. RuntimeError with the time reached, the cause and the fix, if it fails and `throw`.
+
+    ```python
+    solution = jd.simulate(model, q0, v0, jnp.linspace(0.0, 1.0, 101), outputs=("energy",))
+    ```
+    """
+    scene = scene if isinstance(scene, Scene) else Scene(scene)
+    q0, v0, ts = (_as_array(x) for x in (q0, v0, ts))
+    _check_state(scene, q0, v0)
+    _check_times(ts)
+    control = None if control is None else as_pytree(control, "control")
+    solver = checked_method(solver, stepsize)
+    adjoint = checked_adjoint(adjoint, solver)
+    options = {
+        "method": method,
+        "solver": solver,
+        "adjoint": adjoint,
+        "outputs": _checked_outputs(scene, outputs),
+        "progress": bool(progress),
+        "max_steps": checked_step_limit(max_steps, ts, stepsize, adjoint),
+    }
+    dtype = scene.system.home.dtype if isinstance(scene.system, Model) else jnp.result_type(q0, 1.0)
+    numbers = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
+    numbers.append(jnp.asarray(stepsize, dtype) if is_fixed(stepsize) else stepsize)
+    # In a trace, numbers that are known stay known; a nested `jit` would hide them. Elsewhere, compile once per shape.
+    staged = isinstance(jnp.zeros(()), Tracer)
+    concrete = not staged and is_concrete((scene, control, numbers))
+    solution = (_run if staged else _run_compiled)(scene, control, numbers, options)
+    if throw is None:
+        throw = concrete
+    if throw and concrete:
+        _raise_failure(solution, options["max_steps"])
+    elif throw:
+        solution = solution.result.error_if(solution, ~solution.success)
+    return solution
+
+
+def _run(scene: Scene, control, numbers, options) -> Solution:
+    q0, v0, ts, *steps = numbers
+    system, outputs = scene.system, options["outputs"]
+    acceleration = _dynamics(scene, options["method"])
+
+    def effort(args, q, v, t):
+        """Tau plus the scene's forces, or None when there are none."""
+        scene, control = args
+        force = scene.applied_force(q, v, t)
+        if control is None:
+            return force
+        tau = checked_force(control(q, v, t), q, scene.nv, "control")
+        return tau if force is None else tau + force
+
+    def power(force, v):
+        return jnp.zeros((), v.dtype) if force is None else jnp.sum(v * force)
+
+    def derivative(t, y, args):
+        # The scene comes through args: the continuous adjoint differentiates what it finds there, not closures.
+        system = args[0].system
+        q, v = _retract(system, y[0]), y[1]
+        force = effort(args, q, v, t)
+        rates = _configuration_rate(system, q, v), acceleration(args[0], q, v, t, force)
+        return (*rates, power(force, v)) if len(y) == 3 else rates
+
+    q0 = _retract(system, q0)
+    good = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
+    # A bad lane of a batch takes a harmless start, so that it does not make the others wait.
+    harmless = neutral(system).astype(q0.dtype) if isinstance(system, Model) else jnp.zeros_like(q0)
+    q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
+    args = scene, control
+    eqx.filter_eval_shape(effort, args, q0, v0, ts[0])  # refuses callbacks of a wrong shape before diffrax meets them
+    y0 = (q0, v0, jnp.zeros((), q0.dtype)) if "work" in outputs else (q0, v0)
+    solved, time_reached = _integrate(derivative, y0, ts, args, steps, options)
+
+    q, v, *work = (jnp.concatenate([start[None], later]) for start, later in zip(y0, solved.ys, strict=True))
+    reached = good & jnp.isfinite(q).all(1) & jnp.isfinite(v).all(1)
+    q, v = jnp.where(reached[:, None], q, q0[None]), jnp.where(reached[:, None], v, v0[None])
+    q = jax.vmap(_retract, (None, 0))(system, q)
+    result = RESULTS.promote(solved.result)
+    result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
+    result = RESULTS.where(good, result, RESULTS.nonfinite_start)
+
+    def report(q, v, t):
+        values = {}
+        force = effort(args, q, v, t) if {"power", "acceleration"} & set(outputs) else None
+        if "energy" in outputs:
+            values["energy"] = kinetic_energy(system, q, v) + potential_energy(system, q)
+        if "power" in outputs:
+            values["power"] = power(force, v)
+        if "acceleration" in outputs:
+            values["acceleration"] = acceleration(scene, q, v, t, force)
+        frames = [name.removeprefix(_POSE) for name in outputs if name.startswith(_POSE)]
+        return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
+
+    def or_nan(rows):
+        return jnp.where(reached.reshape(-1, *[1] * (rows.ndim - 1)), rows, jnp.full_like(rows, jnp.nan))
+
+    rows = {"q": q, "v": v} | jax.vmap(report)(q, v, ts) | ({"work": work[0]} if work else {})
+    stats = {name: jnp.asarray(solved.stats[name], jnp.int32) for name in _COUNTS}
+    stats["time_reached"] = jnp.where(good, time_reached, ts[0])
+    return Solution(ts=ts, result=result, stats=stats, **jax.tree.map(or_nan, rows))
+
+
+_run_compiled = eqx.filter_jit(_run)
+
+
+def _integrate(derivative, y0, ts, args, steps, options):
+    """diffrax's solution at ts[1:], and the time it came to."""
+    term, adjoint = diffrax.ODETerm(derivative), options["adjoint"]
+    solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
+    if _has_quaternions(args[0].system):
+        solver = ProjectedSolver(solver, _onto_manifold)
+    saves = diffrax.SubSaveAt(ts=ts[1:])
+    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else
+    saveat = diffrax.SaveAt(subs=saves if continuous else (saves, diffrax.SubSaveAt(t1=True, fn=_nothing)))
+    solved: Any = diffrax.diffeqsolve(
+        term,
+        solver,
+        t0=ts[0],
+        t1=ts[-1],
+        dt0=dt0,
+        y0=y0,
+        args=args,
+        saveat=saveat,
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        max_steps=options["max_steps"],
+        throw=False,
+        progress_meter=progress_meter(options["progress"]),
+    )
+    if continuous:
+        return solved, jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
+    (times, end), (ys, _) = solved.ts, solved.ys
+    return eqx.tree_at(lambda s: (s.ts, s.ys), solved, (times, ys)), end[0]
+
+
+def _onto_manifold(t, y, args):
+    scene, _ = args
+    return (normalize(scene.system, y[0]), *y[1:]), diffrax.RESULTS.successful
+
+
+def _nothing(t, y, args):
+    return None
+
+
+def _dynamics(scene: Scene, method: str) -> Callable:
+    """The acceleration `f(scene, q, v, t, force) -> (nv,)` that the scene and the method call for."""
+    if scene.constraints:
+        raise ValueError(
+            f"scene lists {len(scene.constraints)} constraints, and simulate has no constrained dynamics; "
+            "remove them from the scene"
+        )
+    if method not in ("auto", "free"):
+        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free'")
+
+    def free(scene, q, v, t, force):
+        return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force)
+
+    return free
+
+
+def _has_quaternions(system) -> bool:
+    return isinstance(system, Model) and any(kind in ("spherical", "free") for kind in system.topology.kinds)
+
+
+def _retract(system, q):
+    return normalize(system, q) if _has_quaternions(system) else q
+
+
+def _configuration_rate(system, q, v):
+    return configuration_rate(system, q, v) if isinstance(system, Model) else v
+
+
+def _as_array(value):
+    """Lists and numbers as numpy arrays, which stay known inside a trace; arrays and what holds tracers by jax."""
+    if isinstance(value, (np.ndarray, jax.Array)):
+        return value
+    return np.asarray(value) if is_concrete(value) else jnp.asarray(value)
+
+
+def _checked_outputs(scene: Scene, outputs) -> tuple[str, ...]:
+    if isinstance(outputs, str):
+        raise ValueError(f"outputs is the string {outputs!r}; pass a tuple, e.g. outputs=({outputs!r},)")
+    for name in outputs:
+        if isinstance(name, str) and name.startswith(_POSE) and isinstance(scene.system, Model):
+            frame_index(scene.system, name.removeprefix(_POSE))
+        elif name not in _OUTPUTS:
+            raise ValueError(f"outputs has {name!r}; choose from {', '.join(_OUTPUTS)} and '{_POSE}<frame>'")
+    return tuple(sorted(set(outputs)))
+
+
+def _check_state(scene: Scene, q0, v0) -> None:
+    for name, value, size, label in (("q0", q0, scene.nq, "(nq,)"), ("v0", v0, scene.nv, "(nv,)")):
+        if value.shape != (size,):
+            hint = "; simulate takes one sample, use jax.vmap for a batch" if value.ndim == 2 else ""
+            raise ValueError(
+                f"{name} has shape {value.shape}, expected {(size,)} = {label} of the scene's system{hint}"
+            )
+        if is_concrete(value):
+            _check_finite(name, value)
+    if not (_has_quaternions(scene.system) and is_concrete(q0)):
+        return
+    topology = scene.system.topology
+    for joint, kind, place in zip(topology.joint_names, topology.kinds, topology.q_slices, strict=True):
+        if kind in ("spherical", "free"):
+            norm = float(np.linalg.norm(np.asarray(q0, float)[place][-4:]))
+            if abs(norm - 1) > 1e-3:
+                raise ValueError(
+                    f"q0 has a quaternion of length {norm:.6g} at joint {joint!r}, expected 1; "
+                    "divide it by its length (order w, x, y, z)"
+                )
+
+
+def _check_times(ts) -> None:
+    if ts.ndim != 1 or ts.shape[0] < 2:
+        raise ValueError(f"ts has shape {ts.shape}; pass the start and at least one later time, (nt,) with nt >= 2")
+    if not is_concrete(ts):
+        return
+    _check_finite("ts", ts)
+    times = np.asarray(ts, float)
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if back.size:
+        i = back[0]
+        raise ValueError(
+            f"ts does not increase at index {i + 1}: {times[i]} then {times[i + 1]}; sort it, drop doubles"
+        )
+
+
+def _check_finite(name: str, value) -> None:
+    bad = np.flatnonzero(~np.isfinite(np.asarray(value, float)))
+    if bad.size:
+        raise ValueError(f"{name} is {np.asarray(value)[bad[0]]} at index {bad[0]}; give finite numbers")
+
+
+def _raise_failure(solution: Solution, max_steps: int) -> None:
+    if bool(solution.success):
+        return
+    name = next(name for name in RESULTS._name_to_item if bool(solution.result == getattr(RESULTS, name)))
+    reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])
+    advice = _ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(max_steps=max_steps)
+    raise RuntimeError(
+        f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: {advice}. "
+        "With throw=False, what was reached is returned."
+    )

@@ -1,0 +1,4 @@
+"""Time-stepping methods in diffrax's interface."""
+
+from jaxdyn.solvers.projected import ProjectedSolver as ProjectedSolver
+from jaxdyn.solvers.rk4 import RK4 as RK4

@@ -1,0 +1,141 @@
+"""What to integrate with: the user's options checked and turned into diffrax's objects."""
+
+import importlib.util
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from jaxdyn.solvers.rk4 import RK4
+
+ADJOINTS = ("reverse", "direct", "forward", "backsolve")
+# Degree of the dense output of methods that do not bring their own.
+_INTERPOLATION_DEGREE = {
+    diffrax.LocalLinearInterpolation: 1,
+    diffrax.ThirdOrderHermitePolynomialInterpolation: 3,
+    diffrax.FourthOrderPolynomialInterpolation: 4,
+}
+
+
+class _Adaptive(diffrax.PIDController):
+    """Step-size control that starts with the whole span when the first derivative is NaN.
+
+    The first step is chosen from the derivative, and a NaN one would make every step NaN: rejected, and tried again
+    until the last of `max_steps`. A finite one is halved and halved again until the least step ends the run.
+    """
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """End of the first step and state of the controller."""
+        first, state = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return jnp.where(jnp.isfinite(first), first, t1), state
+
+
+def is_concrete(tree) -> bool:
+    """Whether every leaf is known, so that its value can be looked at."""
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def is_fixed(stepsize) -> bool:
+    """Whether `stepsize` is a number."""
+    return not (stepsize is None or isinstance(stepsize, diffrax.AbstractStepSizeController))
+
+
+def checked_method(solver, stepsize):
+    """Method (default: `Dopri8`, or `RK4` for fixed steps), refused when it does not suit the step size or the problem.
+
+    **Raises:** ValueError that names `solver` or `stepsize` and the fix.
+    """
+    if solver is not None and not isinstance(solver, diffrax.AbstractSolver):
+        raise ValueError(f"solver is {solver!r}; pass an instance of a diffrax solver, e.g. diffrax.Tsit5()")
+    if is_fixed(stepsize):
+        if np.shape(stepsize) != ():
+            raise ValueError(f"stepsize has shape {np.shape(stepsize)}; pass one number (s)")
+        if is_concrete(stepsize) and not (np.isfinite(stepsize) and stepsize > 0):
+            raise ValueError(f"stepsize is {stepsize}; pass a positive number (s), or None for adaptive steps")
+        solver = RK4() if solver is None else solver
+    else:
+        if isinstance(stepsize, diffrax.ConstantStepSize):
+            raise ValueError("stepsize is a ConstantStepSize, which holds no length; pass the step as a number (s)")
+        solver = diffrax.Dopri8() if solver is None else solver
+        adaptive = stepsize is None or isinstance(stepsize, diffrax.AbstractAdaptiveStepSizeController)
+        if adaptive and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+            name = type(solver).__name__
+            raise ValueError(f"solver {name} has no error estimate for adaptive steps; pass stepsize=, a number (s)")
+    structure = solver.term_structure
+    if not (isinstance(structure, type) and issubclass(diffrax.ODETerm, structure)):
+        name = type(solver).__name__
+        raise ValueError(f"solver {name} does not take a single ODETerm; choose another, e.g. diffrax.Tsit5()")
+    return solver
+
+
+def checked_adjoint(adjoint, solver) -> diffrax.AbstractAdjoint:
+    """Way of differentiation by name; None is reverse mode with checkpoints.
+
+    **Raises:** ValueError for an unknown name.
+    """
+    if isinstance(adjoint, diffrax.AbstractAdjoint):
+        return adjoint
+    if adjoint is None or adjoint == "reverse":
+        return diffrax.RecursiveCheckpointAdjoint()
+    if adjoint == "direct":
+        return diffrax.DirectAdjoint()
+    if adjoint == "forward":
+        return diffrax.ForwardMode()
+    if adjoint == "backsolve":
+        # Backwards the state is (y, dL/dy, ...), which no projection of y fits.
+        return diffrax.BacksolveAdjoint(solver=solver)
+    raise ValueError(f"adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}, or pass a diffrax adjoint")
+
+
+def checked_step_limit(max_steps, ts, stepsize, adjoint: diffrax.AbstractAdjoint) -> int:
+    """Most steps to take: as given, else what fixed steps need, else 65536 (4096 where each allowed step costs).
+
+    **Raises:** ValueError for anything but a positive integer or None.
+    """
+    if max_steps is not None:
+        if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
+            raise ValueError(f"max_steps is {max_steps!r}; pass a positive integer, or None for the default")
+        return int(max_steps)
+    if is_fixed(stepsize) and is_concrete((ts, stepsize)):
+        # Rounded up to a power of two, so that other times seldom mean another program.
+        needed = 1.001 * float(ts[-1] - ts[0]) / float(stepsize) + 2
+        return 2 ** int(np.ceil(np.log2(max(needed, 16))))
+    return 4096 if isinstance(adjoint, diffrax.DirectAdjoint) else 65536
+
+
+def stepping(solver, term, ts, rtol, atol, stepsize):
+    """Method, controller and first step for diffrax, with tolerances that the dtype can hold."""
+    eps = float(jnp.finfo(ts.dtype).eps)
+    rtol, atol = jnp.maximum(rtol, 10 * eps), jnp.maximum(atol, 10 * eps)
+    if is_fixed(stepsize):
+        if isinstance(solver, diffrax.AbstractImplicitSolver):
+            norm = diffrax.PIDController(rtol, atol).norm
+            solver = eqx.tree_at(lambda s: (s.root_finder.rtol, s.root_finder.atol), solver, (rtol, atol))
+            solver = eqx.tree_at(lambda s: s.root_finder.norm, solver, norm)
+        return solver, diffrax.ConstantStepSize(), stepsize
+    controller = stepsize
+    if controller is None:
+        smallest = 16 * eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+        controller = _Adaptive(rtol, atol, dtmin=smallest, force_dtmin=False)
+    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController) and _has_coarse_dense_output(solver, term):
+        controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
+    return solver, controller, None
+
+
+def progress_meter(progress: bool) -> diffrax.AbstractProgressMeter:
+    """A bar by tqdm where it is installed, lines of text where not, nothing when not asked for."""
+    if not progress:
+        return diffrax.NoProgressMeter()
+    return diffrax.TextProgressMeter() if importlib.util.find_spec("tqdm") is None else diffrax.TqdmProgressMeter()
+
+
+def _has_coarse_dense_output(solver, term) -> bool:
+    """Whether save points between steps would be less accurate than the steps."""
+    interpolation, order = solver.interpolation_cls, solver.order(term)
+    if not isinstance(interpolation, type) or order is None:
+        return False
+    degrees = [degree for cls, degree in _INTERPOLATION_DEGREE.items() if issubclass(interpolation, cls)]
+    return bool(degrees) and max(degrees) + 1 < order

@@ -1,0 +1,56 @@
+"""Settings and fixtures of every test.
+
+There is no persistent compilation cache. It was tried: programs with host callbacks (`eqx.error_if`, hence diffrax) are
+never stored, what is stored logs machine-feature errors when loaded, and its files are not written atomically.
+"""
+
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+ROOT = Path(__file__).resolve().parent.parent
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 2)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# From here on every annotation in jaxdyn is checked, so this precedes the first import of it.
+install_import_hook("jaxdyn", "beartype.beartype")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("jaxdyn")
+    group.addoption("--data", type=Path, default=ROOT.parent / "shared" / "data", help="directory of recorded data")
+    group.addoption("--all-robots", action="store_true", help="run the robot tests on every robot, not on a few")
+
+
+@pytest.fixture(scope="session")
+def data_dir(pytestconfig: pytest.Config) -> Path:
+    """The directory of recorded data; tests that ask for it carry the marker `data`."""
+    directory = pytestconfig.getoption("data")
+    if not directory.is_dir():
+        pytest.skip(f"no recorded data at {directory}; name its directory with --data")
+    return directory
+
+
+@pytest.fixture(scope="session")
+def all_robots(pytestconfig: pytest.Config) -> bool:
+    """Whether robot tests run on every robot."""
+    return pytestconfig.getoption("all_robots")
+
+
+@pytest.fixture(scope="session")
+def robots_dir() -> Path:
+    """The directory `robots` of example-robot-data, with one directory per robot family."""
+    try:
+        package = distribution("example-robot-data")
+    except PackageNotFoundError:
+        pytest.skip("the package example-robot-data is not installed")
+    directory = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data/robots")))
+    if not directory.is_dir():
+        pytest.skip(f"example-robot-data has no directory {directory}")
+    return directory

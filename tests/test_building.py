@@ -1,0 +1,450 @@
+"""ModelBuilder, the reports on inertias, and the built-in mechanisms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxdyn import inertia, joints, kinematics, robots
+from jaxdyn import model as mdl
+from jaxdyn.building import ModelBuilder, inertia_report, repair_inertias
+from tests.pinocchio_bridge import quick, to_pinocchio
+
+BALL = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))
+LEAVES = ("home", "screws", "inertias", "frame_poses", "gravity", "armature", "damping", "friction", "lower", "upper")
+LEAVES += ("velocity_limit", "effort_limit", "coupling_values")
+
+
+def built(**options):
+    """The model of one body with the given options of `add_body`."""
+    return ModelBuilder("one").add_body("b", **{"inertia": BALL, **options}).build()
+
+
+def test_order_is_depth_first_by_joint_name_whatever_the_order_of_addition():
+    #        world -> c, a;  a -> z, m(fixed);  m -> k
+    bodies = {"a": None, "c": None, "z": "a", "m": "a", "k": "m"}
+    for order in (["c", "a", "z", "m", "k"], ["a", "m", "k", "z", "c"]):
+        builder = ModelBuilder("order")
+        for name in order:
+            joint = "fixed" if name == "m" else "prismatic"
+            builder.add_body(name, bodies[name], joint, BALL, joint_name=f"j{name}", pose=(1, 0, 0))
+        model = builder.build()
+        # k hangs on a through the fixed m, and m comes before z.
+        assert model.body_names == ("a", "k", "z", "c")
+        assert model.joint_names == ("ja", "jk", "jz", "jc")
+        assert model.topology.parents == (-1, 0, 0, -1)
+        assert model.frame_names == ("a", "k", "z", "c", "m")
+        assert model.topology.frame_bodies == (0, 1, 2, 3, 0)
+        np.testing.assert_array_equal(model.home[:, 0, 3], [1, 2, 1, 1])
+
+
+def test_fixed_bodies_are_merged_with_their_inertia():
+    pose, rpy = (0.3, -0.2, 0.5), (0.4, -0.9, 1.3)
+    builder = ModelBuilder().add_body("a", None, "free", BALL)
+    builder.add_body("b", "a", "fixed", BALL, pose=(pose, rpy)).add_body("c", "b", "fixed", BALL, pose=(pose, rpy))
+    builder.add_frame("f", "c", (0, 0, 1)).add_frame("w", None, (1, 2, 3))
+    model = builder.build()
+    T = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(pose))
+    ball = pin.Inertia(2.0, np.array([0.1, 0.2, 0.3]), np.diag([0.03, 0.04, 0.05]))
+    expected = ball + T.act(ball) + (T * T).act(ball)
+    np.testing.assert_allclose(model.inertias[0], expected.toDynamicParameters(), rtol=1e-13, atol=1e-14)
+    assert model.frame_names == ("a", "w", "b", "c", "f") and model.topology.frame_bodies == (0, -1, 0, 0, 0)
+    np.testing.assert_allclose(model.frame_poses[3], (T * T).homogeneous, atol=1e-15)
+    np.testing.assert_allclose(model.frame_poses[4][:3, 3], (T * T).act(np.array([0.0, 0, 1])), atol=1e-15)
+
+
+def test_inertia_fixed_to_the_world_is_dropped_and_its_frame_kept():
+    model = ModelBuilder().add_body("base", joint="fixed", inertia=BALL, pose=(1, 2, 3)).build()
+    assert (model.nb, model.nq, model.nv) == (0, 0, 0)
+    assert model.frame_names == ("base",) and model.topology.frame_bodies == (-1,)
+    np.testing.assert_array_equal(model.frame_poses[0][:3, 3], [1, 2, 3])
+
+
+@pytest.mark.parametrize("kind", joints.KINDS)
+def test_every_kind_has_its_sizes(kind):
+    model = built(joint=kind)
+    sizes = joints.KINDS[kind]
+    assert (model.nq, model.nv) == (sizes.nq, sizes.nv) == (model.lower.shape[0], model.effort_limit.shape[0])
+    assert np.isinf(model.lower).all() and np.isinf(model.effort_limit).all()
+    assert model.armature is None and model.damping is None and model.friction is None and model.coupling_values is None
+
+
+def test_screws():
+    def screw(**options):
+        return np.asarray(built(**options).screws[0])
+
+    np.testing.assert_allclose(screw(axis=(0, 3, 4)), [0, 0, 0, 0, 0.6, 0.8], atol=1e-16)
+    np.testing.assert_allclose(screw(axis=(0, 3e-200, 4e-200)), [0, 0, 0, 0, 0.6, 0.8], atol=1e-16)
+    np.testing.assert_allclose(screw(joint="prismatic", axis=(0, -2, 0)), [0, -1, 0, 0, 0, 0], atol=0)
+    np.testing.assert_allclose(screw(joint="helical", axis=(0, 0, 5), pitch=0.1), [0, 0, 0.1, 0, 0, 1], atol=1e-16)
+    np.testing.assert_allclose(screw(joint="revolute", screw=(0, 2, 0, 0, 0, 2)), [0, 1, 0, 0, 0, 1], atol=0)
+    np.testing.assert_allclose(screw(joint="helical", screw=(1, 2, 3, 0, 0, 2)), [0.5, 1, 1.5, 0, 0, 1], atol=0)
+
+
+def test_joint_leaves_are_absent_until_one_joint_has_them():
+    builder = ModelBuilder().add_body("a", None, "planar", BALL, damping=0.5, lower=(-1, -2, -3), effort_limit=7)
+    builder.add_body("b", "a", "revolute", BALL, armature=0.1, upper=2.0, velocity_limit=4)
+    model = builder.build()
+    np.testing.assert_array_equal(model.armature, [0, 0, 0, 0.1])
+    np.testing.assert_array_equal(model.damping, [0.5, 0.5, 0.5, 0])
+    assert model.friction is None
+    np.testing.assert_array_equal(model.lower, [-1, -2, -3, -np.inf])
+    np.testing.assert_array_equal(model.upper, [np.inf, np.inf, np.inf, 2])
+    np.testing.assert_array_equal(model.velocity_limit, [np.inf, np.inf, np.inf, 4])
+    np.testing.assert_array_equal(model.effort_limit, [7, 7, 7, np.inf])
+
+
+def test_couplings_are_static_pairs_with_values_as_leaves():
+    builder = ModelBuilder().add_body("a", None, inertia=BALL).add_body("b", "a", inertia=BALL)
+    builder.add_body("c", "b", "prismatic", BALL).add_coupling("c_joint", "a_joint", -0.5, 0.25)
+    model = builder.build()
+    assert model.topology.couplings == ((2, 0),)
+    np.testing.assert_array_equal(model.coupling_values, [[-0.5, 0.25]])
+    assert model.replace(coupling_values=[[1.0, 0.0]]).coupling_values.tolist() == [[1, 0]]
+    with pytest.raises(ValueError, match="coupling_values"):
+        built().replace(coupling_values=[[1.0, 0.0]])
+
+
+def test_gravity_and_dtype():
+    assert built().gravity.tolist() == [0, 0, -9.81]
+    assert ModelBuilder(gravity=None).add_body("b", inertia=BALL).build().gravity is None
+    model = ModelBuilder(dtype=jnp.float32).add_body("b", inertia=BALL, armature=1).build()
+    assert {leaf.dtype for leaf in jax.tree.leaves(model)} == {jnp.dtype("float32")}
+    assert not any(leaf.weak_type for leaf in jax.tree.leaves(model))
+
+
+def test_models_with_the_same_tree_share_compiled_code():
+    assert built().topology == built(inertia=(1.0, (0, 0, 0), (1, 1, 1))).topology
+    assert hash(built().topology) == hash(built(axis=(1, 0, 0)).topology)
+    assert built().topology != built(joint="continuous").topology
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3).filter(lambda x: max(map(abs, x)) > 1e-6),
+    st.lists(st.floats(-10, 10), min_size=3, max_size=3),
+    st.lists(st.floats(-10, 10), min_size=3, max_size=3),
+    st.floats(-2, 2),
+)
+def test_any_axis_and_pose(axis, xyz, rpy, pitch):
+    model = built(joint="helical", axis=axis, pose=(xyz, rpy), pitch=pitch)
+    v, omega = np.split(np.asarray(model.screws[0]), 2)
+    assert abs(np.linalg.norm(omega) - 1) < 1e-15
+    np.testing.assert_allclose(np.cross(omega, axis), 0, atol=1e-12 * np.linalg.norm(axis))
+    np.testing.assert_allclose(v, pitch * omega, atol=1e-15)
+    rotation = pin.rpy.rpyToMatrix(np.array(rpy))
+    np.testing.assert_allclose(model.home[0, :3, :3], rotation, atol=1e-14)
+    np.testing.assert_array_equal(model.home[0, :3, 3], xyz)
+    again = built(joint="helical", axis=axis, pose=np.asarray(model.home[0]), pitch=pitch)
+    np.testing.assert_array_equal(again.home, model.home)
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(st.permutations(range(8)), st.integers(0, 100))
+def test_order_of_addition_does_not_matter(order, seed):
+    reference = robots.random_tree(seed, 8, branching=1.7, kinds=("revolute", "fixed", "spherical", "helical"))
+    rng = np.random.default_rng(seed)
+    parents = [None if i == 0 else f"b{rng.integers(i)}" for i in range(8)]
+    kinds = rng.choice(["revolute", "fixed", "free"], 8)
+
+    def build(order):
+        builder, done, left = ModelBuilder(), {None}, list(order)
+        while left:
+            i = next(i for i in left if parents[i] in done)
+            left.remove(i)
+            done.add(f"b{i}")
+            builder.add_body(f"b{i}", parents[i], str(kinds[i]), BALL, pose=((i, 0, 1), (0, i, 0)), joint_name=f"j{7 - i}")
+        return builder.build()
+
+    one, two = build(range(8)), build(order)
+    assert one.topology == two.topology
+    for name in LEAVES:
+        a, b = getattr(one, name), getattr(two, name)
+        assert (a is None) == (b is None)
+        if a is not None:
+            np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-14)
+    assert reference.nb >= 1
+
+
+A, EYE = np.eye(4), (1.0, (0, 0, 0), (1, 1, 1))
+REFLECTION, STRETCHED, SHEARED = np.diag([1.0, 1, -1, 1]), np.diag([1.0, 1, 1.1, 1]), A + np.eye(4, k=-3)
+BAD_BODIES = {
+    "unknown kind": (dict(joint="hinge"), "'hinge'.*unknown.*revolute"),
+    "unknown parent": (dict(parent="nobody"), "parent 'nobody' is unknown"),
+    "own parent": (dict(parent="b"), "parent 'b' is unknown.*before its children"),
+    "zero axis": (dict(axis=(0, 0, 0)), r"'b': axis is \[0.0, 0.0, 0.0\].*direction"),
+    "NaN axis": (dict(axis=(0, np.nan, 0)), "axis is.*finite"),
+    "axis shape": (dict(axis=(0, 1)), r"axis has shape \(2,\), expected \(3,\)"),
+    "axis text": (dict(axis="z"), "axis is 'z', expected"),
+    "axis of spherical": (dict(joint="spherical", axis=(1, 0, 0)), "spherical joint has no axis"),
+    "pitch of revolute": (dict(pitch=0.1), "pitch is 0.1.*helical"),
+    "screw and axis": (dict(screw=(0, 0, 0, 0, 0, 1), axis=(1, 0, 0)), "screw is given together"),
+    "screw without omega": (dict(screw=(1, 0, 0, 0, 0, 0)), "needs an omega"),
+    "screw without v": (dict(joint="prismatic", screw=(0, 0, 0, 0, 0, 0)), "needs an v"),
+    "screw with pitch": (dict(screw=(0, 0, 1, 0, 0, 2)), "pitch 0.5.*helical"),
+    "screw that turns": (dict(joint="prismatic", screw=(0, 0, 1, 0, 0, 2)), "turns.*helical"),
+    "screw shape": (dict(screw=(0, 0, 1)), r"screw has shape \(3,\)"),
+    "inf pitch": (dict(joint="helical", pitch=np.inf), "pitch is inf"),
+    "negative mass": (dict(inertia=(-1.0, (0, 0, 0), (1, 1, 1))), "the mass is -1.0 kg"),
+    "NaN mass": (dict(inertia=(np.nan, (0, 0, 0), (1, 1, 1))), "mass is nan.*finite"),
+    "inertia shape": (dict(inertia=(1.0, 2.0, 3.0, 4.0)), r"inertia has shape \(4,\), expected ten numbers"),
+    "com shape": (dict(inertia=(1.0, (0, 0), (1, 1, 1))), r"centre of mass has shape \(2,\)"),
+    "asymmetric": (dict(inertia=(1.0, (0, 0, 0), np.eye(3) + np.eye(3, k=1))), "not symmetric"),
+    "inf parameter": (dict(inertia=[1, 0, 0, 0, np.inf, 0, 1, 0, 0, 1]), "inertia is .*finite"),
+    "pose shape": (dict(pose=(1, 2)), r"pose has shape \(2,\), expected a \(4, 4\) matrix"),
+    "reflection": (dict(pose=REFLECTION), "pose: the rotation.*is a reflection"),
+    "stretched": (dict(pose=STRETCHED), r"not orthonormal: \|R\^T R - 1\| = 0.21"),
+    "last row": (dict(pose=SHEARED), r"last row is \[1.0, 0.0, 0.0, 1.0\]"),
+    "NaN pose": (dict(pose=(0, 0, np.nan)), "pose is.*finite"),
+    "crossed limits": (dict(lower=1.0, upper=-1.0), "lower limit 1.0 is above upper limit -1.0"),
+    "limit shape": (dict(joint="free", lower=1.0), r"lower has shape \(\), expected \(7,\)"),
+    "NaN limit": (dict(effort_limit=np.nan), "effort_limit is nan"),
+    "limits of continuous": (dict(joint="continuous", upper=1.0), "continuous joint has no position limits"),
+    "armature of fixed": (dict(joint="fixed", armature=1.0), "armature is 1.0, but the joint is fixed"),
+    "negative damping": (dict(damping=-1.0), "damping is -1.0; it must not be negative"),
+    "damping shape": (dict(damping=(1.0, 2.0)), r"damping has shape \(2,\), expected a number or \(1,\)"),
+    "empty name": (dict(name=""), "name is ''"),
+    "empty joint name": (dict(joint_name=""), "joint_name is ''"),
+    "name taken": (dict(name="a"), "the name 'a' is taken"),
+    "name taken by a frame": (dict(name="f"), "the name 'f' is taken"),
+    "joint name taken": (dict(joint_name="a_joint"), "joint name 'a_joint' is that of body 'a'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_BODIES)
+def test_bad_bodies(case):
+    options, message = BAD_BODIES[case]
+    builder = ModelBuilder().add_body("a", inertia=EYE).add_frame("f", "a")
+    with pytest.raises(ValueError, match=f"(?s){message}"):
+        builder.add_body(**{"name": "b", "inertia": EYE, **options})
+    assert builder.build().body_names == ("a",)  # nothing half-built
+
+
+def test_bad_frames_couplings_and_settings():
+    builder = ModelBuilder().add_body("a", inertia=EYE).add_body("b", "a", "prismatic", EYE)
+    builder.add_body("s", "b", "spherical", EYE).add_body("c", "s", "fixed").add_frame("f", "a")
+    bad = {
+        "the name 'f' is taken": lambda: builder.add_frame("f", "a"),
+        "parent 'q' is unknown": lambda: builder.add_frame("g", "q"),
+        r"frame 'g': pose has shape \(2, 2\)": lambda: builder.add_frame("g", "a", np.eye(2)),
+        r"joint 'a_jiont' is unknown \(did you mean a_joint": lambda: builder.add_coupling("b_joint", "a_jiont"),
+        "'s_joint' is spherical": lambda: builder.add_coupling("s_joint", "a_joint"),
+        "'c_joint' is fixed": lambda: builder.add_coupling("b_joint", "c_joint"),
+        "would follow itself": lambda: builder.add_coupling("b_joint", "b_joint"),
+        "is nan|is .*nan.*finite": lambda: builder.add_coupling("b_joint", "a_joint", np.nan),
+        r"gravity has shape \(2,\)": lambda: ModelBuilder(gravity=(0, 0)),
+        "dtype is .*floating-point": lambda: ModelBuilder(dtype=jnp.int32),
+    }
+    for message, act in bad.items():
+        with pytest.raises(ValueError, match=message):
+            act()
+    builder.add_coupling("b_joint", "a_joint")
+    with pytest.raises(ValueError, match="follows 'a_joint' already"):
+        builder.add_coupling("b_joint", "a_joint")
+    with pytest.raises(ValueError, match="would follow itself"):
+        builder.add_coupling("a_joint", "b_joint")
+    with jax.enable_x64(False):
+        assert built().home.dtype == jnp.float32
+        with pytest.raises(ValueError, match="dtype is float64, but jax runs in 32 bits"):
+            ModelBuilder(dtype=jnp.float64)
+
+
+def singular(*bodies):
+    builder = ModelBuilder()
+    for body in bodies:
+        builder.add_body(**body)
+    return builder
+
+
+HUB = dict(name="hub", inertia=EYE)
+POINT = (1.0, (0, 0, 1), (0, 0, 0))
+SINGULAR = {
+    "massless leaf": ([HUB, dict(name="tip", parent="hub")], "'tip_joint'.*moves no inertia"),
+    "point mass on its axis": ([dict(name="tip", inertia=POINT)], "'tip_joint'.*moves no inertia"),
+    "displaced axis through a point mass": (
+        [HUB, dict(name="tip", parent="hub", inertia=(3.0, (0.3, 0.1, 7), (0, 0, 0)), screw=(0.1, -0.3, 0, 0, 0, 1))],
+        "'tip_joint'.*moves no inertia",
+    ),
+    "free point mass": (
+        [dict(name="tip", joint="free", inertia=(1.0, (1, 2, 3), (0, 0, 0)))],
+        "'tip_joint'.*without moving any inertia",
+    ),
+    "spherical rod": (
+        [HUB, dict(name="tip", parent="hub", joint="spherical", inertia=(1.0, (0, 0, 1), (0.1, 0.1, 0)))],
+        "'tip_joint'.*moves no inertia",
+    ),
+    "two massless": (
+        [HUB, dict(name="x", parent="hub"), dict(name="y", parent="x")],
+        r"'y_joint'.*with x_joint, y_joint.*lock=\['x_joint', 'y_joint'\]",
+    ),
+    "two turns about one axis": (
+        [dict(name="x"), dict(name="y", parent="x", inertia=EYE, pose=(0, 0, 1))],
+        "'x_joint'.*without moving any inertia",
+    ),
+    "four slides in space": (
+        [
+            dict(name="x", joint="prismatic", axis=(1, 0, 0)),
+            dict(name="y", parent="x", joint="prismatic", axis=(0, 1, 0)),
+            dict(name="z", parent="y", joint="prismatic", axis=(0, 0, 1)),
+            dict(name="w", parent="z", joint="prismatic", axis=(1, 1, 1), inertia=POINT),
+        ],
+        "'x_joint'.*without moving any inertia",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SINGULAR)
+def test_joints_without_inertia_are_refused_by_name(case):
+    bodies, message = SINGULAR[case]
+    with pytest.raises(ValueError, match=f"(?s){message}"):
+        singular(*bodies).build()
+    # An armature on every joint makes any of them regular.
+    assert singular(*[{**body, "armature": 0.1} for body in bodies]).build().nb == len(bodies)
+
+
+def test_what_is_singular_at_one_configuration_alone_is_accepted():
+    # A point mass at the end of two rods without mass can be folded onto the first axis, and is at neutral.
+    two = [dict(name="x", axis=(0, 0, 1)), dict(name="y", parent="x", axis=(0, 0, 1), pose=(1, 0, 0))]
+    two[1]["inertia"] = (1.0, (-1, 0, 0), (0, 0, 0))
+    assert singular(*two).build().nb == 2
+    # Massless links of a gimbal carry a ball.
+    gimbal = [dict(name="x", axis=(1, 0, 0)), dict(name="y", parent="x", axis=(0, 1, 0)), dict(name="z", parent="y")]
+    gimbal[2]["inertia"] = EYE
+    assert singular(*gimbal).build().nb == 3
+    # A micrometre cube of water in free flight, and a needle with a slight but real moment about its axis.
+    assert built(joint="free", inertia=(1e-15, (0, 0, 0), (1.7e-28,) * 3)).nb == 1
+    assert built(joint="spherical", inertia=(1.0, (0, 0, 0.5), (0.1, 0.1, 1e-9))).nb == 1
+
+
+def test_inertia_report_and_repair():
+    builder = ModelBuilder().add_body("whole", inertia=BALL)
+    builder.add_body("flat", "whole", inertia=(1.0, (0, 0, 1), (0.1, -0.2, 0.3)))
+    builder.add_body("long", "flat", inertia=(1.0, (1, 0, 1), (0.1, 0.2, 0.4)))
+    builder.add_body("none", "long", armature=1.0)
+    builder.add_body("rotor", "none", inertia=[0, 0, 0, 0, 1, 0, 1, 0, 0, 1])
+    model = builder.build()
+    report = inertia_report(model)
+    assert [name for name, _ in report] == ["flat", "long", "none", "rotor"]
+    texts = dict(report)
+    assert texts["flat"] == "not positive definite: principal moments -0.2, 0.1, 0.3 kg m^2"
+    assert texts["long"] == "triangle inequality violated: principal moments 0.1, 0.2, 0.4 kg m^2"
+    assert texts["none"] == "massless"
+    assert texts["rotor"].startswith("mass 0.0 kg with")
+    repaired = repair_inertias(model)
+    assert [name for name, _ in inertia_report(repaired)] == ["none", "rotor"]
+    assert all(inertia.is_feasible(repaired.inertias[i]) for i in (0, 1, 2))
+    np.testing.assert_array_equal(repaired.inertias[jnp.array([0, 3, 4])], model.inertias[jnp.array([0, 3, 4])])
+    np.testing.assert_allclose(repaired.inertias[:, 0], model.inertias[:, 0], rtol=1e-14)
+    np.testing.assert_allclose(repaired.inertias[1:3, 1:4], model.inertias[1:3, 1:4], atol=0.1)
+    assert inertia_report(robots.iiwa()) == []
+
+
+def test_iiwa_kinematics_are_the_published_ones():
+    model = robots.iiwa()
+    poses = quick(jax.vmap(kinematics.forward_kinematics, (None, 0)))
+    q = jnp.radians(jnp.array([[0.0] * 7, [60, 30, 60, 30, 60, 30, 60]]))
+    straight, bent = poses(model, q)[:, -1]
+    np.testing.assert_allclose(straight[:3, :3], np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(straight[:3, 3], [0, 0, 1.261], atol=1e-15)
+    rotation = [
+        [-0.5939002959880204, 0.8043869080239565, -0.015625],
+        [-0.8043869080239565, -0.5932991120359317, 0.03094940802395521],
+        [0.015625, 0.03094940802395527, 0.9993988160479114],
+    ]
+    np.testing.assert_allclose(bent[:3, :3], rotation, atol=1e-15)
+    np.testing.assert_allclose(bent[:3, 3], [0.2970356451892219, 0.1727696964662288, 1.154681973689345], atol=1e-15)
+    assert model.frame_names[-1] == "iiwa_link_0" and model.topology.frame_bodies[-1] == -1
+    np.testing.assert_allclose(model.inertias[:, 0].sum(), 25.61, rtol=1e-15)
+    np.testing.assert_allclose(model.upper[6], 3.0543261909900763, rtol=1e-15)
+
+
+def test_iiwa_torques_are_the_published_ones():
+    source, _ = to_pinocchio(robots.iiwa())
+    a = np.array([0, 0, 0, 0, 0, 0, 1000.0])
+    tau = pin.rnea(source, source.createData(), np.zeros(7), np.zeros(7), a)
+    weight = np.array([0, 9.81 * (0.0003 * 6.35 + 0.0001 * 3.5), 0, -9.81 * 0.0001 * 3.5, 0, 0, 0])
+    np.testing.assert_allclose(tau, np.array([1, 0, 1, 0, 1, 0, 1]) + weight, atol=1e-12)
+
+
+def test_chain_has_the_frequencies_of_the_hanging_rods():
+    # Two hanging rods: M = m l^2 [[4/3, 1/2], [1/2, 1/3]], K = m g l diag(3/2, 1/2) in absolute angles.
+    model = robots.chain(2, length=0.7, mass=3.0)
+    source, _ = to_pinocchio(model)
+    M = pin.crba(source, source.createData(), np.zeros(2))
+    absolute = np.array([[1.0, 0], [-1, 1]])  # relative angles from absolute ones
+    np.testing.assert_allclose(absolute.T @ M @ absolute, 3 * 0.49 * np.array([[4 / 3, 0.5], [0.5, 1 / 3]]), rtol=1e-14)
+    assert robots.chain(3).body_names == ("rod_0", "rod_1", "rod_2")
+    with pytest.raises(ValueError, match="n is 0"):
+        robots.chain(0)
+
+
+def test_long_chains_are_built_without_recursion():
+    assert robots.chain(1500).nb == 1500
+
+
+def test_random_trees_are_seeded_and_have_every_kind():
+    model = robots.random_tree(3, 21, branching=2)
+    assert set(model.topology.kinds) == set(joints.KINDS)
+    for kind in joints.KINDS:
+        assert model.topology.kinds.count(kind) == 3
+    again, other = robots.random_tree(3, 21, branching=2), robots.random_tree(4, 21, branching=2)
+    np.testing.assert_array_equal(model.home, again.home)
+    assert not np.allclose(model.home, other.home)
+    assert inertia_report(model) == []
+    assert max(model.topology.parents.count(i) for i in range(21)) == 2
+    assert robots.random_tree(0, 6, branching=1).topology.parents == (-1, 0, 1, 2, 3, 4)
+    assert robots.random_tree(0, 6, branching=6).topology.parents == (-1, 0, 0, 0, 0, 0)
+    assert robots.random_tree(0, 7, kinds=("revolute", "fixed")).nb < 7
+    parallel = robots.random_tree(0, 4, skew=0.0, kinds=("revolute",))
+    np.testing.assert_allclose(parallel.home[:, :3, :3], np.broadcast_to(np.eye(3), (4, 3, 3)), atol=1e-15)
+    np.testing.assert_array_equal(
+        robots.random_tree(jax.random.key(5), 4).home, robots.random_tree(jax.random.key(5), 4).home
+    )
+    assert mdl.neutral(model).shape == (model.nq,)
+    for options, message in ((dict(nb=0), "nb is 0"), (dict(nb=2, branching=0.5), "branching 0.5")):
+        with pytest.raises(ValueError, match=message):
+            robots.random_tree(0, **options)
+    with pytest.raises(ValueError, match="'hinge'"):
+        robots.random_tree(0, 3, kinds=("hinge",))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mass_matrix_is_singular_exactly_where_a_build_is_refused(seed):
+    # Half of the bodies have no inertia: the smallest eigenvalue of Pinocchio's mass matrix is the second opinion.
+    rng = np.random.default_rng(seed)
+    refused = 0
+    for _ in range(25):
+        kinds = rng.choice(["revolute", "prismatic", "helical", "continuous"], 7)
+        parents = [None if i == 0 else f"b{rng.integers(max(0, i - 2), i)}" for i in range(7)]
+        heavy = rng.random(7) < 0.6
+        axes, poses = rng.normal(size=(7, 3)), rng.normal(size=(7, 2, 3))
+
+        def assemble(armature, kinds=kinds, parents=parents, heavy=heavy, axes=axes, poses=poses):
+            builder = ModelBuilder()
+            for i in range(7):
+                body = BALL if heavy[i] else None
+                builder.add_body(
+                    f"b{i}", parents[i], str(kinds[i]), body, axis=axes[i], pose=poses[i], armature=armature
+                )
+            return builder.build()
+
+        # The same mechanism with an armature that is taken away again.
+        source, _ = to_pinocchio(assemble(1.0))
+        source.armature = np.zeros(7)
+        for i in np.flatnonzero(~heavy):
+            source.inertias[source.getJointId(f"b{i}_joint")] = pin.Inertia.Zero()
+        M = pin.crba(source, source.createData(), rng.uniform(-1, 1, 7))
+        size = np.sqrt(np.maximum(np.diag(M), 1e-30))
+        regular = np.linalg.eigvalsh(M / np.outer(size, size))[0] > 1e-10
+        try:
+            assemble(None)
+        except ValueError as error:
+            assert "singular" in str(error)
+            assert not regular
+            refused += 1
+        else:
+            assert regular
+    assert 0 < refused < 25

@@ -1,0 +1,288 @@
+"""Scene forces against closed forms of the motions they cause, and against their definitions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdyn.building import ModelBuilder
+from jaxdyn.dynamics import generalized_force
+from jaxdyn.forces import CoulombFriction, Drive, ExternalWrench, JointDamping, JointSpring
+from jaxdyn.kinematics import frame_pose
+from jaxdyn.model import difference, integrate, neutral, random_configuration
+from jaxdyn.scene import Scene
+from jaxdyn.simulate import simulate
+
+MASS = {"coast": 2.0, "drive": 1.5, "dry": 0.8, "pull": 3.0, "ring": 1.2, "shake": 0.7}
+BALL = 0.35  # principal moment of the ball
+
+
+@pytest.fixture(scope="module")
+def sliders():
+    """Independent sliders without gravity, one for each force, and a ball on a spherical joint."""
+    builder = ModelBuilder("sliders", gravity=None)
+    for name, mass in MASS.items():
+        builder.add_body(name, joint="prismatic", joint_name=name, axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
+    builder.add_body("turn", joint="spherical", joint_name="turn", inertia=(1.0, (0, 0, 0), (BALL, BALL, BALL)))
+    return builder.build()
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """A branched model with every kind of joint, damping and friction."""
+    builder = ModelBuilder("arm")
+    moments = (0.02, 0.03, 0.04)
+    builder.add_body("base", joint="free", inertia=(2.0, (0.1, 0.0, 0.2), moments), damping=0.1)
+    builder.add_body("hip", "base", "spherical", inertia=(1.0, (0, 0.1, 0), moments), pose=(0.1, 0.2, 0.3))
+    builder.add_body("knee", "hip", "revolute", axis=(0, 1, 0), inertia=(0.5, (0, 0, -0.2), moments), pose=(0, 0, -0.4))
+    builder.add_body("slide", "base", "planar", inertia=(0.7, (0.1, 0, 0), moments), friction=(0.3, 0.4, 0.5))
+    builder.add_frame("foot", "knee", ((0.1, 0.0, -0.3), (0.2, 0.3, 0.4)))
+    return builder.build()
+
+
+def push(system, q, v, t):
+    return jnp.zeros_like(v).at[system.joint_names.index("shake")].set(0.9 * jnp.cos(2.3 * t))
+
+
+def oscillation(x0, v0, k, c, m, t):
+    """Damped oscillator m x'' + c x' + k x = 0 by its complex roots."""
+    r1, r2 = np.roots([m, c, k]).astype(complex)
+    a, b = np.linalg.solve([[1, 1], [r1, r2]], [x0, v0])
+    return (a * np.exp(r1 * t) + b * np.exp(r2 * t)).real, (a * r1 * np.exp(r1 * t) + b * r2 * np.exp(r2 * t)).real
+
+
+def test_motions_against_closed_forms(sliders):
+    ts = np.linspace(0.0, 3.0, 16)
+    scene = Scene(
+        sliders,
+        forces=(
+            JointDamping(0.6, joints=("coast",)),
+            Drive(4.0, 1.1, target=0.5, target_velocity=0.2, joints="drive"),
+            CoulombFriction(0.5, v_s=0.3, joints=["dry"]),
+            ExternalWrench("pull", (1.7, 0.4, -2.0, 0.1, 0.2, 0.3), axes="body"),
+            JointSpring(5.0, rest=0.1, joints=("ring",)),
+            JointDamping(0.4, joints=("ring",)),
+            JointSpring([3.0], rest=[0.0], joints=("shake",)),
+            push,
+            JointSpring(0.8, joints=("turn",)),
+        ),
+    )
+    axis = np.array([0.6, 0.0, 0.8])
+    start = np.array([0.3, -0.2, 0.1, 0.0, 0.4, 0.2])
+    speed = np.array([1.0, 0.5, 0.9, -0.3, 0.7, -0.1])
+    q0 = np.concatenate([start, [np.cos(0.5)], np.sin(0.5) * axis])
+    v0 = np.concatenate([speed, 0.3 * axis])
+    solution = simulate(scene, q0, v0, ts, rtol=1e-12, atol=1e-12)
+    names = list(sliders.joint_names)
+    assert names == [*MASS, "turn"]
+    expected = {}
+    decay = np.exp(-0.6 / 2.0 * ts)
+    expected["coast"] = 0.3 + 1.0 * 2.0 / 0.6 * (1 - decay), decay
+    # The drive holds where kp (target - x) + kd target_velocity vanishes.
+    x, v = oscillation(-0.2 - 0.555, 0.5, 4.0, 1.1, MASS["drive"], ts)
+    expected["drive"] = x + 0.555, v
+    expected["dry"] = None, 0.3 * np.arcsinh(np.sinh(0.9 / 0.3) * np.exp(-0.5 / (0.8 * 0.3) * ts))
+    expected["pull"] = -0.3 * ts + 1.7 / 3.0 * ts**2 / 2, -0.3 + 1.7 / 3.0 * ts
+    x, v = oscillation(0.3, 0.7, 5.0, 0.4, MASS["ring"], ts)
+    expected["ring"] = x + 0.1, v
+    gain, w = 0.9 / (3.0 - 0.7 * 2.3**2), 2.3  # steady response to the push
+    x, v = oscillation(0.2 - gain, -0.1, 3.0, 0.0, MASS["shake"], ts)
+    expected["shake"] = x + gain * np.cos(w * ts), v - gain * w * np.sin(w * ts)
+    for name, (x, v) in expected.items():
+        i = names.index(name)
+        if x is not None:
+            np.testing.assert_allclose(solution.q[:, i], x, rtol=0, atol=1e-10, err_msg=name)
+        np.testing.assert_allclose(solution.v[:, i], v, rtol=0, atol=1e-10, err_msg=name)
+    # About a fixed axis the ball is an oscillator in the angle.
+    angle, rate = oscillation(1.0, 0.3, 0.8, 0.0, BALL, ts)
+    np.testing.assert_allclose(solution.v[:, -3:], rate[:, None] * axis, rtol=0, atol=1e-10)
+    quaternion = np.concatenate([np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None] * axis], 1)
+    np.testing.assert_allclose(solution.q[:, -4:], quaternion, rtol=0, atol=1e-10)
+
+
+def sample(model, seed=0):
+    q = random_configuration(model, jax.random.key(seed))
+    return q, jax.random.normal(jax.random.key(seed + 1), (model.nv,))
+
+
+def test_defaults_of_the_model(arm):
+    q, v = sample(arm)
+    damping = np.concatenate([np.full(6, 0.1), np.zeros(7)])
+    friction = np.concatenate([np.zeros(10), [0.3, 0.4, 0.5]])
+    assert arm.joint_names == ("base_joint", "hip_joint", "knee_joint", "slide_joint")
+    np.testing.assert_allclose(JointDamping()(arm, q, v, 0.0), -damping * v, rtol=1e-15)
+    expected = -friction * np.tanh(v / 0.2)
+    np.testing.assert_allclose(CoulombFriction(v_s=0.2)(arm, q, v, 0.0), expected, rtol=1e-14)
+    total = Scene(arm, forces=(JointDamping(), CoulombFriction(v_s=0.2))).applied_force(q, v)
+    np.testing.assert_allclose(total, expected - damping * v, rtol=1e-14)
+    assert Scene(arm).applied_force(q, v) is None
+
+
+def test_joints_are_taken_in_the_order_named(arm):
+    q, v = sample(arm)
+    coefficient = np.arange(1.0, 5.0)
+    force = JointDamping(coefficient, joints=("slide_joint", "knee_joint"))(arm, q, v, 0.0)
+    expected = np.zeros(13)
+    expected[10:], expected[9] = -coefficient[:3] * v[10:], -coefficient[3] * v[9]
+    np.testing.assert_allclose(force, expected, rtol=1e-15)
+    spring = JointSpring(coefficient, rest=[0.1, 0.2, 0.3, 0.4], joints=("knee_joint", "hip_joint"))
+    with pytest.raises(ValueError, match=r"JointSpring: rest has shape \(4,\), expected a scalar or \(5,\)"):
+        spring(arm, q, v, 0.0)
+
+
+def test_spring_and_drive_move_along_the_manifold(arm):
+    """A unit-gain spring is the difference of the library, and minus the gradient of its energy where it is conservative."""
+    q, v = sample(arm, 3)
+    rest, _ = sample(arm, 7)
+    np.testing.assert_allclose(JointSpring(2.0, rest)(arm, q, v, 0.0), -2 * difference(arm, rest, q), rtol=1e-14)
+    # A drive pulls along the twist from q to the target; the spring's twist from its rest is the opposite one.
+    drive = Drive(2.0, 0.3, rest, target_velocity=0.7)(arm, q, v, 0.0)
+    np.testing.assert_allclose(drive, 2 * difference(arm, q, rest) + 0.3 * (0.7 - v), rtol=0, atol=1e-13)
+    place = slice(6, 10)  # the spherical and the revolute joint
+
+    def energy(step):
+        return 0.5 * 2.0 * jnp.sum(difference(arm, rest, integrate(arm, q, step))[place] ** 2)
+
+    gradient = jax.grad(energy)(jnp.zeros(13))[place]
+    spring = JointSpring(2.0, rest[7:12], joints=("hip_joint", "knee_joint"))(arm, q, v, 0.0)
+    np.testing.assert_allclose(spring[place], -gradient, rtol=1e-12, atol=1e-13)
+    assert not np.any(spring[:6]) and not np.any(spring[10:])
+    assert not np.any(JointSpring(2.0)(arm, neutral(arm), v, 0.0))
+
+
+def test_effort_limit(arm):
+    q, v = sample(arm, 3)
+    target, _ = sample(arm, 7)
+    free = Drive(50.0, 1.0, target)(arm, q, v, 0.0)
+    limits = np.where(np.arange(13) % 2, 4.0, np.inf)
+    held = Drive(50.0, 1.0, target, effort_limit=limits)(arm, q, v, 0.0)
+    np.testing.assert_allclose(held[::2], free[::2], rtol=1e-15)
+    np.testing.assert_allclose(held[1::2], 4 * np.tanh(free[1::2] / 4), rtol=1e-14)
+    small = Drive(0.05, 0.0, target, effort_limit=4.0)(arm, q, v, 0.0)
+    np.testing.assert_allclose(small, free * 0 + Drive(0.05, 0.0, target)(arm, q, v, 0.0), rtol=1e-2)
+    gradient = jax.grad(lambda limit: jnp.sum(Drive(50.0, 1.0, target, 0.0, limit)(arm, q, v, 0.0)))(
+        jnp.asarray(limits)
+    )
+    assert np.isfinite(gradient).all() and np.all(gradient[1::2] != 0)
+
+
+@pytest.mark.parametrize("axes", ["world", "body"])
+def test_external_wrench(arm, axes):
+    """Against the wrench carried to the body by hand, and against virtual work by finite differences."""
+    q, v = sample(arm, 5)
+    wrench = np.array([1.0, -2.0, 3.0, 0.4, 0.5, -0.6])
+    value = ExternalWrench("foot", wrench, axes)(arm, q, v, 0.0)
+    pose = np.asarray(frame_pose(arm, q, "foot"))
+    rotation = pose[:3, :3]
+    force, torque = (wrench[:3], wrench[3:]) if axes == "world" else (rotation @ wrench[:3], rotation @ wrench[3:])
+    knee = np.asarray(frame_pose(arm, q, "knee"))
+    torque_knee = torque + np.cross(pose[:3, 3] - knee[:3, 3], force)
+    external = np.zeros((4, 6))
+    external[arm.body_names.index("knee")] = [*(knee[:3, :3].T @ force), *(knee[:3, :3].T @ torque_knee)]
+    np.testing.assert_allclose(value, generalized_force(arm, q, jnp.asarray(external)), rtol=0, atol=1e-13)
+    steps = 1e-5 * np.eye(13)
+    poses = jax.vmap(lambda step: frame_pose(arm, integrate(arm, q, step), "foot"))(np.concatenate([steps, -steps]))
+    rate = (np.asarray(poses[:13]) - np.asarray(poses[13:])) / 2e-5
+    spin = rate[:, :3, :3] @ rotation.T
+    omega = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], 1)
+    # Central differences of step 1e-5 are good to 1e-10 of a second derivative of order one.
+    np.testing.assert_allclose(value, rate[:, :3, 3] @ force + omega @ torque, rtol=0, atol=1e-8)
+
+
+def all_forces(arm, coefficient):
+    rest = neutral(arm)
+    return Scene(
+        arm,
+        forces=(
+            JointDamping(coefficient),
+            CoulombFriction(coefficient, v_s=0.5),
+            JointSpring(coefficient),
+            Drive(coefficient, coefficient, rest, coefficient, effort_limit=9.0),
+            ExternalWrench("foot", jnp.full(6, 1.0) * coefficient),
+        ),
+    )
+
+
+def test_derivatives_batches_and_scenes_as_arguments(arm):
+    """Both modes, second order, at a general point and at rest; a scene is an array pytree for jit and vmap."""
+
+    @jax.jit
+    def total(scene, q, v):
+        return jnp.sum(scene.applied_force(q, v) * jnp.arange(1.0, 14.0))
+
+    def of_all(coefficient, dq, v, q):
+        return total(all_forces(arm, coefficient), integrate(arm, q, dq), v)
+
+    q, v = sample(arm, 11)
+    point = jnp.asarray(0.7), jnp.zeros(13)
+    jax.test_util.check_grads(lambda *x: of_all(*x, q), (*point, v), order=2, atol=1e-5, rtol=1e-5)
+    rest = jax.hessian(of_all, argnums=(0, 1, 2))(*point, jnp.zeros(13), neutral(arm))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(rest))
+    coefficients = jnp.asarray([0.0, 0.3, 2.0])
+    scenes = jax.vmap(lambda c: all_forces(arm, c))(coefficients)
+    axes = jax.tree.map(lambda x, y: 0 if x.ndim > jnp.ndim(y) else None, scenes, all_forces(arm, 0.0))
+    batch = jax.vmap(total, (axes, None, None))(scenes, q, v)
+    one_by_one = [total(all_forces(arm, c), q, v) for c in coefficients]
+    np.testing.assert_allclose(batch, one_by_one, rtol=1e-13)
+
+
+def test_float32(arm):
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), arm)
+    q, v = sample(arm, 11)
+    scene = all_forces(single, 0.7)
+    value = scene.applied_force(q.astype(jnp.float32), v.astype(jnp.float32))
+    assert value.dtype == jnp.float32
+    reference = all_forces(arm, 0.7).applied_force(q, v)
+    np.testing.assert_allclose(value, reference, rtol=0, atol=2e-5 * np.abs(reference).max())
+
+
+def test_leaves_are_not_weakly_typed():
+    """A coefficient given as a Python number must not compile anew when an array takes its place."""
+    leaves = jax.tree.leaves(
+        (JointDamping(1), CoulombFriction(0.5), Drive(1, 2, 3, 4, 5), ExternalWrench("a", [0] * 6))
+    )
+    assert len(leaves) == 9 and all(x.dtype == jnp.float64 and not x.weak_type for x in leaves)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda m: Scene(3), "system is a int, which has no nq and nv"),
+        (lambda m: Scene(m, forces=JointDamping(1.0)), r"forces is a JointDamping; pass a tuple or a list"),
+        (lambda m: Scene(m, forces=(3.0,)), r"forces\[0\] is 3.0, which cannot be called"),
+        (lambda m: Scene(m, constraints="loop"), "constraints is a str; pass a tuple"),
+        (lambda m: CoulombFriction(1.0, v_s=0.0), "v_s is 0.0; give a positive smoothing velocity"),
+        (lambda m: Drive(1.0, 1.0, 0.0, effort_limit=-1.0), "effort_limit is -1.0; give positive limits"),
+        (lambda m: ExternalWrench("foot", [1.0]), r"wrench has shape \(1,\), expected \(6,\)"),
+        (lambda m: ExternalWrench("foot", [1.0] * 6, "tool"), "axes is 'tool'; choose 'world' or 'body'"),
+    ],
+)
+def test_refused_when_made(arm, make, message):
+    with pytest.raises(ValueError, match=message):
+        make(arm)
+
+
+@pytest.mark.parametrize(
+    ("force", "message"),
+    [
+        (JointDamping(1.0, joints=("elbow",)), r"JointDamping: joints \['elbow'\] are not in model 'arm'; it has"),
+        (JointDamping([1.0, 2.0]), r"coefficient has shape \(2,\), expected a scalar or \(13,\)"),
+        (JointSpring(1.0, rest=0.0), "rest is a scalar, but a joint with a quaternion needs all its coordinates, 15"),
+        (Drive(1.0, 1.0, [0.0, 0.0], joints=("knee_joint",)), r"target has shape \(2,\), expected a scalar or \(1,\)"),
+        (Drive(1.0, [1.0, 1.0], 0.0, joints=("knee_joint",)), r"kd has shape \(2,\), expected a scalar or \(1,\)"),
+        (ExternalWrench("fot", [0.0] * 6), "frame 'fot' is not in model 'arm'; did you mean foot"),
+        (lambda system, q, v, t: q, r"forces\[0\] returned shape \(15,\), expected \(13,\)"),
+    ],
+)
+def test_refused_when_called(arm, force, message):
+    q, v = sample(arm)
+    with pytest.raises(ValueError, match=message):
+        Scene(arm, forces=(force,)).applied_force(q, v)
+
+
+def test_refused_without_a_coefficient(sliders):
+    q, v = neutral(sliders), jnp.zeros(sliders.nv)
+    with pytest.raises(ValueError, match="JointDamping: no value given and the system has no damping"):
+        JointDamping()(sliders, q, v, 0.0)
+    with pytest.raises(ValueError, match="CoulombFriction: no value given and the system has no friction"):
+        CoulombFriction()(sliders, q, v, 0.0)

@@ -1,0 +1,203 @@
+"""The matrix form in its two frames, and what it gives in closed form: link frames against the tree frame, printed mechanisms,
+derivatives of the mass matrix."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close, load_robot, make_model, quick, random_states, random_tree
+
+from jaxdyn import dynamics, kinematics
+from jaxdyn.link_form import newton_euler_matrices
+from jaxdyn.model import configuration_rate
+
+ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
+CASES = {
+    "every_kind": lambda: random_tree(11, ALL_KINDS, armature=False),
+    "forest": lambda: random_tree(12, ALL_KINDS, parents=[-1, 0, 0, 2, -1, 4, 5, 4], armature=False),
+    "panda": lambda: load_robot("panda_description/urdf/panda.urdf", lock=("finger",))[1],
+    "solo12": lambda: load_robot("solo_description/robots/solo12.urdf", floating=True)[1],
+}
+
+
+@functools.cache
+def case(name):
+    model = CASES[name]()
+    tip = model.frame_names[-1]
+    states = random_states(model, 3, 5)[:3]
+
+    def values(model, q, v, a):
+        link = newton_euler_matrices(model, q, v, tip=tip)
+        flow = (configuration_rate(model, q, v),)
+        world = {
+            "mass_matrix": dynamics.mass_matrix(model, q),
+            "mass_matrix_rate": jax.jvp(lambda q: dynamics.mass_matrix(model, q), (q,), flow)[1],
+            "coriolis_matrix": dynamics.coriolis_matrix(model, q, v),
+            "gravity_force": dynamics.gravity_force(model, q),
+            "inverse_dynamics": dynamics.inverse_dynamics(model, q, v, a),
+            "bias_force": dynamics.bias_force(model, q, v),
+            "tip": kinematics.body_jacobian(model, q, tip),
+        }
+        products = {name: getattr(link, name) for name in ("mass_matrix", "phi", "Jt", "C0", "Cs", "jacobians")}
+        return link, products, world
+
+    out = quick(jax.vmap(values, (None, 0, 0, 0)))(model, *states)
+    return (model, states, *jax.tree.map(np.asarray, out))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_link_frames_agree_with_the_tree_frame(name):
+    _, (_, v, a), _, link, world = case(name)
+    assert_close(link["mass_matrix"], world["mass_matrix"], 1e-12)
+    assert_close(link["phi"], world["gravity_force"], 1e-12)
+    assert_close(link["Jt"], world["tip"], 1e-12)
+    assert_close(link["Cs"], world["coriolis_matrix"], 1e-12)
+    bias = np.einsum("sij,sj->si", link["C0"], v) + link["phi"]
+    assert_close(bias, world["bias_force"], 1e-12)
+    assert_close(np.einsum("sij,sj->si", link["mass_matrix"], a) + bias, world["inverse_dynamics"], 1e-12)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_identities_of_the_block_matrices(name):
+    model, (_, v, a), m, link, world = case(name)
+    for s in range(len(v)):
+        power = np.eye(6 * model.nb)
+        for _ in range(int(model.topology.depths.max())):
+            assert np.abs(power).max() > 0
+            power = power @ m.Gamma[s]
+        assert not power.any()  # nilpotent, and its index is the depth
+        assert_close(m.G[s] @ (np.eye(6 * model.nb) - m.Gamma[s]), np.eye(6 * model.nb), 1e-12)
+        # The recursions in block form: V, Vdot, F, tau.
+        twists = m.G[s] @ m.xi[s] @ v[s]
+        assert_close(m.V[s], twists, 1e-13)
+        rates = m.G[s] @ (m.xi[s] @ a[s] + m.P0[s] @ m.V0_dot[s] + m.ad_xi[s] @ m.Gamma[s] @ twists)
+        forces = m.G[s].T @ (m.M[s] @ rates + m.ad_V_T[s] @ m.M[s] @ twists)
+        assert_close(m.xi[s].T @ forces, world["inverse_dynamics"][s], 1e-12)
+        # dM/dt = Y + Y^T, Y = xi^T G^T M G ad_xi Gamma G xi; dM/dt - 2 Cs is skew, with C0 it is not.
+        y = m.xi[s].T @ m.G[s].T @ m.M[s] @ m.G[s] @ m.ad_xi[s] @ m.Gamma[s] @ m.G[s] @ m.xi[s]
+        rate = world["mass_matrix_rate"][s]
+        assert_close(y + y.T, rate, 1e-12)
+        for c in (link["Cs"][s], world["coriolis_matrix"][s]):
+            assert_close(c + c.T, rate, 1e-12)
+        c0 = link["C0"][s]
+        assert np.abs(c0 + c0.T - rate).max() > 1e-3 * np.abs(rate).max()
+
+
+def test_tip_wrench_by_virtual_power():
+    # Jt^T F_t: the tip's wrench on its surroundings is an external wrench on the last body with the sign turned.
+    model, (q, v, _), m, link, _ = case("panda")
+    wrench = np.array([1.0, -2, 3, 0.4, 0.5, -0.6])
+    body = model.topology.frame_bodies[-1]
+    on_body = -m.Pt[0][:, 6 * body : 6 * body + 6].T @ wrench
+    external = jnp.zeros((model.nb, 6)).at[body].set(on_body)
+    zero = jnp.zeros(model.nv)
+    tau = quick(dynamics.inverse_dynamics)(model, q[0], v[0], zero, external=external)
+    assert_close(tau, case("panda")[4]["bias_force"][0] + link["Jt"][0].T @ wrench, 1e-12)
+
+
+@quick
+def printed_quantities(model, q, v, a):
+    return (
+        dynamics.mass_matrix(model, q),
+        dynamics.coriolis_matrix(model, q, v) @ v,
+        dynamics.gravity_force(model, q),
+        dynamics.christoffel_symbols(model, q),
+        dynamics.inverse_dynamics(model, q, v, a),
+        dynamics.potential_energy(model, q),
+    )
+
+
+def test_planar_two_link_arm_as_printed():
+    # EQUATIONS section 1, planar 2R: numbers printed there.
+    (m1, m2), l1, (r1, r2), (i1, i2) = (1, 0.8), 1.0, (0.5, 0.4), (0.1, 0.05)
+    home = np.stack([np.eye(4)] * 2)
+    home[1, 0, 3] = l1
+    # About the body origin: I + m r^2 across the link.
+    bodies = [[m, m * r, 0, 0, i, 0, i + m * r**2, 0, 0, i + m * r**2] for m, r, i in ((m1, r1, i1), (m2, r2, i2))]
+    model = make_model([-1, 0], home, [[0, 0, 0, 0, 0, 1]] * 2, bodies, gravity=None)
+    q, v, a = jnp.asarray([0.2, np.pi / 3]), jnp.asarray([1.0, 2.0]), jnp.asarray([1.0, -1.0])
+    mass, coriolis, _, symbols, tau, _ = printed_quantities(model, q, v, a)
+    assert_close(mass, [[1.648, 0.338], [0.338, 0.178]])
+    # Eight digits are printed.
+    printed = np.array([[-0.55425626, -0.83138439], [0.27712813, 0]])
+    assert_close(coriolis, printed @ v, 1e-7)
+    assert_close(tau, [-0.90702503, 0.43712813], 1e-7)
+    assert_close(jnp.einsum("ijk,k->ij", symbols, v), printed, 1e-7)
+    b = m2 * l1 * r2 * np.sin(np.pi / 3)
+    assert_close(symbols, [[[0, -b], [-b, -b]], [[b, 0], [0, 0]]])
+
+
+def test_three_joint_arm_as_printed():
+    # EQUATIONS section 1, 3-dof arm: closed forms and numbers printed there, by the world's axes.
+    l0, l1, r0, r1, r2, g = 0.5, 0.4, 0.2, 0.25, 0.15, 9.81
+    m, ix, iy, iz = (3, 2, 1), (0.01, 0.03, 0.02), (0.02, 0.01, 0.015), (0.03, 0.04, 0.025)
+    home = np.stack([np.eye(4)] * 3)
+    home[1, 2, 3], home[2, 1, 3] = l0, l1
+    centers = [[0, 0, r0], [0, r1, 0.0], [0, r2, 0.0]]
+    bodies = []
+    for i, (x, y, z) in enumerate(centers):
+        moments = (ix[i] + m[i] * (y * y + z * z), 0, iy[i] + m[i] * (x * x + z * z), 0, 0, iz[i] + m[i] * (x * x + y * y))
+        bodies.append([m[i], m[i] * x, m[i] * y, m[i] * z, *moments])
+    screws = [[0, 0, 0, 0, 0, 1], [0, 0, 0, -1, 0, 0], [0, 0, 0, -1, 0, 0]]
+    model = make_model([-1, 0, 1], home, screws, bodies, gravity=(0, 0, -g))
+    q, v = jnp.asarray([0.3, 0.4, -0.7]), jnp.asarray([0.5, -0.6, 0.8])
+    mass, coriolis, gravity, symbols, _, potential = map(np.asarray, printed_quantities(model, q, v, v))
+    # Nine digits are printed.
+    assert_close(mass[[0, 1, 1, 2], [0, 1, 2, 2]], [0.457483792, 0.449281062, 0.088390531, 0.0425], 2e-9)
+    assert_close(mass[0, 1:], [0, 0], 1e-12)
+    assert_close(coriolis, [0.08628446, 0.01508056, -0.02029184], 2e-7)
+    assert_close(gravity, [0, -9.53782516, -1.40577764], 1e-9)
+    c2, s2, s3 = np.cos(0.4), np.sin(0.4), np.sin(-0.7)
+    c23, s23, t = np.cos(-0.3), np.sin(-0.3), m[2] * (l1 * c2 + r2 * np.cos(-0.3))
+    want = np.zeros((3, 3, 3))
+    a = (iy[1] - iz[1] - m[1] * r1**2) * c2 * s2 + (iy[2] - iz[2]) * c23 * s23 - t * (l1 * s2 + r2 * s23)
+    b = (iy[2] - iz[2]) * c23 * s23 - t * r2 * s23
+    want[0, 0, 1], want[0, 1, 0], want[1, 0, 0] = a, a, -a
+    want[0, 0, 2], want[0, 2, 0], want[2, 0, 0] = b, b, -b
+    want[1, 1, 2] = want[1, 2, 1] = want[1, 2, 2] = -m[2] * l1 * r2 * s3
+    want[2, 1, 1] = m[2] * l1 * r2 * s3
+    assert_close(symbols, want)
+    h = (r0, l0 - r1 * s2, l0 - l1 * s2 - r2 * s23)
+    assert_close(potential, g * sum(x * y for x, y in zip(m, h, strict=True)))
+
+
+@pytest.mark.parametrize("parents", [None, [0, 1, 2, 3, 4, 5], [0, 0, 2, -1, 4, 4]], ids=["tree", "chain", "forest"])
+def test_derivative_of_the_mass_matrix(parents):
+    kinds = ["revolute", "prismatic", "helical", "continuous", "revolute", "helical", "revolute"]
+    model = random_tree(21, kinds, parents=None if parents is None else [-1, *parents])
+    q, v = (x[0] for x in random_states(model, 1, 2)[:2])
+
+    @quick
+    def values(model, q, v):
+        return (
+            dynamics.mass_matrix_derivative(model, q),
+            jax.jacfwd(lambda q: dynamics.mass_matrix(model, q))(q),
+            dynamics.christoffel_symbols(model, q),
+            dynamics.coriolis_matrix(model, q, v),
+        )
+
+    closed, automatic, symbols, coriolis = values(model, q, v)
+    assert_close(closed, automatic, 1e-12)
+    assert_close(symbols, symbols.transpose(0, 2, 1), 1e-13)
+    own = jnp.einsum("ijk,k->ij", symbols, v)
+    assert_close(own @ v, coriolis @ v, 1e-12)
+    assert_close(own + own.T, coriolis + coriolis.T, 1e-12)
+    # Turning the first joint of a tree turns all of it.
+    assert_close(closed[:, :, 0], np.zeros_like(closed[:, :, 0]), 1e-12)
+
+
+def test_refusals():
+    model = random_tree(1, ["revolute", "planar"])
+    for function in (dynamics.christoffel_symbols, dynamics.mass_matrix_derivative):
+        with pytest.raises(ValueError, match=r"v = dq/dt .*'j1' \(planar\)"):
+            function(model, jnp.zeros(4))
+    with pytest.raises(ValueError, match="tip is None"):
+        _ = quick(newton_euler_matrices)(random_tree(1, ["revolute"]), jnp.zeros(1), jnp.zeros(1)).Jt
+    with pytest.raises(ValueError, match="frame 'none' is not in model"):
+        newton_euler_matrices(model, jnp.zeros(4), jnp.zeros(4), tip="none")
+    arm = load_robot("panda_description/urdf/panda.urdf", lock=("finger",))[1]
+    base = next(n for n, b in zip(arm.frame_names, arm.topology.frame_bodies, strict=True) if b < 0)
+    with pytest.raises(ValueError, match="fixed to the world"):
+        newton_euler_matrices(arm, jnp.zeros(7), jnp.zeros(7), tip=base)
