@@ -103,7 +103,8 @@ class ModelBuilder:
           length but zero. A planar joint moves in the x-y plane of its body frame at home.
         - `pitch`: of a helical joint, m per rad.
         - `screw`: twist (v, omega) (6,) of a one-degree-of-freedom joint in the body frame, instead of axis and
-          pitch; it is scaled to |omega| = 1 (|v| = 1 for prismatic). Its axis need not pass through the origin.
+          pitch; it is scaled to |omega| = 1 (|v| = 1 for prismatic). Any screw is helical; the axis of a revolute or
+          continuous joint passes through the body's origin.
         - `armature`, `damping`, `friction`: rotor inertia, viscous and Coulomb friction of the joint, a number or
           (nv,). When no joint of the model has one, the model's leaf is None.
         - `lower`, `upper`: position limits, a number or (nq,); `velocity_limit`, `effort_limit`: a number or (nv,).
@@ -262,21 +263,23 @@ def inertia_report(model: Model) -> list[tuple[str, str]]:
     """
     return [
         (name, problem)
-        for name, parameters in zip(model.body_names, np.asarray(model.inertias, np.float64), strict=True)
+        for name, parameters in zip(model.body_names, np.asarray(model.inertias), strict=True)
         for problem in inertia_problems(parameters)
     ]
 
 
 def inertia_problems(parameters) -> list[str]:
     """What is unphysical in ten inertial parameters (10,), in words; empty when nothing is."""
-    parameters = np.asarray(parameters, np.float64)
+    parameters = np.asarray(parameters)
+    # The shift from the origin to the centre of mass leaves a few roundings of the precision the numbers came in.
+    rounding = 64 * np.finfo(parameters.dtype).eps
+    parameters = parameters.astype(np.float64)
     if not parameters.any():
         return ["massless"]
     if parameters[0] <= 0:
         return [f"mass {parameters[0]} kg with first moments and inertia {parameters[1:].tolist()}"]
     moments = np.linalg.eigvalsh(f64.about_com(parameters)[2])
-    # Rounding of the shift from the origin to the centre of mass; float32 models are read with their own rounding.
-    slack = 1e-12 * np.abs(f64.rotational_inertia(parameters)).max()
+    slack = rounding * np.abs(f64.rotational_inertia(parameters)).max()
     text = ", ".join(f"{moment:.6g}" for moment in moments)
     if moments[0] <= slack:
         return [f"not positive definite: principal moments {text} kg m^2"]
@@ -290,11 +293,11 @@ def repair_inertias(model: Model) -> Model:
 
     Bodies that `inertia_report` does not list are left as they are, and massless ones too.
     """
-    inertias = np.array(model.inertias, np.float64)
+    inertias = np.array(model.inertias)
     for i, parameters in enumerate(inertias):
         if parameters[0] > 0 and inertia_problems(parameters):
             inertias[i] = _inertia.nearest_feasible(parameters)
-    return model.replace(inertias=jnp.asarray(inertias, model.inertias.dtype))
+    return model.replace(inertias=jnp.asarray(inertias))
 
 
 def _float_dtype(dtype):
@@ -352,11 +355,14 @@ def _screw(kind: str, axis, pitch, screw, what: str) -> np.ndarray:
     size = np.linalg.norm(v if kind == "prismatic" else omega)
     if size == 0:
         part = "v" if kind == "prismatic" else "omega"
-        raise ValueError(f"{what}: screw is {screw.tolist()}; a {kind} joint needs an {part} other than zero")
+        raise ValueError(f"{what}: screw is {screw.tolist()}; a {kind} joint needs {part} other than zero")
     if kind == "prismatic" and omega.any():
         raise ValueError(f"{what}: screw {screw.tolist()} turns, but the joint is prismatic; use joint='helical'")
-    if kind != "helical" and abs(v @ omega) > 1e-12 * size * np.linalg.norm(v):
-        raise ValueError(f"{what}: screw {screw.tolist()} has pitch {v @ omega / size**2}; use joint='helical'")
+    if kind in ("revolute", "continuous") and v.any():
+        raise ValueError(
+            f"{what}: screw {screw.tolist()} has a pitch or passes beside the body's origin; use joint='helical', "
+            f"which takes any screw"
+        )
     return screw / size
 
 

@@ -1,8 +1,8 @@
 """The dynamics of a model as users call it: M(q) a + C(q, v) v + N(q) = tau + sum of J_i^T f_i.
 
-All functions take one sample, are pure, and can be batched, compiled and differentiated in every argument and in every leaf
-of the model. Velocities and accelerations are the model's v and a (body-fixed, not dq/dt). Joint damping and friction are
-forces of a scene and do not enter here; rotor inertia (armature) does.
+All functions take one sample, are pure, and can be batched, compiled and differentiated in every argument and in every
+leaf of the model. Velocities and accelerations are the model's v and a (body-fixed, not dq/dt). Joint damping and
+friction are forces of a scene and do not enter here; rotor inertia (armature) does.
 
 Every function raises a ValueError that names the argument when a shape does not fit the model.
 """
@@ -23,8 +23,8 @@ def mass_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
 
     **Arguments:** `q` (nq,).
 
-    **Returns:** (nv, nv), kg m^2 for pairs of rotations, kg m and kg where translations take part. Positive definite when
-    every joint moves some inertia.
+    **Returns:** (nv, nv), kg m^2 for pairs of rotations, kg m and kg where translations take part. Positive definite
+    when every joint moves some inertia.
 
     Source: Murray, Li & Sastry (1994), eq. 4.19; EQUATIONS sections 2 and 4.
     """
@@ -80,8 +80,8 @@ def inverse_dynamics(
 ) -> Float[Array, " nv"]:
     """Generalised forces of a motion: tau = M(q) a + C(q, v) v + N(q) - sum of J_i^T f_i.
 
-    **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,), rate of v; `external` (nb, 6), wrench (f, tau) ON each body, at its frame's
-    origin and in its axes (N, N m), or None.
+    **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,), rate of v; `external` (nb, 6), wrench (f, tau) ON each body, at its
+    frame's origin and in its axes (N, N m), or None.
 
     **Returns:** (nv,), N m or N.
 
@@ -101,11 +101,11 @@ def forward_dynamics(
 ) -> Float[Array, " nv"]:
     """Acceleration under given forces: a = M(q)^-1 (tau - C(q, v) v - N(q) + sum of J_i^T f_i).
 
-    **Arguments:** `q` (nq,); `v` (nv,); `tau` (nv,), N m or N; `external` (nb, 6), wrench (f, tau) ON each body, at its frame's
-    origin and in its axes (N, N m), or None.
+    **Arguments:** `q` (nq,); `v` (nv,); `tau` (nv,), N m or N; `external` (nb, 6), wrench (f, tau) ON each body, at its
+    frame's origin and in its axes (N, N m), or None.
 
-    **Returns:** (nv,), the rate of v. NaN when M is not positive definite, which a joint that moves no inertia causes; the
-    error grows with the condition number of M.
+    **Returns:** (nv,), the rate of v. NaN when M is not positive definite, which a joint that moves no inertia causes;
+    the error grows with the condition number of M.
     """
     check_shapes(model, q=q, v=v, tau=tau, external=external)
     return matrix_form.forward_dynamics(model, q, v, tau, external)
@@ -116,7 +116,8 @@ def generalized_force(
 ) -> Float[Array, " nv"]:
     """Generalised forces of wrenches on the bodies: sum of J_i^T f_i.
 
-    **Arguments:** `q` (nq,); `external` (nb, 6), wrench (f, tau) ON each body, at its frame's origin and in its axes (N, N m).
+    **Arguments:** `q` (nq,); `external` (nb, 6), wrench (f, tau) ON each body, at its frame's origin and in its axes
+    (N, N m).
 
     **Returns:** (nv,), N m or N; it stands on the right, with tau.
     """
@@ -170,12 +171,13 @@ def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
 def centroidal_momentum(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "6"]:
     """Momentum of the whole mechanism about its centre of mass, in world axes.
 
-    (l, k) = (sum of m_i cdot_i, sum of (c_i - c) x m_i cdot_i + I_i omega_i), c the common centre of mass. Without contact
-    and joint torques on the world, k is constant and dl/dt = m g.
+    (l, k) = (sum of m_i cdot_i, sum of (c_i - c) x m_i cdot_i + I_i omega_i), c the common centre of mass. Without
+    contact and joint torques on the world, k is constant and dl/dt = m g.
 
     **Arguments:** `q` (nq,); `v` (nv,).
 
-    **Returns:** (6,), linear (kg m/s) then angular (kg m^2/s). Rotors (armature) are left out. NaN when no body has mass.
+    **Returns:** (6,), linear (kg m/s) then angular (kg m^2/s). Rotors (armature) are left out. NaN when no body has
+    mass.
 
     Source: Orin, Goswami & Lee (2013), eq. 21.
     """
@@ -206,8 +208,8 @@ def torque_regressor(
 ) -> Float[Array, "nv nb10"]:
     """Regressor Y(q, v, a) of inverse dynamics: tau = Y pi, linear in the inertial parameters.
 
-    pi = `model.inertias.reshape(-1)`, the numbers (m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) of one body after the
-    other. Rotor inertia is not among them: `inverse_dynamics` = Y pi + armature a.
+    pi = `model.inertias.reshape(-1)`, the numbers (m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) of one body after
+    the other. Rotor inertia is not among them: `inverse_dynamics` = Y pi + armature a.
 
     **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,).
 
@@ -265,8 +267,10 @@ def _check_coordinates(model: Model, name: str) -> None:
 
 
 def _first_moments(model: Model, frame: TreeFrame):
-    """Masses (nb,), first moments (nb, 3) in the tree frames, the world position (3,) of the first tree's origin and each
-    body's tree frame (nb, 3) relative to it: zero, and not a difference of far positions, in a model of one tree."""
+    """Masses (nb,), first moments (nb, 3) in the tree frames, world position (3,) of the first tree's origin, and shifts.
+
+    A shift (3,) is the place of a body's tree frame relative to the first one: zero, not a difference of far positions, for one tree.
+    """
     mass = model.inertias[:, 0]
     rotated = _product(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
     origin = frame.origin[0]

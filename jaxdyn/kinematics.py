@@ -1,9 +1,9 @@
 """Kinematics of trees: products of exponentials, Jacobians of named frames and their rates.
 
-Body i stands at T_i = (product over its ancestors j, root first, of home_j exp(hat(S_j) q_j)), the product of exponentials
-of Murray, Li & Sastry (1994), eq. 3.3, with body frames in place of base-frame screws. The product along the tree is
-taken by pointer jumping: after step k every body holds the product of its last 2^k joints, so log2(depth) batched 4x4
-products give all poses and the program stays short however many bodies there are.
+Body i stands at T_i = (product over its ancestors j, root first, of home_j exp(hat(S_j) q_j)), the product of
+exponentials of Murray, Li & Sastry (1994), eq. 3.3, with body frames in place of base-frame screws. The product along
+the tree is taken by pointer jumping: after step k every body holds the product of its last 2^k joints, so log2(depth)
+batched 4x4 products give all poses and the program stays short however many bodies there are.
 
 Everything that is summed over bodies lives in one *tree frame*: axes parallel to the world's, origin at the origin of
 the tree's root body. Positions in it are built without ever adding the root's own position, so a robot far from the
@@ -28,8 +28,8 @@ class TreeFrame(NamedTuple):
 
     - `pose` (nb, 4, 4): body frame in its tree frame (m).
     - `origin` (nb, 3): world position of the tree frame's origin, for each body (m).
-    - `subspace` (nv, 6): row k is the twist, in the tree frame, of the motion with v_k = 1 alone. As a twist of the fixed
-      frame that coincides with the tree frame at this instant it does not depend on where the root body is.
+    - `subspace` (nv, 6): row k is the twist, in the tree frame, of the motion with v_k = 1 alone. As a twist of the
+      fixed frame that coincides with the tree frame at this instant it does not depend on where the root body is.
     """
 
     pose: Float[Array, "nb 4 4"]
@@ -194,8 +194,8 @@ def jacobian_dot_v(
 
     **Arguments:** `q` (nq,); `v` (nv,); `frame`, one of `model.frame_names` (None: the world, zero).
 
-    **Returns:** (6,), linear then angular, in the frame's axes (m/s^2, rad/s^2). It is the rate of the body twist, not the
-    acceleration of the origin: that is its linear part plus omega x v.
+    **Returns:** (6,), linear then angular, in the frame's axes (m/s^2, rad/s^2). It is the rate of the body twist, not
+    the acceleration of the origin: that is its linear part plus omega x v.
 
     **Raises:** ValueError for an unknown name or shapes that do not fit.
     """

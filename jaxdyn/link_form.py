@@ -5,8 +5,8 @@ With A_i = Ad^-1 of the pose of link i in its parent, in block (i, parent(i)) of
     V = G P0 V_0 + G xi v,    Vdot = G (xi a + P0 Vdot_0 + ad_xi P0 V_0 + ad_xi Gamma V),
     F = G^T (M Vdot + Pt^T F_t + ad_V^T M V),    tau = xi^T F
 
-(EQUATIONS section 4). This is the form to read, to teach and to check against: it costs O(nb^3). What users call runs on
-`matrix_form` or `recursive`, and shares with this module the joints' own transforms and screws alone.
+(EQUATIONS section 4). This is the form to read, to teach and to check against: it costs O(nb^3). What users call runs
+on `matrix_form` or `recursive`, and shares with this module the joints' own transforms and screws alone.
 """
 
 import equinox as eqx
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxdyn import se3
 from jaxdyn.inertia import spatial_inertia
 from jaxdyn.kinematics import body_subspace, relative_poses
-from jaxdyn.model import Model, check_shapes, frame_index, geometry
+from jaxdyn.model import Model, check_shapes, frame_index
 from jaxdyn.so3 import _product
 
 
@@ -31,8 +31,8 @@ class NewtonEulerMatrices(eqx.Module):
     - `M` (6n, 6n): spatial inertias of the bodies, block diagonal.
     - `P0` (6n, 6): A_i for the bodies that hang on the world.
     - `Pt` (6, 6n): body twist of the tip frame from the body twists, or None without a tip.
-    - `ad_xi`, `ad_V`, `ad_V_T` (6n, 6n): blkdiag(-ad of xi_i v_i), blkdiag(-ad of V_i), blkdiag(-ad^T of V_i). The minus signs
-      are part of the definition.
+    - `ad_xi`, `ad_V`, `ad_V_T` (6n, 6n): blkdiag(-ad of xi_i v_i), blkdiag(-ad of V_i), blkdiag(-ad^T of V_i). The
+      minus signs are part of the definition.
     - `V0_dot` (6,): acceleration of the world, (-g, 0); zero without gravity.
     - `V` (6n,): body twists.
 
@@ -103,18 +103,16 @@ def newton_euler_matrices(
 
     **Arguments:** `q` (nq,); `v` (nv,); `tip`, name of the frame where the tip wrench F_t acts, or None.
 
-    **Returns:** `NewtonEulerMatrices`. M(q) a + Cs v + phi + Jt^T F_t = tau, with F_t the wrench that the tip applies TO its
-    surroundings, at the tip frame's origin in its axes.
+    **Returns:** `NewtonEulerMatrices`. M(q) a + Cs v + phi + Jt^T F_t = tau, with F_t the wrench that the tip applies
+    TO its surroundings, at the tip frame's origin in its axes.
 
     **Raises:** ValueError for shapes that do not fit, an unknown tip, or a tip fixed to the world.
 
     Source: EQUATIONS section 4; Park, Bobrow & Ploen (1995), Murray, Li & Sastry (1994) section 4.3.
     """
     check_shapes(model, q=q, v=v)
-    topology, dtype = model.topology, model.home.dtype
-    screws = geometry(model)[1]
-    n = topology.nb
-
+    topology, n = model.topology, model.nb
+    tip_selector = None if tip is None else _tip_selector(model, tip)
     to_child = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))(relative_poses(model, q))
     parents = np.array(topology.parents, int)
     gamma = _place(to_child, parents[:, None] == np.arange(n))

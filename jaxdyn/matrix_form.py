@@ -1,13 +1,13 @@
 """The dynamics as matrix products: M(q) = S^T G^T I G S with G the constant ancestor mask.
 
-In link frames G = (I - Gamma)^-1 holds an adjoint in every block (EQUATIONS section 4; `link_form`). Written in one frame
-for the whole tree those adjoints become identities, and G becomes the constant 0/1 matrix that says which joint moves
-which body. Velocities, accelerations and forces are then products with a constant matrix instead of recursions:
+In link frames G = (I - Gamma)^-1 holds an adjoint in every block (EQUATIONS section 4; `link_form`). Written in one
+frame for the whole tree those adjoints become identities, and G becomes the constant 0/1 matrix that says which joint
+moves which body. Velocities, accelerations and forces are then products with a constant matrix instead of recursions:
 
     V = G (S v),   A = G (S a + Sdot v) + A_0,   F_i = I_i A_i - ad_{V_i}^T I_i V_i,   tau = S . (G^T F).
 
-The frame is the tree frame of `kinematics`. Inertias are sums of ten numbers, so composite inertias are one product too.
-No function here checks its arguments: `dynamics` does.
+The frame is the tree frame of `kinematics`. Inertias are sums of ten numbers, so composite inertias are one product
+too. No function here checks its arguments: `dynamics` does.
 """
 
 import jax
@@ -79,8 +79,8 @@ def forward_dynamics(
 def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
     """Forward dynamics a and M^-1 times `force_change(a)` (nv,), both from one Cholesky factor.
 
-    With ID(q, v, a) = tau, a change of (model, q, v, tau) changes a by M^-1 (dtau - dID at fixed a); `force_change` returns the
-    bracket.
+    With ID(q, v, a) = tau, a change of (model, q, v, tau) changes a by M^-1 (dtau - dID at fixed a); `force_change`
+    returns the bracket.
     """
     frame = tree_frame(model, q)
     inertias = tree_inertias(model, frame)
@@ -89,9 +89,7 @@ def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
     return a, cho_solve(factor, force_change(a))
 
 
-def generalized_force(
-    model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]
-) -> Float[Array, " nv"]:
+def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:
     """sum of J_i^T f_i over the bodies, J_i the body Jacobian of body i."""
     frame = tree_frame(model, q)
     wrenches = jax.vmap(se3.Ad_inv_T_apply)(frame.pose, external)
@@ -101,8 +99,8 @@ def generalized_force(
 def coriolis_matrix(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "nv nv"]:
     """C = sum of J_i^T (I_i Jdot_i - ad_{V_i}^T I_i J_i) over the bodies: Cs of EQUATIONS section 4 in the tree frame.
 
-    In a link frame Cs has the blocks J^T M Jdot + J^T (M ad_V - ad_V^T M) J; with J_s = Ad J, Jdot_s = Ad (Jdot + ad_V J)
-    the term M ad_V joins the first. C + C^T = Mdot because Idot = -ad_V^T I - I ad_V.
+    In a link frame Cs has the blocks J^T M Jdot + J^T (M ad_V - ad_V^T M) J; with J_s = Ad J, Jdot_s = Ad (Jdot + ad_V
+    J) the term M ad_V joins the first. C + C^T = Mdot because Idot = -ad_V^T I - I ad_V.
     """
     frame = tree_frame(model, q)
     twists = body_twists(model, frame, v)
@@ -143,8 +141,8 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     """D_ijk = dM_ij/dq_k in closed form (Property 2 of EQUATIONS section 2), for joints with v = dq/dt.
 
     D_ijk = T_ijk + T_jik, T_ijk = [S_i, S_k] . I_c S_j with I_c the inertia moved by all of i, j, k; zero unless they
-    lie on one path to the root with joint i strictly above joint k. The bracket is the motion of S_i as seen by the bodies
-    that joint k carries.
+    lie on one path to the root with joint i strictly above joint k. The bracket is the motion of S_i as seen by the
+    bodies that joint k carries.
     """
     frame = tree_frame(model, q)
     subspace = frame.subspace
@@ -170,7 +168,7 @@ def tree_inertias(model: Model, frame: TreeFrame) -> Float[Array, "nb 10"]:
 
 
 def momentum(parameters: Float[Array, "10"], twist: Float[Array, "6"]) -> Float[Array, "6"]:
-    """Spatial momentum I V = (m v + omega x h, h x v + I omega), h = m c: a wrench-like vector at the frame's origin."""
+    """Spatial momentum I V = (m v + omega x h, h x v + I omega), h = m c, at the frame's origin."""
     mass, first = parameters[0], parameters[1:4]
     v, omega = twist[:3], twist[3:]
     angular = cross(first, v) + _product(rotational_inertia(parameters), omega)
@@ -229,7 +227,11 @@ def _wrench_regressor(twist, acceleration) -> Float[Array, "6 10"]:
     point = acceleration[:3] + cross(omega, twist[:3])
     turn = so3.hat(omega)
     force = jnp.concatenate([point[:, None], so3.hat(alpha) + _product(turn, turn), jnp.zeros((3, 6), twist.dtype)], 1)
-    torque = [jnp.zeros((3, 1), twist.dtype), -so3.hat(point), _inertia_times(alpha) + _product(turn, _inertia_times(omega))]
+    torque = [
+        jnp.zeros((3, 1), twist.dtype),
+        -so3.hat(point),
+        _inertia_times(alpha) + _product(turn, _inertia_times(omega)),
+    ]
     return jnp.concatenate([force, jnp.concatenate(torque, 1)])
 
 

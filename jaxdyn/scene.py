@@ -18,7 +18,7 @@ class _Static(eqx.Module):
         return self.function(*args)
 
 
-def as_pytree(function: Callable, argument: str) -> Callable:
+def as_pytree(function: Any, argument: str) -> Callable:
     """The callable itself if it is a pytree (an equinox Module, a `jax.tree_util.Partial`), else a static wrapper of
     it.
 

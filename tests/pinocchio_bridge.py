@@ -21,8 +21,8 @@ ROBOTS = os.path.join(os.path.dirname(pin.__file__), "../../../../share/example-
 
 @dataclasses.dataclass(frozen=True)
 class Bridge:
-    """Kinds of the joints on our side, whether Pinocchio writes an angle as (cos, sin), and the offset (nb, 4, 4) of our
-    body frame in Pinocchio's joint frame."""
+    """Kinds of the joints on our side, whether Pinocchio writes an angle as (cos, sin), and the offset (nb, 4, 4) of
+    our body frame in Pinocchio's joint frame."""
 
     kinds: tuple[str, ...]
     circles: tuple[bool, ...]
@@ -148,7 +148,8 @@ def load_robot(path: str, *, floating=False, lock=()) -> tuple[pin.Model, Model,
 
 
 def random_tree(seed: int, kinds, *, parents=None, armature=True, dtype=jnp.float64) -> Model:
-    """A random tree with the given joint kinds: skew placements, axes beside the body origins, tapering physical inertias.
+    """A random tree with the given joint kinds: skew placements, axes beside the body origins, tapering physical
+    inertias.
 
     Parents are drawn so that every subtree is listed without gaps, or given. Each body carries one extra frame.
     """
@@ -168,9 +169,10 @@ def random_tree(seed: int, kinds, *, parents=None, armature=True, dtype=jnp.floa
         axis = _unit(rng.normal(size=3))
         if kind == "prismatic":
             screws[i, :3] = axis
+        elif kind == "helical":
+            screws[i] = np.concatenate([np.cross(rng.normal(size=3) * 0.1, axis) + 0.2 * axis, axis])
         elif kind in SCREW_KINDS:
-            pitch = 0.2 if kind == "helical" else 0.0
-            screws[i] = np.concatenate([np.cross(rng.normal(size=3) * 0.1, axis) + pitch * axis, axis])
+            screws[i, 3:] = axis
     inertias = np.stack([random_inertia(rng) * 0.8 ** (i % 8) for i in range(n)])
     names = tuple(f"b{i}" for i in range(n))
     topology = Topology(

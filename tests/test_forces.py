@@ -4,12 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
+from pinocchio_bridge import quick
 
 from jaxdyn.building import ModelBuilder
 from jaxdyn.dynamics import generalized_force
 from jaxdyn.forces import CoulombFriction, Drive, ExternalWrench, JointDamping, JointSpring
-from jaxdyn.kinematics import frame_pose
-from jaxdyn.model import difference, integrate, neutral, random_configuration
+from jaxdyn.kinematics import forward_kinematics, frame_pose
+from jaxdyn.model import difference, integrate, neutral
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import simulate
 
@@ -38,6 +40,11 @@ def arm():
     builder.add_body("slide", "base", "planar", inertia=(0.7, (0.1, 0, 0), moments), friction=(0.3, 0.4, 0.5))
     builder.add_frame("foot", "knee", ((0.1, 0.0, -0.3), (0.2, 0.3, 0.4)))
     return builder.build()
+
+
+@quick
+def evaluate(force, model, q, v):
+    return force(model, q, v, 0.0)
 
 
 def push(system, q, v, t):
@@ -72,7 +79,8 @@ def test_motions_against_closed_forms(sliders):
     speed = np.array([1.0, 0.5, 0.9, -0.3, 0.7, -0.1])
     q0 = np.concatenate([start, [np.cos(0.5)], np.sin(0.5) * axis])
     v0 = np.concatenate([speed, 0.3 * axis])
-    solution = simulate(scene, q0, v0, ts, rtol=1e-12, atol=1e-12)
+    # Dense output is an order of magnitude less accurate than the steps, hence the tight tolerances.
+    solution = simulate(scene, q0, v0, ts, rtol=1e-14, atol=1e-14)
     names = list(sliders.joint_names)
     assert names == [*MASS, "turn"]
     expected = {}
@@ -101,8 +109,13 @@ def test_motions_against_closed_forms(sliders):
 
 
 def sample(model, seed=0):
-    q = random_configuration(model, jax.random.key(seed))
-    return q, jax.random.normal(jax.random.key(seed + 1), (model.nv,))
+    """A random state, with unit quaternions."""
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=model.nq)
+    for kind, place in zip(model.topology.kinds, model.topology.q_slices, strict=True):
+        if kind in ("spherical", "free"):
+            q[place][-4:] /= np.linalg.norm(q[place][-4:])
+    return jnp.asarray(q), jnp.asarray(rng.normal(size=model.nv))
 
 
 def test_defaults_of_the_model(arm):
@@ -110,9 +123,9 @@ def test_defaults_of_the_model(arm):
     damping = np.concatenate([np.full(6, 0.1), np.zeros(7)])
     friction = np.concatenate([np.zeros(10), [0.3, 0.4, 0.5]])
     assert arm.joint_names == ("base_joint", "hip_joint", "knee_joint", "slide_joint")
-    np.testing.assert_allclose(JointDamping()(arm, q, v, 0.0), -damping * v, rtol=1e-15)
+    np.testing.assert_allclose(evaluate(JointDamping(), arm, q, v), -damping * v, rtol=1e-15)
     expected = -friction * np.tanh(v / 0.2)
-    np.testing.assert_allclose(CoulombFriction(v_s=0.2)(arm, q, v, 0.0), expected, rtol=1e-14)
+    np.testing.assert_allclose(evaluate(CoulombFriction(v_s=0.2), arm, q, v), expected, rtol=1e-14)
     total = Scene(arm, forces=(JointDamping(), CoulombFriction(v_s=0.2))).applied_force(q, v)
     np.testing.assert_allclose(total, expected - damping * v, rtol=1e-14)
     assert Scene(arm).applied_force(q, v) is None
@@ -121,48 +134,49 @@ def test_defaults_of_the_model(arm):
 def test_joints_are_taken_in_the_order_named(arm):
     q, v = sample(arm)
     coefficient = np.arange(1.0, 5.0)
-    force = JointDamping(coefficient, joints=("slide_joint", "knee_joint"))(arm, q, v, 0.0)
+    force = evaluate(JointDamping(coefficient, joints=("slide_joint", "knee_joint")), arm, q, v)
     expected = np.zeros(13)
     expected[10:], expected[9] = -coefficient[:3] * v[10:], -coefficient[3] * v[9]
     np.testing.assert_allclose(force, expected, rtol=1e-15)
     spring = JointSpring(coefficient, rest=[0.1, 0.2, 0.3, 0.4], joints=("knee_joint", "hip_joint"))
     with pytest.raises(ValueError, match=r"JointSpring: rest has shape \(4,\), expected a scalar or \(5,\)"):
-        spring(arm, q, v, 0.0)
+        evaluate(spring, arm, q, v)
 
 
 def test_spring_and_drive_move_along_the_manifold(arm):
-    """A unit-gain spring is the difference of the library, and minus the gradient of its energy where it is conservative."""
+    """A unit-gain spring is the library's difference, and minus the gradient of its energy where it is conservative."""
     q, v = sample(arm, 3)
     rest, _ = sample(arm, 7)
-    np.testing.assert_allclose(JointSpring(2.0, rest)(arm, q, v, 0.0), -2 * difference(arm, rest, q), rtol=1e-14)
+    np.testing.assert_allclose(
+        evaluate(JointSpring(2.0, rest), arm, q, v), -2 * quick(difference)(arm, rest, q), rtol=1e-14
+    )
     # A drive pulls along the twist from q to the target; the spring's twist from its rest is the opposite one.
-    drive = Drive(2.0, 0.3, rest, target_velocity=0.7)(arm, q, v, 0.0)
-    np.testing.assert_allclose(drive, 2 * difference(arm, q, rest) + 0.3 * (0.7 - v), rtol=0, atol=1e-13)
+    drive = evaluate(Drive(2.0, 0.3, rest, target_velocity=0.7), arm, q, v)
+    np.testing.assert_allclose(drive, 2 * quick(difference)(arm, q, rest) + 0.3 * (0.7 - v), rtol=0, atol=1e-13)
     place = slice(6, 10)  # the spherical and the revolute joint
 
     def energy(step):
         return 0.5 * 2.0 * jnp.sum(difference(arm, rest, integrate(arm, q, step))[place] ** 2)
 
-    gradient = jax.grad(energy)(jnp.zeros(13))[place]
-    spring = JointSpring(2.0, rest[7:12], joints=("hip_joint", "knee_joint"))(arm, q, v, 0.0)
+    gradient = quick(jax.grad(energy))(jnp.zeros(13))[place]
+    spring = evaluate(JointSpring(2.0, rest[7:12], joints=("hip_joint", "knee_joint")), arm, q, v)
     np.testing.assert_allclose(spring[place], -gradient, rtol=1e-12, atol=1e-13)
     assert not np.any(spring[:6]) and not np.any(spring[10:])
-    assert not np.any(JointSpring(2.0)(arm, neutral(arm), v, 0.0))
+    assert not np.any(evaluate(JointSpring(2.0), arm, neutral(arm), v))
 
 
 def test_effort_limit(arm):
     q, v = sample(arm, 3)
     target, _ = sample(arm, 7)
-    free = Drive(50.0, 1.0, target)(arm, q, v, 0.0)
+    free = evaluate(Drive(50.0, 1.0, target), arm, q, v)
     limits = np.where(np.arange(13) % 2, 4.0, np.inf)
-    held = Drive(50.0, 1.0, target, effort_limit=limits)(arm, q, v, 0.0)
+    held = evaluate(Drive(50.0, 1.0, target, effort_limit=limits), arm, q, v)
     np.testing.assert_allclose(held[::2], free[::2], rtol=1e-15)
     np.testing.assert_allclose(held[1::2], 4 * np.tanh(free[1::2] / 4), rtol=1e-14)
-    small = Drive(0.05, 0.0, target, effort_limit=4.0)(arm, q, v, 0.0)
-    np.testing.assert_allclose(small, free * 0 + Drive(0.05, 0.0, target)(arm, q, v, 0.0), rtol=1e-2)
-    gradient = jax.grad(lambda limit: jnp.sum(Drive(50.0, 1.0, target, 0.0, limit)(arm, q, v, 0.0)))(
-        jnp.asarray(limits)
-    )
+    small, same = (evaluate(Drive(0.05, 0.0, target, effort_limit=x), arm, q, v) for x in (4.0, np.inf))
+    np.testing.assert_allclose(small, same, rtol=1e-2)
+    total = quick(jax.grad(lambda limit: jnp.sum(Drive(50.0, 1.0, target, 0.0, limit)(arm, q, v, 0.0))))
+    gradient = total(jnp.asarray(limits))
     assert np.isfinite(gradient).all() and np.all(gradient[1::2] != 0)
 
 
@@ -171,18 +185,18 @@ def test_external_wrench(arm, axes):
     """Against the wrench carried to the body by hand, and against virtual work by finite differences."""
     q, v = sample(arm, 5)
     wrench = np.array([1.0, -2.0, 3.0, 0.4, 0.5, -0.6])
-    value = ExternalWrench("foot", wrench, axes)(arm, q, v, 0.0)
-    pose = np.asarray(frame_pose(arm, q, "foot"))
+    value = evaluate(ExternalWrench("foot", wrench, axes), arm, q, v)
+    steps = 1e-5 * np.concatenate([np.zeros((1, 13)), np.eye(13), -np.eye(13)])
+    poses = quick(jax.vmap(lambda step: frame_pose(arm, integrate(arm, q, step), "foot")))(jnp.asarray(steps))
+    pose = np.asarray(poses[0])
     rotation = pose[:3, :3]
     force, torque = (wrench[:3], wrench[3:]) if axes == "world" else (rotation @ wrench[:3], rotation @ wrench[3:])
-    knee = np.asarray(frame_pose(arm, q, "knee"))
+    knee = np.asarray(quick(forward_kinematics)(arm, q))[arm.body_names.index("knee")]
     torque_knee = torque + np.cross(pose[:3, 3] - knee[:3, 3], force)
     external = np.zeros((4, 6))
     external[arm.body_names.index("knee")] = [*(knee[:3, :3].T @ force), *(knee[:3, :3].T @ torque_knee)]
-    np.testing.assert_allclose(value, generalized_force(arm, q, jnp.asarray(external)), rtol=0, atol=1e-13)
-    steps = 1e-5 * np.eye(13)
-    poses = jax.vmap(lambda step: frame_pose(arm, integrate(arm, q, step), "foot"))(np.concatenate([steps, -steps]))
-    rate = (np.asarray(poses[:13]) - np.asarray(poses[13:])) / 2e-5
+    np.testing.assert_allclose(value, quick(generalized_force)(arm, q, jnp.asarray(external)), rtol=0, atol=1e-13)
+    rate = (np.asarray(poses[1:14]) - np.asarray(poses[14:])) / 2e-5
     spin = rate[:, :3, :3] @ rotation.T
     omega = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], 1)
     # Central differences of step 1e-5 are good to 1e-10 of a second derivative of order one.
@@ -206,7 +220,6 @@ def all_forces(arm, coefficient):
 def test_derivatives_batches_and_scenes_as_arguments(arm):
     """Both modes, second order, at a general point and at rest; a scene is an array pytree for jit and vmap."""
 
-    @jax.jit
     def total(scene, q, v):
         return jnp.sum(scene.applied_force(q, v) * jnp.arange(1.0, 14.0))
 
@@ -215,24 +228,25 @@ def test_derivatives_batches_and_scenes_as_arguments(arm):
 
     q, v = sample(arm, 11)
     point = jnp.asarray(0.7), jnp.zeros(13)
-    jax.test_util.check_grads(lambda *x: of_all(*x, q), (*point, v), order=2, atol=1e-5, rtol=1e-5)
-    rest = jax.hessian(of_all, argnums=(0, 1, 2))(*point, jnp.zeros(13), neutral(arm))
+    check_grads(jax.jit(lambda *x: of_all(*x, q)), (*point, v), order=2, atol=1e-5, rtol=1e-5)
+    rest = quick(jax.hessian(of_all, argnums=(0, 1, 2)))(*point, jnp.zeros(13), neutral(arm))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(rest))
     coefficients = jnp.asarray([0.0, 0.3, 2.0])
     scenes = jax.vmap(lambda c: all_forces(arm, c))(coefficients)
     axes = jax.tree.map(lambda x, y: 0 if x.ndim > jnp.ndim(y) else None, scenes, all_forces(arm, 0.0))
-    batch = jax.vmap(total, (axes, None, None))(scenes, q, v)
-    one_by_one = [total(all_forces(arm, c), q, v) for c in coefficients]
+    batch = quick(jax.vmap(total, (axes, None, None)))(scenes, q, v)
+    one_by_one = [quick(total)(all_forces(arm, c), q, v) for c in coefficients]
     np.testing.assert_allclose(batch, one_by_one, rtol=1e-13)
 
 
 def test_float32(arm):
+    applied = quick(lambda scene, q, v: scene.applied_force(q, v))
     single = jax.tree.map(lambda x: x.astype(jnp.float32), arm)
     q, v = sample(arm, 11)
     scene = all_forces(single, 0.7)
-    value = scene.applied_force(q.astype(jnp.float32), v.astype(jnp.float32))
+    value = applied(scene, q.astype(jnp.float32), v.astype(jnp.float32))
     assert value.dtype == jnp.float32
-    reference = all_forces(arm, 0.7).applied_force(q, v)
+    reference = applied(all_forces(arm, 0.7), q, v)
     np.testing.assert_allclose(value, reference, rtol=0, atol=2e-5 * np.abs(reference).max())
 
 

@@ -1,4 +1,4 @@
-"""Forward kinematics, Jacobians and their rates: against Pinocchio, matrix exponentials and derivatives along the motion."""
+"""Forward kinematics, Jacobians and their rates against Pinocchio, matrix exponentials, rates along the motion."""
 
 import functools
 

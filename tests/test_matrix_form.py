@@ -1,5 +1,5 @@
-"""The matrix form in its two frames, and what it gives in closed form: link frames against the tree frame, printed mechanisms,
-derivatives of the mass matrix."""
+"""The matrix form in its two frames, and what it gives in closed form: link frames against the tree frame, printed
+mechanisms, derivatives of the mass matrix."""
 
 import functools
 
@@ -138,8 +138,8 @@ def test_three_joint_arm_as_printed():
     centers = [[0, 0, r0], [0, r1, 0.0], [0, r2, 0.0]]
     bodies = []
     for i, (x, y, z) in enumerate(centers):
-        moments = (ix[i] + m[i] * (y * y + z * z), 0, iy[i] + m[i] * (x * x + z * z), 0, 0, iz[i] + m[i] * (x * x + y * y))
-        bodies.append([m[i], m[i] * x, m[i] * y, m[i] * z, *moments])
+        xx, yy, zz = ix[i] + m[i] * (y * y + z * z), iy[i] + m[i] * (x * x + z * z), iz[i] + m[i] * (x * x + y * y)
+        bodies.append([m[i], m[i] * x, m[i] * y, m[i] * z, xx, 0, yy, 0, 0, zz])
     screws = [[0, 0, 0, 0, 0, 1], [0, 0, 0, -1, 0, 0], [0, 0, 0, -1, 0, 0]]
     model = make_model([-1, 0, 1], home, screws, bodies, gravity=(0, 0, -g))
     q, v = jnp.asarray([0.3, 0.4, -0.7]), jnp.asarray([0.5, -0.6, 0.8])

@@ -1,4 +1,4 @@
-"""Parameters from measurements: linear least squares, physically feasible fits by torque error and by trajectory error."""
+"""Parameters from measurements: least squares, and physically feasible fits by torque or by trajectory error."""
 
 from jaxdyn.identify.feasible import fit_torques as fit_torques
 from jaxdyn.identify.friction import TERMS as TERMS

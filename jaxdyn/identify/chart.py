@@ -1,8 +1,9 @@
 """Coordinates of all feasible models around a nominal one: what the fits search through, and what they return.
 
-A body's pseudo-inertia is P = U0 (U U^T) U0^T with U0 the factor of the nominal body and U = log_cholesky_factor(theta): the
-nominal body, stretched, sheared, shifted and made heavier. Every theta is a physical body, theta = 0 the nominal one, and
-theta has no units. Viscous, Coulomb and rotor terms are scale s^2, so that they cannot become negative; offsets scale s.
+A body's pseudo-inertia is P = U0 (U U^T) U0^T with U0 the factor of the nominal body and U =
+log_cholesky_factor(theta): the nominal body, stretched, sheared, shifted and made heavier. Every theta is a physical
+body, theta = 0 the nominal one, and theta has no units. Viscous, Coulomb and rotor terms are scale s^2, so that they
+cannot become negative; offsets scale s.
 """
 
 import equinox as eqx
@@ -20,7 +21,7 @@ INERTIA = ("full", "mass", "fixed")
 
 
 class Coordinates(eqx.Module):
-    """A point in the chart: `theta` (bodies, 10) or (bodies, 1), `s` (terms, nv). A pytree, for optax and `jax.grad`."""
+    """A point in the chart, a pytree: `theta` (bodies, 10), (bodies, 1) or (0, 0); `s` (terms, nv)."""
 
     theta: Float[Array, "bodies coordinates"]
     s: Float[Array, "terms nv"]
@@ -29,10 +30,10 @@ class Coordinates(eqx.Module):
 class Chart(eqx.Module):
     """Map from unconstrained coordinates to feasible parameters, models and friction.
 
-    - `factors` (bodies, 4, 4): upper-triangular U0 of the nominal pseudo-inertias of the bodies that have mass. Massless
-      bodies stay massless.
-    - `origin` (bodies, 4, 4): upper-triangular; U is origin @ log_cholesky_factor(theta), so the chart can be moved to where
-      a fit has come to. The identity at first.
+    - `factors` (bodies, 4, 4): upper-triangular U0 of the nominal pseudo-inertias of the bodies that have mass.
+      Massless bodies stay massless.
+    - `origin` (bodies, 4, 4): upper-triangular; U is origin @ log_cholesky_factor(theta), so the chart can be moved to
+      where a fit has come to. The identity at first.
     - `scale` (terms, nv): torque-sized units of the terms.
     """
 
@@ -106,7 +107,8 @@ def make_chart(model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_sca
 
     Units are a tenth of the torque, that torque over the velocity and over the acceleration (root mean squares, (nv,)).
 
-    **Raises:** ValueError for unknown terms or `inertia`, and for bodies whose nominal parameters are not strictly feasible.
+    **Raises:** ValueError for unknown terms or `inertia`, and for bodies whose nominal parameters are not strictly
+    feasible.
     """
     terms = check_terms(terms, v_s)
     if inertia not in INERTIA:
@@ -118,8 +120,9 @@ def make_chart(model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_sca
     bad = [model.body_names[i] for i, P in zip(bodies, matrices, strict=True) if not _positive_definite(P)]
     if bad:
         raise ValueError(
-            f"inertia of {', '.join(bad)} is not that of a solid body (pseudo-inertia not positive definite): a feasible fit "
-            "cannot start there; repair it first with jd.repair_inertias(model), or give rods and points some thickness"
+            f"inertia of {', '.join(bad)} is not that of a solid body (pseudo-inertia not positive definite): "
+            "a feasible fit cannot start there; repair it first with jd.repair_inertias(model), or give rods and points "
+            "some thickness"
         )
     factors = np.array([np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1] for P in matrices]).reshape(-1, 4, 4)
     unit = 0.1 * np.asarray(tau_scale, np.float64)

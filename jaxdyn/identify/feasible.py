@@ -15,13 +15,13 @@ from jaxdyn.identify.chart import Chart, Coordinates, make_chart, positive_terms
 from jaxdyn.identify.friction import TERMS, check_terms
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.identify.minimise import METHODS, minimise
-from jaxdyn.identify.regression import Condensed, condense, noise_level
+from jaxdyn.identify.regression import condense, noise_level
 from jaxdyn.identify.result import Fit
 from jaxdyn.model import Model
 
 # A fit is never trusted beyond this share of the torque: rounding and noise-free logs stay well posed.
 _FINEST = 1e-6
-_STEPS = {"newton": 100, "lbfgs": 3000, "adam": 10000}
+_STEPS = {"newton": 100, "lbfgs": 3000, "adam": 5000}
 
 
 class Problem(eqx.Module):
@@ -62,7 +62,8 @@ def fit_torques(
     D(P, P0) = tr(P0^-1 P) - log det(P0^-1 P) - 4 the log-det (entropic) divergence of a body's pseudo-inertia from the
     nominal one. It settles what the torques leave open, is the same in every frame and unit, and grows without bound
     towards bodies that do not exist. x is searched in coordinates in which every point is a feasible body with friction
-    that takes energy (`Chart`), so no iterate can be infeasible. The log is condensed once: a step costs the same for any log.
+    that takes energy (`Chart`), so no iterate can be infeasible. The log is condensed once: a step costs the same for
+    any log.
 
     **Arguments:**
 
@@ -73,9 +74,9 @@ def fit_torques(
     - `weights` (nv,): one over the noise of each joint's torque, relative to the others; ones by default.
     - `prior`: weight of the divergence; 1 counts it like one observation of each body. `sigma`: torque noise (N m);
       by default the residual of the unconstrained least squares.
-    - `method`: "newton" (the loss is convex in x, and this finds its one minimum in some tens of steps), "lbfgs" or "adam"
-      (optax), or any optax.GradientTransformation. `steps`: the most steps. `learning_rate`: of adam. `tolerance`: newton
-      stops when the loss is within this of its minimum; lbfgs at this relative change in ten steps.
+    - `method`: "newton" (the loss is convex in x, and this finds its one minimum in some tens of steps), "lbfgs" or
+      "adam" (optax), or any optax.GradientTransformation. `steps`: the most steps. `learning_rate`: of adam.
+      `tolerance`: newton stops when the loss is within this of its minimum; lbfgs at this relative change in ten steps.
     - `callback(step, loss, model)`: called before every step with the model at that point.
 
     **Returns:** `Fit`.
@@ -137,7 +138,7 @@ def _problem(model, log, terms, v_s, inertia, weights, prior, sigma):
 
 
 def _newton(problem: Problem, point: Coordinates, steps: int, tolerance: float, callback):
-    """Newton's method on the bodies, each step taken in the chart around where it starts: (chart, point, history, result)."""
+    """Newton's method, each step in the chart around the bodies where it starts: chart, point, history, result."""
     history, result = [], "max_steps"
     for step in range(steps + 1):
         value, decrement, next_chart, next_point = _newton_step(problem, point)
@@ -162,8 +163,9 @@ def _newton(problem: Problem, point: Coordinates, steps: int, tolerance: float, 
 def _newton_step(problem: Problem, point: Coordinates):
     """Loss, Newton decrement, and the chart and point after one step.
 
-    The Hessian is that of the loss in x, which is convex, carried to the chart: positive definite everywhere. A term at zero
-    whose gradient pushes it below stays there (its curvature in s is that gradient). The step is halved until the loss falls.
+    The Hessian is that of the loss in x, which is convex, carried to the chart: positive definite everywhere. A term at
+    zero whose gradient pushes it below stays there (its curvature in s is that gradient). The step is halved until the
+    loss falls.
     """
     chart = problem.chart
     value = torque_loss(point, problem)

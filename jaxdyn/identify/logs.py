@@ -1,9 +1,10 @@
-"""Logs: measured motion and torque with names and checks, and the signal preparation that makes one from raw samples."""
+"""Logs: measured motion and torque, checked, and the signal preparation that makes one from raw samples."""
 
 import dataclasses
 
 import equinox as eqx
 import jax
+import jax.core
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -11,8 +12,8 @@ from jaxtyping import Array, Float
 class Log(eqx.Module):
     """Samples of one motion: time, configuration, velocity, acceleration and joint torque, one row per sample.
 
-    - `t` (n,), strictly increasing (s); `q` (n, nq) (rad, m); `v`, `a` (n, nv) (rad/s, rad/s^2; m/s, m/s^2), or None when
-      they were not measured; `tau` (n, nv) (N m; N).
+    - `t` (n,), strictly increasing (s); `q` (n, nq) (rad, m); `v`, `a` (n, nv) (rad/s, rad/s^2; m/s, m/s^2), or None
+      when they were not measured; `tau` (n, nv) (N m; N).
     - `joint_names`: names of the columns of tau, when the file gave them.
 
     Numpy arrays are kept as they are (a log is data of the host; float64 time stamps do not become float32); anything
@@ -68,7 +69,7 @@ def split(log: Log, fraction: float = 0.7) -> tuple[Log, Log]:
 
 
 def check_log(log: Log, model, *, needs=("v", "a")) -> None:
-    """Raise a ValueError unless the log has the model's joints, in the model's order, and the signals named in `needs`."""
+    """Raise a ValueError unless the log has the model's joints in its order, and the signals of `needs`."""
     for name in ("q", "v", "a", "tau"):
         value = getattr(log, name)
         if value is None:
@@ -94,9 +95,10 @@ def from_raw(
     """A log for torque fits from raw positions and torques: uniform time, low-pass without delay, numerical rates.
 
     The samples are interpolated linearly to a uniform grid of as many samples. q is low-passed forward and backward
-    (Butterworth, zero phase); v is its numerical gradient, low-passed again; a the gradient of v, low-passed again; tau is
-    low-passed the same way, so that both sides of the equation of motion went through the same filter. The filter's
-    transients at both ends are dropped, and as the signals hold nothing above the cut-off, only every few samples are kept.
+    (Butterworth, zero phase); v is its numerical gradient, low-passed again; a the gradient of v, low-passed again; tau
+    is low-passed the same way, so that both sides of the equation of motion went through the same filter. The filter's
+    transients at both ends are dropped, and as the signals hold nothing above the cut-off, only every few samples are
+    kept.
 
     **Arguments:**
 
@@ -132,8 +134,8 @@ def from_raw(
     widest = int(np.argmax(np.diff(t)))
     if t[widest + 1] - t[widest] > 0.5 / cutoff:
         raise ValueError(
-            f"gap of {t[widest + 1] - t[widest]:.4g} s after row {widest} (t={t[widest]:.6g} s), longer than half a period of "
-            f"cutoff={cutoff} Hz; cut the log there or lower the cut-off"
+            f"gap of {t[widest + 1] - t[widest]:.4g} s after row {widest} (t={t[widest]:.6g} s), longer than half a "
+            f"period of cutoff={cutoff} Hz; cut the log there or lower the cut-off"
         )
     grid = np.linspace(t[0], t[-1], n)
     numerator, denominator = butter(order, 2 * cutoff / rate)

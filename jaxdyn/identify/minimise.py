@@ -8,16 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxtyping import Array
 
 METHODS = ("lbfgs", "adam")
 
 
-def minimise(loss: Callable, start, args, *, method, steps, learning_rate, tolerance, callback=None):
+def minimise(
+    loss: Callable, start, args, *, method, steps, learning_rate, tolerance, callback=None
+) -> tuple[Array, np.ndarray, str]:
     """Minimise `loss(y, args)` over y (n,) from `start`.
 
-    **Arguments:** `loss`, a function defined once (it is static: another function compiles again), its arrays in `args`;
+    **Arguments:** `loss`, a function defined once (it is static: another function compiles again), its arrays in
+    `args`;
     `method`: "lbfgs", "adam", or any optax.GradientTransformation; `steps`, the most steps; `learning_rate` of adam,
-    decaying to zero along a cosine; `tolerance`: stop once the loss fell by less than this share of itself in 10 steps (lbfgs);
+    decaying to zero along a cosine; `tolerance`: stop once the loss fell by less than this share of itself in 10 steps
+    (lbfgs);
     `callback(step, loss, y)` is called before every step.
 
     **Returns:** the best y found, the loss before each step and at the end (steps + 1,), and "converged", "max_steps"
@@ -36,7 +41,7 @@ def minimise(loss: Callable, start, args, *, method, steps, learning_rate, toler
         best, lowest, result = y, np.inf, "max_steps"
         for step in range(steps + 1):
             following, next_state, value = _step(loss, optimizer, y, state, args)
-            value = float(value)
+            value = float(np.asarray(value))
             history.append(value)
             if not np.isfinite(value):
                 result = "not_finite"
@@ -74,4 +79,4 @@ def _step(loss, optimizer, y, state, args):
     else:
         value, gradient = jax.value_and_grad(value_fn)(y)
         update, state = optimizer.update(gradient, state, y)
-    return optax.apply_updates(y, update), state, value
+    return jnp.asarray(optax.apply_updates(y, update)), state, value

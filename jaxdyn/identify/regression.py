@@ -14,7 +14,8 @@ from jaxdyn.joints import KINDS
 from jaxdyn.model import Model, random_configuration
 
 _NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-# The numbers that stay when a body's ten are grouped, for a joint about z: Khalil & Dombre keep them and put m, m cz and
+# The numbers that stay when a body's ten are grouped, for a joint about z: Khalil & Dombre keep them and put m, m cz
+# and
 # Iyy into the body before. About other axes the elimination finds others by itself.
 _KEPT_FIRST = (9, 1, 2, 4, 5, 7, 8)
 _KEPT_LAST = (6, 3, 0)
@@ -22,10 +23,10 @@ _BLOCK = 256
 
 
 class Condensed(NamedTuple):
-    """Weighted stacked regressor and torques of a log, W x = w, condensed by QR without loss: |W x - w|^2 = |R x - d|^2 + rest.
+    """Stacked regressor and torques of a log, W x = w, condensed: |W x - w|^2 = |R x - d|^2 + rest for every x.
 
-    `R` (p, p) upper triangular, `d` (p,), `rest` a number, `rows` the number of rows of W. Taking R instead of the normal
-    matrix W^T W = R^T R keeps the condition number from being squared.
+    `R` (p, p) upper triangular, `d` (p,), `rest` a number, `rows` the number of rows of W. Taking R instead of the
+    normal matrix W^T W = R^T R keeps the condition number from being squared.
     """
 
     R: np.ndarray
@@ -35,7 +36,7 @@ class Condensed(NamedTuple):
 
 
 def parameter_names(model: Model, terms=TERMS) -> tuple[str, ...]:
-    """Names of the parameters x: the ten numbers of each body (`body.m`, `body.mcx`, ...), then each term (`joint.viscous`)."""
+    """Names of x: the ten numbers of each body (`body.m`, `body.mcx`, ...), then the terms (`joint.viscous`)."""
     joints = []
     for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
         n = KINDS[kind].nv
@@ -45,7 +46,7 @@ def parameter_names(model: Model, terms=TERMS) -> tuple[str, ...]:
 
 
 def nominal_parameters(model: Model) -> np.ndarray:
-    """The model's own x (10 nb + 4 nv,): its inertias, damping, friction, no offset, armature; zero where it has none."""
+    """The model's own x (10 nb + 4 nv,): inertias, damping, friction, no offset, armature; zero what it lacks."""
     leaves = {"viscous": model.damping, "coulomb": model.friction, "armature": model.armature, "offset": None}
     parts = [np.asarray(model.inertias, np.float64).reshape(-1)]
     parts += [np.zeros(model.nv) if leaves[term] is None else np.asarray(leaves[term], np.float64) for term in TERMS]
@@ -85,7 +86,8 @@ def _regressor_block(model, q, v, a, v_s):
 
 
 def condense(model: Model, log: Log, *, v_s=0.01, weights=None) -> Condensed:
-    """Stack the regressor (all terms) over a log and condense it by QR, block by block: memory does not grow with the log."""
+    """Stack the regressor (all terms) over a log and condense it by QR, block by block: memory does not grow with the
+    log."""
     weights = _check_weights(weights, model.nv)
     p = 10 * model.nb + model.nv * len(TERMS)
     triangle = np.zeros((0, p + 1))
@@ -188,8 +190,8 @@ def base_parameters(model: Model, terms=(), *, v_s: float = 0.01, seed: int = 0)
     rank = int(np.sum(singular > tolerance * singular.max(initial=0.0)))
     if rank != len(independent):
         raise ValueError(
-            f"base parameters of {model.name!r} are not clear in {model.home.dtype}: {len(independent)} by elimination, {rank} "
-            "by singular values; use a float64 model (jax_enable_x64) or check for joints that coincide"
+            f"base parameters of {model.name!r} are not clear in {model.home.dtype}: {len(independent)} by "
+            f"elimination, {rank} by singular values; use a float64 model (jax_enable_x64) or check for joints that coincide"
         )
     dependent = np.setdiff1d(np.arange(p), independent)
     beta = np.linalg.lstsq(scaled, (W / scale)[:, dependent], rcond=None)[0]
@@ -203,10 +205,11 @@ def base_parameters(model: Model, terms=(), *, v_s: float = 0.01, seed: int = 0)
 
 
 class LeastSquares(eqx.Module):
-    """Result of `least_squares`: base parameters with standard deviations. Unconstrained: the body it describes may not exist.
+    """Result of `least_squares`: base parameters with standard deviations. No body may exist that has them.
 
     - `base`: which combinations; `values`, `std`, `nominal` (nbase,): fitted, standard deviation, of the model given.
-    - `parameters` (10 nb + 4 nv,): one x with these values, the one nearest to the model's; its numbers mean nothing alone.
+    - `parameters` (10 nb + 4 nv,): one x with these values, the one nearest to the model's; its numbers mean nothing
+      alone.
     - `sigma`: root mean square of the (weighted) residual; `condition`: of the regressor with columns of unit length;
       `rank`: combinations that the log excites, at most nbase.
     - `covariance` (nbase, nbase).
@@ -242,8 +245,9 @@ class LeastSquares(eqx.Module):
         """The fit in words and a table."""
         unknown = len(self.values) - self.rank
         lines = [
-            f"linear least squares, {self.model.name}: {len(self.values)} combinations of {len(self.parameters)} parameters, "
-            f"rank {self.rank}, condition {self.condition:.4g}, residual {self.sigma:.4g} N m",
+            f"linear least squares, {self.model.name}: {len(self.values)} combinations of "
+            f"{len(self.base.parameter_names)} parameters, rank {self.rank}, condition {self.condition:.4g}, "
+            f"residual {self.sigma:.4g} N m",
         ]
         if unknown:
             lines.append(
@@ -265,8 +269,8 @@ def least_squares(
     - `model`: geometry and nominal parameters; `log` with v and a.
     - `terms`: what is fitted beside the links: tau_f = viscous v + coulomb tanh(v / v_s) + offset, and armature a.
     - `weights` (nv,): one over the noise of each joint's torque; ones by default.
-    - `rcond`: directions whose singular value is below this times the largest are not excited by the log; along them the
-      model's values stay.
+    - `rcond`: directions whose singular value is below this times the largest are not excited by the log; along them
+      the model's values stay.
 
     **Returns:** `LeastSquares`. Standard deviations hold for white noise on the torques; filtered samples are
     correlated, and the true ones are then larger by about the root of the correlation length in samples.
@@ -312,7 +316,8 @@ def least_squares(
 def noise_level(condensed: Condensed, *, rcond: float = 1e-9) -> float:
     """Root mean square residual of the unconstrained least squares, the torque noise of a condensed log.
 
-    **Raises:** ValueError when the log has no more rows than the regressor's rank: then nothing is left to tell the noise.
+    **Raises:** ValueError when the log has no more rows than the regressor's rank: then nothing is left to tell the
+    noise.
     """
     fit = _truncated(condensed.R, condensed.d, rcond)
     if condensed.rows <= fit.rank:
@@ -335,7 +340,8 @@ class _Truncated(NamedTuple):
 
 def _truncated(A: np.ndarray, b: np.ndarray, rcond: float) -> _Truncated:
     scale = np.linalg.norm(A, axis=0)
-    scale[scale == 0] = 1.0
+    # A column of rounding errors is no column: scaled up it would count as excited.
+    scale[scale <= 1e-12 * scale.max(initial=0.0)] = np.inf
     U, s, Vt = np.linalg.svd(A / scale, full_matrices=False)
     rank = int(np.sum(s > rcond * s.max(initial=0.0)))
     change = (Vt[:rank].T @ ((U[:, :rank].T @ b) / s[:rank])) / scale

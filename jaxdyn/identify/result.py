@@ -15,8 +15,8 @@ from jaxdyn.model import Model
 class Fit(eqx.Module):
     """A fitted, physically feasible model.
 
-    - `model`: with the fitted inertias, armature, damping and friction. `friction`: the friction law, with its offset; a
-      force for `Scene(fit.model, forces=[fit.friction])`.
+    - `model`: with the fitted inertias, armature, damping and friction. `friction`: the friction law, with its offset;
+      a force for `Scene(fit.model, forces=[fit.friction])`.
     - `nominal`: the model the fit started from.
     - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps" or "not_finite".
     - `sigma`: torque noise (N m) that weighed the data against the prior, or None.
@@ -63,8 +63,8 @@ class Fit(eqx.Module):
     def summary(self, *logs: Log) -> str:
         """The fit in words: how it ended, the error on each log given, and the parameters."""
         lines = [
-            f"{self.method}, {self.model.name}: {self.result} after {len(self.history) - 1} steps, loss {self.history[0]:.6g} -> "
-            f"{self.history[-1]:.6g}"
+            f"{self.method}, {self.model.name}: {self.result} after {len(self.history) - 1} steps, "
+            f"loss {self.history[0]:.6g} -> {self.history[-1]:.6g}"
         ]
         for i, log in enumerate(logs):
             per_joint = ", ".join(f"{x:.3g}" for x in self.rms(log))

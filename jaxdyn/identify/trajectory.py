@@ -1,4 +1,4 @@
-"""Physically feasible inertias and friction by trajectory error: simulate the log in segments and compare the motion."""
+"""Physically feasible inertias and friction by trajectory error: simulate the log and compare the motion."""
 
 from collections.abc import Callable
 from typing import Any
@@ -110,11 +110,12 @@ def fit_trajectory(
 ) -> Fit:
     """Physically feasible inertias and friction by the error of simulated motion, differentiated through `jd.simulate`.
 
-    Minimises mean(((q_sim - q) / q_rms)^2 + ((v_sim - v) / v_rms)^2) + prior * D, over all samples and joints, where each
-    segment of the log is simulated with the measured torques from its own start (multiple shooting), q_rms and v_rms are
-    the root mean squares of each joint's motion in the log, and D is the divergence from the nominal bodies, as in
-    `fit_torques`. Needs no accelerations. Short segments keep the problem close to convex and chaotic or unstable motion
-    from diverging; long ones see small errors that add up.
+    Minimises mean(((q_sim - q) / q_rms)^2 + ((v_sim - v) / v_rms)^2) + prior * D, over all samples and joints, where
+    each segment of the log is simulated with the measured torques from its own start (multiple shooting), q_rms and
+    v_rms are the root mean squares of each joint's motion in the log, and D is the divergence from the nominal bodies,
+    as in
+    `fit_torques`. Needs no accelerations. Short segments keep the problem close to convex and chaotic or unstable
+    motion from diverging; long ones see small errors that add up.
 
     **Arguments:**
 
@@ -123,7 +124,8 @@ def fit_trajectory(
     - `horizon`: steps of the log in a segment; None: the whole log is one.
     - `initial`: "measured" states start the segments; "free" ones are fitted too, for noisy measurements.
     - `hold`: torques between samples, "linear" or "previous" (a controller that holds its output).
-    - `method`: "lbfgs", "adam" or an optax.GradientTransformation; `steps`, `learning_rate`, `tolerance`, `callback` as in
+    - `method`: "lbfgs", "adam" or an optax.GradientTransformation; `steps`, `learning_rate`, `tolerance`, `callback` as
+      in
       `fit_torques`.
     - `simulation`: options of `jd.simulate` (solver, stepsize, rtol, atol, adjoint, max_steps).
 
@@ -184,8 +186,9 @@ def rollout(model: Model, log: Log, friction: Friction | None = None, *, horizon
 def trajectory_error(
     model: Model, log: Log, friction: Friction | None = None, *, horizon=None, hold="linear", **simulation
 ):
-    """Error of the simulated motion along a log in per cent of the motion: 100 sqrt(mean(((q_sim - q) / q_rms)^2) over
-    positions, and the same over velocities; a pair. Arguments as in `fit_trajectory`.
+    """Error of the simulated motion along a log, of positions and of velocities, each in per cent of the motion.
+
+    100 sqrt(mean(((q_sim - q) / q_rms)^2)), and the same of v. Arguments as in `fit_trajectory`.
     """
     data = segments(log, horizon, np.dtype(model.home.dtype))
     q, v = _rollout(model, friction, data, None, hold, dict(simulation))
@@ -224,7 +227,7 @@ def _scaled_errors(model, data: Segments, q, v, scale):
 
 
 def _motion_scale(model, data: Segments) -> Float[Array, "2 nv"]:
-    """Root mean square of each coordinate's way from the first sample and of its velocity; the largest where one rests."""
+    """Root mean square of each coordinate's way from the first sample, and of its velocity; the largest at rest."""
     way = jax.vmap(jax.vmap(lambda q: difference(model, data.q[0, 0], q)))(data.q)
     scale = jnp.stack([jnp.sqrt(jnp.mean(x**2, axis=(0, 1))) for x in (way, data.v)])
     largest = jnp.max(scale, axis=1, keepdims=True)
@@ -234,8 +237,8 @@ def _motion_scale(model, data: Segments) -> Float[Array, "2 nv"]:
 def _scaling(chart: Chart, point: Coordinates, log: Log, a, size: int) -> Float[Array, "n n"]:
     """Matrix with which the optimiser sees coordinates of about equal effect on the motion.
 
-    A change of parameters dx changes the acceleration by -M^-1 Y dx: that Jacobian's Gram matrix is whitened. Directions
-    without effect are stretched at most a thousand times.
+    A change of parameters dx changes the acceleration by -M^-1 Y dx: that Jacobian's Gram matrix is whitened.
+    Directions without effect are stretched at most a thousand times.
     """
     model = chart.model
     few = np.linspace(0, len(log) - 1, min(len(log), 200)).astype(int)

@@ -13,9 +13,10 @@ _SIGNALS = ("q", "v", "a", "tau")
 def read_log(path, *, joint_names=None) -> Log:
     """Read a log from a CSV file with one header line, or from an NPZ archive.
 
-    Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1, ...`
-    torques. The numbers may be replaced by joint names: `q_shoulder, tau_shoulder`. In an NPZ archive each column is an
-    array (n,), or a signal is one array (n, columns) named `q`, `v`, `a`, `tau`. Columns of other names are ignored.
+    Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1,
+    ...` torques. The numbers may be replaced by joint names: `q_shoulder, tau_shoulder`. In an NPZ archive each column
+    is an array (n,), or a signal is one array (n, columns) named `q`, `v`, `a`, `tau`. Columns of other names are
+    ignored.
 
     **Arguments:** `path`; `joint_names`: order of the joints in the result for columns with joint names (a model's
     `joint_names`); columns of other joints are left out. Without it the order of the file's tau columns.
@@ -46,14 +47,16 @@ def write_log(path, log: Log) -> None:
     **Raises:** ValueError for another file type.
     """
     path = pathlib.Path(path)
-    columns = {"t": np.asarray(log.t)}
+    columns: dict[str, np.ndarray] = {"t": np.asarray(log.t)}
     named = log.joint_names if log.q.shape[1] == log.nv else None
     for signal in _SIGNALS:
         value = getattr(log, signal)
-        for i in range(0 if value is None else value.shape[1]):
+        if value is None:
+            continue
+        for i in range(value.shape[1]):
             columns[f"{signal}_{named[i]}" if named else f"{signal}{i + 1}"] = np.asarray(value[:, i])
     if path.suffix.lower() == ".npz":
-        np.savez_compressed(path, **columns)
+        np.savez_compressed(path, **columns)  # pyright: ignore[reportArgumentType]
     elif path.suffix.lower() == ".csv":
         with path.open("w", newline="") as file:
             writer = csv.writer(file)

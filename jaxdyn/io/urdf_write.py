@@ -33,9 +33,9 @@ def save_urdf(model: Model, path: str | os.PathLike) -> None:
     `mimic="couple"`), armature an attribute of `<dynamics>`; gravity has no place in the file. Infinite limits are
     written as the largest double, because readers of URDF take no "inf".
 
-    **Raises:** ValueError naming the joint or body for what URDF cannot express: helical and spherical joints, axes
-    that miss the origin of the body frame, limits of planar and free joints, friction or armature that differs between
-    the directions of one joint, first moments without mass. OSError when the file cannot be written.
+    **Raises:** ValueError naming the joint or body for what URDF cannot express: helical and spherical joints, limits
+    of planar and free joints, friction or armature that differs between the directions of one joint, first moments
+    without mass. OSError when the file cannot be written.
     """
     root, edges = _edges(model)
     inertias = dict(zip(model.body_names, np.asarray(model.inertias, np.float64), strict=True))
@@ -148,7 +148,9 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
     if kind in ("helical", "spherical"):
         raise ValueError(f"{what} is {kind}; URDF has no such joint")
     if kind != "free":
-        ET.SubElement(joint, "axis", xyz=_text(_axis(np.asarray(model.screws[edge.body], np.float64), kind, what)))
+        screw = np.asarray(model.screws[edge.body], np.float64)
+        axis = {"planar": np.array([0.0, 0.0, 1.0]), "prismatic": screw[:3]}.get(kind, screw[3:])
+        ET.SubElement(joint, "axis", xyz=_text(axis))
     _write_limits(joint, model, edge.body, what)
     given = {key: getattr(model, key) for key in ("damping", "friction", "armature")}
     dynamics = {}
@@ -167,16 +169,6 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
             multiplier, offset = np.asarray(model.coupling_values[n], np.float64)
             values = {"joint": model.joint_names[source], "multiplier": _text([multiplier]), "offset": _text([offset])}
             ET.SubElement(joint, "mimic", values)
-
-
-def _axis(screw: np.ndarray, kind: str, what: str) -> np.ndarray:
-    if kind == "planar":
-        return np.array([0.0, 0.0, 1.0])
-    if kind == "prismatic":
-        return screw[:3]
-    if screw[:3].any():
-        raise ValueError(f"{what}: its screw {screw.tolist()} misses the origin of the body frame; URDF cannot say so")
-    return screw[3:]
 
 
 def _write_limits(joint: ET.Element, model: Model, body: int, what: str) -> None:

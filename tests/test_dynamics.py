@@ -1,0 +1,441 @@
+"""What users call: against Pinocchio and C MuJoCo, by the identities of mechanics, by invariance, and its derivatives."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+from jax.test_util import check_grads
+from pinocchio_bridge import (
+    as_dtype,
+    assert_close,
+    load_robot,
+    quick,
+    random_states,
+    random_tree,
+    to_pinocchio,
+)
+from scipy.spatial.transform import Rotation
+
+from jaxdyn import dynamics, kinematics, se3
+from jaxdyn.inertia import transform_inertia
+from jaxdyn.model import configuration_rate
+
+ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
+TREES = {
+    "floating": lambda: random_tree(31, ALL_KINDS),
+    "fixed": lambda: random_tree(32, ["spherical", "prismatic", "planar", "continuous", "helical", "spherical"]),
+    "forest": lambda: random_tree(33, ALL_KINDS, parents=[-1, 0, 0, 2, -1, 4, 5, 4], armature=False),
+}
+ROBOTS = {
+    "panda": ("panda_description/urdf/panda.urdf", False, ("finger",)),
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", False, ()),
+    "kinova": ("kinova_description/robots/kinova.urdf", False, ()),
+    "allegro": ("allegro_hand_description/urdf/allegro_right_hand.urdf", False, ()),
+    "solo12": ("solo_description/robots/solo12.urdf", True, ()),
+    "anymal": ("anymal_c_simple_description/urdf/anymal.urdf", True, ()),
+    "icub": ("icub_description/robots/icub_reduced.urdf", True, ()),
+    "g1": ("g1_description/urdf/g1_29dof_rev_1_0.urdf", True, ()),
+}
+
+
+def values(model, q, v, a, tau, external):
+    return {
+        "mass_matrix": dynamics.mass_matrix(model, q),
+        "coriolis": dynamics.coriolis_matrix(model, q, v) @ v,
+        "gravity_force": dynamics.gravity_force(model, q),
+        "bias_force": dynamics.bias_force(model, q, v),
+        "inverse_dynamics": dynamics.inverse_dynamics(model, q, v, a, external=external),
+        "forward_dynamics": dynamics.forward_dynamics(model, q, v, tau, external=external),
+        "kinetic_energy": dynamics.kinetic_energy(model, q, v),
+        "potential_energy": dynamics.potential_energy(model, q),
+        "center_of_mass": dynamics.center_of_mass(model, q),
+        "centroidal_momentum": dynamics.centroidal_momentum(model, q, v),
+        "centroidal_momentum_matrix": dynamics.centroidal_momentum_matrix(model, q),
+        "torque_regressor": dynamics.torque_regressor(model, q, v, a),
+    }
+
+
+@functools.cache
+def case(name):
+    """Pinocchio's model, ours, the bridge, five states, and all quantities at them from one compiled program."""
+    if name in TREES:
+        model = TREES[name]()
+        source, bridge = to_pinocchio(model)
+    else:
+        path, floating, lock = ROBOTS[name]
+        source, model, bridge = load_robot(path, floating=floating, lock=lock)
+    states = random_states(model, 5, 7)
+    compiled = jax.vmap(values, (None, 0, 0, 0, 0, 0))
+    # One robot is compiled as users compile it.
+    compiled = jax.jit(compiled) if name == "panda" else quick(compiled)
+    return source, model, bridge, states, jax.tree.map(np.asarray, compiled(model, *states))
+
+
+def pinocchio_values(source, bridge, q, v, a, tau, external):
+    data = source.createData()
+    wrenches = pin.StdVec_Force()
+    wrenches.append(pin.Force.Zero())
+    for offset, wrench in zip(bridge.offsets, external, strict=True):
+        wrenches.append(pin.SE3(offset[:3, :3], offset[:3, 3]).act(pin.Force(wrench)))
+    mass = np.triu(pin.crba(source, data, q))
+    mass += np.triu(mass, 1).T
+    out = {
+        "mass_matrix": mass,
+        "coriolis": pin.computeCoriolisMatrix(source, data, q, v) @ v,
+        "gravity_force": pin.computeGeneralizedGravity(source, data, q),
+        "bias_force": pin.nonLinearEffects(source, data, q, v),
+        "inverse_dynamics": pin.rnea(source, data, q, v, a, wrenches),
+        # Pinocchio leaves the rotors out of the kinetic energy.
+        "kinetic_energy": pin.computeKineticEnergy(source, data, q, v) + 0.5 * source.armature @ v**2,
+        "potential_energy": pin.computePotentialEnergy(source, data, q),
+        "center_of_mass": pin.centerOfMass(source, data, q).copy(),
+        "centroidal_momentum": pin.computeCentroidalMomentum(source, data, q, v).vector,
+        "centroidal_momentum_matrix": pin.computeCentroidalMap(source, data, q).copy(),
+    }
+    if not bridge.offsets[:, :3, 3].any():
+        out["torque_regressor"] = pin.computeJointTorqueRegressor(source, data, q, v, a).copy()
+    acceleration = pin.aba(source, data, q, v, tau, wrenches).copy()
+    return out, acceleration
+
+
+@pytest.mark.parametrize("name", [*TREES, *ROBOTS])
+def test_agrees_with_pinocchio(name):
+    source, _, bridge, states, ours = case(name)
+    q, *rest = states
+    for s, state in enumerate(zip(bridge.q_to_pinocchio(q), *map(np.asarray, rest), strict=True)):
+        theirs, acceleration = pinocchio_values(source, bridge, *state)
+        for key, want in theirs.items():
+            assert_close(ours[key][s], want, label=key)
+        # Both accelerations carry the condition number of M (up to 1e6 for hands and humanoids).
+        condition = np.linalg.cond(ours["mass_matrix"][s])
+        assert_close(ours["forward_dynamics"][s], acceleration, max(1e-10, 1e-15 * condition), "forward_dynamics")
+
+
+@pytest.mark.parametrize("name", [*TREES, *ROBOTS])
+def test_identities_at_one_state(name):
+    _, model, _, (_, v, a, tau, _), ours = case(name)
+    mass, armature = ours["mass_matrix"], 0.0 if model.armature is None else np.asarray(model.armature)
+    np.testing.assert_array_equal(mass, mass.transpose(0, 2, 1))
+    assert np.linalg.eigvalsh(mass).min() > 0
+    v, a, tau = map(np.asarray, (v, a, tau))
+    assert_close(ours["kinetic_energy"], 0.5 * np.einsum("si,sij,sj->s", v, mass, v), 1e-12)
+    assert_close(ours["bias_force"], ours["coriolis"] + ours["gravity_force"], 1e-12)
+    assert_close(ours["centroidal_momentum"], np.einsum("sij,sj->si", ours["centroidal_momentum_matrix"], v), 1e-12)
+    # M a_fd + h = tau + J^T f and M a + h = tau_id + J^T f: the wrenches drop out of the difference.
+    forced = ours["inverse_dynamics"] - np.einsum("sij,sj->si", mass, a)
+    residual = np.einsum("sij,sj->si", mass, ours["forward_dynamics"]) + forced - tau
+    assert np.abs(residual).max() <= 1e-10 * np.abs(forced).max()
+    # Y pi leaves out the rotors and the external wrenches.
+    linear = ours["torque_regressor"] @ np.asarray(model.inertias).reshape(-1) + armature * a
+    assert_close(linear, np.einsum("sij,sj->si", mass, a) + ours["bias_force"], 1e-11)
+
+
+@pytest.mark.parametrize("name", ["floating", "fixed", "anymal"])
+def test_identities_along_the_motion(name):
+    _, model, _, (q, v, a, tau, external), _ = case(name)
+    frame = model.body_names[-1]
+    tau_inside = tau.at[:, :6].set(0.0)  # nothing pushes on a floating base
+
+    @quick
+    @functools.partial(jax.vmap, in_axes=(None, 0, 0, 0, 0, 0, 0))
+    def rates(model, q, v, a, tau, tau_inside, external):
+        qdot = configuration_rate(model, q, v)
+
+        def along(function):
+            return jax.jvp(function, (q,), (qdot,))[1]
+
+        def along_motion(function, acceleration):
+            return jax.jvp(function, (q, v), (qdot, acceleration))[1]
+
+        coriolis = dynamics.coriolis_matrix(model, q, v)
+        acceleration = dynamics.forward_dynamics(model, q, v, tau)
+        free = dynamics.forward_dynamics(model, q, v, tau_inside)
+        last = jnp.zeros_like(external).at[-1].set(external[-1])
+        return {
+            "skew": (along(lambda q: dynamics.mass_matrix(model, q)), coriolis + coriolis.T),
+            "gravity": (along(lambda q: dynamics.potential_energy(model, q)), dynamics.gravity_force(model, q) @ v),
+            "power": (
+                along_motion(
+                    lambda q, v: dynamics.kinetic_energy(model, q, v) + dynamics.potential_energy(model, q), acceleration
+                ),
+                v @ tau,
+            ),
+            "momentum": (
+                jnp.sum(model.inertias[:, 0]) * along(lambda q: dynamics.center_of_mass(model, q)),
+                dynamics.centroidal_momentum(model, q, v)[:3],
+            ),
+            "free_momentum": along_motion(lambda q, v: dynamics.centroidal_momentum(model, q, v), free),
+            "wrench": (
+                dynamics.generalized_force(model, q, last),
+                kinematics.body_jacobian(model, q, model.body_names[-1]).T @ external[-1],
+            ),
+            "external": (
+                dynamics.inverse_dynamics(model, q, v, a, external=external),
+                dynamics.inverse_dynamics(model, q, v, a) - dynamics.generalized_force(model, q, external),
+            ),
+        }
+
+    out = rates(model, q, v, a, tau, tau_inside, external)
+    free = out.pop("free_momentum")
+    for key, (got, want) in out.items():
+        assert_close(got, want, label=key)
+    if model.topology.kinds[0] == "free" and model.armature is None:
+        weight = float(jnp.sum(model.inertias[:, 0])) * np.asarray(model.gravity)
+        assert_close(free, np.tile(np.concatenate([weight, np.zeros(3)]), (5, 1)), label="free momentum")
+    assert frame in model.frame_names
+
+
+def _mjcf(model) -> str:
+    """The model as MJCF text. Roots that are free must have the world as their home."""
+    topology = model.topology
+    armature = np.zeros(model.nv) if model.armature is None else np.asarray(model.armature)
+
+    def numbers(x):
+        return " ".join(repr(float(value)) for value in np.asarray(x).reshape(-1))
+
+    def body(i):
+        kind, (v, w) = topology.kinds[i], np.split(np.asarray(model.screws[i]), 2)
+        home = np.asarray(model.home[i])
+        mass, first = float(model.inertias[i, 0]), np.asarray(model.inertias[i, 1:4])
+        xx, xy, yy, xz, yz, zz = np.asarray(model.inertias[i, 4:])
+        com = first / mass
+        central = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        central = central - mass * (com @ com * np.eye(3) - np.outer(com, com))
+        full = central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        attributes = {
+            "revolute": lambda: f'type="hinge" axis="{numbers(w)}" pos="{numbers(np.cross(w, v))}"',
+            "prismatic": lambda: f'type="slide" axis="{numbers(v)}"',
+            "spherical": lambda: 'type="ball"',
+            "free": lambda: 'type="free"',
+        }[kind]()
+        children = "".join(body(j) for j in range(topology.nb) if topology.parents[j] == i)
+        quat = np.roll(Rotation.from_matrix(home[:3, :3]).as_quat(), 1)
+        return (
+            f'<body pos="{numbers(home[:3, 3])}" quat="{numbers(quat)}">'
+            f'<inertial pos="{numbers(com)}" mass="{mass!r}" fullinertia="{numbers(full)}"/>'
+            f'<joint {attributes} armature="{float(armature[topology.v_slices[i]][0])!r}"/>{children}</body>'
+        )
+
+    roots = "".join(body(i) for i in range(topology.nb) if topology.parents[i] < 0)
+    return (
+        f'<mujoco><compiler angle="radian"/><option gravity="{numbers(model.gravity)}"/>'
+        f"<worldbody>{roots}</worldbody></mujoco>"
+    )
+
+
+@pytest.mark.parametrize("first", ["free", "revolute"])
+def test_agrees_with_mujoco(first):
+    kinds = [first, "revolute", "spherical", "prismatic", "revolute", "spherical", "revolute"]
+    model = random_tree(41, kinds)
+    # MuJoCo has one rotor inertia per joint, and places a free body in the world.
+    even = np.concatenate([np.full(s.stop - s.start, 0.01 * (i + 1)) for i, s in enumerate(model.topology.v_slices)])
+    model = model.replace(armature=jnp.asarray(even))
+    if first == "free":
+        model = model.replace(home=model.home.at[0].set(jnp.eye(4)))
+    q, v, _, tau, _ = random_states(model, 5, 1)
+
+    @quick
+    @functools.partial(jax.vmap, in_axes=(None, 0, 0, 0))
+    def ours(model, q, v, tau):
+        return (
+            dynamics.mass_matrix(model, q),
+            dynamics.bias_force(model, q, v),
+            dynamics.forward_dynamics(model, q, v, tau),
+            kinematics.forward_kinematics(model, q),
+        )
+
+    masses, biases, accelerations, poses = map(np.asarray, ours(model, q, v, tau))
+    m = mujoco.MjModel.from_xml_string(_mjcf(model))
+    d = mujoco.MjData(m)
+    q, v, tau = map(np.asarray, (q, v, tau))
+    for s in range(5):
+        # MuJoCo's free joint has the linear velocity in world axes: v_m = B v, dv_m/dt = B (dv/dt + (omega x v, 0)).
+        b, drift = np.eye(model.nv), np.zeros(model.nv)
+        if first == "free":
+            b[:3, :3] = poses[s, 0, :3, :3]
+            drift[:3] = np.cross(v[s, 3:6], v[s, :3])
+        d.qpos, d.qvel = q[s], b @ v[s]
+        mujoco.mj_forward(m, d)
+        their_mass = np.zeros((m.nv, m.nv))
+        mujoco.mj_fullM(m, d, their_mass)
+        assert_close(d.xpos[1:], poses[s, :, :3, 3])
+        # MuJoCo turns each inertia to its principal axes by an iteration that stops at about 1e-12.
+        assert_close(b.T @ their_mass @ b, masses[s], label="mass matrix")
+        assert_close(b.T @ (d.qfrc_bias + their_mass @ b @ drift), biases[s], label="bias")
+        acceleration = np.linalg.solve(b, np.linalg.solve(their_mass, np.linalg.solve(b.T, tau[s]) - d.qfrc_bias)) - drift
+        assert_close(acceleration, accelerations[s], label="acceleration")
+
+
+def _in_other_frames(model, seed):
+    """The same mechanism described in displaced body frames (screw joints only)."""
+    rng = np.random.default_rng(seed)
+    moves = np.tile(np.eye(4), (model.nb, 1, 1))
+    moves[:, :3, :3] = Rotation.from_rotvec(rng.normal(size=(model.nb, 3))).as_matrix()
+    moves[:, :3, 3] = rng.normal(size=(model.nb, 3))
+    back = np.linalg.inv(moves)
+    outer = np.stack([np.eye(4) if p < 0 else back[p] for p in model.topology.parents])
+    own = np.array(model.topology.frame_bodies)
+    return model.replace(
+        home=jnp.asarray(outer @ np.asarray(model.home) @ moves),
+        screws=jax.vmap(se3.Ad_inv_apply)(jnp.asarray(moves), model.screws),
+        inertias=jax.vmap(transform_inertia)(jnp.asarray(back), model.inertias),
+        frame_poses=jnp.asarray(back[own] @ np.asarray(model.frame_poses)),
+    ), moves
+
+
+def test_frames_of_description_do_not_matter():
+    model = random_tree(51, ["revolute", "prismatic", "helical", "revolute", "continuous", "prismatic"])
+    other, moves = _in_other_frames(model, 0)
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), [3, -4, 5]
+    turned = model.replace(
+        home=model.home.at[0].set(jnp.asarray(world) @ model.home[0]), gravity=jnp.asarray(world[:3, :3]) @ model.gravity
+    )
+    q, v, a, tau, external = random_states(model, 5, 3)
+    program = quick(jax.vmap(values, (None, 0, 0, 0, 0, 0)))
+    want = program(model, q, v, a, tau, external)
+    carried = jax.vmap(jax.vmap(se3.AdT_apply), (None, 0))(jnp.asarray(moves), external)
+    invariant = ("mass_matrix", "coriolis", "gravity_force", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
+    for got in (program(other, q, v, a, tau, carried), program(turned, q, v, a, tau, external)):
+        for key in invariant:
+            assert_close(got[key], want[key], label=key)
+    for key in ("potential_energy", "center_of_mass", "centroidal_momentum"):
+        assert_close(program(other, q, v, a, tau, carried)[key], want[key], label=key)
+    turned_center = program(turned, q, v, a, tau, external)["center_of_mass"]
+    assert_close(turned_center, np.asarray(want["center_of_mass"]) @ world[:3, :3].T + world[:3, 3])
+
+
+PLACE_FREE = ("mass_matrix", "coriolis", "gravity_force", "bias_force", "inverse_dynamics", "forward_dynamics")
+PLACE_FREE += ("kinetic_energy", "centroidal_momentum", "centroidal_momentum_matrix", "torque_regressor")
+
+
+@pytest.mark.parametrize("name", ["fixed", "floating"])
+def test_far_robot_is_as_exact_as_at_home(name):
+    # Ten kilometres away, no bit changes, in float64 and in float32.
+    for dtype in (jnp.float64, jnp.float32):
+        model = as_dtype(TREES[name](), dtype)
+        states = random_states(model, 3, 9)
+        shift = jnp.asarray([1e4, -2e4, 1e4], dtype)
+        if name == "fixed":
+            far, far_states = model.replace(home=model.home.at[0, :3, 3].add(shift)), states
+        else:
+            far, far_states = model, (states[0].at[:, :3].add(shift[None]), *states[1:])
+        program = quick(jax.vmap(values, (None, 0, 0, 0, 0, 0)))
+        near, there = program(model, *states), program(far, *far_states)
+        for key in PLACE_FREE:
+            np.testing.assert_array_equal(near[key], there[key], err_msg=key)
+        assert {x.dtype for x in jax.tree.leaves(there)} == {jnp.dtype(dtype)}
+        if dtype == jnp.float32:
+            exact = case(name)[1]
+            exact = quick(jax.vmap(values, (None, 0, 0, 0, 0, 0)))(exact, *(x.astype(jnp.float64) for x in states))
+            for key in PLACE_FREE:
+                # Rounding of float32 times the condition of the tree.
+                assert_close(there[key], exact[key], 1e-4, key)
+
+
+def test_without_gravity_and_armature_nothing_of_them_is_compiled():
+    model = random_tree(61, ["revolute", "spherical", "revolute"])
+    bare = model.replace(gravity=None, armature=None)
+    zero = model.replace(gravity=jnp.zeros(3), armature=jnp.zeros(model.nv))
+    state = [x[0] for x in random_states(model, 1, 0)]
+    got, want = quick(values)(bare, *state), quick(values)(zero, *state)
+    for key in got:
+        assert_close(got[key], want[key], 1e-14, key)
+
+    def operations(function, model, *args):
+        return len(str(jax.make_jaxpr(function)(model, *args)).splitlines())
+
+    q, v, a, tau, _ = state
+    for function, args in ((dynamics.forward_dynamics, (q, v, tau)), (dynamics.inverse_dynamics, (q, v, a))):
+        assert operations(function, bare, *args) < operations(function, zero, *args) - 4
+    for function in (dynamics.gravity_force, dynamics.potential_energy):
+        jaxpr = str(jax.make_jaxpr(lambda m, q, f=function: f(m, q))(bare, q))
+        assert "dot_general" not in jaxpr and "sin" not in jaxpr
+
+
+def test_batch_equals_loop_and_eager_equals_jit():
+    model = TREES["fixed"]()
+    states = random_states(model, 3, 2)
+    batch = quick(jax.vmap(values, (None, 0, 0, 0, 0, 0)))(model, *states)
+    one = quick(values)
+    for s in range(3):
+        single = one(model, *(x[s] for x in states))
+        for key in batch:
+            assert_close(batch[key][s], single[key], 1e-12, key)
+    q, v, _, tau, external = (x[0] for x in states)
+    assert_close(dynamics.forward_dynamics(model, q, v, tau, external=external), batch["forward_dynamics"][0], 1e-12)
+
+
+LEAVES = ("home", "screws", "inertias", "gravity", "armature")
+
+
+def _flat(model, leaves, q, v, u):
+    model = model.replace(**leaves)
+    terms = [
+        dynamics.forward_dynamics(model, q, v, u),
+        dynamics.inverse_dynamics(model, q, v, u),
+        dynamics.coriolis_matrix(model, q, v) @ u,
+        dynamics.potential_energy(model, q)[None],
+        dynamics.centroidal_momentum(model, q, v),
+    ]
+    return jnp.concatenate(terms)
+
+
+def test_derivatives_in_every_leaf():
+    # Helical and spherical joints: both kinds of joint transform. Finite differences are good to 1e-5 at first order.
+    model = random_tree(71, ["helical", "spherical"], parents=[-1, 0])
+    leaves = {name: getattr(model, name) for name in LEAVES}
+    q, v, u, _, _ = (x[0] for x in random_states(model, 1, 4))
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=3 * model.nv + 7))
+
+    @quick
+    def total(leaves, q, v, u):
+        return weights @ jnp.tanh(_flat(model, leaves, q, v, u) / 10)
+
+    check_grads(total, (leaves, q, v, u), order=2, modes=("fwd", "rev"), atol=1e-4, rtol=1e-4)
+    for name, gradient in quick(jax.grad(total))(leaves, q, v, u).items():
+        assert np.abs(gradient).max() > 1e-6, name
+
+
+def test_derivatives_are_finite_at_rest_and_without_mass():
+    # Zero angles, zero velocity, and a body without mass in the middle.
+    model = random_tree(72, ["revolute", "free", "planar"], parents=[-1, 0, 1])
+    model = model.replace(inertias=model.inertias.at[1].set(0.0))
+    leaves = {name: getattr(model, name) for name in LEAVES}
+    q = jnp.asarray([0.0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0])
+    zero = jnp.zeros(model.nv)
+
+    def total(args):
+        return jnp.sum(jnp.sin(_flat(model, *args)))
+
+    @quick
+    def derivatives(args):
+        tangent = jax.tree.map(jnp.ones_like, args)
+        return _flat(model, *args), *jax.jvp(jax.grad(total), (args,), (tangent,))
+
+    for leaf in jax.tree.leaves(derivatives((leaves, q, zero, zero))):
+        assert np.isfinite(leaf).all()
+
+
+def test_refusals():
+    model = random_tree(1, ["revolute", "spherical"])
+    q, v = jnp.asarray([0.0, 1, 0, 0, 0]), jnp.zeros(4)
+    with pytest.raises(ValueError, match=r"q has shape \(4,\), expected \(5,\)"):
+        dynamics.mass_matrix(model, v)
+    with pytest.raises(ValueError, match=r"a has shape \(3,\)"):
+        dynamics.inverse_dynamics(model, q, v, v[:3])
+    with pytest.raises(ValueError, match=r"tau has shape \(5,\)"):
+        dynamics.forward_dynamics(model, q, v, q)
+    with pytest.raises(ValueError, match=r"external has shape \(4, 6\), expected \(2, 6\)"):
+        dynamics.generalized_force(model, q, jnp.zeros((4, 6)))
+    for function in (dynamics.coriolis_matrix, dynamics.bias_force, dynamics.kinetic_energy):
+        with pytest.raises(ValueError, match=r"v has shape \(5,\)"):
+            function(model, q, q)
+    with pytest.raises(ValueError, match=r"v has shape"):
+        dynamics.torque_regressor(model, q, q, v)
+    with pytest.raises(ValueError, match=r"q has shape"):
+        dynamics.center_of_mass(model, v)

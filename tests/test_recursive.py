@@ -1,0 +1,213 @@
+"""The recursions against Pinocchio, against the matrix form, and against their own identities; how they compile."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pinocchio as pin
+import pytest
+from pinocchio_bridge import as_dtype, assert_close, load_robot, quick, random_states, random_tree, to_pinocchio
+
+from jaxdyn import _dispatch, matrix_form, recursive
+from jaxdyn._materialize import materialize
+from jaxdyn._trig import sin_cos
+from jaxdyn.joints import KINDS
+
+ALL = list(KINDS)
+TREES = {
+    "every kind": lambda: random_tree(1, ALL),
+    "every kind, no armature": lambda: random_tree(2, [*ALL[::-1], "revolute"], armature=False),
+    "floating": lambda: random_tree(3, ["free", "revolute", "prismatic", "revolute", "helical", "spherical"]),
+}
+
+
+def everything(model):
+    """All recursive quantities at one sample, with the model's numbers known or (when it is traced) unknown."""
+
+    def at(q, v, a, tau):
+        return {
+            "rnea": recursive.rnea(model, q, v, a),
+            "bias": recursive.bias_force(model, q, v),
+            "aba": recursive.aba(model, q, v, tau),
+            "crba": recursive.crba(model, q),
+            "sqrt": recursive.mass_matrix_sqrt(model, q),
+            "inverse": recursive.mass_matrix_inverse_times(model, q, tau),
+        }
+
+    return at
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_against_pinocchio(name):
+    model = TREES[name]()
+    source, bridge = to_pinocchio(model)
+    data = source.createData()
+    q, v, a, tau, _ = random_states(model, 4, 7)
+    got = quick(jax.vmap(everything(model)))(q, v, a, tau)
+    traced = quick(lambda model, *x: jax.vmap(everything(model))(*x))(model, q, v, a, tau)
+    for key in got:
+        assert_close(traced[key], got[key], 1e-12, key)
+    for i, q_pin in enumerate(bridge.q_to_pinocchio(q)):
+        vi, ai, ti = (np.asarray(x[i]) for x in (v, a, tau))
+        mass = pin.crba(source, data, q_pin)
+        mass = np.triu(mass) + np.triu(mass, 1).T
+        assert_close(got["rnea"][i], pin.rnea(source, data, q_pin, vi, ai), 1e-11, "rnea")
+        assert_close(got["bias"][i], pin.nonLinearEffects(source, data, q_pin, vi), 1e-11, "bias")
+        assert_close(got["aba"][i], pin.aba(source, data, q_pin, vi, ti), 1e-10, "aba")
+        assert_close(got["crba"][i], mass, 1e-11, "crba")
+        assert_close(got["inverse"][i], np.linalg.solve(mass, ti), 1e-10, "inverse")
+        root = np.asarray(got["sqrt"][i])
+        assert_close(root @ root.T, mass, 1e-11, "W W^T")
+        assert_close(np.prod(np.diag(root)) ** 2, np.linalg.det(mass), 1e-9, "det M = prod W_kk^2")
+
+
+def test_root_of_a_chain_is_triangular():
+    model = random_tree(4, ["revolute", "prismatic", "helical", "revolute"], parents=[-1, 0, 1, 2])
+    root = recursive.mass_matrix_sqrt(model, random_states(model, 1, 0)[0][0])
+    assert np.array_equal(np.tril(root, -1), np.zeros((4, 4)))
+    assert (np.diag(root) > 0).all()
+
+
+def test_matrix_form_agrees():
+    for name, tree in TREES.items():
+        model = tree()
+        q, v, a, tau, _ = random_states(model, 2, 11)
+
+        def both(q, v, a, tau, model=model):
+            return (
+                (recursive.rnea(model, q, v, a), matrix_form.inverse_dynamics(model, q, v, a)),
+                (recursive.aba(model, q, v, tau), matrix_form.forward_dynamics(model, q, v, tau)),
+                (recursive.crba(model, q), matrix_form.mass_matrix(model, q)),
+            )
+
+        for ours, other in quick(jax.vmap(both))(q, v, a, tau):
+            assert_close(ours, other, 1e-10, name)
+
+
+def test_float32():
+    model = as_dtype(TREES["every kind"](), jnp.float32)
+    q, v, a, _, _ = random_states(model, 3, 5)
+    got = quick(jax.vmap(lambda q, v, a: recursive.rnea(model, q, v, a)))(q, v, a)
+    assert got.dtype == jnp.float32
+    wide = as_dtype(model, jnp.float64)
+    want = jax.vmap(lambda q, v, a: matrix_form.inverse_dynamics(wide, q, v, a))(*(jnp.asarray(x, jnp.float64) for x in (q, v, a)))
+    # A dozen bodies, each a few roundings of 6e-8 on partly cancelling sums.
+    assert_close(got, want, 2e-5)
+
+
+@pytest.mark.parametrize("dtype,most", [(jnp.float64, 1e7), (jnp.float32, 1e4)])
+def test_sine_and_cosine(dtype, most):
+    rng = np.random.default_rng(0)
+    exact = np.array([0.0, -0.0, 1e-300, np.pi / 4, np.pi / 2, np.pi, -np.pi, 1e-7])
+    x = np.concatenate([exact, rng.uniform(-4, 4, 300), rng.uniform(-1, 1, 300) * np.geomspace(4, most, 300)])
+    x = np.asarray(x, dtype)
+    s, c = sin_cos(jnp.asarray(x))
+    eps = float(jnp.finfo(dtype).eps)
+    mpmath.mp.prec = 200
+    for got, exact in ((s, mpmath.sin), (c, mpmath.cos)):
+        want = np.array([float(exact(mpmath.mpf(float(xi)))) for xi in x])
+        assert np.abs(np.asarray(got, float) - want).max() < 1.1 * eps
+    # Beyond the reach of the split, the error is that of rounding the argument once.
+    far = np.asarray([most * 1e3, -most * 1.7e4], dtype)
+    s, _ = sin_cos(jnp.asarray(far))
+    assert np.abs(np.asarray(s, float) - np.sin(far.astype(float))).max() < 2 * eps * np.abs(far.astype(float)).max()
+    assert np.isnan(sin_cos(jnp.asarray([jnp.inf, jnp.nan], dtype))[0]).all()
+    second = jax.vmap(jax.grad(jax.grad(lambda x: sin_cos(x)[0])))(jnp.asarray(x[:300]))
+    assert_close(second, -np.sin(x[:300].astype(float)), 4 * eps)
+
+
+def test_materialize_is_the_identity():
+    x = jnp.linspace(0.1, 1.0, 5)
+
+    def f(x, keep):
+        y = jnp.sin(x) * x
+        (y,) = materialize(y) if keep else (y,)
+        return jnp.sum(y * y * jnp.exp(y))
+
+    for transform in (lambda f: f, jax.grad, jax.hessian, lambda f: jax.jacfwd(jax.grad(f)), lambda f: jax.vmap(jax.grad(f))):
+        points = jnp.stack([x, 2 * x]) if transform(f) is not f and "vmap" in repr(transform(f)) else x
+        for wrap in (lambda g: g, jax.jit):
+            with_it = wrap(transform(lambda x: f(x, True)))(points)
+            assert_close(with_it, transform(lambda x: f(x, False))(points), 1e-14)
+    assert materialize(1, 0.5, x)[:2] == [1, 0.5]
+
+
+def test_nothing_is_recomputed():
+    """The compiled recursion has at most linearly many fusions, and no flop of it grows with depth (XLA's fusion trap)."""
+    counts, flops = [], []
+    for n in (4, 8):
+        model = random_tree(6, ["revolute"] * n, parents=list(range(-1, n - 1)), armature=False)
+        states = [jnp.zeros((64, n)) for _ in range(3)]
+        compiled = quick(jax.vmap(lambda q, v, tau, m=model: recursive.aba(m, q, v, tau))).lower(*states).compile()
+        counts.append(compiled.as_text().count(" fusion("))
+        flops.append(compiled.cost_analysis()["flops"])
+    assert counts[1] < 2.6 * counts[0] and flops[1] < 2.6 * flops[0], (counts, flops)
+    # Without kept values everything fuses into a few giant fusions that recompute each other.
+    assert counts[0] > 100
+
+
+def test_known_zeros_are_left_out():
+    """A robot whose numbers are known while tracing costs fewer operations than the same robot as an argument."""
+    _, model, _ = load_robot("panda_description/urdf/panda.urdf", lock=("finger",))
+    states = [jnp.zeros((64, 7)) for _ in range(3)]
+    known = quick(jax.vmap(lambda *x: recursive.rnea(model, *x))).lower(*states).compile()
+    given = quick(lambda m, *x: jax.vmap(lambda *y: recursive.rnea(m, *y))(*x)).lower(model, *states).compile()
+    assert known.cost_analysis()["flops"] < 0.6 * given.cost_analysis()["flops"]
+
+
+def test_dispatch_follows_the_batch():
+    """Large batches run on the recursion and small ones on matrices, wherever the vmap stands; all give the same numbers."""
+    model = random_tree(8, ["revolute", "prismatic", "spherical"])
+    q, v, _, tau, _ = random_states(model, 64, 3)
+
+    def f(q, v, tau):
+        return _dispatch.forward_dynamics(model, q, v, tau)
+
+    def fusions(g, *x):
+        return quick(g).lower(*x).compile().as_text().count(" fusion(")
+
+    few = fusions(f, q[0], v[0], tau[0])
+    assert fusions(jax.vmap(f), q[:4], v[:4], tau[:4]) < 2 * few
+    split = [x.reshape(8, 8, -1) for x in (q, v, tau)]
+    for g, args in ((jax.vmap(f), (q, v, tau)), (jax.vmap(jax.jit(f)), (q, v, tau)), (jax.vmap(jax.vmap(f)), split)):
+        assert fusions(g, *args) > 3 * few
+        assert_close(quick(g)(*args).reshape(64, -1), jax.vmap(f)(q[:64], v, tau), 1e-11)
+    want = matrix_form.forward_dynamics(model, q[0], v[0], tau[0])
+    assert_close(f(q[0], v[0], tau[0]), want, 1e-12)
+    assert_close(quick(jax.vmap(f))(q, v, tau)[0], want, 1e-10)
+
+
+def test_derivatives_of_forward_dynamics():
+    """Both implementations, every argument and leaf, forward and reverse, orders 1 and 2, against finite differences."""
+    model = random_tree(9, ["free", "revolute", "helical", "planar"])
+    q, v, _, tau, _ = random_states(model, 40, 3)
+
+    def loss(leaves, q, v, tau):
+        import equinox as eqx
+
+        here = eqx.combine(leaves, model)
+        return jnp.sum(jnp.sin(_dispatch.forward_dynamics(here, q, v, tau)))
+
+    import equinox as eqx
+
+    leaves = eqx.filter(model, eqx.is_array)
+    single = quick(jax.grad(loss, (0, 1, 2, 3)))(leaves, q[0], v[0], tau[0])
+    batch = quick(jax.vmap(jax.grad(loss, (0, 1, 2, 3)), (None, 0, 0, 0)))(leaves, q, v, tau)
+    for name, one, many in zip(itertools.count(), jax.tree.leaves(single), jax.tree.leaves(batch), strict=False):
+        assert_close(many[0], one, 1e-9, f"leaf {name}")
+    # A direction in everything at once: reverse against central differences along the manifold of rotations, and forward.
+    rng = np.random.default_rng(1)
+    step = [jnp.asarray(rng.normal(size=x.shape)) for x in (q[0], v[0], tau[0])]
+
+    def along(s):
+        return loss(leaves, q[0] + s * step[0], v[0] + s * step[1], tau[0] + s * step[2])
+
+    h = 1e-5
+    line = quick(lambda s: (along(s), jax.grad(along)(s), jax.jvp(jax.grad(along), (s,), (jnp.ones(()),))[1]))
+    (f0, d0, _), (f1, d1, _), (_, dm, ddm) = (line(jnp.asarray(s)) for s in (-h, h, 0.0))
+    assert_close(dm, (f1 - f0) / (2 * h), 1e-7, "first derivative; central differences leave h^2")
+    assert_close(ddm, (d1 - d0) / (2 * h), 1e-7, "second derivative")
+    forward = quick(lambda s: jax.jvp(along, (s,), (jnp.ones(()),))[1])(jnp.asarray(0.0))
+    assert_close(forward, dm, 1e-11)

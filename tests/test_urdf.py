@@ -1,0 +1,594 @@
+"""URDF files: every robot of example-robot-data against Pinocchio, locking, mimic joints, refusals, the way back."""
+
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import jax
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from jaxdyn import kinematics, robots
+from jaxdyn.building import ModelBuilder, inertia_report
+from jaxdyn.io import load_urdf, save_urdf, urdf_inertia_report
+from jaxdyn.joints import KINDS
+from tests.pinocchio_bridge import ROBOTS, quick, to_jaxdyn
+
+FILES = sorted(str(path.relative_to(ROBOTS)) for path in Path(ROBOTS).rglob("*.urdf"))
+# Pinocchio loads the second and the third; its mass matrix is singular and its forward dynamics NaN.
+REFUSED = {
+    "ur_description/urdf/ur3.urdf": "has no <link>; expand this xacro file",
+    "romeo_description/urdf/romeo.urdf": "'RThumb3'.*moves no inertia",
+    "romeo_description/urdf/romeo_laas_small.urdf": "'r_gripper_joint'.*moves no inertia",
+}
+LOADED = [name for name in FILES if name not in REFUSED]
+MIMIC = ["panda_description/urdf/panda.urdf", "baxter_description/urdf/baxter.urdf"]
+ROUND_TRIPS = [
+    "panda_description/urdf/panda.urdf",
+    "centauro_description/urdf/centauro.urdf",  # siblings out of the order of their names
+    "tiago_pro_description/robots/tiago_pro.urdf",  # the same, and continuous joints
+    "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+    "double_pendulum_description/urdf/double_pendulum_continuous.urdf",
+    "hector_description/robots/quadrotor_base.urdf",
+]
+INERTIAS = [
+    "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+    "panda_description/urdf/panda.urdf",
+    "talos_data/robots/talos_reduced.urdf",
+    "tiago_description/robots/tiago.urdf",
+    "romeo_description/urdf/romeo_small.urdf",
+    "pr2_description/urdf/pr2.urdf",
+]
+LEAVES = ("home", "screws", "inertias", "frame_poses", "gravity", "armature", "damping", "friction", "lower", "upper")
+LEAVES += ("velocity_limit", "effort_limit", "coupling_values")
+
+
+def in_pinocchio(name, floating=False):
+    path = str(Path(ROBOTS) / name)
+    return pin.buildModelFromUrdf(path, pin.JointModelFreeFlyer()) if floating else pin.buildModelFromUrdf(path)
+
+
+def assert_same_as_pinocchio(model, source):
+    """Every number that both hold: names, tree, placements, axes, inertias, frames, limits, friction."""
+    model = jax.tree.map(np.asarray, model)
+    assert model.joint_names == tuple(source.names)[1:]
+    assert (model.nb, model.nv) == (source.njoints - 1, source.nv)
+    assert model.topology.parents == tuple(parent - 1 for parent in source.parents[1:])
+    total = sum(inertia.mass for inertia in source.inertias[1:])
+    np.testing.assert_allclose(model.inertias[:, 0].sum(), total, rtol=1e-13)
+    for i, (ours, theirs) in enumerate(zip(model.inertias, source.inertias[1:], strict=True)):
+        theirs = theirs.toDynamicParameters()
+        scale = max(np.abs(theirs).max(), 1e-6)
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12 * scale, err_msg=model.body_names[i])
+    carried = {frame.name: frame for frame in source.frames if frame.type == pin.FrameType.BODY}
+    carried.pop("universe", None)
+    assert set(model.frame_names) == set(carried)
+    for name, body, pose in zip(model.frame_names, model.topology.frame_bodies, model.frame_poses, strict=True):
+        assert body == carried[name].parentJoint - 1, name
+        np.testing.assert_allclose(pose, carried[name].placement.homogeneous, atol=1e-14, err_msg=name)
+    if not model.nb:
+        return
+    reference, _ = to_jaxdyn(source)
+    assert model.topology.kinds == reference.topology.kinds
+    np.testing.assert_allclose(model.home, reference.home, atol=1e-14)
+    np.testing.assert_allclose(model.screws, reference.screws, atol=1e-15)
+    for i, kind in enumerate(model.topology.kinds):
+        joint, q, v = source.joints[i + 1], model.topology.q_slices[i], model.topology.v_slices[i]
+        if kind == "free":
+            continue
+        if kind != "continuous":
+            assert model.lower[q] == source.lowerPositionLimit[joint.idx_q]
+            assert model.upper[q] == source.upperPositionLimit[joint.idx_q]
+        assert model.effort_limit[v] == source.effortLimit[joint.idx_v]
+        assert model.velocity_limit[v] == source.velocityLimit[joint.idx_v]
+        for ours, theirs in ((model.damping, source.damping), (model.friction, source.friction)):
+            assert (0.0 if ours is None else ours[v]) == theirs[joint.idx_v]
+
+
+def assert_same_models(one, two, rtol=1e-12):
+    assert one.topology == two.topology
+    for name in LEAVES:
+        a, b = getattr(one, name), getattr(two, name)
+        assert (a is None) == (b is None), name
+        if a is not None:
+            finite = np.abs(a)[np.isfinite(a)]
+            np.testing.assert_allclose(b, a, rtol=rtol, atol=rtol * finite.max(initial=0.0), err_msg=name)
+
+
+@pytest.mark.parametrize("name", LOADED)
+def test_robot_is_the_one_that_pinocchio_loads(name):
+    assert_same_as_pinocchio(load_urdf(Path(ROBOTS) / name), in_pinocchio(name))
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow if i % 6 else ()) for i, x in enumerate(LOADED)]
+)
+def test_robot_with_floating_base_is_the_one_that_pinocchio_loads(name):
+    model = load_urdf(Path(ROBOTS) / name, floating_base=True)
+    assert_same_as_pinocchio(model, in_pinocchio(name, floating=True))
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_robot_is_refused(name):
+    with pytest.raises(ValueError, match=f"(?s){name}.*{REFUSED[name]}"):
+        load_urdf(Path(ROBOTS) / name)
+
+
+def test_the_list_of_joints_to_lock_in_the_refusal_is_enough():
+    path = Path(ROBOTS) / "romeo_description/urdf/romeo_laas_small.urdf"
+    with pytest.raises(ValueError) as refusal:
+        load_urdf(path)
+    names = str(refusal.value).split("lock=[")[1].split("]")[0].replace("'", "").split(", ")
+    source = in_pinocchio("romeo_description/urdf/romeo_laas_small.urdf")
+    reduced = pin.buildReducedModel(source, [source.getJointId(name) for name in names], pin.neutral(source))
+    assert_same_as_pinocchio(load_urdf(path, lock=names), reduced)
+
+
+@pytest.mark.parametrize(
+    "name", ["talos_data/robots/talos_reduced.urdf", "tiago_description/robots/tiago_no_hand.urdf"]
+)
+@pytest.mark.parametrize("floating", [False, True])
+def test_locked_joints_give_pinocchios_reduced_model(name, floating):
+    source = in_pinocchio(name, floating)
+    rng = np.random.default_rng(1)
+    names = [joint for joint in list(source.names)[1:] if joint != "root_joint"]
+    values = dict(zip(names[1::3], rng.uniform(-1, 1, len(names)).tolist(), strict=False))
+    q = pin.neutral(source)
+    for joint, value in values.items():
+        place = source.joints[source.getJointId(joint)]
+        number = [np.cos(value), np.sin(value)] if place.nq == 2 else value
+        q[place.idx_q : place.idx_q + place.nq] = number
+    reduced = pin.buildReducedModel(source, [source.getJointId(joint) for joint in values], q)
+    model = load_urdf(Path(ROBOTS) / name, floating_base=floating, lock=values)
+    assert_same_as_pinocchio(model, reduced)
+    at_zero = load_urdf(Path(ROBOTS) / name, floating_base=floating, lock=list(values))
+    reduced = pin.buildReducedModel(source, [source.getJointId(joint) for joint in values], pin.neutral(source))
+    assert_same_as_pinocchio(at_zero, reduced)
+
+
+# Small files for single features and faults ---------------------------------------------------------------------------
+
+SOLID = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+
+
+def link(name, inside=SOLID):
+    return f'<link name="{name}">{inside}</link>'
+
+
+def joint(name, parent, child, inside="", kind="revolute"):
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">\n{ends}\n{inside}</joint>'
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    """Writes a robot from its parts, one line each, and returns the path."""
+
+    def write(*parts, head='<robot name="r">', tail="</robot>"):
+        path = tmp_path / "robot.urdf"
+        path.write_text("\n".join((head, *parts, tail)))
+        return path
+
+    return write
+
+
+def test_features_of_a_joint(urdf):
+    inside = (
+        '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/><axis xyz="0 3 4"/>'
+        '<limit lower="-1" upper="2" effort="30" velocity="4"/>'
+        '<dynamics damping="0.5" friction="0.25" armature="0.125"/>'
+    )
+    path = urdf(link("a"), joint("j", "a", "b", inside), link("b"), '<gazebo:thing x="1"/>', "<!-- seen -->")
+    model = load_urdf(path, gravity=None)
+    assert (model.name, model.gravity, model.joint_names, model.frame_names) == ("r", None, ("j",), ("b", "a"))
+    np.testing.assert_allclose(model.screws[0], [0, 0, 0, 0, 0.6, 0.8], atol=1e-16)
+    np.testing.assert_allclose(model.home[0, :3, :3], pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), atol=1e-15)
+    values = [getattr(model, name)[0] for name in ("lower", "upper", "effort_limit", "velocity_limit")]
+    assert values == [-1, 2, 30, 4]
+    assert [model.damping[0], model.friction[0], model.armature[0]] == [0.5, 0.25, 0.125]
+
+
+def test_defaults_of_a_joint(urdf):
+    model = load_urdf(urdf(link("a"), joint("j", "a", "b"), link("b")), dtype=np.float32)
+    np.testing.assert_array_equal(model.screws[0], [0, 0, 0, 1, 0, 0])  # the format's default axis is x
+    np.testing.assert_array_equal(model.home[0], np.eye(4))
+    assert [float(model.lower[0]), float(model.upper[0])] == [-np.inf, np.inf]
+    assert (model.damping, model.friction, model.armature) == (None, None, None)
+    assert model.home.dtype == np.float32
+    half = load_urdf(urdf(link("a"), joint("j", "a", "b", '<limit upper="1"/>'), link("b")))
+    assert [float(half.lower[0]), float(half.upper[0]), float(half.effort_limit[0])] == [0, 1, np.inf]
+    free = load_urdf(urdf(link("a"), joint("j", "a", "b", '<limit upper="1" effort="5"/>', "continuous"), link("b")))
+    assert [float(free.upper[0]), float(free.effort_limit[0])] == [np.inf, 5]
+
+
+def test_what_is_only_seen_is_not_read(urdf):
+    broken = (
+        '<visual><origin xyz="what"/><geometry><mesh filename="package://no/where.dae" scale="x"/></geometry></visual>'
+    )
+    assert load_urdf(urdf(link("a"), joint("j", "a", "b"), link("b", SOLID + broken))).nb == 1
+
+
+def test_planar_and_floating_joints_are_pinocchios(urdf):
+    origin = '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>'
+    chain = (link("a"), link("b"), joint("f", "b", "c", origin, "floating"), link("c"))
+    path = urdf(*chain, joint("p", "a", "b", f'{origin}<axis xyz="0 0 1"/>', "planar"))
+    model, source = load_urdf(path), pin.buildModelFromUrdf(str(path))
+    assert model.topology.kinds == ("planar", "free") and model.body_names == ("b", "c")
+    quat = np.array([0.1, 0.5, -0.3, 0.8])
+    quat /= np.linalg.norm(quat)
+    q = np.concatenate([[0.4, -0.7, 2.1, 0.3, 0.2, -0.9], quat])
+    theirs = np.concatenate([[0.4, -0.7, np.cos(2.1), np.sin(2.1), 0.3, 0.2, -0.9], np.roll(quat, -1)])
+    data = source.createData()
+    pin.forwardKinematics(source, data, theirs)
+    poses = quick(kinematics.forward_kinematics)(model, q)
+    np.testing.assert_allclose(poses, [x.homogeneous for x in list(data.oMi)[1:]], atol=1e-14)
+    # Locked there, the poses of the links are the same.
+    held = load_urdf(path, lock={"p": q[:3], "f": q[3:]})
+    assert held.nb == 0 and held.frame_names == ("a", "b", "c")
+    np.testing.assert_allclose(held.frame_poses[1:], poses, atol=1e-14)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0, -1), (1, -2, 0.5)])
+def test_planar_joint_moves_in_the_plane_normal_to_its_axis(urdf, axis):
+    axis_text = f'<axis xyz="{" ".join(map(str, axis))}"/>'
+    origin = '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>'
+    tip = joint("t", "b", "c", '<origin xyz="0 0 1"/>', "fixed")
+    path = urdf(link("a"), link("b"), joint("p", "a", "b", origin + axis_text, "planar"), tip, link("c"))
+    model = load_urdf(path)
+    assert model.body_names == ("b_plane",) and set(model.frame_names) == {"b_plane", "a", "b", "c"}
+
+    def link_pose(name, q):
+        held = load_urdf(path, lock={"p": q})
+        return np.asarray(held.frame_poses[held.frame_names.index(name)])
+
+    home = pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([1.0, 2, 3]))
+    np.testing.assert_allclose(link_pose("b", [0, 0, 0]), home.homogeneous, atol=1e-15)
+    unit = np.array(axis) / np.linalg.norm(axis)
+    moved = home.inverse() * pin.SE3(link_pose("b", [0.4, -0.7, 0.0]))
+    np.testing.assert_allclose(moved.rotation, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose([unit @ moved.translation, moved.translation @ moved.translation], [0, 0.65], atol=1e-14)
+    turned = home.inverse() * pin.SE3(link_pose("b", [0.4, -0.7, 0.9]))
+    np.testing.assert_allclose(pin.log3(turned.rotation), 0.9 * unit, atol=1e-14)
+    np.testing.assert_allclose(turned.translation, moved.translation, atol=1e-15)
+    # The free model goes where the locked ones stand.
+    body = quick(kinematics.forward_kinematics)(model, np.array([0.4, -0.7, 0.9]))[0]
+    for name in ("b", "c"):
+        pose = body @ np.asarray(model.frame_poses[model.frame_names.index(name)])
+        np.testing.assert_allclose(pose, link_pose(name, [0.4, -0.7, 0.9]), atol=1e-14)
+    whole = pin.Inertia(1.0, np.zeros(3), np.eye(3)) + pin.Inertia(1.0, np.array([0, 0, 1.0]), np.eye(3))
+    turn = pin.SE3(np.asarray(model.frame_poses[model.frame_names.index("b")]))
+    np.testing.assert_allclose(model.inertias[0], turn.act(whole).toDynamicParameters(), atol=1e-14)
+
+
+def test_base_is_locked_where_it_is_told(urdf):
+    path = urdf(link("a"), joint("j", "a", "b"), link("b"))
+    model = load_urdf(path, floating_base=True, lock={"root_joint": [1, 2, 3, 0, 0, 0, 2]})
+    assert model.joint_names == ("j",)
+    np.testing.assert_allclose(
+        model.home[0], np.diag([-1.0, -1, 1, 1]) + np.outer([1, 2, 3, 0], [0, 0, 0, 1]), atol=1e-16
+    )
+
+
+def test_root_joint_gives_way_to_a_joint_of_that_name(urdf):
+    model = load_urdf(urdf(link("a"), joint("root_joint", "a", "b"), link("b")), floating_base=True)
+    assert model.joint_names == ("_root_joint", "root_joint")
+
+
+def test_mimic_joints():
+    panda, baxter = (Path(ROBOTS) / name for name in MIMIC)
+    assert load_urdf(panda).topology.couplings == ()
+    model = load_urdf(panda, mimic="couple")
+    assert [(model.joint_names[i], model.joint_names[k]) for i, k in model.topology.couplings] == [
+        ("panda_finger_joint2", "panda_finger_joint1")
+    ]
+    np.testing.assert_array_equal(model.coupling_values, [[1.0, 0.0]])
+    assert model.nv == 9
+    with pytest.raises(ValueError, match=r"panda_finger_joint2 \(follows panda_finger_joint1\); pass mimic='couple'"):
+        load_urdf(panda, mimic="error")
+    with pytest.raises(ValueError, match="mimic is 'follow'"):
+        load_urdf(panda, mimic="follow")
+    model = load_urdf(baxter, mimic="couple")
+    assert sorted(model.coupling_values[:, 0].tolist()) == [-1, -1]
+    # A follower of a locked joint is locked where the coupling puts it.
+    held = load_urdf(panda, mimic="couple", lock={"panda_finger_joint1": 0.03})
+    expected = load_urdf(panda, lock={"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03})
+    assert_same_models(held, expected)
+    assert load_urdf(panda, lock=["panda_finger_joint1"]).nv == 8
+    with pytest.raises(ValueError, match="'panda_finger_joint2' follows 'panda_finger_joint1'; lock that one instead"):
+        load_urdf(panda, mimic="couple", lock=["panda_finger_joint2"])
+    with pytest.raises(ValueError, match=r"'panda_finger_joint2' is held at .*0.01.* but follows"):
+        load_urdf(panda, mimic="couple", lock={"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.01})
+
+
+def test_chains_of_mimic_joints(urdf):
+    follow = '<axis xyz="0 0 1"/><mimic joint="{}" multiplier="{}" offset="{}"/>'
+    parts = [link(name) for name in "abcd"]
+    parts += [joint("j1", "a", "b"), joint("j2", "b", "c", follow.format("j1", 2, 0.5))]
+    path = urdf(*parts, joint("j3", "c", "d", follow.format("j2", -1, 0)))
+    model = load_urdf(path, mimic="couple")
+    assert model.topology.couplings == ((1, 0), (2, 1))
+    np.testing.assert_array_equal(model.coupling_values, [[2, 0.5], [-1, 0]])
+    held = load_urdf(path, mimic="couple", lock={"j1": 0.1})
+    assert_same_models(held, load_urdf(path, lock={"j1": 0.1, "j2": 0.7, "j3": -0.7}))
+
+
+TREE = (link("a"), link("b"))
+COUPLED = joint("j", "a", "b", '<mimic joint="k"/>'), joint("k", "b", "c", "", "{}"), link("c")
+# name: (parts, line of the fault, message). The parts start on line 2; a joint has its ends on its second line.
+BAD_FILES = {
+    "tags crossed": ((link("a"), "<link name='x'>", "</lonk>"), 4, "malformed XML: .*lonk"),
+    "not closed": ((link("a"), "<link name='x'>"), 4, "malformed XML"),
+    "entity": ((link("a"), "<link name='&x;'/>"), 3, "malformed XML: .*Entity"),
+    "no links": ((), 1, "the robot has no <link>"),
+    "link without name": ((link("a"), "<link/>"), 3, "a <link> has no name"),
+    "joint without name": ((*TREE, joint("", "a", "b")), 4, "a <joint> has no name"),
+    "link twice": ((*TREE, link("a")), 4, "the link name 'a' is taken at .*:2; rename one"),
+    "joint twice": ((*TREE, joint("j", "a", "b"), joint("j", "a", "b")), 7, "the joint name 'j' is taken at .*:4"),
+    "type": ((*TREE, joint("j", "a", "b", kind="hinge")), 4, "joint 'j' has type 'hinge', which is unknown; types are"),
+    "no type": ((*TREE, '<joint name="j"><parent link="a"/><child link="b"/></joint>'), 4, "'j' has type None"),
+    "no parent": ((*TREE, '<joint name="j" type="fixed"><child link="b"/></joint>'), 4, "'j' has no <parent>"),
+    "no child": ((*TREE, '<joint name="j" type="fixed"><parent link="a"/></joint>'), 4, "'j' has no <child>"),
+    "parent without link": (
+        (*TREE, joint("j", "a", "b").replace('link="a"', "")),
+        5,
+        "<parent> of joint 'j' has no link",
+    ),
+    "unknown link": ((*TREE, joint("j", "a", "x")), 5, "joint 'j': the child link 'x' is not in the file"),
+    "two roots": ((*TREE, link("c"), joint("j", "a", "b")), None, "2 root links: a, c; join them by a joint"),
+    "two parents": ((*TREE, joint("j", "a", "b"), joint("k", "a", "b")), 7, "'b' is the child of joints 'j' and 'k'"),
+    "cycle": ((*TREE, joint("j", "a", "b"), joint("k", "b", "a")), 7, "links a, b form a cycle"),
+    "cycle apart": ((*TREE, link("c"), joint("j", "b", "c"), joint("k", "c", "b")), 8, "links b, c form a cycle"),
+    "own parent": ((*TREE, joint("j", "b", "b")), 4, "links b form a cycle"),
+    "text for numbers": (
+        (*TREE, joint("j", "a", "b", '<origin xyz="1 2 x"/>')),
+        6,
+        "xyz of <origin> of joint 'j' is '1 2 x'",
+    ),
+    "two for three": ((*TREE, joint("j", "a", "b", '<axis xyz="1 2"/>')), 6, "'1 2', expected 3 finite numbers"),
+    "NaN mass": ((link("a", SOLID.replace('"1"/>', '"nan"/>', 1)),), 2, "value of <mass> of link 'a' is 'nan'"),
+    "infinite limit": (
+        (*TREE, joint("j", "a", "b", '<limit upper="inf"/>')),
+        6,
+        "upper of <limit> of joint 'j' is 'inf'",
+    ),
+    "negative mass": (
+        (link("a", SOLID.replace('value="1"', 'value="-2"')),),
+        2,
+        "link 'a': the mass is -2.0 kg",
+    ),
+    "inertia with a gap": ((link("a", SOLID.replace('izz="1"', "")),), 2, "<inertia> of link 'a' has no izz"),
+    "zero axis": (
+        (*TREE, joint("j", "a", "b", '<axis xyz="0 0 0"/>')),
+        4,
+        "joint 'j': axis is .*direction other than zero",
+    ),
+    "quaternion": ((*TREE, joint("j", "a", "b", '<origin quat_xyzw="0 0 0 1"/>')), 6, "has quat_xyzw.*write it as rpy"),
+    "crossed limits": ((*TREE, joint("j", "a", "b", '<limit lower="1" upper="-1"/>')), 4, "lower limit 1.0 is above"),
+    "no inertia": ((*TREE[:1], link("b", ""), joint("j", "a", "b")), None, "joint 'j' .*moves no inertia"),
+    "mimic without joint": ((*TREE, joint("j", "a", "b", "<mimic/>")), 6, "<mimic> of joint 'j' has no joint"),
+    "mimic of nothing": ((*TREE, COUPLED[0]), 4, "'j' follows 'k', which is not a joint of the file"),
+    "mimic of fixed": ((*TREE, *(part.format("fixed") for part in COUPLED)), 4, "'j' follows 'k', but 'k' is fixed"),
+    "mimic of floating": (
+        (*TREE, *(part.format("floating") for part in COUPLED)),
+        4,
+        "'j' follows 'k', but 'k' is free",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_files(case, urdf):
+    parts, line, message = BAD_FILES[case]
+    path = urdf(*parts)
+    with pytest.raises(ValueError, match=f"(?s){path}:{'' if line is None else f'{line}:'}.*({message})"):
+        load_urdf(path, mimic="couple")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "robot.urdf:1: malformed XML"),
+        ("links and joints", "robot.urdf:1: malformed XML"),
+        ("\n<mujoco/>", "robot.urdf:2: the root element is <mujoco>, expected <robot>"),
+        ("<robot><link name='a'/></robot>", "robot.urdf:1: the robot has no name"),
+        ('<robot xmlns:xacro="http://ros.org/xacro"/>', "robot.urdf:1: .*xacro IN > OUT"),
+    ],
+)
+def test_files_that_are_no_urdf(content, message, tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=message):
+        load_urdf(path)
+    with pytest.raises(ValueError, match=message):
+        urdf_inertia_report(path)
+
+
+def test_bad_arguments(urdf, tmp_path, monkeypatch):
+    path = urdf(*TREE, joint("elbow", "a", "b"), link("c"), joint("weld", "b", "c", kind="fixed"))
+    for lock, message in {
+        "elbow": "lock is 'elbow'; give a list",
+        ("elbwo",): r"lock: joint 'elbwo' is unknown \(did you mean elbow",
+        ("weld",): "lock: joint 'weld' is fixed already",
+        ("root_joint",): "lock: joint 'root_joint' is unknown",
+    }.items():
+        with pytest.raises(ValueError, match=message):
+            load_urdf(path, lock=lock)
+    for value, message in {(1.0, 2.0): r"has shape \(2,\)", np.nan: "nan.*finite", "up": "'up', expected"}.items():
+        with pytest.raises(ValueError, match=f"value of joint 'elbow'.*{message}"):
+            load_urdf(path, lock={"elbow": value})
+    with pytest.raises(ValueError, match=r"its quaternion .* is zero"):
+        load_urdf(path, floating_base=True, lock={"root_joint": np.zeros(7)})
+    with pytest.raises(ValueError, match=r"nowhere.urdf' cannot be read .*check the path"):
+        load_urdf(tmp_path / "nowhere.urdf")
+    with pytest.raises(ValueError, match="cannot be read"):
+        load_urdf(tmp_path)
+    monkeypatch.setitem(sys.modules, "yourdfpy", None)
+    with pytest.raises(ImportError, match=r"pip install jaxdyn\[urdf\]"):
+        load_urdf(path)
+
+
+def test_inertia_report_names_links(urdf):
+    flat = SOLID.replace('ixx="1"', 'ixx="-1"')
+    long = SOLID.replace('ixx="1"', 'ixx="3"')
+    frame = joint("f", "flat", "frame", kind="fixed")
+    moves = [joint(f"j{i}", *ends) for i, ends in enumerate((("a", "flat"), ("a", "long"), ("a", "bare")))]
+    end = joint("j3", "bare", "tip", '<axis xyz="0 1 0"/>')
+    path = urdf(
+        link("a", ""), link("flat", flat), link("long", long), link("bare", ""), link("frame", ""), frame, *moves
+    )
+    path.write_text(path.read_text().replace("</robot>", link("tip") + end + "</robot>"))
+    report = urdf_inertia_report(path)
+    assert [(name, problem.split(":")[0]) for name, problem in report] == [
+        ("flat", "not positive definite"),
+        ("long", "triangle inequality violated"),
+        ("bare", "massless"),
+    ]
+    assert [name for name, _ in inertia_report(load_urdf(path))] == ["flat", "long", "bare"]
+
+
+@pytest.mark.parametrize("name", INERTIAS)
+def test_inertia_reports_of_robots(name):
+    # The same judgement on the matrices as they are printed in the file, read by other means.
+    expected = set()
+    for inertial in ET.parse(Path(ROBOTS) / name).iterfind("link/inertial"):
+        values = {key: float(value) for key, value in inertial.find("inertia").attrib.items()}
+        rows = [[values["i" + "".join(sorted(a + b))] for a in "xyz"] for b in "xyz"]
+        moments = np.linalg.eigvalsh(np.array(rows))
+        mass = float(inertial.find("mass").get("value"))
+        if mass == 0 and not moments.any():
+            expected.add("massless")
+        elif mass > 0 and moments[0] <= 0:
+            expected.add("not positive definite")
+        elif mass > 0 and moments[2] > (1 + 1e-12) * (moments[0] + moments[1]):
+            expected.add("triangle inequality violated")
+    report = urdf_inertia_report(Path(ROBOTS) / name)
+    assert {problem.split(":")[0] for _, problem in report if "no <inertial>" not in problem} == expected
+
+
+# The way back --------------------------------------------------------------------------------------------------------
+
+
+def saved(model, path, **options):
+    save_urdf(model, path)
+    return load_urdf(path, gravity=model.gravity, **options)
+
+
+@pytest.mark.parametrize("name", ROUND_TRIPS)
+@pytest.mark.parametrize("floating", [False, True])
+def test_round_trip_of_robots(name, floating, tmp_path):
+    model = load_urdf(Path(ROBOTS) / name, floating_base=floating, mimic="couple")
+    path = tmp_path / "out.urdf"
+    again = saved(model, path, floating_base=floating, mimic="couple")
+    assert_same_models(model, again)
+    # Pinocchio reads the same robot from the file.
+    source = (
+        pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer()) if floating else pin.buildModelFromUrdf(str(path))
+    )
+    assert model.joint_names == tuple(source.names)[1:]
+    for ours, theirs in zip(np.asarray(model.inertias), source.inertias[1:], strict=True):
+        np.testing.assert_allclose(ours, theirs.toDynamicParameters(), atol=1e-13 * np.abs(ours).max(initial=1.0))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_round_trip_of_random_trees(seed, tmp_path):
+    kinds = ("revolute", "continuous", "prismatic", "planar", "free", "fixed")
+    model = robots.random_tree(seed, 14, branching=2.5, kinds=kinds)
+    again = saved(model, tmp_path / "out.urdf")
+    # A root link is needed, and there was none at the world's origin.
+    assert set(again.frame_names) - set(model.frame_names) == {"world"}
+    keep = [again.frame_names.index(name) for name in model.frame_names]
+    assert again.joint_names == model.joint_names and again.topology.parents == model.topology.parents
+    assert again.topology.kinds == model.topology.kinds
+    for name in ("home", "screws", "inertias"):
+        np.testing.assert_allclose(getattr(again, name), getattr(model, name), rtol=1e-12, atol=1e-13, err_msg=name)
+    np.testing.assert_allclose(again.frame_poses[np.array(keep)], model.frame_poses, atol=1e-13)
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, np.pi / 2 + 1e-5])
+def test_round_trip_at_the_singularity_of_the_angles(pitch, tmp_path):
+    builder = ModelBuilder().add_body("base", joint="fixed")
+    builder.add_body("b", "base", inertia=(1, (0, 0, 0), (1, 1, 1)), pose=((0, 0, 0), (0.7, pitch, -1.9)))
+    model = builder.build()
+    assert_same_models(model, saved(model, tmp_path / "out.urdf"), rtol=1e-15)
+
+
+def test_round_trip_of_all_that_a_model_can_hold(tmp_path):
+    ball = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))
+    builder = ModelBuilder("all", gravity=(0.0, 1.0, -9.0)).add_body("base", joint="fixed")
+    builder.add_body("a", "base", "revolute", ball, armature=0.1, lower=-1.0, velocity_limit=3.0)
+    builder.add_body("b", "a", "continuous", ball, damping=0.2, effort_limit=9.0, axis=(1, 2, 3))
+    builder.add_body("c", "b", "prismatic", ball, friction=0.3, upper=1 / 3, axis=(0, -1, 0))
+    builder.add_body("d", "c", "planar", ball, damping=0.4)
+    builder.add_body("e", "d", "free", ball).add_frame("tool", "e", ((1, 2, 3), (4, 5, 6)))
+    builder.add_body("m", "e", "revolute", armature=1e-3).add_body(
+        "rotor", "e", armature=1.0, inertia=[0] * 4 + [1, 0, 1, 0, 0, 1]
+    )
+    builder.add_coupling("c_joint", "a_joint", 0.5, -0.25)
+    model = builder.build()
+    assert_same_models(model, saved(model, tmp_path / "out.urdf", mimic="couple"), rtol=1e-15)
+
+
+def test_siblings_keep_their_order(tmp_path):
+    ball = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))
+    builder = ModelBuilder().add_body("base", joint="fixed")
+    # Depth-first through the fixed links x (joint m) and y (joint b): n, then d, e by way of x, then a by way of y.
+    builder.add_body("x", "base", "fixed", joint_name="p", pose=(1, 2, 3)).add_body(
+        "y", "base", "fixed", joint_name="q"
+    )
+    for name, parent in (("n", "base"), ("d", "x"), ("e", "x"), ("a", "y")):
+        builder.add_body(name, parent, inertia=ball, joint_name=name, pose=(0, 0, 1))
+    model = builder.build()
+    assert model.joint_names == ("n", "d", "e", "a")
+    assert_same_models(model, saved(model, tmp_path / "out.urdf"), rtol=1e-15)
+    # Without a frame to hang on, one is added: a hangs on x, which comes up after c.
+    builder = ModelBuilder().add_body("base", joint="fixed").add_body("b", "base", "fixed", joint_name="b")
+    for name, parent in (("a", "base"), ("c", "base"), ("z", "b"), ("x", "b")):
+        builder.add_body(name, parent, inertia=ball, joint_name=name)
+    model = builder.build()
+    assert model.joint_names == ("a", "x", "z", "c")
+    again = saved(model, tmp_path / "out.urdf")
+    assert_same_models(model, again, rtol=1e-15)
+    builder = ModelBuilder().add_body("base", joint="fixed").add_body("b", "base", "fixed", joint_name="b")
+    for name, parent in (("a", "base"), ("c", "base"), ("f", "base"), ("z", "b")):
+        builder.add_body(name, parent, inertia=ball, joint_name=name)
+    builder.add_body("b2", "base", "fixed", joint_name="d").add_body("e", "b2", inertia=ball, joint_name="0")
+    model = builder.build()
+    assert model.joint_names == ("a", "z", "c", "0", "f")
+    assert_same_models(model, saved(model, tmp_path / "out.urdf"), rtol=1e-15)
+
+
+def test_names_that_xml_must_escape(tmp_path):
+    builder = ModelBuilder('"<&>"').add_body("bäse & <co>", joint="fixed")
+    model = builder.add_body('"b"', "bäse & <co>", inertia=(1, (0, 0, 0), (1, 1, 1)), joint_name="'j'<").build()
+    assert_same_models(model, saved(model, tmp_path / "out.urdf"))
+
+
+def test_what_urdf_cannot_express_is_refused_by_name(tmp_path):
+    ball = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))
+    refusals = {
+        "joint 'b_joint' is helical": dict(joint="helical", pitch=0.1),
+        "joint 'b_joint' is spherical": dict(joint="spherical"),
+        "joint 'b_joint' is helical; URDF": dict(joint="helical", screw=(0, 1, 0, 0, 0, 1)),
+        r"joint 'b_joint' is planar and has limits \(lower, velocity\)": dict(
+            joint="planar", lower=(-1, -np.inf, -np.inf), velocity_limit=3.0
+        ),
+        "joint 'b_joint': damping .* differs between directions": dict(joint="planar", damping=(1.0, 2.0, 3.0)),
+        "body 'b' has first moments .* without mass": dict(inertia=[0, 1, 0, 0, 1, 0, 1, 0, 0, 1]),
+    }
+    for message, options in refusals.items():
+        model = ModelBuilder().add_body(**{"name": "b", "inertia": ball, **options}).build()
+        with pytest.raises(ValueError, match=message):
+            save_urdf(model, tmp_path / "out.urdf")
+        assert not (tmp_path / "out.urdf").exists()
+    with pytest.raises(OSError, match="nowhere"):
+        save_urdf(robots.iiwa(), tmp_path / "nowhere" / "out.urdf")
+
+
+def test_float32_round_trip(tmp_path):
+    model = robots.random_tree(1, 6, kinds=("revolute",), dtype=np.float32)
+    again = saved(model, tmp_path / "out.urdf", dtype=np.float32)
+    assert {leaf.dtype for leaf in jax.tree.leaves(again)} == {np.dtype("float32")}
+    np.testing.assert_allclose(again.home, model.home, atol=1e-6)
+    np.testing.assert_allclose(again.inertias, model.inertias, atol=1e-6)
+    assert sum(KINDS[kind].nv for kind in again.topology.kinds) == 6
