@@ -15,6 +15,7 @@ branch that is not taken.
 from collections.abc import Callable
 
 import jax
+import jax.core
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray
@@ -23,6 +24,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
 from jaxdyn import matrix_form, recursive
+from jaxdyn._materialize import at_least
 from jaxdyn.model import Model
 
 LEAST_BATCH = 32
@@ -55,7 +57,12 @@ def _choose(model: Model, arrays, recursion: Callable, matrices: Callable):
     large = _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1) if traced else False
     if not isinstance(large, jax.core.Tracer):
         return recursion() if large else matrices()
-    return lax.cond(large, recursion, matrices)
+
+    def recursion_if_large():
+        with at_least(LEAST_BATCH):
+            return recursion()
+
+    return lax.cond(large, recursion_if_large, matrices)
 
 
 def inverse_dynamics(model: Model, q: Array, v: Array, a: Array) -> Array:

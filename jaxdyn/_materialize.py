@@ -10,9 +10,12 @@ this partition has number 2^32 - 1, is false in every program, whatever the data
 does not know that, and may not delete a branch with a side effect. Its cost is one test of a flag per call.
 
 The primitive is the identity in every other respect: it batches, differentiates forward and in reverse (tangents and
-cotangents are kept as well) and lowers to nothing on other platforms and for single numbers. Were a later XLA to fold the
+cotangents are kept as well) and lowers to nothing on other platforms. Were a later XLA to fold the
 condition, results would stay right and become slow; a test counts the fusions of a compiled recursion.
 """
+
+import contextlib
+import contextvars
 
 import jax
 import numpy as np
@@ -27,6 +30,21 @@ except ImportError:  # pragma: no cover - a jax without them still gives right r
 
 _materialize_p = Primitive("materialize")
 _materialize_p.multiple_results = True
+_least_size = contextvars.ContextVar("least_size", default=1)
+
+
+@contextlib.contextmanager
+def at_least(size: int):
+    """While tracing inside: arrays that turn out smaller than `size` are not kept.
+
+    A branch that is compiled only for large batches would otherwise hold side effects at small ones, and XLA would not
+    remove it.
+    """
+    token = _least_size.set(size)
+    try:
+        yield
+    finally:
+        _least_size.reset(token)
 
 
 def materialize(*values):
@@ -34,17 +52,17 @@ def materialize(*values):
     arrays = [i for i, value in enumerate(values) if isinstance(value, jax.Array)]
     kept = list(values)
     if arrays:
-        for i, value in zip(arrays, _materialize_p.bind(*[values[i] for i in arrays]), strict=True):
+        for i, value in zip(arrays, _materialize_p.bind(*[values[i] for i in arrays], least=_least_size.get()), strict=True):
             kept[i] = value
     return kept
 
 
-def _identity_lowering(ctx, *values):
+def _identity_lowering(ctx, *values, least):
     return list(values)
 
 
-def _cpu_lowering(ctx, *values):
-    worth = [value for value, aval in zip(values, ctx.avals_in, strict=True) if aval.size > 1]
+def _cpu_lowering(ctx, *values, least):
+    worth = [value for value, aval in zip(values, ctx.avals_in, strict=True) if aval.size >= least]
     if worth and hlo is not None:
         never = hlo.CompareOp(
             hlo.PartitionIdOp().result,
@@ -61,17 +79,29 @@ def _cpu_lowering(ctx, *values):
     return list(values)
 
 
-def _on_nonzero(values):
+def _on_nonzero(values, least):
     """Apply the primitive to the entries that are not symbolic zeros."""
     live = [value for value in values if type(value) is not ad.Zero]
-    kept = iter(_materialize_p.bind(*live) if live else ())
+    kept = iter(_materialize_p.bind(*live, least=least) if live else ())
     return [value if type(value) is ad.Zero else next(kept) for value in values]
 
 
-_materialize_p.def_impl(lambda *values: list(values))
-_materialize_p.def_abstract_eval(lambda *avals: list(avals))
+def _batch(values, axes, *, least):
+    return _materialize_p.bind(*values, least=least), axes
+
+
+def _jvp(values, tangents, *, least):
+    return _materialize_p.bind(*values, least=least), _on_nonzero(tangents, least)
+
+
+def _transpose(cotangents, *values, least):
+    return _on_nonzero(cotangents, least)
+
+
+_materialize_p.def_impl(lambda *values, least: list(values))
+_materialize_p.def_abstract_eval(lambda *avals, least: list(avals))
 mlir.register_lowering(_materialize_p, _identity_lowering)
 mlir.register_lowering(_materialize_p, _cpu_lowering, platform="cpu")
-batching.primitive_batchers[_materialize_p] = lambda values, axes: (_materialize_p.bind(*values), axes)
-ad.primitive_jvps[_materialize_p] = lambda values, tangents: (_materialize_p.bind(*values), _on_nonzero(tangents))
-ad.primitive_transposes[_materialize_p] = lambda cotangents, *values: _on_nonzero(cotangents)
+batching.primitive_batchers[_materialize_p] = _batch
+ad.primitive_jvps[_materialize_p] = _jvp
+ad.primitive_transposes[_materialize_p] = _transpose

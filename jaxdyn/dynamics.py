@@ -4,21 +4,23 @@ All functions take one sample, are pure, and can be batched, compiled and differ
 leaf of the model. Velocities and accelerations are the model's v and a (body-fixed, not dq/dt). Joint damping and
 friction are forces of a scene and do not enter here; rotor inertia (armature) does.
 
-Every function raises a ValueError that names the argument when a shape does not fit the model.
+Every function raises a ValueError that names the argument when a shape does not fit the model. Those with a time `t`
+(s) take any `System` in the model's place; a Model's dynamics do not depend on it.
 """
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn import matrix_form
+from jaxdyn import _dispatch, matrix_form
 from jaxdyn.kinematics import TreeFrame, body_twists, sum_to_coordinates, take, tree_frame
 from jaxdyn.matrix_form import momentum, tree_inertias
 from jaxdyn.model import Model, check_shapes
 from jaxdyn.so3 import _product, cross
+from jaxdyn.systems import System, checked_time
 
 
-def mass_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
+def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv"]:
     """Mass matrix M(q) = sum of J_i^T M_i J_i over the bodies + diag(armature), symmetric.
 
     **Arguments:** `q` (nq,).
@@ -28,11 +30,15 @@ def mass_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
 
     Source: Murray, Li & Sastry (1994), eq. 4.19; EQUATIONS sections 2 and 4.
     """
+    if isinstance(model, System):
+        return model.mass_matrix(q, checked_time(model, t, q=q))
     check_shapes(model, q=q)
-    return matrix_form.mass_matrix(model, q)
+    return _dispatch.mass_matrix(model, q)
 
 
-def coriolis_matrix(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "nv nv"]:
+def coriolis_matrix(
+    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0
+) -> Float[Array, "nv nv"]:
     """Coriolis matrix C(q, v) with the skew property: C v are the Coriolis and centrifugal forces, dM/dt = C + C^T.
 
     C = sum of J_i^T (M_i Jdot_i + (M_i ad_{V_i} - ad_{V_i}^T M_i) J_i) in link frames. The matrix is not unique: other
@@ -44,37 +50,44 @@ def coriolis_matrix(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]
 
     Source: EQUATIONS section 4, Cs and erratum E11.
     """
+    if isinstance(model, System):
+        return model.coriolis_matrix(q, v, checked_time(model, t, q=q, v=v))
     check_shapes(model, q=q, v=v)
     return matrix_form.coriolis_matrix(model, q, v)
 
 
-def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
+def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nv"]:
     """Generalised gravity force N(q) = +dV/dq along the velocity coordinates; it stands on the left, with M a.
 
     **Arguments:** `q` (nq,).
 
     **Returns:** (nv,), N m or N: the torques that hold the mechanism at rest. Zero when `model.gravity` is None.
     """
+    if isinstance(model, System):
+        return model.gravity_force(q, checked_time(model, t, q=q))
     check_shapes(model, q=q)
     return matrix_form.gravity_force(model, q)
 
 
-def bias_force(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nv"]:
+def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"]:
     """Bias force h = C(q, v) v + N(q): what tau must be for zero acceleration a.
 
     **Arguments:** `q` (nq,); `v` (nv,).
 
     **Returns:** (nv,), N m or N.
     """
+    if isinstance(model, System):
+        return model.bias_force(q, v, checked_time(model, t, q=q, v=v))
     check_shapes(model, q=q, v=v)
-    return matrix_form.inverse_dynamics(model, q, v, None)
+    return _dispatch.bias_force(model, q, v)
 
 
 def inverse_dynamics(
-    model: Model,
+    model: Model | System,
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     a: Float[Array, " nv"],
+    t=0.0,
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
@@ -87,15 +100,20 @@ def inverse_dynamics(
 
     Source: EQUATIONS section 4.
     """
+    if isinstance(model, System):
+        t = checked_time(model, t, external, q=q, v=v, a=a)
+        return model.inverse_dynamics(q, v, a, t)
     check_shapes(model, q=q, v=v, a=a, external=external)
-    return matrix_form.inverse_dynamics(model, q, v, a, external)
+    tau = _dispatch.inverse_dynamics(model, q, v, a)
+    return tau if external is None else tau - matrix_form.generalized_force(model, q, external)
 
 
 def forward_dynamics(
-    model: Model,
+    model: Model | System,
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     tau: Float[Array, " nv"],
+    t=0.0,
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
@@ -107,13 +125,16 @@ def forward_dynamics(
     **Returns:** (nv,), the rate of v. NaN when M is not positive definite, which a joint that moves no inertia causes;
     the error grows with the condition number of M.
     """
+    if isinstance(model, System):
+        t = checked_time(model, t, external, q=q, v=v, tau=tau)
+        return model.forward_dynamics(q, v, tau, t)
     check_shapes(model, q=q, v=v, tau=tau, external=external)
-    return matrix_form.forward_dynamics(model, q, v, tau, external)
+    if external is not None:
+        tau = tau + matrix_form.generalized_force(model, q, external)
+    return _dispatch.forward_dynamics(model, q, v, tau)
 
 
-def generalized_force(
-    model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]
-) -> Float[Array, " nv"]:
+def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:
     """Generalised forces of wrenches on the bodies: sum of J_i^T f_i.
 
     **Arguments:** `q` (nq,); `external` (nb, 6), wrench (f, tau) ON each body, at its frame's origin and in its axes
@@ -125,13 +146,15 @@ def generalized_force(
     return matrix_form.generalized_force(model, q, external)
 
 
-def kinetic_energy(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, ""]:
+def kinetic_energy(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, ""]:
     """Kinetic energy T = 1/2 sum of V_i . M_i V_i + 1/2 sum of armature v^2 = 1/2 v . M(q) v.
 
     **Arguments:** `q` (nq,); `v` (nv,).
 
     **Returns:** (), J.
     """
+    if isinstance(model, System):
+        return model.kinetic_energy(q, v, checked_time(model, t, q=q, v=v))
     check_shapes(model, q=q, v=v)
     frame = tree_frame(model, q)
     twists = body_twists(model, frame, v)
@@ -139,7 +162,7 @@ def kinetic_energy(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"])
     return energy if model.armature is None else energy + 0.5 * jnp.sum(model.armature * v * v)
 
 
-def potential_energy(model: Model, q: Float[Array, " nq"]) -> Float[Array, ""]:
+def potential_energy(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, ""]:
     """Potential energy of gravity, V = -sum of m_i g . c_i with c_i the world position of each centre of mass.
 
     Zero height is the plane through the world's origin. Far from it the value is large, and small differences of it are
@@ -149,6 +172,8 @@ def potential_energy(model: Model, q: Float[Array, " nq"]) -> Float[Array, ""]:
 
     **Returns:** (), J. Zero when `model.gravity` is None.
     """
+    if isinstance(model, System):
+        return model.potential_energy(q, checked_time(model, t, q=q))
     check_shapes(model, q=q)
     if model.gravity is None:
         return jnp.zeros((), model.home.dtype)

@@ -68,31 +68,29 @@ def _is_concrete(*leaves) -> bool:
 
 
 def _canonical(model: Model):
-    """Home poses, screws and inertias in canonical frames, as arrays, by numpy where the values are known."""
-    concrete = _is_concrete(model.home, model.screws, model.inertias)
-    xp = np if concrete else jnp
-    if concrete:
-        home, screws, inertias = (np.asarray(leaf) for leaf in (model.home, model.screws, model.inertias))
-        screws = screws * model.topology.screw_mask
+    """Home poses, screws and inertias in canonical frames, as arrays; by numpy where the values are known."""
+    topology = model.topology
+    if _is_concrete(model.home, model.screws):
+        xp, home, screws = np, np.asarray(model.home), np.asarray(model.screws) * topology.screw_mask
     else:
-        (home, screws), inertias = geometry(model), model.inertias
-    kinds = model.topology.kinds
-    dtype = home.dtype
-    angular = np.array([kind in SCREW_KINDS and kind != "prismatic" for kind in kinds])
-    linear = np.array([kind == "prismatic" for kind in kinds])
-    up = xp.asarray(np.eye(3)[2], dtype)
-    direction = xp.where(angular[:, None], screws[:, 3:], xp.where(linear[:, None], screws[:, :3], up[None]))
+        xp, (home, screws) = jnp, geometry(model)
+    angular = np.array([kind in SCREW_KINDS and kind != "prismatic" for kind in topology.kinds])
+    linear = np.array([kind == "prismatic" for kind in topology.kinds])
+    up = xp.asarray(np.eye(3)[2:], home.dtype)
+    direction = xp.where(angular[:, None], screws[:, 3:], xp.where(linear[:, None], screws[:, :3], up))
     rate = xp.sqrt(xp.sum(direction**2, 1))
     turn = _aligning(direction / rate[:, None], xp)
     turn_t = xp.swapaxes(turn, 1, 2)
-    outer = xp.concatenate([turn_t, xp.eye(3, dtype=dtype)[None]])[np.array(model.topology.parents, int)]
+    outer = xp.concatenate([turn_t, xp.eye(3, dtype=home.dtype)[None]])[np.array(topology.parents, int)]
     rotation = outer @ home[:, :3, :3] @ turn
     shift = (outer @ home[:, :3, 3:])[..., 0]
     slide = (turn_t @ screws[:, :3, None])[..., 0]
+    known = xp is np and _is_concrete(model.inertias)
+    inertias = np.asarray(model.inertias) if known else model.inertias
     first = (turn_t @ inertias[:, 1:4, None])[..., 0]
     full = inertias[:, 4:][:, np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])]
     inertia = (turn_t @ full @ turn)[:, np.array(UPPER)[:, 0], np.array(UPPER)[:, 1]]
-    return concrete, rotation, shift, rate, slide, inertias[:, 0], first, inertia
+    return (xp is np, rotation, shift, rate, slide), (known, inertias[:, 0], first, inertia)
 
 
 def _numbers(array, concrete: bool, rounding: float = 0.0):
@@ -107,17 +105,17 @@ def _numbers(array, concrete: bool, rounding: float = 0.0):
 
 
 def _bodies(model: Model) -> list[_Body]:
-    concrete, rotation, shift, rate, slide, mass, first, inertia = _canonical(model)
-    eps = 4 * float(np.finfo(rotation.dtype).eps)
+    (placed, rotation, shift, rate, slide), (weighed, mass, first, inertia) = _canonical(model)
+    eps = 4 * float(np.finfo(model.home.dtype).eps)
     return [
         _Body(
-            _numbers(rotation[i], concrete, eps),
-            _numbers(shift[i], concrete),
-            _numbers(rate[i], concrete, eps),
-            _numbers(slide[i], concrete) if kind == "helical" else ZERO3,
-            _numbers(mass[i], concrete),
-            _numbers(first[i], concrete),
-            _numbers(inertia[i], concrete),
+            _numbers(rotation[i], placed, eps),
+            _numbers(shift[i], placed),
+            _numbers(rate[i], placed, eps),
+            _numbers(slide[i], placed) if kind == "helical" else ZERO3,
+            _numbers(mass[i], weighed),
+            _numbers(first[i], weighed),
+            _numbers(inertia[i], weighed),
         )
         for i, kind in enumerate(model.topology.kinds)
     ]

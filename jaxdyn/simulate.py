@@ -16,9 +16,19 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
+from jaxdyn.assembly import residuals
+from jaxdyn.constrained_motion import (
+    check_start,
+    chosen_method,
+    consistent,
+    constrained_acceleration,
+    multipliers,
+    onto_constraints,
+)
+from jaxdyn.constraints.base import state_dtype
 from jaxdyn.dynamics import forward_dynamics, kinetic_energy, potential_energy
 from jaxdyn.kinematics import frame_pose
-from jaxdyn.model import Model, configuration_rate, frame_index, neutral, normalize
+from jaxdyn.model import Model, frame_index, neutral
 from jaxdyn.scene import Scene, as_pytree, checked_force
 from jaxdyn.solvers import ProjectedSolver
 from jaxdyn.solvers.choice import (
@@ -30,8 +40,9 @@ from jaxdyn.solvers.choice import (
     progress_meter,
     stepping,
 )
+from jaxdyn.systems import has_quaternions, retract, velocity_to_rate
 
-_OUTPUTS = ("energy", "power", "work", "acceleration")
+_OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
 _POSE = "pose:"
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
@@ -41,6 +52,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
     nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
     nonfinite_state = "The state became NaN or infinite."
+    inconsistent_start = "The initial state is not on the constraints."
+    open_constraints = "The constraints opened, and the projection could not close them."
 
 
 _ADVICE = {
@@ -72,6 +85,8 @@ class Solution(eqx.Module):
     power: Float[Array, " nt"] | None = None
     work: Float[Array, " nt"] | None = None
     acceleration: Float[Array, "nt nv"] | None = None
+    multipliers: Float[Array, "nt nc"] | None = None
+    constraint_residual: Float[Array, "nt 2"] | None = None
     poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
 
     @property
@@ -142,6 +157,9 @@ def simulate(
     q0, v0, ts = (_as_array(x) for x in (q0, v0, ts))
     _check_state(scene, q0, v0)
     _check_times(ts)
+    if chosen_method(scene, method) != "free" and is_concrete((scene, q0, v0, ts)):
+        state = [jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])]
+        check_start(scene, *state)
     control = None if control is None else as_pytree(control, "control")
     solver = checked_method(solver, stepsize)
     adjoint = checked_adjoint(adjoint, solver)
@@ -153,7 +171,7 @@ def simulate(
         "progress": bool(progress),
         "max_steps": checked_step_limit(max_steps, ts, stepsize, adjoint),
     }
-    dtype = scene.system.home.dtype if isinstance(scene.system, Model) else jnp.result_type(q0, 1.0)
+    dtype = state_dtype(scene.system)
     numbers = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
     numbers.append(jnp.asarray(stepsize, dtype) if is_fixed(stepsize) else stepsize)
     # In a trace, numbers that are known stay known; a nested `jit` would hide them. Elsewhere, compile once per shape.
@@ -189,17 +207,22 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
     def derivative(t, y, args):
         # The scene comes through args: the continuous adjoint differentiates what it finds there, not closures.
         system = args[0].system
-        q, v = _retract(system, y[0]), y[1]
+        q, v = retract(system, y[0]), y[1]
         force = effort(args, q, v, t)
-        rates = _configuration_rate(system, q, v), acceleration(args[0], q, v, t, force)
+        rates = velocity_to_rate(system, q, v), acceleration(args[0], q, v, t, force)
         return (*rates, power(force, v)) if len(y) == 3 else rates
 
-    q0 = _retract(system, q0)
+    q0 = retract(system, q0)
     good = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
     # A bad lane of a batch takes a harmless start, so that it does not make the others wait.
     harmless = neutral(system).astype(q0.dtype) if isinstance(system, Model) else jnp.zeros_like(q0)
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
     args = scene, control
+    held = jnp.asarray(True)
+    if scene.constraints:
+        held = consistent(scene, q0, v0, ts[0])
+        if _projects(scene, options["method"]):
+            q0, v0 = onto_constraints(scene, q0, v0, ts[0])
     eqx.filter_eval_shape(effort, args, q0, v0, ts[0])  # refuses callbacks of a wrong shape before diffrax meets them
     y0 = (q0, v0, jnp.zeros((), q0.dtype)) if "work" in outputs else (q0, v0)
     solved, time_reached = _integrate(derivative, y0, ts, args, steps, options)
@@ -207,20 +230,31 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
     q, v, *work = (jnp.concatenate([start[None], later]) for start, later in zip(y0, solved.ys, strict=True))
     reached = good & jnp.isfinite(q).all(1) & jnp.isfinite(v).all(1)
     q, v = jnp.where(reached[:, None], q, q0[None]), jnp.where(reached[:, None], v, v0[None])
-    q = jax.vmap(_retract, (None, 0))(system, q)
+    if _projects(scene, options["method"]):
+        q, v = jax.vmap(onto_constraints, (None, 0, 0, 0))(scene, q, v, ts)
+    else:
+        q = jax.vmap(retract, (None, 0))(system, q)
     result = RESULTS.promote(solved.result)
     result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
+    if _projects(scene, options["method"]):
+        closed = jax.vmap(consistent, (None, 0, 0, 0))(scene, q, v, ts)
+        result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
+    result = RESULTS.where(held, result, RESULTS.inconsistent_start)
     result = RESULTS.where(good, result, RESULTS.nonfinite_start)
 
     def report(q, v, t):
         values = {}
-        force = effort(args, q, v, t) if {"power", "acceleration"} & set(outputs) else None
+        force = effort(args, q, v, t) if {"power", "acceleration", "multipliers"} & set(outputs) else None
         if "energy" in outputs:
-            values["energy"] = kinetic_energy(system, q, v) + potential_energy(system, q)
+            values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
         if "power" in outputs:
             values["power"] = power(force, v)
         if "acceleration" in outputs:
             values["acceleration"] = acceleration(scene, q, v, t, force)
+        if "multipliers" in outputs:
+            values["multipliers"] = multipliers(scene, q, v, t, force)
+        if "constraint_residual" in outputs:
+            values["constraint_residual"] = residuals(scene, q, v, t)
         frames = [name.removeprefix(_POSE) for name in outputs if name.startswith(_POSE)]
         return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
 
@@ -240,7 +274,9 @@ def _integrate(derivative, y0, ts, args, steps, options):
     """diffrax's solution at ts[1:], and the time it came to."""
     term, adjoint = diffrax.ODETerm(derivative), options["adjoint"]
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
-    if _has_quaternions(args[0].system):
+    if _projects(args[0], options["method"]):
+        solver = ProjectedSolver(solver, _onto_constraints)
+    elif has_quaternions(args[0].system):
         solver = ProjectedSolver(solver, _onto_manifold)
     saves = diffrax.SubSaveAt(ts=ts[1:])
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else
@@ -268,7 +304,16 @@ def _integrate(derivative, y0, ts, args, steps, options):
 
 def _onto_manifold(t, y, args):
     scene, _ = args
-    return (normalize(scene.system, y[0]), *y[1:]), diffrax.RESULTS.successful
+    return (retract(scene.system, y[0]), *y[1:]), diffrax.RESULTS.successful
+
+
+def _onto_constraints(t, y, args):
+    # Steps that will be rejected may be too long to be projected, so a projection that fails does not end the run.
+    return (*onto_constraints(args[0], y[0], y[1], t), *y[2:]), diffrax.RESULTS.successful
+
+
+def _projects(scene: Scene, method: str) -> bool:
+    return chosen_method(scene, method) == "projected"
 
 
 def _nothing(t, y, args):
@@ -277,30 +322,13 @@ def _nothing(t, y, args):
 
 def _dynamics(scene: Scene, method: str) -> Callable:
     """The acceleration `f(scene, q, v, t, force) -> (nv,)` that the scene and the method call for."""
-    if scene.constraints:
-        raise ValueError(
-            f"scene lists {len(scene.constraints)} constraints, and simulate has no constrained dynamics; "
-            "remove them from the scene"
-        )
-    if method not in ("auto", "free"):
-        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free'")
+    if chosen_method(scene, method) != "free":
+        return constrained_acceleration
 
     def free(scene, q, v, t, force):
-        return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force)
+        return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force, t)
 
     return free
-
-
-def _has_quaternions(system) -> bool:
-    return isinstance(system, Model) and any(kind in ("spherical", "free") for kind in system.topology.kinds)
-
-
-def _retract(system, q):
-    return normalize(system, q) if _has_quaternions(system) else q
-
-
-def _configuration_rate(system, q, v):
-    return configuration_rate(system, q, v) if isinstance(system, Model) else v
 
 
 def _as_array(value):
@@ -330,7 +358,7 @@ def _check_state(scene: Scene, q0, v0) -> None:
             )
         if is_concrete(value):
             _check_finite(name, value)
-    if not (_has_quaternions(scene.system) and is_concrete(q0)):
+    if not (has_quaternions(scene.system) and is_concrete(q0)):
         return
     topology = scene.system.topology
     for joint, kind, place in zip(topology.joint_names, topology.kinds, topology.q_slices, strict=True):

@@ -55,8 +55,14 @@ class Bridge:
 
 
 def quick(function):
-    """`jax.jit` without LLVM's optimiser, which is most of a compile: for tests that compare numbers of many models."""
-    return jax.jit(function, compiler_options={"xla_backend_optimization_level": "0"})
+    """`jax.jit` that compiles fast and runs slowly, for tests that compare numbers of many models.
+
+    LLVM's optimiser and XLA's newer fusion emitters are most of a compile; neither changes what is computed.
+    """
+    return jax.jit(
+        function,
+        compiler_options={"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": False},
+    )
 
 
 def to_pinocchio(model: Model) -> tuple[pin.Model, Bridge]:
@@ -148,8 +154,7 @@ def load_robot(path: str, *, floating=False, lock=()) -> tuple[pin.Model, Model,
 
 
 def random_tree(seed: int, kinds, *, parents=None, armature=True, dtype=jnp.float64) -> Model:
-    """A random tree with the given joint kinds: skew placements, axes beside the body origins, tapering physical
-    inertias.
+    """A random tree with the given joint kinds: skew placements and axes, tapering physical inertias.
 
     Parents are drawn so that every subtree is listed without gaps, or given. Each body carries one extra frame.
     """

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 from pinocchio_bridge import quick
 
 from jaxdyn.building import ModelBuilder
@@ -217,25 +216,48 @@ def all_forces(arm, coefficient):
     )
 
 
-def test_derivatives_batches_and_scenes_as_arguments(arm):
-    """Both modes, second order, at a general point and at rest; a scene is an array pytree for jit and vmap."""
+def test_derivatives():
+    """Reverse mode and forward over reverse against central differences at a general point; finite at rest."""
+    builder = ModelBuilder("leg")
+    moments = (0.02, 0.03, 0.04)
+    builder.add_body("hip", joint="spherical", inertia=(1.0, (0, 0.1, 0), moments))
+    builder.add_body("knee", "hip", "revolute", axis=(0, 1, 0), inertia=(0.5, (0, 0, -0.2), moments), pose=(0, 0, -0.4))
+    builder.add_frame("foot", "knee", ((0.1, 0.0, -0.3), (0.2, 0.3, 0.4)))
+    leg = builder.build()
 
-    def total(scene, q, v):
-        return jnp.sum(scene.applied_force(q, v) * jnp.arange(1.0, 14.0))
+    def total(z, q):
+        force = all_forces(leg, z[0]).applied_force(integrate(leg, q, z[1:5]), z[5:])
+        return jnp.sum(force * jnp.arange(1.0, 5.0))
 
-    def of_all(coefficient, dq, v, q):
-        return total(all_forces(arm, coefficient), integrate(arm, q, dq), v)
+    @quick
+    @jax.vmap
+    def derivatives(z, q):
+        return total(z, q), jax.grad(total)(z, q), jax.hessian(total)(z, q)
 
+    q, v = sample(leg, 11)
+    point, step = np.concatenate([[0.7], np.zeros(4), v]), 1e-5
+    rest = np.concatenate([[0.7], np.zeros(8)])
+    points = np.concatenate([point + step * np.eye(9), point - step * np.eye(9), [point, rest]])
+    places = np.concatenate([np.tile(q, (19, 1)), [neutral(leg)]])
+    value, gradient, hessian = (np.asarray(x) for x in derivatives(jnp.asarray(points), jnp.asarray(places)))
+    # Central differences of step 1e-5: truncation 1e-10 of the third derivative, rounding 1e-11 of the value.
+    slope = (value[:9] - value[9:18]) / (2 * step)
+    np.testing.assert_allclose(gradient[18], slope, rtol=1e-7, atol=1e-7)
+    curvature = (gradient[:9] - gradient[9:18]) / (2 * step)
+    np.testing.assert_allclose(hessian[18], curvature, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(hessian[18], hessian[18].T, rtol=1e-11, atol=1e-11)
+    assert np.isfinite(gradient[19]).all() and np.isfinite(hessian[19]).all() and np.any(hessian[19])
+
+
+def test_scenes_are_arguments_and_batches(arm):
+    """A scene of library forces is an array pytree for jit, and vmap reaches its leaves."""
     q, v = sample(arm, 11)
-    point = jnp.asarray(0.7), jnp.zeros(13)
-    check_grads(jax.jit(lambda *x: of_all(*x, q)), (*point, v), order=2, atol=1e-5, rtol=1e-5)
-    rest = quick(jax.hessian(of_all, argnums=(0, 1, 2)))(*point, jnp.zeros(13), neutral(arm))
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(rest))
+    applied = quick(lambda scene: scene.applied_force(q, v))
     coefficients = jnp.asarray([0.0, 0.3, 2.0])
     scenes = jax.vmap(lambda c: all_forces(arm, c))(coefficients)
-    axes = jax.tree.map(lambda x, y: 0 if x.ndim > jnp.ndim(y) else None, scenes, all_forces(arm, 0.0))
-    batch = quick(jax.vmap(total, (axes, None, None)))(scenes, q, v)
-    one_by_one = [quick(total)(all_forces(arm, c), q, v) for c in coefficients]
+    axes = jax.tree.map(lambda x, y: 0 if x.ndim > y.ndim else None, scenes, all_forces(arm, 0.0))
+    batch = quick(jax.vmap(lambda scene: scene.applied_force(q, v), (axes,)))(scenes)
+    one_by_one = [applied(all_forces(arm, c)) for c in coefficients]
     np.testing.assert_allclose(batch, one_by_one, rtol=1e-13)
 
 

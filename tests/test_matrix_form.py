@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, load_robot, make_model, quick, random_states, random_tree
 
-from jaxdyn import dynamics, kinematics
+from jaxdyn import dynamics, kinematics, matrix_form
 from jaxdyn.link_form import newton_euler_matrices
 from jaxdyn.model import configuration_rate
 
@@ -32,12 +32,12 @@ def case(name):
         link = newton_euler_matrices(model, q, v, tip=tip)
         flow = (configuration_rate(model, q, v),)
         world = {
-            "mass_matrix": dynamics.mass_matrix(model, q),
-            "mass_matrix_rate": jax.jvp(lambda q: dynamics.mass_matrix(model, q), (q,), flow)[1],
+            "mass_matrix": matrix_form.mass_matrix(model, q),
+            "mass_matrix_rate": jax.jvp(lambda q: matrix_form.mass_matrix(model, q), (q,), flow)[1],
             "coriolis_matrix": dynamics.coriolis_matrix(model, q, v),
             "gravity_force": dynamics.gravity_force(model, q),
-            "inverse_dynamics": dynamics.inverse_dynamics(model, q, v, a),
-            "bias_force": dynamics.bias_force(model, q, v),
+            "inverse_dynamics": matrix_form.inverse_dynamics(model, q, v, a),
+            "bias_force": matrix_form.inverse_dynamics(model, q, v, None),
             "tip": kinematics.body_jacobian(model, q, tip),
         }
         products = {name: getattr(link, name) for name in ("mass_matrix", "phi", "Jt", "C0", "Cs", "jacobians")}
@@ -93,18 +93,18 @@ def test_tip_wrench_by_virtual_power():
     on_body = -m.Pt[0][:, 6 * body : 6 * body + 6].T @ wrench
     external = jnp.zeros((model.nb, 6)).at[body].set(on_body)
     zero = jnp.zeros(model.nv)
-    tau = quick(dynamics.inverse_dynamics)(model, q[0], v[0], zero, external=external)
+    tau = quick(matrix_form.inverse_dynamics)(model, q[0], v[0], zero, external)
     assert_close(tau, case("panda")[4]["bias_force"][0] + link["Jt"][0].T @ wrench, 1e-12)
 
 
 @quick
 def printed_quantities(model, q, v, a):
     return (
-        dynamics.mass_matrix(model, q),
+        matrix_form.mass_matrix(model, q),
         dynamics.coriolis_matrix(model, q, v) @ v,
         dynamics.gravity_force(model, q),
         dynamics.christoffel_symbols(model, q),
-        dynamics.inverse_dynamics(model, q, v, a),
+        matrix_form.inverse_dynamics(model, q, v, a),
         dynamics.potential_energy(model, q),
     )
 
@@ -173,7 +173,7 @@ def test_derivative_of_the_mass_matrix(parents):
     def values(model, q, v):
         return (
             dynamics.mass_matrix_derivative(model, q),
-            jax.jacfwd(lambda q: dynamics.mass_matrix(model, q))(q),
+            jax.jacfwd(lambda q: matrix_form.mass_matrix(model, q))(q),
             dynamics.christoffel_symbols(model, q),
             dynamics.coriolis_matrix(model, q, v),
         )

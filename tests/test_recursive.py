@@ -2,6 +2,7 @@
 
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -18,8 +19,7 @@ from jaxdyn.joints import KINDS
 ALL = list(KINDS)
 TREES = {
     "every kind": lambda: random_tree(1, ALL),
-    "every kind, no armature": lambda: random_tree(2, [*ALL[::-1], "revolute"], armature=False),
-    "floating": lambda: random_tree(3, ["free", "revolute", "prismatic", "revolute", "helical", "spherical"]),
+    "floating, no armature": lambda: random_tree(3, ["free", "revolute", "prismatic", "helical", "spherical"], armature=False),
 }
 
 
@@ -46,9 +46,11 @@ def test_against_pinocchio(name):
     data = source.createData()
     q, v, a, tau, _ = random_states(model, 4, 7)
     got = quick(jax.vmap(everything(model)))(q, v, a, tau)
-    traced = quick(lambda model, *x: jax.vmap(everything(model))(*x))(model, q, v, a, tau)
-    for key in got:
-        assert_close(traced[key], got[key], 1e-12, key)
+    # The same with the model's numbers unknown while tracing, and the other implementation.
+    traced = quick(lambda model, *x: jax.vmap(lambda *y: recursive.aba(model, *y))(*x))(model, q, v, tau)
+    assert_close(traced, got["aba"], 1e-12, "traced")
+    other = quick(jax.vmap(lambda *y: matrix_form.forward_dynamics(model, *y)))(q, v, tau)
+    assert_close(other, got["aba"], 1e-10, "matrix form")
     for i, q_pin in enumerate(bridge.q_to_pinocchio(q)):
         vi, ai, ti = (np.asarray(x[i]) for x in (v, a, tau))
         mass = pin.crba(source, data, q_pin)
@@ -70,29 +72,14 @@ def test_root_of_a_chain_is_triangular():
     assert (np.diag(root) > 0).all()
 
 
-def test_matrix_form_agrees():
-    for name, tree in TREES.items():
-        model = tree()
-        q, v, a, tau, _ = random_states(model, 2, 11)
-
-        def both(q, v, a, tau, model=model):
-            return (
-                (recursive.rnea(model, q, v, a), matrix_form.inverse_dynamics(model, q, v, a)),
-                (recursive.aba(model, q, v, tau), matrix_form.forward_dynamics(model, q, v, tau)),
-                (recursive.crba(model, q), matrix_form.mass_matrix(model, q)),
-            )
-
-        for ours, other in quick(jax.vmap(both))(q, v, a, tau):
-            assert_close(ours, other, 1e-10, name)
-
-
 def test_float32():
     model = as_dtype(TREES["every kind"](), jnp.float32)
     q, v, a, _, _ = random_states(model, 3, 5)
     got = quick(jax.vmap(lambda q, v, a: recursive.rnea(model, q, v, a)))(q, v, a)
     assert got.dtype == jnp.float32
     wide = as_dtype(model, jnp.float64)
-    want = jax.vmap(lambda q, v, a: matrix_form.inverse_dynamics(wide, q, v, a))(*(jnp.asarray(x, jnp.float64) for x in (q, v, a)))
+    exact = quick(jax.vmap(lambda q, v, a: matrix_form.inverse_dynamics(wide, q, v, a)))
+    want = exact(*(jnp.asarray(x, jnp.float64) for x in (q, v, a)))
     # A dozen bodies, each a few roundings of 6e-8 on partly cancelling sums.
     assert_close(got, want, 2e-5)
 
@@ -152,9 +139,10 @@ def test_known_zeros_are_left_out():
     """A robot whose numbers are known while tracing costs fewer operations than the same robot as an argument."""
     _, model, _ = load_robot("panda_description/urdf/panda.urdf", lock=("finger",))
     states = [jnp.zeros((64, 7)) for _ in range(3)]
-    known = quick(jax.vmap(lambda *x: recursive.rnea(model, *x))).lower(*states).compile()
-    given = quick(lambda m, *x: jax.vmap(lambda *y: recursive.rnea(m, *y))(*x)).lower(model, *states).compile()
-    assert known.cost_analysis()["flops"] < 0.6 * given.cost_analysis()["flops"]
+    known = jax.make_jaxpr(jax.vmap(lambda *x: recursive.rnea(model, *x)))(*states)
+    given = jax.make_jaxpr(lambda m, *x: jax.vmap(lambda *y: recursive.rnea(m, *y))(*x))(model, *states)
+    known, given = (sum(eqn.primitive.name in ("mul", "add", "sub") for eqn in j.eqns) for j in (known, given))
+    assert known < 0.6 * given, (known, given)
 
 
 def test_dispatch_follows_the_batch():
@@ -165,18 +153,17 @@ def test_dispatch_follows_the_batch():
     def f(q, v, tau):
         return _dispatch.forward_dynamics(model, q, v, tau)
 
-    def fusions(g, *x):
-        return quick(g).lower(*x).compile().as_text().count(" fusion(")
+    def kept(g, *x):
+        """Number of `materialize` calls in the compiled program: the mark of the recursion."""
+        return quick(g).lower(*x).compile().as_text().count(" conditional(")
 
-    few = fusions(f, q[0], v[0], tau[0])
-    assert fusions(jax.vmap(f), q[:4], v[:4], tau[:4]) < 2 * few
+    assert kept(f, q[0], v[0], tau[0]) == kept(jax.vmap(f), q[:4], v[:4], tau[:4]) == 0
     split = [x.reshape(8, 8, -1) for x in (q, v, tau)]
+    want = quick(jax.vmap(lambda *x: matrix_form.forward_dynamics(model, *x)))(q, v, tau)
     for g, args in ((jax.vmap(f), (q, v, tau)), (jax.vmap(jax.jit(f)), (q, v, tau)), (jax.vmap(jax.vmap(f)), split)):
-        assert fusions(g, *args) > 3 * few
-        assert_close(quick(g)(*args).reshape(64, -1), jax.vmap(f)(q[:64], v, tau), 1e-11)
-    want = matrix_form.forward_dynamics(model, q[0], v[0], tau[0])
-    assert_close(f(q[0], v[0], tau[0]), want, 1e-12)
-    assert_close(quick(jax.vmap(f))(q, v, tau)[0], want, 1e-10)
+        assert kept(g, *args) > 10
+        assert_close(quick(g)(*args).reshape(64, -1), want, 1e-10)
+    assert_close(f(q[0], v[0], tau[0]), want[0], 1e-12)
 
 
 def test_derivatives_of_forward_dynamics():
@@ -185,12 +172,8 @@ def test_derivatives_of_forward_dynamics():
     q, v, _, tau, _ = random_states(model, 40, 3)
 
     def loss(leaves, q, v, tau):
-        import equinox as eqx
-
         here = eqx.combine(leaves, model)
         return jnp.sum(jnp.sin(_dispatch.forward_dynamics(here, q, v, tau)))
-
-    import equinox as eqx
 
     leaves = eqx.filter(model, eqx.is_array)
     single = quick(jax.grad(loss, (0, 1, 2, 3)))(leaves, q[0], v[0], tau[0])

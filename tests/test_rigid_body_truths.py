@@ -90,7 +90,7 @@ def test_jacobi(motions, row):
     ts, _, _, solution = motions
     start, period, end = (np.asarray(x) for x in EULER_TOP[row])
     omega, found = jacobi(MOMENTS, start, ts)
-    np.testing.assert_allclose(found, period, rtol=1e-12)
+    np.testing.assert_allclose(found, period, rtol=2e-11)  # K(m) of the first row, where 1 - m = 4e-6
     # The unstable row multiplies errors by about 1e3 on the way to its first turn.
     np.testing.assert_allclose(omega[-1], end, rtol=0, atol=1e-11)
     for name, place in (("ball", slice(0, 3)), ("flyer", slice(6, 9))):
@@ -132,7 +132,8 @@ def test_flight_and_conserved_energy(motions):
     np.testing.assert_allclose(solution.q[..., 4:7], path, rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(solution.q[..., 11:14], fall + np.zeros((4, 1, 1)), rtol=1e-10, atol=1e-9)
     energy = np.asarray(solution.energy)
-    np.testing.assert_allclose(energy, energy[:, :1] + 0 * energy, rtol=1e-10)
+    # It is a small difference: after 2 km of fall each of its two parts is 25 kJ.
+    np.testing.assert_allclose(energy, energy[:, :1] + 0 * energy, rtol=0, atol=1e-10 * 25e3)
     for place in (slice(0, 4), slice(7, 11), slice(14, 18)):
         np.testing.assert_allclose(np.linalg.norm(solution.q[..., place], axis=-1), 1, rtol=4e-16)
 

@@ -117,14 +117,14 @@ def make_chart(model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_sca
     numbers = np.asarray(model.inertias, np.float64)
     bodies = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()
     matrices = [_pseudo_inertia(numbers[i]) for i in bodies]
-    bad = [model.body_names[i] for i, P in zip(bodies, matrices, strict=True) if not _positive_definite(P)]
+    bad = [model.body_names[i] for i, P in zip(bodies, matrices, strict=True) if not _is_feasible(P, inertia)]
     if bad:
         raise ValueError(
             f"inertia of {', '.join(bad)} is not that of a solid body (pseudo-inertia not positive definite): "
-            "a feasible fit cannot start there; repair it first with jd.repair_inertias(model), or give rods and points "
-            "some thickness"
+            "a feasible fit cannot start there; repair it first with jd.repair_inertias(model), give rods and points "
+            "some thickness, or fit inertia='mass' alone"
         )
-    factors = np.array([np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1] for P in matrices]).reshape(-1, 4, 4)
+    factors = np.array([_factor(P, inertia) for P in matrices]).reshape(-1, 4, 4)
     unit = 0.1 * np.asarray(tau_scale, np.float64)
     unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
     per = {"viscous": v_scale, "coulomb": np.ones(model.nv), "offset": np.ones(model.nv), "armature": a_scale}
@@ -171,6 +171,15 @@ def _pseudo_inertia(numbers: np.ndarray) -> np.ndarray:
     return np.block([[sigma, numbers[1:4, None]], [numbers[None, 1:4], numbers[:1, None]]])
 
 
-def _positive_definite(matrix: np.ndarray) -> bool:
+def _is_feasible(matrix: np.ndarray, inertia: str) -> bool:
+    """Positive definite; rods and points (semidefinite) will do where the density alone is fitted."""
     values = np.linalg.eigvalsh(matrix)
-    return bool(values[0] > 1e-14 * values[-1])
+    return bool(values[0] > (1e-14 if inertia == "full" else -1e-9) * values[-1])
+
+
+def _factor(matrix: np.ndarray, inertia: str) -> np.ndarray:
+    """U0 with U0 U0^T = P0: upper triangular, or any root where the density alone is fitted."""
+    if inertia == "full":
+        return np.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
+    values, vectors = np.linalg.eigh(matrix)
+    return vectors * np.sqrt(np.maximum(values, 0))

@@ -21,7 +21,7 @@ from jaxdyn.model import Model
 
 # A fit is never trusted beyond this share of the torque: rounding and noise-free logs stay well posed.
 _FINEST = 1e-6
-_STEPS = {"newton": 100, "lbfgs": 3000, "adam": 5000}
+_STEPS = {"newton": 100, "lbfgs": 3000, "adam": 10000}
 
 
 class Problem(eqx.Module):

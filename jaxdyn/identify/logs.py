@@ -50,7 +50,7 @@ class Log(eqx.Module):
     def __len__(self) -> int:
         return self.t.shape[0]
 
-    def __getitem__(self, rows: slice) -> "Log":
+    def __getitem__(self, rows) -> "Log":
         """The samples of a slice, as a log."""
         if not isinstance(rows, slice):
             raise ValueError(f"a log is indexed by slices, got {rows!r}; one sample is log.q[i], log.v[i], ...")
@@ -62,8 +62,8 @@ def split(log: Log, fraction: float = 0.7) -> tuple[Log, Log]:
 
     **Raises:** ValueError when the fraction is not between 0 and 1, or one part would have no sample.
     """
-    cut = int(fraction * len(log))
-    if not 0 < fraction < 1 or not 0 < cut < len(log):
+    cut = int(fraction * len(log)) if 0 < fraction < 1 else 0
+    if not 0 < cut < len(log):
         raise ValueError(f"fraction={fraction} of {len(log)} samples leaves one part empty; take one between 0 and 1")
     return log[:cut], log[cut:]
 
@@ -116,7 +116,9 @@ def from_raw(
     from scipy.signal import butter, filtfilt
 
     raw = Log(t, q, tau=tau, joint_names=joint_names)
-    t, q, tau = np.asarray(raw.t, np.float64), np.asarray(raw.q, np.float64), np.asarray(raw.tau, np.float64)
+    t = np.asarray(raw.t, np.float64)
+    q = np.asarray(raw.q, np.float64)
+    tau = np.asarray(raw.tau, np.float64)
     if q.shape[1] != tau.shape[1]:
         raise ValueError(
             f"q has {q.shape[1]} columns and tau {tau.shape[1]}: rates by differences need one coordinate per joint; "
@@ -138,7 +140,8 @@ def from_raw(
             f"period of cutoff={cutoff} Hz; cut the log there or lower the cut-off"
         )
     grid = np.linspace(t[0], t[-1], n)
-    numerator, denominator = butter(order, 2 * cutoff / rate)
+    # scipy's annotations leave open what `output` gives.
+    numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
 
     def uniform(x):
         return np.stack([np.interp(grid, t, column) for column in x.T], axis=1)

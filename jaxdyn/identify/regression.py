@@ -11,7 +11,7 @@ from jaxdyn import dynamics
 from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.joints import KINDS
-from jaxdyn.model import Model, random_configuration
+from jaxdyn.model import Model, integrate, neutral
 
 _NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 # The numbers that stay when a body's ten are grouped, for a joint about z: Khalil & Dombre keep them and put m, m cz
@@ -73,6 +73,11 @@ def regressor(model: Model, q, v, a, *, v_s=0.01) -> np.ndarray:
         part = _regressor_block(model, q[rows], v[rows], a[rows], jnp.asarray(v_s, model.home.dtype))
         parts.append(np.asarray(part, np.float64)[: n - start])
     return np.concatenate(parts)
+
+
+@eqx.filter_jit
+def _moved(model, ways):
+    return jax.vmap(lambda way: integrate(model, neutral(model), way))(ways)
 
 
 @eqx.filter_jit
@@ -167,9 +172,9 @@ def base_parameters(model: Model, terms=(), *, v_s: float = 0.01, seed: int = 0)
     p = len(names)
     count = max(2 * p // max(model.nv, 1) + 1, 30)
     generator = np.random.default_rng(seed)
-    keys = jax.random.split(jax.random.key(seed), count)
-    q = eqx.filter_jit(jax.vmap(random_configuration, (None, 0)))(model, keys)
-    v, a = generator.normal(size=(2, count, model.nv))
+    # Away from the neutral configuration by up to about half a turn; limits do not matter to what is identifiable.
+    way, v, a = generator.normal(size=(3, count, model.nv))
+    q = _moved(model, jnp.asarray(2 * way, model.home.dtype))
     W = regressor(model, q, v, a, v_s=v_s)[:, :, free_columns(model, terms)].reshape(-1, p)
     scale = np.linalg.norm(W, axis=0)
     # A column of rounding errors is zero too.
@@ -191,7 +196,7 @@ def base_parameters(model: Model, terms=(), *, v_s: float = 0.01, seed: int = 0)
     if rank != len(independent):
         raise ValueError(
             f"base parameters of {model.name!r} are not clear in {model.home.dtype}: {len(independent)} by "
-            f"elimination, {rank} by singular values; use a float64 model (jax_enable_x64) or check for joints that coincide"
+            f"elimination, {rank} by singular values; use a float64 model (jax_enable_x64)"
         )
     dependent = np.setdiff1d(np.arange(p), independent)
     beta = np.linalg.lstsq(scaled, (W / scale)[:, dependent], rcond=None)[0]

@@ -223,7 +223,7 @@ def _flat_loss(y, args):
 
 def _scaled_errors(model, data: Segments, q, v, scale):
     far = jax.vmap(jax.vmap(lambda a, b: difference(model, a, b)))(data.q, q)
-    return far / scale[0], (v - data.v) / scale[1]
+    return far / scale[0][None, None], (v - data.v) / scale[1][None, None]
 
 
 def _motion_scale(model, data: Segments) -> Float[Array, "2 nv"]:

@@ -1,0 +1,206 @@
+"""Putting a scene on its constraints: `assemble` from a rough guess, `project_state` for small drift."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jaxdyn.constrained import RESULTS, _right_inverse, correction
+from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, row_matrix, velocity_residual
+from jaxdyn.dynamics import mass_matrix
+from jaxdyn.model import Model, difference
+from jaxdyn.scene import Scene
+from jaxdyn.so3 import _product
+from jaxdyn.systems import displace, retract
+
+_NEAREST_STEPS = 30
+_NEWTON_STEPS = 40
+_POSITION_STEPS = 4
+_VELOCITY_STEPS = 3
+_STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
+
+
+class Assembly(eqx.Module):
+    """A state on the constraints: `q` (nq,), `v` (nv,), the largest `residual` (2,) left in |phi| and |A v - b|, `result`."""
+
+    q: Float[Array, " nq"]
+    v: Float[Array, " nv"]
+    residual: Float[Array, "2"]
+    result: Any
+
+
+def assemble(
+    scene: Scene,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"] | None = None,
+    t=0.0,
+    *,
+    rank_tol: float | None = None,
+    throw: bool | None = None,
+) -> Assembly:
+    """Find q with phi(q, t) = 0 and v with A v = b from a rough guess, with the least change in the mass metric.
+
+    q minimises |q - guess| in the metric M(guess) among the configurations on the constraints (a local minimum, by
+    repeated linearisation, then Newton steps to rounding); v is the guess plus the least change in the metric M(q).
+
+    **Arguments:** `q` (nq,), `v` (nv,) (None: at rest), guesses; `t`, s; `rank_tol` as in `constrained_dynamics`;
+    `throw`: raise when it fails, by default if all inputs are concrete.
+
+    **Returns:** `Assembly`. Derivatives with respect to the scene's numbers are those of the least correction; changes of
+    the guess pass through P_T, the projection onto admissible motions.
+
+    **Raises:** ValueError that names the constraints that stay open and by how much, if it fails and `throw`.
+    """
+    concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, q, v, t)))
+    v = jnp.zeros((scene.nv,), q.dtype) if v is None else v
+    staged = isinstance(jnp.zeros(()), Tracer)
+    found = (_assemble if staged else _assemble_compiled)(scene, q, v, jnp.asarray(t, q.dtype), rank_tol)
+    if concrete and (throw is None or throw) and not bool(found.result == RESULTS.successful):
+        raise ValueError(f"not assembled: {open_constraints(scene, found.q, found.v, t)}; give a better guess")
+    if throw and not concrete:
+        found = found.result.error_if(found, found.result != RESULTS.successful)
+    return found
+
+
+def _assemble(scene, q, v, t, rank_tol):
+    held = holonomic_rows(layout(scene))
+    if held.size:
+        fixed, frozen, guess = (lax.stop_gradient(x) for x in (scene, t, q))
+        place = _nearest(fixed, guess, frozen, held, rank_tol)
+        place = lax.stop_gradient(_newton(fixed, place, frozen, held, rank_tol))
+        # A change of the guess, zero in value, and the change of phi with the scene pass through one linear step.
+        change = difference(scene.system, guess, q) if isinstance(scene.system, Model) else q - guess
+        shifted = displace(scene.system, place, change)
+        step = _product(correction(scene, place, t, rank_tol, holonomic=True), position_residual(scene, shifted, t))
+        q = retract(scene.system, displace(scene.system, shifted, -step))
+    B = correction(scene, q, t, rank_tol, holonomic=False)
+    for _ in range(2):
+        v = v - _product(B, velocity_residual(scene, q, v, t))
+    residual = residuals(scene, q, v, t)
+    good = jnp.all(residual <= float(jnp.finfo(q.dtype).eps) ** 0.7 * (1.0 + jnp.max(jnp.abs(v))))
+    return Assembly(q, v, residual, RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled))
+
+
+_assemble_compiled = eqx.filter_jit(_assemble)
+
+
+def _nearest(scene, guess, t, held, rank_tol):
+    """Displacement e from the guess of least |e| in the metric M(guess) with phi = 0, by repeated linearisation."""
+    factor = jnp.linalg.cholesky(mass_matrix(scene.system, guess, t))
+
+    def residual(e):
+        return position_residual(scene, displace(scene.system, guess, e), t)
+
+    def improve(state):
+        e, _, count = state
+        differentiate = jax.jacrev if held.size < scene.nv else jax.jacfwd
+        A = differentiate(residual)(e)
+        new = _product(_right_inverse(factor, A, rank_tol), _product(A, e) - residual(e))
+        return new, jnp.max(jnp.abs(new - e)), count + 1
+
+    def unfinished(state):
+        e, change, count = state
+        return (count < _NEAREST_STEPS) & (change > 1e-7) & jnp.isfinite(e).all()
+
+    start = jnp.zeros((scene.nv,), guess.dtype)
+    e, _, _ = lax.while_loop(unfinished, improve, (start, jnp.asarray(jnp.inf, guess.dtype), 0))
+    better = jnp.max(jnp.abs(residual(e))) < jnp.max(jnp.abs(residual(start)))
+    return displace(scene.system, guess, jnp.where(better, e, start))
+
+
+def _newton(scene, q, t, held, rank_tol):
+    """Gauss-Newton steps with a choice of lengths, until the residual is at rounding or no longer falls."""
+    lengths = jnp.asarray(_STEP_LENGTHS, q.dtype)
+
+    def size(q):
+        return jnp.max(jnp.abs(position_residual(scene, q, t)))
+
+    def improve(state):
+        q, error, _, count = state
+        step = -_product(correction(scene, q, t, rank_tol, holonomic=True), position_residual(scene, q, t))
+        tried = jax.vmap(lambda s: retract(scene.system, displace(scene.system, q, s * step)))(lengths)
+        errors = jax.vmap(size)(tried)
+        best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.full_like(errors, jnp.inf)))
+        falls = errors[best] < error
+        return jnp.where(falls, tried[best], q), jnp.where(falls, errors[best], error), falls, count + 1
+
+    def unfinished(state):
+        _, error, falls, count = state
+        return falls & (error > 0) & (count < _NEWTON_STEPS)
+
+    return lax.while_loop(unfinished, improve, (q, size(q), jnp.asarray(True), 0))[0]
+
+
+def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
+    """q and v moved by the least change, in the metric M(q), onto the constraints, from a small distance.
+
+    One factorisation serves all steps: with B fixed, each step multiplies the residual by the size of the correction
+    times the curvature of the constraint, 1e-8 -> 1e-16 after one. The steps are a fixed number and differentiated as
+    they are. A projection that does not reduce the residual is not applied.
+    """
+    q = retract(scene.system, q)
+    held = holonomic_rows(layout(scene))
+    B = correction(scene, q, t, rank_tol, holonomic=False)
+    if held.size:
+        only = held.size == B.shape[1]
+        B_held = B if only else correction(scene, q, t, rank_tol, holonomic=True)
+
+        def move(place, _):
+            step = _product(B_held, position_residual(scene, place, t))
+            return displace(scene.system, place, -step), None
+
+        moved, _ = lax.scan(move, q, None, length=_POSITION_STEPS)
+        before, after = (jnp.max(jnp.abs(position_residual(scene, x, t))) for x in (q, moved))
+        q = jnp.where(after <= before, retract(scene.system, moved), q)
+
+    def slow(v, _):
+        return v - _product(B, velocity_residual(scene, q, v, t)), None
+
+    projected, _ = lax.scan(slow, v, None, length=_VELOCITY_STEPS)
+    before, after = (jnp.max(jnp.abs(velocity_residual(scene, q, x, t))) for x in (v, projected))
+    return q, jnp.where(after <= before, projected, v)
+
+
+def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
+    """Largest |phi| and |A v - b|, (2,)."""
+    phi = position_residual(scene, q, t)
+    zero = jnp.zeros((1,), q.dtype)
+    parts = jnp.concatenate([zero, phi]), jnp.concatenate([zero, velocity_residual(scene, q, v, t)])
+    return jnp.stack([jnp.max(jnp.abs(part)) for part in parts])
+
+
+def open_constraints(scene: Scene, q, v, t=0.0, limit: float = 0.0) -> str:
+    """In words, which constraints are violated by more than `limit`, the worst first; for concrete states."""
+    t = jnp.asarray(t, q.dtype)
+    phi, psi = (np.asarray(x) for x in _both_residuals(scene, q, v, t))
+    found, first = [], 0
+    for constraint, place in zip(scene.constraints, layout(scene), strict=True):
+        count = place.slip - place.start
+        apart = float(np.max(np.abs(phi[first : first + count]), initial=0.0))
+        fast = float(np.max(np.abs(psi[place.start : place.end]), initial=0.0))
+        first += count
+        kind = type(constraint).__name__.lower()
+        if apart > limit:
+            found.append((apart, f"{kind} {place.name!r} open by {apart:.3g}"))
+        if fast > limit:
+            found.append((fast, f"{kind} {place.name!r} slips at {fast:.3g}"))
+    return ", ".join(text for _, text in sorted(found, reverse=True)[:6])
+
+
+@eqx.filter_jit
+def _both_residuals(scene, q, v, t):
+    return position_residual(scene, q, t), velocity_residual(scene, q, v, t)
+
+
+@eqx.filter_jit
+def start_evidence(scene: Scene, q, v, t):
+    """Largest residuals (2,) and the rank of the rows at a state."""
+    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
+    A = row_matrix(scene, q, t)
+    rank = jnp.round(jnp.trace(_product(A, _right_inverse(factor, A, None)))).astype(jnp.int32)
+    return residuals(scene, q, v, t), rank

@@ -1,0 +1,280 @@
+"""Dynamics under constraints: M a + h = tau + A^T lam, A a = gamma.
+
+In the metric of M everything is one least-squares problem. With M = L L^T, Y = L^-1 A^T and the free acceleration
+a0 = M^-1 (tau - h), the constraint force L^-1 A^T lam is the shortest w with Y^T w = gamma - A a0: Gauss's principle of
+least constraint. Its pseudo-inverse gives accelerations, multipliers and projections, for dependent rows too:
+
+    w = (Y^+)^T c,   lam = Y^+ w,   a = a0 + L^-T w,   P_T = L^-T (1 - Y Y^+) L^T,   c = gamma - A a0.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jax import lax
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Float, Int
+
+from jaxdyn.constraints.base import Layout, Rows, holonomic_rows, layout, row_matrix, rows
+from jaxdyn.constraints.loops import Loop, relative_poses
+from jaxdyn.dynamics import bias_force, mass_matrix
+from jaxdyn.scene import Scene, checked_force
+from jaxdyn.so3 import _product
+
+METHODS = ("rank_aware", "schur")
+
+
+class RESULTS(lx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How a constrained computation ended."""
+
+    singular_mass_matrix = "The mass matrix is not positive definite: a joint moves no inertia."
+    dependent_rows = "The constraint rows are dependent; take method='rank_aware'."
+    contradictory_rows = "No acceleration satisfies the constraint rows: they contradict each other."
+    not_assembled = "No configuration and velocity that satisfy the constraints were found."
+
+
+class ConstrainedDynamics(eqx.Module):
+    """Accelerations and constraint forces of a scene.
+
+    - `acceleration` (nv,); `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for
+      rows in m and N m for rows in rad.
+    - `rank` (): number of independent rows. `result`: one of `RESULTS`.
+    - `layout`: name and place of each constraint's rows.
+    """
+
+    acceleration: Float[Array, " nv"]
+    multipliers: Float[Array, " nc"]
+    rank: Int[Array, ""]
+    result: Any
+    layout: tuple[Layout, ...] = eqx.field(static=True)
+
+    def by_name(self) -> dict[str, Array]:
+        """Multipliers of each constraint, by its name."""
+        return {place.name: self.multipliers[..., place.start : place.end] for place in self.layout}
+
+
+class Projections(NamedTuple):
+    """P_T (nv, nv) maps velocities to admissible ones; P_omega = P_T^T removes constraint forces from forces."""
+
+    P_T: Float[Array, "nv nv"]
+    P_omega: Float[Array, "nv nv"]
+
+
+def constrained_dynamics(
+    scene: Scene,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    tau: Float[Array, " nv"] | None = None,
+    t=0.0,
+    *,
+    method: str = "rank_aware",
+    rank_tol: float | None = None,
+) -> ConstrainedDynamics:
+    """Acceleration and multipliers: M a + h = tau + forces + A^T lam, A a = gamma = -(Adot v) + bdot.
+
+    The state has to satisfy the constraints (`assemble`); what it violates is not corrected here.
+
+    **Arguments:**
+
+    - `q` (nq,), `v` (nv,), `tau` (nv,) in N m or N (None: zero), `t` in s. The scene's forces are added to tau.
+    - `method`: "rank_aware" for any rows: where they are dependent the acceleration is still right and the multipliers
+      are those of least norm. "schur" forms A M^-1 A^T and its Cholesky factor: faster, for independent rows.
+    - `rank_tol`: singular values of L^-1 A^T below `rank_tol` times the largest count as zero. Default eps^(4/7),
+      1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which rows that depend on each other differ
+      when loops are open by rounding and projection errors, below the least singular values of mechanisms that move.
+
+    **Returns:** `ConstrainedDynamics`. Under "schur", dependent rows give the code `dependent_rows`.
+
+    Differentiable any number of times where the rank is constant; the pseudo-inverse has a rule of its own, no
+    factorisation is differentiated.
+
+    **Raises:** ValueError for shapes that do not fit, unknown methods, and entries of the scene that are no constraints.
+
+    Source: EQUATIONS section 7; Udwadia & Kalaba (1992).
+    """
+    if method not in METHODS:
+        raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}")
+    force = applied(scene, q, v, tau, t)
+    places = layout(scene)
+    if not places:
+        return _free(scene, q, v, force, t)
+    return _solve(scene, q, v, force, t, rows(scene, q, v, t), places, method, rank_tol)
+
+
+def applied(scene: Scene, q, v, tau, t) -> Array:
+    """tau plus the scene's forces, (nv,)."""
+    tau = jnp.zeros_like(v) if tau is None else checked_force(tau, q, scene.nv, "tau")
+    force = scene.applied_force(q, v, t)
+    return tau if force is None else tau + force
+
+
+def _free(scene, q, v, force, t) -> ConstrainedDynamics:
+    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
+    a = cho_solve((factor, True), force - bias_force(scene.system, q, v, t))
+    result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)
+    return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
+
+
+def _solve(scene, q, v, force, t, row: Rows, places, method, rank_tol) -> ConstrainedDynamics:
+    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
+    columns = jnp.concatenate([row.A, (force - bias_force(scene.system, q, v, t))[None]]).T
+    solved = solve_triangular(factor, columns, lower=True)
+    Y, free = solved[:, :-1], solved[:, -1]
+    wanted = row.gamma - _product(Y.T, free)
+    if method == "schur":
+        delassus = jnp.linalg.cholesky(_product(Y.T, Y))
+        lam = cho_solve((delassus, True), wanted)
+        pushed = _product(Y, lam)
+        rank = jnp.asarray(Y.shape[1], jnp.int32)
+        pivots = jnp.diagonal(delassus)
+        # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
+        fine = jnp.min(pivots) > np.sqrt(10 * Y.shape[0] * _eps(Y)) * jnp.max(pivots)
+        result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)
+    else:
+        inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
+        pushed = _product(inverse.T, wanted)
+        lam = _product(inverse, pushed)
+        rank = jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
+        # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
+        missed = jnp.abs(wanted - _product(Y.T, pushed))
+        sizes = jnp.abs(row.gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
+        met = jnp.all(missed <= np.sqrt(_eps(Y)) * (sizes + jnp.max(sizes)))
+        result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)
+    a = solve_triangular(factor, free + pushed, lower=True, trans=1)
+    result = RESULTS.where(jnp.isfinite(factor).all(), result, RESULTS.singular_mass_matrix)
+    return ConstrainedDynamics(a, lam, rank, result, places)
+
+
+def constraint_forces(
+    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t=0.0
+) -> dict[str, Float[Array, " nv"]]:
+    """Generalised force A_i^T lam_i (nv,) of each constraint on the system, by name; N m or N."""
+    A = row_matrix(scene, q, t)
+    return {p.name: _product(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
+
+
+def constraint_wrenches(
+    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"]
+) -> dict[str, Float[Array, "6"]]:
+    """Wrench (f, tau) of each loop on its body B, at the origin and in the axes of its frame A (N, N m), by name.
+
+    The wrench on body A is the negative of it.
+    """
+    found = {}
+    for constraint, place in zip(scene.constraints, layout(scene), strict=True):
+        if isinstance(constraint, Loop):
+            rotation, position = relative_poses([constraint], scene.system, q)
+            found[place.name] = constraint.wrench(rotation[0], position[0], multipliers[place.start : place.end])
+    return found
+
+
+def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None) -> Projections:
+    """Projections of the constrained scene: P_T = 1 - M^-1 A^T (A M^-1 A^T)^+ A on velocities, P_omega = P_T^T on forces.
+
+    P_T is orthogonal in the metric M and keeps what satisfies A v = 0; P_omega removes every constraint force A^T lam.
+
+    **Arguments:** `q` (nq,); `t`, s; `rank_tol` as in `constrained_dynamics`.
+
+    **Returns:** (P_T, P_omega), each (nv, nv).
+
+    Source: EQUATIONS section 7.
+    """
+    factor, Y, inverse = _metric(scene, q, t, rank_tol)
+    keep = jnp.eye(Y.shape[0], dtype=Y.dtype) - _product(Y, inverse)
+    P_T = solve_triangular(factor, _product(keep, factor.T), lower=True, trans=1)
+    return Projections(P_T, P_T.T)
+
+
+def second_fundamental_form(
+    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0, *, rank_tol: float | None = None
+) -> Float[Array, " nv"]:
+    """S(v, v) = (1 - P_T)(a + M^-1 C v): the part of the motion's covariant acceleration that the constraints prescribe.
+
+    S = M^-1 A^T (A M^-1 A^T)^+ (gamma + A M^-1 C v) needs q and v alone. M S is the force, normal to the constraints,
+    that keeps the motion on them.
+
+    **Arguments:** `q` (nq,); `v` (nv,), admissible. **Returns:** (nv,), an acceleration.
+
+    Source: EQUATIONS section 7 and erratum E20.
+    """
+    coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
+    factor, Y, inverse = _metric(scene, q, t, rank_tol)
+    wanted = rows(scene, q, v, t).gamma + _product(Y.T, solve_triangular(factor, coriolis, lower=True))
+    return solve_triangular(factor, _product(inverse.T, wanted), lower=True, trans=1)
+
+
+def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
+    """B (nv, n) such that -B r is the shortest step, in the metric M(q), that removes the residual r of the rows.
+
+    Rows: the holonomic ones, or all.
+    """
+    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
+    A = row_matrix(scene, q, t)
+    return _right_inverse(factor, A[holonomic_rows(layout(scene))] if holonomic else A, rank_tol)
+
+
+def _right_inverse(factor, A, rank_tol):
+    Y = solve_triangular(factor, A.T, lower=True)
+    return solve_triangular(factor, pseudo_inverse(Y, tolerance(rank_tol, Y)).T, lower=True, trans=1)
+
+
+def _metric(scene, q, t, rank_tol):
+    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
+    Y = solve_triangular(factor, row_matrix(scene, q, t).T, lower=True)
+    return factor, Y, pseudo_inverse(Y, tolerance(rank_tol, Y))
+
+
+def tolerance(rank_tol: float | None, like: Array) -> float:
+    """The rank tolerance as given, or the default for the dtype."""
+    return _eps(like) ** (4 / 7) if rank_tol is None else float(rank_tol)
+
+
+def _eps(like) -> float:
+    return float(jnp.finfo(like.dtype).eps)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float) -> Float[Array, "m n"]:
+    """Moore-Penrose inverse of Y, singular values below `rank_tol` times the largest taken for zero.
+
+    Values: on CPU a complete orthogonal decomposition (pivoted QR, then QR of the triangle's transpose), elsewhere an
+    SVD. Derivative: the formula of Golub & Pereyra (1973), eq. 4.12, right wherever the rank is constant; neither
+    factorisation is differentiated.
+    """
+    return lax.platform_dependent(
+        Y, cpu=partial(_by_orthogonal, rank_tol=rank_tol), default=partial(_by_svd, rank_tol=rank_tol)
+    )
+
+
+def _by_orthogonal(Y, rank_tol):
+    Q, R, order = lax.linalg.qr(Y, pivoting=True, full_matrices=False)
+    pivots = jnp.abs(jnp.diagonal(R))
+    keep = pivots > rank_tol * pivots[0]
+    # Y[:, order] = Q R with the rows of R below the rank dropped; R^T = Z T makes what is left square and triangular.
+    Z, T = lax.linalg.qr(jnp.where(keep[:, None], R, jnp.zeros_like(R)).T, full_matrices=False)
+    T = T + jnp.diag(jnp.where(keep, jnp.zeros_like(pivots), jnp.ones_like(pivots)))
+    kept = jnp.where(keep[:, None], Q.T, jnp.zeros_like(Q.T))
+    inverse = _product(Z, solve_triangular(T, kept, trans=1))
+    return jnp.zeros_like(inverse).at[order].set(inverse)
+
+
+def _by_svd(Y, rank_tol):
+    U, s, Vt = jnp.linalg.svd(Y, full_matrices=False)
+    keep = s > rank_tol * s[0]
+    inverse = jnp.where(keep, 1.0 / jnp.where(keep, s, jnp.ones_like(s)), jnp.zeros_like(s))
+    return _product(Vt.T * inverse[None], U.T)
+
+
+@pseudo_inverse.defjvp
+def _pseudo_inverse_jvp(rank_tol, primals, tangents):
+    (Y,), (dY,) = primals, tangents
+    P = pseudo_inverse(Y, rank_tol)
+    across = dY.T - _product(_product(dY.T, Y), P)  # dY^T (1 - Y P)
+    along = dY.T - _product(P, _product(Y, dY.T))  # (1 - P Y) dY^T
+    dP = -_product(_product(P, dY), P)
+    dP = dP + _product(_product(P, P.T), across) + _product(along, _product(P.T, P))
+    return P, dP

@@ -1,0 +1,13 @@
+"""Constraints: functions of the user, loops closed by joints, couplings, and rolling."""
+
+from jaxdyn.constraints.base import Constraint as Constraint
+from jaxdyn.constraints.base import Holonomic as Holonomic
+from jaxdyn.constraints.base import Pfaffian as Pfaffian
+from jaxdyn.constraints.loops import distance as distance
+from jaxdyn.constraints.loops import gear as gear
+from jaxdyn.constraints.loops import lock_joint as lock_joint
+from jaxdyn.constraints.loops import loop as loop
+from jaxdyn.constraints.loops import model_couplings as model_couplings
+from jaxdyn.constraints.rolling import knife_edge as knife_edge
+from jaxdyn.constraints.rolling import rolling_sphere as rolling_sphere
+from jaxdyn.constraints.rolling import rolling_wheel as rolling_wheel

@@ -1,0 +1,254 @@
+"""What a constraint is, and the rows of all constraints of a scene: A(q, t) v = b(q, t), A a = gamma.
+
+A constraint gives up to two functions: a residual phi(q, t) that is to be zero (holonomic part), and a slip velocity
+w(q, v, t), linear in v up to a term without v, that is to be zero (nonholonomic part). Everything else follows by
+`jax.jvp` along the motion, on manifold-valued q too:
+
+    psi(q, v, t) = (d/dt phi, w) = A v - b,   A = dpsi/dv,   gamma = -(d/dt psi at a = 0) = -(Adot v) + bdot.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.scene import Scene, as_pytree
+from jaxdyn.so3 import _product
+from jaxdyn.systems import velocity_to_rate
+
+
+class Constraint(eqx.Module):
+    """Base of all constraints. `name` is used by errors and reports."""
+
+    name: eqx.AbstractVar[str]
+
+    def position(self, system, q, t):
+        """Residual phi(q, t) (nh,) of the holonomic part, or None when there is none."""
+        return None
+
+    def slip(self, system, q, v, t):
+        """Residual w(q, v, t) (np,) of the nonholonomic part, linear in v, or None when there is none."""
+        return None
+
+    def sizes(self, system, dtype) -> tuple[int, int]:
+        """Numbers of holonomic and of nonholonomic rows, found without computing anything."""
+        q, v = (jax.ShapeDtypeStruct((n,), dtype) for n in (system.nq, system.nv))
+        t = jax.ShapeDtypeStruct((), dtype)
+        held = eqx.filter_eval_shape(self.position, system, q, t)
+        free = eqx.filter_eval_shape(self.slip, system, q, v, t)
+        return 0 if held is None else held.shape[0], 0 if free is None else free.shape[0]
+
+    def group(self):
+        """Constraints whose groups are equal and not None are evaluated together by `grouped_position`."""
+        return None
+
+    @classmethod
+    def grouped_position(cls, members: Sequence["Constraint"], system, q, t):
+        """Residuals (n, nh) of constraints of one group."""
+        raise NotImplementedError
+
+
+class Holonomic(Constraint):
+    """A constraint on the configuration: phi(q, t) = 0.
+
+    **Arguments:**
+
+    - `phi`: phi(q, t) -> (n,) or (), m or rad; with `with_system=True` phi(system, q, t), evaluated on the scene's
+      system, so that gradients and batches of its leaves pass through. It must be differentiable twice. A plain
+      function is static: define it once. An equinox Module or `jax.tree_util.Partial` carries numbers as leaves.
+    - `name`: for errors and reports; by default that of the function.
+
+    **Raises:** ValueError when phi cannot be called; (when used) when it returns anything but one row or a vector.
+
+    ```python
+    rod = jd.Holonomic(lambda q, t: q @ q - 1.0, name="rod")
+    ```
+    """
+
+    phi: Callable
+    with_system: bool = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    def __init__(self, phi, with_system: bool = False, name: str | None = None):
+        self.name = _own_name(name, phi, "holonomic")
+        self.phi = as_pytree(phi, f"constraint {self.name!r}: phi")
+        self.with_system = bool(with_system)
+
+    def position(self, system, q, t):
+        """phi(q, t), (n,)."""
+        value = self.phi(system, q, t) if self.with_system else self.phi(q, t)
+        if jnp.ndim(value) > 1:
+            raise ValueError(f"constraint {self.name!r}: phi returned shape {jnp.shape(value)}; return a vector (n,)")
+        return jnp.atleast_1d(jnp.asarray(value, q.dtype))
+
+
+class Pfaffian(Constraint):
+    """A constraint on the velocity: A(q, t) v = b(q, t).
+
+    **Arguments:**
+
+    - `A`: A(q, t) -> (n, nv) or (nv,), acting on the velocity v of the system, which is dq/dt only where nq = nv.
+      With `with_system=True` A(system, q, t).
+    - `b`: b(q, t) -> (n,) or (), or None for zero; with `with_system=True` b(system, q, t).
+    - `name`: for errors and reports; by default that of the function.
+
+    **Raises:** ValueError when A or b cannot be called; (when used) when what they return does not fit.
+
+    Source: Murray, Li & Sastry (1994), chapter 6, eq. 6.4.
+    """
+
+    A: Callable
+    b: Callable | None
+    with_system: bool = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    def __init__(self, A, b=None, with_system: bool = False, name: str | None = None):
+        self.name = _own_name(name, A, "pfaffian")
+        self.A = as_pytree(A, f"constraint {self.name!r}: A")
+        self.b = None if b is None else as_pytree(b, f"constraint {self.name!r}: b")
+        self.with_system = bool(with_system)
+
+    def slip(self, system, q, v, t):
+        """A v - b, (n,)."""
+        place = (system, q, t) if self.with_system else (q, t)
+        rows = jnp.asarray(self.A(*place), q.dtype)
+        rows = rows[None] if rows.ndim == 1 else rows
+        if rows.ndim != 2 or rows.shape[1] != v.shape[0]:
+            raise ValueError(
+                f"constraint {self.name!r}: A returned shape {rows.shape}, expected (n, {v.shape[0]}) = (n, nv)"
+            )
+        slip = _product(rows, v)
+        if self.b is None:
+            return slip
+        b = jnp.atleast_1d(jnp.asarray(self.b(*place), q.dtype))
+        if b.shape != slip.shape:
+            raise ValueError(
+                f"constraint {self.name!r}: b returned shape {b.shape}, expected {slip.shape} as A has rows"
+            )
+        return slip - b
+
+
+class Rows(NamedTuple):
+    """All constraints of a scene at one state, stacked in the scene's order (holonomic rows of each one first).
+
+    - `A` (nc, nv), `gamma` (nc,): A a = gamma.
+    - `velocity` (nc,): A v - b, zero for an admissible velocity.
+    """
+
+    A: Float[Array, "nc nv"]
+    gamma: Float[Array, " nc"]
+    velocity: Float[Array, " nc"]
+
+
+class Layout(NamedTuple):
+    """Where the rows of each constraint stand: its name, and its first, first nonholonomic and past-the-last row."""
+
+    name: str
+    start: int
+    slip: int
+    end: int
+
+
+def layout(scene: Scene) -> tuple[Layout, ...]:
+    """Which rows belong to which constraint of the scene; names that occur twice get a number.
+
+    **Raises:** ValueError for entries that are no constraints, and for constraints without rows.
+    """
+    dtype = state_dtype(scene.system)
+    places, names, start = [], [], 0
+    for i, constraint in enumerate(scene.constraints):
+        if not isinstance(constraint, Constraint):
+            raise ValueError(
+                f"constraints[{i}] is a {type(constraint).__name__}; wrap a function in Holonomic or Pfaffian, "
+                "or take a constraint of the library"
+            )
+        sizes = constraint.sizes(scene.system, dtype)
+        if sum(sizes) == 0:
+            raise ValueError(f"constraint {constraint.name!r} has no rows; remove it from the scene")
+        name = constraint.name
+        while name in names:
+            name = f"{constraint.name} ({i})" if name == constraint.name else f"{name}'"
+        names.append(name)
+        places.append(Layout(name, start, start + sizes[0], start + sum(sizes)))
+        start = places[-1].end
+    return tuple(places)
+
+
+def holonomic_rows(places: Sequence[Layout]) -> np.ndarray:
+    """Indices of the rows that are rates of a residual phi, in order."""
+    return np.concatenate([np.arange(place.start, place.slip) for place in places] or [np.zeros(0, int)])
+
+
+def position_residual(scene: Scene, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nh"]:
+    """phi(q, t) of all holonomic parts, stacked in the scene's order; (0,) when there are none."""
+    t = jnp.asarray(t, q.dtype)
+    parts = [part for part in _positions(scene, q, t) if part is not None]
+    return jnp.concatenate(parts) if parts else jnp.zeros((0,), q.dtype)
+
+
+def velocity_residual(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nc"]:
+    """psi(q, v, t) = A v - b of all constraints, (nc,)."""
+    t = jnp.asarray(t, q.dtype)
+    motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
+    _, rates = jax.jvp(lambda q, t: _positions(scene, q, t), (q, t), motion)
+    parts: list[Any] = []
+    for constraint, rate in zip(scene.constraints, rates, strict=True):
+        parts += [part for part in (rate, constraint.slip(scene.system, q, v, t)) if part is not None]
+    return jnp.concatenate(parts)
+
+
+def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Rows:
+    """A, gamma and A v - b of all constraints of the scene (see `Rows`)."""
+    t = jnp.asarray(t, q.dtype)
+    motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
+    velocity, rate = jax.jvp(lambda q, t: velocity_residual(scene, q, v, t), (q, t), motion)
+    return Rows(row_matrix(scene, q, t), -rate, velocity)
+
+
+def row_matrix(scene: Scene, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nc nv"]:
+    """A(q, t) of all constraints, (nc, nv)."""
+    t = jnp.asarray(t, q.dtype)
+    v = jnp.zeros((scene.nv,), q.dtype)
+    # psi is affine in v, so one mode costs a pass per row and the other one per column.
+    count = layout(scene)[-1].end
+    differentiate = jax.jacrev if count < scene.nv else jax.jacfwd
+    return differentiate(lambda v: velocity_residual(scene, q, v, t))(v)
+
+
+def state_dtype(system):
+    """Floating-point type of a system's states: that of a Model's leaves, else of its numbers, else jax's default."""
+    home = getattr(system, "home", None)
+    if home is not None:
+        return home.dtype
+    kinds = [leaf.dtype for leaf in jax.tree.leaves(system) if eqx.is_inexact_array(leaf)]
+    return jnp.result_type(*kinds) if kinds else jnp.zeros(()).dtype
+
+
+def _positions(scene: Scene, q, t) -> list:
+    """phi of each constraint (None without a holonomic part), those of one group computed together."""
+    found: list[Any] = [None] * len(scene.constraints)
+    groups: dict[Any, list[int]] = {}
+    for i, constraint in enumerate(scene.constraints):
+        key = constraint.group()
+        if key is None:
+            found[i] = constraint.position(scene.system, q, t)
+        else:
+            groups.setdefault((type(constraint), key), []).append(i)
+    for (kind, _), members in groups.items():
+        values = kind.grouped_position([scene.constraints[i] for i in members], scene.system, q, t)
+        for k, i in enumerate(members):
+            found[i] = values[k]
+    return found
+
+
+def _own_name(name, function, default: str) -> str:
+    if name is not None:
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"name is {name!r}; give a non-empty string, or None")
+        return name
+    given = getattr(function, "__name__", default)
+    return default if given == "<lambda>" else given

@@ -1,0 +1,370 @@
+"""Loops closed by a joint between two bodies, couplings of joints, and locks.
+
+A loop holds a frame A of one body and a frame B of another together as a joint would: with T = T_A^-1 T_B = (R, p) it
+has only the residuals that this joint removes. Translations are entries of p (m). Rotations are tangents of half angles,
+twice: smooth, equal to the angle to first order, and large where the frames are turned upside down, so that a correction
+never ends at the false solution that a sine has there.
+
+    axis rows     2 (R_02, R_12) / (1 + R_22)            z of B along z of A
+    attitude rows 4 vee(R) / (1 + tr R) = 2 tan(theta/2) n    axes of B along those of A
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn import _float64 as f64
+from jaxdyn import se3, so3
+from jaxdyn.constraints.base import Constraint
+from jaxdyn.joints import KINDS, SCREW_KINDS, joint_difference
+from jaxdyn.kinematics import tree_frame
+from jaxdyn.model import Model, body_index, frame_index
+from jaxdyn.so3 import _product
+
+
+def _floored(x):
+    # Only exactly upside down is the denominator zero; the residual is then huge, which is what it is to be.
+    tiny = float(jnp.finfo(x.dtype).eps)
+    return jnp.where(x < tiny, jnp.full_like(x, tiny), x)
+
+
+def _axis(rotation):
+    return 2.0 * rotation[:2, 2] / _floored(1.0 + rotation[2, 2])
+
+
+def _attitude(rotation):
+    return 4.0 * so3.vee(rotation) / _floored(1.0 + jnp.trace(rotation))
+
+
+def _turn(rotation):
+    """Twice the tangent of half the angle about z, when that is the only angle, (1,)."""
+    c = 0.5 * (rotation[0, 0] + rotation[1, 1])
+    return ((rotation[1, 0] - rotation[0, 1]) / _floored(1.0 + c))[None]
+
+
+class _Kind(NamedTuple):
+    """Rows that a joint removes: how many, and their residual from (R, p)."""
+
+    count: int
+    residual: Callable
+
+
+_SPATIAL = {
+    "point": _Kind(3, lambda R, p: p),
+    "spherical": _Kind(3, lambda R, p: p),
+    "revolute": _Kind(5, lambda R, p: jnp.concatenate([p, _axis(R)])),
+    "universal": _Kind(4, lambda R, p: jnp.concatenate([p, R[2:, 2]])),
+    "prismatic": _Kind(5, lambda R, p: jnp.concatenate([p[:2], _attitude(R)])),
+    "cylindrical": _Kind(4, lambda R, p: jnp.concatenate([p[:2], _axis(R)])),
+    "planar": _Kind(3, lambda R, p: jnp.concatenate([p[2:], _axis(R)])),
+    "weld": _Kind(6, lambda R, p: jnp.concatenate([p, _attitude(R)])),
+}
+_IN_PLANE = {
+    "point": _Kind(2, lambda R, p: p[:2]),
+    "revolute": _Kind(2, lambda R, p: p[:2]),
+    "prismatic": _Kind(2, lambda R, p: jnp.concatenate([p[1:2], _turn(R)])),
+    "weld": _Kind(3, lambda R, p: jnp.concatenate([p[:2], _turn(R)])),
+}
+
+
+class Loop(Constraint):
+    """A loop closed by a joint between two bodies; made by `jd.loop`."""
+
+    name: str = eqx.field(static=True)
+    joint: str = eqx.field(static=True)
+    body_a: str | None = eqx.field(static=True)
+    body_b: str | None = eqx.field(static=True)
+    in_plane: bool = eqx.field(static=True)
+    pose_a: Float[Array, "4 4"]
+    pose_b: Float[Array, "4 4"]
+
+    @property
+    def _kind(self) -> _Kind:
+        return (_IN_PLANE if self.in_plane else _SPATIAL)[self.joint]
+
+    def sizes(self, system, dtype):
+        """Rows that the joint removes; none are nonholonomic."""
+        check_bodies(self.name, system, (self.body_a, self.body_b))
+        return self._kind.count, 0
+
+    def group(self):
+        """Loops closed by the same joint are evaluated together."""
+        return self.joint, self.in_plane
+
+    def position(self, system, q, t):
+        """Residual of the loop, (n,)."""
+        return self.grouped_position([self], system, q, t)[0]
+
+    @classmethod
+    def grouped_position(cls, members: Sequence["Loop"], system, q, t):
+        """Residuals (n, rows) of loops closed by the same joint."""
+        rotation, position = relative_poses(members, system, q)
+        return jax.vmap(members[0]._kind.residual)(rotation, position)
+
+    def wrench(self, rotation, position, lam):
+        """Wrench (f, tau) (6,) of the joint on body B for the multipliers lam, at the origin and in the axes of frame A.
+
+        `rotation`, `position`: of frame B seen from frame A. The wrench on body A is the negative of it.
+        """
+
+        def along(twist):
+            moved = se3.exp(twist)
+            return self._kind.residual(_product(moved[:3, :3], rotation), se3.apply(moved, position))
+
+        return jax.vjp(along, jnp.zeros((6,), lam.dtype))[1](lam)[0]
+
+
+def loop(
+    body_a: str | None,
+    pose_a,
+    body_b: str | None,
+    pose_b,
+    joint: str = "revolute",
+    *,
+    in_plane: bool = False,
+    name: str | None = None,
+) -> Loop:
+    """Close a loop: hold a frame of one body and a frame of another together as a joint would.
+
+    | joint              | rows | free motion of frame B against frame A             |
+    |--------------------|------|-----------------------------------------------------|
+    | revolute           | 5    | turns about z                                       |
+    | prismatic          | 5    | slides along z of A, attitudes equal                |
+    | cylindrical        | 4    | turns about and slides along z                      |
+    | universal          | 4    | turns about z of A and about z of B, perpendicular  |
+    | spherical, point   | 3    | turns every way                                     |
+    | planar             | 3    | slides in the x-y plane of A, turns about z         |
+    | weld               | 6    | none                                                |
+
+    A mechanism that moves in one plane leaves three rows of a spatial joint without work to do. They do no harm
+    (`constrained_dynamics` takes dependent rows), but cost time: with `in_plane=True` only the rows within the x-y
+    plane of frame A are there: 2 for revolute and point, 3 for weld, 2 for prismatic, which then slides along x of A.
+
+    **Arguments:**
+
+    - `body_a`, `body_b`: names of bodies or frames of the scene's model; None is the world.
+    - `pose_a`, `pose_b`: of the joint's frame in the body's: None (identity), (4, 4), (3,) or (xyz, rpy); m and rad.
+    - `joint`: see the table.
+    - `name`: for errors and reports; by default made of the two bodies.
+
+    **Raises:** ValueError for an unknown joint, a bad pose or twice the same body; when used, for a system that is no
+    `Model` and for names that it does not have.
+    """
+    name = f"{body_a or 'world'}-{body_b or 'world'}" if name is None else name
+    what = f"loop {name!r}"
+    kinds = _IN_PLANE if in_plane else _SPATIAL
+    if joint not in kinds:
+        raise ValueError(f"{what}: joint {joint!r} is unknown; choose from {', '.join(kinds)}")
+    if body_a == body_b:
+        raise ValueError(f"{what}: both frames are on {body_a or 'the world'!r}; name two different bodies")
+    return Loop(
+        name=name,
+        joint=joint,
+        body_a=body_a,
+        body_b=body_b,
+        in_plane=bool(in_plane),
+        pose_a=pose_leaf(pose_a, f"{what}: pose_a"),
+        pose_b=pose_leaf(pose_b, f"{what}: pose_b"),
+    )
+
+
+class Distance(Constraint):
+    """Two points at a fixed distance; made by `jd.distance`."""
+
+    name: str = eqx.field(static=True)
+    body_a: str | None = eqx.field(static=True)
+    body_b: str | None = eqx.field(static=True)
+    pose_a: Float[Array, "4 4"]
+    pose_b: Float[Array, "4 4"]
+    length: Float[Array, ""]
+
+    def sizes(self, system, dtype):
+        """One row."""
+        check_bodies(self.name, system, (self.body_a, self.body_b))
+        return 1, 0
+
+    def position(self, system, q, t):
+        """(|p|^2 - length^2) / (2 length), (1,), m: smooth everywhere, and the change of length to first order."""
+        _, position = relative_poses([self], system, q)
+        length = self.length.astype(q.dtype)
+        return ((jnp.sum(position[0] ** 2) - length**2) / (2.0 * length))[None]
+
+
+def distance(
+    body_a: str | None, point_a, body_b: str | None, point_b, length: float, *, name: str | None = None
+) -> Distance:
+    """Hold two points at a distance, as a massless rod with ball joints does.
+
+    **Arguments:** `body_a`, `body_b`: bodies or frames, None for the world; `point_a`, `point_b` (3,), in the body's
+    frame, m; `length`, m, positive.
+
+    **Raises:** ValueError for bad points or a length that is not positive.
+    """
+    name = f"distance {body_a or 'world'}-{body_b or 'world'}" if name is None else name
+    if not isinstance(length, jax.core.Tracer) and not (np.isfinite(length) and length > 0):
+        raise ValueError(f"{name!r}: length is {length}; give a positive number (m), or take loop(..., joint='point')")
+    return Distance(
+        name=name,
+        body_a=body_a,
+        body_b=body_b,
+        pose_a=pose_leaf(point_a, f"{name!r}: point_a"),
+        pose_b=pose_leaf(point_b, f"{name!r}: point_b"),
+        length=jnp.asarray(length, float) if not isinstance(length, jax.Array) else length,
+    )
+
+
+class Gear(Constraint):
+    """Two joints turning in a fixed ratio; made by `jd.gear`."""
+
+    name: str = eqx.field(static=True)
+    joint_a: str = eqx.field(static=True)
+    joint_b: str = eqx.field(static=True)
+    ratio: Float[Array, ""]
+    offset: Float[Array, ""]
+
+    def sizes(self, system, dtype):
+        """One row."""
+        for joint in (self.joint_a, self.joint_b):
+            kind = system.topology.kinds[joint_index(self.name, system, joint)]
+            if kind not in SCREW_KINDS:
+                raise ValueError(f"{self.name!r}: joint {joint!r} is {kind}; couple joints of one degree of freedom")
+        return 1, 0
+
+    def position(self, system, q, t):
+        """q_a - ratio q_b - offset, (1,)."""
+        starts = [
+            system.topology.q_slices[joint_index(self.name, system, j)].start for j in (self.joint_a, self.joint_b)
+        ]
+        return (q[starts[0]] - self.ratio.astype(q.dtype) * q[starts[1]] - self.offset.astype(q.dtype))[None]
+
+
+def gear(joint_a: str, joint_b: str, ratio, offset=0.0, *, name: str | None = None) -> Gear:
+    """Couple two joints of one degree of freedom: q_a = ratio q_b + offset.
+
+    A prismatic joint with a revolute one is a rack and pinion (ratio in m/rad) or the other way round.
+
+    **Raises:** ValueError when both are the same joint; when used, for joints that do not exist or do not fit.
+    """
+    if joint_a == joint_b:
+        raise ValueError(f"gear: both joints are {joint_a!r}; name two different ones")
+    name = f"gear {joint_a}-{joint_b}" if name is None else name
+    return Gear(name, joint_a, joint_b, jnp.asarray(ratio, float), jnp.asarray(offset, float))
+
+
+class JointLock(Constraint):
+    """A joint held at a value; made by `jd.lock_joint`."""
+
+    name: str = eqx.field(static=True)
+    joint: str = eqx.field(static=True)
+    value: Float[Array, " nqj"]
+
+    def sizes(self, system, dtype):
+        """One row per degree of freedom of the joint."""
+        kind = system.topology.kinds[joint_index(self.name, system, self.joint)]
+        if self.value.shape != (KINDS[kind].nq,):
+            raise ValueError(
+                f"{self.name!r}: value has shape {self.value.shape}, but joint {self.joint!r} is {kind} with "
+                f"{KINDS[kind].nq} coordinates"
+            )
+        return KINDS[kind].nv, 0
+
+    def position(self, system, q, t):
+        """Displacement of the joint from its value, on the joint's manifold, (nv of the joint,)."""
+        i = joint_index(self.name, system, self.joint)
+        return joint_difference(system.topology.kinds[i], self.value.astype(q.dtype), q[system.topology.q_slices[i]])
+
+
+def lock_joint(joint: str, value=0.0, *, name: str | None = None) -> JointLock:
+    """Hold a joint at a value.
+
+    **Arguments:** `joint`, its name; `value`, a number (rad or m) or all its coordinates (with a unit quaternion).
+
+    **Raises:** ValueError for a value that is not finite; when used, for an unknown joint or a value of another size.
+    """
+    if not isinstance(value, jax.core.Tracer) and not np.isfinite(np.asarray(value, float)).all():
+        raise ValueError(f"lock_joint {joint!r}: value is {value}; give finite numbers")
+    name = f"lock {joint}" if name is None else name
+    return JointLock(name, joint, jnp.atleast_1d(jnp.asarray(value, float)))
+
+
+def model_couplings(model: Model) -> tuple[Gear, ...]:
+    """The couplings that a model records (mimic joints of a file, `add_coupling`) as constraints of a scene."""
+    names = model.joint_names
+    return tuple(
+        gear(names[joint], names[source], *(model.coupling_values[i]))  # pyright: ignore[reportOptionalSubscript]
+        for i, (joint, source) in enumerate(model.topology.couplings)
+    )
+
+
+def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
+    """A pose as an array leaf; arrays (4, 4) of jax are taken as they are, so that they can be traced."""
+    if isinstance(pose, jax.Array) and pose.shape == (4, 4):
+        return pose
+    if isinstance(pose, jax.Array) and pose.shape == (3,):
+        return se3.from_parts(jnp.eye(3, dtype=pose.dtype), pose)
+    return jnp.asarray(f64.pose_matrix(pose, what), float)
+
+
+def check_bodies(name: str, system, bodies) -> None:
+    """Raise a ValueError that names the constraint when the system has no such bodies."""
+    if not isinstance(system, Model):
+        raise ValueError(
+            f"constraint {name!r} acts on bodies, and a {type(system).__name__} has none; write it as Holonomic or "
+            "Pfaffian in the system's coordinates"
+        )
+    for body in bodies:
+        try:
+            body_index(system, body)
+        except ValueError as error:
+            raise ValueError(f"constraint {name!r}: {error}; both bodies have to be of the scene's model") from None
+
+
+def joint_index(name: str, system, joint: str) -> int:
+    """Index of a joint by name. **Raises:** ValueError that names the constraint."""
+    if not isinstance(system, Model):
+        raise ValueError(f"constraint {name!r} acts on joints, and a {type(system).__name__} has none; use Holonomic")
+    if joint not in system.joint_names:
+        raise ValueError(
+            f"constraint {name!r}: joint {joint!r} is not in model {system.name!r}; it has {list(system.joint_names)}"
+        )
+    return system.joint_names.index(joint)
+
+
+def frame_poses(model: Model, q, bodies: Sequence[str | None], poses):
+    """Poses (n, 4, 4) of frames on bodies, each in its body's tree frame, and the origins (n, 3) of these tree frames."""
+    frame = tree_frame(model, q)
+    offsets = jnp.stack([pose.astype(q.dtype) for pose in poses])
+    places, named = [], []
+    for k, body in enumerate(bodies):
+        if body is None:
+            places.append(model.nb)
+            continue
+        index = frame_index(model, body)
+        places.append(model.topology.frame_bodies[index] % (model.nb + 1))  # -1 is the world
+        if body not in model.body_names:
+            named.append((k, index))
+    for k, index in named:
+        offsets = offsets.at[k].set(_product(model.frame_poses[index].astype(q.dtype), offsets[k]))
+    index = np.array(places)
+    world = jnp.eye(4, dtype=q.dtype)[None]
+    carried = jnp.concatenate([frame.pose, world])[index]
+    origins = jnp.concatenate([frame.origin, jnp.zeros((1, 3), q.dtype)])[index]
+    return _product(carried, offsets), origins
+
+
+def relative_poses(members, system, q):
+    """Rotations (n, 3, 3) and positions (n, 3) of frame B seen from frame A, for constraints with bodies and poses.
+
+    Positions are subtracted tree by tree: a robot far from the world's origin loses nothing.
+    """
+    n = len(members)
+    bodies = [m.body_a for m in members] + [m.body_b for m in members]
+    pose, origin = frame_poses(system, q, bodies, [m.pose_a for m in members] + [m.pose_b for m in members])
+    turned = jnp.swapaxes(pose[:n, :3, :3], 1, 2)
+    apart = pose[n:, :3, 3] - pose[:n, :3, 3] + (origin[n:] - origin[:n])
+    return _product(turned, pose[n:, :3, :3]), _product(turned, apart[..., None])[..., 0]

@@ -1,0 +1,306 @@
+"""Wheels, spheres and blades on surfaces: contact without slip, where the point of contact is a function of the
+configuration and the velocity of the material points that touch is linear in v.
+
+A contact at the point x with normal n (from the surface to the body) has up to three kinds of rows:
+
+    height   gap(q) = 0                      holonomic; left out by contact=False
+    no slip  e . (v_body(x) - v_surface(x))  for the tangential directions e that do not slip
+    no spin  n . (w_body - w_surface)        only where the contact resists spinning
+
+The multipliers are then the normal force, the friction forces along e (N), and the friction torque about n (N m), on
+the body. Source: Murray, Li & Sastry (1994), chapters 5.6 and 6.1.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn import so3
+from jaxdyn.constraints.base import Constraint
+from jaxdyn.constraints.loops import check_bodies, frame_poses, pose_leaf
+from jaxdyn.so3 import _product, cross
+from jaxdyn.systems import velocity_to_rate
+
+
+class _Contact(NamedTuple):
+    """A point of contact: where (3,), normal (3,), gap (), directions without slip (n, 3); world axes."""
+
+    point: Array
+    normal: Array
+    gap: Array
+    directions: Array
+
+
+class _Touching(Constraint):
+    """A body that touches a surface. Subclasses say where, and in which directions it cannot slip."""
+
+    name: eqx.AbstractVar[str]
+    body: eqx.AbstractVar[str]
+    surface_body: eqx.AbstractVar[str | None]
+    pose: eqx.AbstractVar[Array]
+    surface: eqx.AbstractVar[Array]
+    contact: eqx.AbstractVar[bool]
+    spin: eqx.AbstractVar[bool]
+    count: eqx.AbstractVar[int]
+
+    def _touch(self, body, surface) -> _Contact:
+        """The contact for the poses (rotation, position) of the body's and the surface's frame."""
+        raise NotImplementedError
+
+    def _poses(self, system, q):
+        pose, origin = frame_poses(system, q, [self.body, self.surface_body], [self.pose, self.surface])
+        return pose[:, :3, :3], pose[:, :3, 3] + origin
+
+    def sizes(self, system, dtype):
+        """The height, and the rows without slip and spin."""
+        check_bodies(self.name, system, (self.body, self.surface_body))
+        return int(self.contact), self.count + int(self.spin)
+
+    def position(self, system, q, t):
+        """Gap between body and surface, (1,), m; None when the height is not constrained."""
+        if not self.contact:
+            return None
+        rotation, position = self._poses(system, q)
+        return self._touch((rotation[0], position[0]), (rotation[1], position[1])).gap[None]
+
+    def slip(self, system, q, v, t):
+        """Velocities of slipping (m/s), and of spinning (rad/s) where it is resisted."""
+        motion = velocity_to_rate(system, q, v)
+        (rotation, position), (turning, moving) = jax.jvp(lambda q: self._poses(system, q), (q,), (motion,))
+        touch = self._touch((rotation[0], position[0]), (rotation[1], position[1]))
+        omega = jax.vmap(so3.vee)(_product(turning, jnp.swapaxes(rotation, 1, 2)))
+        lever = touch.point[None] - position
+        velocity = moving + jax.vmap(cross)(omega, lever)
+        found = _product(touch.directions, velocity[0] - velocity[1])
+        if not self.spin:
+            return found
+        return jnp.concatenate([found, jnp.sum(touch.normal * (omega[0] - omega[1]))[None]])
+
+
+def _unit_or(vector, fallback):
+    """The unit vector along `vector`, or `fallback` (a constant) where it vanishes; no NaN in derivatives."""
+    square = jnp.sum(vector * vector)
+    safe = square > float(jnp.finfo(vector.dtype).eps) ** 2
+    length = jnp.sqrt(jnp.where(safe, square, jnp.ones_like(square)))
+    return jnp.where(safe, vector / length, fallback)
+
+
+def _tangents(normal):
+    """Two unit vectors (2, 3) that make a right-handed frame with the normal; smooth but for a jump at normal z = 0.
+
+    The rows that a jump turns span the same plane, so accelerations do not see it. Source: Duff et al. (2017), listing 3.
+    """
+    x, y, z = jnp.unstack(normal)
+    sign = jnp.where(z < 0, -jnp.ones_like(z), jnp.ones_like(z))
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    one = jnp.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+    return jnp.stack([one, jnp.stack([b, sign + y * y * a, -y])])
+
+
+class RollingWheel(_Touching):
+    """A wheel or disk that rolls on a plane; made by `jd.rolling_wheel`."""
+
+    name: str = eqx.field(static=True)
+    body: str = eqx.field(static=True)
+    surface_body: str | None = eqx.field(static=True)
+    pose: Float[Array, "4 4"]
+    surface: Float[Array, "4 4"]
+    radius: Float[Array, ""]
+    contact: bool = eqx.field(static=True)
+    spin: bool = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+    def _touch(self, body, surface):
+        (rotation, center), (plane, origin) = body, surface
+        axis, normal = rotation[:, 2], plane[:, 2]
+        # Down the wheel's plane; for a wheel that lies flat there is no lowest point and any direction serves.
+        tilt = jnp.sum(axis * normal)
+        down = _unit_or(tilt * axis - normal, -rotation[:, 0])
+        point = center + self.radius.astype(center.dtype) * down
+        forward = _unit_or(cross(axis, normal), rotation[:, 1])
+        directions = jnp.stack([forward, cross(normal, forward)])[: self.count]
+        return _Contact(point, normal, jnp.sum(normal * (point - origin)), directions)
+
+
+def rolling_wheel(
+    body: str,
+    pose,
+    radius,
+    *,
+    plane=None,
+    plane_body: str | None = None,
+    contact: bool = True,
+    lateral: bool = True,
+    name: str | None = None,
+) -> RollingWheel:
+    """A wheel or thin disk that rolls on a plane without slipping, upright or leaning.
+
+    Rows: the height of the rim's lowest point (unless `contact=False`, for models whose joints keep the height), its
+    velocity along the wheel's track, and its velocity across.
+
+    **Arguments:**
+
+    - `body`: body or frame that carries the wheel; `pose`: of the wheel's centre in it, z along the axle: None, (4, 4),
+      (3,) or (xyz, rpy).
+    - `radius`: m, to the sharp rim.
+    - `plane`: pose of the ground in `plane_body` (None: the world), its z the normal; by default the world's x-y plane.
+    - `contact`: whether the height is constrained. `lateral`: whether sliding across is; on an axle with two wheels one
+      of the two lateral rows is enough.
+
+    **Raises:** ValueError for a radius that is not positive or a bad pose; when used, for unknown bodies.
+    """
+    name = f"wheel {body}" if name is None else name
+    return RollingWheel(
+        name=name,
+        body=body,
+        surface_body=plane_body,
+        pose=pose_leaf(pose, f"{name!r}: pose"),
+        surface=pose_leaf(plane, f"{name!r}: plane"),
+        radius=_length(radius, f"{name!r}: radius"),
+        contact=bool(contact),
+        spin=False,
+        count=2 if lateral else 1,
+    )
+
+
+class KnifeEdge(_Touching):
+    """A blade that slides along itself on a plane; made by `jd.knife_edge`."""
+
+    name: str = eqx.field(static=True)
+    body: str = eqx.field(static=True)
+    surface_body: str | None = eqx.field(static=True)
+    pose: Float[Array, "4 4"]
+    surface: Float[Array, "4 4"]
+    contact: bool = eqx.field(static=True)
+    spin: bool = eqx.field(static=True, default=False)
+    count: int = eqx.field(static=True, default=1)
+
+    def _touch(self, body, surface):
+        (rotation, point), (plane, origin) = body, surface
+        normal = plane[:, 2]
+        across = _unit_or(cross(normal, rotation[:, 0]), rotation[:, 1])
+        return _Contact(point, normal, jnp.sum(normal * (point - origin)), across[None])
+
+
+def knife_edge(
+    body: str, pose=None, *, plane=None, plane_body: str | None = None, contact: bool = True, name: str | None = None
+) -> KnifeEdge:
+    """A blade (skate, sharp wheel without inertia) that slides along its x axis and not across.
+
+    **Arguments:** `body`: body or frame; `pose`: of the contact point in it, x along the blade; `plane`, `plane_body`,
+    `contact` as in `rolling_wheel`.
+
+    **Raises:** ValueError for a bad pose; when used, for unknown bodies.
+    """
+    name = f"knife edge {body}" if name is None else name
+    return KnifeEdge(
+        name=name,
+        body=body,
+        surface_body=plane_body,
+        pose=pose_leaf(pose, f"{name!r}: pose"),
+        surface=pose_leaf(plane, f"{name!r}: plane"),
+        contact=bool(contact),
+    )
+
+
+class RollingSphere(_Touching):
+    """A sphere that rolls on a plane, a sphere or a cylinder; made by `jd.rolling_sphere`."""
+
+    name: str = eqx.field(static=True)
+    body: str = eqx.field(static=True)
+    surface_body: str | None = eqx.field(static=True)
+    pose: Float[Array, "4 4"]
+    surface: Float[Array, "4 4"]
+    radius: Float[Array, ""]
+    surface_radius: Float[Array, ""] | None
+    on: str = eqx.field(static=True)
+    inside: bool = eqx.field(static=True)
+    contact: bool = eqx.field(static=True)
+    spin: bool = eqx.field(static=True)
+    count: int = eqx.field(static=True, default=2)
+
+    def _touch(self, body, surface):
+        (_, center), (frame, origin) = body, surface
+        radius = self.radius.astype(center.dtype)
+        if self.on == "plane":
+            normal = frame[:, 2]
+            gap = jnp.sum(normal * (center - origin)) - radius
+            directions = frame[:, :2].T
+        else:
+            apart = center - origin
+            if self.on == "cylinder":
+                apart = apart - jnp.sum(apart * frame[:, 2]) * frame[:, 2]
+            outward = _unit_or(apart, frame[:, 0])
+            reach = self.surface_radius.astype(center.dtype)  # pyright: ignore[reportOptionalMemberAccess]
+            distance = jnp.sum(outward * apart)
+            gap = reach - distance - radius if self.inside else distance - reach - radius
+            normal = -outward if self.inside else outward
+            directions = _tangents(normal)
+        return _Contact(center - radius * normal, normal, gap, directions)
+
+
+def rolling_sphere(
+    body: str,
+    center,
+    radius,
+    *,
+    on: str = "plane",
+    surface=None,
+    surface_body: str | None = None,
+    surface_radius=None,
+    inside: bool = False,
+    spin: bool = False,
+    contact: bool = True,
+    name: str | None = None,
+) -> RollingSphere:
+    """A sphere that rolls without slipping on a plane, or outside or inside of a sphere or a cylinder.
+
+    **Arguments:**
+
+    - `body`: body or frame that carries the sphere; `center` (3,) in it (None: its origin), m; `radius`, m.
+    - `on`: "plane", "sphere" or "cylinder". `surface`: pose of the surface in `surface_body` (None: the world): a
+      plane's z is its normal, a sphere's origin its centre, a cylinder's z its axis. `surface_radius`: m, of the latter.
+    - `inside`: whether the sphere rolls on the inner side.
+    - `spin`: whether the contact also resists spinning about the normal (a soft contact).
+    - `contact`: whether the height is constrained.
+
+    **Raises:** ValueError for an unknown surface, radii that are missing, not positive or too small for a sphere inside,
+    or a bad pose; when used, for unknown bodies.
+    """
+    name = f"sphere {body}" if name is None else name
+    if on not in ("plane", "sphere", "cylinder"):
+        raise ValueError(f"{name!r}: on is {on!r}; choose from plane, sphere, cylinder")
+    if (on == "plane") != (surface_radius is None):
+        fix = "leave it out" if on == "plane" else "give the radius of the surface (m)"
+        raise ValueError(f"{name!r}: surface_radius is {surface_radius} on a {on}; {fix}")
+    if on == "plane" and inside:
+        raise ValueError(f"{name!r}: a plane has no inside; turn the plane over")
+    radius = _length(radius, f"{name!r}: radius")
+    reach = None if surface_radius is None else _length(surface_radius, f"{name!r}: surface_radius")
+    concrete = reach is not None and not isinstance(radius - reach, jax.core.Tracer)
+    if inside and concrete and not radius < reach:
+        raise ValueError(f"{name!r}: radius {radius} is not below surface_radius {reach}; it does not fit inside")
+    return RollingSphere(
+        name=name,
+        body=body,
+        surface_body=surface_body,
+        pose=pose_leaf(center, f"{name!r}: center"),
+        surface=pose_leaf(surface, f"{name!r}: surface"),
+        radius=radius,
+        surface_radius=reach,
+        on=on,
+        inside=bool(inside),
+        contact=bool(contact),
+        spin=bool(spin),
+    )
+
+
+def _length(value, what: str) -> Float[Array, ""]:
+    value = jnp.asarray(value, float) if not isinstance(value, jax.Array) else value
+    if value.shape != () or (not isinstance(value, jax.core.Tracer) and not 0 < float(value) < float("inf")):
+        raise ValueError(f"{what} is {value}; give one positive number (m)")
+    return value

@@ -1,0 +1,535 @@
+"""Identification: base parameters, least squares, feasible fits by torque and by trajectory error."""
+
+import importlib.util
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import pytest
+from jax.flatten_util import ravel_pytree
+from jax.test_util import check_grads
+from pinocchio_bridge import to_pinocchio
+
+from jaxdyn import identify, inertia
+from jaxdyn.building import ModelBuilder
+from jaxdyn.identify.chart import Coordinates, make_chart
+from jaxdyn.identify.feasible import Problem, torque_loss
+from jaxdyn.identify.regression import condense
+from jaxdyn.io.urdf import load_urdf
+from jaxdyn.simulate import simulate
+
+PI = np.pi
+# KUKA LBR iiwa as in Drake's benchmark: joint origins (rpy; y and z) in the parent, masses, centres, principal moments.
+IIWA_RPY = [
+    (0, 0, 0),
+    (PI / 2, 0, PI),
+    (PI / 2, 0, PI),
+    (PI / 2, 0, 0),
+    (-PI / 2, PI, 0),
+    (PI / 2, 0, 0),
+    (-PI / 2, PI, 0),
+]
+IIWA_XYZ = [
+    (0, 0, 0.1575),
+    (0, 0, 0.2025),
+    (0, 0.2045, 0),
+    (0, 0, 0.2155),
+    (0, 0.1845, 0),
+    (0, 0, 0.2155),
+    (0, 0.081, 0),
+]
+IIWA_MASS = [5.76, 6.35, 3.5, 3.5, 3.5, 1.8, 1.2]
+IIWA_COM = [
+    (0, -0.03, 0.12),
+    (0.0003, 0.059, 0.042),
+    (0, 0.03, 0.13),
+    (0, 0.067, 0.034),
+    (0.0001, 0.021, 0.076),
+    (0, 0.0006, 0.0004),
+    (0, 0, 0.02),
+]
+IIWA_MOMENTS = [
+    (0.033, 0.0333, 0.0123),
+    (0.0305, 0.0304, 0.011),
+    (0.025, 0.0238, 0.0076),
+    (0.017, 0.0164, 0.006),
+    (0.01, 0.0087, 0.00449),
+    (0.0049, 0.0047, 0.0036),
+    (0.001, 0.001, 0.001),
+]
+
+
+@pytest.fixture(scope="module")
+def iiwa():
+    builder = ModelBuilder("iiwa")
+    for i in range(7):
+        parent = f"link{i}" if i else None
+        builder.add_body(
+            f"link{i + 1}",
+            parent,
+            joint_name=f"joint{i + 1}",
+            pose=((0, *IIWA_YZ[i]), IIWA_RPY[i]),
+            inertia=(IIWA_MASS[i], IIWA_COM[i], IIWA_MOMENTS[i]),
+            damping=0.5,
+            friction=0.2 + 0.1 * i,
+            armature=0.05,
+        )
+    return builder.build()
+
+
+def planar_arm(mass1=1.0, mass2=0.8, dtype=None):
+    """Two links about parallel horizontal axes, in the vertical plane."""
+    builder = ModelBuilder("arm", dtype=dtype)
+    moments = np.array([0.1, 0.09, 0.02])
+    builder.add_body("a", axis=(0, 1, 0), inertia=(mass1, (0.02, 0.01, -0.5), mass1 * moments))
+    builder.add_body("b", "a", pose=(0, 0, -1), axis=(0, 1, 0), inertia=(mass2, (0.01, 0, -0.4), mass2 * moments))
+    return builder.build()
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return planar_arm()
+
+
+def motion(nv, n=300, seed=3):
+    """Sums of sines with their exact derivatives: an exciting motion without noise."""
+    generator = np.random.default_rng(seed)
+    t = np.linspace(0, 6, n)
+    amplitude, phase = generator.uniform(0.3, 1.0, (4, nv)), generator.uniform(0, 2 * PI, (4, nv))
+    w = np.arange(1, 5)[:, None] * 1.3
+    angle = w * t[:, None, None] + phase
+    q = np.sum(amplitude * np.sin(angle), 1)
+    v = np.sum(amplitude * w * np.cos(angle), 1)
+    return t, q, v, np.sum(-amplitude * w**2 * np.sin(angle), 1)
+
+
+def friction_torque(v, viscous, coulomb, offset, v_s=0.01):
+    return viscous * v + coulomb * np.tanh(v / v_s) + offset
+
+
+def pinocchio_log(model, seed=3, noise=0.0, offset=0.0):
+    """A log whose torques Pinocchio computed; friction by its formula."""
+    t, q, v, a = motion(model.nv, seed=seed)
+    reference, bridge = to_pinocchio(model)
+    data = reference.createData()
+    # Rotor inertia is added here and not taken from Pinocchio's armature.
+    reference.armature[:] = 0
+    tau = np.array([pin.rnea(reference, data, bridge.q_to_pinocchio(q[i]), v[i], a[i]) for i in range(len(t))])
+    if model.damping is not None:
+        tau += friction_torque(v, np.asarray(model.damping), np.asarray(model.friction), offset)
+        tau += a * np.asarray(model.armature)
+    return identify.Log(t, q, v, a, tau + noise * np.random.default_rng(7).normal(size=tau.shape))
+
+
+@pytest.fixture(scope="module")
+def iiwa_log(iiwa):
+    return pinocchio_log(iiwa, offset=0.3)
+
+
+@pytest.fixture(scope="module")
+def wrong_iiwa(iiwa):
+    """A nominal model that is feasible and wrong everywhere, without friction."""
+    generator = np.random.default_rng(5)
+    theta = jax.vmap(inertia.to_log_cholesky)(iiwa.inertias) + generator.normal(scale=0.15, size=(7, 10))
+    inertias = jax.vmap(inertia.from_log_cholesky)(theta)
+    return iiwa.replace(inertias=inertias, damping=None, friction=None, armature=None)
+
+
+# --- base parameters --------------------------------------------------------------------------------------------------
+
+
+def test_base_parameters_of_the_iiwa(iiwa):
+    base = identify.base_parameters(iiwa)
+    # Khalil & Dombre: a chain of revolute joints, none parallel, first axis along gravity: 7 n - 6.
+    assert len(base) == 43
+    assert base.names[0] == "link1.Izz"
+    kept = ("mcx", "mcy", "Ixx", "Ixy", "Ixz", "Iyz", "Izz")
+    assert base.names[1:] == tuple(f"link{i}.{k}" for i in range(2, 8) for k in kept)
+    assert set(base.unidentifiable) >= {f"link1.{k}" for k in ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyz")}
+    assert base.expressions[0] == "link1.Izz + 1 link2.Iyy"
+    # The second witness: Pinocchio's regressor has this rank, and does not see a change that keeps the combinations.
+    reference, _ = to_pinocchio(iiwa)
+    data = reference.createData()
+    generator = np.random.default_rng(1)
+    rows = np.vstack(
+        [pin.computeJointTorqueRegressor(reference, data, *generator.normal(size=(3, 7))).copy() for _ in range(60)]
+    )
+    assert np.linalg.matrix_rank(rows, tol=1e-9) == 43
+    null = np.linalg.svd(base.matrix)[2][43:]
+    assert np.abs(rows @ null.T).max() < 1e-10 * np.abs(rows).max() * np.sqrt(70)
+    np.testing.assert_allclose(rows[:, base.independent] @ base.matrix, rows, atol=1e-10 * np.abs(rows).max())
+
+
+def test_base_parameters_of_two_links_in_closed_form(arm):
+    """Moving the second link's mass into the first: Iyy1 + m2 l^2, mcz1 - m2 l; the plane hides the rest."""
+    base = identify.base_parameters(arm)
+    assert base.names == ("a.mcx", "a.mcz", "a.Iyy", "b.mcx", "b.mcz", "b.Iyy")
+    np.testing.assert_allclose(
+        base.values(arm.inertias), base.values(np.asarray(arm.inertias))
+    )  # takes (nb, 10) as well as (10 nb,)
+    x = np.asarray(arm.inertias)
+    expected = [x[0, 1], x[0, 3] - x[1, 0], x[0, 6] + x[1, 0], x[1, 1], x[1, 3], x[1, 6]]
+    np.testing.assert_allclose(base.values(x), expected, rtol=1e-12)
+    with_rotors = identify.base_parameters(arm, ("armature", "viscous"))
+    # The first rotor turns with the first link, the second only relative to it.
+    assert len(with_rotors) == 6 + 1 + 2
+    assert "b_joint.armature" in with_rotors.names and "a_joint.armature" not in with_rotors.names
+
+
+def test_free_body_shows_all_ten():
+    builder = ModelBuilder("free")
+    builder.add_body("body", joint="free", inertia=(2.0, (0.1, 0.2, 0.3), (0.3, 0.4, 0.5)))
+    base = identify.base_parameters(builder.build())
+    assert len(base) == 10 and not base.unidentifiable
+    np.testing.assert_allclose(base.matrix, np.eye(10), atol=1e-12)
+
+
+# --- linear least squares ---------------------------------------------------------------------------------------------
+
+
+def test_least_squares_recovers_base_parameters_without_noise(iiwa, wrong_iiwa, iiwa_log):
+    fit = identify.least_squares(wrong_iiwa, iiwa_log)
+    true = identify.nominal_parameters(iiwa)
+    true[identify.parameter_names(iiwa).index("joint1.offset") :][:7] = 0.3
+    np.testing.assert_allclose(fit.values, fit.base.values(true), rtol=1e-8, atol=1e-8)
+    assert fit.rank == len(fit.base) == 43 + 21 + 5  # two rotors turn with link inertias that are free themselves
+    assert fit.error(iiwa_log) < 1e-8
+    np.testing.assert_allclose(fit.base.values(fit.parameters), fit.values, rtol=1e-10, atol=1e-10)
+    assert "rank 69" in fit.summary() and "link7.Izz" in fit.summary()
+
+
+def test_terms_left_out_keep_the_models_values(iiwa, wrong_iiwa):
+    """Torques made with known friction: fitting the links alone finds them only if that friction is accounted for."""
+    log = pinocchio_log(iiwa)
+    known = wrong_iiwa.replace(damping=iiwa.damping, friction=iiwa.friction, armature=iiwa.armature)
+    fit = identify.least_squares(known, log, terms=())
+    np.testing.assert_allclose(fit.values, fit.base.values(iiwa.inertias), rtol=1e-8, atol=1e-8)
+
+
+def test_least_squares_noise_is_within_its_statistics(iiwa, wrong_iiwa):
+    noise = 0.2
+    log = pinocchio_log(iiwa, noise=noise)
+    fit = identify.least_squares(wrong_iiwa, log)
+    n, p = log.tau.size, len(fit.base)
+    assert abs(fit.sigma / noise - 1) < 4 / np.sqrt(2 * (n - p))
+    off = fit.values - fit.base.values(identify.nominal_parameters(iiwa))
+    chi2 = off @ np.linalg.solve(fit.covariance, off)
+    assert abs(chi2 - p) < 4 * np.sqrt(2 * p)  # chi-square: mean p, variance 2 p
+    assert np.all(np.abs(off) < 4.5 * fit.std)
+    np.testing.assert_allclose(fit.std, np.sqrt(np.diag(fit.covariance)))
+
+
+def test_least_squares_says_what_the_log_does_not_show(arm):
+    """A robot that is held at rest in many poses shows its first moments and no moment of inertia."""
+    t, q, v, _ = motion(2)
+    log = identify.Log(t, q, 0 * v, 0 * v, pinocchio_log(arm).tau)
+    fit = identify.least_squares(arm, log, terms=())
+    assert fit.rank == 4
+    assert [name for name, std in zip(fit.base.names, fit.std, strict=True) if np.isinf(std)] == ["a.Iyy", "b.Iyy"]
+    np.testing.assert_array_equal(fit.values[[2, 5]], fit.nominal[[2, 5]])
+    assert "does not excite" in fit.summary()
+
+
+def test_bad_arguments_raise(arm, iiwa_log):
+    t, q, v, a = motion(2, n=20)
+    log = identify.Log(t, q, v, a, q)
+    with pytest.raises(ValueError, match=r"terms is \('stiction',\)"):
+        identify.least_squares(arm, log, "stiction")
+    with pytest.raises(ValueError, match="v_s is 0"):
+        identify.fit_torques(arm, log, v_s=0)
+    with pytest.raises(ValueError, match="7 columns of q, model 'arm' has 2"):
+        identify.least_squares(arm, iiwa_log)
+    with pytest.raises(ValueError, match="2 samples of 2 torques, too few for 6"):
+        identify.least_squares(arm, log[:2], terms=())
+    with pytest.raises(ValueError, match=r"4 torques for .* unknowns; log more, or give sigma"):
+        identify.fit_torques(arm, log[:2])
+    with pytest.raises(ValueError, match=r"weights is \[1.0, 0.0\]; give 2 positive"):
+        identify.fit_torques(arm, log, weights=[1, 0])
+    for name, value in (("method", "sgd"), ("inertia", "some"), ("prior", 0.0)):
+        with pytest.raises(ValueError, match=f"{name} is '?{value}"):
+            identify.fit_torques(arm, log, **{name: value})
+    with pytest.raises(ValueError, match="steps=0"):
+        identify.fit_torques(arm, log, method="adam", steps=0)
+    rod = arm.replace(inertias=arm.inertias.at[1, 4:].set(0.0))
+    with pytest.raises(ValueError, match=r"inertia of b is not that of a solid body.*jd.repair_inertias"):
+        identify.fit_torques(rod, log)
+    with pytest.raises(ValueError, match=r"viscous of coordinate 1 is -0.5 in the model"):
+        identify.fit_torques(arm.replace(damping=jnp.array([0.0, -0.5])), log)
+    for name, value in (("initial", "guess"), ("hold", "spline"), ("method", "newton"), ("prior", -1.0)):
+        with pytest.raises(ValueError, match=f"{name} is '?{value}"):
+            identify.fit_trajectory(arm, log, **{name: value})
+    with pytest.raises(ValueError, match="horizon=20 steps; a log of 20 samples allows 1 to 19"):
+        identify.fit_trajectory(arm, log, horizon=20)
+    with pytest.raises(ValueError, match="the log has no v"):
+        identify.fit_trajectory(arm, identify.Log(t, q, tau=q))
+
+
+# --- the chart of feasible models -------------------------------------------------------------------------------------
+
+
+def test_every_point_of_the_chart_is_feasible(wrong_iiwa):
+    chart, point = make_chart(wrong_iiwa, identify.TERMS, 0.01, "full", *[np.ones(7)] * 3)
+    np.testing.assert_allclose(chart.inertias(point.theta), wrong_iiwa.inertias, rtol=1e-12, atol=1e-14)
+    far = jax.random.normal(jax.random.key(0), (200, 7, 10))
+    bodies = jax.vmap(chart.inertias)(far).reshape(-1, 10)
+    assert np.linalg.eigvalsh(jax.vmap(inertia.pseudo_inertia)(bodies)).min() > 0
+    s = jax.random.normal(jax.random.key(1), (200, 4, 7))
+    viscous, coulomb, offset, armature = np.moveaxis(np.asarray(jax.vmap(chart.term_values)(s)), 1, 0)
+    assert min(viscous.min(), coulomb.min(), armature.min()) >= 0 > offset.min()
+
+
+def test_divergence_against_its_definition(wrong_iiwa):
+    chart, _ = make_chart(wrong_iiwa, (), 0.01, "full", *[np.ones(7)] * 3)
+    theta = 0.4 * jax.random.normal(jax.random.key(2), (7, 10))
+    P0 = np.asarray(jax.vmap(inertia.pseudo_inertia)(wrong_iiwa.inertias))
+    P = np.asarray(jax.vmap(inertia.pseudo_inertia)(chart.inertias(theta)))
+    ratio = np.linalg.solve(P0, P)
+    expected = np.sum(np.trace(ratio, axis1=1, axis2=2) - np.linalg.slogdet(ratio)[1] - 4)
+    # Condition numbers of the pseudo-inertias, up to 1e4, limit the reference.
+    np.testing.assert_allclose(chart.divergence(theta), expected, rtol=1e-10)
+    assert abs(float(chart.divergence(jnp.zeros((7, 10))))) < 1e-13
+    # Moving the chart changes coordinates, not bodies or the nominal ones.
+    moved = chart.moved(theta)
+    np.testing.assert_allclose(moved.inertias(jnp.zeros((7, 10))), chart.inertias(theta), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(moved.divergence(jnp.zeros((7, 10))), chart.divergence(theta), rtol=1e-12)
+
+
+def test_torque_loss_and_its_gradient(wrong_iiwa, iiwa_log):
+    """The condensed loss is the sum over samples, and its gradient is that of finite differences, to second order."""
+    chart, point = make_chart(wrong_iiwa, identify.TERMS, 0.01, "full", *[np.ones(7)] * 3)
+    condensed = condense(wrong_iiwa, iiwa_log)
+    numbers = (condensed.R, condensed.d, condensed.rest, 0.7)
+    problem = Problem(chart, *(jnp.asarray(x) for x in numbers))
+    y, unflatten = ravel_pytree(point)
+    y = y + 0.1 * jax.random.normal(jax.random.key(3), y.shape)
+    at = unflatten(y)
+    residual = identify.regressor(wrong_iiwa, iiwa_log.q, iiwa_log.v, iiwa_log.a) @ np.asarray(chart.parameters(at))
+    expected = 0.5 * np.sum((residual - iiwa_log.tau) ** 2) + 0.7 * float(chart.divergence(at.theta))
+    np.testing.assert_allclose(torque_loss(at, problem), expected, rtol=1e-10)
+    check_grads(jax.jit(lambda y: torque_loss(unflatten(y), problem) / expected), (y,), order=2, rtol=1e-5)
+
+
+# --- feasible fits by torque error ------------------------------------------------------------------------------------
+
+
+def lowest_eigenvalue(model):
+    return float(np.linalg.eigvalsh(jax.vmap(inertia.pseudo_inertia)(model.inertias)).min())
+
+
+def test_feasible_fit_recovers_base_parameters_without_noise(iiwa, wrong_iiwa, iiwa_log):
+    """sigma is then its floor, 1e-6 of the torque, and the prior's pull is that small."""
+    fit = identify.fit_torques(wrong_iiwa, iiwa_log)
+    assert fit.result == "converged"
+    base = identify.base_parameters(iiwa, identify.TERMS)
+    true = identify.nominal_parameters(iiwa)
+    true[identify.parameter_names(iiwa).index("joint1.offset") :][:7] = 0.3
+    np.testing.assert_allclose(base.values(fit.vector), base.values(true), atol=2e-6)
+    assert fit.error(iiwa_log) < 1e-5
+    np.testing.assert_allclose(fit.friction.offset, 0.3, atol=1e-6)
+    np.testing.assert_allclose(fit.model.damping, 0.5, atol=1e-6)
+    name, nominal, fitted = fit.parameters[0]
+    assert name == "link1.m" and nominal == float(wrong_iiwa.inertias[0, 0])
+    assert fitted == float(fit.model.inertias[0, 0])
+
+
+@pytest.mark.parametrize("method", ["newton", "lbfgs", "adam"])
+def test_every_iterate_is_feasible_and_the_optimum_is_one(iiwa, wrong_iiwa, method):
+    """Whatever the method, it stays among physical models and goes to the one minimum of a convex loss."""
+    log = pinocchio_log(iiwa, noise=0.5)
+    lowest, positive, losses = [], [], []
+
+    def watch(step, loss, model):
+        losses.append(loss)
+        if step % 50 == 0 or method == "newton":
+            lowest.append(lowest_eigenvalue(model))
+            positive.append(min(float(x.min()) for x in (model.damping, model.friction, model.armature)))
+
+    fit = identify.fit_torques(wrong_iiwa, log, method=method, callback=watch, steps={"adam": 3000}.get(method))
+    assert min(lowest) > 0 and min(positive) >= 0
+    np.testing.assert_array_equal(fit.history, losses)
+    newton = fit if method == "newton" else identify.fit_torques(wrong_iiwa, log)
+    assert newton.result == "converged" and np.all(np.diff(newton.history) < 0)
+    # lbfgs and adam approach it to 1e-4 of the loss.
+    assert newton.history[-1] <= fit.history.min() <= newton.history[-1] * (1 + {"adam": 1e-2}.get(method, 1e-4))
+
+
+def test_prior_decides_between_data_and_nominal(arm):
+    """A strong prior keeps the nominal bodies; the weaker it is, the better the fit and the larger the divergence."""
+    log = pinocchio_log(planar_arm(1.4, 0.5), noise=0.1)
+    fits = [identify.fit_torques(arm, log, prior=prior) for prior in (1e9, 1e2, 1.0)]
+    np.testing.assert_allclose(fits[0].model.inertias, arm.inertias, rtol=1e-4, atol=1e-6)
+    assert fits[0].error(log) > fits[1].error(log) > fits[2].error(log)
+    assert all(fit.result == "converged" for fit in fits)
+
+
+def test_subsets_of_what_is_fitted(arm):
+    true = planar_arm(1.4, 0.5)
+    log = pinocchio_log(true)
+    mass = identify.fit_torques(arm, log, (), inertia="mass")
+    np.testing.assert_allclose(mass.model.inertias, true.inertias, rtol=1e-7, atol=1e-9)
+    assert mass.model.damping is None and mass.model.armature is None  # what was absent stays absent
+    fixed = identify.fit_torques(true, log, inertia="fixed")
+    np.testing.assert_array_equal(fixed.model.inertias, true.inertias)
+    assert np.abs(fixed.vector[20:]).max() < 1e-6
+    # A point mass is no solid body, yet its density can be fitted.
+    builder = ModelBuilder("pendulum")
+    builder.add_body("bob", axis=(0, 1, 0), inertia=inertia.point_mass(1.0, (0, 0, -0.7)))
+    bob = builder.build()
+    heavy = bob.replace(inertias=2.5 * bob.inertias)
+    np.testing.assert_allclose(
+        identify.fit_torques(bob, pinocchio_log(heavy), (), inertia="mass").model.inertias, heavy.inertias, rtol=1e-7
+    )
+
+
+def test_float32_models(iiwa):
+    arm, true = planar_arm(dtype=jnp.float32), planar_arm(1.4, 0.5)
+    log = pinocchio_log(true, noise=0.01)
+    single = identify.fit_torques(arm, log)
+    double = identify.fit_torques(planar_arm(), log)
+    assert single.model.inertias.dtype == jnp.float32
+    # The regressor is computed in float32: 1e-6 of the torque beside 1e-3 of noise.
+    assert abs(single.error(log) - double.error(log)) < 1e-2 * double.error(log)
+    assert len(identify.base_parameters(arm)) == 6
+
+
+# --- the recorded Franka log ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def franka(data_dir, robots_dir):
+    folder = data_dir / "franka_panda"
+    if not folder.is_dir():
+        pytest.skip(f"no Franka log at {folder}")
+    spec = importlib.util.spec_from_file_location("prepare", folder / "prepare.py")
+    prepare = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(prepare)
+    t, q, _, tau = prepare.raw()
+    log = identify.from_raw(t, q, tau)
+    path = robots_dir / "panda_description/urdf/panda.urdf"
+    model = load_urdf(path, lock=("panda_finger_joint1", "panda_finger_joint2"))
+    # The file's damping is the same placeholder in every joint; the protocol's nominal model has no friction.
+    return model.replace(damping=None, friction=None), *identify.split(log, 0.7), path
+
+
+@pytest.mark.data
+def test_franka_least_squares_against_pinocchio_and_numpy(franka):
+    model, train, test, path = franka
+    fit = identify.least_squares(model, train)
+    full = pin.buildModelFromUrdf(str(path))
+    fingers = [full.getJointId(name) for name in full.names if "finger" in name]
+    reference = pin.buildReducedModel(full, fingers, pin.neutral(full))
+    data = reference.createData()
+
+    def rows(log):
+        blocks = [
+            np.hstack(
+                [
+                    pin.computeJointTorqueRegressor(reference, data, q, v, a).copy(),
+                    *(np.diag(x) for x in (v, np.tanh(v / 0.01), np.ones(7), a)),
+                ]
+            )
+            for q, v, a in zip(log.q, log.v, log.a, strict=True)
+        ]
+        return np.array(blocks)
+
+    A = rows(train).reshape(-1, 98)
+    scale = np.linalg.norm(A, axis=0)
+    scale[scale < 1e-9] = np.inf  # columns of rounding errors
+    x = np.linalg.lstsq(A / scale, train.tau.reshape(-1), rcond=1e-6)[0] / scale
+    for log, per_cent in ((train, 1.11), (test, 1.36)):
+        oracle = rows(log) @ x
+        np.testing.assert_allclose(fit.torques(log), oracle, atol=1e-9 * np.abs(oracle).max())
+        assert round(fit.error(log), 2) == per_cent
+    nominal = np.array([pin.rnea(reference, data, *z) for z in zip(test.q, test.v, test.a, strict=True)])
+    assert 16 < identify.torque_error(nominal, test.tau) < 20
+    assert fit.rank == len(fit.base) == 69 and fit.condition < 50
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("method", ["newton", "lbfgs"])
+def test_franka_feasible_fit_on_held_out_data(franka, method):
+    model, train, test, _ = franka
+    fit = identify.fit_torques(model, train, method=method)
+    assert fit.error(test) <= 1.45
+    assert fit.error(train) <= 1.21
+    assert lowest_eigenvalue(fit.model) > 0
+    for values in (fit.friction.viscous, fit.friction.coulomb, fit.model.armature):
+        assert np.asarray(values).min() >= 0
+    # The prediction is inverse dynamics and the friction law; the regressor says the same.
+    by_regressor = identify.regressor(model, test.q, test.v, test.a) @ fit.vector
+    np.testing.assert_allclose(fit.torques(test), by_regressor, atol=1e-10 * np.abs(by_regressor).max())
+    assert fit.summary(train, test).count("torque error") == 2
+
+
+# --- feasible fits by trajectory error --------------------------------------------------------------------------------
+
+
+def test_sampled_torque_between_samples():
+    t, tau = jnp.array([0.0, 1.0, 3.0]), jnp.array([[0.0], [2.0], [-2.0]])
+    for hold, expected in (("linear", [0, 1, 2, 0, -2, -2]), ("previous", [0, 0, 2, 2, 2, 2])):
+        control = identify.SampledTorque(t, tau, hold)
+        times = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0)
+        np.testing.assert_allclose([float(control(tau[0], tau[0], jnp.asarray(x))[0]) for x in times], expected)
+
+
+@pytest.fixture(scope="module")
+def simulated(arm):
+    """Two seconds of the arm under known torques, with the solver that the fit uses."""
+    t = jnp.linspace(0, 2, 101)
+    tau = jnp.stack([3 * jnp.sin(3 * t) + 1, jnp.cos(5 * t)], axis=1)
+    start = jnp.array([0.3, -0.4]), jnp.zeros(2)
+    motion = simulate(arm, *start, t, control=identify.SampledTorque(t, tau), stepsize=0.01)
+    return identify.Log(t, motion.q, motion.v, None, tau)
+
+
+def test_trajectory_fit_recovers_masses_without_noise(arm, simulated):
+    nominal = planar_arm(1.5, 0.5)
+    options = dict(horizon=20, stepsize=0.01)
+    lowest = []
+    fit = identify.fit_trajectory(
+        nominal,
+        simulated,
+        inertia="mass",
+        prior=0.0,
+        tolerance=0.0,
+        steps=40,
+        callback=lambda step, loss, model: lowest.append(lowest_eigenvalue(model)),
+        **options,
+    )
+    np.testing.assert_allclose(fit.model.inertias, arm.inertias, rtol=1e-6, atol=1e-9)
+    assert min(lowest) > 0
+    assert fit.history[-1] < 1e-10 * fit.history[0]
+    # The simulated motion of the fitted model, over the whole log at once, is the log.
+    held_out = identify.trajectory_error(fit.model, simulated, stepsize=0.01)
+    assert max(held_out) < 1e-4 < 1 < min(identify.trajectory_error(nominal, simulated, stepsize=0.01))
+
+
+@pytest.mark.slow
+def test_trajectory_fit_of_noisy_states(arm, simulated):
+    """Free initial states: full inertias and friction from noisy positions and velocities."""
+    generator = np.random.default_rng(0)
+    noisy = [np.asarray(x) + 1e-3 * generator.normal(size=x.shape) for x in (simulated.q, simulated.v)]
+    log = identify.Log(simulated.t, *noisy, None, simulated.tau)
+    nominal = planar_arm(1.5, 0.5)
+    fit = identify.fit_trajectory(nominal, log, ("viscous",), horizon=25, initial="free", stepsize=0.02)
+    base = identify.base_parameters(arm)
+    true, found, old = (base.values(model.inertias) for model in (arm, fit.model, nominal))
+    assert np.linalg.norm(found - true) < 0.03 * np.linalg.norm(old - true)
+    assert np.abs(fit.friction.viscous).max() < 0.01
+    assert max(identify.trajectory_error(fit.model, simulated, fit.friction, horizon=50, stepsize=0.02)) < 1
+
+
+def test_trajectory_fit_says_when_a_simulation_failed(simulated):
+    """A step far too long for the motion: the loss is not finite, and the model given comes back."""
+    nominal = planar_arm(1.5, 0.5)
+    broken = eqx.tree_at(lambda log: log.tau, simulated, 1e200 * simulated.tau)
+    fit = identify.fit_trajectory(nominal, broken, inertia="mass", horizon=20, stepsize=0.01)
+    assert fit.result == "not_finite"
+    np.testing.assert_allclose(fit.model.inertias, nominal.inertias, rtol=1e-12)
+
+
+def test_coordinates_are_a_pytree():
+    point = Coordinates(jnp.zeros((2, 10)), jnp.zeros((1, 3)))
+    assert ravel_pytree(point)[0].shape == (23,)

@@ -1,0 +1,196 @@
+"""Logs: what is refused, files there and back, and the filter protocol against the one the data came with."""
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+from jaxdyn import identify
+from jaxdyn.building import ModelBuilder
+from jaxdyn.identify.logs import check_log
+from jaxdyn.io.logs import read_log, write_log
+
+N = 60
+
+
+@pytest.fixture
+def signals():
+    generator = np.random.default_rng(0)
+    t = np.linspace(0.0, 1.0, N) ** 1.1
+    return dict(t=t, **{name: generator.normal(size=(N, 2)) for name in ("q", "v", "a", "tau")})
+
+
+@pytest.fixture(scope="module")
+def arm():
+    builder = ModelBuilder("arm")
+    builder.add_body("upper", joint_name="shoulder", inertia=(1.0, (0.1, 0, 0), (0.1, 0.1, 0.1)))
+    builder.add_body("lower", "upper", joint_name="elbow", pose=(1, 0, 0), inertia=(1.0, (0.1, 0, 0), (0.1, 0.1, 0.1)))
+    return builder.build()
+
+
+def spoilt(signals, name, rows, value):
+    signals = {key: np.array(x) for key, x in signals.items()}
+    signals[name][rows] = value
+    return signals
+
+
+def test_bad_logs_raise(signals):
+    with pytest.raises(ValueError, match=r"q is nan at row 7, column 2 \(1 such values\)"):
+        identify.Log(**spoilt(signals, "q", (7, 1), np.nan))
+    with pytest.raises(ValueError, match="t is inf at row 3"):
+        identify.Log(**spoilt(signals, "t", 3, np.inf))
+    with pytest.raises(ValueError, match=r"unequal lengths: t has 60 rows, q has 59 rows, v has 60"):
+        identify.Log(**signals | dict(q=signals["q"][1:]))
+    back = spoilt(signals, "t", 5, signals["t"][4])
+    with pytest.raises(ValueError, match=r"time does not increase at row 5: t\[4\]=.* \(1 such rows\)"):
+        identify.Log(**back)
+    with pytest.raises(ValueError, match="tau is missing"):
+        identify.Log(signals["t"], signals["q"])
+    with pytest.raises(ValueError, match=r"q has shape \(60,\)"):
+        identify.Log(**signals | dict(q=signals["t"]))
+    with pytest.raises(ValueError, match="v has 1 columns, tau has 2"):
+        identify.Log(**signals | dict(v=signals["v"][:, :1]))
+    with pytest.raises(ValueError, match="no samples"):
+        identify.Log(**{name: x[:0] for name, x in signals.items()})
+    with pytest.raises(ValueError, match="joint_names has 1 names, tau has 2"):
+        identify.Log(**signals, joint_names=("a",))
+    with pytest.raises(ValueError, match="indexed by slices"):
+        identify.Log(**signals)[3]
+
+
+def test_log_must_fit_the_model(signals, arm):
+    log = identify.Log(**signals)
+    check_log(log, arm)
+    with pytest.raises(ValueError, match=r"1 columns of q, model 'arm' has 2 \(joints shoulder, elbow\)"):
+        check_log(identify.Log(signals["t"], *(signals[k][:, :1] for k in ("q", "v", "a", "tau"))), arm)
+    with pytest.raises(ValueError, match=r"the log has no a; .*from_raw"):
+        check_log(identify.Log(**signals | dict(a=None)), arm)
+    with pytest.raises(ValueError, match=r"joints are elbow, shoulder.*joint_names=model.joint_names"):
+        check_log(identify.Log(**signals, joint_names=("elbow", "shoulder")), arm)
+
+
+def test_split_shares_no_sample(signals):
+    log = identify.Log(**signals)
+    first, second = identify.split(log, 0.7)
+    assert (len(first), len(second)) == (42, 18)
+    np.testing.assert_array_equal(np.concatenate([first.tau, second.tau]), log.tau)
+    for fraction in (0.0, 1.0, 0.001, -0.5, np.nan):
+        with pytest.raises(ValueError, match="leaves one part empty"):
+            identify.split(log, fraction)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+@pytest.mark.parametrize("names", [None, ("shoulder", "elbow")])
+def test_files_there_and_back(signals, tmp_path, suffix, names):
+    path = tmp_path / f"log.{suffix}"
+    for given in (signals, signals | dict(v=None, a=None)):
+        log = identify.Log(**given, joint_names=names)
+        write_log(path, log)
+        back = read_log(path)
+        assert back.joint_names == names
+        for name in ("t", "q", "v", "a", "tau"):
+            np.testing.assert_array_equal(getattr(back, name), getattr(log, name))  # every digit
+
+
+def test_columns_with_joint_names_follow_the_model(signals, tmp_path):
+    path = tmp_path / "log.csv"
+    write_log(path, identify.Log(**signals, joint_names=("elbow", "shoulder")))
+    log = read_log(path, joint_names=("shoulder", "elbow"))
+    np.testing.assert_array_equal(log.q, signals["q"][:, ::-1])
+    np.testing.assert_array_equal(read_log(path, joint_names=("elbow",)).tau, signals["tau"][:, :1])
+    with pytest.raises(ValueError, match="missing columns q_wrist, v_wrist, a_wrist, tau_wrist; the file has t"):
+        read_log(path, joint_names=("elbow", "wrist"))
+
+
+def test_npz_takes_whole_signals(signals, tmp_path):
+    np.savez(tmp_path / "log.npz", **signals, note=np.array("ignored"))
+    np.testing.assert_array_equal(read_log(tmp_path / "log.npz").a, signals["a"])
+    np.savez(tmp_path / "flat.npz", t=signals["t"], q=signals["t"], tau=signals["t"])
+    with pytest.raises(ValueError, match=r"flat.npz: q has shape \(60,\)"):
+        read_log(tmp_path / "flat.npz")
+
+
+BAD_FILES = {
+    "empty": ("", "the file is empty"),
+    "no time": ("q1,tau1\n0,0\n", "missing column t; the file has q1, tau1"),
+    "no torque": ("t,q1\n0,0\n", "missing columns tau1"),
+    "hole": ("t,q1,q3,tau1,tau2,tau3\n0,0,0,0,0,0\n", "missing columns q2;"),
+    "repeated": ("t,q1,q1,tau1\n0,0,0,0\n", "repeated columns q1"),
+    "mixed": ("t,q1,q_a,tau1\n0,0,0,0\n", "both numbered .* and named"),
+    "word": ("t,q1,tau1\n0,0,0\n1,oops,0\n", "line 3, column q1: 'oops' is no number"),
+    "blank": ("t,q1,tau1\n0,0,\n", "line 2, column tau1: '' is no number"),
+    "short row": ("t,q1,tau1\n0,0,0\n1,0\n", "line 3 has 2 cells, the header 3"),
+    "nan": ("t,q1,tau1\n0,0,0\n1,nan,0\n", "q is nan at row 1, column 1"),
+    "backwards": ("t,q1,tau1\n0,0,0\n-1,0,0\n", "time does not increase at row 1"),
+    "header only": ("t,q1,tau1\n", "no samples"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_files_raise(tmp_path, case):
+    text, message = BAD_FILES[case]
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"bad\.csv: .*{message}"):
+        read_log(path)
+
+
+def test_unreadable_files_raise(tmp_path, signals):
+    with pytest.raises(FileNotFoundError, match=r"gone\.csv: no such log file"):
+        read_log(tmp_path / "gone.csv")
+    with pytest.raises(ValueError, match=r"are \.csv or \.npz, not '\.mat'"):
+        read_log(tmp_path / "log.mat")
+    with pytest.raises(ValueError, match=r"are \.csv or \.npz, not '\.txt'"):
+        write_log(tmp_path / "log.txt", identify.Log(**signals))
+    np.savez(tmp_path / "log.npz", t=np.arange(3.0), q1=np.arange(3.0), tau1=np.arange(2.0))
+    with pytest.raises(ValueError, match="unequal lengths: t has 3 rows, q1 has 3 rows, tau1 has 2 rows"):
+        read_log(tmp_path / "log.npz")
+
+
+def test_from_raw_recovers_a_slow_sine():
+    """A 1 Hz motion is far below the cut-off: rates are its derivatives.
+
+    Errors: gradients (w dt)^2 / 6 = 7e-6 each, linear interpolation (w dt)^2 / 8 = 5e-6, jitter of the time stamps up
+    to that again, filter (1/8)^8 = 6e-8.
+    """
+    generator = np.random.default_rng(1)
+    t = np.sort(np.linspace(0, 8, 8001) + generator.uniform(-3e-4, 3e-4, 8001))
+    w = 2 * np.pi
+    log = identify.from_raw(t, np.sin(w * t)[:, None], np.cos(w * t)[:, None])
+    middle = log[len(log) // 4 : -len(log) // 4]
+    expected = dict(q=np.sin(w * middle.t), v=w * np.cos(w * middle.t), a=-(w**2) * np.sin(w * middle.t))
+    for name, value in (expected | dict(tau=np.cos(w * middle.t))).items():
+        np.testing.assert_allclose(getattr(middle, name)[:, 0], value, atol=1e-4 * np.abs(value).max())
+
+
+def test_from_raw_refuses():
+    t = np.linspace(0, 2, 2001)
+    x = np.sin(t)[:, None]
+    with pytest.raises(ValueError, match="300 samples are too few for the filter: at least 409"):
+        identify.from_raw(t[:300], x[:300], x[:300])
+    with pytest.raises(ValueError, match=r"cutoff=600.0 Hz must lie between 0 and half the sampling rate, 500 Hz"):
+        identify.from_raw(t, x, x, cutoff=600.0)
+    with pytest.raises(ValueError, match=r"gap of 0.5\d* s after row 999 .*longer than half a period of cutoff=8"):
+        identify.from_raw(np.where(t < 1, t, t + 0.5), x, x)
+    with pytest.raises(ValueError, match="q has 2 columns and tau 1"):
+        identify.from_raw(t, np.hstack([x, x]), x)
+
+
+@pytest.mark.data
+def test_from_raw_is_the_protocol_of_the_recorded_data(data_dir):
+    """Bit for bit the arrays of the script that defines the protocol."""
+    folder = data_dir / "franka_panda"
+    if not folder.is_dir():
+        pytest.skip(f"no Franka log at {folder}")
+    spec = importlib.util.spec_from_file_location("prepare", folder / "prepare.py")
+    prepare = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(prepare)
+    t, q, _, tau = prepare.raw()
+    log = identify.from_raw(t, q, tau)
+    for name, value in zip(("t", "q", "v", "a", "tau"), prepare.prepared(), strict=True):
+        np.testing.assert_array_equal(getattr(log, name), value)
+    train, test = identify.split(log, 0.7)
+    rows = prepare.split(len(log))
+    np.testing.assert_array_equal(train.t, log.t[rows[0]])
+    np.testing.assert_array_equal(test.t, log.t[rows[1]])
+    assert identify.torque_error(1.1 * log.tau, log.tau) == pytest.approx(prepare.error_percent(1.1 * log.tau, log.tau))
