@@ -1,5 +1,14 @@
 """Rigid-body dynamics in JAX: pure functions of one sample, to be batched, compiled and differentiated."""
 
+from jaxdyn import identify as identify
+from jaxdyn import inertia as inertia
+from jaxdyn import robots as robots
+from jaxdyn import se2 as se2
+from jaxdyn import se3 as se3
+from jaxdyn import so3 as so3
+from jaxdyn.building import ModelBuilder as ModelBuilder
+from jaxdyn.building import inertia_report as inertia_report
+from jaxdyn.building import repair_inertias as repair_inertias
 from jaxdyn.dynamics import bias_force as bias_force
 from jaxdyn.dynamics import center_of_mass as center_of_mass
 from jaxdyn.dynamics import centroidal_momentum as centroidal_momentum
@@ -15,6 +24,14 @@ from jaxdyn.dynamics import mass_matrix as mass_matrix
 from jaxdyn.dynamics import mass_matrix_derivative as mass_matrix_derivative
 from jaxdyn.dynamics import potential_energy as potential_energy
 from jaxdyn.dynamics import torque_regressor as torque_regressor
+from jaxdyn.forces import CoulombFriction as CoulombFriction
+from jaxdyn.forces import Drive as Drive
+from jaxdyn.forces import ExternalWrench as ExternalWrench
+from jaxdyn.forces import JointDamping as JointDamping
+from jaxdyn.forces import JointSpring as JointSpring
+from jaxdyn.io import load_urdf as load_urdf
+from jaxdyn.io import save_urdf as save_urdf
+from jaxdyn.io import urdf_inertia_report as urdf_inertia_report
 from jaxdyn.kinematics import body_jacobian as body_jacobian
 from jaxdyn.kinematics import forward_kinematics as forward_kinematics
 from jaxdyn.kinematics import frame_pose as frame_pose
@@ -22,5 +39,21 @@ from jaxdyn.kinematics import jacobian_dot_v as jacobian_dot_v
 from jaxdyn.kinematics import spatial_jacobian as spatial_jacobian
 from jaxdyn.link_form import NewtonEulerMatrices as NewtonEulerMatrices
 from jaxdyn.link_form import newton_euler_matrices as newton_euler_matrices
+from jaxdyn.model import Model as Model
+from jaxdyn.model import Topology as Topology
+from jaxdyn.model import configuration_rate as configuration_rate
+from jaxdyn.model import difference as difference
+from jaxdyn.model import integrate as integrate
+from jaxdyn.model import neutral as neutral
+from jaxdyn.model import normalize as normalize
+from jaxdyn.model import random_configuration as random_configuration
+from jaxdyn.recursive import aba as aba
+from jaxdyn.recursive import crba as crba
+from jaxdyn.recursive import mass_matrix_sqrt as mass_matrix_sqrt
+from jaxdyn.recursive import rnea as rnea
+from jaxdyn.scene import Scene as Scene
+from jaxdyn.simulate import RESULTS as RESULTS
+from jaxdyn.simulate import Solution as Solution
+from jaxdyn.simulate import simulate as simulate
 
 __version__ = "0.1.0"

@@ -1,0 +1,249 @@
+"""Time of the dynamics against Pinocchio (one and two threads), and against frax and MJX where they are installed.
+
+    python -m benchmarks.dynamics [--robots panda g1] [--batches 1 256 4096] [--dtypes float64 float32] [--rounds 20] [--readme]
+
+Per robot, function, batch and dtype: microseconds per evaluation, best and median of 20 interleaved rounds, and the ratio to
+Pinocchio with two threads measured in the same loop. jaxdyn runs through plain `jax.vmap` and `jax.jit`, default XLA flags, the
+model closed over ("known") or passed as an argument ("given"). Compile and trace times are printed apart. `--readme` writes the
+table into README.md.
+"""
+
+import argparse
+import os
+import re
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+
+import jaxdyn as jd
+from benchmarks import timing
+
+ROBOTS = Path(pin.__file__).parents[4] / "share/example-robot-data/robots"
+FILES = {
+    "panda": ("panda_description/urdf/panda.urdf", False, ("panda_finger_joint1", "panda_finger_joint2")),
+    "g1": ("g1_description/urdf/g1_29dof_rev_1_0.urdf", True, ()),
+}
+THREADS = min(2, os.cpu_count() or 1)
+
+
+def load(name):
+    """The robot in jaxdyn and in Pinocchio."""
+    file, floating, lock = FILES[name]
+    source = pin.buildModelFromUrdf(str(ROBOTS / file), *([pin.JointModelFreeFlyer()] if floating else []))
+    if lock:
+        source = pin.buildReducedModel(source, [source.getJointId(joint) for joint in lock], pin.neutral(source))
+    return jd.load_urdf(ROBOTS / file, floating_base=floating, lock=lock), source
+
+
+def states(model, batch, dtype):
+    """Random q, v, tau (batch, .) and q in Pinocchio's order."""
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (batch, model.nq))
+    q_pin = q.copy()
+    if model.topology.kinds[0] == "free":
+        q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+        q_pin = q.copy()
+        q_pin[:, 3:7] = q[:, [4, 5, 6, 3]]
+    v, tau = rng.normal(size=(2, batch, model.nv))
+    return tuple(jnp.asarray(x, dtype) for x in (q, v, tau)), q_pin
+
+
+def ours(model, weights):
+    """The functions under test, on one sample."""
+
+    def gradient(model, q, v, tau):
+        return jax.grad(lambda *x: jnp.vdot(weights, jd.forward_dynamics(model, *x)), (0, 1, 2))(q, v, tau)
+
+    return {
+        "forward dynamics": jd.forward_dynamics,
+        "inverse dynamics": jd.inverse_dynamics,
+        "mass matrix": lambda model, q, v, tau: jd.mass_matrix(model, q),
+        "gradient of forward dynamics": gradient,
+    }
+
+
+def peers(source, q, v, tau):
+    """Pinocchio's calls over the batch, by function and number of threads."""
+    batch = len(q)
+    data, pool = source.createData(), pin.ModelPool(source, THREADS)
+    q_, v_, tau_ = (np.asfortranarray(np.asarray(x, float).T) for x in (q, v, tau))
+    out = np.zeros((source.nv, batch), order="F")
+
+    def mass():
+        for i in range(batch):
+            pin.crba(source, data, q_[:, i])
+
+    def derivatives():
+        for i in range(batch):
+            pin.computeABADerivatives(source, data, q_[:, i], v_[:, i], tau_[:, i])
+
+    calls = {"forward dynamics": {}, "inverse dynamics": {}}
+    for n in sorted({1, THREADS}):
+        calls["forward dynamics"][f"pin {n}"] = lambda n=n: pin.abaInParallel(n, pool, q_, v_, tau_, out)
+        calls["inverse dynamics"][f"pin {n}"] = lambda n=n: pin.rneaInParallel(n, pool, q_, v_, tau_, out)
+    calls["mass matrix"] = {"pin loop": mass}
+    calls["gradient of forward dynamics"] = {"pin loop": derivatives}
+    return calls
+
+
+def compiled(function, *args):
+    """(executable, trace seconds, compile seconds)."""
+    start = time.perf_counter()
+    lowered = jax.jit(function).lower(*args)
+    middle = time.perf_counter()
+    executable = lowered.compile()
+    return executable, middle - start, time.perf_counter() - middle
+
+
+def measure(name, batch, dtype, rounds, functions):
+    """One row per function."""
+    model, source = load(name)
+    model = jax.tree.map(lambda x: x.astype(dtype), model)
+    args, q_pin = states(model, batch, dtype)
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=model.nv), dtype)
+    theirs = peers(source, q_pin, args[1], args[2])
+    rows = []
+    for label, function in ours(model, weights).items():
+        if functions and label not in functions:
+            continue
+
+        def known(q, v, tau, function=function):
+            return jax.vmap(lambda *x: function(model, *x))(q, v, tau)
+
+        def given(model, q, v, tau, function=function):
+            return jax.vmap(lambda *x: function(model, *x))(q, v, tau)
+
+        calls, times = dict(theirs[label]), {}
+        for mode, traced, inputs in (("known", known, args), ("given", given, (model, *args))):
+            if mode == "given" and label != "forward dynamics":
+                continue
+            executable, trace, build = compiled(traced, *inputs)
+            times[mode] = {"trace_s": trace, "compile_s": build}
+            calls[mode] = lambda run=executable, inputs=inputs: jax.block_until_ready(run(*inputs))
+        result = timing.interleaved(calls, rounds)
+        for entry in result.values():
+            entry.update({key + "_us": 1e6 * entry.pop(key) / batch for key in ("best", "median")})
+        rows.append(
+            {"robot": name, "function": label, "batch": batch, "dtype": np.dtype(dtype).name, "times": result} | times
+        )
+        print(line(rows[-1]), flush=True)
+    return rows
+
+
+def reference(row):
+    """The peer that a row is compared with: Pinocchio with the most threads."""
+    return max((key for key in row["times"] if key.startswith("pin")), key=lambda key: (key[-1].isdigit(), key))
+
+
+def line(row):
+    """One row of the table."""
+    base = row["times"][reference(row)]
+    cells = [row["robot"], row["function"], str(row["batch"]), row["dtype"]]
+    for mode in ("known", "given"):
+        entry = row["times"].get(mode)
+        ratios = entry and [entry[key] / base[key] for key in ("best_us", "median_us")]
+        cells.append("" if entry is None else f"{entry['best_us']:.3g} ({entry['median_us']:.3g})")
+        cells.append("" if entry is None else f"{ratios[0]:.2f} ({ratios[1]:.2f})")
+    cells += [f"{base['best_us']:.3g} ({base['median_us']:.3g})", reference(row)]
+    cells.append(f"{row['known']['trace_s']:.1f} + {row['known']['compile_s']:.1f}")
+    return "| " + " | ".join(cells) + " |"
+
+
+HEAD = (
+    "| robot | function | batch | dtype | jaxdyn us | ratio | model given us | ratio | Pinocchio us | as | trace + compile s |\n"
+    "|---|---|---|---|---|---|---|---|---|---|---|"
+)
+
+
+def rollout(name, batch, rounds, steps=100, dt=1e-3):
+    """Steps per second of RK4 rollouts inside one jitted scan: does the speed survive a user's own loop?"""
+    model, _ = load(name)
+    (q, v, tau), _ = states(model, batch, jnp.float64)
+
+    def rate(state, tau):
+        q, v = state
+        return v, jd.forward_dynamics(model, q, v, tau)
+
+    def one(q, v, tau):
+        def step(state, _):
+            shift = lambda k, h: jax.tree.map(lambda x, y: x + h * y, state, k)  # noqa: E731
+            k1 = rate(state, tau)
+            k2 = rate(shift(k1, dt / 2), tau)
+            k3 = rate(shift(k2, dt / 2), tau)
+            k4 = rate(shift(k3, dt), tau)
+            mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+            return shift(mean, dt), None
+
+        return jax.lax.scan(step, (q, v), None, length=steps)[0]
+
+    executable, trace, build = compiled(jax.vmap(one), q, v, tau)
+    result = timing.interleaved({"rk4": lambda: jax.block_until_ready(executable(q, v, tau))}, rounds, least=0.0)["rk4"]
+    row = {"robot": name, "batch": batch, "steps": steps, "trace_s": trace, "compile_s": build}
+    row |= {"steps_per_s": batch * steps / result["best"], "us_per_evaluation": 1e6 * result["best"] / (4 * batch * steps)}
+    print(f"RK4 rollout of {batch} {name}: {row['steps_per_s']:.3g} steps/s, {row['us_per_evaluation']:.3g} us per evaluation")
+    return row
+
+
+def eager(name, batch):
+    """One eager call of a batch against the compiled one (s), second call each."""
+    model, _ = load(name)
+    args, _ = states(model, batch, jnp.float64)
+    call = jax.vmap(lambda *x: jd.forward_dynamics(model, *x))
+    fast = jax.jit(call)
+    result = {}
+    for label, function in (("eager", call), ("jit", fast)):
+        jax.block_until_ready(function(*args))
+        start = time.perf_counter()
+        jax.block_until_ready(function(*args))
+        result[label] = time.perf_counter() - start
+    print(f"{name}, batch {batch}: eager {result['eager']:.3g} s, jit {result['jit']:.3g} s")
+    return {"robot": name, "batch": batch} | result
+
+
+def main(argv=None):
+    """Run the benchmark; see the module's text."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robots", nargs="+", default=list(FILES), choices=list(FILES))
+    parser.add_argument("--batches", nargs="+", type=int, default=[1, 256, 4096])
+    parser.add_argument("--dtypes", nargs="+", default=["float64", "float32"])
+    parser.add_argument("--functions", nargs="+", default=None)
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--readme", action="store_true", help="write the table into README.md")
+    options = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    report = {"machine": timing.machine(), "rows": [], "rollouts": [], "eager": []}
+    print(report["machine"])
+    print(HEAD)
+    for name in options.robots:
+        for dtype in options.dtypes:
+            for batch in options.batches:
+                report["rows"] += measure(name, batch, jnp.dtype(dtype), options.rounds, options.functions)
+                timing.write("benchmark_dynamics", report)
+    if not options.functions:
+        report["rollouts"].append(rollout("panda", 1024, options.rounds))
+        report["eager"].append(eager("panda", 1024))
+    print("written to", timing.write("benchmark_dynamics", report))
+    if options.readme:
+        readme = Path(__file__).resolve().parent.parent / "README.md"
+        table = "\n".join([HEAD, *(line(row) for row in report["rows"])])
+        about = report["machine"]
+        note = (
+            f"Microseconds per evaluation, best (median) of {options.rounds} interleaved rounds; ratios to Pinocchio in the same "
+            f"run; {about['processor']}, {about['cores']} cores, jax {about['versions']['jax']}, pin {about['versions']['pin']}. "
+            "Made by `python -m benchmarks.dynamics --readme`."
+        )
+        text = re.sub(
+            r"(<!-- benchmark:begin -->\n).*(<!-- benchmark:end -->)",
+            lambda found: f"{found[1]}{note}\n\n{table}\n{found[2]}",
+            readme.read_text(),
+            flags=re.DOTALL,
+        )
+        readme.write_text(text)
+
+
+if __name__ == "__main__":
+    main()
