@@ -183,8 +183,13 @@ def rollout(name, batch, rounds, steps=100, dt=1e-3):
     executable, trace, build = compiled(jax.vmap(one), q, v, tau)
     result = timing.interleaved({"rk4": lambda: jax.block_until_ready(executable(q, v, tau))}, rounds, least=0.0)["rk4"]
     row = {"robot": name, "batch": batch, "steps": steps, "trace_s": trace, "compile_s": build}
-    row |= {"steps_per_s": batch * steps / result["best"], "us_per_evaluation": 1e6 * result["best"] / (4 * batch * steps)}
-    print(f"RK4 rollout of {batch} {name}: {row['steps_per_s']:.3g} steps/s, {row['us_per_evaluation']:.3g} us per evaluation")
+    row |= {
+        "steps_per_s": batch * steps / result["best"],
+        "us_per_evaluation": 1e6 * result["best"] / (4 * batch * steps),
+    }
+    print(
+        f"RK4 rollout of {batch} {name}: {row['steps_per_s']:.3g} steps/s, {row['us_per_evaluation']:.3g} us per evaluation"
+    )
     return row
 
 

@@ -33,9 +33,7 @@ MOST_BODIES = 64
 _large_batch_p = Primitive("large_batch")
 _large_batch_p.def_impl(lambda *arrays, count: np.bool_(count >= LEAST_BATCH))
 _large_batch_p.def_abstract_eval(lambda *avals, count: ShapedArray((), np.dtype(bool)))
-mlir.register_lowering(
-    _large_batch_p, lambda ctx, *arrays, count: [mlir.ir_constant(np.bool_(count >= LEAST_BATCH))]
-)
+mlir.register_lowering(_large_batch_p, lambda ctx, *arrays, count: [mlir.ir_constant(np.bool_(count >= LEAST_BATCH))])
 
 
 def _count_samples(arrays, axes, *, count):

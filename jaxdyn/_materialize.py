@@ -19,14 +19,12 @@ import contextvars
 
 import jax
 import numpy as np
+
+# The bindings of MLIR have no public address.
+from jax._src.lib.mlir import ir  # pyright: ignore[reportPrivateImportUsage]
+from jax._src.lib.mlir.dialects import hlo
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-
-try:  # the dialect bindings have no public address
-    from jax._src.lib.mlir import ir
-    from jax._src.lib.mlir.dialects import hlo
-except ImportError:  # pragma: no cover - a jax without them still gives right results
-    ir = hlo = None
 
 _materialize_p = Primitive("materialize")
 _materialize_p.multiple_results = True
@@ -52,7 +50,9 @@ def materialize(*values):
     arrays = [i for i, value in enumerate(values) if isinstance(value, jax.Array)]
     kept = list(values)
     if arrays:
-        for i, value in zip(arrays, _materialize_p.bind(*[values[i] for i in arrays], least=_least_size.get()), strict=True):
+        for i, value in zip(
+            arrays, _materialize_p.bind(*[values[i] for i in arrays], least=_least_size.get()), strict=True
+        ):
             kept[i] = value
     return kept
 
@@ -63,7 +63,7 @@ def _identity_lowering(ctx, *values, least):
 
 def _cpu_lowering(ctx, *values, least):
     worth = [value for value, aval in zip(values, ctx.avals_in, strict=True) if aval.size >= least]
-    if worth and hlo is not None:
+    if worth:
         never = hlo.CompareOp(
             hlo.PartitionIdOp().result,
             mlir.ir_constant(np.uint32(0xFFFFFFFF)),

@@ -23,7 +23,9 @@ def vanishes(vector) -> bool:
 
 def is_identity(rows) -> bool:
     """Whether a 3x3 matrix is structurally the identity."""
-    return all(type(x) is int and x == y for row, eye in zip(rows, EYE3, strict=True) for x, y in zip(row, eye, strict=True))
+    return all(
+        type(x) is int and x == y for row, eye in zip(rows, EYE3, strict=True) for x, y in zip(row, eye, strict=True)
+    )
 
 
 def add(*terms):

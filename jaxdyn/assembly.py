@@ -26,7 +26,7 @@ _STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
 
 
 class Assembly(eqx.Module):
-    """A state on the constraints: `q` (nq,), `v` (nv,), the largest `residual` (2,) left in |phi| and |A v - b|, `result`."""
+    """State on the constraints: `q` (nq,), `v` (nv,), largest `residual` (2,) left in |phi| and |A v - b|, `result`."""
 
     q: Float[Array, " nq"]
     v: Float[Array, " nv"]
@@ -51,8 +51,8 @@ def assemble(
     **Arguments:** `q` (nq,), `v` (nv,) (None: at rest), guesses; `t`, s; `rank_tol` as in `constrained_dynamics`;
     `throw`: raise when it fails, by default if all inputs are concrete.
 
-    **Returns:** `Assembly`. Derivatives with respect to the scene's numbers are those of the least correction; changes of
-    the guess pass through P_T, the projection onto admissible motions.
+    **Returns:** `Assembly`. Derivatives with respect to the scene's numbers are those of the least correction; changes
+    of the guess pass through P_T, the projection onto admissible motions.
 
     **Raises:** ValueError that names the constraints that stay open and by how much, if it fails and `throw`.
     """

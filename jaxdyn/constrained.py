@@ -92,7 +92,7 @@ def constrained_dynamics(
     Differentiable any number of times where the rank is constant; the pseudo-inverse has a rule of its own, no
     factorisation is differentiated.
 
-    **Raises:** ValueError for shapes that do not fit, unknown methods, and entries of the scene that are no constraints.
+    **Raises:** ValueError for shapes that do not fit, unknown methods, and constraints of the scene that are none.
 
     Source: EQUATIONS section 7; Udwadia & Kalaba (1992).
     """
@@ -173,7 +173,7 @@ def constraint_wrenches(
 
 
 def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None) -> Projections:
-    """Projections of the constrained scene: P_T = 1 - M^-1 A^T (A M^-1 A^T)^+ A on velocities, P_omega = P_T^T on forces.
+    """Projections P_T = 1 - M^-1 A^T (A M^-1 A^T)^+ A of velocities and P_omega = P_T^T of forces.
 
     P_T is orthogonal in the metric M and keeps what satisfies A v = 0; P_omega removes every constraint force A^T lam.
 
@@ -192,7 +192,7 @@ def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float 
 def second_fundamental_form(
     scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0, *, rank_tol: float | None = None
 ) -> Float[Array, " nv"]:
-    """S(v, v) = (1 - P_T)(a + M^-1 C v): the part of the motion's covariant acceleration that the constraints prescribe.
+    """S(v, v) = (1 - P_T)(a + M^-1 C v): the covariant acceleration that the constraints prescribe.
 
     S = M^-1 A^T (A M^-1 A^T)^+ (gamma + A M^-1 C v) needs q and v alone. M S is the force, normal to the constraints,
     that keeps the motion on them.

@@ -1,4 +1,4 @@
-"""What `simulate` needs for scenes with constraints: the method, the acceleration, the projection, the check of a start."""
+"""What `simulate` needs for scenes with constraints: method, acceleration, projection, and the check of a start."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -78,7 +78,9 @@ def joint_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, " nqj"]
     if kind == "planar":
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
         one = jnp.ones_like(c)
-        return jnp.stack([c, -s, zero, q[0], s, c, zero, q[1], zero, zero, one, zero, zero, zero, zero, one]).reshape(4, 4)
+        return jnp.stack([c, -s, zero, q[0], s, c, zero, q[1], zero, zero, one, zero, zero, zero, zero, one]).reshape(
+            4, 4
+        )
     if kind == "spherical":
         return se3.from_parts(so3.quat_to_matrix(q), jnp.stack([zero, zero, zero]))
     return se3.from_parts(so3.quat_to_matrix(q[3:]), q[:3])
@@ -150,7 +152,9 @@ def joint_random(kind: str, key: Array, lower: Array, upper: Array, dtype) -> Fl
         quat = so3.quat_normalize(jax.random.normal(spin, (4,), dtype))
         if kind == "spherical":
             return quat
-        place = jax.random.uniform(ends, (3,), dtype, minval=jnp.asarray(lower[:3], dtype), maxval=jnp.asarray(upper[:3], dtype))
+        place = jax.random.uniform(
+            ends, (3,), dtype, minval=jnp.asarray(lower[:3], dtype), maxval=jnp.asarray(upper[:3], dtype)
+        )
         return jnp.concatenate([place, quat])
     return jax.random.uniform(
         key, (KINDS[kind].nq,), dtype, minval=jnp.asarray(lower, dtype), maxval=jnp.asarray(upper, dtype)

@@ -1,10 +1,12 @@
 """The mechanism: a static tree of bodies (`Topology`) and the array leaves that give it numbers (`Model`)."""
 
 import dataclasses
+import itertools
 from functools import cached_property
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -63,13 +65,13 @@ class Topology:
     def q_slices(self) -> tuple[slice, ...]:
         """Where each joint's coordinates stand in q."""
         ends = np.cumsum([0] + [KINDS[kind].nq for kind in self.kinds]).tolist()
-        return tuple(slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True))
+        return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
 
     @cached_property
     def v_slices(self) -> tuple[slice, ...]:
         """Where each joint's coordinates stand in v."""
         ends = np.cumsum([0] + [KINDS[kind].nv for kind in self.kinds]).tolist()
-        return tuple(slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True))
+        return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
 
     @cached_property
     def screw_mask(self) -> np.ndarray:
@@ -239,7 +241,9 @@ def _per_joint(topology: Topology, function, q, *rest) -> Array:
             j += 1
         last = max(j - 1, i)  # a run of one-number joints is a run of plain vectors
         qs = slice(topology.q_slices[i].start, topology.q_slices[last].stop)
-        args = [x[qs] if along_q else x[topology.v_slices[i].start : topology.v_slices[last].stop] for x, along_q in rest]
+        args = [
+            x[qs] if along_q else x[topology.v_slices[i].start : topology.v_slices[last].stop] for x, along_q in rest
+        ]
         parts.append(function(topology.kinds[i], q[qs], *args))
         i = last + 1
     return jnp.concatenate(parts) if parts else q

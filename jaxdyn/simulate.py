@@ -62,6 +62,8 @@ _ADVICE = {
     "moves no inertia) or a force or control that is not finite there; or rtol and atol are below the rounding error",
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+    "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
+    "open_constraints": "tighten rtol and atol, or look for constraints that contradict each other on the way",
 }
 
 
@@ -72,7 +74,8 @@ class Solution(eqx.Module):
     - `result`, a `RESULTS` code; `success` tells whether all went well.
     - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
     - What `outputs` asked for, else None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
-      scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `poses`, one array
+      scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
+      (nt, nc); `constraint_residual` (nt, 2), the largest |phi| and |A v - b|; `poses`, one array
       (nt, 4, 4) by name for each frame asked for as "pose:<frame>".
     """
 
@@ -113,7 +116,7 @@ def simulate(
     max_steps: int | None = None,
     throw: bool | None = None,
 ) -> Solution:
-    """Integrate M(q) a + C(q, v) v + N(q) = tau + forces, dq/dt = H(q) v, from (q0, v0) and save it at the times `ts`.
+    """Integrate M a + C v + N = tau + forces + A^T lam, dq/dt = H(q) v, from (q0, v0) and save it at the times `ts`.
 
     One sample; batch states, controls and the scene's leaves with `jax.vmap`. Computed in the dtype of the model.
     Called outside of `jax.jit` it compiles once per shape, whatever the numbers. Inside your own `jax.jit`, a model
@@ -128,7 +131,10 @@ def simulate(
     - `control(q, v, t) -> (nv,)`: tau (N m or N); q comes with unit quaternions. An equinox Module or a
       `jax.tree_util.Partial` carries leaves that can be differentiated and batched; a plain function is static: define
       it once.
-    - `method`: "auto" or "free", the dynamics without constraints.
+    - `method`: "free" for a scene without constraints; with them "projected": accelerations with multipliers, and q and
+      v put back on the constraints after every step and at save points, by the least change in the mass metric; or
+      "multipliers": the same without the projection, so that the constraints open as the local errors add up. "auto"
+      takes "free" or "projected".
     - `solver`: any diffrax method of an `ODETerm`. Default `Dopri8` for adaptive steps, `RK4` for fixed ones.
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to and besides the size of each entry of (q, v). Values below ten
@@ -136,7 +142,8 @@ def simulate(
     - `adjoint`: "reverse" (default) for reverse mode with checkpoints; "forward" for jvp, jacfwd and Hessians by
       forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
-    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" and
+    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration",
+      "multipliers", "constraint_residual" and
       "pose:<frame>". They are computed only if asked for.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
@@ -146,8 +153,9 @@ def simulate(
     **Returns:** a `Solution`. Save points between steps come from the method's dense output. Where that is less
     accurate than the steps (Kvaerno5), adaptive steps end on every save point.
 
-    **Raises:** ValueError for wrong shapes, NaN, times that do not increase, quaternions far from unit length, unknown
-    options, with names and values. RuntimeError with the time reached, the cause and the fix, if it fails and `throw`.
+    **Raises:** ValueError for wrong shapes, NaN, times that do not increase, quaternions far from unit length, a start
+    off the constraints, constraints that remove all freedom, unknown options, with names and values.
+    RuntimeError with the time reached, the cause and the fix, if it fails and `throw`.
 
     ```python
     solution = jd.simulate(model, q0, v0, jnp.linspace(0.0, 1.0, 101), outputs=("energy",))

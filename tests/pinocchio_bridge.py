@@ -258,7 +258,7 @@ def assert_close(got, want, tol=1e-10, label=""):
 
 def as_dtype(model: Model, dtype) -> Model:
     """The same model with every leaf in another dtype."""
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), model)
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x).astype(dtype)), model)
 
 
 def _model(topology: Topology, leaves: dict, dtype) -> Model:

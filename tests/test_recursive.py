@@ -19,7 +19,9 @@ from jaxdyn.joints import KINDS
 ALL = list(KINDS)
 TREES = {
     "every kind": lambda: random_tree(1, ALL),
-    "floating, no armature": lambda: random_tree(3, ["free", "revolute", "prismatic", "helical", "spherical"], armature=False),
+    "floating, no armature": lambda: random_tree(
+        3, ["free", "revolute", "prismatic", "helical", "spherical"], armature=False
+    ),
 }
 
 
@@ -113,7 +115,13 @@ def test_materialize_is_the_identity():
         (y,) = materialize(y) if keep else (y,)
         return jnp.sum(y * y * jnp.exp(y))
 
-    for transform in (lambda f: f, jax.grad, jax.hessian, lambda f: jax.jacfwd(jax.grad(f)), lambda f: jax.vmap(jax.grad(f))):
+    for transform in (
+        lambda f: f,
+        jax.grad,
+        jax.hessian,
+        lambda f: jax.jacfwd(jax.grad(f)),
+        lambda f: jax.vmap(jax.grad(f)),
+    ):
         points = jnp.stack([x, 2 * x]) if transform(f) is not f and "vmap" in repr(transform(f)) else x
         for wrap in (lambda g: g, jax.jit):
             with_it = wrap(transform(lambda x: f(x, True)))(points)

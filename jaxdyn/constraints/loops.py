@@ -1,9 +1,9 @@
 """Loops closed by a joint between two bodies, couplings of joints, and locks.
 
 A loop holds a frame A of one body and a frame B of another together as a joint would: with T = T_A^-1 T_B = (R, p) it
-has only the residuals that this joint removes. Translations are entries of p (m). Rotations are tangents of half angles,
-twice: smooth, equal to the angle to first order, and large where the frames are turned upside down, so that a correction
-never ends at the false solution that a sine has there.
+has only the residuals that this joint removes. Translations are entries of p (m). Rotations are twice the tangents of
+half angles: smooth, equal to the angle to first order, and large where the frames are turned upside down, so that a
+correction never ends at the false solution that a sine has there.
 
     axis rows     2 (R_02, R_12) / (1 + R_22)            z of B along z of A
     attitude rows 4 vee(R) / (1 + tr R) = 2 tan(theta/2) n    axes of B along those of A
@@ -107,7 +107,7 @@ class Loop(Constraint):
         return jax.vmap(members[0]._kind.residual)(rotation, position)
 
     def wrench(self, rotation, position, lam):
-        """Wrench (f, tau) (6,) of the joint on body B for the multipliers lam, at the origin and in the axes of frame A.
+        """Wrench (f, tau) (6,) of the joint on body B for the multipliers lam, at the origin and in axes of frame A.
 
         `rotation`, `position`: of frame B seen from frame A. The wrench on body A is the negative of it.
         """
@@ -336,7 +336,7 @@ def joint_index(name: str, system, joint: str) -> int:
 
 
 def frame_poses(model: Model, q, bodies: Sequence[str | None], poses):
-    """Poses (n, 4, 4) of frames on bodies, each in its body's tree frame, and the origins (n, 3) of these tree frames."""
+    """Poses (n, 4, 4) of frames on bodies in the tree frames of these, and the tree frames' origins (n, 3)."""
     frame = tree_frame(model, q)
     offsets = jnp.stack([pose.astype(q.dtype) for pose in poses])
     places, named = [], []

@@ -91,7 +91,9 @@ def _unit_or(vector, fallback):
 def _tangents(normal):
     """Two unit vectors (2, 3) that make a right-handed frame with the normal; smooth but for a jump at normal z = 0.
 
-    The rows that a jump turns span the same plane, so accelerations do not see it. Source: Duff et al. (2017), listing 3.
+    The rows that a jump turns span the same plane, so accelerations do not see it.
+
+    Source: Duff et al. (2017), listing 3.
     """
     x, y, z = jnp.unstack(normal)
     sign = jnp.where(z < 0, -jnp.ones_like(z), jnp.ones_like(z))
@@ -263,13 +265,13 @@ def rolling_sphere(
 
     - `body`: body or frame that carries the sphere; `center` (3,) in it (None: its origin), m; `radius`, m.
     - `on`: "plane", "sphere" or "cylinder". `surface`: pose of the surface in `surface_body` (None: the world): a
-      plane's z is its normal, a sphere's origin its centre, a cylinder's z its axis. `surface_radius`: m, of the latter.
+      plane's z is its normal, a sphere's origin its centre, a cylinder's z its axis. `surface_radius`: m, of these two.
     - `inside`: whether the sphere rolls on the inner side.
     - `spin`: whether the contact also resists spinning about the normal (a soft contact).
     - `contact`: whether the height is constrained.
 
-    **Raises:** ValueError for an unknown surface, radii that are missing, not positive or too small for a sphere inside,
-    or a bad pose; when used, for unknown bodies.
+    **Raises:** ValueError for an unknown surface, radii that are missing, not positive or too small for one
+    inside, or a bad pose; when used, for unknown bodies.
     """
     name = f"sphere {body}" if name is None else name
     if on not in ("plane", "sphere", "cylinder"):

@@ -1,0 +1,63 @@
+"""The command line: `jaxdyn info`, `jaxdyn simulate` and `jaxdyn identify`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+import jax
+
+from jaxdyn import __version__
+from jaxdyn.cli import identify, info, simulate
+
+COMMANDS = (info, simulate, identify)
+_EPILOG = """\
+examples:
+  jaxdyn info panda.urdf
+  jaxdyn simulate panda.urdf --duration 2 --torque gravity --out motion.csv
+  jaxdyn identify --urdf panda.urdf --log log.csv --out fitted.urdf
+
+All numbers are in SI units and radians, in float64. `jaxdyn COMMAND --help` explains a command.
+Exit status: 0 done; 1 the computation failed; 2 wrong input or arguments.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command with the arguments given (those of the process by default) and return the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="jaxdyn",
+        description="Rigid-body dynamics of robots: look at a URDF, simulate it, identify its inertias from a log.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"jaxdyn {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for module in COMMANDS:
+        name = module.__name__.rpartition(".")[2]
+        command = commands.add_parser(
+            name,
+            help=module.HELP,
+            description=module.DESCRIPTION,
+            epilog=module.EPILOG,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        module.add_arguments(command)
+        command.add_argument("--debug", action="store_true", help="show where in the program an error arose")
+        command.set_defaults(run=module.run)
+    args = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    try:
+        return args.run(args) or 0
+    except BrokenPipeError:  # the reader (`head`, `less`) has seen enough
+        sys.stderr.close()
+        return 0
+    except (ValueError, OSError, ImportError) as error:
+        return _complain(error, 2, args.debug)
+    except RuntimeError as error:
+        return _complain(error, 1, args.debug)
+
+
+def _complain(error: Exception, status: int, debug: bool) -> int:
+    if debug:
+        raise error
+    print(f"jaxdyn: {' '.join(str(error).split())}", file=sys.stderr)
+    return status

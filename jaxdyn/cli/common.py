@@ -1,0 +1,148 @@
+"""What the commands share: options of the model, vectors on the command line, tables, files to write."""
+
+import argparse
+import contextlib
+import pathlib
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxdyn.io import load_urdf
+from jaxdyn.joints import KINDS
+from jaxdyn.model import Model
+
+# Unit of one number of q, for joints with one.
+UNITS = {"revolute": "rad", "continuous": "rad", "helical": "rad", "prismatic": "m"}
+
+
+def add_model_options(parser: argparse.ArgumentParser) -> None:
+    """Options that decide which mechanism a URDF file becomes."""
+    group = parser.add_argument_group("model")
+    group.add_argument("--floating-base", action="store_true", help="let the root link move freely (6 more freedoms)")
+    group.add_argument(
+        "--lock",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="JOINT[=VALUE]",
+        help="hold these joints, at neutral or at a value (rad, m)",
+    )
+    group.add_argument(
+        "--gravity",
+        nargs=3,
+        type=float,
+        default=(0.0, 0.0, -9.81),
+        metavar=("X", "Y", "Z"),
+        help="in axes of the root link, m/s^2 (default: 0 0 -9.81)",
+    )
+
+
+def load_model(path: str, args: argparse.Namespace) -> Model:
+    """The model of a URDF file under the options of `add_model_options`."""
+    lock: dict[str, Any] = {}
+    for item in args.lock:
+        name, equals, text = item.partition("=")
+        lock[name] = number(text, f"--lock {item}") if equals else None
+    model = load_urdf(path, floating_base=args.floating_base, lock=lock, gravity=tuple(args.gravity))
+    if model.nv == 0:
+        raise ValueError(f"{path}: no joint is free to move; lock fewer joints or use --floating-base")
+    return model
+
+
+def number(text: str, what: str) -> float:
+    """A finite number, or a ValueError that says where it stood."""
+    with contextlib.suppress(ValueError):
+        if np.isfinite(value := float(text)):
+            return value
+    raise ValueError(f"{what}: {text!r} is no finite number")
+
+
+def vector(model: Model, items: Sequence[str], start, what: str) -> np.ndarray:
+    """Coordinates from the command line: as many numbers as `start` has, or JOINT=NUMBER[,NUMBER...] to change some of it."""
+    start = np.array(start, float)
+    slices = model.topology.q_slices if what == "--q0" else model.topology.v_slices
+    items = [part for item in items for part in (item.split(",") if "=" not in item else [item])]
+    if not any("=" in item for item in items):
+        if len(items) != len(start):
+            raise ValueError(
+                f"{what} has {len(items)} numbers, the model needs {len(start)} (joints {', '.join(model.joint_names)}); "
+                "give all of them or JOINT=VALUE"
+            )
+        return np.array([number(item, what) for item in items])
+    for item in items:
+        name, _, text = item.partition("=")
+        if name not in model.joint_names:
+            raise ValueError(f"{what}: {name!r} is no joint of the model; joints are {', '.join(model.joint_names)}")
+        place = slices[model.joint_names.index(name)]
+        values = [number(part, f"{what} {item}") for part in text.split(",")]
+        if len(values) != place.stop - place.start:
+            raise ValueError(f"{what} {item}: joint {name!r} has {place.stop - place.start} numbers, got {len(values)}")
+        start[place] = values
+    return start
+
+
+def per_coordinate(model: Model, values: Sequence[float], what: str) -> np.ndarray:
+    """One number for all velocity coordinates, or one each."""
+    if len(values) not in (1, model.nv):
+        raise ValueError(f"{what} has {len(values)} numbers; give 1, or {model.nv}, one per velocity coordinate")
+    return np.broadcast_to(np.array(values, float), (model.nv,)).copy()
+
+
+def coordinate_labels(model: Model) -> tuple[list[str], list[str]]:
+    """A label with its unit for each number of v, and the unit of its torque."""
+    labels, torque_units = [], []
+    for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
+        for i in range(KINDS[kind].nv):
+            linear = kind == "prismatic" or (kind == "free" and i < 3) or (kind == "planar" and i < 2)
+            labels.append(name if KINDS[kind].nv == 1 else f"{name}[{i}]")
+            torque_units.append("N" if linear else "N m")
+    return labels, torque_units
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], indent: str = "  ") -> str:
+    """Columns aligned to the left where they hold words and to the right where they hold numbers."""
+    rows = [[str(cell) for cell in row] for row in rows]
+    columns = list(zip(header, *rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    numeric = [all(_is_number(cell) for cell in column[1:]) for column in columns]
+    lines = []
+    for row in ([*header], *rows):
+        cells = [
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(row, widths, numeric, strict=True)
+        ]
+        lines.append((indent + "  ".join(cells)).rstrip())
+    return "\n".join(lines)
+
+
+def short(value: float, digits: int = 4) -> str:
+    """A number for a table; a dash for infinity (no limit) and for what is not there."""
+    return "-" if value is None or not np.isfinite(value) else f"{value:.{digits}g}"
+
+
+def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathlib.Path | None:
+    """A file to write, checked before any work is done: its type is known and its directory exists."""
+    if text is None:
+        return None
+    path = pathlib.Path(text)
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{option} {text}: write to a file that ends in {' or '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise ValueError(f"{option} {text}: there is no directory {path.parent}")
+    return path
+
+
+class Stopwatch:
+    """Wall-clock seconds since it was made."""
+
+    def __init__(self):
+        self._start = time.perf_counter()
+
+    def __str__(self):
+        return f"{time.perf_counter() - self._start:.1f} s"
+
+
+def _is_number(cell: str) -> bool:
+    return cell in ("", "-") or cell.replace(".", "").replace("-", "").replace("+", "").replace("e", "").isdecimal()

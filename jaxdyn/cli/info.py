@@ -1,0 +1,159 @@
+"""`jaxdyn info`: what a URDF file describes, and what is wrong with it."""
+
+import argparse
+import collections
+
+import numpy as np
+
+from jaxdyn.building import inertia_report, repair_inertias
+from jaxdyn.cli.common import UNITS, add_model_options, load_model, output_path, short, table
+from jaxdyn.io import save_urdf, urdf_inertia_report
+from jaxdyn.joints import KINDS
+from jaxdyn.model import Model
+
+HELP = "bodies, joints, limits, frames and faulty inertias of a URDF file"
+DESCRIPTION = """\
+Print what a URDF file describes: bodies with mass, joints with axes and limits in the order of q and v,
+frames, links whose inertia no solid body can have, and what the file holds that is not used.
+"""
+EPILOG = """\
+examples:
+  jaxdyn info panda.urdf
+  jaxdyn info panda.urdf --lock panda_finger_joint1 panda_finger_joint2=0.02
+  jaxdyn info humanoid.urdf --floating-base
+  jaxdyn info hand.urdf --repair hand_repaired.urdf
+
+Links on fixed joints are merged into the body that carries them; they stay available as frames.
+Units: kg, m, rad, rad/s or m/s, N m or N, kg m^2.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("urdf", help="the URDF file (expand xacro first; meshes are not read)")
+    add_model_options(parser)
+    parser.add_argument(
+        "--repair",
+        metavar="OUT.urdf",
+        help="write the model with faulty inertias replaced by physical ones close to them (merged links stay merged)",
+    )
+
+
+def run(args: argparse.Namespace) -> None:
+    """Print the report, and write the repaired model if asked."""
+    out = output_path(args.repair, (".urdf",), "--repair")
+    model = load_model(args.urdf, args)
+    link_problems = urdf_inertia_report(args.urdf)
+    body_problems = inertia_report(model)
+    print(describe(model, args.urdf))
+    print(_problems(link_problems, body_problems))
+    print(_unused(args.urdf))
+    if out is not None:
+        repaired = repair_inertias(model)
+        save_urdf(repaired, out)
+        changed = [name for name, *_ in body_problems if name not in dict(inertia_report(repaired))]
+        print(f"\nWrote {out}: inertias of {len(changed)} bodies repaired{_listed(changed)}.")
+
+
+def describe(model: Model, source: str) -> str:
+    """The model in words and tables."""
+    base = "floating base" if "free" in model.topology.kinds[:1] else "fixed base"
+    mass = float(np.sum(model.inertias[:, 0]))
+    quaternions = "" if model.nq == model.nv else f" (q has {model.nq} numbers, v has {model.nv})"
+    lines = [
+        f"{source}: robot {model.name!r}, {base}, {model.nb} moving bodies, {model.nv} degrees of freedom{quaternions}",
+        f"moving mass {mass:.6g} kg (links fixed to the world do not count)",
+        "",
+        "Joints, in the order of q and v (axis in the body's frame)",
+        _joint_table(model),
+        "",
+        "Bodies (centre of mass and principal moments of inertia about it, in m and kg m^2)",
+        _body_table(model),
+        "",
+        _frames(model),
+    ]
+    if model.coupling_values is not None:
+        lines.append(f"Couplings: {len(model.topology.couplings)}")
+    return "\n".join(lines)
+
+
+def _joint_table(model: Model) -> str:
+    topology = model.topology
+    leaves = {key: getattr(model, key) for key in ("velocity_limit", "effort_limit", "damping", "friction", "armature")}
+    shown = {key: np.asarray(value) for key, value in leaves.items() if value is not None}
+    rows = []
+    for i, (name, kind) in enumerate(zip(model.joint_names, topology.kinds, strict=True)):
+        in_q, in_v = topology.q_slices[i], topology.v_slices[i]
+        screw = np.asarray(model.screws[i])
+        axis = "" if KINDS[kind].nv > 1 else " ".join(f"{x + 0.0:.4g}" for x in screw[:3] if kind == "prismatic")
+        axis = axis or ("" if KINDS[kind].nv > 1 else " ".join(f"{x + 0.0:.4g}" for x in screw[3:]))
+        parent = "world" if topology.parents[i] < 0 else model.body_names[topology.parents[i]]
+        span = f"{in_q.start}" if KINDS[kind].nq == 1 else f"{in_q.start}..{in_q.stop - 1}"
+        single = KINDS[kind].nv == 1
+        limits = [short(float(x[in_q.start])) if single else "-" for x in (model.lower, model.upper)]
+        numbers = [short(float(values[in_v.start])) if single else "-" for values in shown.values()]
+        rows.append(
+            [span, name, kind, UNITS.get(kind, ""), axis, f"{parent} -> {model.body_names[i]}", *limits, *numbers]
+        )
+    header = ["q", "joint", "kind", "unit", "axis", "moves", "lower", "upper", "speed", "effort"]
+    return table(header + [key for key in shown if not key.endswith("_limit")], rows)
+
+
+def _body_table(model: Model) -> str:
+    rows = []
+    for name, parameters in zip(model.body_names, np.asarray(model.inertias), strict=True):
+        mass, first = parameters[0], parameters[1:4]
+        xx, xy, yy, xz, yz, zz = parameters[4:]
+        com = first / mass if mass > 0 else np.zeros(3)
+        about_com = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - mass * (
+            com @ com * np.eye(3) - np.outer(com, com)
+        )
+        moments = np.linalg.eigvalsh(about_com)
+        rows.append([name, f"{mass:.4g}", *(f"{x:.4f}" for x in com), *(f"{x:.3g}" for x in moments)])
+    return table(["body", "mass", "x", "y", "z", "I1", "I2", "I3"], rows)
+
+
+def _frames(model: Model) -> str:
+    carried = collections.defaultdict(list)
+    for name, body in zip(model.frame_names[model.nb :], model.topology.frame_bodies[model.nb :], strict=True):
+        carried["world" if body < 0 else model.body_names[body]].append(name)
+    if not carried:
+        return "Frames: those of the bodies."
+    lines = [f"Frames: those of the {model.nb} bodies, and fixed to them"]
+    return "\n".join(lines + [f"  {body}: {', '.join(names)}" for body, names in carried.items()])
+
+
+def _problems(links: list[tuple[str, str]], bodies: list[tuple[str, str]]) -> str:
+    if not links:
+        text = "\nInertias: every link that moves has a physical inertia."
+    else:
+        text = f"\nInertia problems, link by link as the file states them ({len(links)})\n" + table(
+            ("link", "problem"), links
+        )
+    if bodies:
+        text += f"\nOf the merged bodies, which are what moves, {len(bodies)} are affected{_listed([b for b, _ in bodies])}."
+        text += "\nThe model is used as it is; --repair writes a physical one."
+    elif links:
+        text += "\nOnce fixed links are merged, every body has a physical inertia."
+    return text
+
+
+def _listed(names: list[str]) -> str:
+    return f": {', '.join(names)}" if names else ""
+
+
+def _unused(path: str) -> str:
+    """What the file holds that the model does not, counted by element."""
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+
+    root = etree.parse(path, etree.XMLParser(recover=True, remove_comments=True, remove_pis=True)).getroot()
+    counts: collections.Counter[str] = collections.Counter()
+    for element in root:
+        if element.tag not in ("link", "joint"):
+            counts[element.tag] += 1
+            continue
+        used = {"inertial", "origin", "parent", "child", "axis", "limit", "dynamics"}
+        counts.update(part.tag for part in element if part.tag not in used)
+    names = ", ".join(f"{count} <{tag}>" for tag, count in sorted(counts.items()))
+    follow = " Joints with <mimic> are free joints here." if counts["mimic"] else ""
+    return f"\nIn the file and not used: {names or 'nothing'}.{follow}"

@@ -1,0 +1,267 @@
+"""`jaxdyn simulate`: motions of a URDF robot under chosen torques, to a file and a picture."""
+
+import argparse
+import csv
+import pathlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.cli.common import (
+    Stopwatch,
+    add_model_options,
+    load_model,
+    output_path,
+    per_coordinate,
+    vector,
+)
+from jaxdyn.excitation import FourierTorque, random_torque
+from jaxdyn.forces import CoulombFriction, JointDamping
+from jaxdyn.identify import SampledTorque
+from jaxdyn.io.logs import read_log
+from jaxdyn.model import Model, integrate, neutral
+from jaxdyn.scene import Scene
+from jaxdyn.simulate import Solution, simulate
+
+HELP = "simulate a URDF robot, one motion or a batch, and write or plot the motions"
+DESCRIPTION = """\
+Simulate the robot from a given state under chosen joint torques. Energy minus work is printed as a check
+of the integration: it has to be tiny.
+"""
+EPILOG = """\
+examples:
+  jaxdyn simulate panda.urdf --duration 2 --q0 0 -0.5 0 -2 0 1.5 0.7 0 0 --out motion.csv --plot motion.png
+  jaxdyn simulate panda.urdf --q0 panda_joint4=-2 panda_joint6=1.5 --torque gravity --damping 1
+  jaxdyn simulate panda.urdf --batch 256 --torque gravity+random --torque-size 2 --seed 1 --out motions.npz
+  jaxdyn simulate panda.urdf --torque log.csv --out replay.csv
+
+torques (--torque):
+  zero             none: the robot falls
+  gravity          carries the robot's weight, N(q)
+  random           smooth random torques (three harmonics of 0.5 Hz), another one for each motion
+  gravity+random   both
+  FILE.csv, .npz   replays the columns tau1, tau2, ... (N m, N) of a log with t (s) and q1, q2, ...; it starts at
+                   the log's first state unless --q0 and --v0 say otherwise, and lasts as long as the log
+
+output (--out):
+  .csv             columns t, q1.., v1.., tau1.., energy; with --batch also rollout, the number of the motion
+  .npz             arrays t (nt), q (nt, nq), v and tau (nt, nv), energy (nt); with --batch a leading axis of motions
+  v is the velocity in the body's frame: of a free base, linear (m/s) then angular (rad/s).
+  Quaternions in q are (w, x, y, z); a free base is (x, y, z, qw, qx, qy, qz).
+"""
+_KINDS = ("zero", "gravity", "random", "gravity+random")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("urdf", help="the URDF file")
+    add_model_options(parser)
+    motion = parser.add_argument_group("motion")
+    motion.add_argument(
+        "--duration", type=float, metavar="S", help="length of the motion, s (default: 2, or the log's)"
+    )
+    motion.add_argument(
+        "--sample", type=float, default=0.01, metavar="S", help="time between output rows, s (default: 0.01)"
+    )
+    motion.add_argument("--q0", nargs="+", metavar="Q", help="start: all of q, or JOINT=VALUE (default: zero; rad, m)")
+    motion.add_argument(
+        "--v0", nargs="+", metavar="V", help="start velocity, in the same way (default: zero; rad/s, m/s)"
+    )
+    motion.add_argument("--batch", type=int, default=1, metavar="N", help="number of motions (default: 1)")
+    motion.add_argument(
+        "--spread", type=float, default=0.0, metavar="D", help="standard deviation of the start around q0"
+    )
+    motion.add_argument("--seed", type=int, default=0, help="of random torques and starts (default: 0)")
+    forces = parser.add_argument_group("forces")
+    forces.add_argument(
+        "--torque", default="zero", metavar="KIND", help="zero, gravity, random, gravity+random or a log"
+    )
+    forces.add_argument(
+        "--torque-size",
+        nargs="+",
+        type=float,
+        metavar="T",
+        help="standard deviation of random torques, N m or N, one number or one per coordinate "
+        "(default: 1 %% of the effort limit, 1 where there is none)",
+    )
+    forces.add_argument(
+        "--damping",
+        nargs="+",
+        type=float,
+        metavar="D",
+        help="joint damping, N m s or N s, one number or one per coordinate (default: as the file states)",
+    )
+    forces.add_argument(
+        "--friction",
+        nargs="+",
+        type=float,
+        metavar="F",
+        help="Coulomb friction, N m or N, smoothed below 0.01 rad/s (default: as the file states)",
+    )
+    solver = parser.add_argument_group("integration")
+    solver.add_argument("--dt", type=float, metavar="S", help="fixed steps (Runge-Kutta of order 4) of this length, s")
+    solver.add_argument(
+        "--rtol", type=float, default=1e-8, help="tolerance of adaptive steps (order 8), the default: 1e-8"
+    )
+    solver.add_argument("--max-steps", type=int, metavar="N", help="give up after so many steps")
+    solver.add_argument("--progress", action="store_true", help="show how far the motion has come")
+    files = parser.add_argument_group("output")
+    files.add_argument("--out", metavar="FILE", help="write the motions to FILE.csv or FILE.npz")
+    files.add_argument(
+        "--plot", metavar="FILE", help="draw positions, velocities and torques to FILE.png, .pdf or .svg"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate, print a summary, write the files; 1 if a motion could not be computed to its end."""
+    out = output_path(args.out, (".csv", ".npz"), "--out")
+    plot = output_path(args.plot, (".png", ".pdf", ".svg"), "--plot")
+    if args.batch < 1:
+        raise ValueError(f"--batch is {args.batch}; give at least 1")
+    if args.dt is not None and not args.dt > 0:
+        raise ValueError(f"--dt is {args.dt}; give a positive step, s")
+    model = load_model(args.urdf, args)
+    control, q0, v0, duration = _excitation(model, args)
+    if args.duration is not None:
+        duration = args.duration
+    if not (duration > 0 and 0 < args.sample <= duration):
+        raise ValueError(f"--duration is {duration} s, --sample {args.sample} s; give 0 < sample <= duration")
+    ts = np.linspace(0.0, duration, round(duration / args.sample) + 1)
+    starts = _starts(model, q0, args)
+    scene = Scene(model, forces=_joint_forces(model, args))
+    steps = {"stepsize": args.dt} if args.dt is not None else {"rtol": args.rtol, "atol": args.rtol}
+    if args.max_steps is not None:
+        steps["max_steps"] = args.max_steps
+
+    watch = Stopwatch()
+    carry = model if args.torque.startswith("gravity") else None
+    steps["progress"] = args.progress
+    solution, tau = _simulate(scene, control, carry, starts, jnp.asarray(v0), ts, steps)
+    done = np.asarray(solution.success)
+    print(f"{args.urdf}: {args.batch} motion{'s' * (args.batch > 1)} of {duration:g} s, {len(ts)} rows each, in {watch} "
+          "(compilation included)")  # fmt: skip
+    _summarise(model, solution, done)
+    if out is not None:
+        _write(out, args.batch, ts, solution, tau)
+        print(f"Wrote {out}.")
+    if plot is not None:
+        from jaxdyn.plotting import motion_figure
+
+        motion_figure(model, ts, solution.q, solution.v, tau).savefig(plot)
+        print(f"Wrote {plot}.")
+    if not done.all():
+        reached = np.asarray(solution.stats["time_reached"])[~done]
+        print(f"{np.sum(~done)} of {args.batch} motions stopped early, the first at t = {reached.min():.6g} s; "
+              "try a smaller --dt or --rtol, or a larger --max-steps")  # fmt: skip
+    return int(not done.all())
+
+
+def _excitation(model: Model, args):
+    """Control (with a leading axis of motions in its leaves), start and duration."""
+    q0, v0, duration = np.asarray(neutral(model)), np.zeros(model.nv), 2.0
+    size = _torque_size(model, args)
+    if args.torque in _KINDS:
+        random = size if "random" in args.torque else 0 * size
+        keys = jax.random.split(jax.random.key(args.seed), args.batch)
+        control = jax.vmap(lambda key: random_torque(key, random))(keys)
+    elif pathlib.Path(args.torque).suffix.lower() in (".csv", ".npz"):
+        log = read_log(args.torque, joint_names=model.joint_names)
+        if (log.q.shape[1], log.nv) != (model.nq, model.nv):
+            raise ValueError(f"--torque {args.torque}: the log has {log.q.shape[1]} columns of q and {log.nv} of tau, the "
+                             f"model needs {model.nq} and {model.nv}; use --lock for joints that were not logged")  # fmt: skip
+        q0, v0 = np.asarray(log.q)[0], v0 if log.v is None else np.asarray(log.v)[0]
+        t = np.asarray(log.t) - float(log.t[0])
+        duration = float(t[-1])
+        replay = SampledTorque(jnp.asarray(t), jnp.asarray(log.tau))
+        control = jax.tree.map(lambda x: jnp.broadcast_to(x, (args.batch, *x.shape)), replay)
+    else:
+        raise ValueError(f"--torque is {args.torque!r}; give {', '.join(_KINDS)}, or a log FILE.csv or FILE.npz")
+    if args.batch > 1 and args.spread == 0 and "random" not in args.torque:
+        raise ValueError(f"--batch {args.batch}: all motions would be the same; add --torque random or --spread")
+    q0 = q0 if args.q0 is None else vector(model, args.q0, q0, "--q0")
+    v0 = v0 if args.v0 is None else vector(model, args.v0, v0, "--v0")
+    return control, q0, v0, duration
+
+
+def _torque_size(model: Model, args) -> jax.Array:
+    if args.torque_size is not None:
+        return jnp.asarray(per_coordinate(model, args.torque_size, "--torque-size"))
+    limit = np.asarray(model.effort_limit)
+    return jnp.asarray(np.where(np.isfinite(limit) & (limit > 0), 0.01 * limit, 1.0))
+
+
+def _starts(model: Model, q0, args) -> jax.Array:
+    away = args.spread * jax.random.normal(jax.random.key(args.seed + 1), (args.batch, model.nv))
+    return jax.vmap(lambda step: integrate(model, jnp.asarray(q0), step))(away)
+
+
+def _joint_forces(model: Model, args) -> list:
+    forces = []
+    for option, leaf, force in (
+        ("damping", model.damping, JointDamping),
+        ("friction", model.friction, CoulombFriction),
+    ):
+        given = getattr(args, option)
+        values = leaf if given is None else per_coordinate(model, given, f"--{option}")
+        if values is not None and np.any(np.asarray(values) < 0):
+            raise ValueError(f"--{option} is {np.asarray(values).tolist()}; it must not be negative")
+        if values is not None and np.any(np.asarray(values) != 0):
+            forces.append(force(values))
+    return forces
+
+
+def _simulate(scene: Scene, control, carry: Model | None, starts, v0, ts, options) -> tuple[Solution, jax.Array]:
+    """All motions and the torques at their rows, with a leading axis of motions."""
+
+    # Model and options are closed over: known numbers make a faster program.
+    @eqx.filter_jit
+    def batch(control, starts):
+        def one(control, q0):
+            if carry is not None:
+                control = FourierTorque(control.cosine, control.sine, control.period, carry)
+            solution = simulate(scene, q0, v0, ts, control=control, outputs=("energy", "work"), throw=False, **options)
+            return solution, jax.vmap(control)(solution.q, solution.v, solution.ts)
+
+        return jax.vmap(one)(control, starts)
+
+    return batch(control, starts)
+
+
+def _summarise(model: Model, solution: Solution, done: np.ndarray) -> None:
+    steps = np.asarray(solution.stats["num_steps"])
+    print(f"steps: {steps.min()} to {steps.max()}" if steps.min() < steps.max() else f"steps: {steps.max()}")
+    if not done.any():
+        return
+    energy, work = np.asarray(solution.energy)[done], np.asarray(solution.work)[done]
+    drift = np.abs(energy - energy[:, :1] - work).max()
+    exchanged = max(np.ptp(energy, axis=1).max(), np.abs(work).max())
+    print(
+        f"energy minus work of torques and friction: at most {drift:.2e} J off its start, of {exchanged:.4g} J exchanged"
+    )
+    outside = _outside(model, np.asarray(solution.q)[done])
+    if outside:
+        print(f"joints beyond their limits on the way (limits are not enforced): {', '.join(outside)}")
+
+
+def _outside(model: Model, q: np.ndarray) -> list[str]:
+    far = ((q < np.asarray(model.lower)) | (q > np.asarray(model.upper))).any((0, 1))
+    return [name for name, place in zip(model.joint_names, model.topology.q_slices, strict=True) if far[place].any()]
+
+
+def _write(path: pathlib.Path, count: int, ts, solution: Solution, tau) -> None:
+    arrays = {"q": solution.q, "v": solution.v, "tau": tau, "energy": solution.energy}
+    arrays = {name: np.asarray(value) for name, value in arrays.items()}
+    if path.suffix.lower() == ".npz":
+        arrays = arrays if count > 1 else {name: value[0] for name, value in arrays.items()}
+        np.savez_compressed(path, t=ts, **arrays)  # pyright: ignore[reportArgumentType]
+        return
+    header = ["rollout"] if count > 1 else []
+    header += ["t", *(f"{name}{i + 1}" for name in ("q", "v", "tau") for i in range(arrays[name].shape[2])), "energy"]
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        for k in range(count):
+            rows = np.column_stack([ts, *(arrays[name][k] for name in ("q", "v", "tau", "energy"))])
+            writer.writerows([str(k + 1)] * (count > 1) + [repr(float(x)) for x in row] for row in rows)

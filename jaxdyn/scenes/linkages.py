@@ -1,0 +1,115 @@
+"""Planar linkages built from bodies, their loops closed by revolute joints."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn import inertia
+from jaxdyn.building import ModelBuilder
+from jaxdyn.constraints import loop
+from jaxdyn.scene import Scene
+from jaxdyn.scenes._named import named
+
+_DOWN = (0.0, -9.81, 0.0)
+
+
+def _bar(mass, length):
+    """A uniform thin bar along x from its end."""
+    return inertia.displaced(inertia.rod(mass, length), (length / 2, 0.0, 0.0))
+
+
+def _circles(center, radius, other, reach):
+    """The intersection of two circles that lies to the left of the way from the first centre to the second."""
+    way = np.asarray(other, float) - center
+    apart = np.hypot(*way)
+    along = (radius**2 - reach**2 + apart**2) / (2 * apart)
+    square = radius**2 - along**2
+    if square < 0:
+        raise ValueError(f"lengths {radius} and {reach} do not close over {apart:.6g}; no such configuration exists")
+    way = way / apart
+    return np.asarray(center, float) + along * way + np.sqrt(square) * np.array([-way[1], way[0]])
+
+
+def _four_bar_start(lengths=(1.0, 3.0, 2.5, 3.5), angle=1.0, rate=1.0, in_plane=True):
+    crank, coupler, rocker, ground = lengths
+    a = crank * np.array([np.cos(angle), np.sin(angle)])
+    b = _circles(a, coupler, (ground, 0.0), rocker)
+    coupling, rocking = np.arctan2(*(b - a)[::-1]), np.arctan2(b[1], b[0] - ground)
+    # Velocities of B as carried by the coupler and by the rocker agree.
+    turn = lambda length, at: length * np.array([-np.sin(at), np.cos(at)])  # noqa: E731
+    rates = np.linalg.solve(np.stack([turn(coupler, coupling), -turn(rocker, rocking)], 1), -rate * turn(crank, angle))
+    return jnp.asarray([angle, coupling - angle, rocking]), jnp.asarray([rate, rates[0] - rate, rates[1]])
+
+
+@named(_four_bar_start)
+def four_bar(*, lengths=(1.0, 3.0, 2.5, 3.5), masses=(1.0, 3.0, 2.5), gravity=_DOWN, in_plane=True) -> Scene:
+    """Four-bar linkage in the x-y plane: crank and coupler as a chain, rocker on the ground, closed by a joint.
+
+    q = (crank angle, coupler angle relative to the crank, rocker angle). `lengths`: crank, coupler, rocker, ground (m);
+    uniform bars with `masses` (kg). With `in_plane=False` the joint has all five rows of a revolute joint in space,
+    three of which depend on the others. Start: the crank's `angle` (rad) and `rate` (rad/s), assembled to the left.
+    """
+    crank, coupler, rocker, ground = lengths
+    builder = ModelBuilder("four-bar", gravity=gravity)
+    builder.add_body("crank", None, "continuous", _bar(masses[0], crank), joint_name="1")
+    builder.add_body("coupler", "crank", "continuous", _bar(masses[1], coupler), joint_name="2", pose=(crank, 0.0, 0.0))
+    builder.add_body("rocker", None, "continuous", _bar(masses[2], rocker), joint_name="3", pose=(ground, 0.0, 0.0))
+    closing = loop("coupler", (coupler, 0.0, 0.0), "rocker", (rocker, 0.0, 0.0), in_plane=in_plane, name="knee")
+    return Scene(builder.build(), (closing,))
+
+
+def _slider_crank_start(crank=1.0, rod=2.5, angle=1.0, rate=1.0):
+    lean = -np.arcsin(crank * np.sin(angle) / rod)
+    leaning = -crank * np.cos(angle) * rate / (rod * np.cos(lean))
+    place = crank * np.cos(angle) + rod * np.cos(lean)
+    sliding = -crank * np.sin(angle) * rate - rod * np.sin(lean) * leaning
+    return jnp.asarray([angle, lean - angle, place]), jnp.asarray([rate, leaning - rate, sliding])
+
+
+@named(_slider_crank_start)
+def slider_crank(*, crank=1.0, rod=2.5, masses=(1.0, 2.0, 1.5), gravity=_DOWN) -> Scene:
+    """Slider-crank in the x-y plane: crank and rod as a chain, the slider on the x axis, closed by a revolute joint.
+
+    q = (crank angle, rod angle relative to the crank, slider's x). `masses` (kg) of crank, rod and slider.
+    """
+    builder = ModelBuilder("slider-crank", gravity=gravity)
+    builder.add_body("crank", None, "continuous", _bar(masses[0], crank), joint_name="1")
+    builder.add_body("rod", "crank", "continuous", _bar(masses[1], rod), joint_name="2", pose=(crank, 0.0, 0.0))
+    slider = inertia.point_mass(masses[2])
+    builder.add_body("slider", None, "prismatic", slider, joint_name="3", axis=(1.0, 0.0, 0.0))
+    closing = loop("rod", (rod, 0.0, 0.0), "slider", None, in_plane=True, name="pin")
+    return Scene(builder.build(), (closing,))
+
+
+def _names(count: int) -> tuple[list[str], list[str]]:
+    width = len(str(count))
+    uprights = [f"upright{i:0{width}d}" for i in range(count + 1)]
+    return uprights, [f"coupler{i:0{width}d}" for i in range(count)]
+
+
+def _windows_start(count=2, rate=1.0):
+    # Depth-first: each upright but the last one is followed by the coupler that it carries, which does not turn.
+    v = np.array([sign * rate for _ in range(count) for sign in (-1.0, 1.0)] + [-rate])
+    return jnp.zeros(2 * count + 1), jnp.asarray(v)
+
+
+@named(_windows_start)
+def windows(*, count=2, mass=1.0, length=1.0, gravity=_DOWN) -> Scene:
+    """N four-bar windows in a row (problem A02 of the IFToMM benchmark library), N = `count`.
+
+    N + 1 uprights on the ground at x = 0, 1 .. N lengths, N couplers between their tops, all uniform bars of one `mass`
+    and `length`, in the x-y plane. All angles are zero at the start, uprights pointing up; top 0 moves at +`rate` m/s
+    per m of length. Where the uprights are horizontal the rows lose rank and the mechanism has N more freedoms.
+    """
+    uprights, couplers = _names(count)
+    up = inertia.displaced(inertia.rod(mass, length, "y"), (0.0, length / 2, 0.0))
+    builder = ModelBuilder(f"{count} windows", gravity=gravity)
+    for i, name in enumerate(uprights):
+        builder.add_body(name, None, "continuous", up, pose=(i * length, 0.0, 0.0))
+    for i, name in enumerate(couplers):
+        builder.add_body(name, uprights[i], "continuous", _bar(mass, length), pose=(0.0, length, 0.0))
+    top = (0.0, length, 0.0)
+    closing = [
+        loop(name, (length, 0.0, 0.0), uprights[i + 1], top, in_plane=True, name=f"window {i + 1}")
+        for i, name in enumerate(couplers)
+    ]
+    return Scene(builder.build(), closing)

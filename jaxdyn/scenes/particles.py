@@ -1,0 +1,64 @@
+"""A particle on a rod, in Cartesian coordinates: the constraint as a function of the configuration."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints import Holonomic
+from jaxdyn.scene import Scene
+from jaxdyn.scenes._named import named
+from jaxdyn.systems import LagrangianSystem
+
+
+class _Rod(eqx.Module):
+    """(|q|^2 - length^2) / 2, so that A = q^T and the tension is -lam length."""
+
+    length: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float))
+
+    def __call__(self, q, t):
+        return 0.5 * (jnp.sum(q * q) - self.length.astype(q.dtype) ** 2)
+
+
+def _particle(q, v, t, p):
+    return 0.5 * p["mass"] * jnp.sum(v * v) - p["mass"] * p["gravity"] * q[-1]
+
+
+def _scene(dimension: int, mass, length, gravity) -> Scene:
+    system = LagrangianSystem(_particle, dimension, parameters={"mass": mass, "gravity": gravity})
+    return Scene(system, (Holonomic(_Rod(length), name="rod"),))
+
+
+def _plane_start(length=1.0, angle=-np.pi / 2, rate=0.0):
+    direction = jnp.asarray([np.sin(angle), -np.cos(angle)])
+    return length * direction, length * rate * jnp.asarray([np.cos(angle), np.sin(angle)])
+
+
+@named(_plane_start)
+def pendulum_in_plane(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+    """Plane pendulum in x and y (up): L = m |v|^2/2 - m g y, phi = (x^2 + y^2 - l^2)/2.
+
+    lam = -(m/l^2)(|v|^2 - g y); the tension of the rod is -l lam. Start: `angle` from the downward vertical and `rate`;
+    by default problem A01 of the IFToMM benchmark library, x = -1, at rest.
+
+    Source: EQUATIONS section 6, with the sign of the multiplier on the right.
+    """
+    return _scene(2, mass, length, gravity)
+
+
+def _sphere_start(length=1.0, theta=1.0, phi=0.0, theta_rate=0.0, phi_rate=1.0):
+    s, c, sp, cp = np.sin(theta), np.cos(theta), np.sin(phi), np.cos(phi)
+    q = length * jnp.asarray([s * cp, s * sp, -c])
+    along = theta_rate * np.array([c * cp, c * sp, s]) + phi_rate * s * np.array([-sp, cp, 0.0])
+    return q, length * jnp.asarray(along)
+
+
+@named(_sphere_start)
+def spherical_pendulum(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+    """Spherical pendulum in x, y and z (up): L = m |v|^2/2 - m g z, phi = (|q|^2 - l^2)/2.
+
+    lam = (m/l^2)(g z - |v|^2). Start by angles: theta from the downward vertical, phi about it.
+
+    Source: EQUATIONS sections 1 and 7.
+    """
+    return _scene(3, mass, length, gravity)

@@ -1,0 +1,150 @@
+"""Robots of example-robot-data, read by `load_urdf`, against Pinocchio reading the same file."""
+
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import pytest
+from pinocchio_bridge import ROBOTS, Bridge, assert_close, quick, random_states
+
+import jaxdyn as jd
+from jaxdyn import _dispatch, recursive
+
+FEW = {
+    "panda.urdf": False,
+    "ur5_robot.urdf": False,
+    "kinova.urdf": False,
+    "allegro_right_hand.urdf": False,
+    "solo12.urdf": True,
+    "anymal.urdf": True,
+    "g1_29dof_rev_1_0.urdf": True,
+    "talos_reduced.urdf": True,
+}
+# ur3.urdf is a xacro file without links, which Pinocchio refuses too; the links of these two have no mass, so that some of
+# their joints move no inertia and M is singular.
+REFUSED = {"ur3.urdf": "ur3.urdf", "romeo.urdf": "no inertia", "romeo_laas_small.urdf": "no inertia"}
+
+
+def _paths():
+    paths = {}
+    for folder, _, files in sorted(os.walk(ROBOTS)):
+        for file in sorted(files):
+            if file.endswith(".urdf"):
+                paths.setdefault(file, os.path.join(folder, file))
+    return paths
+
+
+PATHS = _paths()
+CASES = [
+    pytest.param(file, floating, marks=() if FEW.get(file) is floating else pytest.mark.slow, id=f"{file}-{floating}")
+    for file in PATHS
+    if file not in REFUSED
+    for floating in (False, True)
+]
+
+
+def both(file, floating):
+    """The robot on both sides, and the conversion of configurations."""
+    source = pin.buildModelFromUrdf(PATHS[file], *([pin.JointModelFreeFlyer()] if floating else []))
+    model = jd.load_urdf(PATHS[file], floating_base=floating)
+    extra = [
+        joint.nq - (part.stop - part.start)
+        for joint, part in zip(list(source.joints)[1:], model.topology.q_slices, strict=True)
+    ]
+    return model, source, Bridge(model.topology.kinds, tuple(x == 1 for x in extra), np.zeros(0))
+
+
+def ours(model, frames):
+    """Every quantity of one state, by the matrix form."""
+
+    def at(q, v, a, tau):
+        return {
+            "poses": jd.forward_kinematics(model, q),
+            "body jacobians": jnp.stack([jd.body_jacobian(model, q, name) for name in frames]),
+            "spatial jacobians": jnp.stack([jd.spatial_jacobian(model, q, name) for name in frames]),
+            "mass matrix": jd.mass_matrix(model, q),
+            "C v": jd.coriolis_matrix(model, q, v) @ v,
+            "bias": jd.bias_force(model, q, v),
+            "gravity": jd.gravity_force(model, q),
+            "inverse dynamics": jd.inverse_dynamics(model, q, v, a),
+            "forward dynamics": jd.forward_dynamics(model, q, v, tau),
+            "center of mass": jd.center_of_mass(model, q),
+            "centroidal momentum": jd.centroidal_momentum(model, q, v),
+            "regressor": jd.torque_regressor(model, q, v, a),
+        }
+
+    return at
+
+
+def theirs(source, frames, q, v, a, tau):
+    """The same quantities by Pinocchio."""
+    data = source.createData()
+    ids = [source.getFrameId(name, pin.FrameType.BODY) for name in frames]
+    mass = pin.crba(source, data, q)
+    mass = np.triu(mass) + np.triu(mass, 1).T
+    pin.computeJointJacobians(source, data, q)
+    pin.updateFramePlacements(source, data)
+    pin.forwardKinematics(source, data, q)
+    gravity = pin.computeGeneralizedGravity(source, data, q).copy()
+    bias = pin.nonLinearEffects(source, data, q, v).copy()
+    return {
+        "poses": np.stack([data.oMi[i].homogeneous for i in range(1, source.njoints)]),
+        "body jacobians": np.stack([pin.getFrameJacobian(source, data, i, pin.LOCAL) for i in ids]),
+        "spatial jacobians": np.stack([pin.getFrameJacobian(source, data, i, pin.WORLD) for i in ids]),
+        "mass matrix": mass,
+        "C v": bias - gravity,
+        "bias": bias,
+        "gravity": gravity,
+        "inverse dynamics": pin.rnea(source, data, q, v, a).copy(),
+        "forward dynamics": pin.aba(source, data, q, v, tau).copy(),
+        "center of mass": pin.centerOfMass(source, data, q).copy(),
+        "centroidal momentum": pin.computeCentroidalMomentum(source, data, q, v).np.copy(),
+        "regressor": pin.computeJointTorqueRegressor(source, data, q, v, a).copy(),
+    }
+
+
+@pytest.mark.parametrize("file,floating", CASES)
+def test_agrees_with_pinocchio(file, floating, monkeypatch):
+    monkeypatch.setattr(_dispatch, "MOST_BODIES", 0)  # the matrix form only; the recursion has its own test below
+    model, source, bridge = both(file, floating)
+    links = [name for name in model.frame_names if source.existFrame(name, pin.FrameType.BODY)]
+    frames = [links[0], links[len(links) // 2], links[-1]]
+    q, v, a, tau, _ = random_states(model, 5, 1)
+    got = quick(jax.vmap(ours(model, frames)))(q, v, a, tau)
+    for i, q_pin in enumerate(bridge.q_to_pinocchio(q)):
+        want = theirs(source, frames, q_pin, *(np.asarray(x[i]) for x in (v, a, tau)))
+        mass, spread = want["mass matrix"], np.linalg.cond(want["mass matrix"])
+        for key, value in want.items():
+            # Solving with M amplifies rounding by its condition number, which reaches 1e7 where fingers hang on humanoids.
+            tolerance = 1e-10 if key != "forward dynamics" else max(1e-10, 1e-15 * spread)
+            assert_close(got[key][i], value, tolerance, key)
+        # Free of that amplification: the acceleration found gives back the force.
+        assert_close(
+            mass @ np.asarray(got["forward dynamics"][i]) + want["bias"], tau[i], 1e-9, "residual of M a + h = tau"
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("file,floating", [case for case in CASES])
+def test_recursion_agrees_with_pinocchio(file, floating):
+    model, source, bridge = both(file, floating)
+    q, v, a, tau, _ = random_states(model, 5, 2)
+    got = quick(jax.vmap(lambda q, v, a, tau: (recursive.rnea(model, q, v, a), recursive.aba(model, q, v, tau))))(
+        q, v, a, tau
+    )
+    data = source.createData()
+    for i, q_pin in enumerate(bridge.q_to_pinocchio(q)):
+        vi, ai, ti = (np.asarray(x[i]) for x in (v, a, tau))
+        spread = np.linalg.cond(pin.crba(source, data, q_pin) + np.tril(data.M.T, -1))
+        assert_close(got[0][i], pin.rnea(source, data, q_pin, vi, ai), 1e-10, "rnea")
+        assert_close(got[1][i], pin.aba(source, data, q_pin, vi, ti), max(1e-10, 1e-15 * spread), "aba")
+
+
+@pytest.mark.parametrize("file", REFUSED)
+def test_refused_robots_say_why(file):
+    if file not in PATHS:
+        pytest.skip(f"{file} is not in this release of example-robot-data")
+    with pytest.raises(ValueError, match=REFUSED[file]):
+        jd.load_urdf(PATHS[file])
