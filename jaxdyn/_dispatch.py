@@ -12,10 +12,12 @@ large?"; its batching rule counts the samples, and what is left unbatched answer
 branch that is not taken.
 """
 
+import functools
 from collections.abc import Callable
 
 import jax
 import jax.core
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray
@@ -47,45 +49,54 @@ def _count_samples(arrays, axes, *, count):
 batching.primitive_batchers[_large_batch_p] = _count_samples
 
 
-def _choose(model: Model, arrays, recursion: Callable, matrices: Callable):
-    """`recursion()` for large batches of mechanisms of moderate size, else `matrices()`."""
+@functools.cache
+def _traced_once(function: Callable) -> Callable:
+    """`function` behind a `jit` of its own, so that a program which calls it many times traces it once per mechanism."""
+
+    def run(least, *args):
+        with at_least(least):
+            return function(*args)
+
+    return jax.jit(run, static_argnums=0)
+
+
+def _choose(model: Model, recursion: Callable, matrices: Callable, *args):
+    """`recursion(model, *args)` for large batches of mechanisms of moderate size, else `matrices(model, *args)`."""
     if model.nb > MOST_BODIES or model.nb == 0:
-        return matrices()
-    traced = [x for x in (*jax.tree.leaves(model), *arrays) if isinstance(x, jax.core.Tracer)]
+        return matrices(model, *args)
+    traced = [x for x in jax.tree.leaves((model, *args[:3])) if isinstance(x, jax.core.Tracer)]
     large = _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1) if traced else False
-    if not isinstance(large, jax.core.Tracer):
-        return recursion() if large else matrices()
+    # A mechanism whose numbers are known is traced in place: inside a jit of its own its zeros would be hidden.
+    given = isinstance(model.home, jax.core.Tracer) and isinstance(model.screws, jax.core.Tracer)
 
-    def recursion_if_large():
-        with at_least(LEAST_BATCH):
-            return recursion()
+    def recursion_from(least):
+        if given:
+            return _traced_once(recursion)(least, model, *args)
+        with at_least(least):
+            return recursion(model, *args)
 
-    return lax.cond(large, recursion_if_large, matrices)
+    if isinstance(large, jax.core.Tracer):
+        return lax.cond(large, lambda: recursion_from(LEAST_BATCH), lambda: matrices(model, *args))
+    return recursion_from(1) if large else matrices(model, *args)
 
 
 def inverse_dynamics(model: Model, q: Array, v: Array, a: Array) -> Array:
     """tau = M a + C v + N, (nv,)."""
-    return _choose(
-        model,
-        (q, v, a),
-        lambda: recursive.rnea(model, q, v, a),
-        lambda: matrix_form.inverse_dynamics(model, q, v, a),
-    )
+    return _choose(model, recursive.rnea, matrix_form.inverse_dynamics, q, v, a)
 
 
 def bias_force(model: Model, q: Array, v: Array) -> Array:
     """h = C v + N, (nv,)."""
-    return _choose(
-        model,
-        (q, v),
-        lambda: recursive.bias_force(model, q, v),
-        lambda: matrix_form.inverse_dynamics(model, q, v, None),
-    )
+    return _choose(model, recursive.bias_force, _bias_by_matrices, q, v)
+
+
+def _bias_by_matrices(model, q, v):
+    return matrix_form.inverse_dynamics(model, q, v, None)
 
 
 def mass_matrix(model: Model, q: Array) -> Array:
     """M(q), (nv, nv)."""
-    return _choose(model, (q,), lambda: recursive.crba(model, q), lambda: matrix_form.mass_matrix(model, q))
+    return _choose(model, recursive.crba, matrix_form.mass_matrix, q)
 
 
 def forward_dynamics(model: Model, q: Array, v: Array, tau: Array) -> Array:
@@ -103,47 +114,49 @@ def forward_dynamics(model: Model, q: Array, v: Array, tau: Array) -> Array:
 
     @jax.custom_jvp
     def solve(traced, q, v, tau):
-        here = rebuild(traced)
-        return _choose(
-            here,
-            (q, v, tau),
-            lambda: recursive.aba(here, q, v, tau),
-            lambda: matrix_form.forward_dynamics(here, q, v, tau),
-        )
+        return _choose(rebuild(traced), recursive.aba, matrix_form.forward_dynamics, q, v, tau)
 
     def rule(primals, tangents):
         traced, q, v, tau = primals
-        here = rebuild(traced)
-
-        def force_change(inverse):
-            """dtau - dID(q, v, a) at fixed a, along the tangents that are not structurally zero."""
-
-            def change(a):
-                live = [not isinstance(x, jax.custom_derivatives.SymbolicZero) for x in (*tangents[0], *tangents[1:3])]
-                base = [*traced, q, v]
-                total = tangents[3]
-                if isinstance(total, jax.custom_derivatives.SymbolicZero):
-                    total = np.zeros(tau.shape, tau.dtype)
-                if any(live):
-
-                    def along(*moving):
-                        numbers = iter(moving)
-                        full = [next(numbers) if alive else x for alive, x in zip(live, base, strict=True)]
-                        return inverse(rebuild(full[:-2]), full[-2], full[-1], a)
-
-                    start = [x for alive, x in zip(live, base, strict=True) if alive]
-                    step = [x for alive, x in zip(live, (*tangents[0], *tangents[1:3]), strict=True) if alive]
-                    total = total - jax.jvp(along, start, step)[1]
-                return total
-
-            return change
-
-        return _choose(
-            here,
-            (q, v, tau),
-            lambda: recursive.aba_tangent(here, q, v, tau, force_change(recursive.rnea)),
-            lambda: matrix_form.forward_dynamics_tangent(here, q, v, tau, force_change(matrix_form.inverse_dynamics)),
-        )
+        zero = jax.custom_derivatives.SymbolicZero
+        steps = [None] * len(leaves)
+        for place, step in zip(places, tangents[0], strict=True):
+            steps[place] = step
+        steps = [None if isinstance(step, zero) else step for step in (*steps, *tangents[1:])]
+        return _choose(rebuild(traced), _tangent_by_recursion, _tangent_by_matrices, q, v, tau, steps)
 
     solve.defjvp(rule, symbolic_zeros=True)
     return solve([leaves[i] for i in places], q, v, tau)
+
+
+def _tangent_by_recursion(model, q, v, tau, steps):
+    change = _force_change(recursive.rnea, model, q, v, tau, steps)
+    return recursive.aba_tangent(model, q, v, tau, change)
+
+
+def _tangent_by_matrices(model, q, v, tau, steps):
+    change = _force_change(matrix_form.inverse_dynamics, model, q, v, tau, steps)
+    return matrix_form.forward_dynamics_tangent(model, q, v, tau, change)
+
+
+def _force_change(inverse: Callable, model, q, v, tau, steps) -> Callable:
+    """a -> dtau - dID(q, v, a) at fixed a, for `steps` in the model's leaves, q, v and tau; None where nothing moves."""
+    leaves, structure = jax.tree.flatten(model)
+    *steps, tau_step = steps
+    base = [*leaves, q, v]
+    moving = [i for i, step in enumerate(steps) if step is not None]
+
+    def change(a):
+        total = jnp.zeros_like(tau) if tau_step is None else tau_step
+        if not moving:
+            return total
+
+        def along(*values):
+            here = list(base)
+            for i, value in zip(moving, values, strict=True):
+                here[i] = value
+            return inverse(jax.tree.unflatten(structure, here[:-2]), here[-2], here[-1], a)
+
+        return total - jax.jvp(along, [base[i] for i in moving], [steps[i] for i in moving])[1]
+
+    return change

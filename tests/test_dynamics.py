@@ -303,7 +303,9 @@ def test_frames_of_description_do_not_matter():
     world[:3, :3], world[:3, 3] = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), [3, -4, 5]
     turned_home = np.array(model.home)
     turned_home[0] = world @ turned_home[0]
-    turned = model.replace(home=jnp.asarray(turned_home), gravity=jnp.asarray(world[:3, :3] @ np.asarray(model.gravity)))
+    turned = model.replace(
+        home=jnp.asarray(turned_home), gravity=jnp.asarray(world[:3, :3] @ np.asarray(model.gravity))
+    )
     q, v, a, tau, external = random_states(model, 5, 3)
     want = PROGRAM(model, q, v, a, tau, external)
     carried = quick(jax.vmap(jax.vmap(se3.AdT_apply), (None, 0)))(jnp.asarray(moves), external)
@@ -349,7 +351,9 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
     bare = model.replace(gravity=None, armature=None)
     zero = model.replace(gravity=jnp.zeros(3), armature=jnp.zeros(model.nv))
     state = [x[0] for x in random_states(model, 1, 0)]
-    one = quick(lambda m, q, v, a, tau, _: (matrix_form.forward_dynamics(m, q, v, tau), dynamics.kinetic_energy(m, q, v)))
+    one = quick(
+        lambda m, q, v, a, tau, _: (matrix_form.forward_dynamics(m, q, v, tau), dynamics.kinetic_energy(m, q, v))
+    )
     for got, want in zip(one(bare, *state), one(zero, *state), strict=True):
         assert_close(got, want, 1e-13)
 
@@ -362,7 +366,9 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
     for function in (dynamics.gravity_force, dynamics.potential_energy):
         jaxpr = str(jax.make_jaxpr(lambda m, q, f=function: f(m, q))(bare, q))
         assert "dot_general" not in jaxpr and "sin" not in jaxpr
-        np.testing.assert_array_equal(function(bare, q), jnp.zeros(model.nv if function is dynamics.gravity_force else ()))
+        np.testing.assert_array_equal(
+            function(bare, q), jnp.zeros(model.nv if function is dynamics.gravity_force else ())
+        )
 
 
 def test_batch_equals_loop_and_eager_equals_jit():
@@ -404,7 +410,6 @@ def _flat(model, leaves, q, v, u):
     model = model.replace(**leaves)
     terms = [
         matrix_form.forward_dynamics(model, q, v, u),
-        matrix_form.inverse_dynamics(model, q, v, u),
         dynamics.coriolis_matrix(model, q, v) @ u,
         dynamics.potential_energy(model, q)[None],
         dynamics.centroidal_momentum(model, q, v),
@@ -412,23 +417,60 @@ def _flat(model, leaves, q, v, u):
     return jnp.concatenate(terms)
 
 
-def test_derivatives_in_every_leaf():
-    # Helical and spherical joints: both kinds of joint transform. Finite differences are good to 1e-5 at first order.
+def _derivative_case():
+    # Helical and spherical joints: both kinds of joint transform.
     model = random_tree(71, ["helical", "spherical"], parents=[-1, 0])
-    leaves = {name: getattr(model, name) for name in LEAVES}
-    q, v, u, _, _ = (x[0] for x in random_states(model, 1, 4))
-    weights = jnp.asarray(np.random.default_rng(0).normal(size=3 * model.nv + 7))
+    return model, ({name: getattr(model, name) for name in LEAVES}, *(x[0] for x in random_states(model, 1, 4)[:3]))
 
-    def total(leaves, q, v, u):
-        return weights @ jnp.tanh(_flat(model, leaves, q, v, u) / 10)
 
+def _total(model, leaves, q, v, tau):
+    return jnp.sum(jnp.tanh(matrix_form.forward_dynamics(model.replace(**leaves), q, v, tau) / 10))
+
+
+@pytest.mark.slow
+def test_forward_dynamics_by_check_grads():
+    model, at = _derivative_case()
+    total = functools.partial(_total, model)
     jax.config.update("jax_disable_most_optimizations", True)  # as `quick`, which does not nest
     try:
-        check_grads(jax.jit(total), (leaves, q, v, u), order=2, modes=("fwd", "rev"), atol=1e-4, rtol=1e-4)
+        # Finite differences of second order are good to 1e-4.
+        check_grads(jax.jit(total), at, order=2, modes=("fwd", "rev"), atol=1e-4, rtol=1e-4)
     finally:
         jax.config.update("jax_disable_most_optimizations", False)
-    for name, gradient in quick(jax.grad(total))(leaves, q, v, u).items():
-        assert np.abs(gradient).max() > 1e-6, name
+
+
+def test_every_quantity_has_derivatives_in_every_leaf():
+    model, at = _derivative_case()
+    rng = np.random.default_rng(0)
+    along = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), at)
+    weights = jnp.asarray(rng.normal(size=2 * model.nv + 7))
+    function = functools.partial(_flat, model)
+    h = 1e-5
+
+    def moved(step):
+        return jax.tree.map(lambda x, d: jnp.asarray(np.asarray(x) + step * np.asarray(d)), at, along)
+
+    value = quick(function)
+    ahead, back = value(*moved(h)), value(*moved(-h))
+    forward = quick(lambda at, along: jax.jvp(function, at, along)[1])(at, along)
+    # Central differences: h^2 and eps / h, both about 1e-10, times third derivatives and values of some hundred.
+    assert_close(forward, (ahead - back) / (2 * h), 1e-7)
+    gradient = quick(lambda at: jax.vjp(function, *at)[1](weights))(at)
+    pairs = zip(jax.tree.leaves(gradient), jax.tree.leaves(along), strict=True)
+    assert_close(sum(np.vdot(g, d) for g, d in pairs), weights @ forward, 1e-10)
+    for name, part in gradient[0].items():
+        assert np.abs(part).max() > 1e-3, name
+
+    # Second order, forward over reverse, against differences of the gradient.
+    @quick
+    def second(at, along):
+        return jax.jvp(lambda at: jax.grad(_total, argnums=(1, 2, 3, 4))(model, *at), (at,), (along,))
+
+    _, hessian = second(at, along)
+    (ahead, _), (back, _) = second(moved(h), along), second(moved(-h), along)
+    differences = jax.tree.map(lambda a, b: np.asarray(a - b) / (2 * h), ahead, back)
+    for got, want in zip(jax.tree.leaves(hessian), jax.tree.leaves(differences), strict=True):
+        assert_close(got, want, 1e-5)
 
 
 def test_derivatives_are_finite_at_rest_and_without_mass():

@@ -246,7 +246,7 @@ def _summarise(model: Model, solution: Solution, done: np.ndarray) -> None:
 
 
 def _outside(model: Model, q: np.ndarray) -> list[str]:
-    far = ((q < np.asarray(model.lower)) | (q > np.asarray(model.upper))).any((0, 1))
+    far = np.any((q < np.asarray(model.lower)) | (q > np.asarray(model.upper)), axis=(0, 1))
     return [name for name, place in zip(model.joint_names, model.topology.q_slices, strict=True) if far[place].any()]
 
 

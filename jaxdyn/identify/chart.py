@@ -35,12 +35,14 @@ class Chart(eqx.Module):
     - `origin` (bodies, 4, 4): upper-triangular; U is origin @ log_cholesky_factor(theta), so the chart can be moved to
       where a fit has come to. The identity at first.
     - `scale` (terms, nv): torque-sized units of the terms.
+    - `nominal_inertias` (nb, 10) and `nominal_terms` (4, nv): the model's values, kept by what is not fitted.
     """
 
-    model: Model
     factors: Float[Array, "bodies 4 4"]
     origin: Float[Array, "bodies 4 4"]
     scale: Float[Array, "terms nv"]
+    nominal_inertias: Float[Array, "nb 10"]
+    nominal_terms: Float[Array, "4 nv"]
     v_s: Float[Array, ""]
     bodies: tuple[int, ...] = eqx.field(static=True)
     terms: tuple[str, ...] = eqx.field(static=True)
@@ -55,31 +57,33 @@ class Chart(eqx.Module):
     def inertias(self, theta: Float[Array, "bodies n"]) -> Float[Array, "nb 10"]:
         """The ten numbers of every body."""
         if not self.bodies:
-            return self.model.inertias
+            return self.nominal_inertias
         upper = jnp.einsum("bij,bjk->bik", self.factors, self.relative_factors(theta))
         fitted = jax.vmap(_inertia.parameters_from_pseudo)(jnp.einsum("bij,bkj->bik", upper, upper))
-        return self.model.inertias.at[np.array(self.bodies)].set(fitted)
+        return self.nominal_inertias.at[np.array(self.bodies)].set(fitted)
 
     def term_values(self, s: Float[Array, "terms nv"]) -> Float[Array, "4 nv"]:
         """Values of all `TERMS`: those fitted at s, the others at the model's value."""
         fitted = self.scale * jnp.where(positive_terms(self.terms), s * s, s)
-        own = _own_terms(self.model)
-        return jnp.stack([fitted[self.terms.index(term)] if term in self.terms else own[term] for term in TERMS])
+        rows = [
+            fitted[self.terms.index(term)] if term in self.terms else self.nominal_terms[i]
+            for i, term in enumerate(TERMS)
+        ]
+        return jnp.stack(rows)
 
     def parameters(self, point: Coordinates) -> Float[Array, " p"]:
         """x (10 nb + 4 nv,), in the order of `parameter_names`."""
         return jnp.concatenate([self.inertias(point.theta).reshape(-1), self.term_values(point.s).reshape(-1)])
 
-    def fitted(self, point: Coordinates) -> tuple[Model, Friction]:
-        """The model, with its inertias, armature, damping and friction, and the friction law with its offset."""
+    def fitted(self, model: Model, point: Coordinates) -> tuple[Model, Friction]:
+        """`model` with the inertias, armature, damping and friction of a point, and the friction law with its offset."""
         viscous, coulomb, offset, armature = self.term_values(point.s)
-        old = self.model
         # A leaf that is absent and not fitted stays absent.
-        model = old.replace(
+        model = model.replace(
             inertias=self.inertias(point.theta),
-            armature=None if old.armature is None and "armature" not in self.terms else armature,
-            damping=None if old.damping is None and "viscous" not in self.terms else viscous,
-            friction=None if old.friction is None and "coulomb" not in self.terms else coulomb,
+            armature=None if model.armature is None and "armature" not in self.terms else armature,
+            damping=None if model.damping is None and "viscous" not in self.terms else viscous,
+            friction=None if model.friction is None and "coulomb" not in self.terms else coulomb,
         )
         return model, Friction(viscous, coulomb, offset, self.v_s)
 
@@ -141,10 +145,11 @@ def make_chart(model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_sca
     s = np.where(positive_terms(terms), np.sqrt(np.where(own > 0, own / scale, 0.1)), 0.0)
     size = {"full": 10, "mass": 1, "fixed": 0}[inertia]
     chart = Chart(
-        model,
         jnp.asarray(factors, dtype),
         jnp.asarray(np.broadcast_to(np.eye(4), factors.shape), dtype),
         jnp.asarray(scale, dtype),
+        model.inertias,
+        jnp.stack([_own_terms(model)[term] for term in TERMS]),
         jnp.asarray(v_s, dtype),
         bodies,
         terms,

@@ -98,14 +98,14 @@ def fit_torques(
     limit = _STEPS.get(method, _STEPS["adam"]) if isinstance(method, str) else _STEPS["adam"]
     steps = limit if steps is None else steps
     if isinstance(method, str) and method == "newton":
-        chart, point, history, result = _newton(problem, point, steps, tolerance, callback)
+        chart, point, history, result = _newton(model, problem, point, steps, tolerance, callback)
     else:
         start, scaling = _whitening(problem, point)
         _, unflatten = ravel_pytree(point)
 
         def report(step, value, y):
             if callback is not None:
-                callback(step, value, chart.fitted(unflatten(start + scaling @ y))[0])
+                callback(step, value, chart.fitted(model, unflatten(start + scaling @ y))[0])
 
         y, history, result = minimise(
             _flat_loss,
@@ -118,7 +118,7 @@ def fit_torques(
             callback=report,
         )
         point = unflatten(start + scaling @ y)
-    fitted, friction = chart.fitted(chart.settled(point))
+    fitted, friction = chart.fitted(model, chart.settled(point))
     name = method if isinstance(method, str) else type(method).__name__
     return Fit(fitted, friction, model, history, result, f"torque fit by {name}", terms, sigma)
 
@@ -137,14 +137,14 @@ def _problem(model, log, terms, v_s, inertia, weights, prior, sigma):
     return Problem(chart, *(jnp.asarray(x, dtype) for x in numbers)), point, float(sigma)
 
 
-def _newton(problem: Problem, point: Coordinates, steps: int, tolerance: float, callback):
+def _newton(model: Model, problem: Problem, point: Coordinates, steps: int, tolerance: float, callback):
     """Newton's method, each step in the chart around the bodies where it starts: chart, point, history, result."""
     history, result = [], "max_steps"
     for step in range(steps + 1):
         value, decrement, next_chart, next_point = _newton_step(problem, point)
         history.append(float(value))
         if callback is not None:
-            callback(step, float(value), problem.chart.fitted(point)[0])
+            callback(step, float(value), problem.chart.fitted(model, point)[0])
         if not np.isfinite(history[-1] + float(decrement)):
             result = "not_finite"
             break
@@ -173,7 +173,7 @@ def _newton_step(problem: Problem, point: Coordinates):
     gradient, _ = ravel_pytree(jax.grad(torque_loss)(point, problem))
     rows = problem.R @ jax.jacfwd(lambda y: chart.parameters(unflatten(y)))(y)
     slope = problem.R.T @ (problem.R @ chart.parameters(point) - problem.d)
-    slope = slope[-len(TERMS) * chart.model.nv :].reshape(len(TERMS), -1)[
+    slope = slope[-chart.nominal_terms.size :].reshape(len(TERMS), -1)[
         np.array([TERMS.index(t) for t in chart.terms], int)
     ]
     pressed = jnp.where(positive_terms(chart.terms), 2 * chart.scale * jnp.maximum(slope, 0), jnp.zeros_like(slope))

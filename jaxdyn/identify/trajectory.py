@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -82,6 +83,7 @@ class _Unknowns(eqx.Module):
 
 
 class _Problem(eqx.Module):
+    model: Model
     chart: Chart
     data: Segments
     scale: Float[Array, "2 nv"]
@@ -100,6 +102,7 @@ def fit_trajectory(
     horizon: int | None = None,
     initial: str = "measured",
     hold: str = "linear",
+    substeps: int | None = None,
     prior: float = 1e-6,
     method: Any = "lbfgs",
     steps: int = 200,
@@ -127,6 +130,8 @@ def fit_trajectory(
     - `method`: "lbfgs", "adam" or an optax.GradientTransformation; `steps`, `learning_rate`, `tolerance`, `callback` as
       in
       `fit_torques`.
+    - `substeps`: fixed steps between two samples (Tsit5 unless `solver` says otherwise); None: adaptive steps. Fixed
+      steps end on every sample, where the torques have their kinks, and cost the same in every segment.
     - `simulation`: options of `jd.simulate` (solver, stepsize, rtol, atol, adjoint, max_steps).
 
     **Returns:** `Fit`. Its `result` is "not_finite" when a simulation failed; the model is then the best before.
@@ -144,20 +149,21 @@ def fit_trajectory(
         raise ValueError(f"method is {method!r}; take one of {METHODS} or an optax.GradientTransformation")
     if not prior >= 0:
         raise ValueError(f"prior is {prior}; it must not be negative")
+    options = _options(substeps, simulation)
     dtype = np.dtype(model.home.dtype)
     data = segments(log, horizon, dtype)
     a = np.gradient(np.asarray(log.v, np.float64), np.asarray(log.t, np.float64), axis=0) if log.a is None else log.a
     rms = [np.sqrt(np.mean(np.asarray(x, np.float64) ** 2, axis=0)) for x in (log.tau, log.v, a)]
     chart, point = make_chart(model, terms, v_s, inertia, *rms)
     start = jnp.zeros((data.q.shape[0], 2, model.nv), dtype) if initial == "free" else None
-    problem = _Problem(chart, data, _motion_scale(model, data), jnp.asarray(prior, dtype), hold, dict(simulation))
+    problem = _Problem(model, chart, data, _motion_scale(model, data), jnp.asarray(prior, dtype), hold, options)
     unknowns = _Unknowns(point, start)
     y0, unflatten = ravel_pytree(unknowns)
-    scaling = _scaling(chart, point, log, a, y0.size)
+    scaling = _scaling(model, chart, point, log, a, y0.size)
 
     def report(step, value, y):
         if callback is not None:
-            callback(step, value, chart.fitted(unflatten(y0 + scaling @ y).point)[0])
+            callback(step, value, chart.fitted(model, unflatten(y0 + scaling @ y).point)[0])
 
     y, history, result = minimise(
         _flat_loss,
@@ -169,31 +175,57 @@ def fit_trajectory(
         tolerance=tolerance,
         callback=report,
     )
-    fitted, friction = chart.fitted(chart.settled(unflatten(y0 + scaling @ y).point))
+    fitted, friction = chart.fitted(model, chart.settled(unflatten(y0 + scaling @ y).point))
     name = method if isinstance(method, str) else type(method).__name__
     return Fit(fitted, friction, model, history, result, f"trajectory fit by {name}", terms)
 
 
-def rollout(model: Model, log: Log, friction: Friction | None = None, *, horizon=None, hold="linear", **simulation):
+def rollout(
+    model: Model,
+    log: Log,
+    friction: Friction | None = None,
+    *,
+    horizon=None,
+    hold="linear",
+    substeps=None,
+    **simulation,
+):
     """Simulate a log's segments with its torques from its measured states: q (segments, n, nq) and v (segments, n, nv).
 
     Arguments as in `fit_trajectory`.
     """
     data = segments(log, horizon, np.dtype(model.home.dtype))
-    return _rollout(model, friction, data, None, hold, dict(simulation))
+    return _rollout(model, friction, data, None, hold, _options(substeps, simulation))
 
 
 def trajectory_error(
-    model: Model, log: Log, friction: Friction | None = None, *, horizon=None, hold="linear", **simulation
+    model: Model,
+    log: Log,
+    friction: Friction | None = None,
+    *,
+    horizon=None,
+    hold="linear",
+    substeps=None,
+    **simulation,
 ):
     """Error of the simulated motion along a log, of positions and of velocities, each in per cent of the motion.
 
     100 sqrt(mean(((q_sim - q) / q_rms)^2)), and the same of v. Arguments as in `fit_trajectory`.
     """
     data = segments(log, horizon, np.dtype(model.home.dtype))
-    q, v = _rollout(model, friction, data, None, hold, dict(simulation))
+    q, v = _rollout(model, friction, data, None, hold, _options(substeps, simulation))
     errors = _scaled_errors(model, data, q, v, _motion_scale(model, data))
     return tuple(100 * float(jnp.sqrt(jnp.mean(error**2))) for error in errors)
+
+
+def _options(substeps, simulation: dict) -> dict:
+    if substeps is None:
+        return dict(simulation)
+    if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
+        raise ValueError(f"substeps is {substeps!r}; give a positive integer, or None for adaptive steps")
+    if "stepsize" in simulation:
+        raise ValueError("substeps and stepsize both say how to step; give one of them")
+    return {"solver": diffrax.Tsit5(), "substeps": substeps} | simulation
 
 
 @eqx.filter_jit
@@ -201,8 +233,15 @@ def _rollout(model, friction, data: Segments, start, hold: str, options):
     scene = Scene(model, forces=() if friction is None else (friction,))
 
     def one(t, q, v, tau, change):
+        given = dict(options)
+        substeps = given.pop("substeps", None)
+        if substeps is not None:
+            shares = jnp.arange(substeps, dtype=t.dtype) / substeps
+            steps = t[:-1, None] + (t[1:] - t[:-1])[:, None] * shares[None, :]
+            given.setdefault("max_steps", steps.size + 1)
+            given["stepsize"] = diffrax.StepTo(ts=jnp.append(steps.reshape(-1), t[-1]))
         q0, v0 = (q[0], v[0]) if change is None else (integrate(model, q[0], change[0]), v[0] + change[1])
-        motion = simulate(scene, q0, v0, t, control=SampledTorque(t, tau, hold), throw=False, **options)
+        motion = simulate(scene, q0, v0, t, control=SampledTorque(t, tau, hold), throw=False, **given)
         return motion.q, motion.v
 
     return jax.vmap(one)(data.t, data.q, data.v, data.tau, start)
@@ -213,11 +252,11 @@ def _flat_loss(y, args):
     _, unflatten = ravel_pytree(unknowns)
     found = unflatten(y0 + scaling @ y)
     chart, data = problem.chart, problem.data
-    model, friction = chart.fitted(found.point)
+    model, friction = chart.fitted(problem.model, found.point)
     has_friction = chart.terms or model.damping is not None or model.friction is not None
     change = None if found.start is None else found.start * problem.scale
     q, v = _rollout(model, friction if has_friction else None, data, change, problem.hold, problem.options)
-    errors = _scaled_errors(chart.model, data, q, v, problem.scale)
+    errors = _scaled_errors(model, data, q, v, problem.scale)
     return sum(jnp.mean(error**2) for error in errors) + problem.prior * chart.divergence(found.point.theta)
 
 
@@ -234,13 +273,12 @@ def _motion_scale(model, data: Segments) -> Float[Array, "2 nv"]:
     return jnp.where(scale > 1e-3 * largest, scale, jnp.where(largest > 0, largest, jnp.ones_like(largest)))
 
 
-def _scaling(chart: Chart, point: Coordinates, log: Log, a, size: int) -> Float[Array, "n n"]:
+def _scaling(model: Model, chart: Chart, point: Coordinates, log: Log, a, size: int) -> Float[Array, "n n"]:
     """Matrix with which the optimiser sees coordinates of about equal effect on the motion.
 
     A change of parameters dx changes the acceleration by -M^-1 Y dx: that Jacobian's Gram matrix is whitened.
     Directions without effect are stretched at most a thousand times.
     """
-    model = chart.model
     few = np.linspace(0, len(log) - 1, min(len(log), 200)).astype(int)
     q, v, a = (np.asarray(x, model.home.dtype)[few] for x in (log.q, log.v, a))
     M = jax.jit(jax.vmap(lambda q: mass_matrix(model, q)))(jnp.asarray(q))

@@ -1,0 +1,443 @@
+"""Constrained dynamics against Pinocchio, a KKT solve, Gauss's principle, the lemmas of the projections, printed numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import pytest
+from pinocchio_bridge import assert_close, quick, random_tree, to_pinocchio
+
+from jaxdyn import scenes
+from jaxdyn.assembly import assemble, residuals
+from jaxdyn.constrained import (
+    RESULTS,
+    constrained_dynamics,
+    constraint_forces,
+    constraint_wrenches,
+    projections,
+    pseudo_inverse,
+    second_fundamental_form,
+)
+from jaxdyn.constraints import Holonomic, Pfaffian, lock_joint, loop, rolling_wheel
+from jaxdyn.constraints.base import rows
+from jaxdyn.dynamics import bias_force, coriolis_matrix, gravity_force, mass_matrix
+from jaxdyn.kinematics import forward_kinematics
+from jaxdyn.model import difference, integrate
+from jaxdyn.scene import Scene
+from jaxdyn.systems import LagrangianSystem
+
+KINDS = ("free", "revolute", "spherical", "prismatic", "revolute", "helical", "revolute")
+
+
+@pytest.fixture(scope="module")
+def tree():
+    """A floating tree with two loops, a weld and a ball joint, and a state on them."""
+    model = random_tree(5, KINDS, parents=(-1, 0, 1, 2, 0, 4, 5))
+    scene = Scene(model, (loop("b3", POSE, "b6", None, "spherical", name="ball"), loop("b0", None, "b2", POSE, "weld")))
+    rng = np.random.default_rng(2)
+    q = rng.normal(size=model.nq) * 0.3
+    q[3] += 1.0
+    q[3:7] /= np.linalg.norm(q[3:7])
+    place = model.topology.q_slices[2]
+    q[place.start] += 1.0
+    q[place] /= np.linalg.norm(q[place])
+    # The loops are closed where the guess is: the frames are put there.
+    poses = np.asarray(forward_kinematics(model, jnp.asarray(q)))
+    ball = np.linalg.inv(poses[6]) @ poses[3] @ np.asarray(scene.constraints[0].pose_a)
+    weld = np.linalg.inv(poses[2]) @ poses[0]
+    scene = Scene(
+        model,
+        (
+            loop("b3", POSE, "b6", jnp.asarray(ball), "spherical", name="ball"),
+            loop("b0", None, "b2", jnp.asarray(weld), "weld", name="weld"),
+        ),
+    )
+    return scene, jnp.asarray(q), jnp.asarray(rng.normal(size=model.nv)), jnp.asarray(rng.normal(size=model.nv))
+
+
+POSE = ((0.1, -0.2, 0.3), (0.5, 0.2, -0.4))
+
+
+@pytest.fixture(scope="module")
+def solved(tree):
+    """Everything that is compared, from one program."""
+    scene, q, guess, tau = tree
+
+    @quick
+    def compute(scene, q, guess, tau):
+        found = assemble(scene, q, guess)
+        q, v = found.q, found.v
+        row = rows(scene, q, v, 0.0)
+        ranked = constrained_dynamics(scene, q, v, tau)
+        return {
+            "q": q,
+            "v": v,
+            "residual": found.residual,
+            "A": row.A,
+            "gamma": row.gamma,
+            "M": mass_matrix(scene.system, q),
+            "h": bias_force(scene.system, q, v),
+            "C": coriolis_matrix(scene.system, q, v),
+            "N": gravity_force(scene.system, q),
+            "a": ranked.acceleration,
+            "lam": ranked.multipliers,
+            "rank": ranked.rank,
+            "result": ranked.result == RESULTS.successful,
+            "schur": constrained_dynamics(scene, q, v, tau, method="schur").acceleration,
+            "schur lam": constrained_dynamics(scene, q, v, tau, method="schur").multipliers,
+            "P_T": projections(scene, q).P_T,
+            "S": second_fundamental_form(scene, q, v),
+            "wrenches": constraint_wrenches(scene, q, ranked.multipliers),
+            "forces": constraint_forces(scene, q, ranked.multipliers),
+        }
+
+    return jax.tree.map(np.asarray, compute(scene, q, guess, tau)) | {"tau": np.asarray(tau)}
+
+
+def test_both_methods_solve_the_saddle_point_system(solved):
+    """M a + h = tau + A^T lam, A a = gamma, against a dense solve of both at once."""
+    x = solved
+    n, m = x["A"].shape[1], x["A"].shape[0]
+    matrix = np.block([[x["M"], -x["A"].T], [x["A"], np.zeros((m, m))]])
+    want = np.linalg.solve(matrix, np.concatenate([x["tau"] - x["h"], x["gamma"]]))
+    assert x["residual"].max() < 1e-12
+    assert x["rank"] == m == 9 and x["result"]
+    assert_close(x["a"], want[:n], 1e-10)
+    assert_close(x["lam"], want[n:], 1e-10)
+    assert_close(x["schur"], want[:n], 1e-9)  # the condition number of A M^-1 A^T is that of Y squared
+    assert_close(x["schur lam"], want[n:], 1e-9)
+
+
+def test_acceleration_is_that_of_pinocchio(solved, tree):
+    """Pinocchio's constraintDynamics with a 3d and a 6d contact; its contact forces are minus the joint's, on joint 1."""
+    model, q = tree[0].system, solved["q"]
+    source, bridge = to_pinocchio(model)
+    ids = {name: source.getJointId(f"j{name[1:]}") for name in model.body_names}
+    contacts = []
+    for kind, constraint in zip(
+        (pin.ContactType.CONTACT_3D, pin.ContactType.CONTACT_6D), tree[0].constraints, strict=True
+    ):
+        ends = []
+        for body, pose in ((constraint.body_a, constraint.pose_a), (constraint.body_b, constraint.pose_b)):
+            placement = source.frames[source.getFrameId(body)].placement * pin.SE3(np.asarray(pose))
+            ends += [ids[body], placement]
+        contacts.append(pin.RigidConstraintModel(kind, source, *ends, pin.ReferenceFrame.LOCAL))
+    source.armature[:] = np.asarray(model.armature)
+    data, datas = source.createData(), [contact.createData() for contact in contacts]
+    pin.initConstraintDynamics(source, data, contacts)
+    settings = pin.ProximalSettings(1e-14, 0.0, 20)
+    a = pin.constraintDynamics(
+        source, data, bridge.q_to_pinocchio(q), solved["v"], solved["tau"], contacts, datas, settings
+    )
+    assert_close(solved["a"], a, 1e-9)  # Pinocchio stops at 1e-14 of its own proximal residual
+    weld = solved["wrenches"]["weld"]
+    assert_close(weld, datas[1].contact_force.vector * np.sign(weld @ datas[1].contact_force.vector), 1e-8)
+
+
+def test_gauss_principle(solved):
+    """The acceleration is the admissible one nearest to the free one in the metric M (least constraint)."""
+    x = solved
+    free = np.linalg.solve(x["M"], x["tau"] - x["h"])
+    # All admissible accelerations: a particular one plus the null space; minimise by plain least squares.
+    start = np.linalg.lstsq(x["A"], x["gamma"], rcond=None)[0]
+    null = np.linalg.svd(x["A"])[2][x["rank"] :].T
+    root = np.linalg.cholesky(x["M"]).T
+    step = np.linalg.lstsq(root @ null, root @ (free - start), rcond=None)[0]
+    assert_close(x["a"], start + null @ step, 1e-10)
+
+
+def test_lemmas_of_the_projections(solved):
+    """EQUATIONS section 7."""
+    x = solved
+    P, M, A = x["P_T"], x["M"], x["A"]
+    n, rank = len(P), int(x["rank"])
+    assert_close(P @ P, P, 1e-11)
+    assert_close(P.T @ M, M @ P, 1e-11)  # self-adjoint in M: P_omega M = M P_T
+    np.testing.assert_allclose(A @ P, 0, atol=1e-11)
+    np.testing.assert_allclose(P.T @ A.T, 0, atol=1e-11)
+    assert abs(np.trace(P) - (n - rank)) < 1e-10
+    assert np.linalg.matrix_rank(P, tol=1e-8) == n - rank
+    np.testing.assert_allclose(P @ x["v"], x["v"], atol=1e-11)  # an admissible velocity
+    # Motion by the projected equation, and the force that keeps it there: M S = (1 - P_omega)(tau - N) + A^T lam.
+    assert_close(P.T @ (M @ x["a"] + x["h"]), P.T @ x["tau"], 1e-10)
+    normal = (np.eye(n) - P.T) @ (x["tau"] - x["N"]) + A.T @ x["lam"]
+    assert_close(M @ x["S"], normal, 1e-10)
+    np.testing.assert_allclose(P @ x["S"], 0, atol=1e-9 * np.abs(x["S"]).max())
+    covariant = x["a"] + np.linalg.solve(M, x["C"] @ x["v"])
+    assert_close(x["S"], (np.eye(n) - P) @ covariant, 1e-10)
+
+
+def test_forces_by_name_are_those_of_the_wrenches(solved, tree):
+    """A_i^T lam_i is what the wrench does on the two bodies: equal power on random velocities."""
+    scene, x = tree[0], solved
+    total = sum(x["forces"].values())
+    assert set(x["forces"]) == {"ball", "weld"}
+    assert_close(total, x["A"].T @ x["lam"], 1e-12)
+    power = quick(lambda v: relative_twists(scene, jnp.asarray(x["q"]), v))
+    v = jnp.asarray(np.random.default_rng(0).normal(size=scene.nv))
+    for name, twist in power(v).items():
+        np.testing.assert_allclose(x["forces"][name] @ v, x["wrenches"][name] @ twist, rtol=1e-9)
+    np.testing.assert_allclose(total @ x["v"], 0, atol=1e-9 * np.abs(total).max())  # no work on the motion
+
+
+def relative_twists(scene, q, v):
+    """Twist of frame B against frame A, in A, by differences of Jacobians along v."""
+    found = {}
+    for constraint in scene.constraints:
+
+        def relative(s, constraint=constraint):
+            poses = forward_kinematics(scene.system, integrate(scene.system, q, s * v))
+            a, b = (scene.system.body_names.index(n) for n in (constraint.body_a, constraint.body_b))
+            return jnp.linalg.inv(poses[a] @ constraint.pose_a) @ poses[b] @ constraint.pose_b
+
+        pose, rate = jax.jvp(relative, (jnp.zeros(()),), (jnp.ones(()),))
+        spatial = rate @ jnp.linalg.inv(pose)
+        found[constraint.name] = jnp.concatenate(
+            [spatial[:3, 3], jnp.stack([spatial[2, 1], spatial[0, 2], spatial[1, 0]])]
+        )
+    return found
+
+
+def test_dependent_rows_give_the_same_motion_and_the_least_multipliers():
+    """The four-bar with five rows of a revolute joint in space for two in the plane, and a loop listed twice."""
+    q, v = scenes.four_bar.start()
+    flat = scenes.four_bar()
+    space = scenes.four_bar(in_plane=False)
+    twice = Scene(flat.system, flat.constraints * 2)
+    solve = quick(lambda scene: constrained_dynamics(scene, q, v))
+    one, five, four = solve(flat), solve(space), solve(twice)
+    assert [int(x.rank) for x in (one, five, four)] == [2, 2, 2]
+    assert all(bool(x.result == RESULTS.successful) for x in (one, five, four))
+    assert_close(five.acceleration, one.acceleration, 1e-11)
+    assert_close(four.acceleration, one.acceleration, 1e-11)
+    assert_close(five.multipliers, [*one.multipliers, 0, 0, 0], 1e-11)
+    assert_close(four.multipliers, np.tile(one.multipliers / 2, 2), 1e-11)
+    assert set(four.by_name()) == {"knee", "knee (1)"}
+    broken = quick(lambda scene: constrained_dynamics(scene, q, v, method="schur").result)(twice)
+    assert bool(broken == RESULTS.dependent_rows)
+
+
+def test_rows_without_a_solution_are_reported():
+    """Both accelerations a = 0 and a = 1 are asked for."""
+    q, v = jnp.zeros(2), jnp.ones(2)
+    system = LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 2)
+    rest, move = Pfaffian(lambda q, t: jnp.eye(2)[:1]), Pfaffian(lambda q, t: jnp.eye(2)[:1], lambda q, t: t[None])
+    found = constrained_dynamics(Scene(system, (rest, move)), q, v)
+    assert bool(found.result == RESULTS.contradictory_rows) and int(found.rank) == 1
+
+
+def test_derivatives_by_differences_also_where_rows_depend():
+    """First and second derivatives in states, lengths and masses; with dependent rows as without."""
+    q, v = scenes.four_bar.start()
+
+    def value(x, in_plane):
+        # The guess is on the constraints for the lengths of the start; off them the formula is still smooth in x.
+        scene = scenes.four_bar(in_plane=in_plane)
+        scale = jnp.ones((3, 1)) + x[6] * jnp.asarray([[0.0], [0.0], [1.0]])
+        model = scene.system.replace(inertias=scene.system.inertias * scale)
+        found = constrained_dynamics(Scene(model, scene.constraints), q + x[:3], v + x[3:6])
+        return jnp.sum(found.acceleration * jnp.asarray([1.0, -0.3, 0.7]))
+
+    x = jnp.zeros(7)
+    direction = jnp.asarray(np.random.default_rng(0).normal(size=7))
+    differentiate = quick(
+        lambda x, in_plane: (
+            jax.grad(value)(x, in_plane),
+            jax.jvp(lambda x: jax.grad(value)(x, in_plane), (x,), (direction,))[1],
+        )
+    )
+    first = {}
+    for in_plane in (True, False):
+        f = quick(lambda x, p=in_plane: value(x, p))
+        g = quick(
+            lambda x, p=in_plane: (
+                jax.grad(value)(x, p),
+                jax.jvp(jax.grad(lambda y: value(y, p)), (x,), (direction,))[1],
+            )
+        )
+        first[in_plane] = g(x)
+        h = 1e-3
+        slope = (8 * (f(h * direction) - f(-h * direction)) - (f(2 * h * direction) - f(-2 * h * direction))) / (12 * h)
+        np.testing.assert_allclose(first[in_plane][0] @ direction, slope, rtol=1e-7)  # h^4 of the differences
+    # Both have the same rank on every side, so derivatives agree in all directions that keep the loop closed.
+    assert_close(first[True][0], first[False][0], 1e-9)
+    assert_close(first[True][1], first[False][1], 1e-8)
+    del differentiate
+
+
+@pytest.mark.parametrize("shape", [(7, 4), (4, 7), (6, 6)])
+def test_pseudo_inverse_of_any_rank(shape):
+    """The four Penrose conditions, numpy, and the derivative along a curve of constant rank."""
+    rng = np.random.default_rng(0)
+    for rank in (0, 1, 3, min(shape)):
+        left, right = rng.normal(size=(shape[0], rank)), rng.normal(size=(rank, shape[1]))
+        turn_l, turn_r = rng.normal(size=(shape[0], shape[0])), rng.normal(size=(shape[1], shape[1]))
+
+        def curve(s, left=left, right=right, turn_l=turn_l, turn_r=turn_r):
+            return (jnp.eye(shape[0]) + s * turn_l) @ (left @ right) @ (jnp.eye(shape[1]) + s * turn_r)
+
+        inverse = quick(lambda s, curve=curve: pseudo_inverse(curve(s), 1e-9))
+        slope = quick(lambda s, curve=curve: jax.jvp(lambda s: pseudo_inverse(curve(s), 1e-9), (s,), (1.0,))[1])
+        Y, P = np.asarray(curve(0.0)), inverse(0.0)
+        np.testing.assert_allclose(P, np.linalg.pinv(Y, rcond=1e-9), atol=1e-12 * max(1, np.abs(P).max()))
+        h = 1e-3
+        want = (8 * (inverse(h) - inverse(-h)) - (inverse(2 * h) - inverse(-2 * h))) / (12 * h)
+        np.testing.assert_allclose(slope(0.0), want, atol=1e-7 * max(1, np.abs(want).max()))  # h^4 of the differences
+
+
+def test_printed_numbers():
+    """Planar pendulum of EQUATIONS section 6, Andrews' mechanism at its start, the coin's contact force."""
+    angle, rate, mass, length = 0.5, 1.7, 0.7, 1.2
+    q, v = scenes.pendulum_in_plane.start(length=length, angle=angle, rate=rate)
+    found = constrained_dynamics(scenes.pendulum_in_plane(mass=mass, length=length), q, v)
+    np.testing.assert_allclose(found.multipliers, -7.04496621, rtol=1e-9)
+    np.testing.assert_allclose(-length * found.multipliers, 8.45395945, rtol=1e-9)
+
+    q, v = scenes.andrews.start()
+    found = quick(lambda scene: constrained_dynamics(scene, q, v))(scenes.andrews())
+    want = [14222.4439199541138705911625887, -10666.8329399655854029433719415, 0, 0, 0, 0, 0]
+    np.testing.assert_allclose(found.acceleration, want, rtol=1e-11, atol=1e-8)
+    # Printed multipliers stand on the left.
+    want = [-98.5668703962410896057654982170, 6.12268834425566265503114393122, 0, 0, 0, 0]
+    np.testing.assert_allclose(found.multipliers, want, rtol=1e-11, atol=1e-11)
+
+    q, v = scenes.rolling_coin.start()
+    found = quick(lambda scene: constrained_dynamics(scene, q, v))(scenes.rolling_coin())
+    normal, forward, across = found.multipliers
+    np.testing.assert_allclose([normal, abs(across)], [2.990088, 0.174144017028], rtol=1e-10)
+    assert abs(forward) < 1e-12
+    centripetal = found.acceleration[:3] + jnp.cross(v[3:], v[:3])
+    np.testing.assert_allclose(jnp.linalg.norm(centripetal), 0.174144017028 / 0.3048, rtol=1e-10)
+
+
+def test_spherical_pendulum_by_projection():
+    """S = -|v|^2/r^2 q and P_T = 1 - q q^T/r^2, and the motion against the equations in angles."""
+    r, theta, rates = 1.3, 0.9, (0.4, 1.1)
+    q, v = scenes.spherical_pendulum.start(length=r, theta=theta, phi=0.3, theta_rate=rates[0], phi_rate=rates[1])
+    scene = scenes.spherical_pendulum(length=r)
+    assert_close(projections(scene, q).P_T, np.eye(3) - np.outer(q, q) / r**2, 1e-14)
+    assert_close(second_fundamental_form(scene, q, v), -(v @ v) / r**2 * q, 1e-14)
+    found = constrained_dynamics(scene, q, v)
+    assert_close(found.multipliers, [(9.81 * q[2] - v @ v) / r**2], 1e-14)
+
+    def place(angles):
+        return r * jnp.stack(
+            [jnp.sin(angles[0]) * jnp.cos(angles[1]), jnp.sin(angles[0]) * jnp.sin(angles[1]), -jnp.cos(angles[0])]
+        )
+
+    # theta and phi from EQUATIONS section 1, carried to space.
+    accelerations = np.array(
+        [
+            np.sin(theta) * np.cos(theta) * rates[1] ** 2 - 9.81 / r * np.sin(theta),
+            -2 * rates[0] * rates[1] / np.tan(theta),
+        ]
+    )
+    angles, speeds = jnp.asarray([theta, 0.3]), jnp.asarray(rates)
+
+    def velocity(angles, speeds):
+        return jax.jvp(place, (angles,), (speeds,))[1]
+
+    _, want = jax.jvp(velocity, (angles, speeds), (speeds, jnp.asarray(accelerations)))
+    assert_close(found.acceleration, want, 1e-13)
+
+
+def test_rolling_disk_with_torques():
+    """I1 thetadd = tau_theta, (I2 + m rho^2) phidd = tau_phi, multipliers m d/dt (rho phidot (cos, sin))."""
+    scene = scenes.rolling_disk(mass=2.0, radius=0.5, steer_inertia=0.125, roll_inertia=0.25)
+    q, v = scenes.rolling_disk.start(heading=0.7, steering=1.3, rolling=2.0)
+    found = constrained_dynamics(scene, q, v, jnp.asarray([0.0, 0.0, 0.3, 0.9]))
+    turn, roll = 0.3 / 0.125, 0.9 / (0.25 + 2.0 * 0.25)
+    c, s = np.cos(0.7), np.sin(0.7)
+    forward = 0.5 * np.array([roll * c - 1.3 * 2.0 * s, roll * s + 1.3 * 2.0 * c])
+    assert_close(found.acceleration, [*forward, turn, roll], 1e-13)
+    assert_close(found.multipliers, 2.0 * forward, 1e-13)
+
+
+def test_assemble_finds_the_nearest_configuration():
+    """From a rough guess: closed to rounding, the least change in the metric M(guess), admissible velocity."""
+    scene = scenes.four_bar()
+    guess, rate = jnp.asarray([0.9, -0.4, 1.6]), jnp.asarray([1.0, 0.0, 0.0])
+    found = assemble(scene, guess, rate)
+    assert float(found.residual.max()) < 1e-13
+    # A stationary point: M (q - guess) is a combination of the rows.
+    pull = mass_matrix(scene.system, guess) @ difference(scene.system, guess, found.q)
+    row = rows(scene, found.q, found.v, 0.0).A
+    left = pull - row.T @ np.linalg.lstsq(np.asarray(row.T), np.asarray(pull), rcond=None)[0]
+    np.testing.assert_allclose(left, 0, atol=1e-6)  # Newton's last steps, to close the loop, are not taken along it
+    change = mass_matrix(scene.system, found.q) @ (found.v - rate)
+    left = change - row.T @ np.linalg.lstsq(np.asarray(row.T), np.asarray(change), rcond=None)[0]
+    np.testing.assert_allclose(left, 0, atol=1e-12)
+
+
+def test_assemble_fails_clearly():
+    scene = scenes.four_bar(lengths=(1.0, 1.0, 1.0, 2.5))
+    far = scene.system.replace(home=scene.system.home.at[2, 0, 3].set(4.0))
+    broken = Scene(far, scene.constraints)
+    with pytest.raises(ValueError, match="not assembled: loop 'knee' open by 1"):
+        assemble(broken, jnp.asarray([0.1, 0.2, 3.0]))
+    codes = jax.vmap(
+        lambda x: (
+            assemble(
+                Scene(scene.system.replace(home=far.home.at[2, 0, 3].set(x)), scene.constraints),
+                jnp.asarray([0.3, -0.4, 2.0]),
+            ).result
+            == RESULTS.not_assembled
+        )
+    )(jnp.asarray([2.5, 4.0]))
+    assert codes.tolist() == [False, True]
+    system = LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 2)
+    both = [Holonomic(lambda q, t, x=x: q[0] - x, name=f"x = {x}") for x in (0.0, 1.0)]
+    with pytest.raises(ValueError, match=r"not assembled: holonomic 'x = 1.0' open by 0.5, holonomic 'x = 0.0' open"):
+        assemble(Scene(system, both), jnp.asarray([0.2, 0.1]))
+
+
+def test_a_batch_of_mechanisms_of_different_lengths():
+    """One vmap over lengths equals a loop, and every lane assembles."""
+    lengths = jnp.linspace(2.0, 3.0, 50)
+    base = scenes.four_bar()
+
+    def solve(coupler):
+        closing = base.constraints[0]
+        moved = type(closing)(**{**vars(closing), "pose_a": closing.pose_a.at[0, 3].set(coupler)})
+        scene = Scene(base.system, (moved,))
+        state = assemble(scene, jnp.asarray([1.0, -0.3, 1.7]), jnp.asarray([1.0, 0.0, 0.0]))
+        return state.residual, constrained_dynamics(scene, state.q, state.v).acceleration
+
+    residual, a = quick(jax.vmap(solve))(lengths)
+    assert float(residual.max()) < 1e-12
+    one = quick(solve)
+    for i in (0, 17, 49):
+        assert_close(a[i], one(lengths[i])[1], 1e-10)
+
+
+def test_a_wheel_built_from_bodies_moves_as_the_disk_in_coordinates():
+    """Planar joint and axle with `rolling_wheel` against the Lagrangian of Murray, Li & Sastry."""
+    from jaxdyn.building import ModelBuilder
+
+    mass, rho, steer, roll = 2.0, 0.5, 0.125, 0.25
+    builder = ModelBuilder("disk", gravity=None)
+    builder.add_body("fork", None, "planar", (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), pose=(0.0, 0.0, rho))
+    builder.add_body("wheel", "fork", "continuous", (mass, (0, 0, 0), (steer, roll, steer)), axis=(0.0, 1.0, 0.0))
+    wheel = rolling_wheel("wheel", ((0, 0, 0), (-np.pi / 2, 0, 0)), rho, contact=False)
+    scene = Scene(builder.build(), (wheel,))
+    q, v = jnp.asarray([0.1, 0.2, 0.7, 0.3]), jnp.asarray([rho * 2.0, 0.0, 1.3, 2.0])
+    solve = quick(lambda scene, q, v, tau: (residuals(scene, q, v), constrained_dynamics(scene, q, v, tau)))
+    error, found = solve(scene, q, v, jnp.asarray([0.0, 0.0, 0.3, 0.9]))
+    assert float(error.max()) < 1e-14
+    turn, rolling = 0.3 / steer, 0.9 / (roll + mass * rho**2)
+    assert_close(found.acceleration, [rho * rolling, 0.0, turn, rolling], 1e-12)
+    assert_close(found.multipliers[1:], [mass * rho * 2.0 * 1.3], 1e-12)
+
+
+def test_locked_joints_and_float32():
+    """Locking all but one joint leaves a pendulum; in float32 the numbers keep their type."""
+    q, _ = scenes.four_bar.start()
+    model = scenes.four_bar().system
+    locked = Scene(model, (lock_joint("2", float(q[1])), lock_joint("3", float(q[2]))))
+    found = constrained_dynamics(locked, q, jnp.asarray([1.0, 0.0, 0.0]))
+    M, h = mass_matrix(model, q), bias_force(model, q, jnp.asarray([1.0, 0.0, 0.0]))
+    assert_close(found.acceleration, [-h[0] / M[0, 0], 0.0, 0.0], 1e-13)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, locked)
+    low = constrained_dynamics(single, q.astype(jnp.float32), jnp.asarray([1.0, 0.0, 0.0], jnp.float32))
+    assert low.acceleration.dtype == low.multipliers.dtype == jnp.float32
+    assert_close(low.acceleration, found.acceleration, 1e-5)
