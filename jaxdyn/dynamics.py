@@ -294,7 +294,8 @@ def _check_coordinates(model: Model, name: str) -> None:
 def _first_moments(model: Model, frame: TreeFrame):
     """Masses (nb,), first moments (nb, 3) in the tree frames, world position (3,) of the first tree's origin, and shifts.
 
-    A shift (3,) is the place of a body's tree frame relative to the first one: zero, not a difference of far positions, for one tree.
+    A shift (3,) is the place of a body's tree frame relative to the first one: zero, not a difference of far
+    positions, for one tree.
     """
     mass = model.inertias[:, 0]
     rotated = _product(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
