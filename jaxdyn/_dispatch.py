@@ -29,7 +29,7 @@ from jaxdyn import matrix_form, recursive
 from jaxdyn._materialize import at_least
 from jaxdyn.model import Model
 
-LEAST_BATCH = 32
+LEAST_BATCH = 256
 MOST_BODIES = 64
 
 _large_batch_p = Primitive("large_batch")

@@ -48,7 +48,7 @@ class Constraint(eqx.Module):
 
     @classmethod
     def grouped_position(cls, members: Sequence["Constraint"], system, q, t):
-        """Residuals (n, nh) of constraints of one group."""
+        """Residuals (nh,) of each of the constraints of one group."""
         raise NotImplementedError
 
 
@@ -203,6 +203,7 @@ def velocity_residual(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv
 
 def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Rows:
     """A, gamma and A v - b of all constraints of the scene (see `Rows`)."""
+    layout(scene)  # refuses what is no constraint, and constraints that do not fit the system
     t = jnp.asarray(t, q.dtype)
     motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
     velocity, rate = jax.jvp(lambda q, t: velocity_residual(scene, q, v, t), (q, t), motion)

@@ -22,7 +22,7 @@ from jaxdyn import _float64 as f64
 from jaxdyn import se3, so3
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.joints import KINDS, SCREW_KINDS, joint_difference
-from jaxdyn.kinematics import tree_frame
+from jaxdyn.kinematics import take, tree_frame
 from jaxdyn.model import Model, body_index, frame_index
 from jaxdyn.so3 import _product
 
@@ -93,8 +93,8 @@ class Loop(Constraint):
         return self._kind.count, 0
 
     def group(self):
-        """Loops closed by the same joint are evaluated together."""
-        return self.joint, self.in_plane
+        """All loops are evaluated together, on one pass of the kinematics."""
+        return "loops"
 
     def position(self, system, q, t):
         """Residual of the loop, (n,)."""
@@ -102,9 +102,18 @@ class Loop(Constraint):
 
     @classmethod
     def grouped_position(cls, members: Sequence["Loop"], system, q, t):
-        """Residuals (n, rows) of loops closed by the same joint."""
+        """Residuals (n,) of each loop; those closed by the same joint are one batch."""
         rotation, position = relative_poses(members, system, q)
-        return jax.vmap(members[0]._kind.residual)(rotation, position)
+        found: list = [None] * len(members)
+        alike: dict[tuple[str, bool], list[int]] = {}
+        for i, member in enumerate(members):
+            alike.setdefault((member.joint, member.in_plane), []).append(i)
+        for places in alike.values():
+            residual = members[places[0]]._kind.residual
+            values = jax.vmap(residual)(take(rotation, np.array(places)), take(position, np.array(places)))
+            for k, i in enumerate(places):
+                found[i] = values[k]
+        return found
 
     def wrench(self, rotation, position, lam):
         """Wrench (f, tau) (6,) of the joint on body B for the multipliers lam, at the origin and in axes of frame A.

@@ -97,13 +97,9 @@ class Chart(eqx.Module):
         return jnp.sum(upper**2) - 2 * jnp.sum(jnp.log(diagonal)) - 4.0 * len(self.bodies)
 
     def settled(self, point: Coordinates) -> Coordinates:
-        """The point with terms that came to a billionth of their unit at zero, which s^2 approaches without end."""
-        tiny = positive_terms(self.terms) & (point.s**2 < 1e-9)
+        """The point with terms below a millionth of their unit at zero, which fits approach without end."""
+        tiny = positive_terms(self.terms) & (point.s**2 < 1e-6)
         return Coordinates(point.theta, jnp.where(tiny, jnp.zeros_like(point.s), point.s))
-
-    def moved(self, theta: Float[Array, "bodies n"]) -> "Chart":
-        """The same chart around the bodies at theta: its zero is where theta was."""
-        return eqx.tree_at(lambda chart: chart.origin, self, self.relative_factors(theta))
 
 
 def make_chart(model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_scale) -> tuple[Chart, Coordinates]:

@@ -15,13 +15,13 @@ from jaxdyn.identify.chart import Chart, Coordinates, make_chart, positive_terms
 from jaxdyn.identify.friction import TERMS, check_terms
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.identify.minimise import METHODS, minimise
-from jaxdyn.identify.regression import condense, noise_level
+from jaxdyn.identify.regression import condense, free_columns, noise_level
 from jaxdyn.identify.result import Fit
 from jaxdyn.model import Model
 
 # A fit is never trusted beyond this share of the torque: rounding and noise-free logs stay well posed.
 _FINEST = 1e-6
-_STEPS = {"newton": 100, "lbfgs": 3000, "adam": 10000}
+_STEPS = {"newton": 200, "lbfgs": 3000, "adam": 10000}
 
 
 class Problem(eqx.Module):
@@ -138,75 +138,112 @@ def _problem(model, log, terms, v_s, inertia, weights, prior, sigma):
 
 
 def _newton(model: Model, problem: Problem, point: Coordinates, steps: int, tolerance: float, callback):
-    """Newton's method, each step in the chart around the bodies where it starts: chart, point, history, result."""
+    """Newton's method with barriers (interior point): chart, point, history of the loss itself, result.
+
+    The divergence keeps bodies from the edge of what is feasible, -barrier * log keeps the terms above zero. A log of little
+    noise far from the nominal model would still press both against their edges and leave only small steps, so the barriers
+    start as strong as the data and are released in stages, the divergence down to the prior, the terms' down to where
+    it is worth less than the tolerance.
+    """
     history, result = [], "max_steps"
+    prior = float(problem.prior)
+    count = int(positive_terms(problem.chart.terms).sum()) * point.s.shape[1]
+    least = 0.1 * tolerance / max(count, 1)
+    barrier = max(prior, 0.01 * float(torque_loss(point, problem)))
     for step in range(steps + 1):
-        value, decrement, next_chart, next_point = _newton_step(problem, point)
+        weights = jnp.asarray(max(prior, barrier), problem.R.dtype), jnp.asarray(barrier, problem.R.dtype)
+        value, decrement, origin, s = _newton_step(problem, point, *weights)
         history.append(float(value))
         if callback is not None:
-            callback(step, float(value), problem.chart.fitted(model, point)[0])
+            callback(step, history[-1], problem.chart.fitted(model, point)[0])
         if not np.isfinite(history[-1] + float(decrement)):
             result = "not_finite"
             break
         # Rounding of the loss limits how small a decrease can be seen.
         resolution = 10 * float(jnp.finfo(problem.R.dtype).eps) * abs(history[-1])
-        if float(decrement) / 2 <= max(tolerance, resolution):
+        if barrier <= least and float(decrement) / 2 <= max(tolerance, resolution):
             result = "converged"
             break
         if step < steps:
-            problem = eqx.tree_at(lambda p: p.chart, problem, next_chart)
-            point = next_point
+            problem = eqx.tree_at(lambda p: p.chart.origin, problem, origin)
+            point = Coordinates(point.theta, s)
+            if float(decrement) / 2 <= max(barrier, resolution):
+                barrier = max(least, barrier / 30)
     return problem.chart, point, np.array(history), result
 
 
 @eqx.filter_jit
-def _newton_step(problem: Problem, point: Coordinates):
-    """Loss, Newton decrement, and the chart and point after one step.
+def _newton_step(problem: Problem, point: Coordinates, weight, barrier):
+    """Loss, twice the decrease that the quadratic model promises of the loss with barriers, and the point after a step.
 
-    The Hessian is that of the loss in x, which is convex, carried to the chart: positive definite everywhere. A term at
-    zero whose gradient pushes it below stays there (its curvature in s is that gradient). The step is halved until the
-    loss falls.
+    That loss is convex in x, so the step goes straight in x and stops short of the edge: P = A (1 + h S) A^T, with A the
+    factor now. A curved step would leave the narrow valley that a precise log makes.
     """
-    chart = problem.chart
-    value = torque_loss(point, problem)
-    y, unflatten = ravel_pytree(point)
-    gradient, _ = ravel_pytree(jax.grad(torque_loss)(point, problem))
-    rows = problem.R @ jax.jacfwd(lambda y: chart.parameters(unflatten(y)))(y)
-    slope = problem.R.T @ (problem.R @ chart.parameters(point) - problem.d)
-    slope = slope[-chart.nominal_terms.size :].reshape(len(TERMS), -1)[
-        np.array([TERMS.index(t) for t in chart.terms], int)
-    ]
-    pressed = jnp.where(positive_terms(chart.terms), 2 * chart.scale * jnp.maximum(slope, 0), jnp.zeros_like(slope))
-    curvature = jnp.kron(
-        jnp.eye(len(chart.bodies), dtype=y.dtype), problem.prior * _metric(point.theta.shape[1], y.dtype)
-    )
-    hessian = rows.T @ rows + jax.scipy.linalg.block_diag(curvature, jnp.diag(pressed.reshape(-1)))
+    chart, dtype = problem.chart, problem.R.dtype
+    positive = jnp.broadcast_to(jnp.asarray(positive_terms(chart.terms)), point.s.shape).reshape(-1)
+    start = point.s.reshape(-1)
+    terms = jnp.where(positive, start**2, start)
+    inverse = jnp.where(positive, 1 / jnp.where(positive, terms, 1), 0)
+    bodies = point.theta.size
+    nb, nv = chart.nominal_inertias.shape[0], chart.nominal_terms.shape[1]
 
+    inertial = jax.jacfwd(lambda theta: chart.inertias(theta).reshape(-1))(point.theta).reshape(-1, bodies)
+    places = free_columns(nb, nv, chart.terms)[10 * nb :]
+    rows = [problem.R[:, : 10 * nb] @ inertial, problem.R[:, places] * chart.scale.reshape(1, -1)]
+    rows = jnp.concatenate(rows, axis=1)
+    slope = weight * jax.grad(chart.divergence)(point.theta).reshape(-1)
+    gradient = rows.T @ (problem.R @ chart.parameters(point) - problem.d) + jnp.append(slope, -barrier * inverse)
+    metric = jnp.kron(jnp.eye(len(chart.bodies), dtype=dtype), weight * _metric(point.theta.shape[1], dtype))
+    hessian = rows.T @ rows + jax.scipy.linalg.block_diag(metric, jnp.diag(barrier * inverse**2))
     diagonal = jnp.diagonal(hessian)
     unit = jnp.sqrt(jnp.where(diagonal > 0, diagonal, jnp.ones_like(diagonal)))
-    damping = 4 * jnp.finfo(y.dtype).eps * jnp.eye(y.size, dtype=y.dtype)
+    damping = 4 * jnp.finfo(dtype).eps * jnp.eye(unit.size, dtype=dtype)
     factor = jax.scipy.linalg.cho_factor(hessian / (unit[:, None] * unit[None, :]) + damping)
     direction = -jax.scipy.linalg.cho_solve(factor, gradient / unit) / unit
     decrement = -(gradient @ direction)
 
-    lengths = 0.5 ** jnp.arange(40, dtype=y.dtype)
-    losses = jax.vmap(lambda h: torque_loss(unflatten(y + h * direction), problem))(lengths)
-    accepted = losses <= value - 1e-4 * lengths * decrement
-    length = jnp.where(jnp.any(accepted), lengths[jnp.argmax(accepted)], jnp.zeros((), y.dtype))
-    following = unflatten(y + length * direction)
-    moved = Coordinates(jnp.zeros_like(following.theta), following.s)
-    return value, decrement, chart.moved(following.theta), moved
+    one = jnp.eye(4, dtype=dtype)
+    stretch = jax.vmap(_linear_factor)(direction[:bodies].reshape(point.theta.shape))
+    stretch = stretch + jnp.swapaxes(stretch, 1, 2)
+    fastest = jnp.minimum(
+        jnp.min(jnp.linalg.eigvalsh(stretch), initial=0), jnp.min(direction[bodies:] * inverse, initial=0)
+    )
+    lengths = 0.5 ** jnp.arange(40, dtype=dtype) * jnp.minimum(1, -0.95 / jnp.minimum(fastest, -0.95))
+
+    def moved(length):
+        roots = jax.vmap(_upper_root)(one[None] + length * stretch)
+        following = terms + length * direction[bodies:]
+        s = jnp.where(positive, jnp.sqrt(jnp.where(positive, following, 1)), following).reshape(point.s.shape)
+        return jnp.einsum("bij,bjk->bik", chart.origin, roots), s
+
+    def outcome(length):
+        origin, s = moved(length)
+        there = eqx.tree_at(lambda p: (p.chart.origin, p.prior), problem, (origin, weight))
+        logs = jnp.sum(jnp.log(jnp.where(positive, s.reshape(-1), 1)))
+        return torque_loss(Coordinates(point.theta, s), there) - 2 * barrier * logs
+
+    losses = jax.vmap(outcome)(lengths)
+    accepted = losses <= outcome(jnp.zeros((), dtype)) - 1e-4 * lengths * decrement
+    length = jnp.where(jnp.any(accepted), lengths[jnp.argmax(accepted)], 0)
+    return torque_loss(point, problem), decrement, *moved(length)
+
+
+def _linear_factor(step):
+    """Derivative of `log_cholesky_factor` at zero along a step (10,), or along its first number (1,)."""
+    step = jnp.append(step, jnp.zeros((10 - step.size,), step.dtype))
+    return jax.jvp(_inertia.log_cholesky_factor, (jnp.zeros_like(step),), (step,))[1]
+
+
+def _upper_root(matrix):
+    """Upper-triangular U with U U^T = matrix; NaN when it is not positive definite."""
+    return jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
 
 
 def _metric(size: int, dtype):
-    """Second derivative of -log det of a pseudo-inertia U U^T at theta = 0, the same for every body: |dU + dU^T|^2."""
-
-    def pseudo(theta):
-        upper = _inertia.log_cholesky_factor(jnp.concatenate([theta, jnp.zeros((10 - size,), dtype)]))
-        return (upper @ upper.T).reshape(-1)
-
-    jacobian = jax.jacfwd(pseudo)(jnp.zeros((size,), dtype))
-    return jacobian.T @ jacobian
+    """Second derivative of -log det(A (1 + S) A^T) at S = 0, |S|^2, along the coordinates of a body; for every A."""
+    stretch = jax.vmap(_linear_factor)(jnp.eye(size, dtype=dtype))
+    stretch = (stretch + jnp.swapaxes(stretch, 1, 2)).reshape(size, 16)
+    return stretch @ stretch.T
 
 
 def _whitening(problem: Problem, point: Coordinates):

@@ -53,9 +53,9 @@ def nominal_parameters(model: Model) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def free_columns(model: Model, terms) -> np.ndarray:
+def free_columns(nb: int, nv: int, terms) -> np.ndarray:
     """Positions in x of the inertial parameters and of the terms given."""
-    start, nv = 10 * model.nb, model.nv
+    start = 10 * nb
     blocks = [start + nv * TERMS.index(term) + np.arange(nv) for term in terms]
     return np.concatenate([np.arange(start), *blocks]).astype(int)
 
@@ -175,7 +175,7 @@ def base_parameters(model: Model, terms=(), *, v_s: float = 0.01, seed: int = 0)
     # Away from the neutral configuration by up to about half a turn; limits do not matter to what is identifiable.
     way, v, a = generator.normal(size=(3, count, model.nv))
     q = _moved(model, jnp.asarray(2 * way, model.home.dtype))
-    W = regressor(model, q, v, a, v_s=v_s)[:, :, free_columns(model, terms)].reshape(-1, p)
+    W = regressor(model, q, v, a, v_s=v_s)[:, :, free_columns(model.nb, model.nv, terms)].reshape(-1, p)
     scale = np.linalg.norm(W, axis=0)
     # A column of rounding errors is zero too.
     noise = np.finfo(np.dtype(model.home.dtype)).eps
@@ -291,7 +291,7 @@ def least_squares(
     if condensed.rows <= len(base):
         raise ValueError(f"the log has {len(log)} samples of {model.nv} torques, too few for {len(base)} combinations")
     x0 = nominal_parameters(model)
-    columns = free_columns(model, terms)
+    columns = free_columns(model.nb, model.nv, terms)
     # What is not fitted (friction terms left out) stays at the model's value, on the other side.
     residual = condensed.d - condensed.R @ x0
     fit = _truncated(condensed.R[:, columns[base.independent]], residual, rcond)
