@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-import numpy as np
 from jax import lax
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, Int
@@ -132,7 +131,7 @@ def _solve(scene, q, v, force, t, row: Rows, places, method, rank_tol) -> Constr
         rank = jnp.asarray(Y.shape[1], jnp.int32)
         pivots = jnp.diagonal(delassus)
         # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
-        fine = jnp.min(pivots) > np.sqrt(10 * Y.shape[0] * _eps(Y)) * jnp.max(pivots)
+        fine = jnp.min(pivots) > (10 * Y.shape[0] * _eps(Y)) ** 0.5 * jnp.max(pivots)
         result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)
     else:
         inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
@@ -142,7 +141,7 @@ def _solve(scene, q, v, force, t, row: Rows, places, method, rank_tol) -> Constr
         # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
         missed = jnp.abs(wanted - _product(Y.T, pushed))
         sizes = jnp.abs(row.gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
-        met = jnp.all(missed <= np.sqrt(_eps(Y)) * (sizes + jnp.max(sizes)))
+        met = jnp.all(missed <= _eps(Y) ** 0.5 * (sizes + jnp.max(sizes)))
         result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)
     a = solve_triangular(factor, free + pushed, lower=True, trans=1)
     result = RESULTS.where(jnp.isfinite(factor).all(), result, RESULTS.singular_mass_matrix)

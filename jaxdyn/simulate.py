@@ -199,10 +199,20 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
     q0, v0, ts, *steps = numbers
     system, outputs = scene.system, options["outputs"]
     acceleration = _dynamics(scene, options["method"])
+    # diffrax compiles its arguments, which hides their values. What is known stays in closures, the rest is `args`:
+    # flat, because its continuous adjoint takes no empty tuples.
+    leaves, structure = jax.tree.flatten((scene, control))
+    unknown = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Tracer)]
+    args = tuple(leaves[i] for i in unknown) or None
+
+    def given(args):
+        """The scene and the control."""
+        filled = dict(enumerate(leaves)) | dict(zip(unknown, args or (), strict=True))
+        return jax.tree.unflatten(structure, filled.values())
 
     def effort(args, q, v, t):
         """Tau plus the scene's forces, or None when there are none."""
-        scene, control = args
+        scene, control = given(args)
         force = scene.applied_force(q, v, t)
         if control is None:
             return force
@@ -212,20 +222,26 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
     def power(force, v):
         return jnp.zeros((), v.dtype) if force is None else jnp.sum(v * force)
 
+    @jax.jit  # traced once for all the places where diffrax and differentiation call it
     def derivative(t, y, args):
-        # The scene comes through args: the continuous adjoint differentiates what it finds there, not closures.
-        system = args[0].system
-        q, v = retract(system, y[0]), y[1]
+        scene, _ = given(args)
+        q, v = retract(scene.system, y[0]), y[1]
         force = effort(args, q, v, t)
-        rates = velocity_to_rate(system, q, v), acceleration(args[0], q, v, t, force)
+        rates = velocity_to_rate(scene.system, q, v), acceleration(scene, q, v, t, force)
         return (*rates, power(force, v)) if len(y) == 3 else rates
+
+    def project(t, y, args):
+        scene, _ = given(args)
+        if _projects(scene, options["method"]):
+            # A step that will be rejected may be too long to be projected, so failing here does not end the run.
+            return (*onto_constraints(scene, y[0], y[1], t), *y[2:]), diffrax.RESULTS.successful
+        return (retract(scene.system, y[0]), *y[1:]), diffrax.RESULTS.successful
 
     q0 = retract(system, q0)
     good = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
     # A bad lane of a batch takes a harmless start, so that it does not make the others wait.
     harmless = neutral(system).astype(q0.dtype) if isinstance(system, Model) else jnp.zeros_like(q0)
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
-    args = scene, control
     held = jnp.asarray(True)
     if scene.constraints:
         held = consistent(scene, q0, v0, ts[0])
@@ -233,7 +249,8 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
             q0, v0 = onto_constraints(scene, q0, v0, ts[0])
     eqx.filter_eval_shape(effort, args, q0, v0, ts[0])  # refuses callbacks of a wrong shape before diffrax meets them
     y0 = (q0, v0, jnp.zeros((), q0.dtype)) if "work" in outputs else (q0, v0)
-    solved, time_reached = _integrate(derivative, y0, ts, args, steps, options)
+    leaves_manifold = _projects(scene, options["method"]) or has_quaternions(system)
+    solved, time_reached = _integrate(derivative, project if leaves_manifold else None, y0, ts, args, steps, options)
 
     q, v, *work = (jnp.concatenate([start[None], later]) for start, later in zip(y0, solved.ys, strict=True))
     reached = good & jnp.isfinite(q).all(1) & jnp.isfinite(v).all(1)
@@ -278,14 +295,12 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
 _run_compiled = eqx.filter_jit(_run)
 
 
-def _integrate(derivative, y0, ts, args, steps, options):
+def _integrate(derivative, project, y0, ts, args, steps, options):
     """diffrax's solution at ts[1:], and the time it came to."""
     term, adjoint = diffrax.ODETerm(derivative), options["adjoint"]
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
-    if _projects(args[0], options["method"]):
-        solver = ProjectedSolver(solver, _onto_constraints)
-    elif has_quaternions(args[0].system):
-        solver = ProjectedSolver(solver, _onto_manifold)
+    if project:
+        solver = ProjectedSolver(solver, project)
     saves = diffrax.SubSaveAt(ts=ts[1:])
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else
     saveat = diffrax.SaveAt(subs=saves if continuous else (saves, diffrax.SubSaveAt(t1=True, fn=_nothing)))
@@ -308,16 +323,6 @@ def _integrate(derivative, y0, ts, args, steps, options):
         return solved, jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
     (times, end), (ys, _) = solved.ts, solved.ys
     return eqx.tree_at(lambda s: (s.ts, s.ys), solved, (times, ys)), end[0]
-
-
-def _onto_manifold(t, y, args):
-    scene, _ = args
-    return (retract(scene.system, y[0]), *y[1:]), diffrax.RESULTS.successful
-
-
-def _onto_constraints(t, y, args):
-    # Steps that will be rejected may be too long to be projected, so a projection that fails does not end the run.
-    return (*onto_constraints(args[0], y[0], y[1], t), *y[2:]), diffrax.RESULTS.successful
 
 
 def _projects(scene: Scene, method: str) -> bool:

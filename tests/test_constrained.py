@@ -31,9 +31,8 @@ KINDS = ("free", "revolute", "spherical", "prismatic", "revolute", "helical", "r
 
 @pytest.fixture(scope="module")
 def tree():
-    """A floating tree with two loops, a weld and a ball joint, and a state on them."""
+    """A floating tree with two branches joined by a ball joint and its base welded to the world, and a guess."""
     model = random_tree(5, KINDS, parents=(-1, 0, 1, 2, 0, 4, 5))
-    scene = Scene(model, (loop("b3", POSE, "b6", None, "spherical", name="ball"), loop("b0", None, "b2", POSE, "weld")))
     rng = np.random.default_rng(2)
     q = rng.normal(size=model.nq) * 0.3
     q[3] += 1.0
@@ -43,15 +42,11 @@ def tree():
     q[place] /= np.linalg.norm(q[place])
     # The loops are closed where the guess is: the frames are put there.
     poses = np.asarray(forward_kinematics(model, jnp.asarray(q)))
-    ball = np.linalg.inv(poses[6]) @ poses[3] @ np.asarray(scene.constraints[0].pose_a)
-    weld = np.linalg.inv(poses[2]) @ poses[0]
-    scene = Scene(
-        model,
-        (
-            loop("b3", POSE, "b6", jnp.asarray(ball), "spherical", name="ball"),
-            loop("b0", None, "b2", jnp.asarray(weld), "weld", name="weld"),
-        ),
-    )
+    pose = np.asarray(loop("a", POSE, "b", None).pose_a)
+    ball = jnp.asarray(np.linalg.inv(poses[6]) @ poses[3] @ pose)
+    weld = jnp.asarray(np.linalg.inv(poses[0]) @ pose)
+    closing = loop("b3", POSE, "b6", ball, "spherical", name="ball"), loop(None, POSE, "b0", weld, "weld", name="weld")
+    scene = Scene(model, closing)
     return scene, jnp.asarray(q), jnp.asarray(rng.normal(size=model.nv)), jnp.asarray(rng.normal(size=model.nv))
 
 
@@ -113,18 +108,19 @@ def test_acceleration_is_that_of_pinocchio(solved, tree):
     model, q = tree[0].system, solved["q"]
     source, bridge = to_pinocchio(model)
     ids = {name: source.getJointId(f"j{name[1:]}") for name in model.body_names}
-    contacts = []
+    contacts = pin.StdVec_RigidConstraintModel()
     for kind, constraint in zip(
         (pin.ContactType.CONTACT_3D, pin.ContactType.CONTACT_6D), tree[0].constraints, strict=True
     ):
         ends = []
         for body, pose in ((constraint.body_a, constraint.pose_a), (constraint.body_b, constraint.pose_b)):
-            placement = source.frames[source.getFrameId(body)].placement * pin.SE3(np.asarray(pose))
-            ends += [ids[body], placement]
+            offset = pin.SE3.Identity() if body is None else source.frames[source.getFrameId(body)].placement
+            ends += [0 if body is None else ids[body], offset * pin.SE3(np.asarray(pose))]
         contacts.append(pin.RigidConstraintModel(kind, source, *ends, pin.ReferenceFrame.LOCAL))
     source.armature[:] = np.asarray(model.armature)
-    data, datas = source.createData(), [contact.createData() for contact in contacts]
-    pin.initConstraintDynamics(source, data, contacts)
+    data, datas = source.createData(), pin.StdVec_RigidConstraintData()
+    datas.extend([contact.createData() for contact in contacts])
+    pin.initConstraintDynamics(source, data, contacts, datas)
     settings = pin.ProximalSettings(1e-14, 0.0, 20)
     a = pin.constraintDynamics(
         source, data, bridge.q_to_pinocchio(q), solved["v"], solved["tau"], contacts, datas, settings
@@ -187,8 +183,10 @@ def relative_twists(scene, q, v):
 
         def relative(s, constraint=constraint):
             poses = forward_kinematics(scene.system, integrate(scene.system, q, s * v))
-            a, b = (scene.system.body_names.index(n) for n in (constraint.body_a, constraint.body_b))
-            return jnp.linalg.inv(poses[a] @ constraint.pose_a) @ poses[b] @ constraint.pose_b
+            poses = jnp.concatenate([poses, jnp.eye(4)[None]])
+            names = (*scene.system.body_names, None)
+            a, b = (poses[names.index(n)] for n in (constraint.body_a, constraint.body_b))
+            return jnp.linalg.inv(a @ constraint.pose_a) @ b @ constraint.pose_b
 
         pose, rate = jax.jvp(relative, (jnp.zeros(()),), (jnp.ones(()),))
         spatial = rate @ jnp.linalg.inv(pose)
@@ -226,43 +224,50 @@ def test_rows_without_a_solution_are_reported():
     assert bool(found.result == RESULTS.contradictory_rows) and int(found.rank) == 1
 
 
-def test_derivatives_by_differences_also_where_rows_depend():
-    """First and second derivatives in states, lengths and masses; with dependent rows as without."""
-    q, v = scenes.four_bar.start()
+def differences(function, direction, h=1e-3):
+    """Slope along a direction by central differences of fourth order."""
+    f = lambda s: function(s * direction)  # noqa: E731
+    return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
 
-    def value(x, in_plane):
-        # The guess is on the constraints for the lengths of the start; off them the formula is still smooth in x.
-        scene = scenes.four_bar(in_plane=in_plane)
+
+def test_derivatives_in_states_and_masses_where_rows_depend():
+    """Reverse mode by finite differences, for the four-bar with three rows without work."""
+    q, v = scenes.four_bar.start()
+    scene = scenes.four_bar(in_plane=False)
+
+    def value(x):
         scale = jnp.ones((3, 1)) + x[6] * jnp.asarray([[0.0], [0.0], [1.0]])
         model = scene.system.replace(inertias=scene.system.inertias * scale)
         found = constrained_dynamics(Scene(model, scene.constraints), q + x[:3], v + x[3:6])
-        return jnp.sum(found.acceleration * jnp.asarray([1.0, -0.3, 0.7]))
+        return jnp.sum(found.acceleration * jnp.asarray([1.0, -0.3, 0.7])) + jnp.sum(found.multipliers**2)
 
-    x = jnp.zeros(7)
     direction = jnp.asarray(np.random.default_rng(0).normal(size=7))
-    differentiate = quick(
-        lambda x, in_plane: (
-            jax.grad(value)(x, in_plane),
-            jax.jvp(lambda x: jax.grad(value)(x, in_plane), (x,), (direction,))[1],
+    slope = quick(jax.grad(value))(jnp.zeros(7))
+    assert (np.abs(slope) > 1e-3).all()
+    np.testing.assert_allclose(slope @ direction, differences(quick(value), direction), rtol=1e-7)  # h^4
+
+
+def test_second_derivatives_where_rows_depend():
+    """Hessians of the same motion with a row listed once (both methods) and twice (rank-aware) agree, also at rest."""
+    q, v = scenes.spherical_pendulum.start(length=1.2, theta=0.8, theta_rate=0.3)
+    once = scenes.spherical_pendulum(length=1.2)
+    twice = Scene(once.system, once.constraints * 2)
+
+    def value(x, scene, method):
+        return jnp.sum(constrained_dynamics(scene, x[:3], x[3:], method=method).acceleration ** 2)
+
+    x, still = jnp.concatenate([q, v]), jnp.concatenate([q, 0 * v])
+    for at in (x, still):
+        one, other, direct = (
+            quick(jax.hessian(lambda x, s=s, m=m: value(x, s, m)))(at)
+            for s, m in ((once, "rank_aware"), (twice, "rank_aware"), (once, "schur"))
         )
-    )
-    first = {}
-    for in_plane in (True, False):
-        f = quick(lambda x, p=in_plane: value(x, p))
-        g = quick(
-            lambda x, p=in_plane: (
-                jax.grad(value)(x, p),
-                jax.jvp(jax.grad(lambda y: value(y, p)), (x,), (direction,))[1],
-            )
-        )
-        first[in_plane] = g(x)
-        h = 1e-3
-        slope = (8 * (f(h * direction) - f(-h * direction)) - (f(2 * h * direction) - f(-2 * h * direction))) / (12 * h)
-        np.testing.assert_allclose(first[in_plane][0] @ direction, slope, rtol=1e-7)  # h^4 of the differences
-    # Both have the same rank on every side, so derivatives agree in all directions that keep the loop closed.
-    assert_close(first[True][0], first[False][0], 1e-9)
-    assert_close(first[True][1], first[False][1], 1e-8)
-    del differentiate
+        assert_close(other, one, 1e-11)
+        assert_close(direct, one, 1e-11)
+    direction = jnp.asarray(np.random.default_rng(0).normal(size=6))
+    grad = quick(jax.grad(lambda x: value(x, twice, "rank_aware")))
+    hessian = quick(jax.hessian(lambda x: value(x, twice, "rank_aware")))(x)
+    assert_close(hessian @ direction, differences(lambda dx: grad(x + dx), direction), 1e-8)  # h^4
 
 
 @pytest.mark.parametrize("shape", [(7, 4), (4, 7), (6, 6)])
@@ -357,14 +362,19 @@ def test_assemble_finds_the_nearest_configuration():
     """From a rough guess: closed to rounding, the least change in the metric M(guess), admissible velocity."""
     scene = scenes.four_bar()
     guess, rate = jnp.asarray([0.9, -0.4, 1.6]), jnp.asarray([1.0, 0.0, 0.0])
-    found = assemble(scene, guess, rate)
+
+    @quick
+    def solve(guess, rate):
+        found = assemble(scene, guess, rate)
+        before, after = (mass_matrix(scene.system, x) for x in (guess, found.q))
+        pull = before @ difference(scene.system, guess, found.q)
+        return found, pull, after @ (found.v - rate), rows(scene, found.q, found.v, 0.0).A
+
+    found, pull, change, row = solve(guess, rate)
     assert float(found.residual.max()) < 1e-13
     # A stationary point: M (q - guess) is a combination of the rows.
-    pull = mass_matrix(scene.system, guess) @ difference(scene.system, guess, found.q)
-    row = rows(scene, found.q, found.v, 0.0).A
     left = pull - row.T @ np.linalg.lstsq(np.asarray(row.T), np.asarray(pull), rcond=None)[0]
     np.testing.assert_allclose(left, 0, atol=1e-6)  # Newton's last steps, to close the loop, are not taken along it
-    change = mass_matrix(scene.system, found.q) @ (found.v - rate)
     left = change - row.T @ np.linalg.lstsq(np.asarray(row.T), np.asarray(change), rcond=None)[0]
     np.testing.assert_allclose(left, 0, atol=1e-12)
 
@@ -372,18 +382,15 @@ def test_assemble_finds_the_nearest_configuration():
 def test_assemble_fails_clearly():
     scene = scenes.four_bar(lengths=(1.0, 1.0, 1.0, 2.5))
     far = scene.system.replace(home=scene.system.home.at[2, 0, 3].set(4.0))
-    broken = Scene(far, scene.constraints)
-    with pytest.raises(ValueError, match="not assembled: loop 'knee' open by 1"):
-        assemble(broken, jnp.asarray([0.1, 0.2, 3.0]))
-    codes = jax.vmap(
-        lambda x: (
-            assemble(
-                Scene(scene.system.replace(home=far.home.at[2, 0, 3].set(x)), scene.constraints),
-                jnp.asarray([0.3, -0.4, 2.0]),
-            ).result
-            == RESULTS.not_assembled
-        )
-    )(jnp.asarray([2.5, 4.0]))
+    broken, guess = Scene(far, scene.constraints), jnp.asarray([0.3, -0.4, 2.0])
+    with pytest.raises(ValueError, match=r"not assembled: loop 'knee' open by [1-9]"):
+        assemble(broken, guess)
+
+    def fails(ground):
+        model = scene.system.replace(home=far.home.at[2, 0, 3].set(ground))
+        return assemble(Scene(model, scene.constraints), guess).result == RESULTS.not_assembled
+
+    codes = quick(jax.vmap(fails))(jnp.asarray([2.5, 4.0]))
     assert codes.tolist() == [False, True]
     system = LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 2)
     both = [Holonomic(lambda q, t, x=x: q[0] - x, name=f"x = {x}") for x in (0.0, 1.0)]
@@ -434,10 +441,12 @@ def test_locked_joints_and_float32():
     q, _ = scenes.four_bar.start()
     model = scenes.four_bar().system
     locked = Scene(model, (lock_joint("2", float(q[1])), lock_joint("3", float(q[2]))))
-    found = constrained_dynamics(locked, q, jnp.asarray([1.0, 0.0, 0.0]))
-    M, h = mass_matrix(model, q), bias_force(model, q, jnp.asarray([1.0, 0.0, 0.0]))
+    v = jnp.asarray([1.0, 0.0, 0.0])
+    solve = quick(lambda scene, q, v: constrained_dynamics(scene, q, v))
+    found = solve(locked, q, v)
+    M, h = quick(lambda q, v: (mass_matrix(model, q), bias_force(model, q, v)))(q, v)
     assert_close(found.acceleration, [-h[0] / M[0, 0], 0.0, 0.0], 1e-13)
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, locked)
-    low = constrained_dynamics(single, q.astype(jnp.float32), jnp.asarray([1.0, 0.0, 0.0], jnp.float32))
+    low = solve(single, q.astype(jnp.float32), v.astype(jnp.float32))
     assert low.acceleration.dtype == low.multipliers.dtype == jnp.float32
     assert_close(low.acceleration, found.acceleration, 1e-5)

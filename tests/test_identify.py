@@ -2,13 +2,13 @@
 
 import importlib.util
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
 from jax.flatten_util import ravel_pytree
-from jax.test_util import check_grads
 from pinocchio_bridge import to_pinocchio
 
 from jaxdyn import identify, inertia, robots
@@ -20,6 +20,7 @@ from jaxdyn.io.urdf import load_urdf
 from jaxdyn.simulate import simulate
 
 PI = np.pi
+pseudo_inertias = jax.jit(jax.vmap(inertia.pseudo_inertia))
 
 
 @pytest.fixture(scope="module")
@@ -82,8 +83,8 @@ def iiwa_log(iiwa):
 def wrong_iiwa(iiwa):
     """A nominal model that is feasible and wrong everywhere, without friction."""
     generator = np.random.default_rng(5)
-    theta = jax.vmap(inertia.to_log_cholesky)(iiwa.inertias) + generator.normal(scale=0.15, size=(7, 10))
-    inertias = jax.vmap(inertia.from_log_cholesky)(theta)
+    wrong = jax.jit(jax.vmap(lambda x, step: inertia.from_log_cholesky(inertia.to_log_cholesky(x) + step)))
+    inertias = wrong(iiwa.inertias, generator.normal(scale=0.15, size=(7, 10)))
     return iiwa.replace(inertias=inertias, damping=None, friction=None, armature=None)
 
 
@@ -189,8 +190,8 @@ def test_bad_arguments_raise(arm, iiwa_log):
     log = identify.Log(t, q, v, a, q)
     with pytest.raises(ValueError, match=r"terms is \('stiction',\)"):
         identify.least_squares(arm, log, "stiction")
-    with pytest.raises(ValueError, match="v_s is 0"):
-        identify.fit_torques(arm, log, v_s=0)
+    with pytest.raises(ValueError, match=r"v_s is 0\.0"):
+        identify.fit_torques(arm, log, v_s=0.0)
     with pytest.raises(ValueError, match="7 columns of q, model 'arm' has 2"):
         identify.least_squares(arm, iiwa_log)
     with pytest.raises(ValueError, match="2 samples of 2 torques, too few for 6"):
@@ -225,8 +226,8 @@ def test_every_point_of_the_chart_is_feasible(wrong_iiwa):
     chart, point = make_chart(wrong_iiwa, identify.TERMS, 0.01, "full", *[np.ones(7)] * 3)
     np.testing.assert_allclose(chart.inertias(point.theta), wrong_iiwa.inertias, rtol=1e-12, atol=1e-14)
     far = jax.random.normal(jax.random.key(0), (200, 7, 10))
-    bodies = jax.vmap(chart.inertias)(far).reshape(-1, 10)
-    assert np.linalg.eigvalsh(jax.vmap(inertia.pseudo_inertia)(bodies)).min() > 0
+    bodies = jax.jit(jax.vmap(chart.inertias))(far).reshape(-1, 10)
+    assert np.linalg.eigvalsh(pseudo_inertias(bodies)).min() > 0
     s = jax.random.normal(jax.random.key(1), (200, 4, 7))
     viscous, coulomb, offset, armature = np.moveaxis(np.asarray(jax.vmap(chart.term_values)(s)), 1, 0)
     assert min(viscous.min(), coulomb.min(), armature.min()) >= 0 > offset.min()
@@ -235,15 +236,14 @@ def test_every_point_of_the_chart_is_feasible(wrong_iiwa):
 def test_divergence_against_its_definition(wrong_iiwa):
     chart, _ = make_chart(wrong_iiwa, (), 0.01, "full", *[np.ones(7)] * 3)
     theta = 0.4 * jax.random.normal(jax.random.key(2), (7, 10))
-    P0 = np.asarray(jax.vmap(inertia.pseudo_inertia)(wrong_iiwa.inertias))
-    P = np.asarray(jax.vmap(inertia.pseudo_inertia)(chart.inertias(theta)))
+    P0, P = np.asarray(pseudo_inertias(wrong_iiwa.inertias)), np.asarray(pseudo_inertias(chart.inertias(theta)))
     ratio = np.linalg.solve(P0, P)
     expected = np.sum(np.trace(ratio, axis1=1, axis2=2) - np.linalg.slogdet(ratio)[1] - 4)
     # Condition numbers of the pseudo-inertias, up to 1e4, limit the reference.
     np.testing.assert_allclose(chart.divergence(theta), expected, rtol=1e-10)
     assert abs(float(chart.divergence(jnp.zeros((7, 10))))) < 1e-13
     # Moving the chart changes coordinates, not bodies or the nominal ones.
-    moved = chart.moved(theta)
+    moved = eqx.tree_at(lambda chart: chart.origin, chart, chart.relative_factors(theta))
     np.testing.assert_allclose(moved.inertias(jnp.zeros((7, 10))), chart.inertias(theta), rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(moved.divergence(jnp.zeros((7, 10))), chart.divergence(theta), rtol=1e-12)
 
@@ -260,14 +260,28 @@ def test_torque_loss_and_its_gradient(wrong_iiwa, iiwa_log):
     residual = identify.regressor(wrong_iiwa, iiwa_log.q, iiwa_log.v, iiwa_log.a) @ np.asarray(chart.parameters(at))
     expected = 0.5 * np.sum((residual - iiwa_log.tau) ** 2) + 0.7 * float(chart.divergence(at.theta))
     np.testing.assert_allclose(torque_loss(at, problem), expected, rtol=1e-10)
-    check_grads(jax.jit(lambda y: torque_loss(unflatten(y), problem) / expected), (y,), order=2, rtol=1e-5)
+
+    @jax.jit
+    def derivatives(y, way):
+        """The loss over its value, its gradient, and the second derivative along a way, forward over reverse."""
+        function = jax.value_and_grad(lambda y: torque_loss(unflatten(y), problem) / expected)
+        (loss, gradient), (slope, turn) = jax.jvp(function, (y,), (way,))
+        return loss, gradient, slope, turn
+
+    way = jax.random.normal(jax.random.key(4), y.shape)
+    step = 1e-5  # central differences: step^2 of truncation, 1e-16 / step of rounding
+    after, before = derivatives(y + step * way, way), derivatives(y - step * way, way)
+    _, gradient, slope, turn = derivatives(y, way)
+    np.testing.assert_allclose(gradient @ way, slope, rtol=1e-12)
+    np.testing.assert_allclose(slope, (after[0] - before[0]) / (2 * step), rtol=1e-7)
+    np.testing.assert_allclose(turn, (after[1] - before[1]) / (2 * step), atol=1e-7 * np.abs(turn).max())
 
 
 # --- feasible fits by torque error ------------------------------------------------------------------------------------
 
 
 def lowest_eigenvalue(model):
-    return float(np.linalg.eigvalsh(jax.vmap(inertia.pseudo_inertia)(model.inertias)).min())
+    return float(np.linalg.eigvalsh(pseudo_inertias(model.inertias)).min())
 
 
 def test_feasible_fit_recovers_base_parameters_without_noise(iiwa, wrong_iiwa, iiwa_log):
@@ -308,7 +322,7 @@ def test_every_iterate_is_feasible_and_the_optimum_is_one(wrong_iiwa, noisy, met
     fit = identify.fit_torques(wrong_iiwa, log, method=method, callback=watch, steps={"adam": 3000}.get(method))
     assert min(lowest) > 0 and min(positive) >= 0
     np.testing.assert_array_equal(fit.history, losses)
-    assert newton.result == "converged" and np.all(np.diff(newton.history) < 0)
+    assert newton.result == "converged" and len(newton.history) < 60
     # The others approach it to this share of the loss in the steps that they are given.
     share = {"newton": 0.0, "lbfgs": 1e-4, "adam": 1e-2}[method]
     assert newton.history[-1] <= fit.history.min() <= newton.history[-1] * (1 + share)
@@ -389,8 +403,7 @@ def test_franka_least_squares_against_pinocchio_and_numpy(franka):
     scale = np.linalg.norm(A, axis=0)
     scale[scale < 1e-9] = np.inf  # columns of rounding errors
     x = np.linalg.lstsq(A / scale, train.tau.reshape(-1), rcond=1e-6)[0] / scale
-    for log, per_cent in ((train, 1.11), (test, 1.36)):
-        oracle = rows(log) @ x
+    for log, per_cent, oracle in ((train, 1.11, (A @ x).reshape(-1, 7)), (test, 1.36, rows(test) @ x)):
         np.testing.assert_allclose(fit.torques(log), oracle, atol=1e-9 * np.abs(oracle).max())
         assert round(fit.error(log), 2) == per_cent
     nominal = np.array([pin.rnea(reference, data, *z) for z in zip(test.q, test.v, test.a, strict=True)])

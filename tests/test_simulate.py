@@ -93,15 +93,14 @@ def test_projected_solver_steps_on_the_manifold_and_evaluates_the_first_stage_an
         np.testing.assert_allclose(end, y1, rtol=1e-14)
 
 
-def test_projection_belongs_to_models_with_quaternions(pendulum, leg):
-    """Nothing to retract, nothing compiled: a pendulum's program holds no square root but those of the step control."""
-
-    def roots(model, q0, v0):
-        program = jax.make_jaxpr(lambda q, v: simulate(model, q, v, [0.0, 1.0], stepsize=0.1).q)(q0, v0)
-        return str(program).count(" sqrt ")
-
-    assert roots(pendulum, np.zeros(1), np.zeros(1)) == 0
-    assert roots(leg, Q0, V0) > 0
+def test_only_models_with_quaternions_are_retracted(pendulum, leg, monkeypatch):
+    """Nothing to retract, nothing compiled."""
+    wrapped = []
+    monkeypatch.setattr("jaxdyn.simulate.ProjectedSolver", lambda *x: wrapped.append(x) or ProjectedSolver(*x))
+    for model, size in ((pendulum, 0), (leg, 1)):
+        q0, v0 = neutral(model), jnp.zeros(model.nv)
+        jax.make_jaxpr(lambda q, v, model=model: simulate(model, q, v, [0.0, 1.0], stepsize=0.1).q)(q0, v0)
+        assert len(wrapped) == size
 
 
 # Steps whose errors lie between rounding and the first terms of the expansion.
@@ -109,8 +108,8 @@ ORDERS = [
     (diffrax.Heun(), 2, [0.02, 0.01, 0.005]),
     (RK4(), 4, [0.1, 0.05, 0.025]),
     (diffrax.Tsit5(), 5, [0.1, 0.05, 0.025]),
-    (diffrax.Dopri8(), 8, [0.4, 0.2, 0.1]),
-    (diffrax.Kvaerno5(), 5, [0.1, 0.05, 0.025]),
+    (diffrax.Dopri8(), 8, [1.0, 0.5, 0.25]),
+    pytest.param(diffrax.Kvaerno5(), 5, [0.1, 0.05, 0.025], marks=pytest.mark.slow),
 ]
 
 
@@ -128,7 +127,7 @@ def test_order_of_convergence_with_retraction(solver, order, steps):
     @quick
     @jax.vmap
     def run(h):
-        tolerances = {"rtol": 1e-13, "atol": 1e-13}  # of the implicit method's inner iteration
+        tolerances = {"rtol": 1e-11, "atol": 1e-11}  # of the implicit method's inner iteration
         out = simulate(bodies, q0, v0, [0.0, 2.0], solver=solver, stepsize=h, max_steps=1024, **tolerances)
         return out.q[-1], out.v[-1], out.success, out.stats["num_steps"]
 
@@ -147,8 +146,8 @@ def test_order_of_convergence_with_retraction(solver, order, steps):
         "path": np.abs(q[:, 4:7] - place).max(1),
     }
     for name, error in errors.items():
-        slope = np.log2(error[:-1] / error[1:])
-        assert slope.min() > order - 0.35, f"{name}: errors {error}, orders {slope}"
+        slope = np.log2(error[:-1] / error[1:])[error[1:] > 1e-12]  # above rounding
+        assert slope.size and slope.min() > order - 0.35, f"{name}: errors {error}, orders {slope}"
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -182,7 +181,7 @@ def test_panda_against_pinocchio_and_scipy():
 @pytest.fixture(scope="module")
 def driven(leg):
     """The leg with damping, friction, a spring and a control, with every output."""
-    forces = (JointDamping(0.1), CoulombFriction(0.2, v_s=0.3), JointSpring(1.5))
+    forces = (JointDamping(0.1), CoulombFriction(0.05, v_s=0.5), JointSpring(1.5))
     control = Feedback(jnp.asarray(0.05), jnp.asarray([0.3, -0.2, 0.1, 0.4]))
     outputs = ("energy", "work", "power", "acceleration", "pose:foot")
     scene = Scene(leg, forces=forces)
@@ -198,9 +197,9 @@ def test_energy_is_work(driven):
     energy, work, power = (np.asarray(x) for x in (solution.energy, solution.work, solution.power))
     assert np.ptp(energy) > 0.5 and work[0] == 0
     np.testing.assert_allclose(energy - energy[0], work, rtol=0, atol=1e-10 * np.abs(energy).max())
-    # Simpson's rule over 200 pairs of steps of 5 ms: h^4 / 180 of a fourth derivative of order 1e3.
-    simpson = np.concatenate([[0], np.cumsum(power[:-2:2] + 4 * power[1:-1:2] + power[2::2])]) * 0.005 / 3
-    np.testing.assert_allclose(simpson, work[::2], rtol=0, atol=1e-7)
+    # Fourth-order differences of the energy give the power, once the first fast motion has died out.
+    rate = (energy[:-4] - 8 * energy[1:-3] + 8 * energy[3:-1] - energy[4:]) / (12 * 0.005)
+    np.testing.assert_allclose(rate[100:], power[102:-2], rtol=0, atol=1e-4 * np.abs(power[102:]).max())
 
 
 def test_outputs_are_those_of_the_saved_states(driven, leg):
@@ -217,9 +216,9 @@ def test_outputs_are_those_of_the_saved_states(driven, leg):
     found = solution.energy, solution.power, solution.acceleration, solution.poses["foot"]
     for x, y in zip(found, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-12)
-    # dv/dt by central differences of step 5 ms, good to h^2 / 6 of the third derivative.
-    rate = (solution.v[2:] - solution.v[:-2]) / 0.01
-    np.testing.assert_allclose(rate, solution.acceleration[1:-1], rtol=0, atol=2e-2)
+    rate = (solution.v[:-4] - 8 * solution.v[1:-3] + 8 * solution.v[3:-1] - solution.v[4:]) / (12 * 0.005)
+    scale = np.abs(solution.acceleration[102:]).max()
+    np.testing.assert_allclose(rate[100:], solution.acceleration[102:-2], rtol=0, atol=1e-4 * scale)
     np.testing.assert_allclose(np.linalg.norm(solution.q[:, :4], axis=1), 1, rtol=4e-16)
     np.testing.assert_array_equal(solution.q[0, 4:], Q0[4:])
     assert float(solution.stats["time_reached"]) == 2.0
@@ -246,100 +245,96 @@ def test_stiff_friction_with_an_implicit_method():
 # Derivatives and batches
 
 
-def final(leg, masses, dq, v0, gain, push, **options):
-    """A number that depends on everything: masses, start, and a control."""
-    model = eqx.tree_at(lambda m: m.inertias, leg, leg.inertias * masses[:, None])
-    scene = Scene(model, forces=(JointDamping(gain[0]), JointSpring(gain[1])))
-    start = integrate(leg, jnp.asarray(Q0), dq)
-    solution = simulate(scene, start, v0, [0.0, 0.3, 0.5], control=Feedback(gain[2], push), **options)
-    return jnp.sum(solution.q[-1] * jnp.arange(1.0, 6.0)) + jnp.sum(solution.v[1:] * jnp.arange(1.0, 5.0)[None])
-
-
 SIZES = (2, 4, 4, 3, 4)
 POINT = np.concatenate([[1.0, 1.2], np.zeros(4), V0, [0.1, 1.5, 0.05], [0.3, -0.2, 0.1, 0.4]])
-ADAPTIVE = {"rtol": 1e-11, "atol": 1e-11}
-FIXED = {"stepsize": 0.05, "max_steps": 16}
 
 
-def of_vector(leg, **options):
-    ends = np.cumsum(SIZES)[:-1]
-    return lambda z: final(leg, *jnp.split(z, ends), **options)
+def leg_end(leg, z, q0, **options):
+    """A number that depends on everything: masses, start, force coefficients, and a control."""
+    masses, dq, v0, gain, push = jnp.split(z, np.cumsum(SIZES)[:-1])
+    model = eqx.tree_at(lambda m: m.inertias, leg, leg.inertias * masses[:, None])
+    scene = Scene(model, forces=(JointDamping(gain[0]), JointSpring(gain[1])))
+    control = Feedback(gain[2], push)
+    out = simulate(scene, integrate(leg, q0, dq), v0, [0.0, 0.3, 0.5], control=control, **options)
+    return jnp.sum(out.q[-1] * jnp.arange(1.0, 6.0)) + jnp.sum(out.v[1:] * jnp.arange(1.0, 5.0)[None])
 
 
-def central_difference(function, step=1e-4):
-    """Fourth-order differences of a batched function about POINT, every coordinate in one call."""
-    offsets = step * np.array([1, -1, 2, -2])[:, None, None] * np.eye(POINT.size)
-    values = np.asarray(function(jnp.asarray((POINT + offsets).reshape(-1, POINT.size))))
-    one, minus, two, minus_two = values.reshape(4, POINT.size, *values.shape[1:])
+def central_difference(function, point, step=1e-4):
+    """Fourth-order differences of a batched function, every coordinate in one call."""
+    offsets = step * np.array([1, -1, 2, -2])[:, None, None] * np.eye(point.size)
+    values = np.asarray(function(jnp.asarray((point + offsets).reshape(-1, point.size))))
+    one, minus, two, minus_two = values.reshape(4, point.size, *values.shape[1:])
     return (8 * (one - minus) - (two - minus_two)) / (12 * step)
 
 
 def test_reverse_mode_against_finite_differences(leg):
-    """Masses, start, force coefficients and control, with adaptive steps; differences and batch from one program."""
-    function = of_vector(leg, **ADAPTIVE)
-    slope = central_difference(quick(jax.vmap(function)))
-    gradient = np.asarray(quick(jax.grad(function))(jnp.asarray(POINT)))
+    """Masses, start, coefficients and control, with adaptive steps; and finite at rest, where error estimates vanish."""
+
+    def function(z, q0):
+        return leg_end(leg, z, q0, rtol=1e-11, atol=1e-11)
+
+    q0 = jnp.asarray(Q0)
+    slope = central_difference(quick(jax.vmap(lambda z: function(z, q0))), POINT)
+    reverse = quick(jax.grad(function))
+    gradient = np.asarray(reverse(jnp.asarray(POINT), q0))
     assert np.abs(slope).min() > 1e-3  # every input matters
     # The steps are chosen anew at every shifted point, so the tolerance 1e-11 is seen through the step 1e-4.
     np.testing.assert_allclose(gradient, slope, rtol=1e-6, atol=1e-6)
+    hanging = POINT * (np.arange(POINT.size) < 2)
+    at_rest = np.asarray(reverse(jnp.asarray(hanging), neutral(leg)))
+    assert np.isfinite(at_rest).all() and np.any(at_rest)
 
 
-def test_all_modes_agree(leg):
-    """jvp = vjp, the Hessian is symmetric and the derivative of the gradient; finite at rest, where steps are exact."""
-    direct, forward, reverse = (of_vector(leg, adjoint=name, **FIXED) for name in ("direct", "forward", "reverse"))
-
-    @quick
-    def modes(z):
-        return jax.jacfwd(forward)(z), jax.grad(reverse)(z), jax.jacrev(direct)(z)
-
-    @quick
-    @jax.vmap
-    def second(z):
-        return jax.grad(direct)(z), jax.hessian(direct)(z)
-
-    jacfwd, gradient, jacrev = modes(jnp.asarray(POINT))
-    np.testing.assert_allclose(jacfwd, gradient, rtol=1e-11, atol=1e-12)
-    np.testing.assert_allclose(jacrev, gradient, rtol=1e-11, atol=1e-12)
-    curvature = central_difference(lambda z: second(z)[0])
-    hessian = np.asarray(second(jnp.asarray(np.tile(POINT, (4 * POINT.size, 1))))[1][0])
-    np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-10 * np.abs(hessian).max())
-    np.testing.assert_allclose(hessian, curvature, rtol=0, atol=1e-7 * np.abs(hessian).max())
+def swing(pendulum, z, **options):
+    """A number that depends on mass, start, damping and control of a pendulum."""
+    model = eqx.tree_at(lambda m: m.inertias, pendulum, pendulum.inertias * z[0])
+    scene = Scene(model, forces=(JointDamping(z[3]),))
+    out = simulate(scene, z[1:2], z[2:3], [0.0, 0.3, 0.5], control=Feedback(z[4], z[5:]), **options)
+    return jnp.sum(out.q) + 2 * jnp.sum(out.v)
 
 
-def test_forward_mode_with_adaptive_steps_at_rest(leg):
-    """Hanging at rest every error estimate is zero; derivatives stay finite, in forward mode and in reverse."""
-    model = leg
+def test_modes_and_second_order(pendulum):
+    """jvp = vjp, adaptive steps at rest too; the Hessian is symmetric and the derivative of the gradient."""
+    point = np.array([1.2, 0.7, -0.5, 0.1, 0.05, 0.3])
+    rest = np.array([1.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 
-    def end(mode):
-        def function(v0):
-            out = simulate(model, neutral(model), v0, [0.0, 0.2], adjoint=mode, max_steps=256)
-            return jnp.concatenate([out.q[-1], out.v[-1]])
+    def direct(z):
+        return swing(pendulum, z, adjoint="direct", stepsize=0.05, max_steps=16)
 
-        return function
+    def gradient_twice(z):
+        gradient = jax.grad(direct)(z)
+        return gradient, gradient
 
-    rest = jnp.zeros(4)
-    jacfwd, jacrev = quick(lambda v: (jax.jacfwd(end("forward"))(v), jax.jacrev(end("reverse"))(v)))(rest)
-    assert np.isfinite(jacfwd).all() and np.any(jacfwd != 0)
-    np.testing.assert_allclose(jacfwd, jacrev, rtol=1e-10, atol=1e-12)
+    both = quick(jax.vmap(jax.jacfwd(gradient_twice, has_aux=True)))
+    hessian, gradient = (np.asarray(x) for x in both(jnp.asarray([point, rest])))
+    np.testing.assert_allclose(hessian, hessian.swapaxes(1, 2), rtol=0, atol=1e-12 * np.abs(hessian).max())
+    assert np.isfinite(hessian).all()
+    curvature = central_difference(lambda z: quick(jax.vmap(jax.jacfwd(gradient_twice, has_aux=True)))(z)[1], point)
+    np.testing.assert_allclose(hessian[0], curvature, rtol=0, atol=1e-9 * np.abs(hessian).max())
+    for options in ({"stepsize": 0.05}, {}):
+        jacobian = quick(jax.jacfwd(lambda z, options=options: swing(pendulum, z, adjoint="forward", **options)))
+        if options:
+            np.testing.assert_allclose(jacobian(jnp.asarray(point)), gradient[0], rtol=1e-12, atol=1e-13)
+        else:
+            # Adaptive steps follow the exact motion, RK4 with h = 0.05 is off by 1e-5 or so.
+            np.testing.assert_allclose(jacobian(jnp.asarray(point)), gradient[0], rtol=1e-3)
+            assert np.isfinite(jacobian(jnp.asarray(rest))).all()
 
 
+@pytest.mark.slow
 def test_continuous_adjoint(pendulum):
     """Its gradients are those of the exact motion, to the tolerance of the solution."""
-
-    def swing(z, adjoint):
-        scene = Scene(pendulum, forces=(JointDamping(z[2]),))
-        out = simulate(scene, z[:1], z[1:2], [0.0, 0.4, 0.8], adjoint=adjoint, rtol=1e-10, atol=1e-10)
-        return jnp.sum(out.q) + jnp.sum(out.v)
-
-    z = jnp.asarray([0.5, 0.3, 0.2])
-    gradients = quick(lambda z: (jax.grad(swing)(z, "backsolve"), jax.grad(swing)(z, "reverse")))(z)
-    np.testing.assert_allclose(*gradients, rtol=1e-7)
+    z = jnp.asarray([1.2, 0.7, -0.5, 0.1, 0.05, 0.3])
+    tight = {"rtol": 1e-10, "atol": 1e-10}
+    found = quick(jax.grad(lambda z: swing(pendulum, z, adjoint="backsolve", **tight)))(z)
+    expected = quick(jax.grad(lambda z: swing(pendulum, z, **tight)))(z)
+    np.testing.assert_allclose(found, expected, rtol=1e-7)
 
 
 def lane(leg, q0, v0, mass, control):
     model = eqx.tree_at(lambda m: m.inertias, leg, leg.inertias * mass)
     scene = Scene(model, forces=(JointDamping(0.1),))
-    return simulate(scene, q0, v0, np.linspace(0, 1, 5), control=control, outputs=("energy", "work"))
+    return simulate(scene, q0, v0, np.linspace(0, 1, 5), control=control, stepsize=0.01, outputs=("energy", "work"))
 
 
 def test_batch_is_the_loop_and_one_bad_lane_stops_no_other(leg):
@@ -354,7 +349,7 @@ def test_batch_is_the_loop_and_one_bad_lane_stops_no_other(leg):
     for i in range(3):
         single = one(*jax.tree.map(lambda x, i=i: x[i], inputs))
         for name in ("q", "v", "energy", "work"):
-            # The same steps, but sums are vectorised differently.
+            # Sums are vectorised differently.
             np.testing.assert_allclose(getattr(batch, name)[i], getattr(single, name), rtol=1e-10, atol=1e-11)
     np.testing.assert_array_equal(batch.success, [True, True, True, False, False])
     np.testing.assert_array_equal(batch.result == RESULTS.nonfinite_start, [False, False, False, True, True])
@@ -402,15 +397,12 @@ def test_known_numbers_stay_known_in_a_trace(pendulum):
     """Inside `jit` the leaves of a closed-over model reach the dynamics as numbers, which may be built into it."""
     seen = []
 
-    def control(q, v, t):
-        return jnp.zeros_like(v)
-
     def force(system, q, v, t):
         seen.append(isinstance(system.inertias, jax.core.Tracer))
         return jnp.zeros_like(v)
 
     scene = Scene(pendulum, forces=(force,))
-    jax.jit(lambda q: simulate(scene, q, [0.0], [0.0, 0.1], control=control, stepsize=0.05).q).lower(jnp.zeros(1))
+    jax.jit(lambda q: simulate(scene, q, [0.0], [0.0, 0.1], stepsize=0.05).q).lower(jnp.zeros(1))
     assert seen and not any(seen)
 
 
@@ -430,7 +422,7 @@ def test_failures_are_codes_or_errors(pendulum):
     reached = float(short.stats["time_reached"])
     np.testing.assert_array_equal(np.isnan(short.q[:, 0]), np.asarray(ts) > reached)
     assert 0.1 < reached < 4 and int(short.stats["num_steps"]) == 9
-    with pytest.raises(RuntimeError, match=r"stopped at t = 0.(29|30)\d* s.*minimum step size.*singular mass matrix"):
+    with pytest.raises(RuntimeError, match=r"stopped at t = 0\.(29\d*|3) s.*minimum step size.*singular mass matrix"):
         simulate(pendulum, [1.0], [0.0], ts, control=control)
     found = simulate(pendulum, [1.0], [0.0], ts, control=control, throw=False)
     assert found.result == RESULTS.dt_min_reached
@@ -484,7 +476,7 @@ def nothing(q, v, t):
         ({"ts": []}, r"ts has shape \(0,\); pass the start and at least one later time"),
         ({"ts": [0.0]}, r"ts has shape \(1,\)"),
         ({"ts": [[0.0, 1.0]]}, r"ts has shape \(1, 2\)"),
-        ({"ts": [0.0, np.nan, 1.0]}, "ts is nan at index 1; give finite times"),
+        ({"ts": [0.0, np.nan, 1.0]}, "ts is nan at index 1; give finite numbers"),
         ({"ts": [0.0, 2.0, 1.0]}, "ts does not increase at index 2: 2.0 then 1.0; sort it"),
         ({"ts": [0.0, 1.0, 1.0]}, "ts does not increase at index 2"),
         ({"control": 3.0}, "control is 3.0, which cannot be called"),
@@ -512,12 +504,6 @@ def test_refused(leg, arguments, message):
     given = {"scene": leg, "q0": Q0, "v0": V0, "ts": [0.0, 0.1]} | arguments
     with pytest.raises(ValueError, match=message):
         simulate(given.pop("scene"), given.pop("q0"), given.pop("v0"), given.pop("ts"), **given)
-
-
-def test_constraints_are_refused(leg):
-    scene = Scene(leg, constraints=(lambda q, t: q[:1],))
-    with pytest.raises(ValueError, match="scene lists 1 constraints, and simulate has no constrained dynamics"):
-        simulate(scene, Q0, V0, [0.0, 0.1])
 
 
 def test_quaternions_near_unit_length_are_normalised(leg):

@@ -137,22 +137,32 @@ def _problem(model, log, terms, v_s, inertia, weights, prior, sigma):
     return Problem(chart, *(jnp.asarray(x, dtype) for x in numbers)), point, float(sigma)
 
 
-def _newton(model: Model, problem: Problem, point: Coordinates, steps: int, tolerance: float, callback):
-    """Newton's method with barriers (interior point): chart, point, history of the loss itself, result.
+class _Dual(eqx.Module):
+    """Multipliers: of a body's pseudo-inertia being positive definite, in the frame where that is 1, and of terms >= 0."""
 
-    The divergence keeps bodies from the edge of what is feasible, -barrier * log keeps the terms above zero. A log of little
-    noise far from the nominal model would still press both against their edges and leave only small steps, so the barriers
-    start as strong as the data and are released in stages, the divergence down to the prior, the terms' down to where
-    it is worth less than the tolerance.
+    bodies: Float[Array, "bodies 4 4"]
+    terms: Float[Array, " n"]
+
+
+def _newton(model: Model, problem: Problem, point: Coordinates, steps: int, tolerance: float, callback):
+    """Primal-dual interior-point method: chart, point, history of the loss, result.
+
+    The loss is min |R x - d|^2 / 2 + prior tr(P0^-1 P) with -prior log det P as the barrier that stays. The barrier starts as
+    strong as the data, so that bodies are not pushed against the edge of what is feasible, and is released as fast as the
+    complementarity of bodies and multipliers allows: down to the prior for the bodies, to nothing for the terms.
     """
     history, result = [], "max_steps"
+    dtype = problem.R.dtype
     prior = float(problem.prior)
-    count = int(positive_terms(problem.chart.terms).sum()) * point.s.shape[1]
-    least = 0.1 * tolerance / max(count, 1)
-    barrier = max(prior, 0.01 * float(torque_loss(point, problem)))
+    inequalities = point.s.shape[1] * int(positive_terms(problem.chart.terms).sum())
+    least = 0.1 * tolerance / max(inequalities, 1)
+    gap = max(prior, float(torque_loss(point, problem)) / (4 * len(problem.chart.bodies) + max(inequalities, 1)))
+    one = jnp.broadcast_to(jnp.eye(4, dtype=dtype), problem.chart.origin.shape)
+    dual = _Dual(gap * one, jnp.full((point.s.size,), gap, dtype) / jnp.maximum(point.s.reshape(-1) ** 2, 1e-3))
+    targets = gap, gap
     for step in range(steps + 1):
-        weights = jnp.asarray(max(prior, barrier), problem.R.dtype), jnp.asarray(barrier, problem.R.dtype)
-        value, decrement, origin, s = _newton_step(problem, point, *weights)
+        weights = (jnp.asarray(target, dtype) for target in targets)
+        value, decrement, gaps, length, origin, s, dual = _newton_step(problem, point, dual, *weights)
         history.append(float(value))
         if callback is not None:
             callback(step, history[-1], problem.chart.fitted(model, point)[0])
@@ -160,72 +170,95 @@ def _newton(model: Model, problem: Problem, point: Coordinates, steps: int, tole
             result = "not_finite"
             break
         # Rounding of the loss limits how small a decrease can be seen.
-        resolution = 10 * float(jnp.finfo(problem.R.dtype).eps) * abs(history[-1])
-        if barrier <= least and float(decrement) / 2 <= max(tolerance, resolution):
+        resolution = 10 * float(jnp.finfo(dtype).eps) * abs(history[-1])
+        if targets == (prior, least) and float(decrement) / 2 <= max(tolerance, resolution):
             result = "converged"
             break
         if step < steps:
             problem = eqx.tree_at(lambda p: p.chart.origin, problem, origin)
             point = Coordinates(point.theta, s)
-            if float(decrement) / 2 <= max(barrier, resolution):
-                barrier = max(least, barrier / 30)
+            # The longer the step was, the more of the barrier goes next; short steps are for getting back to the middle.
+            share = min(max(0.02, (1 - float(length)) ** 2), 0.9)
+            targets = max(prior, share * float(gaps[0])), max(least, share * float(gaps[1]))
     return problem.chart, point, np.array(history), result
 
 
 @eqx.filter_jit
-def _newton_step(problem: Problem, point: Coordinates, weight, barrier):
-    """Loss, twice the decrease that the quadratic model promises of the loss with barriers, and the point after a step.
+def _newton_step(problem: Problem, point: Coordinates, dual: _Dual, weight, barrier):
+    """One step towards P Z = weight, terms * multipliers = barrier, and what it starts from.
 
-    That loss is convex in x, so the step goes straight in x and stops short of the edge: P = A (1 + h S) A^T, with A the
-    factor now. A curved step would leave the narrow valley that a precise log makes.
+    Steps go straight in x and stop short of the edge, P = A (1 + h S) A^T with A the factor now: a curved step would leave
+    the narrow valley that a precise log makes. The equations are those of Newton's method on the loss with barriers, but the
+    barrier's curvature is that of the multipliers, Z S + S Z, which already know where the edge is (Helmberg, Rendl,
+    Vanderbei & Wolkowicz 1996; Nesterov & Nemirovskii 1994).
+
+    **Returns:** loss, decrement, mean products with the multipliers, length of the step, then the origin, terms and
+    multipliers after it.
     """
     chart, dtype = problem.chart, problem.R.dtype
     positive = jnp.broadcast_to(jnp.asarray(positive_terms(chart.terms)), point.s.shape).reshape(-1)
     start = point.s.reshape(-1)
     terms = jnp.where(positive, start**2, start)
     inverse = jnp.where(positive, 1 / jnp.where(positive, terms, 1), 0)
-    bodies = point.theta.size
+    multiplier = jnp.where(positive, dual.terms, 0)
+    count, size = point.theta.shape
     nb, nv = chart.nominal_inertias.shape[0], chart.nominal_terms.shape[1]
 
-    inertial = jax.jacfwd(lambda theta: chart.inertias(theta).reshape(-1))(point.theta).reshape(-1, bodies)
+    inertial = jax.jacfwd(lambda theta: chart.inertias(theta).reshape(-1))(point.theta).reshape(10 * nb, count * size)
     places = free_columns(nb, nv, chart.terms)[10 * nb :]
     rows = [problem.R[:, : 10 * nb] @ inertial, problem.R[:, places] * chart.scale.reshape(1, -1)]
     rows = jnp.concatenate(rows, axis=1)
-    slope = weight * jax.grad(chart.divergence)(point.theta).reshape(-1)
-    gradient = rows.T @ (problem.R @ chart.parameters(point) - problem.d) + jnp.append(slope, -barrier * inverse)
-    metric = jnp.kron(jnp.eye(len(chart.bodies), dtype=dtype), weight * _metric(point.theta.shape[1], dtype))
-    hessian = rows.T @ rows + jax.scipy.linalg.block_diag(metric, jnp.diag(barrier * inverse**2))
+    basis = jax.vmap(_linear_factor)(jnp.eye(size, dtype=dtype))
+    basis = basis + jnp.swapaxes(basis, 1, 2)
+    traces = jnp.trace(basis, axis1=1, axis2=2)
+    # prior tr(P0^-1 P) is what remains of the divergence without its log det.
+    slope = problem.prior * (jax.grad(chart.divergence)(point.theta) + traces[None]) - weight * traces[None]
+    gradient = rows.T @ (problem.R @ chart.parameters(point) - problem.d)
+    gradient = gradient + jnp.append(slope.reshape(-1), -barrier * inverse)
+    curvature = jnp.einsum("kij,bjm,lmi->bkl", basis, dual.bodies, basis)
+    blocks = jnp.einsum("bkl,bc->bkcl", curvature, jnp.eye(count, dtype=dtype)).reshape(count * size, count * size)
+    hessian = rows.T @ rows + jax.scipy.linalg.block_diag(blocks, jnp.diag(multiplier * inverse))
     diagonal = jnp.diagonal(hessian)
     unit = jnp.sqrt(jnp.where(diagonal > 0, diagonal, jnp.ones_like(diagonal)))
     damping = 4 * jnp.finfo(dtype).eps * jnp.eye(unit.size, dtype=dtype)
     factor = jax.scipy.linalg.cho_factor(hessian / (unit[:, None] * unit[None, :]) + damping)
     direction = -jax.scipy.linalg.cho_solve(factor, gradient / unit) / unit
-    decrement = -(gradient @ direction)
 
-    one = jnp.eye(4, dtype=dtype)
-    stretch = jax.vmap(_linear_factor)(direction[:bodies].reshape(point.theta.shape))
-    stretch = stretch + jnp.swapaxes(stretch, 1, 2)
-    fastest = jnp.minimum(
-        jnp.min(jnp.linalg.eigvalsh(stretch), initial=0), jnp.min(direction[bodies:] * inverse, initial=0)
+    one = jnp.eye(4, dtype=dtype)[None]
+    stretch = jnp.einsum("bk,kij->bij", direction[: count * size].reshape(count, size), basis)
+    change = direction[count * size :]
+    product = dual.bodies @ stretch
+    dual_stretch = weight * one - dual.bodies - (product + jnp.swapaxes(product, 1, 2)) / 2
+    dual_change = jnp.where(positive, (barrier - multiplier * change) * inverse - multiplier, 0)
+
+    length = _length(jnp.linalg.eigvalsh(stretch), change * inverse)
+    roots = jax.vmap(_upper_root)(dual.bodies)
+    relative = jax.vmap(lambda root, step: jax.scipy.linalg.solve(root, jax.scipy.linalg.solve(root, step).T))(
+        roots, dual_stretch
     )
-    lengths = 0.5 ** jnp.arange(40, dtype=dtype) * jnp.minimum(1, -0.95 / jnp.minimum(fastest, -0.95))
+    dual_length = _length(
+        jnp.linalg.eigvalsh((relative + jnp.swapaxes(relative, 1, 2)) / 2),
+        dual_change / jnp.where(positive, multiplier, 1),
+    )
+    roots = jax.vmap(_upper_root)(one + length * stretch)
+    bodies = dual.bodies + dual_length * dual_stretch
+    moved = _Dual(jnp.swapaxes(roots, 1, 2) @ bodies @ roots, multiplier + dual_length * dual_change)
+    following = terms + length * change
+    s = jnp.where(positive, jnp.sqrt(jnp.where(positive, following, 1)), following)
+    # Mean products of what must stay positive and its multipliers.
+    gaps = (
+        jnp.sum(jnp.trace(moved.bodies, axis1=1, axis2=2)) / max(4 * count, 1),
+        jnp.sum(jnp.where(positive, moved.terms * following, 0)) / max(int(positive_terms(chart.terms).sum()) * nv, 1),
+    )
+    origin = jnp.einsum("bij,bjk->bik", chart.origin, roots)
+    value, decrement = torque_loss(point, problem), -(gradient @ direction)
+    return value, decrement, gaps, jnp.minimum(length, dual_length), origin, s.reshape(point.s.shape), moved
 
-    def moved(length):
-        roots = jax.vmap(_upper_root)(one[None] + length * stretch)
-        following = terms + length * direction[bodies:]
-        s = jnp.where(positive, jnp.sqrt(jnp.where(positive, following, 1)), following).reshape(point.s.shape)
-        return jnp.einsum("bij,bjk->bik", chart.origin, roots), s
 
-    def outcome(length):
-        origin, s = moved(length)
-        there = eqx.tree_at(lambda p: (p.chart.origin, p.prior), problem, (origin, weight))
-        logs = jnp.sum(jnp.log(jnp.where(positive, s.reshape(-1), 1)))
-        return torque_loss(Coordinates(point.theta, s), there) - 2 * barrier * logs
-
-    losses = jax.vmap(outcome)(lengths)
-    accepted = losses <= outcome(jnp.zeros((), dtype)) - 1e-4 * lengths * decrement
-    length = jnp.where(jnp.any(accepted), lengths[jnp.argmax(accepted)], 0)
-    return torque_loss(point, problem), decrement, *moved(length)
+def _length(*rates):
+    """Longest step up to 1 that leaves a twentieth of everything that shrinks at these rates."""
+    fastest = jnp.min(jnp.concatenate([rate.reshape(-1) for rate in rates]), initial=0)
+    return jnp.minimum(1, -0.95 / jnp.minimum(fastest, -0.95))
 
 
 def _linear_factor(step):
@@ -237,13 +270,6 @@ def _linear_factor(step):
 def _upper_root(matrix):
     """Upper-triangular U with U U^T = matrix; NaN when it is not positive definite."""
     return jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
-
-
-def _metric(size: int, dtype):
-    """Second derivative of -log det(A (1 + S) A^T) at S = 0, |S|^2, along the coordinates of a body; for every A."""
-    stretch = jax.vmap(_linear_factor)(jnp.eye(size, dtype=dtype))
-    stretch = (stretch + jnp.swapaxes(stretch, 1, 2)).reshape(size, 16)
-    return stretch @ stretch.T
 
 
 def _whitening(problem: Problem, point: Coordinates):

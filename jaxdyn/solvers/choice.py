@@ -101,7 +101,8 @@ def checked_step_limit(max_steps, ts, stepsize, adjoint: diffrax.AbstractAdjoint
         return int(max_steps)
     if is_fixed(stepsize) and is_concrete((ts, stepsize)):
         # Rounded up to a power of two, so that other times seldom mean another program.
-        needed = 1.001 * float(ts[-1] - ts[0]) / float(stepsize) + 2
+        first, last = np.asarray(ts)[[0, -1]]  # in numpy: inside a jit, jax would trace the difference of known times too
+        needed = 1.001 * float(last - first) / float(stepsize) + 2
         return 2 ** int(np.ceil(np.log2(max(needed, 16))))
     return 4096 if isinstance(adjoint, diffrax.DirectAdjoint) else 65536
 

@@ -1,0 +1,195 @@
+"""A batch of rollouts of a real arm, and its inertias recovered from a noisy log: `python -m jaxdyn.demo`, or `make demo`.
+
+No file is needed: the arm is the KUKA iiwa of `jaxdyn.robots`. Two figures are written into out/.
+"""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxdyn as jd
+from jaxdyn.excitation import Tracking, random_motion, random_torque
+from jaxdyn.plotting import BLUE, GREY, ORANGE, RED, bands, new_figure
+
+# Standard deviation of the random torques of each joint (N m), about a tenth of what the arm's weight asks for.
+TORQUES = (4.0, 4.0, 2.0, 2.0, 0.4, 0.4, 0.1)
+HOME = (0.0, 0.6, 0.0, -1.2, 0.0, 0.8, 0.0)
+# Noise of the simulated log: encoders, velocities and torque sensors of a good arm.
+NOISE_Q, NOISE_V, NOISE_TAU = 1e-4, 2e-3, 0.005
+
+
+def rollouts(model, count: int, duration: float, progress: bool):
+    """`count` motions under random torques added to gravity compensation; returns the solution and its seconds."""
+    torques = jax.vmap(lambda key: random_torque(key, jnp.asarray(TORQUES), carry=model))(
+        jax.random.split(jax.random.key(0), count)
+    )
+    ts = jnp.linspace(0.0, duration, 41)
+
+    def one(control):
+        return jd.simulate(
+            model, jnp.asarray(HOME), jnp.zeros(model.nv), ts, control=control, outputs=("energy", "work"), stepsize=0.005,
+            progress=progress, throw=False,
+        )  # fmt: skip
+
+    start = time.perf_counter()
+    solution = jax.block_until_ready(jax.jit(jax.vmap(one))(torques))
+    return solution, time.perf_counter() - start
+
+
+def experiment(model, nominal, samples: int):
+    """Two noisy logs of 10 s, for training and for testing: the arm follows random motions by a controller that believes
+    in the nominal model."""
+    ts = np.linspace(0.0, 10.0, samples + 1)
+    motions = [random_motion(jax.random.key(seed), jnp.asarray(HOME), jnp.full(7, 0.5)) for seed in (1, 2)]
+    gains = jnp.asarray(100.0), jnp.asarray(20.0)
+
+    @jax.jit
+    @jax.vmap
+    def run(motion):
+        control = Tracking(nominal, motion, *gains)
+        q, v, _ = motion(0.0)
+        solution = jd.simulate(model, q, v, ts, control=control, stepsize=0.005, max_steps=4096, throw=False)
+        return solution.q, solution.v, jax.vmap(control)(solution.q, solution.v, jnp.asarray(ts))
+
+    rng = np.random.default_rng(0)
+    logs = []
+    for q, v, tau in zip(*map(np.asarray, run(jax.tree.map(lambda *x: jnp.stack(x), *motions))), strict=True):
+        noise = [rng.normal(size=x.shape) for x in (q, v, tau)]
+        tau_noise = NOISE_TAU * tau.std(0) * noise[2]
+        logs.append(jd.identify.Log(ts, q + NOISE_Q * noise[0], v + NOISE_V * noise[1], tau=tau + tau_noise))
+    return logs
+
+
+def wrong_model(model):
+    """The arm as a designer might guess it: masses off by up to 20 %, centres of mass by about 5 mm."""
+    rng = np.random.default_rng(1)
+    guess = [
+        jd.inertia.displaced(row * rng.uniform(0.8, 1.2), rng.normal(size=3) * 0.005)
+        for row in np.asarray(model.inertias)
+    ]
+    return model.replace(inertias=jnp.asarray(np.array(guess)))
+
+
+def rollout_figure(model, solution) -> Any:
+    """Joint angles of all motions, and the energy balance."""
+    ts = np.asarray(solution.ts)[0]
+    figure, axes = new_figure(11.0, 5.0, 2, 4)
+    for j in range(model.nv):
+        ax = axes.flat[j]
+        bands(ax, ts, np.asarray(solution.q)[:, :, j], BLUE)
+        ax.set_title(f"joint {j + 1}", fontsize=9)
+        ax.set_xlabel("time (s)", fontsize=9)
+        ax.set_ylabel("angle (rad)", fontsize=9)
+    balance = np.abs(_balance(solution))
+    ax = axes.flat[-1]
+    ax.semilogy(ts[1:], np.median(balance, 0)[1:] + 1e-17, color=GREY, label="median")
+    ax.semilogy(ts[1:], balance.max(0)[1:] + 1e-17, color=RED, label="worst")
+    ax.set_title("energy minus work", fontsize=9)
+    ax.set_xlabel("time (s)", fontsize=9)
+    ax.set_ylabel("|E - E(0) - W| (J)", fontsize=9)
+    ax.legend(fontsize=8, frameon=False)
+    count = len(solution.q)
+    figure.suptitle(f"{count} motions under random torques: median, 25 to 75 % and 5 to 95 % bands", fontsize=10)
+    return figure
+
+
+def _balance(solution):
+    energy = np.asarray(solution.energy)
+    return energy - energy[:, :1] - np.asarray(solution.work)
+
+
+def fit_figure(names, truth, start, fitted, history, test, before, after) -> Any:
+    """Base parameters before and after, the course of the fit, and a held-out motion."""
+    figure, axes = new_figure(11.5, 7.0, 2, 2)
+    ax = axes[0, 0]
+    scale = np.maximum(np.abs(truth), 0.02)
+    ax.axhline(0, color="0.4", linewidth=0.8)
+    ax.plot((start - truth) / scale, "o", color=ORANGE, markersize=4, label="nominal")
+    ax.plot((fitted - truth) / scale, "o", color=BLUE, markersize=4, label="fitted")
+    ax.set_yscale("symlog", linthresh=0.1)
+    ax.set_xlabel(f"base parameter, 1 to {len(names)}", fontsize=9)
+    ax.set_ylabel("error / max(|true value|, 0.02)", fontsize=9)
+    ax.legend(fontsize=8, frameon=False)
+    ax.set_title("identifiable combinations of the inertias", fontsize=9)
+    ax = axes[0, 1]
+    ax.semilogy(np.asarray(history), color=BLUE)
+    ax.set_xlabel("iteration", fontsize=9)
+    ax.set_ylabel("mean squared motion error (relative)", fontsize=9)
+    ax.set_title("descent through the simulator", fontsize=9)
+    t = np.asarray(test.t)[1:]
+    for ax, joint in zip(axes[1], (3, 5), strict=True):
+        for values, colour, label in ((before, ORANGE, "nominal"), (after, BLUE, "fitted")):
+            rate = values[1].reshape(-1, values[1].shape[-1])[: len(t), joint]
+            ax.plot(t, rate - np.asarray(test.v)[1:, joint], color=colour, linewidth=0.8, label=label)
+        ax.set_xlabel("time (s)", fontsize=9)
+        ax.set_ylabel("velocity error (rad/s)", fontsize=9)
+        ax.set_title(f"held-out motion, joint {joint + 1}: simulated minus measured", fontsize=9)
+        ax.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def main(argv=None) -> dict[str, float]:
+    """Run the demo; returns the numbers it prints."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rollouts", type=int, default=1024)
+    parser.add_argument("--duration", type=float, default=2.0, help="length of the rollouts (s)")
+    parser.add_argument("--samples", type=int, default=1000, help="samples of the 10 s log")
+    parser.add_argument("--steps", type=int, default=120, help="iterations of the fit")
+    parser.add_argument("--out", type=Path, default=Path("out"))
+    options = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    began = time.perf_counter()
+    options.out.mkdir(parents=True, exist_ok=True)
+    model = jd.robots.iiwa()
+    print(f"Arm: {model.name}, {model.nb} bodies, {model.nv} joints, {float(model.inertias[:, 0].sum()):.2f} kg")
+
+    print(f"\n1. {options.rollouts} motions of {options.duration:g} s under random torques on top of gravity compensation")
+    solution, seconds = rollouts(model, options.rollouts, options.duration, progress=True)
+    worst = float(np.abs(_balance(solution)).max())
+    reach = float(np.abs(np.asarray(solution.energy) - np.asarray(solution.energy)[:, :1]).max())
+    print(f"   {seconds:.1f} s, compiling included; energy moved by up to {reach:.1f} J")
+    print(f"   energy minus work: at most {worst:.1e} J")
+    rollout_figure(model, solution).savefig(options.out / "rollouts.png")
+
+    nominal = wrong_model(model)
+    base = jd.identify.base_parameters(model)
+    print(f"\n2. Inertias from a noisy 10 s log: 70 numbers, of which motion shows {len(base.names)} combinations")
+    print(f"   noise: {NOISE_Q:g} rad, {NOISE_V:g} rad/s, {100 * NOISE_TAU:g} % of each joint's torque")
+    train, test = experiment(model, nominal, options.samples)
+    settings: dict[str, Any] = {"horizon": 10, "substeps": 1}
+
+    def report(step, loss, _):
+        if step % 20 == 0:
+            print(f"   iteration {step:4d}: motion error {loss:.3e}", flush=True)
+
+    fit = jd.identify.fit_trajectory(nominal, train, steps=options.steps, callback=report, **settings)
+    errors = {}
+    for name, candidate in (("nominal", nominal), ("fitted", fit.model), ("true", model)):
+        errors[name] = jd.identify.trajectory_error(candidate, test, **settings)
+        print(f"   {name:8s} held-out motion: position error {errors[name][0]:.3f} %, velocity error {errors[name][1]:.3f} %")
+    truth, start, fitted = (base.values(m.inertias.reshape(-1)) for m in (model, nominal, fit.model))
+    print(f"\n   {'base parameter':32s} {'true':>10s} {'nominal':>10s} {'fitted':>10s}")
+    for name, *values in zip(base.names, truth, start, fitted, strict=True):
+        print(f"   {name:32s} " + " ".join(f"{value:10.4f}" for value in values))
+    sizes = [100 * np.linalg.norm(x - truth) / np.linalg.norm(truth) for x in (start, fitted)]
+    print(f"   error of all base parameters together: nominal {sizes[0]:.1f} %, fitted {sizes[1]:.2f} %")
+    motions = [jd.identify.rollout(m, test, **settings) for m in (nominal, fit.model)]
+    figure = fit_figure(base.names, truth, start, fitted, fit.history, test, *motions)
+    figure.savefig(options.out / "fit.png")
+    print(f"\nFigures: {options.out / 'rollouts.png'}, {options.out / 'fit.png'}; {time.perf_counter() - began:.0f} s in all")
+    return {
+        "energy minus work": worst,
+        "nominal": float(errors["nominal"][1]),
+        "fitted": float(errors["fitted"][1]),
+        "parameters before": float(sizes[0]),
+        "parameters after": float(sizes[1]),
+    }
+
+
+if __name__ == "__main__":
+    main()
