@@ -224,12 +224,13 @@ def test_bad_arguments_raise(arm, iiwa_log):
 
 def test_every_point_of_the_chart_is_feasible(wrong_iiwa):
     chart, point = make_chart(wrong_iiwa, identify.TERMS, 0.01, "full", *[np.ones(7)] * 3)
-    np.testing.assert_allclose(chart.inertias(point.theta), wrong_iiwa.inertias, rtol=1e-12, atol=1e-14)
-    far = jax.random.normal(jax.random.key(0), (200, 7, 10))
+    generator = np.random.default_rng(0)
+    np.testing.assert_allclose(chart.fitted(wrong_iiwa, point)[0].inertias, wrong_iiwa.inertias, rtol=1e-12, atol=1e-14)
+    far = generator.normal(size=(200, 7, 10))
     bodies = jax.jit(jax.vmap(chart.inertias))(far).reshape(-1, 10)
     assert np.linalg.eigvalsh(pseudo_inertias(bodies)).min() > 0
-    s = jax.random.normal(jax.random.key(1), (200, 4, 7))
-    viscous, coulomb, offset, armature = np.moveaxis(np.asarray(jax.vmap(chart.term_values)(s)), 1, 0)
+    values = jax.jit(jax.vmap(chart.term_values))(generator.normal(size=(200, 4, 7)))
+    viscous, coulomb, offset, armature = np.moveaxis(np.asarray(values), 1, 0)
     assert min(viscous.min(), coulomb.min(), armature.min()) >= 0 > offset.min()
 
 

@@ -75,6 +75,7 @@ class Chart(eqx.Module):
         """x (10 nb + 4 nv,), in the order of `parameter_names`."""
         return jnp.concatenate([self.inertias(point.theta).reshape(-1), self.term_values(point.s).reshape(-1)])
 
+    @eqx.filter_jit
     def fitted(self, model: Model, point: Coordinates) -> tuple[Model, Friction]:
         """`model` with the inertias, armature, damping and friction of a point, and the friction law with its offset."""
         viscous, coulomb, offset, armature = self.term_values(point.s)

@@ -272,6 +272,7 @@ def _upper_root(matrix):
     return jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
 
 
+@eqx.filter_jit
 def _whitening(problem: Problem, point: Coordinates):
     """Flat start and a matrix with which optax sees a loss of about unit curvature and a way to go of about one."""
     y, unflatten = ravel_pytree(point)

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jax.core import Tracer
 
 from jaxdyn.solvers.rk4 import RK4
@@ -112,10 +113,9 @@ def stepping(solver, term, ts, rtol, atol, stepsize):
     eps = float(jnp.finfo(ts.dtype).eps)
     rtol, atol = jnp.maximum(rtol, 10 * eps), jnp.maximum(atol, 10 * eps)
     if is_fixed(stepsize):
-        if isinstance(solver, diffrax.AbstractImplicitSolver):
-            norm = diffrax.PIDController(rtol, atol).norm
-            solver = eqx.tree_at(lambda s: (s.root_finder.rtol, s.root_finder.atol), solver, (rtol, atol))
-            solver = eqx.tree_at(lambda s: s.root_finder.norm, solver, norm)
+        # The default of diffrax gives up after two iterations and relies on a shorter step, which is not to be had here.
+        if isinstance(solver, diffrax.AbstractImplicitSolver) and not eqx.is_array_like(solver.root_finder.rtol):
+            solver = eqx.tree_at(lambda s: s.root_finder, solver, optimistix.Newton(rtol, atol))
         return solver, diffrax.ConstantStepSize(), stepsize
     controller = stepsize
     if controller is None:

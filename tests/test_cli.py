@@ -1,0 +1,273 @@
+"""The command line: what it prints and writes, and how it says no."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+from jaxdyn.cli import main
+from jaxdyn.io.logs import read_log, write_log
+
+FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    """A URDF of three joints: one with friction, one that slides, and one whose link breaks the triangle inequality."""
+    builder = jd.ModelBuilder("arm")
+    body = (2.0, (0, 0, 0.2), (0.02, 0.03, 0.02))
+    builder.add_body("base", None, "fixed", body)
+    builder.add_body(
+        "upper", "base", "revolute", body, joint_name="shoulder", axis=(0, 1, 0), damping=0.3, friction=0.1
+    )
+    slide = {"axis": (0, 0, 1), "lower": -0.3, "upper": 0.3, "effort_limit": 50.0, "velocity_limit": 1.0}
+    builder.add_body("slide", "upper", "prismatic", body, joint_name="lift", pose=(0, 0, 0.4), **slide)
+    flat = (0.5, (0.1, 0, 0), (0.1, 0.001, 0.001))
+    builder.add_body("hand", "slide", "continuous", flat, joint_name="wrist", pose=(0, 0, 0.1))
+    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    jd.save_urdf(builder.build(), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def panda(robots_dir):
+    return robots_dir / "panda_description" / "urdf" / "panda.urdf"
+
+
+@pytest.fixture(scope="module")
+def franka(data_dir):
+    """Raw samples of the recorded Franka Panda: t (n,), q and tau (n, 7)."""
+    directory = data_dir / "franka_panda" / "matlab" / "data" / "Exciting_Traj" / "Trajectory_1" / "rbt_log"
+    t, q, tau = (np.loadtxt(directory / f"exciting_traj_{name}.txt") for name in ("time", "positions", "torques"))
+    return t, q.reshape(-1, 7), tau.reshape(-1, 7)
+
+
+def columns_of(path):
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))
+    return dict(zip(rows[0], np.array(rows[1:], float).T, strict=True))
+
+
+def test_help_names_units_columns_and_examples(capsys):
+    for command, words in {
+        "info": ("rad", "kg", "--repair"),
+        "simulate": ("N m", "tau1", "--torque gravity"),
+        "identify": ("tau1", "--lock", "8 Hz"),
+    }.items():
+        with pytest.raises(SystemExit) as stop:
+            main([command, "--help"])
+        assert stop.value.code == 0
+        text = capsys.readouterr().out
+        assert "examples:" in text
+        for word in words:
+            assert word in text
+
+
+def test_info_shows_the_robot_and_its_faults(arm, capsys):
+    assert main(["info", str(arm)]) == 0
+    text = capsys.readouterr().out
+    assert "3 moving bodies, 3 degrees of freedom" in text
+    assert "moving mass 4.5 kg" in text
+    for words in (("shoulder", "revolute", "rad", "0 1 0"), ("lift", "prismatic", "m", "0 0 1", "-0.3", "50")):
+        line = next(line for line in text.splitlines() if words[0] in line)
+        assert all(word in line for word in words)
+    assert any("hand" in line and "triangle inequality" in line for line in text.splitlines())
+
+
+def test_info_locks_floats_and_repairs(arm, tmp_path, capsys):
+    out = tmp_path / "repaired.urdf"
+    assert main(["info", str(arm), "--lock", "lift=0.1", "--repair", str(out)]) == 0
+    assert "2 degrees of freedom" in capsys.readouterr().out
+    repaired = jd.load_urdf(out)
+    assert jd.inertia_report(repaired) == []
+    np.testing.assert_allclose(repaired.inertias[:, 0].sum(), 4.5, rtol=1e-12)
+    assert main(["info", str(arm), "--floating-base"]) == 0
+    text = capsys.readouterr().out
+    assert "floating base" in text
+    assert "9 degrees of freedom (q has 10 numbers, v has 9)" in text
+
+
+def test_info_of_a_real_robot_says_what_is_not_used(panda, capsys):
+    assert main(["info", str(panda)]) == 0
+    text = capsys.readouterr().out
+    assert "panda_hand_tcp" in text
+    assert "11 <visual>" in text
+    assert "<mimic>" in text
+
+
+def test_simulate_writes_the_motion_that_the_library_computes(arm, tmp_path, capsys):
+    out = tmp_path / "motion.csv"
+    args = ["--duration", "0.2", "--sample", "0.05", "--q0", "shoulder=0.5", "--friction", "0", "--torque", "gravity"]
+    assert main(["simulate", str(arm), *args, "--v0", "0.1", "0", "-0.2", "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    drift = float(text.split("at most ")[1].split(" J")[0])
+    assert drift < 1e-7
+    columns = columns_of(out)
+    assert list(columns) == ["t", *(f"{s}{i}" for s in ("q", "v", "tau") for i in (1, 2, 3)), "energy"]
+
+    model = jd.load_urdf(arm)
+    q0, v0 = np.array([0.5, 0.0, 0.0]), np.array([0.1, 0.0, -0.2])
+    motion = jd.simulate(
+        jd.Scene(model, forces=[jd.JointDamping()]),
+        q0,
+        v0,
+        np.linspace(0, 0.2, 5),
+        control=lambda q, v, t: jd.gravity_force(model, q),
+        rtol=1e-10,
+        atol=1e-10,
+    )
+    # Both integrations have a tolerance of 1e-8 or less per step.
+    for i in range(3):
+        np.testing.assert_allclose(columns[f"q{i + 1}"], motion.q[:, i], atol=1e-7)
+        np.testing.assert_allclose(columns[f"v{i + 1}"], motion.v[:, i], atol=1e-7)
+    np.testing.assert_allclose(columns["tau1"][0], jd.gravity_force(model, q0)[0], rtol=1e-12)
+
+    # The file is a log: replayed, it gives the motion again, up to the torque between two rows.
+    again = tmp_path / "again.npz"
+    assert (
+        main(["simulate", str(arm), "--sample", "0.05", "--friction", "0", "--torque", str(out), "--out", str(again)])
+        == 0
+    )
+    np.testing.assert_allclose(read_log(again).q, motion.q, atol=1e-4)
+
+
+def test_simulate_a_batch_with_seed_and_plot(arm, tmp_path, capsys):
+    args = ["simulate", str(arm), "--duration", "0.1", "--dt", "0.01", "--batch", "3", "--torque", "gravity+random"]
+    for name, seed in (("a.npz", 1), ("b.npz", 1), ("c.npz", 2)):
+        plot = ["--plot", str(tmp_path / "motion.png")] if name == "a.npz" else []
+        assert main([*args, "--seed", str(seed), "--out", str(tmp_path / name), *plot]) == 0
+    a, b, c = (np.load(tmp_path / name) for name in ("a.npz", "b.npz", "c.npz"))
+    assert a["q"].shape == (3, 11, 3)
+    assert a["energy"].shape == (3, 11)
+    np.testing.assert_array_equal(a["tau"], b["tau"])
+    assert np.abs(a["tau"] - c["tau"]).max() > 1e-3
+    assert np.ptp(a["q"][:, -1], axis=0).max() > 1e-6
+    assert (tmp_path / "motion.png").stat().st_size > 10_000
+    capsys.readouterr()
+
+
+def test_a_simulation_that_stops_early_is_exit_status_1(arm, capsys):
+    assert main(["simulate", str(arm), "--duration", "1", "--max-steps", "3"]) == 1
+    assert "1 of 1 motions stopped early" in capsys.readouterr().out
+
+
+@pytest.mark.data
+def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, capsys):
+    """Held-out torque error at most 1.45 %; unconstrained least squares with the same filter and split has 1.36 %."""
+    t, q, tau = franka
+    raw, out = tmp_path / "log.csv", tmp_path / "fitted.urdf"
+    write_log(raw, jd.identify.Log(t, q, tau=tau))
+    plot = tmp_path / "fit.png"
+    args = ["--urdf", str(panda), "--log", str(raw), "--lock", *FINGERS]
+    assert main(["identify", *args, "--out", str(out), "--plot", str(plot)]) == 0
+    text = capsys.readouterr().out
+    assert "low-passed at 8 Hz" in text
+    report = json.loads(out.with_suffix(".json").read_text())
+    assert report["torque_error"]["test_percent"] <= 1.45
+    assert report["torque_error"]["nominal_test_percent"] > 10
+    assert report["samples"] == {"train": 1762, "test": 756}
+    assert plot.stat().st_size > 10_000
+
+    # What was written is what was fitted: bodies that exist, and with the offsets of the report the same torques.
+    fitted = jd.load_urdf(out)
+    assert jd.inertia_report(fitted) == []
+    log = jd.identify.from_raw(t, q, tau)
+    _, test = jd.identify.split(log)
+    x = jd.identify.nominal_parameters(fitted)
+    offset = 10 * fitted.nb + fitted.nv * jd.identify.TERMS.index("offset")
+    x[offset : offset + fitted.nv] = report["friction"]["offset"]
+    rows = jd.identify.regressor(fitted, test.q, test.v, test.a)
+    # A URDF holds the inertia about the centre of mass, so some digits of small moments are lost on the way.
+    np.testing.assert_allclose(
+        jd.identify.torque_error(rows @ x, test.tau), report["torque_error"]["test_percent"], rtol=1e-6
+    )
+
+    # The same samples, filtered beforehand and so marked by their accelerations, give the same answer.
+    filtered = tmp_path / "filtered.npz"
+    write_log(filtered, log)
+    args[3] = str(filtered)
+    assert main(["identify", *args, "--method", "least-squares", "--report", str(tmp_path / "ls.json")]) == 0
+    assert "taken as filtered" in capsys.readouterr().out
+    report = json.loads((tmp_path / "ls.json").read_text())
+    assert abs(report["torque_error"]["test_percent"] - 1.36) < 0.01
+    assert len(report["base_parameters"]["fitted"]) == len(report["base_parameters"]["std"])
+
+
+def test_identify_recovers_a_simulated_arm(arm, tmp_path, capsys):
+    """Noise-free samples at 100 Hz, filtered beforehand: the true base parameters come back."""
+    truth = jd.load_urdf(arm)
+    rng = np.random.default_rng(0)
+    t = np.linspace(0, 4, 401)
+    size, rate, phase = rng.uniform(0.2, 0.5, (3, 3)), rng.uniform(1, 4, (3, 3)), rng.uniform(0, 6, (3, 3))
+    angle = rate * t[:, None, None] + phase
+    q, v, a = (
+        np.sum(x, 1) for x in (size * np.sin(angle), size * rate * np.cos(angle), -size * rate**2 * np.sin(angle))
+    )
+    rows = jd.identify.regressor(truth, q, v, a)
+    x = jd.identify.nominal_parameters(truth)
+    path = tmp_path / "log.csv"
+    write_log(path, jd.identify.Log(t, q, v, a, rows @ x))
+    wrong = tmp_path / "wrong.urdf"
+    inertias = np.array(truth.inertias)
+    inertias[:, :4] *= 1.2
+    jd.save_urdf(truth.replace(inertias=inertias), wrong)
+    args = ["identify", "--urdf", str(wrong), "--log", str(path), "--method", "least-squares"]
+    assert main([*args, "--report", str(tmp_path / "report.json")]) == 0
+    capsys.readouterr()
+    report = json.loads((tmp_path / "report.json").read_text())
+    base = jd.identify.base_parameters(truth, jd.identify.TERMS)
+    np.testing.assert_allclose(report["base_parameters"]["fitted"], base.values(x), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["info", "nowhere.urdf"], "nowhere.urdf"),
+        (["info", "ARM", "--lock", "elbow"], "elbow"),
+        (["info", "ARM", "--lock", "lift=high"], "no finite number"),
+        (["info", "ARM", "--repair", "out.txt"], "--repair"),
+        (["simulate", "ARM", "--q0", "1", "2"], "--q0 has 2 numbers"),
+        (["simulate", "ARM", "--v0", "elbow=1"], "elbow"),
+        (["simulate", "ARM", "--torque", "full"], "--torque"),
+        (["simulate", "ARM", "--batch", "4"], "all motions would be the same"),
+        (["simulate", "ARM", "--damping", "-1"], "--damping"),
+        (["simulate", "ARM", "--dt", "0"], "--dt"),
+        (["simulate", "ARM", "--duration", "-1"], "--duration"),
+        (["simulate", "ARM", "--out", "motion.txt"], "--out"),
+        (["simulate", "ARM", "--torque", "nowhere.csv"], "nowhere.csv"),
+        (["identify", "--urdf", "ARM", "--log", "nowhere.csv"], "nowhere.csv"),
+        (["identify", "--urdf", "ARM", "--log", "SHORT"], "lock"),
+        (["identify", "--urdf", "ARM", "--log", "NAN"], "nan"),
+        (["identify", "--urdf", "ARM", "--log", "BACK"], "time does not increase"),
+        (["identify", "--urdf", "ARM", "--log", "GOOD", "--train", "1"], "fraction"),
+        (
+            ["identify", "--urdf", "ARM", "--log", "GOOD", "--method", "least-squares", "--out", "x.urdf"],
+            "least squares",
+        ),
+        (["identify", "--urdf", "ARM", "--log", "GOOD"], "too few"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_status_2(arguments, words, arm, tmp_path, capsys):
+    header = "t,q1,q2,q3,tau1,tau2,tau3\n"
+    files = {
+        "SHORT": "t,q1,tau1\n0,0,0\n1,0,0\n",
+        "NAN": header + "0,0,nan,0,0,0,0\n1,0,0,0,0,0,0\n",
+        "BACK": header + "0,0,0,0,0,0,0\n0,0,0,0,0,0,0\n",
+        "GOOD": header + "".join(f"{0.01 * i},0,0,0,0,0,0\n" for i in range(20)),
+    }
+    places = {"ARM": str(arm)}
+    for name, text in files.items():
+        places[name] = str(tmp_path / f"{name.lower()}.csv")
+        (tmp_path / f"{name.lower()}.csv").write_text(text)
+    assert main([places.get(argument, argument) for argument in arguments]) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith("jaxdyn: ")
+    assert shown.count("\n") == 1
+    assert words in shown
+
+
+def test_debug_shows_where_an_error_arose():
+    with pytest.raises(ValueError, match=r"nowhere\.urdf"):
+        main(["info", "nowhere.urdf", "--debug"])
