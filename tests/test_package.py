@@ -52,7 +52,7 @@ INDEPENDENT = [("matrix_form", "recursive"), ("link_form", "matrix_form"), ("lin
 USERS = {
     "diffrax": ABOVE_CONTROL,
     "optax": {"identify"} | PROGRAMS,
-    "optimistix": {"constraints", "constrained", "reduced", "identify"} | PROGRAMS,
+    "optimistix": {"constraints", "constrained", "reduced", "solvers", "identify"} | PROGRAMS,
     "lineax": ABOVE_DYNAMICS,
     "matplotlib": FILES_AND_PLOTS,
     "scipy": {"identify"} | FILES_AND_PLOTS,  # a dependency of jax, so always there; not when jaxdyn is imported

@@ -102,7 +102,9 @@ def checked_step_limit(max_steps, ts, stepsize, adjoint: diffrax.AbstractAdjoint
         return int(max_steps)
     if is_fixed(stepsize) and is_concrete((ts, stepsize)):
         # Rounded up to a power of two, so that other times seldom mean another program.
-        first, last = np.asarray(ts)[[0, -1]]  # in numpy: inside a jit, jax would trace the difference of known times too
+        first, last = np.asarray(ts)[
+            [0, -1]
+        ]  # in numpy: inside a jit, jax would trace the difference of known times too
         needed = 1.001 * float(last - first) / float(stepsize) + 2
         return 2 ** int(np.ceil(np.log2(max(needed, 16))))
     return 4096 if isinstance(adjoint, diffrax.DirectAdjoint) else 65536
@@ -115,7 +117,8 @@ def stepping(solver, term, ts, rtol, atol, stepsize):
     if is_fixed(stepsize):
         # The default of diffrax gives up after two iterations and relies on a shorter step, which is not to be had here.
         if isinstance(solver, diffrax.AbstractImplicitSolver) and not eqx.is_array_like(solver.root_finder.rtol):
-            solver = eqx.tree_at(lambda s: s.root_finder, solver, optimistix.Newton(rtol, atol))
+            newton = optimistix.Newton(rtol, atol)  # pyright: ignore[reportArgumentType]
+            solver = eqx.tree_at(lambda s: s.root_finder, solver, newton)
         return solver, diffrax.ConstantStepSize(), stepsize
     controller = stepsize
     if controller is None:
