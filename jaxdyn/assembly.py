@@ -83,7 +83,7 @@ def _assemble(scene, q, v, t, rank_tol):
         v = v - _product(B, velocity_residual(scene, q, v, t))
     residual = residuals(scene, q, v, t)
     good = jnp.all(residual <= float(jnp.finfo(q.dtype).eps) ** 0.7 * (1.0 + jnp.max(jnp.abs(v))))
-    return Assembly(q, v, residual, RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled))
+    return Assembly(q, v, residual, RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled))  # pyright: ignore[reportArgumentType]
 
 
 _assemble_compiled = eqx.filter_jit(_assemble)

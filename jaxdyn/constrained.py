@@ -114,7 +114,7 @@ def applied(scene: Scene, q, v, tau, t) -> Array:
 def _free(scene, q, v, force, t) -> ConstrainedDynamics:
     factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
     a = cho_solve((factor, True), force - bias_force(scene.system, q, v, t))
-    result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)
+    result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
 
 
@@ -132,7 +132,7 @@ def _solve(scene, q, v, force, t, row: Rows, places, method, rank_tol) -> Constr
         pivots = jnp.diagonal(delassus)
         # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
         fine = jnp.min(pivots) > (10 * Y.shape[0] * _eps(Y)) ** 0.5 * jnp.max(pivots)
-        result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)
+        result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     else:
         inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
         pushed = _product(inverse.T, wanted)
@@ -142,7 +142,7 @@ def _solve(scene, q, v, force, t, row: Rows, places, method, rank_tol) -> Constr
         missed = jnp.abs(wanted - _product(Y.T, pushed))
         sizes = jnp.abs(row.gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
         met = jnp.all(missed <= _eps(Y) ** 0.5 * (sizes + jnp.max(sizes)))
-        result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)
+        result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
     a = solve_triangular(factor, free + pushed, lower=True, trans=1)
     result = RESULTS.where(jnp.isfinite(factor).all(), result, RESULTS.singular_mass_matrix)
     return ConstrainedDynamics(a, lam, rank, result, places)

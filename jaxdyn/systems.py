@@ -30,19 +30,19 @@ class System(eqx.Module):
         return self.nq
 
     @abc.abstractmethod
-    def mass_matrix(self, q, t):
+    def mass_matrix(self, q, t) -> Array:
         """M(q, t), (nv, nv), symmetric."""
 
     @abc.abstractmethod
-    def bias_force(self, q, v, t):
+    def bias_force(self, q, v, t) -> Array:
         """h(q, v, t) in M a + h = tau, (nv,)."""
 
     @abc.abstractmethod
-    def kinetic_energy(self, q, v, t):
+    def kinetic_energy(self, q, v, t) -> Array:
         """Kinetic energy, (), J."""
 
     @abc.abstractmethod
-    def potential_energy(self, q, t):
+    def potential_energy(self, q, t) -> Array:
         """Potential energy, (), J."""
 
     def gravity_force(self, q, t):

@@ -190,7 +190,9 @@ def position_residual(scene: Scene, q: Float[Array, " nq"], t=0.0) -> Float[Arra
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), q.dtype)
 
 
-def velocity_residual(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nc"]:
+def velocity_residual(
+    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0
+) -> Float[Array, " nc"]:
     """psi(q, v, t) = A v - b of all constraints, (nc,)."""
     t = jnp.asarray(t, q.dtype)
     motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
@@ -210,7 +212,7 @@ def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) ->
     return Rows(row_matrix(scene, q, t), -rate, velocity)
 
 
-def row_matrix(scene: Scene, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nc nv"]:
+def row_matrix(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "nc nv"]:
     """A(q, t) of all constraints, (nc, nv)."""
     t = jnp.asarray(t, q.dtype)
     v = jnp.zeros((scene.nv,), q.dtype)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -284,7 +285,7 @@ def rolling_sphere(
     radius = _length(radius, f"{name!r}: radius")
     reach = None if surface_radius is None else _length(surface_radius, f"{name!r}: surface_radius")
     concrete = reach is not None and not isinstance(radius - reach, jax.core.Tracer)
-    if inside and concrete and not radius < reach:
+    if inside and concrete and reach is not None and not radius < reach:
         raise ValueError(f"{name!r}: radius {radius} is not below surface_radius {reach}; it does not fit inside")
     return RollingSphere(
         name=name,

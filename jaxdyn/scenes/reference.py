@@ -1,5 +1,7 @@
 """Mechanisms of the test set for initial-value problems (CWI and Bari), from their printed equations."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -159,7 +161,7 @@ def andrews() -> Scene:
 
     Source: Hairer & Wanner, Solving Ordinary Differential Equations II (1996), section VII.7; test set for IVP solvers.
     """
-    p = _numbers(_ANDREWS)
+    p: Any = _numbers(_ANDREWS)
     system = ExplicitSystem(_andrews_mass, _andrews_bias, 7, parameters=p, potential=_andrews_potential)
     return Scene(system, (Holonomic(_AndrewsLoops(p["lengths"], p["A"], p["B"]), name="loops"),))
 
@@ -200,7 +202,7 @@ def car_axis() -> Scene:
     Source: Schneider (1995); test set for IVP solvers, problem "car axis", with k = M eps^2/2 = 5e-4.
     """
     eps, mass = 1e-2, 10.0
-    p = {"k": mass * eps**2 / 2, "length": 1.0, "rest": 0.5, "amplitude": 0.1, "frequency": 10.0, "g": 1.0}
+    p: Any = {"k": mass * eps**2 / 2, "length": 1.0, "rest": 0.5, "amplitude": 0.1, "frequency": 10.0, "g": 1.0}
     p = _numbers(p)
     system = LagrangianSystem(_car, 4, parameters=p)
     return Scene(system, (Holonomic(_CarRows(p), name="rows"),))

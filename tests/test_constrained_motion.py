@@ -1,0 +1,257 @@
+"""Motions under constraints against closed forms and published end points; order, starts, gradients of `simulate`.
+
+Programs are compiled without optimisation: the integrations are short. Residuals are asked for at all save points.
+"""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import quick
+from scipy.integrate import solve_ivp
+
+from jaxdyn import scenes
+from jaxdyn.constraints import Holonomic, lock_joint
+from jaxdyn.scene import Scene
+from jaxdyn.simulate import RESULTS, simulate
+from jaxdyn.systems import LagrangianSystem
+
+TIGHT = {"rtol": 1e-12, "atol": 1e-12}
+
+
+def motion(scene, state, ts, **options):
+    """Solution from a start, with energies and residuals; it must have succeeded and stayed on the constraints."""
+    options = TIGHT | options
+
+    @quick
+    def run(scene, q, v, ts):
+        return simulate(scene, q, v, ts, outputs=("energy", "constraint_residual"), **options)
+
+    solution = run(scene, *state, jnp.asarray(ts))
+    assert bool(solution.success)
+    assert float(solution.constraint_residual.max()) <= 1e-12
+    return solution
+
+
+def drift(solution) -> float:
+    return float(jnp.max(jnp.abs(solution.energy - solution.energy[0])))
+
+
+def test_a01_pendulum_in_plane():
+    """IFToMM A01: exact positions (elliptic functions), energy error below 1e-9 J over 10 s."""
+    found = motion(scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(), [0.0, 1.0, 5.0, 9.99, 10.0])
+    want = [
+        [-1.0, 0.0],
+        [0.986291751131875319, -0.165010853125541169],
+        [-0.942305435043757335, -0.334754338414000581],
+        [-0.316436469913032291, -0.948613704575776519],
+        [-0.27508746257611686, -0.961419205099125064],
+    ]
+    np.testing.assert_allclose(found.q, want, atol=1e-10)
+    assert drift(found) < 1e-9
+
+
+def test_car_axis():
+    """Moving constraints, all components at t = 3 (published, quadruple precision)."""
+    found = motion(scenes.car_axis(), scenes.car_axis.start(), [0.0, 3.0], rtol=1e-11, atol=1e-11)
+    q = [0.493455784275402809122e-1, 0.496989460230171153861, 0.104174252488542151681e1, 0.373911027265361256927]
+    v = [-0.770583684040972357970e-1, 0.744686658723778553466e-2, 0.175568157537232222276e-1, 0.770341043779251976443]
+    np.testing.assert_allclose(found.q[-1], q, atol=1e-9)
+    np.testing.assert_allclose(found.v[-1], v, atol=1e-9)
+
+
+def test_andrews():
+    """Positions published to 1e-10, velocities to 5e-8 relative; the energy balance is exact."""
+    found = motion(scenes.andrews(), scenes.andrews.start(), [0.0, 0.01, 0.02, 0.03], atol=1e-13)
+    q = [15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948]
+    q += [0.5244099658805304, 0.5347301163226948, 1.048080741042263]
+    v = [1139.920302151208, -1424.379294994111, 11.03291221937134, 19.29337464421385]
+    v += [0.5735699284790808, -19.29337464421385, 0.3231791658026955]
+    np.testing.assert_allclose(found.q[-1], q, rtol=1e-9)
+    np.testing.assert_allclose(found.v[-1], v, rtol=6e-8)  # the published ones are off by 5.1e-8
+    beta = [2.16011313153, 8.18490588966, 15.81077119516]
+    np.testing.assert_allclose(found.q[1:, 0], beta, rtol=1e-11)
+    assert drift(found) < 1e-11
+
+
+def test_chaplygin_sleigh():
+    """tanh and sech: printed state at t = 10."""
+    found = motion(scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start(), [0.0, 1.0, 2.0, 5.0, 10.0])
+    np.testing.assert_allclose(found.q[-1], [-8.600842105481, -0.4306517115655, 3.570508149338], atol=1e-10)
+    np.testing.assert_allclose(found.v[-1], [1.169390226108, 0.0, 0.00670176830728], atol=1e-10)
+
+
+def test_knife_edge_on_an_incline():
+    """A cycloid: it does not go downhill on average."""
+    t = np.array([0.0, 1.0, 5.0, 10.0])
+    found = motion(scenes.knife_edge_on_incline(), scenes.knife_edge_on_incline.start(), t)
+    scale, turn = 9.81 * 0.5 / 8.0, 2.0 * t
+    np.testing.assert_allclose(found.q[:, 0], scale * np.sin(turn) ** 2, atol=1e-10)
+    np.testing.assert_allclose(found.q[:, 1], scale * (turn - np.sin(2 * turn) / 2), atol=1e-10)
+
+
+@pytest.mark.slow
+def test_ball_on_a_turntable():
+    """A circle at 2/7 of the table's rate: back at the start after 7 pi/3 s; the drive moves the table."""
+    rate = 3.0
+    ts = np.linspace(0.0, 7 * np.pi / rate, 5)
+    found = motion(scenes.ball_on_turntable(rate=rate), scenes.ball_on_turntable.start(rate=rate), ts)
+    np.testing.assert_allclose(found.q[-1, 1:4], found.q[0, 1:4], atol=1e-10)
+    np.testing.assert_allclose(found.q[:, 0], rate * ts, atol=1e-10)
+    # Radius |v| / (2/7 rate), centre to the left of the velocity.
+    center = np.array([1.0, 0.0]) - np.array([0.5, 0.0]) / (2 * rate / 7)
+    np.testing.assert_allclose(np.hypot(*(found.q[:, 1:3] - center).T), 0.5 / (2 * rate / 7), atol=1e-10)
+
+
+@pytest.mark.slow
+def test_coin_on_a_steady_circle():
+    """Problem 3.10: the radius is constant over a turn, and the start is reached again."""
+    found = motion(scenes.rolling_coin(), scenes.rolling_coin.start(), np.linspace(0.0, 5.852173782956319, 9))
+    np.testing.assert_allclose(np.hypot(found.q[:, 0], found.q[:, 1]), 0.4956422128626671, atol=1e-10)
+    np.testing.assert_allclose(found.q[-1, :3], found.q[0, :3], atol=1e-10)
+    np.testing.assert_allclose(np.abs(found.v), np.abs(found.v[:1]).repeat(9, 0), atol=1e-10)
+
+
+def test_rolling_disk_rolls_on_a_circle():
+    """Radius rho phidot / thetadot, and the torques' closed form for constant ones along a straight line."""
+    rho, steer, roll = 0.5, 1.0, 2.0
+    t = np.linspace(0.0, 5.0, 6)
+    found = motion(scenes.rolling_disk(radius=rho), scenes.rolling_disk.start(radius=rho), t)
+    want = np.stack([rho * roll / steer * np.sin(steer * t), rho * roll / steer * (1 - np.cos(steer * t))], 1)
+    np.testing.assert_allclose(found.q[:, :2], want, atol=1e-10)
+
+
+def window_angle(count, ts):
+    """Exact motion of the parallelogram branch of A02: I th'' = g G sin th."""
+    moment, pull = (count + 1) / 3 + count, (count + 1) / 2 + count
+    system = lambda t, y: [y[1], 9.81 * pull / moment * np.sin(y[0])]  # noqa: E731
+    return solve_ivp(system, (0.0, ts[-1]), [0.0, 1.0], method="DOP853", rtol=1e-13, atol=1e-13, t_eval=ts).y[0]
+
+
+def test_a02_windows_pass_their_singular_positions():
+    """N = 2 over 10 s and four singular passages, top 0 to 1e-7. Fixed steps: near the singular position the stages of
+    a step, a little off the constraints, make an error estimate that small tolerances cannot meet.
+    """
+    ts = np.linspace(0.0, 10.0, 5)
+    start = scenes.windows.start(count=2)
+    found = motion(scenes.windows(count=2), start, ts, stepsize=0.01, solver=diffrax.Dopri8())
+    want, got = window_angle(2, ts), -np.asarray(found.q[:, 0])
+    np.testing.assert_allclose(np.sin(got), np.sin(want), atol=1e-7)
+    np.testing.assert_allclose(np.cos(got), np.cos(want), atol=1e-7)
+    np.testing.assert_allclose(found.q[:, 1], -found.q[:, 0], atol=1e-7)  # couplers do not turn
+    assert drift(found) < 1e-6
+
+
+@pytest.mark.slow
+def test_a02_forty_windows():
+    """N = 40: top 0 to 1e-6, energy to 1e-4 J."""
+    ts = np.linspace(0.0, 10.0, 3)
+    found = motion(scenes.windows(count=40), scenes.windows.start(count=40), ts, stepsize=0.005)
+    want, got = window_angle(40, ts), -np.asarray(found.q[:, 0])
+    np.testing.assert_allclose(np.sin(got), np.sin(want), atol=1e-6)
+    np.testing.assert_allclose(np.cos(got), np.cos(want), atol=1e-6)
+    assert drift(found) < 1e-4
+
+
+@pytest.mark.parametrize(("solver", "order"), [(diffrax.Tsit5(), 5), (diffrax.Dopri8(), 8), (diffrax.Kvaerno5(), 5)])
+def test_projection_keeps_the_order(solver, order):
+    """Error of the spherical pendulum at t = 1 under halved steps, and of a save point between steps."""
+    scene, (q, v) = scenes.spherical_pendulum(), scenes.spherical_pendulum.start()
+    ts = jnp.asarray([0.0, 0.53, 1.0])
+
+    @quick
+    def run(step):
+        return simulate(scene, q, v, ts, stepsize=step, solver=solver, rtol=1e-12, atol=1e-12, max_steps=512).q
+
+    exact = quick(lambda: simulate(scene, q, v, ts, rtol=1e-13, atol=1e-13).q)()
+    steps = [0.1, 0.05] if order == 8 else [0.05, 0.025]
+    errors = [np.abs(run(step)[-1] - exact[-1]).max() for step in steps]
+    assert np.log2(errors[0] / errors[1]) > order - 0.6
+    np.testing.assert_allclose(jnp.sum(run(steps[1]) ** 2, axis=1), 1.0, atol=1e-13)  # dense output is projected too
+
+
+def test_without_projection_the_constraint_opens():
+    """The same accelerations, method "multipliers": the residual is that of the integration and not zero."""
+    scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start()
+
+    @quick
+    def run():
+        options = {"rtol": 1e-8, "atol": 1e-8, "outputs": ("constraint_residual", "multipliers")}
+        return simulate(scene, q, v, jnp.asarray([0.0, 10.0]), method="multipliers", **options)
+
+    found = run()
+    assert 1e-9 < float(found.constraint_residual[-1, 0]) < 1e-3
+    want = -(found.v**2).sum(1) + 9.81 * found.q[:, 1]
+    np.testing.assert_allclose(found.multipliers[:, 0], want / (found.q**2).sum(1), rtol=1e-12)
+
+
+def test_gradients_through_the_projected_motion():
+    """d(final state)/d(start, mass, gravity, length) in reverse and forward mode, by differences."""
+    ts = jnp.asarray([0.0, 0.7])
+
+    def final(x, adjoint="reverse"):
+        q, v = scenes.pendulum_in_plane.start(angle=0.4, rate=0.5)
+        scene = scenes.pendulum_in_plane(gravity=9.81 + x[0], length=1.0 + x[1])
+        turn = jnp.stack([jnp.cos(x[2]), jnp.sin(x[2])])
+        q, v = (jnp.stack([turn[0] * p[0] - turn[1] * p[1], turn[1] * p[0] + turn[0] * p[1]]) for p in (q, v))
+        speed = v * (1.0 + x[3])
+        return simulate(scene, q * (1.0 + x[1]), speed, ts, stepsize=0.02, adjoint=adjoint).q[-1]
+
+    x = jnp.zeros(4)
+    reverse = quick(jax.jacrev(final))(x)
+    forward = quick(jax.jacfwd(lambda x: final(x, "forward")))(x)
+    np.testing.assert_allclose(reverse, forward, atol=1e-12)
+    run, h = quick(final), 1e-4
+    for k in range(4):
+        e = jnp.zeros(4).at[k].set(h)
+        slope = (8 * (run(e) - run(-e)) - (run(2 * e) - run(-2 * e))) / (12 * h)
+        np.testing.assert_allclose(reverse[:, k], slope, atol=1e-9)
+    assert (np.abs(reverse).max(0) > 1e-3).all()
+
+
+def test_bad_starts_and_methods_are_refused():
+    scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start()
+    ts = np.array([0.0, 1.0])
+    with pytest.raises(
+        ValueError, match=r"'rod' open by 0.0[0-9]+ \(position residual .* jd.assemble\(scene, q0, v0\)"
+    ):
+        simulate(scene, 0.95 * q, v, ts)
+    with pytest.raises(ValueError, match="'rod' slips at 0.3"):
+        simulate(scene, q, v + jnp.asarray([0.3, 0.0]), ts)
+    with pytest.raises(ValueError, match="scene with constraints takes 'auto' or 'multipliers', 'projected'"):
+        simulate(scene, q, v, ts, method="free")
+    with pytest.raises(ValueError, match="scene without constraints takes 'auto' or 'free'"):
+        simulate(Scene(scene.system), q, v, ts, method="projected")
+    with pytest.raises(ValueError, match="'rod', 'wall' remove all freedom: 2 independent rows for nv = 2"):
+        simulate(Scene(scene.system, (*scene.constraints, Holonomic(lambda q, t: q[1], name="wall"))), q, v, ts)
+    codes = quick(lambda q: simulate(scene, q, v, jnp.asarray(ts), stepsize=0.1).result == RESULTS.inconsistent_start)
+    assert [bool(codes(x * q)) for x in (0.9, 1.0)] == [True, False]
+
+
+def test_a_joint_lock_holds_a_moving_mechanism():
+    """A lock on one joint of a double pendulum leaves a rigid pendulum: its period's angle by the reduced equation."""
+    system = LagrangianSystem(double_pendulum, 2)
+    scene = Scene(system, (Holonomic(lambda q, t: q[1] - q[0], name="rigid"),))
+    t = np.array([0.0, 1.0, 2.0])
+    found = motion(scene, (jnp.asarray([0.5, 0.5]), jnp.zeros(2)), t)
+    # Two unit masses at 1 and 2 m: 5 thdd = -3 g sin(th).
+    want = solve_ivp(
+        lambda t, y: [y[1], -3 * 9.81 / 5 * np.sin(y[0])],
+        (0, 2),
+        [0.5, 0],
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-13,
+        t_eval=t,
+    ).y[0]
+    np.testing.assert_allclose(found.q, np.stack([want, want], 1), atol=1e-10)
+    with pytest.raises(ValueError, match="acts on joints, and a LagrangianSystem has none"):
+        simulate(Scene(system, (lock_joint("1"),)), jnp.zeros(2), jnp.zeros(2), t)
+
+
+def double_pendulum(q, v):
+    rates = v[0] * jnp.stack([jnp.cos(q[0]), jnp.sin(q[0])]), v[1] * jnp.stack([jnp.cos(q[1]), jnp.sin(q[1])])
+    heights = -jnp.cos(q[0]), -jnp.cos(q[0]) - jnp.cos(q[1])
+    kinetic = 0.5 * (jnp.sum(rates[0] ** 2) + jnp.sum((rates[0] + rates[1]) ** 2))
+    return kinetic - 9.81 * (heights[0] + heights[1])
