@@ -3,12 +3,26 @@
 from jaxdyn import identify as identify
 from jaxdyn import inertia as inertia
 from jaxdyn import robots as robots
+from jaxdyn import scenes as scenes
 from jaxdyn import se2 as se2
 from jaxdyn import se3 as se3
 from jaxdyn import so3 as so3
+from jaxdyn.assembly import assemble as assemble
 from jaxdyn.building import ModelBuilder as ModelBuilder
 from jaxdyn.building import inertia_report as inertia_report
 from jaxdyn.building import repair_inertias as repair_inertias
+from jaxdyn.constrained import constrained_dynamics as constrained_dynamics
+from jaxdyn.constrained import projections as projections
+from jaxdyn.constrained import second_fundamental_form as second_fundamental_form
+from jaxdyn.constraints import Holonomic as Holonomic
+from jaxdyn.constraints import Pfaffian as Pfaffian
+from jaxdyn.constraints import distance as distance
+from jaxdyn.constraints import gear as gear
+from jaxdyn.constraints import knife_edge as knife_edge
+from jaxdyn.constraints import lock_joint as lock_joint
+from jaxdyn.constraints import loop as loop
+from jaxdyn.constraints import rolling_sphere as rolling_sphere
+from jaxdyn.constraints import rolling_wheel as rolling_wheel
 from jaxdyn.dynamics import bias_force as bias_force
 from jaxdyn.dynamics import center_of_mass as center_of_mass
 from jaxdyn.dynamics import centroidal_momentum as centroidal_momentum
@@ -55,5 +69,7 @@ from jaxdyn.scene import Scene as Scene
 from jaxdyn.simulate import RESULTS as RESULTS
 from jaxdyn.simulate import Solution as Solution
 from jaxdyn.simulate import simulate as simulate
+from jaxdyn.systems import ExplicitSystem as ExplicitSystem
+from jaxdyn.systems import LagrangianSystem as LagrangianSystem
 
 __version__ = "0.1.0"

@@ -90,6 +90,11 @@ def bias_force(model: Model, q: Array, v: Array) -> Array:
     return _choose(model, recursive.bias_force, _bias_by_matrices, q, v)
 
 
+def gravity_force(model: Model, q: Array) -> Array:
+    """N, (nv,)."""
+    return _choose(model, recursive.gravity_force, matrix_form.gravity_force, q)
+
+
 def _bias_by_matrices(model, q, v):
     return matrix_form.inverse_dynamics(model, q, v, None)
 

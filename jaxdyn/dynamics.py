@@ -66,7 +66,7 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float
     if isinstance(model, System):
         return model.gravity_force(q, checked_time(model, t, q=q))
     check_shapes(model, q=q)
-    return matrix_form.gravity_force(model, q)
+    return _dispatch.gravity_force(model, q)
 
 
 def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"]:

@@ -128,6 +128,14 @@ def bias_force(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> 
     return stack(_joint_forces(model, moves, _body_wrenches(model, bodies, moves, v)), q)
 
 
+def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """Gravity force N = +dV/dq (nv,): `rnea` at rest, whose velocity terms are not computed."""
+    check_shapes(model, q=q)
+    bodies = canonical_bodies(model)
+    moves = place_joints(model, bodies, q)
+    return stack(_joint_forces(model, moves, _body_wrenches(model, bodies, moves, None)), q)
+
+
 def aba(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
     """Forward dynamics a = M^-1 (tau - C v - N) by the articulated-body algorithm.
 

@@ -48,7 +48,7 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a simulation ended: diffrax's codes and two more."""
+    """How a simulation ended: diffrax's codes and four more."""
 
     nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
     nonfinite_state = "The state became NaN or infinite."
@@ -59,8 +59,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 _ADVICE = {
     "max_steps_reached": "raise max_steps (now {max_steps}), loosen rtol and atol, or take an implicit solver if stiff",
     "dt_min_reached": "the acceleration is NaN or grows without bound: look for a singular mass matrix (a joint that "
-    "moves no inertia) or a force or control that is not finite there; or constraints whose rows lose rank on the way, which fixed steps "
-    "pass (stepsize=0.01); or rtol and atol are below the rounding error",
+    "moves no inertia) or a force or control that is not finite there; or constraints whose rows lose rank on the way, "
+    "which fixed steps pass (stepsize=0.01); or rtol and atol are below the rounding error",
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",

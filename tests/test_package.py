@@ -31,19 +31,19 @@ LAYERS = (
     "lagrange geometry",
     "constraints constrained reduced",
     "contact grasp",
-    "control",
+    "control excitation",
     "solvers simulate",
     "identify",
     "scenes",
     "io scale",
-    "report",
+    "report plotting",
     "cli demo __main__",
 )
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer.split()}
 PROGRAMS = set(LAYERS[-1].split())
 ABOVE_DYNAMICS = {name for name, rank in RANK.items() if rank > RANK["dynamics"]}
 ABOVE_CONTROL = {name for name, rank in RANK.items() if rank > RANK["control"]}
-FILES_AND_PLOTS = {"io", "report"} | PROGRAMS
+FILES_AND_PLOTS = {"io", "report", "plotting"} | PROGRAMS
 
 # Two implementations that check each other share nothing above the kinematics.
 INDEPENDENT = [("matrix_form", "recursive"), ("link_form", "matrix_form"), ("link_form", "recursive")]

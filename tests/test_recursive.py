@@ -32,6 +32,7 @@ def everything(model):
         return {
             "rnea": recursive.rnea(model, q, v, a),
             "bias": recursive.bias_force(model, q, v),
+            "gravity": recursive.gravity_force(model, q),
             "aba": recursive.aba(model, q, v, tau),
             "crba": recursive.crba(model, q),
             "sqrt": recursive.mass_matrix_sqrt(model, q),
@@ -59,6 +60,7 @@ def test_against_pinocchio(name):
         mass = np.triu(mass) + np.triu(mass, 1).T
         assert_close(got["rnea"][i], pin.rnea(source, data, q_pin, vi, ai), 1e-11, "rnea")
         assert_close(got["bias"][i], pin.nonLinearEffects(source, data, q_pin, vi), 1e-11, "bias")
+        assert_close(got["gravity"][i], pin.computeGeneralizedGravity(source, data, q_pin), 1e-11, "gravity")
         assert_close(got["aba"][i], pin.aba(source, data, q_pin, vi, ti), 1e-10, "aba")
         assert_close(got["crba"][i], mass, 1e-11, "crba")
         assert_close(got["inverse"][i], np.linalg.solve(mass, ti), 1e-10, "inverse")
