@@ -167,8 +167,10 @@ def simulate(
     _check_state(scene, q0, v0)
     _check_times(ts)
     if chosen_method(scene, method) != "free" and is_concrete((scene, q0, v0, ts)):
-        state = [jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])]
-        check_start(scene, *state)
+        # Inside a jit, jax would trace operations on known numbers too.
+        with jax.ensure_compile_time_eval():
+            state = [jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])]
+            check_start(scene, *state)
     control = None if control is None else as_pytree(control, "control")
     solver = checked_method(solver, stepsize)
     adjoint = checked_adjoint(adjoint, solver)

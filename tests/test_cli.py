@@ -149,7 +149,7 @@ def test_simulate_a_batch_with_seed_and_plot(arm, tmp_path, capsys):
 
 
 def test_a_simulation_that_stops_early_is_exit_status_1(arm, capsys):
-    assert main(["simulate", str(arm), "--duration", "1", "--max-steps", "3"]) == 1
+    assert main(["simulate", str(arm), "--duration", "1", "--max-steps", "3", "--q0", "shoulder=0.5"]) == 1
     assert "1 of 1 motions stopped early" in capsys.readouterr().out
 
 
@@ -241,7 +241,7 @@ def test_identify_recovers_a_simulated_arm(arm, tmp_path, capsys):
         (["identify", "--urdf", "ARM", "--log", "SHORT"], "lock"),
         (["identify", "--urdf", "ARM", "--log", "NAN"], "nan"),
         (["identify", "--urdf", "ARM", "--log", "BACK"], "time does not increase"),
-        (["identify", "--urdf", "ARM", "--log", "GOOD", "--train", "1"], "fraction"),
+        (["identify", "--urdf", "ARM", "--log", "LONG", "--train", "1"], "fraction"),
         (
             ["identify", "--urdf", "ARM", "--log", "GOOD", "--method", "least-squares", "--out", "x.urdf"],
             "least squares",
@@ -255,6 +255,7 @@ def test_bad_input_is_one_line_and_exit_status_2(arguments, words, arm, tmp_path
         "SHORT": "t,q1,tau1\n0,0,0\n1,0,0\n",
         "NAN": header + "0,0,nan,0,0,0,0\n1,0,0,0,0,0,0\n",
         "BACK": header + "0,0,0,0,0,0,0\n0,0,0,0,0,0,0\n",
+        "LONG": header + "".join(f"{0.01 * i},0,0,0,0,0,0\n" for i in range(400)),
         "GOOD": header + "".join(f"{0.01 * i},0,0,0,0,0,0\n" for i in range(20)),
     }
     places = {"ARM": str(arm)}

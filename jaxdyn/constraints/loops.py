@@ -275,7 +275,8 @@ class JointLock(Constraint):
 
     def sizes(self, system, dtype):
         """One row per degree of freedom of the joint."""
-        kind = system.topology.kinds[joint_index(self.name, system, self.joint)]
+        i = joint_index(self.name, system, self.joint)  # refuses systems without joints
+        kind = system.topology.kinds[i]
         if self.value.shape != (KINDS[kind].nq,):
             raise ValueError(
                 f"{self.name!r}: value has shape {self.value.shape}, but joint {self.joint!r} is {kind} with "
