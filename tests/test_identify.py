@@ -473,11 +473,6 @@ def test_trajectory_fit_recovers_a_mass_without_noise():
     assert min(masses) > 0 and len(masses) == len(fit.history)
     errors = [max(identify.trajectory_error(model, log, **options)) for model in (nominal, fit.model)]
     assert errors[0] > 1 and errors[1] < 1e-6
-    # A motion that runs away from the start: the loss is not finite, and the model given comes back.
-    broken = identify.Log(log.t, log.q, log.v, None, 1e200 * log.tau)
-    fit = identify.fit_trajectory(nominal, broken, inertia="mass", **options)
-    assert fit.result == "not_finite"
-    np.testing.assert_allclose(fit.model.inertias, nominal.inertias, rtol=1e-12)
     with pytest.raises(ValueError, match="substeps is 0"):
         identify.rollout(nominal, log, substeps=0)
     with pytest.raises(ValueError, match="substeps and stepsize both"):
