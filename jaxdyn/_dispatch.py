@@ -92,6 +92,8 @@ def bias_force(model: Model, q: Array, v: Array) -> Array:
 
 def gravity_force(model: Model, q: Array) -> Array:
     """N, (nv,)."""
+    if model.gravity is None:
+        return jnp.zeros((model.nv,), model.home.dtype)
     return _choose(model, recursive.gravity_force, matrix_form.gravity_force, q)
 
 
