@@ -324,18 +324,23 @@ def test_every_iterate_is_feasible_and_the_optimum_is_one(wrong_iiwa, noisy, met
     assert min(lowest) > 0 and min(positive) >= 0
     np.testing.assert_array_equal(fit.history, losses)
     assert newton.result == "converged" and len(newton.history) < 60
-    # First-order methods creep along the narrow valley of such a loss: in 3000 steps they come from 1e7 to within this
-    # factor of the minimum, and never below it.
-    factor = {"newton": 1.0, "lbfgs": 1.1, "adam": 10.0}[method]
-    assert newton.history[-1] <= fit.history.min() <= newton.history[-1] * factor
+    # The loss begins at 1e7. Newton's tolerance is 1e-6 above the minimum; the others come this close, and never below it.
+    share = {"newton": 0.0, "lbfgs": 1e-5, "adam": 1e-5}[method]
+    assert -1e-6 <= fit.history.min() - newton.history[-1] <= share * newton.history[-1]
 
 
 def test_prior_decides_between_data_and_nominal(arm):
     """A strong prior keeps the nominal bodies; the weaker it is, the better the fit and the larger the divergence."""
     log = pinocchio_log(planar_arm(1.4, 0.5), noise=0.1)
-    fits = [identify.fit_torques(arm, log, prior=prior) for prior in (1e13, 1e2, 1.0)]
-    np.testing.assert_allclose(fits[0].model.inertias, arm.inertias, rtol=1e-4, atol=1e-6)
-    assert fits[0].error(log) > fits[1].error(log) > fits[2].error(log)
+    priors = (1e13, 1e12, 1e2, 1.0)
+    fits = [identify.fit_torques(arm, log, prior=prior) for prior in priors]
+    assert fits[0].error(log) > fits[2].error(log) > fits[3].error(log)
+    # Close to the nominal bodies the way from them is the slope of the data over the prior: to first order, priors share it
+    # in inverse proportion, and the second order is the relative size of the way.
+    ways = [np.asarray(fit.model.inertias - arm.inertias) for fit in fits]
+    size = np.abs(ways[1]).max() / np.abs(np.asarray(arm.inertias)).max()
+    assert 0 < size < 1e-3
+    np.testing.assert_allclose(10 * ways[0], ways[1], rtol=0, atol=10 * size * np.abs(ways[1]).max())
     assert all(fit.result == "converged" for fit in fits)
 
 
@@ -473,6 +478,11 @@ def test_trajectory_fit_recovers_a_mass_without_noise():
     assert min(masses) > 0 and len(masses) == len(fit.history)
     errors = [max(identify.trajectory_error(model, log, **options)) for model in (nominal, fit.model)]
     assert errors[0] > 1 and errors[1] < 1e-6
+    # A motion that runs away from the start: the loss is not finite, and the model given comes back.
+    broken = identify.Log(log.t, log.q, log.v, None, 1e200 * log.tau)
+    fit = identify.fit_trajectory(nominal, broken, inertia="mass", **options)
+    assert fit.result == "not_finite"
+    np.testing.assert_allclose(fit.model.inertias, nominal.inertias, rtol=1e-12)
     with pytest.raises(ValueError, match="substeps is 0"):
         identify.rollout(nominal, log, substeps=0)
     with pytest.raises(ValueError, match="substeps and stepsize both"):

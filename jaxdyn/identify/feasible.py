@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxdyn import inertia as _inertia
 from jaxdyn.identify.chart import Chart, Coordinates, make_chart, positive_terms
 from jaxdyn.identify.friction import TERMS, check_terms
-from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.identify.logs import Log, check_log, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
 from jaxdyn.identify.regression import condense, free_columns, noise_level
 from jaxdyn.identify.result import Fit
@@ -52,7 +52,7 @@ def fit_torques(
     sigma: float | None = None,
     method: Any = "newton",
     steps: int | None = None,
-    learning_rate: float = 0.01,
+    learning_rate: float = 0.1,
     tolerance: float = 1e-6,
     callback: Callable[[int, float, Model], None] | None = None,
 ) -> Fit:
@@ -75,7 +75,8 @@ def fit_torques(
     - `prior`: weight of the divergence; 1 counts it like one observation of each body. `sigma`: torque noise (N m);
       by default the residual of the unconstrained least squares.
     - `method`: "newton" (the loss is convex in x, and this finds its one minimum in some tens of steps), "lbfgs" or
-      "adam" (optax), or any optax.GradientTransformation. `steps`: the most steps. `learning_rate`: of adam.
+      "adam" (optax), or any optax.GradientTransformation. `steps`: the most steps. `learning_rate`: of
+      adam, a share of the way that the curvature foresees.
       `tolerance`: newton stops when the loss is within this of its minimum; lbfgs at this relative change in ten steps.
     - `callback(step, loss, model)`: called before every step with the model at that point.
 
@@ -100,24 +101,24 @@ def fit_torques(
     if isinstance(method, str) and method == "newton":
         chart, point, history, result = _newton(model, problem, point, steps, tolerance, callback)
     else:
-        start, scaling = _whitening(problem, point)
-        _, unflatten = ravel_pytree(point)
+        start, unflatten = ravel_pytree(point)
 
         def report(step, value, y):
             if callback is not None:
-                callback(step, value, chart.fitted(model, unflatten(start + scaling @ y))[0])
+                callback(step, value, chart.fitted(model, unflatten(y))[0])
 
         y, history, result = minimise(
             _flat_loss,
-            jnp.zeros_like(start),
-            (problem, point, start, scaling),
+            start,
+            (problem, point),
             method=method,
             steps=steps,
             learning_rate=learning_rate,
             tolerance=tolerance,
+            scaling=lambda y: _whitening(problem, unflatten(y)),
             callback=report,
         )
-        point = unflatten(start + scaling @ y)
+        point = unflatten(y)
     fitted, friction = chart.fitted(model, chart.settled(point))
     name = method if isinstance(method, str) else type(method).__name__
     return Fit(fitted, friction, model, history, result, f"torque fit by {name}", terms, sigma)
@@ -126,7 +127,7 @@ def fit_torques(
 def _problem(model, log, terms, v_s, inertia, weights, prior, sigma):
     condensed = condense(model, log, v_s=v_s, weights=weights)
     tau = np.asarray(log.tau, np.float64)
-    rms = [np.sqrt(np.mean(np.asarray(x, np.float64) ** 2, axis=0)) for x in (tau, log.v, log.a)]
+    rms = [root_mean_square(x) for x in (tau, log.v, log.a)]
     if sigma is None:
         sigma = max(noise_level(condensed), _FINEST * float(np.sqrt(np.mean(tau**2))))
     if not sigma > 0:
@@ -274,17 +275,16 @@ def _upper_root(matrix):
 
 @eqx.filter_jit
 def _whitening(problem: Problem, point: Coordinates):
-    """Flat start and a matrix with which optax sees a loss of about unit curvature and a way to go of about one."""
+    """S with S S^T the inverse of the Gauss-Newton Hessian of the loss."""
     y, unflatten = ravel_pytree(point)
     rows = problem.R @ jax.jacfwd(lambda y: problem.chart.parameters(unflatten(y)))(y)
-    values, vectors = jnp.linalg.eigh(rows.T @ rows)
-    # Nothing is stretched so far that one unit leaves the neighbourhood in which exponentials behave.
-    fall = 2 * torque_loss(point, problem)
-    values = jnp.maximum(values, fall)
-    return y, vectors * jnp.sqrt(fall / values)[None, :]
+    bent = jax.hessian(lambda y: problem.chart.divergence(unflatten(y).theta))(y)
+    values, vectors = jnp.linalg.eigh(rows.T @ rows + problem.prior * (bent + bent.T) / 2)
+    # Terms that the log does not show have no curvature, and far from the nominal bodies that of the prior can be negative.
+    return vectors / jnp.sqrt(jnp.maximum(values, problem.prior))[None, :]
 
 
 def _flat_loss(y, args):
-    problem, point, start, scaling = args
+    problem, point = args
     _, unflatten = ravel_pytree(point)
-    return torque_loss(unflatten(start + scaling @ y), problem)
+    return torque_loss(unflatten(y), problem)

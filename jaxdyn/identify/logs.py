@@ -201,3 +201,10 @@ def _check_signals(signals: dict) -> None:
 def _select(log: Log, rows) -> Log:
     values = {f.name: getattr(log, f.name) for f in dataclasses.fields(log) if f.name != "joint_names"}
     return Log(**{k: None if x is None else x[rows] for k, x in values.items()}, joint_names=log.joint_names)
+
+
+def root_mean_square(samples) -> np.ndarray:
+    """Root mean square of every column of samples (n, columns), whatever their size."""
+    samples = np.asarray(samples, np.float64)
+    largest = np.abs(samples).max(axis=0, initial=0)
+    return largest * np.sqrt(np.mean((samples / np.where(largest > 0, largest, 1)) ** 2, axis=0))

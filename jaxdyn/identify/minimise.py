@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,71 +14,116 @@ from jaxtyping import Array
 METHODS = ("lbfgs", "adam")
 # Weak Wolfe conditions: enough decrease, and a slope that has flattened enough for a positive curvature pair.
 _DECREASE, _FLATTER = 1e-4, 0.9
+# Steps of a round of L-BFGS, and the number of rounds of Adam.
+_ROUND, _ADAM_ROUNDS = 20, 10
 
 
 def minimise(
-    loss: Callable, start, args, *, method, steps, learning_rate, tolerance, callback=None
+    loss: Callable, start, args, *, method, steps, learning_rate, tolerance, scaling: Callable, callback=None
 ) -> tuple[Array, np.ndarray, str]:
-    """Minimise `loss(y, args)` over y (n,) from `start`.
+    """Minimise `loss(y, args)` over y (n,) from `start`, in coordinates that follow the curvature.
+
+    The optimiser sees z with y = center + S z. "lbfgs" and "adam" work in rounds: each starts with the S and the center of
+    where the last one came to, because a metric that fits the start is a poor guide far from it.
 
     **Arguments:** `loss`, a function defined once (it is static: another one compiles again), its arrays in `args`;
-    `method`: "lbfgs", "adam", or an optax.GradientTransformation without a line search; `steps`, the most steps;
-    `learning_rate` of adam, decaying to zero along a cosine; `tolerance`: lbfgs stops once ten steps have lowered the
-    loss by less than this share of it; `callback(step, loss, y)` is called at every point, the start included.
+    `scaling(y) -> (n, n)`, for a round that starts at y: S S^T is about the inverse of the Hessian there;
+    `method`: "lbfgs", "adam", or an optax.GradientTransformation without a line search, which gets one round, since its
+    state and schedule are its own; `steps`, the most steps; `learning_rate` of adam, decaying to zero along a cosine in
+    every round; `tolerance`: lbfgs stops once a round has lowered the loss by less than this share of it;
+    `callback(step, loss, y)` is called at every point, the start included.
 
     **Returns:** the best y found; the loss at every point (steps + 1,); "converged", "max_steps" or "not_finite" (the
-    loss was not finite where a step led; the best y is a point before).
+    loss or its gradient was not finite where a step led; the best y is a point before).
 
     **Raises:** ValueError for an unknown method or numbers that are not positive.
     """
     if not (steps > 0 and learning_rate > 0 and tolerance >= 0):
         raise ValueError(f"steps={steps}, learning_rate={learning_rate}, tolerance={tolerance}; all must be positive")
     searching = isinstance(method, str) and method == "lbfgs"
-    optimizer = _optimizer(method, int(steps), float(learning_rate)) if isinstance(method, str) else method
+    length = _ROUND if searching else -(-int(steps) // _ADAM_ROUNDS) if isinstance(method, str) else int(steps)
+    optimizer = _optimizer(method, length, float(learning_rate)) if isinstance(method, str) else method
     # optax mixes python and numpy numbers with arrays, which strict promotion refuses.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        y = jnp.asarray(start)
-        value, gradient = _evaluate(loss, y, args)
-        state = optimizer.init(y)
-        history = [float(value)]
-        best, lowest, result = y, np.inf, "max_steps"
-        for step in range(steps + 1):
-            if not np.isfinite(history[-1]):
-                result = "not_finite"
-                break
-            if history[-1] < lowest:
-                best, lowest = y, history[-1]
-            if callback is not None:
-                callback(step, history[-1], y)
-            slow = len(history) > 10 and history[-11] - history[-1] <= tolerance * abs(history[-1])
-            if history[-1] == 0 or (searching and slow):
-                result = "converged"
-                break
-            if step == steps:
-                break
-            update, state = _update(optimizer, gradient, state, y)
-            if searching:
-                found = _line_search(loss, args, y, value, gradient, update)
-                if found is None:  # no decrease that rounding lets one see
-                    result = "converged"
+        best, lowest, history = jnp.asarray(start), np.inf, []
+        while True:
+            path, value, gradient = _begin(loss, args, best, scaling(best))
+            before, stalled = lowest, False
+            z = jnp.zeros_like(best)
+            state = optimizer.init(z)
+            # A round begins where the last one ended: the point is in the history already.
+            for step in range(length + 1):
+                if step > 0 or not history:
+                    history.append(float(value))
+                    if callback is not None:
+                        callback(len(history) - 1, history[-1], path.point(z))
+                if not (np.isfinite(float(value)) and bool(jnp.isfinite(gradient).all())):
+                    return best, np.array(history), "not_finite"
+                if float(value) < lowest:
+                    best, lowest = path.point(z), float(value)
+                if lowest == 0:
+                    return best, np.array(history), "converged"
+                if len(history) > steps:
+                    return best, np.array(history), "max_steps"
+                if step == length or (searching and step >= 10 and _slow(history, tolerance)):
                     break
-                y, value, gradient = found
-            else:
-                y = y + update
-                value, gradient = _evaluate(loss, y, args)
-            history.append(float(value))
-    return best, np.array(history), result
+                update, state = _update(optimizer, gradient, state, z)
+                if searching:
+                    found = _line_search(path.evaluate, z, value, gradient, update)
+                    if found is None:  # no decrease that rounding lets one see
+                        stalled = True
+                        break
+                    z, value, gradient = found
+                else:
+                    z = z + update
+                    value, gradient = path.evaluate(z)
+            if searching and before - lowest <= tolerance * lowest and (before < np.inf or stalled):
+                return best, np.array(history), "converged"
 
 
-def _line_search(loss, args, y, value, gradient, direction):
+class _Path(NamedTuple):
+    """The loss along y = center + S z."""
+
+    loss: Callable
+    args: Any
+    center: Array
+    scaling: Array
+
+    def point(self, z):
+        return self.center + self.scaling @ z
+
+    def evaluate(self, z):
+        value, gradient = _evaluate(self.loss, self.point(z), self.args)
+        return value, gradient @ self.scaling
+
+
+def _begin(loss: Callable, args, center, scaling):
+    """A path from `center`, with the loss and its gradient there.
+
+    A unit of z is the way that `scaling` foresees, but no column is longer than one unit of y: beyond that, where exponentials
+    take over, what holds at the center says nothing.
+    """
+    path = _Path(loss, args, center, scaling)
+    value, gradient = path.evaluate(jnp.zeros_like(center))
+    way = jnp.sqrt(gradient @ gradient)
+    way = jnp.where((way > 0) & jnp.isfinite(way), way, jnp.ones_like(way))
+    units = way * jnp.minimum(1, 1 / (way * jnp.linalg.norm(scaling, axis=0)))
+    return path._replace(scaling=scaling * units[None, :]), value, gradient * units
+
+
+def _slow(history, tolerance) -> bool:
+    return history[-11] - history[-1] <= tolerance * abs(history[-1])
+
+
+def _line_search(evaluate: Callable, z, value, gradient, direction):
     """Point, loss and gradient along a direction, by bracketing the weak Wolfe conditions; None when there is none."""
     slope = float(gradient @ direction)
     if not slope < 0:  # rounding has spoilt the curvature pairs
         direction, slope = -gradient, -float(gradient @ gradient)
     low, high, length, found = 0.0, np.inf, 1.0, None
     for _ in range(40):
-        point = y + length * direction
-        trial, trial_gradient = _evaluate(loss, point, args)
+        point = z + length * direction
+        trial, trial_gradient = evaluate(point)
         if not float(trial) <= float(value) + _DECREASE * length * slope:  # NaN too
             high = length
         else:

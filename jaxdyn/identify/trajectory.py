@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxdyn.dynamics import mass_matrix
 from jaxdyn.identify.chart import Chart, Coordinates, make_chart
 from jaxdyn.identify.friction import Friction, check_terms
-from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.identify.logs import Log, check_log, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
 from jaxdyn.identify.regression import regressor
 from jaxdyn.identify.result import Fit
@@ -106,7 +106,7 @@ def fit_trajectory(
     prior: float = 1e-6,
     method: Any = "lbfgs",
     steps: int = 200,
-    learning_rate: float = 0.01,
+    learning_rate: float = 0.1,
     tolerance: float = 1e-9,
     callback: Callable[[int, float, Model], None] | None = None,
     **simulation,
@@ -115,9 +115,8 @@ def fit_trajectory(
 
     Minimises mean(((q_sim - q) / q_rms)^2 + ((v_sim - v) / v_rms)^2) + prior * D, over all samples and joints, where
     each segment of the log is simulated with the measured torques from its own start (multiple shooting), q_rms and
-    v_rms are the root mean squares of each joint's motion in the log, and D is the divergence from the nominal bodies,
-    as in
-    `fit_torques`. Needs no accelerations. Short segments keep the problem close to convex and chaotic or unstable
+    v_rms are the root mean squares of each joint's motion in the log, and D is the divergence from the nominal bodies, as
+    in `fit_torques`. Needs no accelerations. Short segments keep the problem close to convex and chaotic or unstable
     motion from diverging; long ones see small errors that add up.
 
     **Arguments:**
@@ -127,9 +126,8 @@ def fit_trajectory(
     - `horizon`: steps of the log in a segment; None: the whole log is one.
     - `initial`: "measured" states start the segments; "free" ones are fitted too, for noisy measurements.
     - `hold`: torques between samples, "linear" or "previous" (a controller that holds its output).
-    - `method`: "lbfgs", "adam" or an optax.GradientTransformation; `steps`, `learning_rate`, `tolerance`, `callback` as
-      in
-      `fit_torques`.
+    - `method`: "lbfgs", "adam" or an optax.GradientTransformation; `steps`, `learning_rate`, `tolerance`, `callback`
+      as in `fit_torques`.
     - `substeps`: fixed steps between two samples (Tsit5 unless `solver` says otherwise); None: adaptive steps. Fixed
       steps end on every sample, where the torques have their kinks, and cost the same in every segment.
     - `simulation`: options of `jd.simulate` (solver, stepsize, rtol, atol, adjoint, max_steps).
@@ -153,29 +151,29 @@ def fit_trajectory(
     dtype = np.dtype(model.home.dtype)
     data = segments(log, horizon, dtype)
     a = np.gradient(np.asarray(log.v, np.float64), np.asarray(log.t, np.float64), axis=0) if log.a is None else log.a
-    rms = [np.sqrt(np.mean(np.asarray(x, np.float64) ** 2, axis=0)) for x in (log.tau, log.v, a)]
+    rms = [root_mean_square(x) for x in (log.tau, log.v, a)]
     chart, point = make_chart(model, terms, v_s, inertia, *rms)
     start = jnp.zeros((data.q.shape[0], 2, model.nv), dtype) if initial == "free" else None
     problem = _Problem(model, chart, data, _motion_scale(model, data), jnp.asarray(prior, dtype), hold, options)
     unknowns = _Unknowns(point, start)
     y0, unflatten = ravel_pytree(unknowns)
-    scaling = _scaling(model, chart, point, log, a, y0.size)
 
     def report(step, value, y):
         if callback is not None:
-            callback(step, value, chart.fitted(model, unflatten(y0 + scaling @ y).point)[0])
+            callback(step, value, chart.fitted(model, unflatten(y).point)[0])
 
     y, history, result = minimise(
         _flat_loss,
-        jnp.zeros_like(y0),
-        (problem, unknowns, y0, scaling),
+        y0,
+        (problem, unknowns),
         method=method,
         steps=steps,
         learning_rate=learning_rate,
         tolerance=tolerance,
+        scaling=lambda y: _scaling(problem, unflatten(y).point, log, a, y.size),
         callback=report,
     )
-    fitted, friction = chart.fitted(model, chart.settled(unflatten(y0 + scaling @ y).point))
+    fitted, friction = chart.fitted(model, chart.settled(unflatten(y).point))
     name = method if isinstance(method, str) else type(method).__name__
     return Fit(fitted, friction, model, history, result, f"trajectory fit by {name}", terms)
 
@@ -248,9 +246,9 @@ def _rollout(model, friction, data: Segments, start, hold: str, options):
 
 
 def _flat_loss(y, args):
-    problem, unknowns, y0, scaling = args
+    problem, unknowns = args
     _, unflatten = ravel_pytree(unknowns)
-    found = unflatten(y0 + scaling @ y)
+    found = unflatten(y)
     chart, data = problem.chart, problem.data
     model, friction = chart.fitted(problem.model, found.point)
     has_friction = chart.terms or model.damping is not None or model.friction is not None
@@ -273,24 +271,33 @@ def _motion_scale(model, data: Segments) -> Float[Array, "2 nv"]:
     return jnp.where(scale > 1e-3 * largest, scale, jnp.where(largest > 0, largest, jnp.ones_like(largest)))
 
 
-def _scaling(model: Model, chart: Chart, point: Coordinates, log: Log, a, size: int) -> Float[Array, "n n"]:
-    """Matrix with which the optimiser sees coordinates of about equal effect on the motion.
+def _scaling(problem: _Problem, point: Coordinates, log: Log, a, size: int) -> Float[Array, "n n"]:
+    """S with S S^T about the inverse of the Hessian of the motion error.
 
-    A change of parameters dx changes the acceleration by -M^-1 Y dx: that Jacobian's Gram matrix is whitened.
-    Directions without effect are stretched at most a thousand times.
+    A change dx of the parameters changes the acceleration by -M^-1 Y dx at first, and the velocity by that times the time
+    since the segment began. Directions without effect are stretched at most a thousand times.
     """
+    chart, span = problem.chart, float(problem.data.t[0, -1])
+    model, _ = chart.fitted(problem.model, point)
     few = np.linspace(0, len(log) - 1, min(len(log), 200)).astype(int)
     q, v, a = (np.asarray(x, model.home.dtype)[few] for x in (log.q, log.v, a))
-    M = jax.jit(jax.vmap(lambda q: mass_matrix(model, q)))(jnp.asarray(q))
-    y, unflatten = ravel_pytree(point)
-    jacobian = jax.jacfwd(lambda y: chart.parameters(unflatten(y)))(y)
-    rows = np.linalg.solve(
-        np.asarray(M, np.float64), regressor(model, q, v, a, v_s=float(chart.v_s)) @ np.asarray(jacobian)
-    )
-    rows /= np.maximum(np.sqrt(np.mean(a**2, axis=0)), 1e-3 * np.abs(a).max(initial=1e-3))[:, None]
-    rows = rows.reshape(-1, y.size)
-    values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
+    effect = regressor(model, q, v, a, v_s=float(chart.v_s)) @ np.asarray(_parameter_jacobian(chart, point), np.float64)
+    rows = np.linalg.solve(np.asarray(_mass_matrices(model, jnp.asarray(q)), np.float64), effect)
+    rows *= span / np.sqrt(3) / np.asarray(problem.scale, np.float64)[1][:, None]
+    rows = rows.reshape(-1, rows.shape[-1])
+    values, vectors = np.linalg.eigh(2 * rows.T @ rows / len(rows))
     values = np.maximum(values, 1e-6 * values.max(initial=1e-300))
     result = np.eye(size)
-    result[: y.size, : y.size] = vectors / np.sqrt(values)
-    return jnp.asarray(result, y.dtype)
+    result[: values.size, : values.size] = vectors / np.sqrt(values)
+    return jnp.asarray(result, problem.prior.dtype)
+
+
+@eqx.filter_jit
+def _mass_matrices(model: Model, q):
+    return jax.vmap(mass_matrix, (None, 0))(model, q)
+
+
+@eqx.filter_jit
+def _parameter_jacobian(chart: Chart, point: Coordinates):
+    y, unflatten = ravel_pytree(point)
+    return jax.jacfwd(lambda y: chart.parameters(unflatten(y)))(y)
