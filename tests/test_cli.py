@@ -221,6 +221,24 @@ def test_identify_recovers_a_simulated_arm(arm, tmp_path, capsys):
     np.testing.assert_allclose(report["base_parameters"]["fitted"], base.values(x), rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
+def test_identify_by_trajectory_from_a_log_taken_as_filtered(arm, tmp_path, capsys):
+    """A log that the command line itself simulated, accelerations left out: the mass error of a fifth is found."""
+    log, wrong, out = tmp_path / "log.csv", tmp_path / "wrong.urdf", tmp_path / "fitted.urdf"
+    model = jd.repair_inertias(jd.load_urdf(arm))
+    jd.save_urdf(model, tmp_path / "true.urdf")
+    jd.save_urdf(model.replace(inertias=1.2 * model.inertias), wrong)
+    motion = ["--torque", "gravity+random", "--duration", "3", "--sample", "0.01", "--friction", "0", "--seed", "2"]
+    assert main(["simulate", str(tmp_path / "true.urdf"), *motion, "--out", str(log)]) == 0
+    args = ["identify", "--urdf", str(wrong), "--log", str(log), "--filtered", "--method", "trajectory"]
+    assert main([*args, "--terms", "viscous", "--horizon", "0.1", "--out", str(out)]) == 0
+    assert "trajectory fit" in capsys.readouterr().out
+    report = json.loads(out.with_suffix(".json").read_text())
+    # The torque between two rows of the log is not what the simulation had; that error of interpolation stays.
+    errors = report["torque_error"]
+    assert errors["test_percent"] < 1 < 10 < errors["nominal_test_percent"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import pathlib
 from typing import Any
 
@@ -23,6 +24,8 @@ from jaxdyn.io import save_urdf
 from jaxdyn.io.logs import read_log
 from jaxdyn.model import Model
 
+# Of the simulation in a trajectory fit (s).
+_LONGEST_STEP = 0.0025
 HELP = "identify inertias, friction and rotor inertias from a log of positions and torques"
 DESCRIPTION = """\
 Identify link inertias, joint friction and rotor inertias from a recorded log of joint positions and torques.
@@ -99,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--horizon", type=float, default=0.25, metavar="S", help="length of the simulated pieces, s (default: 0.25)"
     )
     fit.add_argument(
-        "--steps", type=int, default=40, metavar="N", help="most steps of the trajectory fit (default: 40)"
+        "--steps", type=int, default=100, metavar="N", help="most steps of the trajectory fit (default: 100)"
     )
     files = parser.add_argument_group("output")
     files.add_argument("--out", metavar="FILE.urdf", help="write the fitted robot")
@@ -201,9 +204,8 @@ def _fit(model: Model, train: Log, args) -> Fit | LeastSquares:
         horizon=horizon,
         steps=args.steps,
         callback=show,
-        rtol=1e-6,
-        atol=1e-6,
-        max_steps=4096,
+        # Fixed steps: in a batch of segments, adaptive ones cost every segment what the stiffest needs.
+        substeps=max(1, math.ceil(dt / _LONGEST_STEP)),
     )
 
 
