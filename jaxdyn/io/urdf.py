@@ -103,8 +103,9 @@ def load_urdf(
     while stack:
         joint = urdf.joints[stack.pop()]
         stack.extend(reversed(urdf.children[joint.child]))
+        inertia = _inertia(urdf, joint.child)
         try:
-            _add_joint(builder, joint, urdf, held)
+            _add_joint(builder, joint, inertia, urdf, held)
         except ValueError as error:
             raise ValueError(f"{urdf.places[f'joint {joint.name}']}: {error}") from error
     if mimic == "couple":
@@ -134,8 +135,8 @@ def urdf_inertia_report(path: str | os.PathLike) -> list[tuple[str, str]]:
     return report
 
 
-def _add_joint(builder: ModelBuilder, joint, urdf: _Description, held: dict[str, np.ndarray]) -> None:
-    kind, name, inertia = _KINDS[joint.type], joint.child, _inertia(urdf, joint.child)
+def _add_joint(builder: ModelBuilder, joint, inertia, urdf: _Description, held: dict[str, np.ndarray]) -> None:
+    kind, name = _KINDS[joint.type], joint.child
     pose = np.eye(4) if joint.origin is None else joint.origin
     parent, axis, turn = joint.parent, _Z, np.eye(4)
     if kind in SCREW_KINDS or kind == "planar":
