@@ -14,6 +14,8 @@ from jaxdyn.building import repair_inertias as repair_inertias
 from jaxdyn.constrained import constrained_dynamics as constrained_dynamics
 from jaxdyn.constrained import projections as projections
 from jaxdyn.constrained import second_fundamental_form as second_fundamental_form
+from jaxdyn.constrained_motion import Baumgarte as Baumgarte
+from jaxdyn.constrained_motion import Reduced as Reduced
 from jaxdyn.constraints import Holonomic as Holonomic
 from jaxdyn.constraints import Pfaffian as Pfaffian
 from jaxdyn.constraints import distance as distance
@@ -23,6 +25,8 @@ from jaxdyn.constraints import lock_joint as lock_joint
 from jaxdyn.constraints import loop as loop
 from jaxdyn.constraints import rolling_sphere as rolling_sphere
 from jaxdyn.constraints import rolling_wheel as rolling_wheel
+from jaxdyn.distributions import involutive as involutive
+from jaxdyn.distributions import spurious_terms as spurious_terms
 from jaxdyn.dynamics import bias_force as bias_force
 from jaxdyn.dynamics import center_of_mass as center_of_mass
 from jaxdyn.dynamics import centroidal_momentum as centroidal_momentum
@@ -43,6 +47,7 @@ from jaxdyn.forces import Drive as Drive
 from jaxdyn.forces import ExternalWrench as ExternalWrench
 from jaxdyn.forces import JointDamping as JointDamping
 from jaxdyn.forces import JointSpring as JointSpring
+from jaxdyn.gauge import gauge_invariant as gauge_invariant
 from jaxdyn.io import load_urdf as load_urdf
 from jaxdyn.io import save_urdf as save_urdf
 from jaxdyn.io import urdf_inertia_report as urdf_inertia_report
@@ -65,6 +70,8 @@ from jaxdyn.recursive import aba as aba
 from jaxdyn.recursive import crba as crba
 from jaxdyn.recursive import mass_matrix_sqrt as mass_matrix_sqrt
 from jaxdyn.recursive import rnea as rnea
+from jaxdyn.reduced import reduced_dynamics as reduced_dynamics
+from jaxdyn.reduced import tangent_basis as tangent_basis
 from jaxdyn.scene import Scene as Scene
 from jaxdyn.simulate import RESULTS as RESULTS
 from jaxdyn.simulate import Solution as Solution

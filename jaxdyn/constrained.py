@@ -21,10 +21,12 @@ from jaxtyping import Array, Float, Int
 from jaxdyn.constraints.base import Layout, Rows, holonomic_rows, layout, row_matrix, rows
 from jaxdyn.constraints.loops import Loop, relative_poses
 from jaxdyn.dynamics import bias_force, mass_matrix
+from jaxdyn.model import Model
+from jaxdyn.recursive import aba_with_columns
 from jaxdyn.scene import Scene, checked_force
 from jaxdyn.so3 import _product
 
-METHODS = ("rank_aware", "schur")
+METHODS = ("rank_aware", "schur", "range_space")
 
 
 class RESULTS(lx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -33,6 +35,7 @@ class RESULTS(lx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     singular_mass_matrix = "The mass matrix is not positive definite: a joint moves no inertia."
     dependent_rows = "The constraint rows are dependent; take method='rank_aware'."
     contradictory_rows = "No acceleration satisfies the constraint rows: they contradict each other."
+    singular_basis = "The minimal velocities do not determine the others here; choose another basis."
     not_assembled = "No configuration and velocity that satisfy the constraints were found."
 
 
@@ -82,11 +85,13 @@ def constrained_dynamics(
     - `q` (nq,), `v` (nv,), `tau` (nv,) in N m or N (None: zero), `t` in s. The scene's forces are added to tau.
     - `method`: "rank_aware" for any rows: where they are dependent the acceleration is still right and the multipliers
       are those of least norm. "schur" forms A M^-1 A^T and its Cholesky factor: faster, for independent rows.
+      "range_space" is the same without ever forming M: M^-1 is applied to the k rows by the articulated bodies of a
+      `Model`, in O(nb k) operations; for few rows on a large tree, in batches. Other systems take their dense M.
     - `rank_tol`: singular values of L^-1 A^T below `rank_tol` times the largest count as zero. Default eps^(4/7),
       1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which rows that depend on each other differ
       when loops are open by rounding and projection errors, below the least singular values of mechanisms that move.
 
-    **Returns:** `ConstrainedDynamics`. Under "schur", dependent rows give the code `dependent_rows`.
+    **Returns:** `ConstrainedDynamics`. Under "schur" and "range_space", dependent rows give the code `dependent_rows`.
 
     Differentiable any number of times where the rank is constant; the pseudo-inverse has a rule of its own, no
     factorisation is differentiated.
@@ -101,7 +106,7 @@ def constrained_dynamics(
     places = layout(scene)
     if not places:
         return _free(scene, q, v, force, t)
-    return _solve(scene, q, v, force, t, rows(scene, q, v, t), places, method, rank_tol)
+    return solve_rows(scene, q, v, force, t, rows(scene, q, v, t), method, rank_tol)
 
 
 def applied(scene: Scene, q, v, tau, t) -> Array:
@@ -118,21 +123,21 @@ def _free(scene, q, v, force, t) -> ConstrainedDynamics:
     return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
 
 
-def _solve(scene, q, v, force, t, row: Rows, places, method, rank_tol) -> ConstrainedDynamics:
+def solve_rows(
+    scene: Scene, q, v, force, t, row: Rows, method: str = "rank_aware", rank_tol: float | None = None
+) -> ConstrainedDynamics:
+    """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
+    if method == "range_space" and isinstance(scene.system, Model):
+        return _by_range_space(scene, q, v, force, row)
     factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
     columns = jnp.concatenate([row.A, (force - bias_force(scene.system, q, v, t))[None]]).T
     solved = solve_triangular(factor, columns, lower=True)
     Y, free = solved[:, :-1], solved[:, -1]
     wanted = row.gamma - _product(Y.T, free)
-    if method == "schur":
-        delassus = jnp.linalg.cholesky(_product(Y.T, Y))
-        lam = cho_solve((delassus, True), wanted)
+    if method != "rank_aware":
+        lam, result = _by_delassus(_product(Y.T, Y), wanted, scene.nv)
         pushed = _product(Y, lam)
         rank = jnp.asarray(Y.shape[1], jnp.int32)
-        pivots = jnp.diagonal(delassus)
-        # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
-        fine = jnp.min(pivots) > (10 * Y.shape[0] * _eps(Y)) ** 0.5 * jnp.max(pivots)
-        result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     else:
         inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
         pushed = _product(inverse.T, wanted)
@@ -145,7 +150,25 @@ def _solve(scene, q, v, force, t, row: Rows, places, method, rank_tol) -> Constr
         result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
     a = solve_triangular(factor, free + pushed, lower=True, trans=1)
     result = RESULTS.where(jnp.isfinite(factor).all(), result, RESULTS.singular_mass_matrix)
-    return ConstrainedDynamics(a, lam, rank, result, places)
+    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+
+
+def _by_range_space(scene, q, v, force, row: Rows) -> ConstrainedDynamics:
+    """The Schur complement from a0 and X = M^-1 A^T of one articulated-body factorisation: a = a0 + X lam."""
+    free, X = aba_with_columns(scene.system, q, v, force, row.A.T)
+    lam, result = _by_delassus(_product(row.A, X), row.gamma - _product(row.A, free), scene.nv)
+    a = free + _product(X, lam)
+    result = RESULTS.where(jnp.isfinite(free).all(), result, RESULTS.singular_mass_matrix)
+    return ConstrainedDynamics(a, lam, jnp.asarray(row.A.shape[0], jnp.int32), result, layout(scene))
+
+
+def _by_delassus(delassus, wanted, nv: int):
+    """lam with A M^-1 A^T lam = wanted by Cholesky, and whether the rows were independent."""
+    factor = jnp.linalg.cholesky(0.5 * (delassus + delassus.T))
+    pivots = jnp.diagonal(factor)
+    # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
+    fine = jnp.min(pivots) > (10 * nv * _eps(delassus)) ** 0.5 * jnp.max(pivots)
+    return cho_solve((factor, True), wanted), RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
 
 
 def constraint_forces(
@@ -250,11 +273,16 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float) -> Float[Array, "m n
 
 
 def _by_orthogonal(Y, rank_tol):
-    Q, R, order = lax.linalg.qr(Y, pivoting=True, full_matrices=False)
+    # The triangles are taken as products with Q and Z, and not from the factorisations, so that these run one after the
+    # other: two large LAPACK calls at once can wait for each other's share of XLA's thread pool for ever.
+    Q, _, order = lax.linalg.qr(Y, pivoting=True, full_matrices=False)
+    R = jnp.triu(_product(Q.T, Y[:, order]))
     pivots = jnp.abs(jnp.diagonal(R))
     keep = pivots > rank_tol * pivots[0]
     # Y[:, order] = Q R with the rows of R below the rank dropped; R^T = Z T makes what is left square and triangular.
-    Z, T = lax.linalg.qr(jnp.where(keep[:, None], R, jnp.zeros_like(R)).T, full_matrices=False)
+    left = jnp.where(keep[:, None], R, jnp.zeros_like(R)).T
+    Z, _ = lax.linalg.qr(left, full_matrices=False)
+    T = jnp.triu(_product(Z.T, left))
     T = T + jnp.diag(jnp.where(keep, jnp.zeros_like(pivots), jnp.ones_like(pivots)))
     kept = jnp.where(keep[:, None], Q.T, jnp.zeros_like(Q.T))
     inverse = _product(Z, solve_triangular(T, kept, trans=1))

@@ -1,49 +1,247 @@
-"""What `simulate` needs for scenes with constraints: method, acceleration, projection, and the check of a start."""
+"""How a scene becomes an ordinary differential equation: the methods of `simulate`, and the check of a start.
 
+A method says what the state y of the equation is, how it changes, and what is done to it after a step:
+
+    free         y = (q, v), no constraints
+    multipliers  y = (q, v), accelerations with multipliers
+    projected    the same, and q and v put back on the constraints after every step
+    baumgarte    the same as multipliers, with A a = gamma - 2 alpha psi - beta^2 phi
+    reduced      y = (q, nu), v = N(q, t) nu + v0(q, t)
+"""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxdyn.assembly import open_constraints, project_state, residuals, start_evidence
-from jaxdyn.constrained import constrained_dynamics
-from jaxdyn.constraints.base import layout
-from jaxdyn.scene import Scene
+from jaxdyn.constrained import constrained_dynamics, solve_rows
+from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
+from jaxdyn.dynamics import forward_dynamics
+from jaxdyn.reduced import Basis, Given, Orthonormal, as_basis, least_quality, minimal_velocity, reduce, tangent_basis
+from jaxdyn.scene import Scene, as_pytree
+from jaxdyn.so3 import _product
+from jaxdyn.systems import has_quaternions, retract, velocity_to_rate
 
-METHODS = ("multipliers", "projected")
+
+class Method(eqx.Module):
+    """How a scene is integrated. The state is a dictionary of arrays with the entry "q"."""
+
+    name: ClassVar[str] = "free"
+    projects: ClassVar[bool] = False
+
+    def start(self, scene: Scene, q, v, t) -> dict[str, Array]:
+        """State of the equation at (q, v)."""
+        return {"q": q, "v": v}
+
+    def place(self, scene: Scene, y, t) -> tuple[Array, Array]:
+        """q, with unit quaternions, and v of a state."""
+        return retract(scene.system, y["q"]), y["v"]
+
+    def rates(self, scene: Scene, y, q, v, t, force) -> dict[str, Array]:
+        """dy/dt; q and v are those of `place`, `force` (nv,) is tau plus the scene's forces, or None."""
+        return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
+
+    def acceleration(self, scene: Scene, q, v, t, force) -> Array:
+        """Rate of v, (nv,)."""
+        return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force, t)
+
+    def corrects(self, scene: Scene) -> bool:
+        """Whether `corrected` changes a state."""
+        return self.projects or has_quaternions(scene.system)
+
+    def corrected(self, scene: Scene, y, t) -> dict[str, Array]:
+        """The state put back after a step, or between steps where it is saved."""
+        return y | {"q": retract(scene.system, y["q"])}
+
+    def continued(self, scene: Scene, y, t) -> dict[str, Array]:
+        """The state as the next step starts from it: entries in `jumping` may have changed."""
+        return y
+
+    @property
+    def jumping(self) -> tuple[str, ...]:
+        """Entries of the state that are constant during a step."""
+        return ()
+
+    def quality(self, scene: Scene, y, t) -> Array | None:
+        """How far the state is from where the method fails (`Parametrization.quality`), None when it never does."""
+        return None
 
 
-def chosen_method(scene: Scene, method: str) -> str:
+class Free(Method):
+    """No constraints."""
+
+
+class Multipliers(Method):
+    """Accelerations with multipliers; nothing keeps the constraints from opening as the local errors add up."""
+
+    name: ClassVar[str] = "multipliers"
+
+    def acceleration(self, scene, q, v, t, force):
+        """From `constrained_dynamics`."""
+        return dynamics(scene, q, v, t, force).acceleration
+
+
+class Projected(Multipliers):
+    """Accelerations with multipliers, and the least change, in the mass metric, back onto the constraints."""
+
+    name: ClassVar[str] = "projected"
+    projects: ClassVar[bool] = True
+
+    def corrected(self, scene, y, t):
+        """q and v on the constraints, quaternions of unit length."""
+        q, v = project_state(scene, y["q"], y["v"], t)
+        return y | {"q": q, "v": v}
+
+
+class Baumgarte(Multipliers):
+    """Accelerations that pull violated rows back, for comparison: the pull is an error where it is not zero.
+
+    Holonomic rows: d2 phi/dt2 + 2 alpha dphi/dt + beta^2 phi = 0. Nonholonomic rows: d psi/dt + 2 alpha psi = 0.
+
+    **Arguments:** `alpha`, `beta`, 1/s, positive.
+
+    Source: Baumgarte (1972).
+    """
+
+    alpha: Float[Array, ""]
+    beta: Float[Array, ""]
+    name: ClassVar[str] = "baumgarte"
+
+    def __init__(self, alpha: Any = 10.0, beta: Any = 10.0):
+        self.alpha, self.beta = jnp.asarray(alpha, float), jnp.asarray(beta, float)
+
+    def acceleration(self, scene, q, v, t, force):
+        """Under the rows A a = gamma - 2 alpha psi - beta^2 phi."""
+        row, held = rows(scene, q, v, t), holonomic_rows(layout(scene))
+        alpha, beta = self.alpha.astype(q.dtype), self.beta.astype(q.dtype)
+        wanted = row.gamma - 2 * alpha * row.velocity
+        wanted = wanted.at[held].add(-(beta**2) * position_residual(scene, q, t))
+        force = jnp.zeros_like(v) if force is None else force
+        return solve_rows(scene, q, v, force, t, Rows(row.A, wanted, row.velocity)).acceleration
+
+
+class Reduced(Method):
+    """Minimal velocities nu are integrated, and q with the velocity v = N nu + v0 that they determine.
+
+    Velocities satisfy the constraints by construction. For holonomic rows q is put back on them after every step.
+
+    **Arguments:**
+
+    - `basis`: what nu is, as in `reduced_dynamics`: a tuple of indices of independent velocities, or a function N(q, t).
+      Where N becomes singular on the way the run ends with the code `singular_basis`. By default an orthonormal basis
+      that is continued from step to step, which serves as long as the rank of the rows is constant.
+    - `dof`: number of minimal velocities of the default basis. By default nv less the rank of the rows on concrete
+      numbers, and less their number on traced ones.
+    """
+
+    basis: Any
+    dof: int | None = eqx.field(static=True)
+    name: ClassVar[str] = "reduced"
+    projects: ClassVar[bool] = True
+
+    def __init__(self, basis: Any = None, *, dof: int | None = None):
+        given = callable(basis) and not isinstance(basis, Basis)
+        self.basis = Given(as_pytree(basis, "basis")) if given else basis
+        self.dof = dof
+
+    def fitted(self, scene: Scene, dof: int | None) -> "Reduced":
+        """The method with its basis made for the scene; `dof` where it is known."""
+        basis = None if self.basis is None else as_basis(self.basis, scene)
+        return Reduced(basis, dof=dof if self.dof is None else self.dof)
+
+    @property
+    def jumping(self):
+        """The reference of an orthonormal basis."""
+        return ("frame",) if self.basis is None or isinstance(self.basis, Orthonormal) else ()
+
+    def _at(self, scene, y, q, t):
+        return (Orthonormal(y["frame"]) if self.jumping else self.basis).at(scene, q, t)
+
+    def start(self, scene, q, v, t):
+        """q, nu and, for an orthonormal basis, its reference."""
+        y = {"q": q}
+        if self.jumping:
+            reference = tangent_basis(scene, q, t, dof=self.dof) if self.basis is None else self.basis.reference
+            y["frame"] = reference.astype(q.dtype)
+        return y | {"nu": minimal_velocity(self._at(scene, y, q, t), v)}
+
+    def place(self, scene, y, t):
+        """q, with unit quaternions, and v = N nu + v0."""
+        q = retract(scene.system, y["q"])
+        found = self._at(scene, y, q, t)
+        return q, _product(found.N, y["nu"]) + found.v0
+
+    def rates(self, scene, y, q, v, t, force):
+        """From the reduced equations."""
+        basis = Orthonormal(y["frame"]) if self.jumping else self.basis
+        found = reduce(Scene(scene.system, scene.constraints), basis, q, y["nu"], force, t)
+        fixed = {name: jnp.zeros_like(y[name]) for name in self.jumping}
+        return {"q": velocity_to_rate(scene.system, q, v), "nu": found.nu_rate} | fixed
+
+    def acceleration(self, scene, q, v, t, force):
+        """Rate of v."""
+        return dynamics(scene, q, v, t, force).acceleration
+
+    def corrects(self, scene):
+        """Where there are holonomic rows, quaternions, or a reference to be renewed."""
+        return bool(holonomic_rows(layout(scene)).size or self.jumping or has_quaternions(scene.system))
+
+    def corrected(self, scene, y, t):
+        """q on the holonomic constraints; nu stays."""
+        if not holonomic_rows(layout(scene)).size:
+            return super().corrected(scene, y, t)
+        q, _ = project_state(scene, y["q"], jnp.zeros((scene.nv,), y["q"].dtype), t)
+        return y | {"q": q}
+
+    def continued(self, scene, y, t):
+        """N(q) as the new reference, which leaves N(q) and nu as they are."""
+        return y | {"frame": self._at(scene, y, y["q"], t).N} if self.jumping else y
+
+    def quality(self, scene, y, t):
+        """Of N at the state."""
+        return self._at(scene, y, retract(scene.system, y["q"]), t).quality
+
+
+METHODS: dict[str, type[Method]] = {kind.name: kind for kind in (Multipliers, Projected, Reduced, Baumgarte)}
+
+
+def chosen_method(scene: Scene, method: str | Method) -> Method:
     """How to integrate: "auto" is "projected" for a scene with constraints and "free" for one without.
+
+    "projected" is the rule because it serves where the others fail: dependent rows, and places where rows lose rank on
+    the way, and needs no choice of velocities.
 
     **Raises:** ValueError for a method that does not fit the scene.
     """
-    allowed = METHODS if scene.constraints else ("free",)
+    if not scene.constraints:
+        if method in ("auto", "free") or isinstance(method, Free):
+            return Free()
+        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free'")
     if method == "auto":
-        return allowed[-1]
-    if method not in allowed:
-        kind = "with" if scene.constraints else "without"
+        return Projected()
+    if isinstance(method, Method) and not isinstance(method, Free):
+        chosen = method
+    elif isinstance(method, str) and method in METHODS:
+        chosen = METHODS[method]()
+    else:
+        names = ", ".join(map(repr, METHODS))
         raise ValueError(
-            f"method is {method!r}; a scene {kind} constraints takes 'auto' or {', '.join(map(repr, allowed))}"
+            f"method is {method!r}; a scene with constraints takes 'auto' or {names}, or jd.Reduced(...), jd.Baumgarte(...)"
         )
-    return method
+    return chosen.fitted(scene, None) if isinstance(chosen, Reduced) else chosen
 
 
-def constrained_acceleration(scene: Scene, q, v, t, force):
-    """Acceleration (nv,) under the constraints; `force` (nv,) is tau plus the scene's forces, or None."""
-    return _dynamics(scene, q, v, t, force).acceleration
-
-
-def multipliers(scene: Scene, q, v, t, force):
-    """Multipliers (nc,) at a state."""
-    return _dynamics(scene, q, v, t, force).multipliers
-
-
-def _dynamics(scene, q, v, t, force):
+def dynamics(scene: Scene, q, v, t, force):
+    """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
     return constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t)
 
 
-def onto_constraints(scene: Scene, q, v, t):
-    """q and v put back on the constraints (and quaternions to unit length) after a step."""
-    return project_state(scene, q, v, t)
+def serves(quality) -> Array:
+    """Whether a quality (see `Method.quality`) is far enough from zero, also for NaN."""
+    return jnp.abs(quality) > least_quality(quality.dtype)
 
 
 def start_limit(dtype) -> float:
@@ -56,10 +254,11 @@ def consistent(scene: Scene, q, v, t):
     return jnp.max(residuals(scene, q, v, t)) <= start_limit(q.dtype)
 
 
-def check_start(scene: Scene, q, v, t) -> None:
-    """Refuse a start that is not on the constraints, or that they hold completely; concrete numbers.
+def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
+    """The method for a start with concrete numbers, which must be on the constraints and have some freedom.
 
-    **Raises:** ValueError that names the constraints and by how much they are violated, and the fix.
+    **Raises:** ValueError that names the constraints and by how much they are violated, and the fix; for a basis that
+    does not serve at the start.
     """
     found, rank = start_evidence(scene, q, v, jnp.asarray(t, q.dtype))
     limit = start_limit(q.dtype)
@@ -75,3 +274,14 @@ def check_start(scene: Scene, q, v, t) -> None:
             f"the constraints {names} remove all freedom: {int(rank)} independent rows for nv = {scene.nv}; "
             "leave one out, or free a joint"
         )
+    if not isinstance(method, Reduced):
+        return method
+    method = method.fitted(scene, scene.nv - int(rank))
+    if method.basis is not None and not bool(_serves_at(scene, method.basis, q, jnp.asarray(t, q.dtype))):
+        raise ValueError(f"the basis does not serve at q0: {method.basis.advice(scene, q, t)}")
+    return method
+
+
+@eqx.filter_jit
+def _serves_at(scene, basis, q, t):
+    return serves(basis.at(scene, q, t).quality)

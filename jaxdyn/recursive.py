@@ -11,6 +11,7 @@ Under `jax.vmap` every number is a vector over the batch. This module and `matri
 other.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -161,6 +162,18 @@ def mass_matrix_inverse_times(model: Model, q: Float[Array, " nq"], forces: Floa
     bodies = canonical_bodies(model)
     moves = place_joints(model, bodies, q)
     return stack(solve(model, moves, factorize(model, bodies, moves), split(forces, model.topology.v_slices)), q)
+
+
+def aba_with_columns(model: Model, q, v, tau, columns):
+    """Forward dynamics a (nv,) and M^-1 times `columns` (nv, k), from one factorisation of M, in O(nb k) operations."""
+    bodies = canonical_bodies(model)
+    moves = place_joints(model, bodies, q)
+    wrenches = _body_wrenches(model, bodies, moves, v)
+    factor = factorize(model, bodies, moves)
+    slices = model.topology.v_slices
+    a = stack(solve(model, moves, factor, split(tau, slices), wrenches), q)
+    times = jax.vmap(lambda column: stack(solve(model, moves, factor, split(column, slices)), q), 1, 1)
+    return a, times(columns)
 
 
 def aba_tangent(model: Model, q, v, tau, force_change):

@@ -5,28 +5,20 @@ returned to unit length at the end of every step (`ProjectedSolver`), which keep
 without quaternions gets no projection at all.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.assembly import residuals
-from jaxdyn.constrained_motion import (
-    check_start,
-    chosen_method,
-    consistent,
-    constrained_acceleration,
-    multipliers,
-    onto_constraints,
-)
+from jaxdyn.assembly import project_state, residuals
+from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, dynamics, serves
 from jaxdyn.constraints.base import state_dtype
-from jaxdyn.dynamics import forward_dynamics, kinetic_energy, potential_energy
+from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import Model, frame_index, neutral
 from jaxdyn.scene import Scene, as_pytree, checked_force
@@ -40,7 +32,8 @@ from jaxdyn.solvers.choice import (
     progress_meter,
     stepping,
 )
-from jaxdyn.systems import has_quaternions, retract, velocity_to_rate
+from jaxdyn.solvers.inputs import as_array, check_state, check_times
+from jaxdyn.systems import retract
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
 _POSE = "pose:"
@@ -48,12 +41,13 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a simulation ended: diffrax's codes and four more."""
+    """How a simulation ended: diffrax's codes and five more."""
 
     nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
     nonfinite_state = "The state became NaN or infinite."
     inconsistent_start = "The initial state is not on the constraints."
     open_constraints = "The constraints opened, and the projection could not close them."
+    singular_basis = "The minimal velocities no longer determine the others."
 
 
 _ADVICE = {
@@ -64,6 +58,8 @@ _ADVICE = {
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
+    "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
+    "method='projected' needs none",
     "open_constraints": "tighten rtol and atol, or look for constraints that contradict each other on the way",
 }
 
@@ -106,7 +102,7 @@ def simulate(
     ts: Any,
     *,
     control: Any = None,
-    method: str = "auto",
+    method: str | Method = "auto",
     solver: Any = None,
     stepsize: Any = None,
     rtol: Any = 1e-8,
@@ -132,10 +128,13 @@ def simulate(
     - `control(q, v, t) -> (nv,)`: tau (N m or N); q comes with unit quaternions. An equinox Module or a
       `jax.tree_util.Partial` carries leaves that can be differentiated and batched; a plain function is static: define
       it once.
-    - `method`: "free" for a scene without constraints; with them "projected": accelerations with multipliers, and q and
-      v put back on the constraints after every step and at save points, by the least change in the mass metric; or
-      "multipliers": the same without the projection, so that the constraints open as the local errors add up. "auto"
-      takes "free" or "projected".
+    - `method`: "free" for a scene without constraints. With them
+      "projected": accelerations with multipliers, and q and v put back on the constraints after every step and at save
+      points, by the least change in the mass metric;
+      "multipliers": the same without the projection, so that the constraints open as the local errors add up;
+      "reduced": minimal velocities are integrated, and q by v = N nu + v0; `jd.Reduced(basis)` chooses them;
+      "baumgarte": violated rows are pulled back, for comparison; `jd.Baumgarte(alpha, beta)` sets how fast.
+      "auto" takes "free", or "projected", which takes dependent rows and rank loss in passing and needs no choice.
     - `solver`: any diffrax method of an `ODETerm`. Default `Dopri8` for adaptive steps, `RK4` for fixed ones.
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to and besides the size of each entry of (q, v). Values below ten
@@ -163,19 +162,24 @@ def simulate(
     ```
     """
     scene = scene if isinstance(scene, Scene) else Scene(scene)
-    q0, v0, ts = (_as_array(x) for x in (q0, v0, ts))
-    _check_state(scene, q0, v0)
-    _check_times(ts)
-    if chosen_method(scene, method) != "free" and is_concrete((scene, q0, v0, ts)):
+    q0, v0, ts = (as_array(x) for x in (q0, v0, ts))
+    check_state(scene, q0, v0)
+    check_times(ts)
+    method = chosen_method(scene, method)
+    if scene.constraints and is_concrete((scene, method, q0, v0, ts)):
         # Inside a jit, jax would trace operations on known numbers too.
         with jax.ensure_compile_time_eval():
             state = [jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])]
-            check_start(scene, *state)
+            method = checked_start(scene, method, *state)
     control = None if control is None else as_pytree(control, "control")
     solver = checked_method(solver, stepsize)
     adjoint = checked_adjoint(adjoint, solver)
+    if method.jumping and isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards; take 'reverse', or "
+            "jd.Reduced with independent velocities or a function"
+        )
     options = {
-        "method": method,
         "solver": solver,
         "adjoint": adjoint,
         "outputs": _checked_outputs(scene, outputs),
@@ -187,8 +191,8 @@ def simulate(
     numbers.append(jnp.asarray(stepsize, dtype) if is_fixed(stepsize) else stepsize)
     # In a trace, numbers that are known stay known; a nested `jit` would hide them. Elsewhere, compile once per shape.
     staged = isinstance(jnp.zeros(()), Tracer)
-    concrete = not staged and is_concrete((scene, control, numbers))
-    solution = (_run if staged else _run_compiled)(scene, control, numbers, options)
+    concrete = not staged and is_concrete((scene, control, method, numbers))
+    solution = (_run if staged else _run_compiled)(scene, control, method, numbers, options)
     if throw is None:
         throw = concrete
     if throw and concrete:
@@ -198,24 +202,23 @@ def simulate(
     return solution
 
 
-def _run(scene: Scene, control, numbers, options) -> Solution:
+def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     q0, v0, ts, *steps = numbers
     system, outputs = scene.system, options["outputs"]
-    acceleration = _dynamics(scene, options["method"])
     # diffrax compiles its arguments, which hides their values. What is known stays in closures, the rest is `args`:
     # flat, because its continuous adjoint takes no empty tuples.
-    leaves, structure = jax.tree.flatten((scene, control))
+    leaves, structure = jax.tree.flatten((scene, control, method))
     unknown = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Tracer)]
     args = tuple(leaves[i] for i in unknown) or None
 
     def given(args):
-        """The scene and the control."""
+        """The scene, the control and the method."""
         filled = dict(enumerate(leaves)) | dict(zip(unknown, args or (), strict=True))
         return jax.tree.unflatten(structure, filled.values())
 
     def effort(args, q, v, t):
         """Tau plus the scene's forces, or None when there are none."""
-        scene, control = given(args)
+        scene, control, _ = given(args)
         force = scene.applied_force(q, v, t)
         if control is None:
             return force
@@ -227,18 +230,20 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
 
     @jax.jit  # traced once for all the places where diffrax and differentiation call it
     def derivative(t, y, args):
-        scene, _ = given(args)
-        q, v = retract(scene.system, y[0]), y[1]
+        scene, _, method = given(args)
+        q, v = method.place(scene, y, t)
         force = effort(args, q, v, t)
-        rates = velocity_to_rate(scene.system, q, v), acceleration(scene, q, v, t, force)
-        return (*rates, power(force, v)) if len(y) == 3 else rates
+        rates = method.rates(scene, y, q, v, t, force)
+        return rates | {"work": power(force, v)} if "work" in y else rates
 
     def project(t, y, args):
-        scene, _ = given(args)
-        if _projects(scene, options["method"]):
-            # A step that will be rejected may be too long to be projected, so failing here does not end the run.
-            return (*onto_constraints(scene, y[0], y[1], t), *y[2:]), diffrax.RESULTS.successful
-        return (retract(scene.system, y[0]), *y[1:]), diffrax.RESULTS.successful
+        scene, _, method = given(args)
+        # A step that will be rejected may be too long to be projected, so failing here does not end the run.
+        return method.continued(scene, method.corrected(scene, y, t), t), diffrax.RESULTS.successful
+
+    def quality(t, y, args, **_):
+        scene, _, method = given(args)
+        return method.quality(scene, y, t)
 
     q0 = retract(system, q0)
     good = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
@@ -248,25 +253,29 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
     held = jnp.asarray(True)
     if scene.constraints:
         held = consistent(scene, q0, v0, ts[0])
-        if _projects(scene, options["method"]):
-            q0, v0 = onto_constraints(scene, q0, v0, ts[0])
+        if method.projects:
+            q0, v0 = project_state(scene, q0, v0, ts[0])
     eqx.filter_eval_shape(effort, args, q0, v0, ts[0])  # refuses callbacks of a wrong shape before diffrax meets them
-    y0 = (q0, v0, jnp.zeros((), q0.dtype)) if "work" in outputs else (q0, v0)
-    leaves_manifold = _projects(scene, options["method"]) or has_quaternions(system)
-    solved, time_reached = _integrate(derivative, project if leaves_manifold else None, y0, ts, args, steps, options)
+    y0 = method.start(scene, q0, v0, ts[0])
+    first = method.quality(scene, y0, ts[0])
+    y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
+    corrector = project if method.corrects(scene) else None
+    solved, time_reached = _integrate(derivative, corrector, quality, method, y0, ts, args, steps, options)
 
-    q, v, *work = (jnp.concatenate([start[None], later]) for start, later in zip(y0, solved.ys, strict=True))
-    reached = good & jnp.isfinite(q).all(1) & jnp.isfinite(v).all(1)
-    q, v = jnp.where(reached[:, None], q, q0[None]), jnp.where(reached[:, None], v, v0[None])
-    if _projects(scene, options["method"]):
-        q, v = jax.vmap(onto_constraints, (None, 0, 0, 0))(scene, q, v, ts)
-    else:
-        q = jax.vmap(retract, (None, 0))(system, q)
+    y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, solved.ys)
+    finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]
+    reached = good & jnp.stack(finite).all(0)
+    y = jax.tree.map(lambda rows, start: jnp.where(_along(reached, rows), rows, start[None]), y, y0)
+    work = y.pop("work", None)
+    q, v = jax.vmap(lambda y, t: method.place(scene, method.corrected(scene, y, t), t))(y, ts)
     result = RESULTS.promote(solved.result)
+    result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
     result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
-    if _projects(scene, options["method"]):
+    if method.projects:
         closed = jax.vmap(consistent, (None, 0, 0, 0))(scene, q, v, ts)
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
+    if first is not None:
+        result = RESULTS.where(serves(first), result, RESULTS.singular_basis)
     result = RESULTS.where(held, result, RESULTS.inconsistent_start)
     result = RESULTS.where(good, result, RESULTS.nonfinite_start)
 
@@ -278,18 +287,18 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
         if "power" in outputs:
             values["power"] = power(force, v)
         if "acceleration" in outputs:
-            values["acceleration"] = acceleration(scene, q, v, t, force)
+            values["acceleration"] = method.acceleration(scene, q, v, t, force)
         if "multipliers" in outputs:
-            values["multipliers"] = multipliers(scene, q, v, t, force)
+            values["multipliers"] = dynamics(scene, q, v, t, force).multipliers
         if "constraint_residual" in outputs:
             values["constraint_residual"] = residuals(scene, q, v, t)
         frames = [name.removeprefix(_POSE) for name in outputs if name.startswith(_POSE)]
         return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
 
     def or_nan(rows):
-        return jnp.where(reached.reshape(-1, *[1] * (rows.ndim - 1)), rows, jnp.full_like(rows, jnp.nan))
+        return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
 
-    rows = {"q": q, "v": v} | jax.vmap(report)(q, v, ts) | ({"work": work[0]} if work else {})
+    rows = {"q": q, "v": v} | jax.vmap(report)(q, v, ts) | ({} if work is None else {"work": work})
     stats = {name: jnp.asarray(solved.stats[name], jnp.int32) for name in _COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     return Solution(ts=ts, result=result, stats=stats, **jax.tree.map(or_nan, rows))
@@ -298,15 +307,19 @@ def _run(scene: Scene, control, numbers, options) -> Solution:
 _run_compiled = eqx.filter_jit(_run)
 
 
-def _integrate(derivative, project, y0, ts, args, steps, options):
+def _integrate(derivative, project, quality, method, y0, ts, args, steps, options):
     """diffrax's solution at ts[1:], and the time it came to."""
     term, adjoint = diffrax.ODETerm(derivative), options["adjoint"]
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
     if project:
-        solver = ProjectedSolver(solver, project)
+        solver = ProjectedSolver(solver, project, method.jumping)
     saves = diffrax.SubSaveAt(ts=ts[1:])
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else
     saveat = diffrax.SaveAt(subs=saves if continuous else (saves, diffrax.SubSaveAt(t1=True, fn=_nothing)))
+    event = None
+    if isinstance(method, Reduced) and not continuous:
+        # Near a singular basis steps become short; a long one may pass it, which the sign shows.
+        event = diffrax.Event((lambda t, y, args, **_: ~serves(quality(t, y, args)), quality))
     solved: Any = diffrax.diffeqsolve(
         term,
         solver,
@@ -318,6 +331,7 @@ def _integrate(derivative, project, y0, ts, args, steps, options):
         saveat=saveat,
         stepsize_controller=controller,
         adjoint=adjoint,
+        event=event,
         max_steps=options["max_steps"],
         throw=False,
         progress_meter=progress_meter(options["progress"]),
@@ -328,30 +342,13 @@ def _integrate(derivative, project, y0, ts, args, steps, options):
     return eqx.tree_at(lambda s: (s.ts, s.ys), solved, (times, ys)), end[0]
 
 
-def _projects(scene: Scene, method: str) -> bool:
-    return chosen_method(scene, method) == "projected"
+def _along(mask, rows):
+    """The mask (nt,) shaped so that it applies to the rows (nt, ...)."""
+    return mask.reshape(-1, *[1] * (rows.ndim - 1))
 
 
 def _nothing(t, y, args):
     return None
-
-
-def _dynamics(scene: Scene, method: str) -> Callable:
-    """The acceleration `f(scene, q, v, t, force) -> (nv,)` that the scene and the method call for."""
-    if chosen_method(scene, method) != "free":
-        return constrained_acceleration
-
-    def free(scene, q, v, t, force):
-        return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force, t)
-
-    return free
-
-
-def _as_array(value):
-    """Lists and numbers as numpy arrays, which stay known inside a trace; arrays and what holds tracers by jax."""
-    if isinstance(value, (np.ndarray, jax.Array)):
-        return value
-    return np.asarray(value) if is_concrete(value) else jnp.asarray(value)
 
 
 def _checked_outputs(scene: Scene, outputs) -> tuple[str, ...]:
@@ -363,49 +360,6 @@ def _checked_outputs(scene: Scene, outputs) -> tuple[str, ...]:
         elif name not in _OUTPUTS:
             raise ValueError(f"outputs has {name!r}; choose from {', '.join(_OUTPUTS)} and '{_POSE}<frame>'")
     return tuple(sorted(set(outputs)))
-
-
-def _check_state(scene: Scene, q0, v0) -> None:
-    for name, value, size, label in (("q0", q0, scene.nq, "(nq,)"), ("v0", v0, scene.nv, "(nv,)")):
-        if value.shape != (size,):
-            hint = "; simulate takes one sample, use jax.vmap for a batch" if value.ndim == 2 else ""
-            raise ValueError(
-                f"{name} has shape {value.shape}, expected {(size,)} = {label} of the scene's system{hint}"
-            )
-        if is_concrete(value):
-            _check_finite(name, value)
-    if not (has_quaternions(scene.system) and is_concrete(q0)):
-        return
-    topology = scene.system.topology
-    for joint, kind, place in zip(topology.joint_names, topology.kinds, topology.q_slices, strict=True):
-        if kind in ("spherical", "free"):
-            norm = float(np.linalg.norm(np.asarray(q0, float)[place][-4:]))
-            if abs(norm - 1) > 1e-3:
-                raise ValueError(
-                    f"q0 has a quaternion of length {norm:.6g} at joint {joint!r}, expected 1; "
-                    "divide it by its length (order w, x, y, z)"
-                )
-
-
-def _check_times(ts) -> None:
-    if ts.ndim != 1 or ts.shape[0] < 2:
-        raise ValueError(f"ts has shape {ts.shape}; pass the start and at least one later time, (nt,) with nt >= 2")
-    if not is_concrete(ts):
-        return
-    _check_finite("ts", ts)
-    times = np.asarray(ts, float)
-    back = np.flatnonzero(np.diff(times) <= 0)
-    if back.size:
-        i = back[0]
-        raise ValueError(
-            f"ts does not increase at index {i + 1}: {times[i]} then {times[i + 1]}; sort it, drop doubles"
-        )
-
-
-def _check_finite(name: str, value) -> None:
-    bad = np.flatnonzero(~np.isfinite(np.asarray(value, float)))
-    if bad.size:
-        raise ValueError(f"{name} is {np.asarray(value)[bad[0]]} at index {bad[0]}; give finite numbers")
 
 
 def _raise_failure(solution: Solution, max_steps: int) -> None:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
+from jax.extend.core import jaxprs_in_params
 from pinocchio_bridge import assert_close, quick, random_tree, to_pinocchio
 
 from jaxdyn import scenes
@@ -80,6 +81,8 @@ def solved(tree):
             "result": ranked.result == RESULTS.successful,
             "schur": constrained_dynamics(scene, q, v, tau, method="schur").acceleration,
             "schur lam": constrained_dynamics(scene, q, v, tau, method="schur").multipliers,
+            "range": constrained_dynamics(scene, q, v, tau, method="range_space").acceleration,
+            "range lam": constrained_dynamics(scene, q, v, tau, method="range_space").multipliers,
             "P_T": projections(scene, q).P_T,
             "S": second_fundamental_form(scene, q, v),
             "wrenches": constraint_wrenches(scene, q, ranked.multipliers),
@@ -89,7 +92,7 @@ def solved(tree):
     return jax.tree.map(np.asarray, compute(scene, q, guess, tau)) | {"tau": np.asarray(tau)}
 
 
-def test_both_methods_solve_the_saddle_point_system(solved):
+def test_all_methods_solve_the_saddle_point_system(solved):
     """M a + h = tau + A^T lam, A a = gamma, against a dense solve of both at once."""
     x = solved
     n, m = x["A"].shape[1], x["A"].shape[0]
@@ -101,6 +104,8 @@ def test_both_methods_solve_the_saddle_point_system(solved):
     assert_close(x["lam"], want[n:], 1e-10)
     assert_close(x["schur"], want[:n], 1e-9)  # the condition number of A M^-1 A^T is that of Y squared
     assert_close(x["schur lam"], want[n:], 1e-9)
+    assert_close(x["range"], want[:n], 1e-9)
+    assert_close(x["range lam"], want[n:], 1e-9)
 
 
 def test_acceleration_is_that_of_pinocchio(solved, tree):
@@ -140,6 +145,39 @@ def test_gauss_principle(solved):
     root = np.linalg.cholesky(x["M"]).T
     step = np.linalg.lstsq(root @ null, root @ (free - start), rcond=None)[0]
     assert_close(x["a"], start + null @ step, 1e-10)
+    # Every other admissible acceleration has a larger constraint (a - free)^T M (a - free), by the square of the change.
+    constraint = lambda a: (a - free) @ x["M"] @ (a - free)  # noqa: E731
+    for change in np.random.default_rng(0).normal(size=(20, null.shape[1])) @ null.T:
+        more = constraint(x["a"] + change) - constraint(x["a"])
+        np.testing.assert_allclose(more, change @ x["M"] @ change, rtol=1e-8)
+
+
+def test_range_space_forms_no_mass_matrix(tree):
+    """Three rows on nv = 13: only A M^-1 A^T is factorised; dependent rows are reported."""
+    scene = tree[0]
+    few, n = Scene(scene.system, scene.constraints[:1]), scene.nv
+    shapes = {}
+    for method in ("schur", "range_space"):
+        found = jax.make_jaxpr(lambda q, v, m=method: constrained_dynamics(few, q, v, method=m).acceleration)(
+            *tree[1:3]
+        )
+        shapes[method] = factorised(found.jaxpr)
+    assert (n, n) in shapes["schur"]
+    assert shapes["range_space"] == {(3, 3)}
+    broken = Scene(few.system, few.constraints * 2)
+    result = quick(lambda q, v: constrained_dynamics(broken, q, v, method="range_space").result)(*tree[1:3])
+    assert bool(result == RESULTS.dependent_rows)
+
+
+def factorised(jaxpr) -> set:
+    """Shapes of all matrices that a program factorises by Cholesky."""
+    found = set()
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "cholesky":
+            found.add(equation.invars[0].aval.shape[-2:])
+        for inner in jaxprs_in_params(equation.params):
+            found |= factorised(inner)
+    return found
 
 
 def test_lemmas_of_the_projections(solved):

@@ -29,7 +29,7 @@ LAYERS = (
     "link_form matrix_form recursive",
     "dynamics",
     "lagrange geometry",
-    "constraints constrained reduced",
+    "constraints constrained reduced gauge distributions",
     "contact grasp",
     "control excitation",
     "solvers simulate",

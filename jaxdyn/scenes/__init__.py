@@ -2,18 +2,29 @@
 
 from jaxdyn.scenes._named import REGISTRY as _REGISTRY
 from jaxdyn.scenes._named import NamedScene as NamedScene
+from jaxdyn.scenes.balls import ball_on_incline as ball_on_incline
+from jaxdyn.scenes.balls import ball_on_turntable as ball_on_turntable
+from jaxdyn.scenes.balls import bowling_ball as bowling_ball
+from jaxdyn.scenes.linkages import closed_ring as closed_ring
 from jaxdyn.scenes.linkages import four_bar as four_bar
+from jaxdyn.scenes.linkages import parallel_manipulator as parallel_manipulator
 from jaxdyn.scenes.linkages import slider_crank as slider_crank
 from jaxdyn.scenes.linkages import windows as windows
 from jaxdyn.scenes.particles import pendulum_in_plane as pendulum_in_plane
 from jaxdyn.scenes.particles import spherical_pendulum as spherical_pendulum
 from jaxdyn.scenes.reference import andrews as andrews
+from jaxdyn.scenes.reference import andrews_bodies as andrews_bodies
 from jaxdyn.scenes.reference import car_axis as car_axis
-from jaxdyn.scenes.rolling import ball_on_turntable as ball_on_turntable
 from jaxdyn.scenes.rolling import chaplygin_sleigh as chaplygin_sleigh
 from jaxdyn.scenes.rolling import knife_edge_on_incline as knife_edge_on_incline
 from jaxdyn.scenes.rolling import rolling_coin as rolling_coin
 from jaxdyn.scenes.rolling import rolling_disk as rolling_disk
+from jaxdyn.scenes.rolling import suslov as suslov
+from jaxdyn.scenes.spatial_linkages import bennett as bennett
+from jaxdyn.scenes.vehicles import bicycle as bicycle
+from jaxdyn.scenes.vehicles import car as car
+from jaxdyn.scenes.vehicles import differential_drive as differential_drive
+from jaxdyn.scenes.vehicles import snakeboard as snakeboard
 
 
 def names() -> tuple[str, ...]:

@@ -3,6 +3,8 @@
 import functools
 from collections.abc import Callable
 
+import jax.numpy as jnp
+
 from jaxdyn.scene import Scene
 
 REGISTRY: dict[str, "NamedScene"] = {}
@@ -36,3 +38,8 @@ def named(start: Callable) -> Callable[[Callable], NamedScene]:
         return scene
 
     return register
+
+
+def as_leaf(value):
+    """A number as a leaf, which can be differentiated and batched."""
+    return jnp.asarray(value, float)

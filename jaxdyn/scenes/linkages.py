@@ -1,9 +1,10 @@
 """Planar linkages built from bodies, their loops closed by revolute joints."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn import inertia
 from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import loop
 from jaxdyn.scene import Scene
@@ -12,9 +13,10 @@ from jaxdyn.scenes._named import named
 _DOWN = (0.0, -9.81, 0.0)
 
 
-def _bar(mass, length):
-    """A uniform thin bar along x from its end."""
-    return inertia.displaced(inertia.rod(mass, length), (length / 2, 0.0, 0.0))
+def thin_bar(mass, length):
+    """A uniform thin bar along x from its end: mass, centre and moments about it."""
+    moment = mass * length**2 / 12
+    return mass, (length / 2, 0.0, 0.0), (0.0, moment, moment)
 
 
 def _circles(center, radius, other, reach):
@@ -50,9 +52,11 @@ def four_bar(*, lengths=(1.0, 3.0, 2.5, 3.5), masses=(1.0, 3.0, 2.5), gravity=_D
     """
     crank, coupler, rocker, ground = lengths
     builder = ModelBuilder("four-bar", gravity=gravity)
-    builder.add_body("crank", None, "continuous", _bar(masses[0], crank), joint_name="1")
-    builder.add_body("coupler", "crank", "continuous", _bar(masses[1], coupler), joint_name="2", pose=(crank, 0.0, 0.0))
-    builder.add_body("rocker", None, "continuous", _bar(masses[2], rocker), joint_name="3", pose=(ground, 0.0, 0.0))
+    builder.add_body("crank", None, "continuous", thin_bar(masses[0], crank), joint_name="1")
+    builder.add_body(
+        "coupler", "crank", "continuous", thin_bar(masses[1], coupler), joint_name="2", pose=(crank, 0.0, 0.0)
+    )
+    builder.add_body("rocker", None, "continuous", thin_bar(masses[2], rocker), joint_name="3", pose=(ground, 0.0, 0.0))
     closing = loop("coupler", (coupler, 0.0, 0.0), "rocker", (rocker, 0.0, 0.0), in_plane=in_plane, name="knee")
     return Scene(builder.build(), (closing,))
 
@@ -72,9 +76,9 @@ def slider_crank(*, crank=1.0, rod=2.5, masses=(1.0, 2.0, 1.5), gravity=_DOWN) -
     q = (crank angle, rod angle relative to the crank, slider's x). `masses` (kg) of crank, rod and slider.
     """
     builder = ModelBuilder("slider-crank", gravity=gravity)
-    builder.add_body("crank", None, "continuous", _bar(masses[0], crank), joint_name="1")
-    builder.add_body("rod", "crank", "continuous", _bar(masses[1], rod), joint_name="2", pose=(crank, 0.0, 0.0))
-    slider = inertia.point_mass(masses[2])
+    builder.add_body("crank", None, "continuous", thin_bar(masses[0], crank), joint_name="1")
+    builder.add_body("rod", "crank", "continuous", thin_bar(masses[1], rod), joint_name="2", pose=(crank, 0.0, 0.0))
+    slider = (masses[2], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     builder.add_body("slider", None, "prismatic", slider, joint_name="3", axis=(1.0, 0.0, 0.0))
     closing = loop("rod", (rod, 0.0, 0.0), "slider", None, in_plane=True, name="pin")
     return Scene(builder.build(), (closing,))
@@ -101,15 +105,74 @@ def windows(*, count=2, mass=1.0, length=1.0, gravity=_DOWN) -> Scene:
     per m of length. Where the uprights are horizontal the rows lose rank and the mechanism has N more freedoms.
     """
     uprights, couplers = _names(count)
-    up = inertia.displaced(inertia.rod(mass, length, "y"), (0.0, length / 2, 0.0))
+    moment = mass * length**2 / 12
+    up = (mass, (0.0, length / 2, 0.0), (moment, 0.0, moment))
     builder = ModelBuilder(f"{count} windows", gravity=gravity)
     for i, name in enumerate(uprights):
         builder.add_body(name, None, "continuous", up, pose=(i * length, 0.0, 0.0))
     for i, name in enumerate(couplers):
-        builder.add_body(name, uprights[i], "continuous", _bar(mass, length), pose=(0.0, length, 0.0))
+        builder.add_body(name, uprights[i], "continuous", thin_bar(mass, length), pose=(0.0, length, 0.0))
     top = (0.0, length, 0.0)
     closing = [
         loop(name, (length, 0.0, 0.0), uprights[i + 1], top, in_plane=True, name=f"window {i + 1}")
         for i, name in enumerate(couplers)
     ]
     return Scene(builder.build(), closing)
+
+
+_BASES = ((0.0, 1.2), (-1.04, -0.6), (1.04, -0.6))
+
+
+def _parallel_start(point=(0.1, 0.05), velocity=(0.3, -0.2), length=1.0, bases=_BASES, elbows=(1, 1, 1)):
+    q, v = [], []
+    for base, elbow in zip(bases, elbows, strict=True):
+        a = _circles(base, length, point, length) if elbow > 0 else _circles(point, length, base, length)
+        first, second = (np.arctan2(*(end - start)[::-1]) for start, end in ((base, a), (a, np.asarray(point))))
+        turn = length * np.array([[-np.sin(first), -np.sin(second)], [np.cos(first), np.cos(second)]])
+        rates = np.linalg.solve(turn, velocity)
+        q += [first, second - first]
+        v += [rates[0], rates[1] - rates[0]]
+    return jnp.asarray(q), jnp.asarray(v)
+
+
+@named(_parallel_start)
+def parallel_manipulator(*, length=1.0, bases=_BASES, mass=1.0, gravity=None) -> Scene:
+    """Three legs of two links in the x-y plane that carry one point: q = (a1, a2, b1, b2, c1, c2), two freedoms.
+
+    All links are uniform bars of one `length` (m) and `mass` (kg); the legs turn about the `bases` (3 points, m), the
+    second angle of each is relative to the first. With motors on all six joints, or on the three at the bases, it has
+    more motors than freedoms: torques in the null space of the motors change the internal forces alone.
+
+    Start: the carried `point` (m) and its `velocity` (m/s); `elbows` +1 to the left of the way from base to point.
+
+    Source: EQUATIONS section 8.
+    """
+    builder = ModelBuilder("parallel manipulator", gravity=gravity)
+    for leg, (x, y) in zip("abc", bases, strict=True):
+        builder.add_body(f"{leg}1", None, "continuous", thin_bar(mass, length), joint_name=f"{leg}1", pose=(x, y, 0.0))
+        upper = {"joint_name": f"{leg}2", "pose": (length, 0.0, 0.0)}
+        builder.add_body(f"{leg}2", f"{leg}1", "continuous", thin_bar(mass, length), **upper)
+    tip = (length, 0.0, 0.0)
+    return Scene(builder.build(), [loop("a2", tip, leg, tip, "point", in_plane=True) for leg in ("b2", "c2")])
+
+
+def _ring_start(count=6, length=1.0, rate=1.0):
+    middle = length / 2 * np.array([1.0, 1 / np.tan(np.pi / count)])
+    q = [-middle[0], -middle[1], 0.0, *[2 * np.pi / count] * (count - 1)]
+    return jnp.asarray(q), jnp.asarray([rate * middle[1], -rate * middle[0], rate, *[0.0] * (count - 1)])
+
+
+@named(_ring_start)
+def closed_ring(*, count=6, mass=1.0, length=1.0, gravity=None) -> Scene:
+    """Ring of `count` equal uniform bars joined end to end, free in the x-y plane: `count` freedoms.
+
+    q = (x, y, angle of the first bar, angles of the others relative to the one before). Bars of one `mass` (kg) and
+    `length` (m). Start: a regular polygon about the world's origin that turns at `rate` (rad/s), as it goes on to do:
+    the joints then carry mass (length/4) cot(pi/count)/sin(pi/count) rate^2.
+    """
+    names = [f"bar{i:0{len(str(count))}d}" for i in range(count)]
+    builder = ModelBuilder(f"ring of {count}", gravity=gravity)
+    builder.add_body(names[0], None, "planar", thin_bar(mass, length))
+    for before, name in itertools.pairwise(names):
+        builder.add_body(name, before, "continuous", thin_bar(mass, length), pose=(length, 0.0, 0.0))
+    return Scene(builder.build(), (loop(names[-1], (length, 0.0, 0.0), names[0], None, in_plane=True, name="ring"),))

@@ -7,14 +7,14 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints import Holonomic
 from jaxdyn.scene import Scene
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems import LagrangianSystem
 
 
 class _Rod(eqx.Module):
     """(|q|^2 - length^2) / 2, so that A = q^T and the tension is -lam length."""
 
-    length: Float[Array, ""] = eqx.field(converter=lambda x: jnp.asarray(x, float))
+    length: Float[Array, ""] = eqx.field(converter=as_leaf)
 
     def __call__(self, q, t):
         return 0.5 * (jnp.sum(q * q) - self.length.astype(q.dtype) ** 2)

@@ -3,12 +3,15 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints import Holonomic
+from jaxdyn.building import ModelBuilder
+from jaxdyn.constraints import Holonomic, loop
+from jaxdyn.kinematics import frame_pose
 from jaxdyn.scene import Scene
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems import ExplicitSystem, LagrangianSystem
 
 # Names as printed; m, I are lists m1..m7 and I1..I7. SI units.
@@ -150,6 +153,65 @@ def _andrews_start():
         1.23054744454982119249735015568,
     )
     return jnp.asarray(q), jnp.zeros(7)
+
+
+# Place of each joint of the tree in the printed coordinates: beta, Theta, gamma, delta, Phi, epsilon, Omega.
+ANDREWS_ORDER = (0, 1, 2, 4, 3, 6, 5)
+
+
+class _AndrewsPotential(eqx.Module):
+    """Forces of the spring between C and the point D of body 3, and of the motor: minus the slope of their energy."""
+
+    stiffness: Float[Array, ""] = eqx.field(converter=as_leaf)
+    rest: Float[Array, ""] = eqx.field(converter=as_leaf)
+    foot: Float[Array, "2"] = eqx.field(converter=as_leaf)
+    torque: Float[Array, ""] = eqx.field(converter=as_leaf)
+
+    def energy(self, system, q):
+        end = frame_pose(system, q, "D")[:2, 3]
+        length = jnp.sqrt(jnp.sum((end - self.foot.astype(q.dtype)) ** 2))
+        stored = 0.5 * self.stiffness.astype(q.dtype) * (length - self.rest.astype(q.dtype)) ** 2
+        return stored - self.torque.astype(q.dtype) * q[0]
+
+    def __call__(self, system, q, v, t):
+        return -jax.grad(self.energy, argnums=1)(system, q)
+
+
+def _andrews_bodies_start():
+    q, v = _andrews_start()
+    return q[jnp.asarray(ANDREWS_ORDER)], v
+
+
+@named(_andrews_bodies_start)
+def andrews_bodies() -> Scene:
+    """Andrews' squeezing mechanism built from its seven bodies: a tree of four branches, three loops at the point E.
+
+    The angles are those of `andrews`, as the tree orders them: (beta, Theta, gamma, delta, Phi, epsilon, Omega). Spring
+    and motor are a force of the scene.
+
+    Source: as `andrews`; the drawing of the mechanism says where the centres of mass are.
+    """
+    p, s = _ANDREWS, _ANDREWS["lengths"]
+    builder = ModelBuilder("Andrews' mechanism", gravity=None)
+
+    def body(number, parent, joint, center, place=(0.0, 0.0)):
+        inertia = (p["m"][number - 1], (*center, 0.0), (0.0, 0.0, p["I"][number - 1]))
+        builder.add_body(f"K{number}", parent, "continuous", inertia, joint_name=joint, pose=(*place, 0.0))
+
+    # x of each body along the link where the printed equations have a cosine; -y where they have (sin, -cos).
+    body(1, None, "1 beta", (s["ra"], 0.0))
+    body(2, "K1", "2 Theta", (-s["da"], 0.0), (s["rr"], 0.0))
+    body(3, None, "3 gamma", (s["sb"], -s["sa"]), p["B"])
+    body(5, None, "4 delta", (s["ta"], s["tb"]), p["A"])
+    body(4, "K5", "5 Phi", (0.0, s["ea"] - s["e"]), (s["zt"], 0.0))
+    body(7, None, "6 epsilon", (-s["ub"], -s["ua"]), p["A"])
+    body(6, "K7", "7 Omega", (s["zf"] - s["fa"], 0.0), (0.0, -s["u"]))
+    builder.add_frame("D", "K3", (s["sd"], -s["sc"], 0.0))
+    ends = {"K3": (0.0, -s["ss"], 0.0), "K4": (0.0, -s["e"], 0.0), "K6": (s["zf"], 0.0, 0.0)}
+    closing = [
+        loop("K2", (-s["d"], 0.0, 0.0), name, end, in_plane=True, name=f"E on {name}") for name, end in ends.items()
+    ]
+    return Scene(builder.build(), closing, (_AndrewsPotential(p["c0"], p["l0"], p["C"], p["torque"]),))
 
 
 @named(_andrews_start)

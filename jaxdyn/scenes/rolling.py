@@ -1,26 +1,21 @@
-"""Bodies that roll or slide on a blade: nonholonomic constraints."""
+"""Disks that roll, blades that slide, a body that cannot turn about one of its axes: nonholonomic constraints."""
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn import inertia
 from jaxdyn.building import ModelBuilder
-from jaxdyn.constraints import Holonomic, Pfaffian, knife_edge, rolling_sphere, rolling_wheel
+from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
 from jaxdyn.scene import Scene
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems import LagrangianSystem
-
-
-def _as_leaf(value):
-    return jnp.asarray(value, float)
 
 
 class _DiskRows(eqx.Module):
     """xdot = rho cos(theta) phidot, ydot = rho sin(theta) phidot."""
 
-    radius: Float[Array, ""] = eqx.field(converter=_as_leaf)
+    radius: Float[Array, ""] = eqx.field(converter=as_leaf)
 
     def __call__(self, q, t):
         rho = self.radius.astype(q.dtype)
@@ -95,38 +90,6 @@ def knife_edge_on_incline(*, mass=1.0, moment=0.2, slope=np.pi / 6, gravity=9.81
     return Scene(builder.build(), (knife_edge("skate", contact=False, name="blade"),))
 
 
-class _Steady(eqx.Module):
-    """First coordinate minus rate times t: a table driven at a constant rate."""
-
-    rate: Float[Array, ""] = eqx.field(converter=_as_leaf)
-
-    def __call__(self, q, t):
-        return q[0] - self.rate.astype(q.dtype) * t
-
-
-def _turntable_start(radius=0.2, rate=3.0, position=(1.0, 0.0), velocity=(0.0, 0.5)):
-    # The contact point of the ball moves with the table: v + w x (-r e_z) = rate e_z x p.
-    slip = rate * np.array([-position[1], position[0]]) - velocity
-    spin = np.array([slip[1], -slip[0], 0.0]) / radius
-    q = [0.0, *position, radius, 1.0, 0.0, 0.0, 0.0]
-    return jnp.asarray(q), jnp.asarray([rate, *velocity, 0.0, *spin])
-
-
-@named(_turntable_start)
-def ball_on_turntable(*, mass=1.0, radius=0.2, rate=3.0, gravity=9.81) -> Scene:
-    """Solid ball that rolls on a turntable driven at a constant rate: vdot = (2/7) rate e_z x v, a circle.
-
-    q = (table angle, the ball's free joint). The drive is a moving holonomic constraint, the contact rolls on a body.
-
-    Source: Weltner (1979), Am. J. Phys. 47, 984.
-    """
-    builder = ModelBuilder("turntable", gravity=(0.0, 0.0, -gravity))
-    builder.add_body("table", None, "continuous", (1.0, (0.0, 0.0, 0.0), (0.5, 0.5, 1.0)), joint_name="1")
-    builder.add_body("ball", None, "free", inertia.sphere(mass, radius), joint_name="2")
-    rolling = rolling_sphere("ball", None, radius, surface_body="table", name="contact")
-    return Scene(builder.build(), (Holonomic(_Steady(rate), name="drive"), rolling))
-
-
 def _coin_start(radius=0.05, circle=0.5, lean=np.pi / 36, gravity=9.81):
     rho = radius / circle
     sine, cosine = np.sin(lean), np.cos(lean)
@@ -153,3 +116,32 @@ def rolling_coin(*, mass=0.3048, radius=0.05, gravity=9.81) -> Scene:
     builder.add_body("coin", None, "free", (mass, (0.0, 0.0, 0.0), tuple(moments)))
     axle = (np.zeros(3), (-np.pi / 2, 0.0, 0.0))  # z of the wheel along y of the body
     return Scene(builder.build(), (rolling_wheel("coin", axle, radius, name="rim"),))
+
+
+class _NoTurn(eqx.Module):
+    """The third angular velocity is zero."""
+
+    def __call__(self, q, t):
+        return jnp.asarray([0.0, 0.0, 1.0], q.dtype)
+
+
+def _suslov_start(across=1.0, along=-0.5):
+    return jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray([across, along, 0.0])
+
+
+@named(_suslov_start)
+def suslov(*, moments=(1.0, 1.5, 2.0), product=0.4) -> Scene:
+    """Suslov's problem: a rigid body turns freely about a fixed point, but not about its own z axis.
+
+    `moments` (I11, I22, I33) and `product` I13, the entry of the inertia matrix, kg m^2. With I12 = I23 = 0
+    w1' = -(I13/I11) w1 w2, w2' = (I13/I22) w1^2: from the start w = (across, along, 0) (rad/s) it goes over to a steady
+    rotation about the second axis, w2 = c tanh(n (t + t0)), w1 = c sqrt(I22/I11) sech(n (t + t0)), n = I13 c/I11,
+    c^2 = w2^2 + (I11/I22) w1^2.
+
+    Source: Garcia-Naranjo & Jimenez (2017), The geometric discretisation of the Suslov problem.
+    """
+    xx, yy, zz = moments
+    tensor = np.array([[xx, 0.0, product], [0.0, yy, 0.0], [product, 0.0, zz]])
+    builder = ModelBuilder("Suslov body", gravity=None)
+    builder.add_body("body", None, "spherical", (1.0, (0.0, 0.0, 0.0), tensor))
+    return Scene(builder.build(), (Pfaffian(_NoTurn(), name="no turn about z"),))

@@ -123,10 +123,15 @@ def stepping(solver, term, ts, rtol, atol, stepsize):
     controller = stepsize
     if controller is None:
         smallest = 16 * eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-        controller = _Adaptive(rtol, atol, dtmin=smallest, force_dtmin=False)
+        controller = _Adaptive(rtol, atol, norm=_error_size, dtmin=smallest, force_dtmin=False)
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController) and _has_coarse_dense_output(solver, term):
         controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
     return solver, controller, None
+
+
+def _error_size(error):
+    """Root mean square of the scaled errors, without what is constant during a step."""
+    return optimistix.rms_norm({k: e for k, e in error.items() if k != "frame"} if isinstance(error, dict) else error)
 
 
 def progress_meter(progress: bool) -> diffrax.AbstractProgressMeter:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -44,11 +45,14 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     projection is part of the step: it acts on every result the step-size control sees, and on no other.
 
     **Arguments:** `solver`, any diffrax method of an `ODETerm`. `project(t, y, args) -> (y, diffrax.RESULTS)`, which
-    says whether it succeeded; everything it depends on comes through `args`, so that gradients reach it.
+    says whether it succeeded; everything it depends on comes through `args`, so that gradients reach it. `jumping` names
+    entries of a state that is a dictionary: constants of a step that `project` may change for the next one, so that
+    within the step the dense output keeps the old ones.
     """
 
     solver: diffrax.AbstractSolver
     project: Callable
+    jumping: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def term_structure(self):
@@ -105,5 +109,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         )
         projected, projection_result = self.project(t1, y1, args)
         shift = jax.tree.map(lambda a, b: a - b, projected, y1)
+        for name in self.jumping:
+            shift = shift | {name: jnp.zeros_like(shift[name])}
         result = diffrax.RESULTS.where(diffrax.is_successful(result), projection_result, result)
         return projected, error, {"dense_info": dense_info, "shift": shift}, solver_state, result

@@ -1,0 +1,110 @@
+"""Balls that roll or slide on planes."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn import inertia, so3
+from jaxdyn.building import ModelBuilder
+from jaxdyn.constraints import Holonomic, rolling_sphere
+from jaxdyn.scene import Scene
+from jaxdyn.scenes._named import as_leaf, named
+
+
+class _Steady(eqx.Module):
+    """First coordinate minus rate times t: a table driven at a constant rate."""
+
+    rate: Float[Array, ""] = eqx.field(converter=as_leaf)
+
+    def __call__(self, q, t):
+        return q[0] - self.rate.astype(q.dtype) * t
+
+
+def _turntable_start(radius=0.2, rate=3.0, position=(1.0, 0.0), velocity=(0.0, 0.5)):
+    # The contact point of the ball moves with the table: v + w x (-r e_z) = rate e_z x p.
+    slip = rate * np.array([-position[1], position[0]]) - velocity
+    spin = np.array([slip[1], -slip[0], 0.0]) / radius
+    q = [0.0, *position, radius, 1.0, 0.0, 0.0, 0.0]
+    return jnp.asarray(q), jnp.asarray([rate, *velocity, 0.0, *spin])
+
+
+@named(_turntable_start)
+def ball_on_turntable(*, mass=1.0, radius=0.2, rate=3.0, gravity=9.81) -> Scene:
+    """Solid ball that rolls on a turntable driven at a constant rate: vdot = (2/7) rate e_z x v, a circle.
+
+    q = (table angle, the ball's free joint). The drive is a moving holonomic constraint, the contact rolls on a body.
+
+    Source: Weltner (1979), Am. J. Phys. 47, 984.
+    """
+    builder = ModelBuilder("turntable", gravity=(0.0, 0.0, -gravity))
+    builder.add_body("table", None, "continuous", (1.0, (0.0, 0.0, 0.0), (0.5, 0.5, 1.0)), joint_name="1")
+    builder.add_body("ball", None, "free", inertia.sphere(mass, radius), joint_name="2")
+    rolling = rolling_sphere("ball", None, radius, surface_body="table", name="contact")
+    return Scene(builder.build(), (Holonomic(_Steady(rate), name="drive"), rolling))
+
+
+def _incline_start(radius=0.1, velocity=(0.0, 0.5)):
+    # Rolling: v + w x (-r e_z) = 0.
+    x, y = velocity
+    q = [0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]
+    return jnp.asarray(q), jnp.asarray([x, y, 0.0, -y / radius, x / radius, 0.0])
+
+
+@named(_incline_start)
+def ball_on_incline(*, mass=1.0, radius=0.1, slope=np.pi / 6, gravity=9.81) -> Scene:
+    """Solid ball that rolls on an inclined plane, x down the slope, z along its normal: a parabola.
+
+    vdot = (5/7) g sin(slope) e_x. Start: `velocity` (m/s) of the centre, without spin about the normal.
+    """
+    pull = (gravity * np.sin(slope), 0.0, -gravity * np.cos(slope))
+    builder = ModelBuilder("ball on an incline", gravity=pull)
+    builder.add_body("ball", None, "free", inertia.sphere(mass, radius))
+    return Scene(builder.build(), (rolling_sphere("ball", None, radius, name="contact"),))
+
+
+class _Height(eqx.Module):
+    """Height of the centre above its place on the plane z = 0."""
+
+    radius: Float[Array, ""] = eqx.field(converter=as_leaf)
+
+    def __call__(self, q, t):
+        return q[2] - self.radius.astype(q.dtype)
+
+
+class _Sliding(eqx.Module):
+    """Friction on a ball that slides: `force` (N) against the velocity of the point that touches the plane z = 0.
+
+    It has no direction, hence no derivatives, where the ball rolls.
+    """
+
+    force: Float[Array, ""] = eqx.field(converter=as_leaf)
+    radius: Float[Array, ""] = eqx.field(converter=as_leaf)
+
+    def __call__(self, system, q, v, t):
+        rotation = so3.quat_to_matrix(q[3:])
+        down = -self.radius.astype(q.dtype) * rotation[2]  # to the contact, in axes of the ball
+        slip = v[:3] + so3.cross(v[3:], down)
+        push = -self.force.astype(q.dtype) * slip / jnp.sqrt(jnp.sum(slip * slip))
+        return jnp.concatenate([push, so3.cross(down, push)])
+
+
+def _bowling_start(radius=0.10795, velocity=(8.0, 0.0), spin=(-8 * np.pi, 0.0, 0.0)):
+    return jnp.asarray([0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]), jnp.asarray([*velocity, 0.0, *spin])
+
+
+@named(_bowling_start)
+def bowling_ball(*, mass=6.35, radius=0.10795, moment=0.0296, friction=0.12, gravity=9.8) -> Scene:
+    """Bowling ball that slides with Coulomb friction, up to the time at which it rolls.
+
+    The velocity u of the point that touches the lane keeps its direction, so that the centre moves on a parabola:
+    vdot = -mu g u/|u|, with I w + m r e_z x v constant. It rolls after |u0| / (mu g (1 + m r^2/I)).
+
+    Start: `velocity` (m/s) of the centre, `spin` (rad/s) in axes of the world.
+
+    Source: test "bowling ball" of Drake (multibody/benchmarks).
+    """
+    builder = ModelBuilder("bowling ball", gravity=(0.0, 0.0, -gravity))
+    builder.add_body("ball", None, "free", (mass, (0.0, 0.0, 0.0), (moment, moment, moment)))
+    held = Holonomic(_Height(radius), name="lane")
+    return Scene(builder.build(), (held,), (_Sliding(friction * mass * gravity, radius),))

@@ -1,0 +1,58 @@
+"""Linkages in space that move although counting their joints says that they cannot."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.building import ModelBuilder
+from jaxdyn.constraints import loop
+from jaxdyn.scene import Scene
+from jaxdyn.scenes._named import named
+from jaxdyn.scenes.linkages import thin_bar
+
+
+def _link(length, twist):
+    """Pose of a link's end in its beginning: along x by the length, then turned about x by the twist."""
+    c, s = np.cos(twist), np.sin(twist)
+    return np.array([[1.0, 0.0, 0.0, length], [0.0, c, -s, 0.0], [0.0, s, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def _second(length, twist, other):
+    """Twist of the links of the length `other` that lets the linkage move: a/sin(alpha) = b/sin(beta)."""
+    sine = other * np.sin(twist) / length
+    if abs(sine) >= 1:
+        raise ValueError(
+            f"lengths {length} and {other} with twist {twist} make no Bennett linkage; sin(beta) is {sine:.4g}"
+        )
+    return np.arcsin(sine)
+
+
+def _bennett_start(lengths=(1.0, 0.7), twist=1.1, angle=0.8, rate=1.0):
+    first, second = twist, _second(lengths[0], twist, lengths[1])
+    # tan(q1/2) tan(q2/2) = k, and q3 = -q1 up to a turn.
+    k = np.sin((second + first) / 2) / np.sin((second - first) / 2)
+    follower = 2 * np.arctan2(k, np.tan(angle / 2))
+    following = -rate * np.sin(follower) / np.sin(angle)
+    return jnp.asarray([angle, follower, -angle]), jnp.asarray([rate, following, -rate])
+
+
+@named(_bennett_start)
+def bennett(*, lengths=(1.0, 0.7), twist=1.1, mass=1.0, gravity=(0.0, 0.0, -9.81)) -> Scene:
+    """Bennett's linkage: four links, opposite ones equal, joined by four revolute joints whose axes never meet.
+
+    Links of `lengths` (a, b) (m) and twists (alpha, beta) (rad) with a/sin(alpha) = b/sin(beta); `twist` is alpha.
+    q = angles of the three moving links, uniform bars of `mass` (kg); the fourth joint closes the loop. Its five rows
+    for three joints leave one freedom, because only two of them are independent:
+
+        tan(q1/2) tan(q2/2) = sin((beta + alpha)/2)/sin((beta - alpha)/2),  q3 = -q1.
+
+    Start: the first `angle` (rad, not 0) and its `rate` (rad/s).
+
+    Source: Bennett (1903), A new mechanism; Hunt (1978), Kinematic Geometry of Mechanisms.
+    """
+    poses = [_link(lengths[0], twist), _link(lengths[1], _second(lengths[0], twist, lengths[1]))]
+    bars = [thin_bar(mass, length) for length in lengths]
+    builder = ModelBuilder("Bennett linkage", gravity=gravity)
+    builder.add_body("link1", None, "continuous", bars[0])
+    builder.add_body("link2", "link1", "continuous", bars[1], pose=poses[0])
+    builder.add_body("link3", "link2", "continuous", bars[0], pose=poses[1])
+    return Scene(builder.build(), (loop("link3", poses[0], None, np.linalg.inv(poses[1]), name="fourth joint"),))

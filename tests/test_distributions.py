@@ -1,0 +1,167 @@
+"""Integrability against growth vectors of the literature, and spurious terms against the equations worked out by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close, quick
+
+from jaxdyn import scenes
+from jaxdyn.building import ModelBuilder
+from jaxdyn.constraints import Holonomic, Pfaffian
+from jaxdyn.distributions import involutive, spurious_terms
+from jaxdyn.reduced import reduced_dynamics
+from jaxdyn.scene import Scene
+from jaxdyn.systems import LagrangianSystem
+
+
+def free(count):
+    """A particle in R^count."""
+    return LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), count)
+
+
+def test_growth_of_known_distributions():
+    """Nonholonomic: disk 2, 3, 4, knife edge 2, 3. Integrable: a loop, x dy + y dx, a gear between two angles."""
+    place = jnp.asarray([0.3, -0.2, 0.7, 0.4])
+    assert involutive(scenes.rolling_disk(), place).ranks == (2, 3, 4)
+    assert not involutive(scenes.rolling_disk(), place).value
+    edge = Pfaffian(lambda q, t: jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0.0 * t]))
+    found = involutive(Scene(free(3), (edge,)), place[:3])
+    assert found.ranks == (2, 3) and not found.value
+    # d(x y) = 0 times a factor that hides it, as a Pfaffian row.
+    hidden = Pfaffian(lambda q, t: jnp.exp(q[2]) * jnp.stack([q[1], q[0], 0.0 * t]))
+    found = involutive(Scene(free(3), (hidden,)), place[:3])
+    assert found.ranks == (2, 2) and found.value
+    gear = Pfaffian(lambda q, t: jnp.stack([1.0 + 0 * t, -2.5 + 0 * t, 0 * t]))
+    assert involutive(Scene(free(3), (gear,)), place[:3]).value
+    assert involutive(scenes.spherical_pendulum(), scenes.spherical_pendulum.start()[0]).ranks == (2, 2)
+    # The singular values show how clear the answer is: [X, Y] of the edge has length 1.
+    sizes = involutive(Scene(free(3), (edge,)), place[:3]).singular_values
+    assert_close(sizes[0], [1.0, 1.0], 1e-12)
+    assert_close(sizes[1], [1.0, 1.0, 1.0], 1e-12)
+
+
+def test_mixed_rows_count_the_holonomic_ones():
+    """A knife edge and one integrable row in five coordinates: 3, 4, 4: of two rows one is holonomic."""
+
+    def row(q, t):
+        zero = 0.0 * t
+        edge = jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), zero, zero, zero])
+        level = jnp.stack([zero, zero, zero, 2 * q[3], zero])  # d(q3^2)
+        tied = edge + level  # the rows only span the two forms
+        return jnp.stack([tied, level - 0.5 * edge])
+
+    found = involutive(Scene(free(5), (Pfaffian(row),)), jnp.asarray([0.1, 0.2, 0.5, 0.8, -0.3]))
+    assert found.ranks == (3, 4, 4) and not found.value
+    # A holonomic row added to the disk: it cannot climb, x^2 + y^2 = const. The growth stops one short.
+    disk = scenes.rolling_disk()
+    round_ = Holonomic(lambda q, t: q[0] ** 2 + q[1] ** 2 - 1.0)
+    both = Scene(disk.system, (*disk.constraints, round_))
+    found = involutive(both, jnp.asarray([0.6, 0.8, 0.3, 0.1]))
+    assert found.ranks[0] == 1 and found.value  # one direction is left, and one field is always integrable
+
+
+def test_prescribed_slip_is_part_of_the_test():
+    """xdot = y in the plane: ker A = d/dy alone is integrable, the affine row is not; xdot = sin t is."""
+    row = lambda q, t: jnp.stack([1.0 + 0 * t, 0 * t])  # noqa: E731
+    place = jnp.asarray([0.2, 0.4])
+    assert involutive(Scene(free(2), (Pfaffian(row),)), place).ranks == (1, 1)
+    assert involutive(Scene(free(2), (Pfaffian(row, lambda q, t: q[1]),)), place).ranks == (1, 2)
+    assert involutive(Scene(free(2), (Pfaffian(row, lambda q, t: jnp.sin(t)),)), place, 0.3).ranks == (1, 1)
+
+
+def test_bodies_on_a_manifold():
+    """A body on a ball joint that cannot spin about its own z axis turns about all three by 2, 3; about one only by 1, 1."""
+    builder = ModelBuilder("ball joint", gravity=None)
+    builder.add_body("body", None, "spherical", (1.0, (0.0, 0.0, 0.0), (1.0, 2.0, 2.5)))
+    model, q = builder.build(), jnp.asarray([0.8, 0.0, 0.6, 0.0])
+    assert involutive(Scene(model, (Pfaffian(lambda q, t: jnp.eye(3)[2]),)), q).ranks == (2, 3)
+    assert involutive(Scene(model, (Pfaffian(lambda q, t: jnp.eye(3)[:2]),)), q).ranks == (1, 1)
+
+
+@pytest.mark.slow
+def test_growth_of_the_leaning_coin():
+    """Three rows, of which the height is holonomic; growth 3, 4, 5 (that of the disk and the lean)."""
+    found = involutive(scenes.rolling_coin(), scenes.rolling_coin.start()[0])
+    assert found.ranks == (3, 4, 5) and not found.value
+
+
+def test_involutive_refuses():
+    with pytest.raises(ValueError, match="no constraints"):
+        involutive(Scene(free(2)), jnp.zeros(2))
+    with pytest.raises(ValueError, match="outside of jit"):
+        jax.jit(lambda q: jnp.asarray(involutive(scenes.rolling_disk(), q).ranks))(jnp.zeros(4))
+
+
+def test_spurious_terms_of_the_printed_example():
+    """L = (r1'^2 + r2'^2 + s'^2)/2, s' = -r1 r2' (EQUATIONS section 6): numbers by hand, right and wrong."""
+    scene = Scene(free(3), (Pfaffian(lambda q, t: jnp.stack([0 * t, q[0], 1.0 + 0 * t])),))
+    q, nu = jnp.asarray([0.7, -0.4, 0.2]), jnp.asarray([1.1, 0.6])
+    found = spurious_terms(scene, q, nu, independent=(0, 1))
+    r1, (d1, d2) = 0.7, (1.1, 0.6)
+    assert_close(found.mass_matrix, np.diag([1.0, 1 + r1**2]), 1e-14)
+    assert_close(found.bias_force, [0.0, r1 * d1 * d2], 1e-14)
+    assert_close(found.wrong_bias_force, [-r1 * d2**2, 2 * r1 * d1 * d2], 1e-14)
+    assert_close(found.terms, [r1 * d2**2, -r1 * d1 * d2], 1e-14)
+    assert_close(found.acceleration, [0.0, -r1 * d1 * d2 / (1 + r1**2)], 1e-14)
+    assert_close(found.wrong_acceleration, [r1 * d2**2, -2 * r1 * d1 * d2 / (1 + r1**2)], 1e-14)
+
+
+def sleigh(q, v):
+    """Mass 1 at 0.3 ahead of the blade, moment 0.5; q = (x, y, theta) of the blade."""
+    c, s = jnp.cos(q[2]), jnp.sin(q[2])
+    com = v[0] - 0.3 * s * v[2], v[1] + 0.3 * c * v[2]
+    return 0.5 * (com[0] ** 2 + com[1] ** 2) + 0.25 * v[2] ** 2
+
+
+def blade(q, t):
+    return jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0 * t])
+
+
+def test_spurious_terms_of_the_sleigh():
+    """Right: forward speed u with u' = a w^2, w' = -m a u w/(I + m a^2). Wrong: another motion, by terms worked out here.
+
+    y' = tan(th) x': p = dL/dy', spurious = p (sec^2(th) x' w) against x' and -p sec^2(th) x' x' ... with the signs of E33.
+    """
+    scene = Scene(LagrangianSystem(sleigh, 3), (Pfaffian(blade),))
+    theta, u, w = 0.5, 0.8, 1.3
+    c, s = np.cos(theta), np.sin(theta)
+    q, tau = jnp.asarray([0.2, -0.1, theta]), jnp.asarray([0.1, 0.3, -0.2])
+    found = spurious_terms(scene, q, jnp.asarray([u * c, w]), independent=(0, 2))
+    # x' = u cos(th): x'' = u' cos(th) - u w sin(th).
+    rates = 0.3 * w**2, -0.3 * u * w / (0.5 + 0.09)
+    assert_close(found.acceleration, [rates[0] * c - u * w * s, rates[1]], 1e-12)
+    # a = (-tan, 0): a_x' - 0 = -sec^2 w;   -(da_x/dth) x' = sec^2 x'.
+    p = u * s + 0.3 * c * w
+    assert_close(found.terms, [-p * w / c**2, p * u * c / c**2], 1e-12)
+    assert_close(found.bias_force - found.wrong_bias_force, found.terms, 1e-12)
+    assert np.abs(found.acceleration - found.wrong_acceleration).max() > 0.5
+    pushed = spurious_terms(scene, q, jnp.asarray([u * c, w]), tau, independent=(0, 2))
+    want = quick(lambda q, nu: reduced_dynamics(scene, q, nu, tau, basis=(0, 2)).nu_rate)(q, jnp.asarray([u * c, w]))
+    assert_close(pushed.acceleration, want, 1e-12)
+    # What is spurious does no work: the wrong equations conserve the energy too, which is why they look right.
+    assert abs(found.terms @ np.array([u * c, w])) < 1e-12
+
+
+def test_no_spurious_terms():
+    """Integrable rows, s = h(r), allow the substitution; so does, by accident, the upright disk."""
+    curved = Pfaffian(lambda q, t: jnp.stack([jnp.cos(q[0]) * q[1], jnp.sin(q[0]), 1.0 + 0 * t]))  # d(q1 sin q0 + q2)
+    found = spurious_terms(
+        Scene(free(3), (curved,)), jnp.asarray([0.7, -0.4, 0.2]), jnp.asarray([1.1, 0.6]), independent=(0, 1)
+    )
+    assert np.abs(found.bias_force).max() > 0.1
+    np.testing.assert_allclose(found.terms, 0, atol=1e-15)
+    assert_close(found.wrong_acceleration, found.acceleration, 1e-13)
+    q, v = scenes.rolling_disk.start(heading=0.7)
+    found = spurious_terms(scenes.rolling_disk(), q, v[2:], independent=(2, 3))
+    np.testing.assert_allclose(found.terms, 0, atol=1e-15)
+
+
+def test_spurious_terms_refuse():
+    scene = Scene(LagrangianSystem(sleigh, 3), (Pfaffian(blade),))
+    with pytest.raises(ValueError, match=r"depend on the eliminated coordinates \(by"):
+        spurious_terms(scene, jnp.asarray([0.2, -0.1, 0.5]), jnp.ones(2), independent=(0, 1))
+    with pytest.raises(ValueError, match=r"nu has shape \(1,\), expected \(2,\)"):
+        spurious_terms(scene, jnp.zeros(3), jnp.ones(1), independent=(0, 2))
+    with pytest.raises(ValueError, match="nq = 7, nv = 6"):
+        spurious_terms(scenes.rolling_coin(), scenes.rolling_coin.start()[0], jnp.ones(3), independent=(0, 1, 2))

@@ -1,0 +1,174 @@
+"""The gauge-invariant form against the projection form, its own identities, and changes of gauge."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close, quick
+
+from jaxdyn import scenes
+from jaxdyn.constrained import RESULTS, constrained_dynamics, projections
+from jaxdyn.constraints import Pfaffian
+from jaxdyn.constraints.base import row_matrix
+from jaxdyn.dynamics import mass_matrix
+from jaxdyn.gauge import gauge_invariant
+from jaxdyn.scene import Scene
+from jaxdyn.systems import LagrangianSystem
+
+
+def turned(n, seed=0):
+    """A random orthogonal matrix."""
+    return jnp.asarray(np.linalg.qr(np.random.default_rng(seed).normal(size=(n, n)))[0])
+
+
+def coupled(q, v):
+    """Four coordinates with a metric and a potential that couple them all."""
+    mixing = jnp.asarray([[0.3, 0.2, -0.1, 0.4], [0.1, -0.5, 0.2, 0.3]])
+    across = mixing[0] @ v + q[1] * v[0]
+    return 0.5 * jnp.sum((2.0 + jnp.sin(q)) * v**2) + 0.5 * across**2 - jnp.cos(mixing[1] @ q)
+
+
+def two_rows(q, t):
+    return jnp.stack(
+        [jnp.stack([q[3], 1.0 + 0 * t, jnp.sin(q[0]), q[1]]), jnp.stack([q[2] ** 2, 0 * t, q[3], 1.0 + 0 * t])]
+    )
+
+
+def slip(q, t):
+    return jnp.stack([jnp.sin(t) * q[0], 0.2 + 0 * t])
+
+
+@pytest.fixture(scope="module")
+def state():
+    rng = np.random.default_rng(3)
+    q, v, tau = (jnp.asarray(rng.normal(size=4)) for _ in range(3))
+    return q, v, tau
+
+
+def admissible(v, A, b=0.0):
+    """The nearest velocity with A v = b."""
+    return v - np.linalg.pinv(A) @ (A @ v - b)
+
+
+def test_it_equals_the_projection_form(state):
+    """Same acceleration and multipliers, the two projections of EQUATIONS section 9, both decoupled equations."""
+    q, v, tau = state
+    scene = Scene(LagrangianSystem(coupled, 4), (Pfaffian(two_rows),))
+    v = admissible(v, two_rows(q, jnp.zeros(())))
+
+    @quick
+    def compute(q, v, tau):
+        lines = gauge_invariant(scene, q, v, tau), constrained_dynamics(scene, q, v, tau), projections(scene, q)
+        return *lines, mass_matrix(scene.system, q)
+
+    x, want, (P_T, P_omega), M = compute(q, v, tau)
+    assert bool(x.result == RESULTS.successful)
+    assert_close(x.acceleration, want.acceleration, 1e-12)
+    assert_close(x.multipliers, want.multipliers, 1e-12)
+    assert_close(x.W @ x.W.T, M, 1e-14)
+    np.testing.assert_allclose(x.velocity @ x.velocity, v @ M @ v, rtol=1e-13)  # twice the kinetic energy
+    np.testing.assert_allclose(x.Gamma + x.Gamma.T, 0, atol=1e-13)
+    np.testing.assert_allclose(x.Lambda @ x.velocity, 0, atol=1e-13)
+    V = np.concatenate([x.V1, x.V2], 1)
+    assert_close(V.T @ V, np.eye(4), 1e-13)
+    assert_close(x.Lambda @ V, np.concatenate([x.Lambda_r, np.zeros((2, 2))], 1), 1e-13)
+    inverse = np.linalg.inv(x.W)
+    assert_close(x.W @ x.V2 @ x.V2.T @ inverse, P_omega, 1e-12)
+    assert_close(inverse.T @ x.V2 @ x.V2.T @ x.W.T, P_T, 1e-12)
+    assert_close(x.reduced_acceleration, x.reduced_force - x.Gamma_r @ x.reduced_velocity, 1e-12)
+    assert_close(x.Lambda_r.T @ x.multipliers, x.Gamma_o @ x.reduced_velocity - x.normal_force, 1e-12)
+
+
+def test_rates_are_those_along_the_motion(state):
+    """Differences in time along the accelerated motion: W^T v has the rate u + Lam^T lam - Gamma w, and T the power.
+
+    V2 is carried in parallel: the rate of V2^T w is V2^T times that of w, less V2^T V1dot V1^T w.
+    """
+    q, v, tau = state
+    scene = Scene(LagrangianSystem(coupled, 4), (Pfaffian(two_rows, slip),))
+    t = jnp.asarray(0.4)
+    v = admissible(v, two_rows(q, t), slip(q, t))
+    f = quick(lambda q, v, t: gauge_invariant(scene, q, v, tau, t))
+    x, want = f(q, v, t), quick(lambda q, v, t: constrained_dynamics(scene, q, v, tau, t))(q, v, t)
+    assert_close(x.acceleration, want.acceleration, 1e-12)
+    assert_close(x.multipliers, want.multipliers, 1e-12)
+    h = 1e-3
+    ahead = [f(q + s * h * v, v + s * h * x.acceleration, t + s * h) for s in (-2, -1, 1, 2)]
+    slope = lambda y: (8 * (y[2] - y[1]) - (y[3] - y[0])) / (12 * h)  # noqa: E731
+    rate = slope([y.velocity for y in ahead])
+    # Along the parabola: the third derivative of the motion enters by h^4 only.
+    assert_close(rate, x.force + x.Lambda.T @ x.multipliers - x.Gamma @ x.velocity, 1e-9)
+    # Bases at the four places, turned into each other: V2 V2^T V2_0 has no turn in itself to second order.
+    carried = []
+    for y in ahead:
+        U, _, Vt = np.linalg.svd(np.asarray(y.V2).T @ np.asarray(x.V2))
+        carried.append((np.asarray(y.V2) @ U @ Vt).T @ np.asarray(y.velocity))
+    assert_close(x.reduced_acceleration, slope(carried), 1e-8)
+    # Rate of Lam w = b in quasi velocities.
+    assert_close(x.Lambda @ x.velocity, slip(q, t), 1e-12)
+    assert_close(
+        slope([y.Lambda @ y.velocity for y in ahead]), jnp.stack([jnp.cos(t) * q[0] + jnp.sin(t) * v[0], 0 * t]), 1e-9
+    )
+
+
+def test_the_motion_does_not_depend_on_the_gauge(state):
+    """W -> W Q and V2 -> V2 R: accelerations and multipliers stay, w and w_r turn, Gamma and Gamma_r are conjugated."""
+    q, v, tau = state
+    scene = Scene(LagrangianSystem(coupled, 4), (Pfaffian(two_rows),))
+    v = admissible(v, two_rows(q, jnp.zeros(())))
+    Q, R = turned(4, 1), turned(2, 2)
+    solve = quick(lambda Q, R: gauge_invariant(scene, q, v, tau, rotation=Q, motion_rotation=R))
+    x, y, z = solve(jnp.eye(4), jnp.eye(2)), solve(Q, jnp.eye(2)), solve(jnp.eye(4), R)
+    for other in (y, z):
+        assert_close(other.acceleration, x.acceleration, 1e-12)
+        assert_close(other.multipliers, x.multipliers, 1e-12)
+    assert_close(y.velocity, Q.T @ x.velocity, 1e-13)
+    assert_close(y.Gamma, Q.T @ x.Gamma @ Q, 1e-12)
+    assert_close(y.Lambda, x.Lambda @ Q, 1e-12)
+    assert_close(z.reduced_velocity, R.T @ x.reduced_velocity, 1e-13)
+    assert_close(z.Gamma_r, R.T @ x.Gamma_r @ R, 1e-12)
+    assert_close(z.reduced_acceleration, R.T @ x.reduced_acceleration, 1e-12)
+    # A gauge that turns in time, R(t) = exp(S t): Gamma_r gains R^T Rdot, and the motion of w_r = R w_r' is the same.
+    S = np.array([[0.0, 0.7], [-0.7, 0.0]])
+    turning = R.T @ x.Gamma_r @ R + R.T @ S @ R
+    rate = R.T @ x.reduced_force - turning @ (R.T @ x.reduced_velocity)
+    back = S @ x.reduced_velocity + R @ rate
+    assert_close(back, x.reduced_acceleration, 1e-12)
+
+
+def test_bodies_with_dependent_rows():
+    """A pendulum with its rod listed three times; the sleigh, a body whose velocity is not dq/dt. Eager calls."""
+    scene, (q, v) = scenes.spherical_pendulum(), scenes.spherical_pendulum.start()
+    scene = Scene(scene.system, scene.constraints * 3)
+    found, want = gauge_invariant(scene, q, v), quick(lambda q, v: constrained_dynamics(scene, q, v))(q, v)
+    assert found.V2.shape == (3, 2) and bool(found.result == RESULTS.successful)
+    assert_close(found.acceleration, want.acceleration, 1e-10)
+    assert_close(found.multipliers, want.multipliers, 1e-10)
+    wrong = quick(lambda q, v: gauge_invariant(scene, q, v, dof=1).result == RESULTS.singular_basis)
+    assert bool(wrong(q, v))
+    with pytest.raises(ValueError, match=r"3 constraint rows leave no freedom of nv = 3: .* give dof"):
+        jax.jit(lambda q, v: gauge_invariant(scene, q, v))(q, v)
+    with pytest.raises(ValueError, match=r"rotation has shape \(2, 2\), expected \(3, 3\)"):
+        gauge_invariant(scene, q, v, rotation=jnp.eye(2), dof=1)
+    sleigh, (q, v) = scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start()
+    found = gauge_invariant(sleigh, q, v)
+    a, m, moment = 0.3, 1.0, 0.5
+    want = [a * v[2] ** 2, 0.0, -m * a * v[0] * v[2] / (moment + m * a**2)]
+    assert_close(found.acceleration, want, 1e-12)
+    assert_close(found.Lambda @ found.W.T, row_matrix(sleigh, q), 1e-13)
+
+
+def test_derivatives_and_float32(state):
+    """The acceleration's Jacobian equals that of the projection form, also at rest; float32 keeps its type."""
+    q, _, tau = state
+    scene = Scene(LagrangianSystem(coupled, 4), (Pfaffian(two_rows),))
+    one = lambda x: gauge_invariant(scene, x[:4], x[4:], tau).acceleration  # noqa: E731
+    other = lambda x: constrained_dynamics(scene, x[:4], x[4:], tau).acceleration  # noqa: E731
+    slopes = quick(lambda x: (jax.jacrev(one)(x), jax.jacfwd(other)(x)))(jnp.concatenate([q, 0 * q]))
+    assert_close(*slopes, 1e-10)
+    disk, (q, v) = scenes.rolling_disk(), scenes.rolling_disk.start(heading=0.3)
+    low = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, (disk, q, v))
+    found = quick(gauge_invariant)(*low)
+    assert found.acceleration.dtype == found.Gamma_r.dtype == jnp.float32
+    exact = quick(lambda q, v: constrained_dynamics(disk, q, v).acceleration)(q, v)
+    np.testing.assert_allclose(found.acceleration, exact, atol=1e-5)

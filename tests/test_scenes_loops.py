@@ -1,0 +1,331 @@
+"""Scenes with closed loops against equations by hand, symmetries and closed forms."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close, quick
+from scipy.integrate import solve_ivp
+
+from jaxdyn import scenes
+from jaxdyn.assembly import assemble, project_state, residuals
+from jaxdyn.constrained import RESULTS, constrained_dynamics, projections
+from jaxdyn.constraints.base import row_matrix
+from jaxdyn.dynamics import kinetic_energy, potential_energy
+from jaxdyn.simulate import simulate
+from jaxdyn.systems import ExplicitSystem, LagrangianSystem
+
+
+@pytest.fixture(scope="module")
+def parallel():
+    """The parallel manipulator at a moving state, and by hand what EQUATIONS section 8 says of it."""
+    mass, length = 1.3, 0.9
+    scene = scenes.parallel_manipulator(mass=mass, length=length)
+    velocity = np.array([0.3, -0.2])
+    q, v = scenes.parallel_manipulator.start(point=(0.1, 0.05), velocity=velocity, length=length, elbows=(1, -1, 1))
+
+    @quick
+    def solve(taus):
+        found = jax.vmap(lambda tau: constrained_dynamics(scene, q, v, tau))(taus)
+        return found, residuals(scene, q, v), row_matrix(scene, q), projections(scene, q).P_omega
+
+    M, h, J, carried = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 2)), np.zeros(6)
+    unit = mass * length**2
+    for leg in range(3):
+        rows = slice(2 * leg, 2 * leg + 2)
+        (first, second), (one, two) = np.asarray(q[rows]), np.asarray(v[rows])
+        bend = np.cos(second)
+        M[rows, rows] = unit * np.array([[5 / 3 + bend, 1 / 3 + bend / 2], [1 / 3 + bend / 2, 1 / 3]])
+        h[rows] = unit / 2 * np.sin(second) * np.array([-2 * one * two - two**2, one**2])
+        at, rate = first + np.array([0.0, second]), one + np.array([0.0, two])
+        ends, turning = np.exp(1j * at) * length, 1j * np.exp(1j * at) * length * rate
+        place, moving = (1j * np.array([x.sum(), x[1]]) for x in (ends, turning))
+        forward, change = (np.stack([x.real, x.imag]) for x in (place, moving))
+        J[rows] = np.linalg.inv(forward)
+        carried[rows] = -J[rows] @ change @ [one, two]  # d/dt(J) xdot
+    return {"solve": solve, "M": M, "h": h, "J": J, "carried": carried, "v": v, "velocity": velocity}
+
+
+def test_parallel_manipulator(parallel):
+    """Two equations for the carried point, J^T (M (J xdd + Jdot xd) + h) = J^T tau, with torques on all joints."""
+    M, h, J, carried = (parallel[name] for name in ("M", "h", "J", "carried"))
+    taus = np.random.default_rng(0).normal(size=(6, 6))
+    found, error, A, _ = parallel["solve"](jnp.asarray(taus))
+    assert float(error.max()) < 1e-14
+    assert_close(parallel["v"], J @ parallel["velocity"], 1e-13)
+    point = np.linalg.solve(J.T @ M @ J, J.T @ (taus - h - M @ carried).T)
+    assert_close(found.acceleration, (J @ point).T + carried, 1e-11)
+    assert (np.asarray(found.rank) == 4).all()
+    np.testing.assert_allclose(A @ J, 0, atol=1e-13)
+    assert_close(A.T @ found.multipliers.T, (M @ found.acceleration.T + h[:, None] - taus.T), 1e-11)
+
+
+def test_actuation_of_the_parallel_manipulator(parallel):
+    """Six motors or the three at the bases give any motion, and internal forces without motion (erratum E27)."""
+    M, h, J, carried = (parallel[name] for name in ("M", "h", "J", "carried"))
+    wanted = J @ np.array([0.7, -1.1]) + carried
+    needed = J.T @ (M @ wanted + h)
+    base = np.array([0, 2, 4])
+    P_omega = np.asarray(parallel["solve"](jnp.zeros((6, 6)))[3])
+    assert np.linalg.matrix_rank(P_omega[:, base], tol=1e-10) == 2
+    all_joints, three = np.linalg.pinv(J.T) @ needed, np.zeros(6)
+    three[base] = np.linalg.pinv(J.T[:, base]) @ needed
+    inner, inner_three = np.linalg.svd(J.T)[2][2:], np.zeros(6)
+    inner_three[base] = np.linalg.svd(J.T[:, base])[2][2]
+    taus = np.stack([all_joints, all_joints + inner[0], all_joints + inner[3], three, three + inner_three, np.zeros(6)])
+    found, *_ = parallel["solve"](jnp.asarray(taus))
+    assert_close(found.acceleration[:5], np.tile(wanted, (5, 1)), 1e-11)
+    lam = np.asarray(found.multipliers)
+    assert np.linalg.norm(lam[[1, 2]] - lam[0], axis=1).min() > 0.1
+    assert np.linalg.norm(lam[4] - lam[3]) > 0.1
+    # The least torques: the same motion costs more with three motors, and more with internal forces.
+    cost = np.linalg.norm(taus, axis=1)
+    assert cost[0] < cost[3] < cost[4] and cost[0] < cost[1]
+
+
+def test_ring_of_bars():
+    """A turning polygon carries a closed-form tension; in any motion the choice of the first bar makes no difference,
+    and momentum and angular momentum stay."""
+    count, mass, length, rate = 6, 1.2, 0.8, 1.7
+    scene = scenes.closed_ring(count=count, mass=mass, length=length)
+    solve = quick(
+        jax.vmap(lambda q, v: (residuals(scene, q, v), constrained_dynamics(scene, q, v), row_matrix(scene, q)))
+    )
+    polygon = scenes.closed_ring.start(count=count, length=length, rate=rate)
+    # A centrally symmetric hexagon closes; the rates close if sum w_i (-sin, cos) = 0.
+    rng = np.random.default_rng(0)
+    angles = np.array([0.3, 1.2, 2.3])
+    angles = np.concatenate([angles, angles + np.pi])
+    across = np.stack([-np.sin(angles), np.cos(angles)])
+    rates = np.concatenate([rng.normal(size=4), np.zeros(2)])
+    rates[4:] = -np.linalg.solve(across[:, 4:], across[:, :4] @ rates[:4])
+    place, speed = np.array([0.4, -0.3]), np.array([0.5, 0.2])
+    states = [polygon]
+    for first in (0, 1):
+        turned, w = np.roll(angles, -first), np.roll(rates, -first)
+        c, s = np.cos(turned[0]), np.sin(turned[0])
+        q = jnp.asarray([*place, turned[0], *np.diff(turned)])
+        states.append((q, jnp.asarray([*(np.array([[c, s], [-s, c]]) @ speed), w[0], *np.diff(w)])))
+        place = place + length * np.array([c, s])
+        speed = speed + length * w[0] * np.array([-s, c])
+    error, found, _ = solve(*(jnp.stack(x) for x in zip(*states, strict=True)))
+    assert float(error.max()) < 1e-14
+    a = np.asarray(found.acceleration)
+
+    still = polygon[1][2] * np.array([-polygon[1][1], polygon[1][0], 0.0])
+    np.testing.assert_allclose(
+        a[0], [*(-still[:2] - rate**2 * np.asarray(polygon[0][:2]))[:2], *np.zeros(6)], atol=1e-12
+    )
+    tension = mass * length / 4 / np.tan(np.pi / count) / np.sin(np.pi / count) * rate**2
+    np.testing.assert_allclose(np.linalg.norm(found.multipliers[0]), tension, rtol=1e-12)
+
+    turning = np.cumsum(a[1:, 2:], 1)
+    assert_close(np.roll(turning[1], 1), turning[0], 1e-11)
+    # Accelerations of the bars' centres from the first joint on.
+    q, v = states[1]
+    c, s = np.cos(q[2]), np.sin(q[2])
+    joint = np.array([[c, -s], [s, c]]) @ (a[1, :2] + np.asarray(v[2] * jnp.asarray([-v[1], v[0]])))
+    along = length * np.stack([np.cos(angles), np.sin(angles)], 1)
+    steps = turning[0][:, None] * length * across.T - rates[:, None] ** 2 * along
+    joints = joint + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, 0)])
+    np.testing.assert_allclose(joints[-1], joints[0], atol=1e-12)
+    centers = joints[:-1] + steps / 2
+    np.testing.assert_allclose(centers.sum(0), 0, atol=1e-12)
+    places = np.concatenate([np.zeros((1, 2)), np.cumsum(along, 0)])[:-1] + along / 2
+    moment = places[:, 0] * centers[:, 1] - places[:, 1] * centers[:, 0]
+    np.testing.assert_allclose(moment.sum() + length**2 / 12 * turning[0].sum(), 0, atol=1e-12)
+
+
+class Bennett:
+    """Bennett's linkage as one equation for the first angle, from the energies of rods with moving ends."""
+
+    def __init__(self, lengths=(1.0, 0.7), twist=1.1, mass=1.0, gravity=9.81):
+        self.mass, self.gravity = mass, gravity
+        other = np.arcsin(lengths[1] * np.sin(twist) / lengths[0])
+        self.ratio = np.sin((other + twist) / 2) / np.sin((other - twist) / 2)
+        self.links = [(lengths[0], twist), (lengths[1], other)]
+
+    def angles(self, q):
+        return q, 2 * np.arctan(self.ratio / np.tan(q / 2)), -q
+
+    def ends(self, q):
+        """Joints 1 to 4 (4, 3); complex steps may pass."""
+        pose, places = np.eye(4, dtype=np.result_type(q, float)), [np.zeros(3)]
+        for angle, (length, twist) in zip(self.angles(q), [*self.links, self.links[0]], strict=True):
+            c, s, ct, st = np.cos(angle), np.sin(angle), np.cos(twist), np.sin(twist)
+            turn = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+            pose = pose @ turn @ np.array([[1, 0, 0, length], [0, ct, -st, 0], [0, st, ct, 0], [0, 0, 0, 1]])
+            places.append(pose[:3, 3])
+        return np.stack(places)
+
+    def inertia(self, q):
+        """I(q) in T = I q'^2/2: rods with ends moving at u and w hold m (u.u + u.w + w.w)/6."""
+        u = self.ends(q + 1e-30j).imag / 1e-30
+        pairs = np.sum(u[:-1] ** 2 + u[:-1] * u[1:] + u[1:] ** 2)
+        return self.mass / 3 * pairs
+
+    def potential(self, q):
+        heights = self.ends(q)[:, 2]
+        return self.mass * self.gravity / 2 * np.sum(heights[:-1] + heights[1:])
+
+    def acceleration(self, q, rate, h=1e-3):
+        """From I q'' + I' q'^2/2 + V' = 0; the slopes by differences of eighth order."""
+        slope = lambda f: sum(  # noqa: E731
+            w * (f(q + k * h) - f(q - k * h)) / h for k, w in ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+        )
+        return -(slope(self.inertia) * rate**2 / 2 + slope(self.potential)) / self.inertia(q)
+
+
+def test_bennett_linkage():
+    """Five rows of rank two: one freedom that counting does not find, with the right acceleration."""
+    scene, oracle = scenes.bennett(), Bennett()
+    solve = quick(jax.vmap(lambda q, v: (residuals(scene, q, v), constrained_dynamics(scene, q, v))))
+    cases = [(0.8, 1.0), (2.5, -0.7), (-1.2, 2.0)]
+    starts = [scenes.bennett.start(angle=angle, rate=rate) for angle, rate in cases]
+    error, found = solve(*(jnp.stack(x) for x in zip(*starts, strict=True)))
+    assert float(error.max()) < 1e-14
+    assert (np.asarray(found.rank) == 2).all() and found.multipliers.shape == (3, 5)
+    assert bool((found.result == RESULTS.successful).all())
+    for (angle, rate), a in zip(cases, np.asarray(found.acceleration), strict=True):
+        first = oracle.acceleration(angle, rate)
+        follower = oracle.angles(angle)[1]
+        # q2' = -q1' sin q2/sin q1, differentiated.
+        ratio = np.sin(follower) / np.sin(angle)
+        second = -first * ratio - rate * (np.cos(follower) * -rate * ratio - ratio * np.cos(angle) * rate) / np.sin(
+            angle
+        )
+        assert_close(a, [first, second, -first], 1e-10)
+    with pytest.raises(ValueError, match=r"make no Bennett linkage; sin\(beta\) is 1.7"):
+        scenes.bennett(lengths=(1.0, 2.0))
+
+
+def test_andrews_from_its_bodies():
+    """The tree of seven bodies and the printed M and f: equal accelerations and energies on the constraints."""
+    printed, built = scenes.andrews(), scenes.andrews_bodies()
+    order = np.array([0, 1, 2, 4, 3, 6, 5])
+    q0, v0 = scenes.andrews.start()
+    rough = [15.8107, -15.7563, 0.040822, -0.53473, 0.524410, 0.53473, 1.04808]
+
+    @quick
+    def compute(q, v):
+        state = assemble(printed, q, v)
+        q, v = state.q, state.v
+        x, w = q[order], v[order]
+        found = []
+        for scene, place, rate in ((printed, q, v), (built, x, w)):
+            energy = kinetic_energy(scene.system, place, rate)
+            a = constrained_dynamics(scene, place, rate).acceleration
+            found.append((a, energy, residuals(scene, place, rate)))
+        return found, potential_energy(printed.system, q), built.forces[0].energy(built.system, x)
+
+    rates = [1140.0, -1424.0, 11.0, 19.0, 0.6, -19.0, 0.3]
+    for q, v in ((q0, v0), (jnp.asarray(rough), jnp.asarray(rates))):
+        ((a, kinetic, _), (b, same, error)), stored, also = compute(q, v)
+        assert float(error[0]) < 1e-15 and float(error[1]) < 1e-12  # m and m/s, of 0.1 m and 8 m/s
+        assert_close(b, a[order], 1e-10)
+        np.testing.assert_allclose(same, kinetic, rtol=1e-12)
+        np.testing.assert_allclose(also, stored, rtol=1e-12)
+    assert float(kinetic) > 0.1
+
+
+def test_spherical_pendulum_three_ways():
+    """Angles, projection in space, and the second fundamental form a = P_T g + S(v, v): one motion."""
+    radius, gravity = 1.3, 9.81
+    t = jnp.linspace(0.0, 10.0, 6)
+
+    def kinetic_minus_potential(q, v):
+        angular = v[0] ** 2 + jnp.sin(q[0]) ** 2 * v[1] ** 2
+        return 0.5 * radius**2 * angular + gravity * radius * jnp.cos(q[0])
+
+    def pull(q, v):
+        # -(P_T g - |v|^2/r^2 q)
+        fall = jnp.asarray([0.0, 0.0, -gravity])
+        return (jnp.sum(fall * q) + jnp.sum(v * v)) / radius**2 * q - fall
+
+    start = {"length": radius, "theta": 0.9, "phi": 0.3, "theta_rate": 0.4, "phi_rate": 1.1}
+    state = scenes.spherical_pendulum.start(**start)
+    angles = LagrangianSystem(kinetic_minus_potential, 2)
+    form = ExplicitSystem(lambda q: jnp.eye(3), pull, 3)
+
+    @quick
+    def run():
+        options = {"stepsize": 0.02, "solver": diffrax.Dopri8()}
+        first = simulate(angles, jnp.asarray([0.9, 0.3]), jnp.asarray([0.4, 1.1]), t, **options).q
+        projected = simulate(scenes.spherical_pendulum(length=radius), *state, t, **options).q
+        return first, projected, simulate(form, *state, t, **options).q
+
+    chart, projected, form = (np.asarray(x) for x in run())
+    sine = np.sin(chart[:, 0])
+    place = np.stack([sine * np.cos(chart[:, 1]), sine * np.sin(chart[:, 1]), -np.cos(chart[:, 0])], 1)
+    np.testing.assert_allclose(projected, radius * place, atol=1e-10)
+    np.testing.assert_allclose(form, projected, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_motion_of_the_bennett_linkage():
+    """Turned by gravity, against the one equation; the five dependent rows stay closed.
+
+    The rows depend on each other only where the loop is closed. Within a step it is open by the errors of the stages,
+    so the rank tolerance has to lie above these: with the default, the third singular value would count.
+    """
+    oracle, ts = Bennett(), np.linspace(0.0, 3.0, 7)
+    want = solve_ivp(
+        lambda t, y: [y[1], oracle.acceleration(*y)],
+        (0.0, 3.0),
+        [0.8, 1.0],
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-12,
+        t_eval=ts,
+    ).y
+    scene, step, tol = scenes.bennett(), 0.002, 1e-4
+
+    def slope(q, v):
+        return v, constrained_dynamics(scene, q, v, rank_tol=tol).acceleration
+
+    def advance(_, state):
+        one = slope(*state)
+        two = slope(*(x + step / 2 * dx for x, dx in zip(state, one, strict=True)))
+        three = slope(*(x + step / 2 * dx for x, dx in zip(state, two, strict=True)))
+        four = slope(*(x + step * dx for x, dx in zip(state, three, strict=True)))
+        moved = [
+            x + step / 6 * (a + 2 * b + 2 * c + d) for x, a, b, c, d in zip(state, one, two, three, four, strict=True)
+        ]
+        return project_state(scene, *moved, 0.0, tol)
+
+    @quick
+    def run(q, v):
+        def save(state, _):
+            state = jax.lax.fori_loop(0, 250, advance, state)
+            return state, (*state, residuals(scene, *state))
+
+        return jax.lax.scan(save, (q, v), None, length=6)[1]
+
+    q, v, error = run(*scenes.bennett.start(angle=0.8, rate=1.0))
+    assert float(error.max()) <= 1e-13
+    np.testing.assert_allclose(q[:, 0], want[0, 1:], atol=1e-9)  # h^4, and the differences in the equation
+    np.testing.assert_allclose(v[:, 0], want[1, 1:], atol=1e-9)
+    np.testing.assert_allclose(q[:, 2], -q[:, 0], atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a01_pendulum_for_2000_seconds():
+    """IFToMM A01 as first stated: position after 100 and after 2000 s, 845 periods, to 1e-6."""
+    scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start()
+    ts = jnp.asarray([0.0, 100.0, 2000.0])
+
+    @jax.jit
+    def run():
+        options = {"stepsize": 0.02, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
+        return simulate(scene, q, v, ts, max_steps=110_000, **options)
+
+    found = run()
+    want = [
+        [-1.0, 0.0],
+        [-0.181513351427031385, -0.983388480334057505],
+        [0.814603068589032152, -0.580018827836935462],
+    ]
+    assert bool(found.success) and float(found.constraint_residual.max()) <= 1e-12
+    np.testing.assert_allclose(found.q, want, atol=1e-6)
+    np.testing.assert_allclose(found.energy, found.energy[0], atol=1e-9)
