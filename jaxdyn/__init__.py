@@ -15,6 +15,8 @@ from jaxdyn.constrained import constrained_dynamics as constrained_dynamics
 from jaxdyn.constrained import projections as projections
 from jaxdyn.constrained import second_fundamental_form as second_fundamental_form
 from jaxdyn.constrained_motion import Baumgarte as Baumgarte
+from jaxdyn.constrained_motion import Multipliers as Multipliers
+from jaxdyn.constrained_motion import Projected as Projected
 from jaxdyn.constrained_motion import Reduced as Reduced
 from jaxdyn.constraints import Holonomic as Holonomic
 from jaxdyn.constraints import Pfaffian as Pfaffian

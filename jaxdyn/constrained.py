@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import lineax as lx
 from jax import lax
@@ -102,6 +103,7 @@ def constrained_dynamics(
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}")
+    rank_tol = checked_tolerance(rank_tol)
     force = applied(scene, q, v, tau, t)
     places = layout(scene)
     if not places:
@@ -248,6 +250,15 @@ def _metric(scene, q, t, rank_tol):
     factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
     Y = solve_triangular(factor, row_matrix(scene, q, t).T, lower=True)
     return factor, Y, pseudo_inverse(Y, tolerance(rank_tol, Y))
+
+
+def checked_tolerance(rank_tol: float | None) -> float | None:
+    """The rank tolerance as a float, or None for the default. **Raises:** ValueError outside (0, 1)."""
+    if rank_tol is None:
+        return None
+    if isinstance(rank_tol, jax.core.Tracer) or not 0 < float(rank_tol) < 1:
+        raise ValueError(f"rank_tol is {rank_tol}; give a number between 0 and 1 that is not traced, or None")
+    return float(rank_tol)
 
 
 def tolerance(rank_tol: float | None, like: Array) -> float:

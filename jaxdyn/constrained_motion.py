@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.assembly import open_constraints, project_state, residuals, start_evidence
-from jaxdyn.constrained import constrained_dynamics, solve_rows
+from jaxdyn.constrained import checked_tolerance, constrained_dynamics, solve_rows
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
 from jaxdyn.dynamics import forward_dynamics
 from jaxdyn.reduced import Basis, Given, Orthonormal, as_basis, least_quality, minimal_velocity, reduce, tangent_basis
@@ -48,6 +48,10 @@ class Method(eqx.Module):
         """Rate of v, (nv,)."""
         return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force, t)
 
+    def multipliers(self, scene: Scene, q, v, t, force) -> Array:
+        """Constraint forces along the rows, (nc,)."""
+        return dynamics(scene, q, v, t, force).multipliers
+
     def corrects(self, scene: Scene) -> bool:
         """Whether `corrected` changes a state."""
         return self.projects or has_quaternions(scene.system)
@@ -75,24 +79,39 @@ class Free(Method):
 
 
 class Multipliers(Method):
-    """Accelerations with multipliers; nothing keeps the constraints from opening as the local errors add up."""
+    """Accelerations with multipliers; nothing keeps the constraints from opening as the local errors add up.
 
+    **Arguments:** `rank_tol`, as in `constrained_dynamics`. Rows that depend on each other only on the constraints, as those
+    of an overconstrained loop do, need one above what the stages of a step open: 1e-4 to 1e-6.
+    """
+
+    rank_tol: float | None = eqx.field(static=True, default=None, kw_only=True)
     name: ClassVar[str] = "multipliers"
+
+    def __check_init__(self):
+        checked_tolerance(self.rank_tol)
 
     def acceleration(self, scene, q, v, t, force):
         """From `constrained_dynamics`."""
-        return dynamics(scene, q, v, t, force).acceleration
+        return dynamics(scene, q, v, t, force, self.rank_tol).acceleration
+
+    def multipliers(self, scene, q, v, t, force):
+        """From `constrained_dynamics`."""
+        return dynamics(scene, q, v, t, force, self.rank_tol).multipliers
 
 
 class Projected(Multipliers):
-    """Accelerations with multipliers, and the least change, in the mass metric, back onto the constraints."""
+    """Accelerations with multipliers, and the least change, in the mass metric, back onto the constraints.
+
+    **Arguments:** `rank_tol`, as in `Multipliers`.
+    """
 
     name: ClassVar[str] = "projected"
     projects: ClassVar[bool] = True
 
     def corrected(self, scene, y, t):
         """q and v on the constraints, quaternions of unit length."""
-        q, v = project_state(scene, y["q"], y["v"], t)
+        q, v = project_state(scene, y["q"], y["v"], t, self.rank_tol)
         return y | {"q": q, "v": v}
 
 
@@ -229,14 +248,14 @@ def chosen_method(scene: Scene, method: str | Method) -> Method:
     else:
         names = ", ".join(map(repr, METHODS))
         raise ValueError(
-            f"method is {method!r}; a scene with constraints takes 'auto' or {names}, or jd.Reduced(...), jd.Baumgarte(...)"
+            f"method is {method!r}; a scene with constraints takes 'auto', {names}, or e.g. jd.Reduced(...)"
         )
     return chosen.fitted(scene, None) if isinstance(chosen, Reduced) else chosen
 
 
-def dynamics(scene: Scene, q, v, t, force):
+def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
     """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
-    return constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t)
+    return constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
 
 
 def serves(quality) -> Array:

@@ -16,7 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.assembly import project_state, residuals
-from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, dynamics, serves
+from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves
 from jaxdyn.constraints.base import state_dtype
 from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.kinematics import frame_pose
@@ -289,7 +289,7 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
         if "acceleration" in outputs:
             values["acceleration"] = method.acceleration(scene, q, v, t, force)
         if "multipliers" in outputs:
-            values["multipliers"] = dynamics(scene, q, v, t, force).multipliers
+            values["multipliers"] = method.multipliers(scene, q, v, t, force)
         if "constraint_residual" in outputs:
             values["constraint_residual"] = residuals(scene, q, v, t)
         frames = [name.removeprefix(_POSE) for name in outputs if name.startswith(_POSE)]
