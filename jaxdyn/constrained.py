@@ -20,7 +20,8 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, Int
 
 from jaxdyn.constraints.base import Layout, Rows, holonomic_rows, layout, row_matrix, rows
-from jaxdyn.constraints.loops import Loop, relative_poses
+from jaxdyn.constraints.frames import relative_poses
+from jaxdyn.constraints.loops import Loop
 from jaxdyn.dynamics import bias_force, mass_matrix
 from jaxdyn.model import Model
 from jaxdyn.recursive import aba_with_columns

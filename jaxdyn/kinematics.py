@@ -10,6 +10,7 @@ the tree's root body. Positions in it are built without ever adding the root's o
 world's origin is computed exactly as one at home.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -92,6 +93,76 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     return TreeFrame(pose, origin, subspace)
 
 
+class Carried(NamedTuple):
+    """A few frames, and the coordinates that move them.
+
+    - `pose` (n, 4, 4): in the tree frame of the body that carries it; `origin` (n, 3): of that tree frame in the world.
+    - `coordinates` (k,): velocity coordinates that move any of them; `subspace` (k, 6): their rows of `TreeFrame.subspace`.
+    - `moves` (n, k) of bool: which frame each of these coordinates moves.
+    """
+
+    pose: Float[Array, "n 4 4"]
+    origin: Float[Array, "n 3"]
+    subspace: Float[Array, "k 6"]
+    coordinates: np.ndarray
+    moves: np.ndarray
+
+
+def carried(model: Model, q: Float[Array, " nq"], bodies: Sequence[int]) -> Carried:
+    """The frames of a few bodies (-1 is the world), computed on their ancestors alone."""
+    topology, n = model.topology, len(bodies)
+    named = np.array([body for body in bodies if body >= 0], int)
+    kept = np.flatnonzero(topology.ancestors[named].any(0)).tolist()
+    if not kept:
+        pose = jnp.broadcast_to(jnp.eye(4, dtype=q.dtype), (n, 4, 4))
+        return Carried(
+            pose, jnp.zeros((n, 3), q.dtype), jnp.zeros((0, 6), q.dtype), np.zeros(0, int), np.zeros((n, 0), bool)
+        )
+    coordinates = _places(topology.v_slices, kept)
+    if len(kept) < model.nb:
+        model, q = _pruned(model, kept), take(q, _places(topology.q_slices, kept))
+    frame = tree_frame(model, q)
+    index = np.array([kept.index(body) if body >= 0 else len(kept) for body in bodies])
+    pose = jnp.concatenate([frame.pose, jnp.eye(4, dtype=q.dtype)[None]])
+    origin = jnp.concatenate([frame.origin, jnp.zeros((1, 3), q.dtype)])
+    moves = np.concatenate([model.topology.dof_ancestors, np.zeros((1, model.nv), bool)])[index]
+    return Carried(take(pose, index), take(origin, index), frame.subspace, coordinates, moves)
+
+
+def _pruned(model: Model, kept: list[int]) -> Model:
+    """The model with some of its bodies alone, which include the parent of each; what kinematics does not read is left out."""
+    old, index = model.topology, np.array(kept)
+
+    def chosen(names):
+        return tuple(names[i] for i in kept)
+
+    parents = tuple(kept.index(parent) if parent >= 0 else -1 for parent in chosen(old.parents))
+    names = chosen(old.body_names)
+    topology = Topology(
+        old.name, parents, chosen(old.kinds), names, chosen(old.joint_names), names, tuple(range(len(kept)))
+    )
+    at_q, at_v = _places(old.q_slices, kept), _places(old.v_slices, kept)
+    return Model(
+        home=take(model.home, index),
+        screws=take(model.screws, index),
+        inertias=take(model.inertias, index),
+        frame_poses=jnp.zeros((len(kept), 4, 4), model.home.dtype),
+        gravity=None,
+        armature=None,
+        damping=None,
+        friction=None,
+        lower=take(model.lower, at_q),
+        upper=take(model.upper, at_q),
+        velocity_limit=take(model.velocity_limit, at_v),
+        effort_limit=take(model.effort_limit, at_v),
+        topology=topology,
+    )
+
+
+def _places(slices, kept: list[int]) -> np.ndarray:
+    return np.concatenate([np.arange(slices[i].start, slices[i].stop) for i in kept])
+
+
 def body_twists(model: Model, frame: TreeFrame, v: Float[Array, " nv"]) -> Float[Array, "nb 6"]:
     """Twist of every body in its tree frame: V_i = sum of S_k v_k over the coordinates k that move body i."""
     return sum_to_bodies(model, frame.subspace * v[:, None])
@@ -141,8 +212,8 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
     body, offset = _named_frame(model, name)
     if body < 0:
         return offset
-    frame = tree_frame(model, q)
-    return _product(frame.pose[body], offset).at[:3, 3].add(frame.origin[body])
+    found = carried(model, q, [body])
+    return _product(found.pose[0], offset).at[:3, 3].add(found.origin[0])
 
 
 def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:

@@ -51,6 +51,11 @@ class Constraint(eqx.Module):
         """Residuals (nh,) of each of the constraints of one group."""
         raise NotImplementedError
 
+    @classmethod
+    def grouped_rows(cls, members: Sequence["Constraint"], system, q, t) -> list | None:
+        """Rows A (n, nv) of each of the constraints of one group, or None: to be had by differentiation alone."""
+        return None
+
 
 class Holonomic(Constraint):
     """A constraint on the configuration: phi(q, t) = 0.
@@ -215,11 +220,21 @@ def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) ->
 def row_matrix(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "nc nv"]:
     """A(q, t) of all constraints, (nc, nv)."""
     t = jnp.asarray(t, q.dtype)
-    v = jnp.zeros((scene.nv,), q.dtype)
-    # psi is affine in v, so one mode costs a pass per row and the other one per column.
-    count = layout(scene)[-1].end
-    differentiate = jax.jacrev if count < scene.nv else jax.jacfwd
-    return differentiate(lambda v: velocity_residual(scene, q, v, t))(v)
+    found: list[Any] = [None] * len(scene.constraints)
+    for (kind, _), members in _grouped(scene):
+        values = kind.grouped_rows([scene.constraints[i] for i in members], scene.system, q, t)
+        for i, value in zip(members, values or (), strict=False):
+            found[i] = value
+    rest = [i for i, value in enumerate(found) if value is None]
+    if rest:
+        others = Scene(scene.system, tuple(scene.constraints[i] for i in rest))
+        places, v = layout(others), jnp.zeros((scene.nv,), q.dtype)
+        # psi is affine in v, so one mode costs a pass per row and the other one per column.
+        differentiate = jax.jacrev if places[-1].end < scene.nv else jax.jacfwd
+        A = differentiate(lambda v: velocity_residual(others, q, v, t))(v)
+        for i, place in zip(rest, places, strict=True):
+            found[i] = A[place.start : place.end]
+    return jnp.concatenate(found)
 
 
 def state_dtype(system):
@@ -234,18 +249,23 @@ def state_dtype(system):
 def _positions(scene: Scene, q, t) -> list:
     """phi of each constraint (None without a holonomic part), those of one group computed together."""
     found: list[Any] = [None] * len(scene.constraints)
-    groups: dict[Any, list[int]] = {}
     for i, constraint in enumerate(scene.constraints):
-        key = constraint.group()
-        if key is None:
+        if constraint.group() is None:
             found[i] = constraint.position(scene.system, q, t)
-        else:
-            groups.setdefault((type(constraint), key), []).append(i)
-    for (kind, _), members in groups.items():
+    for (kind, _), members in _grouped(scene):
         values = kind.grouped_position([scene.constraints[i] for i in members], scene.system, q, t)
         for k, i in enumerate(members):
             found[i] = values[k]
     return found
+
+
+def _grouped(scene: Scene):
+    """Pairs of ((type, group), indices of the constraints in it)."""
+    groups: dict[Any, list[int]] = {}
+    for i, constraint in enumerate(scene.constraints):
+        if constraint.group() is not None:
+            groups.setdefault((type(constraint), constraint.group()), []).append(i)
+    return groups.items()
 
 
 def _own_name(name, function, default: str) -> str:

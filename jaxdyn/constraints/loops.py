@@ -22,9 +22,10 @@ from jaxtyping import Array, Float
 from jaxdyn import _float64 as f64
 from jaxdyn import se3, so3
 from jaxdyn.constraints.base import Constraint
+from jaxdyn.constraints.frames import relative_poses, rows_by_twists
 from jaxdyn.joints import KINDS, SCREW_KINDS, joint_difference
-from jaxdyn.kinematics import take, tree_frame
-from jaxdyn.model import Model, body_index, frame_index
+from jaxdyn.kinematics import take
+from jaxdyn.model import Model, body_index
 from jaxdyn.so3 import _product
 
 
@@ -106,27 +107,44 @@ class Loop(Constraint):
         """Residuals (n,) of each loop; those closed by the same joint are one batch."""
         rotation, position = relative_poses(members, system, q)
         found: list = [None] * len(members)
-        alike: dict[tuple[str, bool], list[int]] = {}
-        for i, member in enumerate(members):
-            alike.setdefault((member.joint, member.in_plane), []).append(i)
-        for places in alike.values():
+        for places in _alike(members):
             residual = members[places[0]]._kind.residual
             values = jax.vmap(residual)(take(rotation, np.array(places)), take(position, np.array(places)))
             for k, i in enumerate(places):
                 found[i] = values[k]
         return found
 
+    @classmethod
+    def grouped_rows(cls, members: Sequence["Loop"], system, q, t):
+        """Rows (n, nv) of each loop."""
+
+        def derivatives(rotation, position):
+            for places in _alike(members):
+                slope, index = jax.jacfwd(members[places[0]]._displaced), np.array(places)
+                zero = jnp.zeros((len(places), 6), q.dtype)
+                yield index, jax.vmap(slope)(zero, take(rotation, index), take(position, index))
+
+        return rows_by_twists(members, derivatives, system, q)
+
+    def _displaced(self, twist, rotation, position):
+        """Residual after frame B has moved along a twist, seen from frame A."""
+        moved = se3.exp(twist)
+        return self._kind.residual(_product(moved[:3, :3], rotation), se3.apply(moved, position))
+
     def wrench(self, rotation, position, lam):
         """Wrench (f, tau) (6,) of the joint on body B for the multipliers lam, at the origin and in axes of frame A.
 
         `rotation`, `position`: of frame B seen from frame A. The wrench on body A is the negative of it.
         """
+        return jax.vjp(lambda twist: self._displaced(twist, rotation, position), jnp.zeros((6,), lam.dtype))[1](lam)[0]
 
-        def along(twist):
-            moved = se3.exp(twist)
-            return self._kind.residual(_product(moved[:3, :3], rotation), se3.apply(moved, position))
 
-        return jax.vjp(along, jnp.zeros((6,), lam.dtype))[1](lam)[0]
+def _alike(members: Sequence[Loop]) -> list[list[int]]:
+    """Loops that are closed by the same joint."""
+    found: dict[tuple[str, bool], list[int]] = {}
+    for i, member in enumerate(members):
+        found.setdefault((member.joint, member.in_plane), []).append(i)
+    return list(found.values())
 
 
 def loop(
@@ -344,38 +362,3 @@ def joint_index(name: str, system, joint: str) -> int:
             f"constraint {name!r}: joint {joint!r} is not in model {system.name!r}; it has {list(system.joint_names)}"
         )
     return system.joint_names.index(joint)
-
-
-def frame_poses(model: Model, q, bodies: Sequence[str | None], poses):
-    """Poses (n, 4, 4) of frames on bodies in the tree frames of these, and the tree frames' origins (n, 3)."""
-    frame = tree_frame(model, q)
-    offsets = jnp.stack([pose.astype(q.dtype) for pose in poses])
-    places, named = [], []
-    for k, body in enumerate(bodies):
-        if body is None:
-            places.append(model.nb)
-            continue
-        index = frame_index(model, body)
-        places.append(model.topology.frame_bodies[index] % (model.nb + 1))  # -1 is the world
-        if body not in model.body_names:
-            named.append((k, index))
-    for k, index in named:
-        offsets = offsets.at[k].set(_product(model.frame_poses[index].astype(q.dtype), offsets[k]))
-    index = np.array(places)
-    world = jnp.eye(4, dtype=q.dtype)[None]
-    carried = jnp.concatenate([frame.pose, world])[index]
-    origins = jnp.concatenate([frame.origin, jnp.zeros((1, 3), q.dtype)])[index]
-    return _product(carried, offsets), origins
-
-
-def relative_poses(members, system, q):
-    """Rotations (n, 3, 3) and positions (n, 3) of frame B seen from frame A, for constraints with bodies and poses.
-
-    Positions are subtracted tree by tree: a robot far from the world's origin loses nothing.
-    """
-    n = len(members)
-    bodies = [m.body_a for m in members] + [m.body_b for m in members]
-    pose, origin = frame_poses(system, q, bodies, [m.pose_a for m in members] + [m.pose_b for m in members])
-    turned = jnp.swapaxes(pose[:n, :3, :3], 1, 2)
-    apart = pose[n:, :3, 3] - pose[:n, :3, 3] + (origin[n:] - origin[:n])
-    return _product(turned, pose[n:, :3, :3]), _product(turned, apart[..., None])[..., 0]

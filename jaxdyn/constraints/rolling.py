@@ -21,7 +21,8 @@ from jaxtyping import Array, Float
 
 from jaxdyn import so3
 from jaxdyn.constraints.base import Constraint
-from jaxdyn.constraints.loops import check_bodies, frame_poses, pose_leaf
+from jaxdyn.constraints.frames import frames_on
+from jaxdyn.constraints.loops import check_bodies, pose_leaf
 from jaxdyn.so3 import _product, cross
 from jaxdyn.systems import velocity_to_rate
 
@@ -52,7 +53,7 @@ class _Touching(Constraint):
         raise NotImplementedError
 
     def _poses(self, system, q):
-        pose, origin = frame_poses(system, q, [self.body, self.surface_body], [self.pose, self.surface])
+        pose, origin, *_ = frames_on(system, q, [self.body, self.surface_body], [self.pose, self.surface])
         return pose[:, :3, :3], pose[:, :3, 3] + origin
 
     def sizes(self, system, dtype):
