@@ -189,7 +189,8 @@ def open_constraints(scene: Scene, q, v, t=0.0, limit: float = 0.0) -> str:
             found.append((apart, f"{kind} {place.name!r} open by {apart:.3g}"))
         if fast > limit:
             found.append((fast, f"{kind} {place.name!r} slips at {fast:.3g}"))
-    return ", ".join(text for _, text in sorted(found, reverse=True)[:6])
+    # Those that print alike stay in the scene's order, whatever their rounding errors.
+    return ", ".join(text for _, text in sorted(found, key=lambda entry: -float(f"{entry[0]:.3g}"))[:6])
 
 
 @eqx.filter_jit

@@ -248,7 +248,7 @@ def chosen_method(scene: Scene, method: str | Method) -> Method:
     else:
         names = ", ".join(map(repr, METHODS))
         raise ValueError(
-            f"method is {method!r}; a scene with constraints takes 'auto', {names}, or e.g. jd.Reduced(...)"
+            f"method is {method!r}; a scene with constraints takes 'auto' or {names}, or e.g. jd.Reduced(...)"
         )
     return chosen.fitted(scene, None) if isinstance(chosen, Reduced) else chosen
 

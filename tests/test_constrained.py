@@ -432,7 +432,7 @@ def test_assemble_fails_clearly():
     assert codes.tolist() == [False, True]
     system = LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 2)
     both = [Holonomic(lambda q, t, x=x: q[0] - x, name=f"x = {x}") for x in (0.0, 1.0)]
-    with pytest.raises(ValueError, match=r"not assembled: holonomic 'x = 1.0' open by 0.5, holonomic 'x = 0.0' open"):
+    with pytest.raises(ValueError, match=r"not assembled: holonomic 'x = 0.0' open by 0.5, holonomic 'x = 1.0' open"):
         assemble(Scene(system, both), jnp.asarray([0.2, 0.1]))
 
 
