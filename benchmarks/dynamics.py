@@ -20,7 +20,7 @@ import numpy as np
 import pinocchio as pin
 
 import jaxdyn as jd
-from benchmarks import timing
+from benchmarks import jax_peers, timing
 
 ROBOTS = Path(pin.__file__).parents[4] / "share/example-robot-data/robots"
 FILES = {
@@ -124,6 +124,12 @@ def measure(name, batch, dtype, rounds, functions):
             executable, trace, build = compiled(traced, *inputs)
             times[mode] = {"trace_s": trace, "compile_s": build}
             calls[mode] = lambda run=executable, inputs=inputs: jax.block_until_ready(run(*inputs))
+        if label == "forward dynamics":
+            for peer, call in jax_peers.forward_dynamics(model).items():
+                if jax_peers.checked(peer, call, model, *args):
+                    executable, trace, build = compiled(jax.vmap(call), *args)
+                    times[peer] = {"trace_s": trace, "compile_s": build}
+                    calls[peer] = lambda run=executable: jax.block_until_ready(run(*args))
         result = timing.interleaved(calls, rounds)
         for entry in result.values():
             entry.update({key + "_us": 1e6 * entry.pop(key) / batch for key in ("best", "median")})
@@ -149,13 +155,16 @@ def line(row):
         cells.append("" if entry is None else f"{entry['best_us']:.3g} ({entry['median_us']:.3g})")
         cells.append("" if entry is None else f"{ratios[0]:.2f} ({ratios[1]:.2f})")
     cells += [f"{base['best_us']:.3g} ({base['median_us']:.3g})", reference(row)]
+    for peer in ("frax", "MJX"):
+        entry = row["times"].get(peer)
+        cells.append("" if entry is None else f"{entry['best_us']:.3g} ({entry['median_us']:.3g})")
     cells.append(f"{row['known']['trace_s']:.1f} + {row['known']['compile_s']:.1f}")
     return "| " + " | ".join(cells) + " |"
 
 
 HEAD = (
-    "| robot | function | batch | dtype | jaxdyn us | ratio | model given us | ratio | Pinocchio us | as | trace + compile s |\n"
-    "|---|---|---|---|---|---|---|---|---|---|---|"
+    "| robot | function | batch | dtype | jaxdyn us | ratio | model given us | ratio | Pinocchio us | as | frax us | MJX us | "
+    "trace + compile s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
