@@ -99,6 +99,8 @@ class Carried(NamedTuple):
     - `pose` (n, 4, 4): in the tree frame of the body that carries it; `origin` (n, 3): of that tree frame in the world.
     - `coordinates` (k,): velocity coordinates that move any of them; `subspace` (k, 6): their rows of `TreeFrame.subspace`.
     - `moves` (n, k) of bool: which frame each of these coordinates moves.
+    - `twist`, `bias` (n, 6): twist of each frame, as a twist of the fixed frame that now coincides with the tree frame, and
+      its rate at a = 0; None when no velocity was given.
     """
 
     pose: Float[Array, "n 4 4"]
@@ -106,18 +108,22 @@ class Carried(NamedTuple):
     subspace: Float[Array, "k 6"]
     coordinates: np.ndarray
     moves: np.ndarray
+    twist: Float[Array, "n 6"] | None = None
+    bias: Float[Array, "n 6"] | None = None
 
 
-def carried(model: Model, q: Float[Array, " nq"], bodies: Sequence[int]) -> Carried:
-    """The frames of a few bodies (-1 is the world), computed on their ancestors alone."""
+def carried(
+    model: Model, q: Float[Array, " nq"], bodies: Sequence[int], v: Float[Array, " nv"] | None = None
+) -> Carried:
+    """The frames of a few bodies (-1 is the world), and with v their twists, computed on their ancestors alone."""
     topology, n = model.topology, len(bodies)
     named = np.array([body for body in bodies if body >= 0], int)
     kept = np.flatnonzero(topology.ancestors[named].any(0)).tolist()
     if not kept:
         pose = jnp.broadcast_to(jnp.eye(4, dtype=q.dtype), (n, 4, 4))
-        return Carried(
-            pose, jnp.zeros((n, 3), q.dtype), jnp.zeros((0, 6), q.dtype), np.zeros(0, int), np.zeros((n, 0), bool)
-        )
+        none, still = np.zeros(0, int), None if v is None else jnp.zeros((n, 6), q.dtype)
+        nowhere = jnp.zeros((0, 6), q.dtype)
+        return Carried(pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), still, still)
     coordinates = _places(topology.v_slices, kept)
     if len(kept) < model.nb:
         model, q = _pruned(model, kept), take(q, _places(topology.q_slices, kept))
@@ -126,7 +132,14 @@ def carried(model: Model, q: Float[Array, " nq"], bodies: Sequence[int]) -> Carr
     pose = jnp.concatenate([frame.pose, jnp.eye(4, dtype=q.dtype)[None]])
     origin = jnp.concatenate([frame.origin, jnp.zeros((1, 3), q.dtype)])
     moves = np.concatenate([model.topology.dof_ancestors, np.zeros((1, model.nv), bool)])[index]
-    return Carried(take(pose, index), take(origin, index), frame.subspace, coordinates, moves)
+    found = Carried(take(pose, index), take(origin, index), frame.subspace, coordinates, moves)
+    if v is None:
+        return found
+    v = take(v, coordinates)
+    rates = subspace_rate(model, frame, body_twists(model, frame, v))
+    # One product gives the twists and their rates.
+    sums = _product(jnp.asarray(moves, q.dtype), jnp.concatenate([frame.subspace, rates], axis=1) * v[:, None])
+    return found._replace(twist=sums[:, :6], bias=sums[:, 6:])
 
 
 def _pruned(model: Model, kept: list[int]) -> Model:

@@ -52,8 +52,9 @@ class Constraint(eqx.Module):
         raise NotImplementedError
 
     @classmethod
-    def grouped_rows(cls, members: Sequence["Constraint"], system, q, t) -> list | None:
-        """Rows A (n, nv) of each of the constraints of one group, or None: to be had by differentiation alone."""
+    def grouped_motion(cls, members: Sequence["Constraint"], system, q, v, t) -> list | None:
+        """A (n, nv), gamma (n,) and A v - b (n,) of each of the constraints of one group, or None: to be had by
+        differentiation alone."""
         return None
 
 
@@ -210,31 +211,45 @@ def velocity_residual(
 
 def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Rows:
     """A, gamma and A v - b of all constraints of the scene (see `Rows`)."""
-    layout(scene)  # refuses what is no constraint, and constraints that do not fit the system
     t = jnp.asarray(t, q.dtype)
-    motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
-    velocity, rate = jax.jvp(lambda q, t: velocity_residual(scene, q, v, t), (q, t), motion)
-    return Rows(row_matrix(scene, q, t), -rate, velocity)
+    found, rest, others = _split(scene, q, v, t)
+    if rest:
+        motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
+        velocity, rate = jax.jvp(lambda q, t: velocity_residual(others, q, v, t), (q, t), motion)
+        A = _by_differentiation(others, q, t)
+        for i, place in zip(rest, layout(others), strict=True):
+            part = slice(place.start, place.end)
+            found[i] = A[part], -rate[part], velocity[part]
+    return Rows(*(jnp.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 def row_matrix(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "nc nv"]:
     """A(q, t) of all constraints, (nc, nv)."""
     t = jnp.asarray(t, q.dtype)
+    found, rest, others = _split(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
+    if rest:
+        A = _by_differentiation(others, q, t)
+        for i, place in zip(rest, layout(others), strict=True):
+            found[i] = (A[place.start : place.end],)
+    return jnp.concatenate([parts[0] for parts in found])
+
+
+def _split(scene: Scene, q, v, t):
+    """A, gamma and velocity of the constraints that give them themselves, which ones do not, and a scene of these."""
+    layout(scene)  # refuses what is no constraint, and constraints that do not fit the system
     found: list[Any] = [None] * len(scene.constraints)
     for (kind, _), members in _grouped(scene):
-        values = kind.grouped_rows([scene.constraints[i] for i in members], scene.system, q, t)
+        values = kind.grouped_motion([scene.constraints[i] for i in members], scene.system, q, v, t)
         for i, value in zip(members, values or (), strict=False):
             found[i] = value
     rest = [i for i, value in enumerate(found) if value is None]
-    if rest:
-        others = Scene(scene.system, tuple(scene.constraints[i] for i in rest))
-        places, v = layout(others), jnp.zeros((scene.nv,), q.dtype)
-        # psi is affine in v, so one mode costs a pass per row and the other one per column.
-        differentiate = jax.jacrev if places[-1].end < scene.nv else jax.jacfwd
-        A = differentiate(lambda v: velocity_residual(others, q, v, t))(v)
-        for i, place in zip(rest, places, strict=True):
-            found[i] = A[place.start : place.end]
-    return jnp.concatenate(found)
+    return found, rest, Scene(scene.system, tuple(scene.constraints[i] for i in rest))
+
+
+def _by_differentiation(scene: Scene, q, t):
+    # psi is affine in v, so one mode costs a pass per row and the other one per column.
+    differentiate = jax.jacrev if layout(scene)[-1].end < scene.nv else jax.jacfwd
+    return differentiate(lambda v: velocity_residual(scene, q, v, t))(jnp.zeros((scene.nv,), q.dtype))
 
 
 def state_dtype(system):

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxdyn import _float64 as f64
 from jaxdyn import se3, so3
 from jaxdyn.constraints.base import Constraint
-from jaxdyn.constraints.frames import relative_poses, rows_by_twists
+from jaxdyn.constraints.frames import motion_by_twists, relative_poses
 from jaxdyn.joints import KINDS, SCREW_KINDS, joint_difference
 from jaxdyn.kinematics import take
 from jaxdyn.model import Model, body_index
@@ -115,16 +115,10 @@ class Loop(Constraint):
         return found
 
     @classmethod
-    def grouped_rows(cls, members: Sequence["Loop"], system, q, t):
-        """Rows (n, nv) of each loop."""
-
-        def derivatives(rotation, position):
-            for places in _alike(members):
-                slope, index = jax.jacfwd(members[places[0]]._displaced), np.array(places)
-                zero = jnp.zeros((len(places), 6), q.dtype)
-                yield index, jax.vmap(slope)(zero, take(rotation, index), take(position, index))
-
-        return rows_by_twists(members, derivatives, system, q)
+    def grouped_motion(cls, members: Sequence["Loop"], system, q, v, t):
+        """A, gamma and velocity of each loop."""
+        sets = [np.array(places) for places in _alike(members)]
+        return motion_by_twists(members, sets, lambda i: members[i]._displaced, system, q, v)
 
     def _displaced(self, twist, rotation, position):
         """Residual after frame B has moved along a twist, seen from frame A."""
