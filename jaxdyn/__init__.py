@@ -1,5 +1,6 @@
 """Rigid-body dynamics in JAX: pure functions of one sample, to be batched, compiled and differentiated."""
 
+from jaxdyn import geometry as geometry
 from jaxdyn import identify as identify
 from jaxdyn import inertia as inertia
 from jaxdyn import robots as robots
@@ -27,6 +28,8 @@ from jaxdyn.constraints import lock_joint as lock_joint
 from jaxdyn.constraints import loop as loop
 from jaxdyn.constraints import rolling_sphere as rolling_sphere
 from jaxdyn.constraints import rolling_wheel as rolling_wheel
+from jaxdyn.dissipation import RayleighDissipation as RayleighDissipation
+from jaxdyn.dissipation import SlidingFriction as SlidingFriction
 from jaxdyn.distributions import involutive as involutive
 from jaxdyn.distributions import spurious_terms as spurious_terms
 from jaxdyn.dynamics import bias_force as bias_force
@@ -50,6 +53,8 @@ from jaxdyn.forces import ExternalWrench as ExternalWrench
 from jaxdyn.forces import JointDamping as JointDamping
 from jaxdyn.forces import JointSpring as JointSpring
 from jaxdyn.gauge import gauge_invariant as gauge_invariant
+from jaxdyn.immersion import constrain_by_immersion as constrain_by_immersion
+from jaxdyn.immersion import reaction_force as reaction_force
 from jaxdyn.io import load_urdf as load_urdf
 from jaxdyn.io import save_urdf as save_urdf
 from jaxdyn.io import urdf_inertia_report as urdf_inertia_report
@@ -80,5 +85,6 @@ from jaxdyn.simulate import Solution as Solution
 from jaxdyn.simulate import simulate as simulate
 from jaxdyn.systems import ExplicitSystem as ExplicitSystem
 from jaxdyn.systems import LagrangianSystem as LagrangianSystem
+from jaxdyn.systems import MetricSystem as MetricSystem
 
 __version__ = "0.1.0"

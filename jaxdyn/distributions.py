@@ -225,5 +225,5 @@ def _lagrangian(system, q, v, t):
     """L of a system: as given, or T - V."""
     if isinstance(system, LagrangianSystem):
         # Not T - V, which lacks terms linear in v.
-        return system.lagrangian(*((q, v) if system.parameters is None else (q, v, t, system.parameters)))
+        return system.value(q, v, t)
     return kinetic_energy(system, q, v, t) - potential_energy(system, q, t)

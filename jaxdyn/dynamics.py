@@ -17,7 +17,7 @@ from jaxdyn.kinematics import TreeFrame, body_twists, sum_to_coordinates, take, 
 from jaxdyn.matrix_form import momentum, tree_inertias
 from jaxdyn.model import Model, check_shapes
 from jaxdyn.so3 import _product, cross
-from jaxdyn.systems import System, checked_time
+from jaxdyn.systems import System, checked_time, symbols
 
 
 def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv"]:
@@ -124,9 +124,13 @@ def forward_dynamics(
 
     **Returns:** (nv,), the rate of v. NaN when M is not positive definite, which a joint that moves no inertia causes;
     the error grows with the condition number of M.
+
+    **Raises:** ValueError, on concrete numbers, for a `System` without a motion here: M singular (its rank is named), a
+    Lagrangian that is not finite, an immersion of too low a rank.
     """
     if isinstance(model, System):
         t = checked_time(model, t, external, q=q, v=v, tau=tau)
+        model.check_start(q, v, t)
         return model.forward_dynamics(q, v, tau, t)
     check_shapes(model, q=q, v=v, tau=tau, external=external)
     if external is not None:
@@ -262,7 +266,7 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     return matrix_form.mass_matrix_derivative(model, q)
 
 
-def christoffel_symbols(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
+def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv nv"]:
     """Christoffel symbols of the first kind, Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i).
 
     The matrix C_ij = sum_k Gamma_ijk v_k has the same C v and C + C^T as `coriolis_matrix`.
@@ -275,10 +279,11 @@ def christoffel_symbols(model: Model, q: Float[Array, " nq"]) -> Float[Array, "n
 
     Source: Murray, Li & Sastry (1994), eq. 4.23; EQUATIONS section 0.
     """
+    if isinstance(model, System):
+        return model.christoffel_symbols(q, checked_time(model, t, q=q))
     _check_coordinates(model, "christoffel_symbols")
     check_shapes(model, q=q)
-    derivative = matrix_form.mass_matrix_derivative(model, q)
-    return 0.5 * (derivative + derivative.transpose(0, 2, 1) - derivative.transpose(2, 1, 0))
+    return symbols(matrix_form.mass_matrix_derivative(model, q))
 
 
 def _check_coordinates(model: Model, name: str) -> None:

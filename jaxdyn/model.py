@@ -105,7 +105,7 @@ class Topology:
     @cached_property
     def roots(self) -> np.ndarray:
         """(nb,): the root body of the tree that each body belongs to."""
-        return np.argmax(self.ancestors, axis=1)
+        return np.argmax(self.ancestors, axis=1) if self.nb else np.zeros(0, int)
 
     @cached_property
     def jumps(self) -> tuple[np.ndarray, ...]:

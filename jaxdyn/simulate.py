@@ -33,7 +33,7 @@ from jaxdyn.solvers.choice import (
     stepping,
 )
 from jaxdyn.solvers.inputs import as_array, check_state, check_times
-from jaxdyn.systems import retract
+from jaxdyn.systems import System, retract
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
 _POSE = "pose:"
@@ -154,7 +154,8 @@ def simulate(
     accurate than the steps (Kvaerno5), adaptive steps end on every save point.
 
     **Raises:** ValueError for wrong shapes, NaN, times that do not increase, quaternions far from unit length, a start
-    off the constraints, constraints that remove all freedom, unknown options, with names and values.
+    off the constraints or without a motion (a singular mass matrix of a `System`), constraints that remove all freedom,
+    unknown options, with names and values.
     RuntimeError with the time reached, the cause and the fix, if it fails and `throw`.
 
     ```python
@@ -171,6 +172,9 @@ def simulate(
         with jax.ensure_compile_time_eval():
             state = [jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])]
             method = checked_start(scene, method, *state)
+    if isinstance(scene.system, System) and is_concrete((scene, q0, v0, ts)):
+        with jax.ensure_compile_time_eval():
+            scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
     control = None if control is None else as_pytree(control, "control")
     solver = checked_method(solver, stepsize)
     adjoint = checked_adjoint(adjoint, solver)

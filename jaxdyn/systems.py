@@ -1,7 +1,8 @@
-"""Systems beside `Model`: given by a Lagrangian, or by their mass matrix and bias force.
+"""Systems beside `Model`: given by a Lagrangian, by a metric and a potential, or by mass matrix and bias force.
 
-Both have as many velocities as coordinates, v = dq/dt. They are taken wherever a `Model` is taken that needs no bodies:
-`mass_matrix`, `bias_force`, `forward_dynamics`, energies, constraints, `simulate`.
+All have as many velocities as coordinates, v = dq/dt. They are taken wherever a `Model` is taken that needs no bodies:
+`mass_matrix`, `bias_force`, `forward_dynamics`, energies, constraints, `simulate`. Generalised forces are the components
+of one-forms in these coordinates: what acts on dq by tau . dq. Those of a scene are its forces.
 """
 
 import abc
@@ -11,9 +12,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
+import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn._small import solve_positive
+from jaxdyn._start import check_mass_matrix, is_known, place_of
 from jaxdyn.model import Model, configuration_rate, integrate, normalize
 from jaxdyn.scene import as_pytree
 from jaxdyn.so3 import _product
@@ -49,6 +52,10 @@ class System(eqx.Module):
         """Bias force at rest, (nv,)."""
         return self.bias_force(q, jnp.zeros_like(q), t)
 
+    def christoffel_symbols(self, q, t):
+        """Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i), of the first kind, (nv, nv, nv)."""
+        return symbols(jax.jacfwd(self.mass_matrix)(q, t))
+
     def coriolis_matrix(self, q, v, t):
         """C_ij = sum_k Gamma_ijk v_k with the Christoffel symbols of M, (nv, nv): dM/dt = C + C^T for constant t."""
         derivative = jax.jacfwd(self.mass_matrix)(q, t)
@@ -62,16 +69,24 @@ class System(eqx.Module):
 
     def forward_dynamics(self, q, v, tau, t):
         """M^-1 (tau - h), (nv,)."""
-        factor = jnp.linalg.cholesky(self.mass_matrix(q, t))
-        return cho_solve((factor, True), tau - self.bias_force(q, v, t))
+        return solve_positive(self.mass_matrix(q, t), tau - self.bias_force(q, v, t))
+
+    def check_start(self, q, v, t) -> None:
+        """Refuse a state from which no motion can be computed. Nothing is done where a number is traced.
+
+        **Raises:** ValueError for a mass matrix that is not finite or not positive definite, with its rank.
+        """
+        if is_known(self, q, v, t):
+            check_mass_matrix(_mass_matrix_compiled(self, q, t), type(self).__name__, q, t)
 
 
 class LagrangianSystem(System):
     """A system given by its Lagrangian: d/dt dL/dv - dL/dq = tau.
 
-    M = d2L/dv2 and h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq come from automatic differentiation, so L may hold any
-    coordinates, gyroscopic terms and time. The potential energy is -L(q, 0); the kinetic energy is what the Jacobi
-    integral v . dL/dv - L adds to it, so for L = T - V they are T and V.
+    M = d2L/dv2 and h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq come from automatic differentiation, the first rate as one
+    derivative along the motion, so L may hold any coordinates, gyroscopic terms and time. L is quadratic in v. The
+    potential energy is -L(q, 0); the kinetic energy is what the Jacobi integral v . dL/dv - L adds to it, so for
+    L = T - V they are T and V.
 
     **Arguments:**
 
@@ -79,9 +94,15 @@ class LagrangianSystem(System):
       define it once.
     - `nq`: number of coordinates.
     - `parameters`: any pytree of numbers; its leaves can be differentiated and batched.
+    - `potential`: V(q) -> () in J, or V(q, t, parameters), when it is split off: the Lagrangian of the system is then
+      lagrangian - V, `lagrangian` has to vanish at v = 0, and V is differentiated once instead of with the rest.
 
     **Raises:** ValueError for an nq that is no positive integer, a lagrangian that cannot be called, and (when used) a
-    Lagrangian that does not return one number.
+    Lagrangian that does not return one number. Before a motion from concrete numbers is computed (`forward_dynamics`,
+    `simulate`): for a Lagrangian that is not finite there, reads coordinates beyond nq, is not quadratic in v, or is
+    degenerate (M not positive definite; its rank is named).
+
+    Source: EQUATIONS sections 0 and 1.
 
     ```python
     pendulum = jd.LagrangianSystem(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]), 1)
@@ -91,21 +112,27 @@ class LagrangianSystem(System):
     lagrangian: Callable
     nq: int = eqx.field(static=True)
     parameters: Any = None
+    potential: Callable | None = None
 
-    def __init__(self, lagrangian, nq, *, parameters=None):
+    def __init__(self, lagrangian, nq, *, parameters=None, potential=None):
         self.lagrangian = as_pytree(lagrangian, "lagrangian")
-        self.nq = _checked_size(nq)
+        self.potential = None if potential is None else as_pytree(potential, "potential")
+        self.nq = checked_size(nq)
         self.parameters = jax.tree.map(_number, parameters)
 
-    def _value(self, q, v, t):
-        arguments = (q, v) if self.parameters is None else (q, v, t, self.parameters)
-        value = self.lagrangian(*arguments)
-        if jnp.shape(value) != ():
-            raise ValueError(f"lagrangian returned shape {jnp.shape(value)}; return one number, ()")
-        return jnp.asarray(value, q.dtype)
+    def value(self, q, v, t):
+        """L(q, v, t), (), J; less the potential that is split off."""
+        value = self._moving(q, v, t)
+        return value if self.potential is None else value - self._held(q, t)
+
+    def _moving(self, q, v, t):
+        return _called(self.lagrangian, (), "lagrangian", (q, v), t, self.parameters)
+
+    def _held(self, q, t):
+        return _called(self.potential, (), "potential", (q,), t, self.parameters)
 
     def _momentum(self, q, v, t):
-        return jax.grad(self._value, argnums=1)(q, v, t)
+        return jax.grad(self._moving, argnums=1)(q, v, t)
 
     def mass_matrix(self, q, t):
         """M = d2L/dv2 at v = 0, (nv, nv)."""
@@ -113,17 +140,131 @@ class LagrangianSystem(System):
 
     def bias_force(self, q, v, t):
         """h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq, (nv,)."""
-        _, rate = jax.jvp(lambda q, t: self._momentum(q, v, t), (q, t), (v, jnp.ones_like(t)))
-        return rate - jax.grad(self._value)(q, v, t)
+        if self.parameters is None:  # then L knows no time
+            _, rate = jax.jvp(lambda q: self._momentum(q, v, t), (q,), (v,))
+        else:
+            _, rate = jax.jvp(lambda q, t: self._momentum(q, v, t), (q, t), (v, jnp.ones_like(t)))
+        force = rate - jax.grad(self._moving)(q, v, t)
+        return force if self.potential is None else force + jax.grad(self._held)(q, t)
+
+    def gravity_force(self, q, t):
+        """dV/dq where the potential is split off, else the bias force at rest, (nv,)."""
+        return super().gravity_force(q, t) if self.potential is None else jax.grad(self._held)(q, t)
+
+    def coriolis_matrix(self, q, v, t):
+        """C with C v = h - h(v = 0), (nv, nv): that of the Christoffel symbols, plus the matrix of terms linear in v.
+
+        The latter is skew where M does not depend on t: gyroscopic forces of terms of L linear in v.
+        """
+        # h is of second degree in v: half of its slope is the symbols' matrix plus half of the linear terms'.
+        slope = jax.jacfwd(self.bias_force, argnums=1)
+        return 0.5 * (slope(q, v, t) + slope(q, jnp.zeros_like(v), t))
 
     def kinetic_energy(self, q, v, t):
         """v . dL/dv - L(q, v) + L(q, 0), (), J."""
-        rest = self._value(q, jnp.zeros_like(v), t)
-        return jnp.sum(v * self._momentum(q, v, t)) - self._value(q, v, t) + rest
+        energy = jnp.sum(v * self._momentum(q, v, t)) - self._moving(q, v, t)
+        return energy if self.potential is not None else energy + self._moving(q, jnp.zeros_like(v), t)
 
     def potential_energy(self, q, t):
-        """-L(q, 0), (), J."""
-        return -self._value(q, jnp.zeros_like(q), t)
+        """-L(q, 0), or V as split off, (), J."""
+        return -self._moving(q, jnp.zeros_like(q), t) if self.potential is None else self._held(q, t)
+
+    def check_start(self, q, v, t) -> None:
+        """As for any system; also that L is finite, fits nq, and is quadratic in v."""
+        if not is_known(self, q, v, t):
+            return
+        place = place_of(q, t, v)
+        self._check_coordinates(q, v, t)
+        value, rest, mass, moved = (np.asarray(x, float) for x in _probe_compiled(self, q, v, t))
+        if not np.isfinite(value):
+            raise ValueError(f"lagrangian is {value} at {place}; start where it is finite, or write it without a pole")
+        if self.potential is not None and abs(rest) > 1e-6 * (abs(value) + np.abs(mass).max()):
+            raise ValueError(
+                f"lagrangian is {rest:.6g} at rest at {place}, but with potential= it has to vanish there; move what "
+                "does not depend on v into potential"
+            )
+        check_mass_matrix(mass, "LagrangianSystem", q, t)
+        if not np.abs(moved - mass).max() <= 1e-3 * np.abs(mass).max():
+            raise ValueError(
+                f"lagrangian is not quadratic in v at {place}: d2L/dv2 is {mass.tolist()} at v = 0 and "
+                f"{moved.tolist()} at v + 1; give the equations of motion as a jd.ExplicitSystem"
+            )
+
+    def _check_coordinates(self, q, v, t):
+        # jax clamps an index that is too large; numpy refuses it.
+        state = [np.asarray(x) for x in (q, v)]
+        given = state if self.parameters is None else [*state, t, self.parameters]
+        try:
+            with np.errstate(all="ignore"):
+                jax.eval_shape(lambda: self.lagrangian(*given))
+        except (IndexError, ValueError) as error:
+            raise ValueError(f"lagrangian does not fit nq = {self.nq}: {error}; pass the number it reads") from error
+        except (TypeError, AttributeError):
+            return  # it needs arrays of jax (`.at`, or their dtypes), and this cannot be told
+
+
+class MetricSystem(System):
+    """A system given by a metric and a potential: L = 1/2 v . M(q) v - V(q). Without a potential it moves on geodesics.
+
+    h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq takes one derivative along the motion and one gradient: neither the Christoffel
+    symbols nor second derivatives are formed.
+
+    **Arguments:**
+
+    - `metric`: M(q) -> (nq, nq), symmetric positive definite; or M(q, t, parameters) when parameters are given.
+    - `nq`: number of coordinates.
+    - `potential`: V(q) -> () in J, or V(q, t, parameters); None for none.
+    - `parameters`: any pytree of numbers; its leaves can be differentiated and batched.
+
+    **Raises:** ValueError for an nq that is no positive integer, functions that cannot be called, and (when used) for
+    results of a wrong shape.
+
+    Source: EQUATIONS section 12.
+
+    ```python
+    sphere = jd.MetricSystem(lambda q: jnp.diag(jnp.stack([jnp.ones(()), jnp.sin(q[0]) ** 2])), 2)
+    ```
+    """
+
+    metric: Callable
+    nq: int = eqx.field(static=True)
+    potential: Callable | None = None
+    parameters: Any = None
+
+    def __init__(self, metric, nq, *, potential=None, parameters=None):
+        self.metric = as_pytree(metric, "metric")
+        self.potential = None if potential is None else as_pytree(potential, "potential")
+        self.nq = checked_size(nq)
+        self.parameters = jax.tree.map(_number, parameters)
+
+    def mass_matrix(self, q, t):
+        """M as given, (nv, nv)."""
+        return _called(self.metric, (self.nq, self.nq), "metric", (q,), t, self.parameters)
+
+    def bias_force(self, q, v, t):
+        """h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq, (nv,)."""
+
+        def momentum(q, t):
+            return _product(self.mass_matrix(q, t), v)
+
+        _, rate = jax.jvp(momentum, (q, t), (v, jnp.ones_like(t)))
+        _, pull = jax.vjp(lambda q: momentum(q, t), q)
+        force = rate - 0.5 * pull(v)[0]
+        return force if self.potential is None else force + self.gravity_force(q, t)
+
+    def gravity_force(self, q, t):
+        """dV/dq, (nv,)."""
+        return jnp.zeros_like(q) if self.potential is None else jax.grad(self.potential_energy)(q, t)
+
+    def kinetic_energy(self, q, v, t):
+        """v . M v / 2, (), J."""
+        return 0.5 * jnp.sum(v * _product(self.mass_matrix(q, t), v))
+
+    def potential_energy(self, q, t):
+        """V as given, (), J; zero when there is none."""
+        if self.potential is None:
+            return jnp.zeros((), q.dtype)
+        return _called(self.potential, (), "potential", (q,), t, self.parameters)
 
 
 class ExplicitSystem(System):
@@ -151,22 +292,16 @@ class ExplicitSystem(System):
         self._mass_matrix = as_pytree(mass_matrix, "mass_matrix")
         self._bias_force = as_pytree(bias_force, "bias_force")
         self._potential = None if potential is None else as_pytree(potential, "potential")
-        self.nq = _checked_size(nq)
+        self.nq = checked_size(nq)
         self.parameters = jax.tree.map(_number, parameters)
-
-    def _call(self, function, shape, name, t, *state):
-        value = function(*state) if self.parameters is None else function(*state, t, self.parameters)
-        if jnp.shape(value) != shape:
-            raise ValueError(f"{name} returned shape {jnp.shape(value)}, expected {shape} for nq = {self.nq}")
-        return jnp.asarray(value, state[0].dtype)
 
     def mass_matrix(self, q, t):
         """M as given, (nv, nv)."""
-        return self._call(self._mass_matrix, (self.nq, self.nq), "mass_matrix", t, q)
+        return _called(self._mass_matrix, (self.nq, self.nq), "mass_matrix", (q,), t, self.parameters)
 
     def bias_force(self, q, v, t):
         """h as given, (nv,)."""
-        return self._call(self._bias_force, (self.nq,), "bias_force", t, q, v)
+        return _called(self._bias_force, (self.nq,), "bias_force", (q, v), t, self.parameters)
 
     def kinetic_energy(self, q, v, t):
         """v . M v / 2, (), J."""
@@ -176,7 +311,7 @@ class ExplicitSystem(System):
         """V as given, (), J. **Raises:** ValueError when it was not."""
         if self._potential is None:
             raise ValueError("this ExplicitSystem has no potential energy; pass potential= when making it")
-        return self._call(self._potential, (), "potential", t, q)
+        return _called(self._potential, (), "potential", (q,), t, self.parameters)
 
 
 def checked_time(system: System, t, external=None, **arguments) -> Array:
@@ -198,6 +333,21 @@ def velocity_to_rate(system, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> 
     return configuration_rate(system, q, v) if isinstance(system, Model) else v
 
 
+def rate_to_velocity(system, q: Float[Array, " nq"], rate: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """Velocity v (nv,) of any system whose dq/dt is `rate` (nq,), tangent to its manifold."""
+    if not isinstance(system, Model):
+        return rate
+    (v,) = jax.linear_transpose(lambda v: configuration_rate(system, q, v), jnp.zeros(system.nv, rate.dtype))(rate)
+    if not has_quaternions(system):
+        return v
+    # H^T H is 1 but for angular velocities, where unit quaternions move at half the rate: 1/4.
+    weight = np.ones(system.nv)
+    for kind, place in zip(system.topology.kinds, system.topology.v_slices, strict=True):
+        if kind in ("spherical", "free"):
+            weight[place][-3:] = 4.0
+    return jnp.asarray(weight, rate.dtype) * v
+
+
 def displace(system, q: Float[Array, " nq"], step: Float[Array, " nv"]) -> Float[Array, " nq"]:
     """Configuration reached from q by the displacement `step` (nv,) of any system, on the manifold of a `Model`."""
     return integrate(system, q, step) if isinstance(system, Model) else q + step
@@ -213,7 +363,36 @@ def retract(system, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
     return normalize(system, q) if has_quaternions(system) else q
 
 
-def _checked_size(nq) -> int:
+def symbols(derivative: Float[Array, "n n n"]) -> Float[Array, "n n n"]:
+    """Christoffel symbols of the first kind from dM_ij/dq_k: 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i)."""
+    return 0.5 * (derivative + derivative.transpose(0, 2, 1) - derivative.transpose(2, 1, 0))
+
+
+def _called(function, shape, name, state, t, parameters):
+    """What a function of the user returned for the state, or for (state, t, parameters) when it has parameters."""
+    value = function(*state) if parameters is None else function(*state, t, parameters)
+    if jnp.shape(value) != shape:
+        size = state[0].shape[0]
+        wanted = "return one number, ()" if shape == () else f"expected {shape} for nq = {size}"
+        raise ValueError(f"{name} returned shape {jnp.shape(value)}{';' if shape == () else ','} {wanted}")
+    return jnp.asarray(value, state[0].dtype)
+
+
+_mass_matrix_compiled = eqx.filter_jit(lambda system, q, t: system.mass_matrix(q, t))
+
+
+def _probe(system: LagrangianSystem, q, v, t):
+    """L, L without the potential at rest, and d2L/dv2 at v = 0 and at v + 1."""
+    hessian = jax.jacfwd(system._momentum, argnums=1)
+    zero = jnp.zeros_like(v)
+    return system.value(q, v, t), system._moving(q, zero, t), hessian(q, zero, t), hessian(q, v + 1, t)
+
+
+_probe_compiled = eqx.filter_jit(_probe)
+
+
+def checked_size(nq) -> int:
+    """nq, a positive integer."""
     if isinstance(nq, bool) or not isinstance(nq, int) or nq < 1:
         raise ValueError(f"nq is {nq!r}; pass the number of coordinates, a positive integer")
     return nq

@@ -228,7 +228,7 @@ def random_states(model: Model, n: int, seed: int):
     """Batches of q (n, nq), v, a, tau (n, nv) and external wrenches (n, nb, 6)."""
     rng = np.random.default_rng(seed)
     dtype = model.home.dtype
-    parts = []
+    parts = [np.zeros((n, 0))]
     for kind in model.topology.kinds:
         x = rng.normal(size=(n, KINDS[kind].nq))
         if kind in ("spherical", "free"):

@@ -28,7 +28,7 @@ LAYERS = (
     "kinematics",
     "link_form matrix_form recursive",
     "dynamics",
-    "lagrange geometry",
+    "immersion geometry",
     "constraints constrained reduced gauge distributions",
     "contact grasp",
     "control excitation",

@@ -109,6 +109,8 @@ def theirs(source, frames, q, v, a, tau):
 def test_agrees_with_pinocchio(file, floating, monkeypatch):
     monkeypatch.setattr(_dispatch, "MOST_BODIES", 0)  # the matrix form only; the recursion has its own test below
     model, source, bridge = both(file, floating)
+    if model.nv == 0:
+        pytest.skip("no joints: nothing moves")
     links = [name for name in model.frame_names if source.existFrame(name, pin.FrameType.BODY)]
     frames = [links[0], links[len(links) // 2], links[-1]]
     q, v, a, tau, _ = random_states(model, 5, 1)
@@ -120,16 +122,19 @@ def test_agrees_with_pinocchio(file, floating, monkeypatch):
             # Solving with M amplifies rounding by its condition number, which reaches 1e7 where fingers hang on humanoids.
             tolerance = 1e-10 if key != "forward dynamics" else max(1e-10, 1e-15 * spread)
             assert_close(got[key][i], value, tolerance, key)
-        # Free of that amplification: the acceleration found gives back the force.
-        assert_close(
-            mass @ np.asarray(got["forward dynamics"][i]) + want["bias"], tau[i], 1e-9, "residual of M a + h = tau"
-        )
+        # Free of that amplification: the acceleration found gives back the force, but for what the last digit of each
+        # acceleration is worth, |M| |a| eps. Fingers of 1e-5 kg m^2 on a humanoid accelerate by 1e10 under 1 N m.
+        found = np.asarray(got["forward dynamics"][i])
+        missed, worth = mass @ found + want["bias"] - np.asarray(tau[i]), np.abs(mass) @ np.abs(found)
+        assert np.abs(missed).max() <= 1e-10 * np.abs(tau[i]).max() + 1e-14 * worth.max(), "residual of M a + h = tau"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file,floating", [case for case in CASES])
 def test_recursion_agrees_with_pinocchio(file, floating):
     model, source, bridge = both(file, floating)
+    if model.nv == 0:
+        pytest.skip("no joints: nothing moves")
     q, v, a, tau, _ = random_states(model, 5, 2)
     got = quick(jax.vmap(lambda q, v, a, tau: (recursive.rnea(model, q, v, a), recursive.aba(model, q, v, tau))))(
         q, v, a, tau
@@ -137,7 +142,8 @@ def test_recursion_agrees_with_pinocchio(file, floating):
     data = source.createData()
     for i, q_pin in enumerate(bridge.q_to_pinocchio(q)):
         vi, ai, ti = (np.asarray(x[i]) for x in (v, a, tau))
-        spread = np.linalg.cond(pin.crba(source, data, q_pin) + np.tril(data.M.T, -1))
+        mass = np.triu(pin.crba(source, data, q_pin))
+        spread = np.linalg.cond(mass + np.triu(mass, 1).T)
         assert_close(got[0][i], pin.rnea(source, data, q_pin, vi, ai), 1e-10, "rnea")
         assert_close(got[1][i], pin.aba(source, data, q_pin, vi, ti), max(1e-10, 1e-15 * spread), "aba")
 

@@ -7,8 +7,13 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 
 from jaxdyn import dynamics
+from jaxdyn._small import solve_positive
 from jaxdyn.building import ModelBuilder
-from jaxdyn.systems import ExplicitSystem, LagrangianSystem
+from jaxdyn.dissipation import RayleighDissipation, SlidingFriction
+from jaxdyn.forces import JointDamping
+from jaxdyn.scene import Scene
+from jaxdyn.simulate import simulate
+from jaxdyn.systems import ExplicitSystem, LagrangianSystem, MetricSystem
 
 # Planar 2R arm of EQUATIONS section 1: m, l1, r, I.
 MASS, LENGTH, REACH, MOMENT = (1.0, 0.8), 1.0, (0.5, 0.4), (0.1, 0.05)
@@ -133,6 +138,112 @@ def test_parameters_are_differentiated_and_batched():
     slope = (one(1.0 + step) - one(1.0 - step)) / (2 * step)
     assert_close(quick(jax.jacfwd(acceleration))(1.0), slope, 1e-8)  # central differences
     assert_close(quick(jax.vmap(acceleration))(scales), np.stack([one(s) for s in scales]), 1e-13)
+
+
+def test_small_systems_are_solved_without_lapack():
+    """Written out up to six unknowns, equal to numpy, NaN where not positive definite; no call for each sample."""
+    root = np.random.default_rng(5).normal(size=(7, 7))
+    whole = root @ root.T + np.eye(7)
+    for n in (1, 2, 3, 6, 7):
+        right = root[:n, :3]
+        found = solve_positive(jnp.asarray(whole[:n, :n]), jnp.asarray(right))
+        assert_close(found, np.linalg.solve(whole[:n, :n], right), 1e-13)
+    assert np.isnan(solve_positive(jnp.asarray([[1.0, 2.0], [2.0, 1.0]]), jnp.ones(2))).all()
+    system, batch = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS), jnp.ones((3, 2))
+    motion = jax.jit(jax.vmap(lambda q: dynamics.forward_dynamics(system, q, q, q)))
+    assert "custom_call" not in motion.lower(batch).as_text()
+
+
+def test_potential_split_off_gives_the_same_system():
+    rest = lambda q, t, p: -lagrangian(q, jnp.zeros(2), t, p)  # noqa: E731
+    moving = lambda q, v, t, p: lagrangian(q, v, t, p) + rest(q, t, p)  # noqa: E731
+    whole = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS)
+    split = LagrangianSystem(moving, 2, parameters=PARAMETERS, potential=rest)
+    q, v, a = (jnp.asarray(x) for x in np.random.default_rng(1).normal(size=(3, 2)))
+    want = everything(whole, q, v, a)
+    for name, value in everything(split, q, v, a).items():
+        assert_close(value, want[name], 1e-13, name)
+    assert_close(split.value(q, v, jnp.zeros(())), whole.value(q, v, jnp.zeros(())), 1e-13)
+
+
+def test_coriolis_matrix_holds_gyroscopic_terms():
+    """C v + N = h and C + C^T = dM/dt for a Lagrangian with terms linear in v."""
+
+    def charged(q, v):
+        return 0.5 * (1 + q[0] ** 2) * v[0] ** 2 + 0.5 * v[1] ** 2 + q[0] * q[1] ** 2 * v[1] - jnp.sin(q[0])
+
+    system, (q, v) = LagrangianSystem(charged, 2), np.random.default_rng(3).normal(size=(2, 2))
+    q, v = jnp.asarray(q), jnp.asarray(v)
+    C, N, h, rate = quick(
+        lambda q, v: (
+            dynamics.coriolis_matrix(system, q, v),
+            dynamics.gravity_force(system, q),
+            dynamics.bias_force(system, q, v),
+            jax.jvp(lambda q: dynamics.mass_matrix(system, q), (q,), (v,))[1],
+        )
+    )(q, v)
+    field = q[1] ** 2  # of the one-form q0 q1^2 dq1
+    printed = np.array([q[0] * v[0] ** 2 - field * v[1] + np.cos(q[0]), field * v[0]])
+    assert_close(h, printed, 1e-13)
+    assert_close(C @ v + N, h, 1e-13)
+    assert_close(C + C.T, rate, 1e-13)
+
+
+def test_dissipation():
+    """Rayleigh's function of damped joints is their damping; sliding friction is mu N against the sliding."""
+    system = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS)
+    q, v, t = jnp.array([0.3, 1.1]), jnp.array([0.7, -0.4]), jnp.zeros(())
+    damping = jnp.array([0.4, 0.9])
+    rayleigh = RayleighDissipation(jax.tree_util.Partial(lambda d, q, v, t: 0.5 * jnp.sum(d * v * v), damping))
+    assert_close(rayleigh(system, q, v, t), JointDamping(damping)(system, q, v, t), 1e-15)
+    sliding = SlidingFriction(0.3, lambda system, q, v, t: 2.0 + q[0], -1, 1)
+    assert_close(sliding(system, q, v, t), [0.0, 0.3 * 2.3], 1e-15)
+    rows = SlidingFriction(0.3, 2.0, 1, lambda q, t: jnp.stack([jnp.ones(()), q[1]]))
+    assert_close(rows(system, q, v, t), [-0.6, -0.66], 1e-15)
+    with pytest.raises(ValueError, match=r"function returned shape \(2,\)"):
+        RayleighDissipation(lambda q, v, t: v)(system, q, v, t)
+    with pytest.raises(ValueError, match="direction is 0; give the sign of the sliding velocity"):
+        SlidingFriction(0.3, 2.0, 0)
+    with pytest.raises(ValueError, match=r"coefficient is -0\.3"):
+        SlidingFriction(-0.3, 2.0, 1)
+    with pytest.raises(ValueError, match="along is 2, but the system has nv = 2"):
+        SlidingFriction(0.3, 2.0, 1, 2)(system, q, v, t)
+    with pytest.raises(ValueError, match="along is 'x'"):
+        SlidingFriction(0.3, 2.0, 1, "x")
+
+
+def test_starts_without_a_motion_are_refused():
+    """Degenerate, not finite, not quadratic, too few or too many coordinates: at the start of any motion."""
+
+    def three(q, v):
+        x, y, z = v
+        return 0.5 * (x * x + y * y + z * z)
+
+    def start(lagrangian, nq, q=0.0, **options):
+        system, state = LagrangianSystem(lagrangian, nq, **options), jnp.full(nq, q)
+        return lambda: dynamics.forward_dynamics(system, state, jnp.zeros(nq), jnp.zeros(nq))
+
+    idle = (
+        r"mass matrix of this LagrangianSystem has rank 1 of 2 at q = \[0.0, 0.0\].*velocity \[.*1.0.*\] moves no mass"
+    )
+    swing = lambda q, v: 0.5 * v[0] ** 2 + jnp.cos(q[0])  # noqa: E731
+    refused = {
+        idle: start(swing, 2),
+        "does not fit nq = 2: index 2 is out of bounds": start(lambda q, v: 0.5 * jnp.sum(v * v) - q[2], 2),
+        "does not fit nq = 2: not enough values": start(three, 2),
+        "lagrangian is nan at q": start(lambda q, v: 0.5 * v[0] ** 2 + jnp.log(q[0]), 1, -1.0),
+        "is not positive definite at q .*eigenvalues": start(lambda q, v: 0.5 * (v[0] ** 2 - v[1] ** 2), 2),
+        "not quadratic in v at q": start(lambda q, v: 0.5 * v[0] ** 2 + v[0] ** 4, 1),
+        "1 at rest at q": start(lambda q, v: 0.5 * v[0] ** 2 + 1.0, 1, potential=lambda q: q[0]),
+    }
+    for message, motion in refused.items():
+        with pytest.raises(ValueError, match=message):
+            motion()
+    with pytest.raises(ValueError, match=idle):
+        simulate(Scene(LagrangianSystem(swing, 2)), jnp.zeros(2), jnp.zeros(2), jnp.array([0.0, 1.0]))
+    flat = MetricSystem(lambda q: jnp.ones((2, 2)), 2)
+    with pytest.raises(ValueError, match=r"mass matrix of this MetricSystem has rank 1 of 2.*velocity \["):
+        dynamics.forward_dynamics(flat, jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
 
 
 def test_bad_systems_are_refused():

@@ -5,6 +5,15 @@ from jaxdyn.scenes._named import NamedScene as NamedScene
 from jaxdyn.scenes.balls import ball_on_incline as ball_on_incline
 from jaxdyn.scenes.balls import ball_on_turntable as ball_on_turntable
 from jaxdyn.scenes.balls import bowling_ball as bowling_ball
+from jaxdyn.scenes.immersions import disk_and_link as disk_and_link
+from jaxdyn.scenes.immersions import double_pendulum as double_pendulum
+from jaxdyn.scenes.lagrangian import particle_in_plane as particle_in_plane
+from jaxdyn.scenes.lagrangian import pendulum as pendulum
+from jaxdyn.scenes.lagrangian import planar_arm as planar_arm
+from jaxdyn.scenes.lagrangian import rigid_body_in_euler_angles as rigid_body_in_euler_angles
+from jaxdyn.scenes.lagrangian import sliding_block as sliding_block
+from jaxdyn.scenes.lagrangian import spatial_arm as spatial_arm
+from jaxdyn.scenes.lagrangian import spherical_pendulum_in_angles as spherical_pendulum_in_angles
 from jaxdyn.scenes.linkages import closed_ring as closed_ring
 from jaxdyn.scenes.linkages import four_bar as four_bar
 from jaxdyn.scenes.linkages import parallel_manipulator as parallel_manipulator

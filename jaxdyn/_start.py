@@ -1,0 +1,43 @@
+"""Checks of a start in concrete numbers: what would make every later number NaN is refused with its cause."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+
+def is_known(*values) -> bool:
+    """Whether no number is traced, nor would be when computed with."""
+    return not any(isinstance(leaf, Tracer) for leaf in (jnp.zeros(()), *jax.tree.leaves(values)))
+
+
+def place_of(q, t, v=None) -> str:
+    """The state in words."""
+    moving = "" if v is None else f"v = {np.asarray(v).tolist()}, "
+    return f"q = {np.asarray(q).tolist()}, {moving}t = {float(t):.6g}"
+
+
+def check_mass_matrix(mass, name: str, q, t) -> None:
+    """Refuse a mass matrix that is not finite or not positive definite, in a measure that does not depend on units."""
+    mass = np.asarray(mass, float)
+    place = place_of(q, t)
+    if not np.isfinite(mass).all():
+        raise ValueError(f"the mass matrix of this {name} is not finite at {place}: {mass.tolist()}; start elsewhere")
+    scale = np.sqrt(np.abs(np.diag(mass)))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(mass / np.outer(scale, scale))
+    least = 10 * len(mass) * float(np.finfo(np.asarray(q).dtype).eps)
+    if values[0] > least:
+        return
+    rank = int(np.sum(np.abs(values) > least))
+    if rank == len(mass):
+        raise ValueError(
+            f"the mass matrix of this {name} is not positive definite at {place}: eigenvalues "
+            f"{np.linalg.eigvalsh(mass).tolist()}; check the signs of the kinetic energy"
+        )
+    idle = vectors[:, np.argmin(np.abs(values))] / scale
+    raise ValueError(
+        f"the mass matrix of this {name} has rank {rank} of {len(mass)} at {place}: the velocity "
+        f"{(idle / np.abs(idle).max()).round(6).tolist()} moves no mass; start elsewhere, leave coordinates out, or give "
+        "them inertia"
+    )

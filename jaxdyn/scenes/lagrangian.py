@@ -1,0 +1,201 @@
+"""Systems from the first pages of mechanics: pendulums in angles, arms, a body in Euler angles, a block that slides."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.building import ModelBuilder
+from jaxdyn.dissipation import SlidingFriction
+from jaxdyn.scene import Scene
+from jaxdyn.scenes._named import named
+from jaxdyn.systems import LagrangianSystem, MetricSystem
+
+
+def _given(position, velocity):
+    return jnp.asarray(position, float), jnp.asarray(velocity, float)
+
+
+def _particle_start(position=(0.0, 0.0), velocity=(1.0, 2.0)):
+    return _given(position, velocity)
+
+
+def _quadratic(q, v, t, p):
+    return 0.5 * p["mass"] * jnp.sum(v * v)
+
+
+def _height_energy(q, t, p):
+    return p["mass"] * p["gravity"] * q[-1]
+
+
+@named(_particle_start)
+def particle_in_plane(*, mass=1.0, gravity=9.81) -> Scene:
+    """Particle in x and y (up): m xdd = F_x, m ydd = F_y - m g.
+
+    Source: EQUATIONS section 1.
+    """
+    parameters = {"mass": mass, "gravity": gravity}
+    return Scene(LagrangianSystem(_quadratic, 2, parameters=parameters, potential=_height_energy))
+
+
+def _pendulum_start(angle=-np.pi / 2, rate=0.0):
+    return _given([angle], [rate])
+
+
+def _swing(q, v, t, p):
+    return 0.5 * p["mass"] * p["length"] ** 2 * v[0] ** 2
+
+
+def _swing_potential(q, t, p):
+    return p["mass"] * p["gravity"] * p["length"] * (1 - jnp.cos(q[0]))
+
+
+@named(_pendulum_start)
+def pendulum(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+    """Pendulum by its angle from the downward vertical: m l^2 thetadd + m g l sin(theta) = tau.
+
+    Without tau, sin(theta/2) = k sn(K(k) - w0 t), w0^2 = g/l, from rest at theta = -2 arcsin k. Start: `angle`, `rate`;
+    by default problem A01 of the IFToMM benchmark library.
+
+    Source: EQUATIONS section 1.
+    """
+    parameters = {"mass": mass, "length": length, "gravity": gravity}
+    return Scene(LagrangianSystem(_swing, 1, parameters=parameters, potential=_swing_potential))
+
+
+def _sphere_start(theta=1.0, phi=0.0, theta_rate=0.0, phi_rate=1.0):
+    return _given([theta, phi], [theta_rate, phi_rate])
+
+
+def _sphere(q, v, t, p):
+    return 0.5 * p["mass"] * p["length"] ** 2 * (v[0] ** 2 + jnp.sin(q[0]) ** 2 * v[1] ** 2)
+
+
+def _sphere_potential(q, t, p):
+    return -p["mass"] * p["gravity"] * p["length"] * jnp.cos(q[0])
+
+
+@named(_sphere_start)
+def spherical_pendulum_in_angles(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+    """Spherical pendulum by theta from the downward vertical and phi about it; m l^2 sin^2(theta) phid is conserved.
+
+    Singular at sin(theta) = 0; `spherical_pendulum` is not.
+
+    Source: EQUATIONS section 1 and erratum E1.
+    """
+    parameters = {"mass": mass, "length": length, "gravity": gravity}
+    return Scene(LagrangianSystem(_sphere, 2, parameters=parameters, potential=_sphere_potential))
+
+
+def _arm_start(angles=(0.3, 1.1), rates=(0.7, -0.4)):
+    return _given(angles, rates)
+
+
+def _arm(q, v, t, p):
+    a, b = q[0], q[0] + q[1]
+    wa, wb = v[0], v[0] + v[1]
+    across = lambda at: jnp.stack([-jnp.sin(at), jnp.cos(at)])  # noqa: E731
+    elbow = p["length"] * wa * across(a)
+    speeds = p["reaches"][0] * wa * across(a), elbow + p["reaches"][1] * wb * across(b)
+    turning = p["moments"][0] * wa**2 + p["moments"][1] * wb**2
+    return 0.5 * (sum(p["masses"][i] * jnp.sum(speeds[i] ** 2) for i in range(2)) + turning)
+
+
+def _arm_potential(q, t, p):
+    upper, lower = jnp.sin(q[0]), jnp.sin(q[0] + q[1])
+    heights = p["reaches"][0] * upper, p["length"] * upper + p["reaches"][1] * lower
+    return p["gravity"] * sum(p["masses"][i] * heights[i] for i in range(2))
+
+
+@named(_arm_start)
+def planar_arm(*, masses=(1.0, 0.8), length=1.0, reaches=(0.5, 0.4), moments=(0.1, 0.05), gravity=None) -> Scene:
+    """Planar arm with two revolute joints, q = (th1, th2), th1 from the x axis and th2 relative to the first link.
+
+    M = [[alpha + 2 beta c2, delta + beta c2], [delta + beta c2, delta]] with alpha = I1 + I2 + m1 r1^2 + m2 (l1^2 + r2^2),
+    beta = m2 l1 r2, delta = I2 + m2 r2^2. `reaches`, joint to centre of mass, and `length` of the first link, m; `moments`
+    about z at the centres, kg m^2. `gravity` along -y (m/s^2); None is a horizontal plane.
+
+    Source: EQUATIONS section 1.
+    """
+    parameters = {"masses": masses, "length": length, "reaches": reaches, "moments": moments}
+    potential = None
+    if gravity is not None:
+        parameters, potential = parameters | {"gravity": gravity}, _arm_potential
+    return Scene(LagrangianSystem(_arm, 2, parameters=parameters, potential=potential))
+
+
+def _spatial_start(angles=(0.3, 0.4, -0.7), rates=(0.5, -0.6, 0.8)):
+    return _given(angles, rates)
+
+
+@named(_spatial_start)
+def spatial_arm(
+    *,
+    lengths=(0.5, 0.4),
+    reaches=(0.2, 0.25, 0.15),
+    masses=(3.0, 2.0, 1.0),
+    moments=((0.01, 0.02, 0.03), (0.03, 0.01, 0.04), (0.02, 0.015, 0.025)),
+    gravity=9.81,
+) -> Scene:
+    """Arm with a yaw and two parallel pitch axes, its links along +y at zero, z up; positive pitch angles lower it.
+
+    `lengths` of base and upper arm, `reaches` from each joint to the centre of mass, m; `moments` (Ix, Iy, Iz) of each
+    link about it. The frames "centre1" to "centre3" stand at the centres of mass.
+
+    Source: EQUATIONS section 1 with errata E3 to E7.
+    """
+    base, upper = lengths
+    builder = ModelBuilder("spatial arm", gravity=(0.0, 0.0, -gravity))
+    centres = ((0.0, 0.0, reaches[0]), (0.0, reaches[1], 0.0), (0.0, reaches[2], 0.0))
+    places = ((0.0, 0.0, 0.0), (0.0, 0.0, base), (0.0, upper, 0.0))
+    for i, parent in enumerate((None, "link1", "link2")):
+        name, axis = f"link{i + 1}", (0.0, 0.0, 1.0) if i == 0 else (-1.0, 0.0, 0.0)
+        builder.add_body(name, parent, inertia=(masses[i], centres[i], moments[i]), pose=places[i], axis=axis)
+        builder.add_frame(f"centre{i + 1}", name, centres[i])
+    return Scene(builder.build())
+
+
+def _euler_start(angles=(0.4, 1.1, -0.3), rates=(0.5, -0.8, 1.3)):
+    return _given(angles, rates)
+
+
+def _body_rates(q):
+    """E with w = E qd, body-fixed, for R = Rz(phi) Ry(theta) Rz(psi)."""
+    s, c, sp, cp = jnp.sin(q[1]), jnp.cos(q[1]), jnp.sin(q[2]), jnp.cos(q[2])
+    zero, one = jnp.zeros_like(s), jnp.ones_like(s)
+    return jnp.stack([jnp.stack([-s * cp, sp, zero]), jnp.stack([s * sp, cp, zero]), jnp.stack([c, zero, one])])
+
+
+def _euler_metric(q, t, p):
+    E = _body_rates(q)
+    return E.T @ (jnp.stack(p["moments"])[:, None] * E)
+
+
+@named(_euler_start)
+def rigid_body_in_euler_angles(*, moments=(1.0, 2.0, 3.0)) -> Scene:
+    """Body that turns freely about its centre, q = (phi, theta, psi) with R = Rz(phi) Ry(theta) Rz(psi): a geodesic.
+
+    The metric is rho = E^T diag(I1, I2, I3) E with w = E qd in body axes; tau are the torques about the Euler axes,
+    E^T of those in body axes. Singular at sin(theta) = 0; a `Model` with a spherical joint is not.
+
+    Source: EQUATIONS section 12 with errata E50 to E52.
+    """
+    return Scene(MetricSystem(_euler_metric, 3, parameters={"moments": moments}))
+
+
+def _block_start(position=0.0, velocity=2.0):
+    return _given([position], [velocity])
+
+
+def _block(q, v, t, p):
+    return 0.5 * p["mass"] * v[0] ** 2
+
+
+@named(_block_start)
+def sliding_block(*, mass=1.0, friction=0.3, gravity=9.81, direction=1) -> Scene:
+    """Block that slides on a table with Coulomb friction: m xdd = u - direction mu m g while xd has that sign.
+
+    Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on; there the scene ceases to hold.
+
+    Source: EQUATIONS section 11 and erratum E42.
+    """
+    system = LagrangianSystem(_block, 1, parameters={"mass": mass})
+    return Scene(system, forces=(SlidingFriction(friction, mass * gravity, direction),))

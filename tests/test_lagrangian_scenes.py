@@ -1,0 +1,415 @@
+"""Scenes from Lagrangians, metrics and immersions against the printed formulas and against each other."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close, quick
+
+from jaxdyn import dynamics, geometry, inertia, scenes, se3
+from jaxdyn.building import ModelBuilder
+from jaxdyn.constrained import constrained_dynamics
+from jaxdyn.forces import JointDamping
+from jaxdyn.immersion import constrain_by_immersion, reaction_force
+from jaxdyn.kinematics import body_jacobian, frame_pose
+from jaxdyn.scene import Scene
+from jaxdyn.simulate import simulate
+from jaxdyn.so3 import hat
+from jaxdyn.systems import LagrangianSystem
+
+G = 9.81
+STATES = np.random.default_rng(8).normal(size=(3, 20, 4))
+
+
+def states(count):
+    """Twenty random q, v, a."""
+    return (jnp.asarray(x[:, :count]) for x in STATES)
+
+
+def matrix(rows):
+    """An array from nested lists of traced numbers."""
+    return jnp.stack([jnp.stack([jnp.asarray(x, float) for x in row]) for row in rows])
+
+
+def check(pairs, tol=1e-11):
+    for name, (got, want) in pairs.items():
+        assert_close(got, want, tol, name)
+
+
+@quick
+@jax.vmap
+def first_pages(q, v, a):
+    """Particle, spherical pendulum and planar arm, each against what is printed."""
+    pairs = {}
+    particle = scenes.particle_in_plane(mass=1.3).system
+    newton = 1.3 * a[:2] + jnp.asarray([0.0, 1.3 * G])
+    pairs["particle"] = dynamics.inverse_dynamics(particle, q[:2], v[:2], a[:2]), newton
+
+    q, v, a = q[:2], v[:2], a[:2]
+    sphere = scenes.spherical_pendulum_in_angles(mass=1.3, length=0.7).system
+    s, c, ml = jnp.sin(q[0]), jnp.cos(q[0]), 1.3 * 0.7
+    printed = ml * 0.7 * jnp.stack([a[0] - s * c * v[1] ** 2 + G / 0.7 * s, s**2 * a[1] + 2 * s * c * v[0] * v[1]])
+    moving = dynamics.forward_dynamics(sphere, q, v, jnp.zeros(2))
+    momentum = lambda q, v: ml * 0.7 * jnp.sin(q[0]) ** 2 * v[1]  # noqa: E731
+    pairs |= {
+        "sphere": (dynamics.inverse_dynamics(sphere, q, v, a), printed),
+        "sphere M": (dynamics.mass_matrix(sphere, q), ml * 0.7 * jnp.diag(jnp.stack([1 + 0 * s, s**2]))),
+        "sphere N": (dynamics.gravity_force(sphere, q), ml * G * jnp.stack([s, 0 * s])),
+        "sphere C": (dynamics.coriolis_matrix(sphere, q, v), ml * 0.7 * s * c * matrix([[0, -v[1]], [v[1], v[0]]])),
+        "first integral": (jax.jvp(momentum, (q, v), (v, moving))[1], 0.0 * s),
+    }
+
+    arm = scenes.planar_arm(gravity=G).system
+    (m1, m2), l1, (r1, r2), (I1, I2) = (1.0, 0.8), 1.0, (0.5, 0.4), (0.1, 0.05)
+    alpha, beta, delta = I1 + I2 + m1 * r1**2 + m2 * (l1**2 + r2**2), m2 * l1 * r2, I2 + m2 * r2**2
+    c2, bs = jnp.cos(q[1]), beta * jnp.sin(q[1])
+    gamma = jnp.zeros((2, 2, 2)).at[(0, 0, 0), (0, 1, 1), (1, 0, 1)].set(-bs).at[1, 0, 0].set(bs)
+    C = matrix([[-bs * v[1], -bs * (v[0] + v[1])], [bs * v[0], 0.0]])
+    c1, c12 = jnp.cos(q[0]), jnp.cos(q[0] + q[1])
+    rate = jax.jvp(lambda q: dynamics.mass_matrix(arm, q), (q,), (v,))[1]
+    found = dynamics.coriolis_matrix(arm, q, v)
+    return pairs | {
+        "arm M": (
+            dynamics.mass_matrix(arm, q),
+            matrix([[alpha + 2 * beta * c2, delta + beta * c2], [delta + beta * c2, delta]]),
+        ),
+        "arm symbols": (dynamics.christoffel_symbols(arm, q), gamma),
+        "arm C": (found, C),
+        "arm skew": (rate - 2 * found, bs * (2 * v[0] + v[1]) * jnp.asarray([[0.0, 1.0], [-1.0, 0.0]])),
+        "arm N": (
+            dynamics.gravity_force(arm, q),
+            G * jnp.stack([m1 * r1 * c1 + m2 * (l1 * c1 + r2 * c12), m2 * r2 * c12]),
+        ),
+        "arm h": (dynamics.bias_force(arm, q, v), found @ v + dynamics.gravity_force(arm, q)),
+    }
+
+
+def test_first_pages_of_mechanics():
+    check(first_pages(*states(4)))
+    arm = scenes.planar_arm().system
+    q, v, a = jnp.asarray([0.0, np.pi / 3]), jnp.asarray([1.0, 2.0]), jnp.asarray([1.0, -1.0])
+    assert_close(dynamics.inverse_dynamics(arm, q, v, a), [-0.90702503, 0.43712813], 1e-8)  # as many digits are given
+
+
+def printed_spatial_arm(theta):
+    """M, J_2, J_3, Gamma_ijk and N of the 3-dof arm, EQUATIONS section 1 with its errata."""
+    (_, l1), (_, r1, r2), (_, m2, m3) = (0.5, 0.4), (0.2, 0.25, 0.15), (3.0, 2.0, 1.0)
+    (_, _, z1), (x2, y2, z2), (x3, y3, z3) = (0.01, 0.02, 0.03), (0.03, 0.01, 0.04), (0.02, 0.015, 0.025)
+    s2, c2, s3, c3 = jnp.sin(theta[1]), jnp.cos(theta[1]), jnp.sin(theta[2]), jnp.cos(theta[2])
+    s23, c23 = jnp.sin(theta[1] + theta[2]), jnp.cos(theta[1] + theta[2])
+    reach = l1 * c2 + r2 * c23
+    M11 = y2 * s2**2 + y3 * s23**2 + z1 + z2 * c2**2 + z3 * c23**2 + m2 * r1**2 * c2**2 + m3 * reach**2
+    M22 = x2 + x3 + m3 * l1**2 + m2 * r1**2 + m3 * r2**2 + 2 * m3 * l1 * r2 * c3
+    M23, M33 = x3 + m3 * r2**2 + m3 * l1 * r2 * c3, x3 + m3 * r2**2
+    M = matrix([[M11, 0, 0], [0, M22, M23], [0, M23, M33]])
+    J2 = matrix([[-r1 * c2, 0, 0, 0, -s2, c2], [0, 0, -r1, -1, 0, 0], [0] * 6]).T
+    J3 = matrix([[-reach, 0, 0, 0, -s23, c23], [0, l1 * s3, -r2 - l1 * c3, -1, 0, 0], [0, 0, -r2, -1, 0, 0]]).T
+    t = m3 * reach
+    g112 = (y2 - z2 - m2 * r1**2) * c2 * s2 + (y3 - z3) * c23 * s23 - t * (l1 * s2 + r2 * s23)
+    g113 = (y3 - z3) * c23 * s23 - t * r2 * s23
+    g223 = -m3 * l1 * r2 * s3
+    gamma = jnp.zeros((3, 3, 3)).at[(0, 0), (0, 1), (1, 0)].set(g112).at[1, 0, 0].set(-g112)
+    gamma = gamma.at[(0, 0), (0, 2), (2, 0)].set(g113).at[2, 0, 0].set(-g113)
+    gamma = gamma.at[(1, 1, 1), (1, 2, 2), (2, 1, 2)].set(g223).at[2, 1, 1].set(-g223)
+    N = -G * jnp.stack([0 * c2, (m2 * r1 + m3 * l1) * c2 + m3 * r2 * c23, m3 * r2 * c23])
+    return M, J2, J3, gamma, N
+
+
+LINK_MASSES = (3.0, 2.0, 1.0)
+LINK_MOMENTS = ((0.01, 0.02, 0.03), (0.03, 0.01, 0.04), (0.02, 0.015, 0.025))
+
+
+@quick
+@jax.vmap
+def spatial_arm(q, v, a):
+    model = scenes.spatial_arm().system
+    M, J2, J3, gamma, N = printed_spatial_arm(q)
+
+    def in_space(q):
+        """Rotation, and translational and rotational Jacobian in the world's axes, of each link."""
+        turned = [frame_pose(model, q, f"centre{i}")[:3, :3] for i in (1, 2, 3)]
+        jacobians = [body_jacobian(model, q, f"centre{i}") for i in (1, 2, 3)]
+        return [(R, R @ J[:3], R @ J[3:]) for R, J in zip(turned, jacobians, strict=True)]
+
+    links, rates = jax.jvp(in_space, (q,), (v,))
+    found = [jnp.concatenate([R.T @ Jt, R.T @ JR]) for R, Jt, JR in links]
+    by_links, bias, weight = jnp.zeros((3, 3)), jnp.zeros(3), jnp.zeros(3)
+    for i, ((R, Jt, JR), (_, Jt_rate, JR_rate)) in enumerate(zip(links, rates, strict=True)):
+        mass, inertia = LINK_MASSES[i], R @ jnp.diag(jnp.asarray(LINK_MOMENTS[i])) @ R.T
+        by_links = by_links + mass * Jt.T @ Jt + JR.T @ inertia @ JR
+        turning = JR.T @ inertia @ JR_rate - JR.T @ hat(inertia @ JR @ v) @ JR
+        bias = bias + (mass * Jt.T @ Jt_rate + turning) @ v
+        weight = weight + mass * Jt.T @ jnp.asarray([0.0, 0.0, -G])
+    mass_matrix, gravity = dynamics.mass_matrix(model, q), dynamics.gravity_force(model, q)
+    coriolis = dynamics.bias_force(model, q, v) - gravity
+    pairs = {
+        "J1": (found[0], jnp.zeros((6, 3)).at[5, 0].set(1.0)),
+        "J2": (found[1], J2),
+        "J3": (found[2], J3),
+        "M": (mass_matrix, M),
+        "M by link Jacobians": (by_links, M),
+        "symbols": (dynamics.christoffel_symbols(model, q), gamma),
+        "C v": (coriolis, jnp.einsum("ijk,j,k->i", gamma, v, v)),
+        "C v by link Jacobians": (bias, coriolis),
+        "N": (gravity, N),
+        "weights through centre-of-mass Jacobians": (-weight, N),
+    }
+    return pairs, (mass_matrix, coriolis, gravity)
+
+
+def test_spatial_arm():
+    """Twenty random states and the one of EQUATIONS, whose numbers have eight or nine digits."""
+    drawn = zip(states(3), (*scenes.spatial_arm.start(), jnp.zeros(3)), strict=True)
+    pairs, (M, coriolis, N) = spatial_arm(*(jnp.concatenate([x, last[None]]) for x, last in drawn))
+    check(pairs)
+    assert_close(M[-1][(0, 1, 1, 2), (0, 1, 2, 2)], [0.457483792, 0.449281062, 0.088390531, 0.0425], 2e-9)
+    assert_close(coriolis[-1], [0.08628446, 0.01508056, -0.02029184], 1e-7)
+    assert_close(N[-1], [0, -9.53782516, -1.40577764], 1e-8)
+
+
+def euler_quaternion(angles):
+    """Quaternion of Rz(phi) Ry(theta) Rz(psi)."""
+    half, plus, minus = angles[1] / 2, (angles[0] + angles[2]) / 2, (angles[0] - angles[2]) / 2
+    c, s = jnp.cos(half), jnp.sin(half)
+    return jnp.stack([c * jnp.cos(plus), -s * jnp.sin(minus), s * jnp.cos(minus), c * jnp.sin(plus)])
+
+
+def test_rigid_body_in_euler_angles():
+    """Metric, geodesic form and torques; equal to Euler's equations, to a quaternion model, and to that model immersed."""
+    moments = jnp.asarray([1.0, 2.0, 3.0])
+    system = scenes.rigid_body_in_euler_angles().system
+    builder = ModelBuilder("body", gravity=None)
+    builder.add_body("body", None, "spherical", (1.0, (0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
+    model = builder.build()
+    immersed = constrain_by_immersion(model, euler_quaternion, 3)
+
+    def rates(q):
+        st, ct, sp, cp = jnp.sin(q[1]), jnp.cos(q[1]), jnp.sin(q[2]), jnp.cos(q[2])
+        return matrix([[-st * cp, sp, 0], [st * sp, cp, 0], [ct, 0, 1]])
+
+    @quick
+    @jax.vmap
+    def both(q, v, a):
+        q = q.at[1].set(1.2 + 0.3 * jnp.sin(q[1]))  # away from sin(theta) = 0
+        E, (w, w_rate) = rates(q), jax.jvp(lambda q, v: rates(q) @ v, (q, v), (v, a))
+        torque = moments * w_rate + jnp.cross(w, moments * w)
+        about_axes = dynamics.inverse_dynamics(system, q, v, a)
+        st, ct, sp, cp = jnp.sin(q[1]), jnp.cos(q[1]), jnp.sin(q[2]), jnp.cos(q[2])
+        printed = matrix([[-cp / st, sp, cp * ct / st], [sp / st, cp, -sp * ct / st], [0, 0, 1]])
+        acceleration = dynamics.forward_dynamics(system, q, v, about_axes)
+        return {
+            "metric": (dynamics.mass_matrix(system, q), E.T @ jnp.diag(moments) @ E),
+            "torque": (about_axes, E.T @ torque),
+            "body axes": (printed @ about_axes, torque),
+            "geodesic": (geometry.flat(system, q, geometry.covariant_rate(system, q, v, v, a)), about_axes),
+            "acceleration": (acceleration, a),
+            "model": (dynamics.forward_dynamics(model, euler_quaternion(q), w, torque), w_rate),
+            "velocity": (immersed.velocities(q, v, jnp.zeros(()))[0], w),
+            "immersed": (dynamics.inverse_dynamics(immersed, q, v, a), about_axes),
+            "immersed bias": (dynamics.bias_force(immersed, q, v), about_axes - dynamics.mass_matrix(system, q) @ a),
+        }
+
+    check(both(*states(3)))
+
+
+FORMULATIONS = ("lagrangian", "immersion", "model", "loop")
+
+
+def test_double_pendulum_in_four_formulations():
+    """One mechanism: the same accelerations, energies and equations as printed, for bars and for point masses."""
+    built = {name: scenes.double_pendulum(formulation=name) for name in FORMULATIONS}
+    points = scenes.double_pendulum(reaches=(1.0, 0.7), moments=(0.0, 0.0), gravity=G).system
+
+    @quick
+    @jax.vmap
+    def both(angles, rates, a):
+        found, energies = [], []
+        for name, scene in built.items():
+            q, v = scenes.double_pendulum.start(formulation=name, angles=angles, rates=rates)
+            got = constrained_dynamics(scene, q, v).acceleration
+            theta = got[0]
+            phi = got[0] + got[1] if name == "model" else got[-1]
+            found.append(jnp.stack([theta, phi]))
+            kinetic, potential = (
+                dynamics.kinetic_energy(scene.system, q, v),
+                dynamics.potential_energy(scene.system, q),
+            )
+            energies.append(jnp.stack([kinetic, potential]))
+        (m1, m2), (l1, l2) = (1.0, 0.5), (1.0, 0.7)
+        c, s = jnp.cos(angles[0] - angles[1]), jnp.sin(angles[0] - angles[1])
+        rho = matrix([[(m1 + m2) * l1**2, m2 * l1 * l2 * c], [m2 * l1 * l2 * c, m2 * l2**2]])
+        D = m2 * l1**2 * l2**2 * (m1 + m2 * s**2)
+        gamma = jnp.zeros((2, 2, 2))
+        gamma = gamma.at[0, 0, 0].set(m2**2 * l1**2 * l2**2 * c * s / D).at[0, 1, 1].set(m2**2 * l1 * l2**3 * s / D)
+        gamma = gamma.at[1, 0, 0].set(-(m1 + m2) * m2 * l1**3 * l2 * s / D)
+        gamma = gamma.at[1, 1, 1].set(-(m2**2) * l1**2 * l2**2 * c * s / D)
+        pull = G * jnp.stack([(m1 + m2) * l1 * jnp.sin(angles[0]), m2 * l2 * jnp.sin(angles[1])])
+        turning = m2 * l1 * l2 * s * jnp.stack([rates[1] ** 2, -(rates[0] ** 2)])
+        pairs = {f"acceleration by {name}": (other, found[0]) for name, other in zip(built, found, strict=True)}
+        pairs |= {f"energy by {name}": (other, energies[0]) for name, other in zip(built, energies, strict=True)}
+        return pairs | {
+            "metric": (dynamics.mass_matrix(points, angles), rho),
+            "symbols": (geometry.christoffel_symbols(points, angles), gamma),
+            "motion": (dynamics.inverse_dynamics(points, angles, rates, a), rho @ a + turning + pull),
+        }
+
+    check(both(*states(2)))
+    q, v = scenes.double_pendulum.start()
+    assert_close(dynamics.forward_dynamics(points, q, v, 0 * q), [-7.48670516, 11.47569246], 1e-8)  # digits given
+
+
+def test_lagrangian_takes_no_more_operations_than_bodies():
+    """In a large batch; and the bias of a metric takes fewer than its Christoffel symbols."""
+
+    def operations(function, *arguments):
+        return jax.jit(jax.vmap(function)).lower(*arguments).compile().cost_analysis()["flops"]
+
+    batch = jnp.ones((4096, 2))
+    count = {
+        name: operations(lambda q, scene=scene: dynamics.forward_dynamics(scene.system, q, q, q), batch)
+        for name in ("lagrangian", "immersion", "model")
+        for scene in (scenes.double_pendulum(formulation=name),)
+    }
+    assert 0 < count["lagrangian"] < count["immersion"] <= count["model"], count
+    metric = scenes.rigid_body_in_euler_angles().system
+    symbols = lambda q, v: jnp.einsum("ijk,j,k->i", dynamics.christoffel_symbols(metric, q), v, v)  # noqa: E731
+    state = jnp.ones((4096, 3))
+    bias = operations(lambda q, v: dynamics.bias_force(metric, q, v), state, state)
+    assert 0 < 1.5 * bias < operations(symbols, state, state)
+
+
+def test_disk_and_link_in_contact():
+    """Printed metric and forces, without and with friction; the reactions are those of the two normal forces."""
+    m, m2, moment, moment2, torque = 1.0, 0.6, 0.5, 0.2, 0.7
+
+    @quick
+    @jax.vmap
+    def both(q, v, force):
+        q = 0.4 * q
+        f1, f2 = force[0], force[1]
+        scene = scenes.disk_and_link(torque=torque, friction=force[:2])
+        k, s, c = jnp.tan(q[3]), jnp.sin(q[3]), jnp.cos(q[3])
+        along = (q[0] - q[2] + s) / c
+        a = along / c
+        rho = matrix(
+            [
+                [m + m2 * k**2, 0, -m2 * k**2, a * m2 * k],
+                [0, moment, 0, 0],
+                [-m2 * k**2, 0, m2 + m2 * k**2, -a * m2 * k],
+                [a * m2 * k, 0, -a * m2 * k, moment2 + m2 * a**2],
+            ]
+        )
+        dry = jnp.stack([-m2 * G * k, 0 * k, m2 * G * k, torque - a * m2 * G])
+        friction = jnp.stack([f1 * s * k + f1 * c - f2, -f1 - f2, -f1 * s * k - f1 * c, a * f1 * s])
+        pulled = scene.applied_force(q, v) - dynamics.gravity_force(scene.system, q)
+        disk, link = reaction_force(scene, q, v)
+        nu, u = link[1] / c, disk[1] + link[1]
+        zero = jnp.zeros(())
+        return {
+            "metric": (dynamics.mass_matrix(scene.system, q), rho),
+            "force": (pulled, dry + friction),
+            "reaction on the disk": (disk, jnp.stack([-nu * s, u - nu * c, zero])),
+            "reaction on the link": (link, jnp.stack([nu * s, nu * c, -nu * along])),
+        }
+
+    check(both(*states(4)))
+
+
+def test_pendulum_has_the_elliptic_motion():
+    """Problem A01 of the IFToMM benchmark library, from rest at 90 degrees."""
+    q0, v0 = scenes.pendulum.start()
+    found = simulate(scenes.pendulum(), q0, v0, jnp.asarray([0.0, 1.0, 5.0, 9.99]), rtol=1e-12, atol=1e-12)
+    x, y = jnp.sin(found.q[1:, 0]), -jnp.cos(found.q[1:, 0])
+    assert_close(x, [0.986291751131875319, -0.942305435043757335, -0.316436469913032291], 1e-9)  # steps add up
+    assert_close(y, [-0.165010853125541169, -0.334754338414000581, -0.948613704575776519], 1e-9)
+
+
+def test_block_slides_until_it_stops():
+    """It stops after v0 / (mu g), v0^2 / (2 mu g) further on; slid the other way it is the mirror image."""
+    stop = 2.0 / (0.3 * G)
+    q0, v0 = scenes.sliding_block.start(velocity=2.0)
+    found = simulate(scenes.sliding_block(mass=1.7), q0, v0, jnp.asarray([0.0, stop]), stepsize=stop / 2)
+    assert_close(found.q[-1], [2.0**2 / (2 * 0.3 * G)], 1e-13)  # the method is exact for a parabola
+    assert_close(found.v[-1], [0.0], 1e-13)
+    assert_close(scenes.sliding_block(mass=1.7, direction=-1).applied_force(q0, -v0), [0.3 * 1.7 * G], 1e-15)
+
+
+def test_trajectories_are_differentiated_by_parameters_of_the_lagrangian():
+    """Reverse mode through half a second of a double pendulum, against central differences."""
+    at = jnp.asarray([1.0, 0.5, 1.0, 0.5, 0.35, G])
+
+    def end(p):
+        scene = scenes.double_pendulum(masses=(p[0], p[1]), length=p[2], reaches=(p[3], p[4]), gravity=p[5])
+        q0, v0 = scenes.double_pendulum.start()
+        found = simulate(scene, q0, v0, jnp.asarray([0.0, 0.5]), stepsize=0.025)
+        return jnp.sum(jnp.asarray([1.0, -0.7]) * found.q[-1]) + found.v[-1, 0]
+
+    step = 1e-5 * np.eye(6)
+    ahead, behind = quick(jax.vmap(end))(jnp.concatenate([at[None] + step, at[None] - step])).reshape(2, 6)
+    assert_close(quick(jax.grad(end))(at), (ahead - behind) / 2e-5, 1e-8)
+
+
+def test_derivatives_at_rest():
+    """Parameters reach through an immersion; first and second derivatives agree with the Lagrangian's, hanging still."""
+
+    def acceleration(formulation, x):
+        scene = scenes.double_pendulum(
+            formulation=formulation, masses=(x[0], x[1]), length=x[2], reaches=(x[3], x[4]), gravity=x[5]
+        )
+        return dynamics.forward_dynamics(scene.system, x[6:8], x[8:10], jnp.zeros(2))
+
+    at = jnp.asarray([1.0, 0.5, 1.0, 0.5, 0.35, G, 0.0, 0.0, 0.0, 0.0])
+    both = quick(
+        lambda x: [
+            (jax.jacrev(f)(x), jax.jacfwd(jax.jacrev(f))(x))
+            for f in (lambda x: acceleration("lagrangian", x), lambda x: acceleration("immersion", x))
+        ]
+    )
+    (first, second), (other, twice) = both(at)
+    assert_close(first, other, 1e-11)
+    assert_close(second, twice, 1e-11)
+
+
+def test_separate_scenes_are_joined_with_their_forces():
+    """Kron's method with forces on each unit, moving: a motor drives one end of a spring, through both frictions."""
+
+    def sliding(mass):
+        return LagrangianSystem(lambda q, v, t, p: 0.5 * p * v[0] ** 2 - 2.0 * q[0] ** 2, 1, parameters=mass)
+
+    units = tuple(Scene(sliding(m), forces=(JointDamping(c),)) for m, c in ((1.3, 0.4), (0.7, 0.9)))
+    between = lambda q, v, t: (3.0 * jnp.ones(1), jnp.sin(q[0]))  # noqa: E731
+    xi = lambda s, t: (2.0 * s, 3.0 * s + jnp.sin(t))  # noqa: E731
+    scene = constrain_by_immersion(units, xi, 1, moving=True, force=between)
+    s, v, t = jnp.asarray([0.3]), jnp.asarray([-0.6]), jnp.asarray(0.4)
+    a = constrained_dynamics(scene, s, v, t=t).acceleration
+    first, second = 2.0 * v, 3.0 * v + jnp.cos(t)
+    place = 3.0 * s + jnp.sin(t)
+    mass = 4 * 1.3 + 9 * 0.7
+    force = 2 * (3.0 - 0.4 * first - 8.0 * s) + 3 * (jnp.sin(2 * s) - 0.9 * second - 4.0 * place + 0.7 * jnp.sin(t))
+    assert_close(a, force / mass, 1e-13)
+    reactions = reaction_force(scene, s, v, (jnp.ones(1), jnp.zeros(1)), t)
+    pushed = a + 2.0 / mass  # the force on the first unit is one larger
+    want = 1.3 * 2 * pushed + 8.0 * s - 4.0 + 0.4 * first
+    assert_close(reactions[0], want, 1e-13)
+    assert_close(3 * reactions[1], -2 * reactions[0], 1e-13)
+    with pytest.raises(ValueError, match="force has 1 entries; give one for each of the 2 systems"):
+        reaction_force(scene, s, v, (jnp.ones(1),), t)
+
+
+def test_inertia_of_a_box_and_its_change_of_frame():
+    """Printed moments of a box, and M_2 = Ad^T M_1 Ad for frames fixed to one body."""
+    mass, (l, w, h) = 2.4, (0.3, 0.5, 0.8)
+    moments = mass / 12 * np.array([w * w + h * h, l * l + h * h, l * l + w * w])
+    numbers = jnp.asarray(inertia.box(mass, (l, w, h)))
+    M = inertia.spatial_inertia(numbers)
+    assert_close(M, np.diag([mass] * 3 + list(moments)), 1e-15)
+    pose = se3.exp(jnp.asarray([0.3, -0.2, 0.5, 0.4, 1.1, -0.6]))
+    moved = inertia.spatial_inertia(inertia.transform_inertia(se3.inverse(pose), numbers))
+    assert_close(moved, se3.Ad(pose).T @ M @ se3.Ad(pose), 1e-13)
+
+
+def test_unknown_formulations_are_refused():
+    with pytest.raises(ValueError, match="formulation is 'newton'; choose from lagrangian, model, immersion, loop"):
+        scenes.double_pendulum(formulation="newton")
+    with pytest.raises(ValueError, match=r"formulation='loop' takes moments\[1\] > 0"):
+        scenes.double_pendulum(formulation="loop", moments=(0.0, 0.0))
