@@ -32,6 +32,13 @@ def interleaved(contestants: dict, rounds: int = 20, least: float = 0.02) -> dic
     return {name: {"best": min(x), "median": statistics.median(x)} for name, x in samples.items()}
 
 
+def once(call) -> float:
+    """Seconds of one call."""
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
 def machine() -> dict:
     """Processor, cores and versions, for the head of a report."""
     processor = platform.processor()

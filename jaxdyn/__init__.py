@@ -1,6 +1,7 @@
 """Rigid-body dynamics in JAX: pure functions of one sample, to be batched, compiled and differentiated."""
 
 from jaxdyn import geometry as geometry
+from jaxdyn import grasp as grasp
 from jaxdyn import identify as identify
 from jaxdyn import inertia as inertia
 from jaxdyn import robots as robots

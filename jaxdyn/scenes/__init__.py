@@ -5,6 +5,10 @@ from jaxdyn.scenes._named import NamedScene as NamedScene
 from jaxdyn.scenes.balls import ball_on_incline as ball_on_incline
 from jaxdyn.scenes.balls import ball_on_turntable as ball_on_turntable
 from jaxdyn.scenes.balls import bowling_ball as bowling_ball
+from jaxdyn.scenes.hands import hand_rolling_ball as hand_rolling_ball
+from jaxdyn.scenes.hands import hand_with_ball as hand_with_ball
+from jaxdyn.scenes.hands import hand_with_bar as hand_with_bar
+from jaxdyn.scenes.hands import hand_with_disk as hand_with_disk
 from jaxdyn.scenes.immersions import disk_and_link as disk_and_link
 from jaxdyn.scenes.immersions import double_pendulum as double_pendulum
 from jaxdyn.scenes.lagrangian import particle_in_plane as particle_in_plane

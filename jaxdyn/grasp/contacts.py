@@ -1,0 +1,187 @@
+"""Contacts between a finger and an object: which components of the relative twist they remove.
+
+A contact frame on the object has its z along the normal, into the object. With the wrench basis B of the contact, whose
+columns are the wrenches that it can transmit, in that frame,
+
+    B^T (twist of the object - twist of the finger) = G^T V_o - J_h thetadot = 0,
+
+so that the multipliers of these rows are the forces of the finger on the object along the columns of B.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn import so3
+from jaxdyn.constraints.base import Constraint
+from jaxdyn.constraints.frames import relative_poses
+from jaxdyn.constraints.loops import _attitude, check_bodies, pose_leaf
+from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
+from jaxdyn.so3 import _product
+from jaxdyn.systems import velocity_to_rate
+
+# Components (fx, fy, fz, tx, ty, tz) of a wrench that each contact transmits.
+_SPATIAL = {
+    "frictionless": (2,),
+    "hard-finger": (0, 1, 2),
+    "soft-finger": (0, 1, 2, 5),
+    "rigid": (0, 1, 2, 3, 4, 5),
+}
+_IN_PLANE = {"frictionless": (2,), "hard-finger": (0, 2), "rigid": (0, 2, 4)}
+
+
+def wrench_basis(kind: str, *, in_plane: bool = False) -> Float[np.ndarray, "6 m"]:
+    """Wrench basis B (6, m) of a contact: its columns are the wrenches (f, tau) that it transmits.
+
+    | kind         | m | B in the contact frame                   | m and rows in a plane |
+    |--------------|---|------------------------------------------|-----------------------|
+    | frictionless | 1 | force along z                            | 1: fz                 |
+    | hard-finger  | 3 | all forces: a point with friction        | 2: fx, fz             |
+    | soft-finger  | 4 | all forces, torque about z               |                       |
+    | rigid        | 6 | all                                      | 3: fx, fz, ty         |
+
+    The contact frame's z is the normal into the object, and its x-z plane is the plane of a planar mechanism.
+
+    **Raises:** ValueError for an unknown kind.
+
+    Source: Murray, Li & Sastry (1994), table 5.2; EQUATIONS section 10.
+    """
+    return np.eye(6)[:, list(_components(kind, in_plane, "contact"))]
+
+
+def _components(kind: str, in_plane: bool, what: str) -> tuple[int, ...]:
+    kinds = _IN_PLANE if in_plane else _SPATIAL
+    if kind not in kinds:
+        hint = "; in a plane a soft finger is a hard one" if kind in _SPATIAL else ""
+        raise ValueError(f"{what}: kind {kind!r} is unknown; choose from {', '.join(kinds)}{hint}")
+    return kinds[kind]
+
+
+class Contact(Constraint):
+    """A contact at a place that is fixed on the object; made by `contact`."""
+
+    name: str = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    finger: str = eqx.field(static=True)
+    object: str | None = eqx.field(static=True)
+    in_plane: bool = eqx.field(static=True)
+    pose: Float[Array, "4 4"]
+    finger_pose: Float[Array, "4 4"]
+
+    # What `relative_poses` reads: frame B on the finger, seen from frame A on the object.
+    body_a = property(lambda self: self.object)
+    body_b = property(lambda self: self.finger)
+    pose_a = property(lambda self: self.pose)
+    pose_b = property(lambda self: self.finger_pose)
+
+    @property
+    def components(self) -> tuple[int, ...]:
+        """Components of the relative twist, in the contact frame, that are zero."""
+        return _components(self.kind, self.in_plane, self.name)
+
+    @property
+    def _spins(self) -> bool:
+        # Turning about the normal alone is not the rate of a function of the configuration.
+        return self.kind == "soft-finger"
+
+    def sizes(self, system, dtype):
+        """All rows are holonomic but the one of a soft finger's torque."""
+        check_bodies(self.name, system, (self.object, self.finger))
+        return len(self.components) - int(self._spins), int(self._spins)
+
+    def group(self):
+        """All contacts are evaluated together, on one pass of the kinematics."""
+        return "contacts"
+
+    def position(self, system, q, t):
+        """Place, and where it is held attitude, of the contact frame seen from the fingertip, (n,), m and rad."""
+        return self.grouped_position([self], system, q, t)[0]
+
+    @classmethod
+    def grouped_position(cls, members: Sequence["Contact"], system, q, t):
+        """Residuals (n,) of each contact."""
+        rotation, position = relative_poses(members, system, q)
+        return [member._residual(rotation[i], position[i]) for i, member in enumerate(members)]
+
+    def _residual(self, rotation, position):
+        # The fingertip moves against the object as the object moves against the fingertip, with the other sign.
+        apart = position if self.kind != "rigid" else jnp.concatenate([position, _attitude(rotation)])
+        return -apart[np.array([i for i in self.components if i < apart.shape[0]])]
+
+    def slip(self, system, q, v, t):
+        """Angular velocity of the object against the finger about the normal, (1,), rad/s, for a soft finger."""
+        if not self._spins:
+            return None
+        motion = velocity_to_rate(system, q, v)
+        rotation, turning = jax.jvp(lambda q: relative_poses([self], system, q)[0][0], (q,), (motion,))
+        return -so3.vee(_product(turning, rotation.T))[2:]
+
+
+def contact(
+    kind: str,
+    finger: str,
+    pose,
+    *,
+    finger_pose=None,
+    object: str | None = None,
+    in_plane: bool = False,
+    name: str | None = None,
+) -> Contact:
+    """A contact of a fingertip at a place fixed on the object.
+
+    Rows: the components of the object's twist relative to the finger, in the contact frame, along the columns of
+    `wrench_basis(kind)`. Their multipliers are the components of the wrench on the object (N, N m). A frictionless
+    contact holds the fingertip on the x-y plane of the contact frame, on which it slides.
+
+    **Arguments:**
+
+    - `kind`: "frictionless", "hard-finger" (a point with friction), "soft-finger" or "rigid".
+    - `finger`: body or frame that touches; `finger_pose`: of the fingertip in it, by default its own frame. The origin
+      is the point that touches; the axes matter in a rigid contact alone, where they are those of the contact frame.
+    - `pose`: of the contact frame in the object: z is the normal into the object. Poses are None (identity), (4, 4), (3,)
+      or (xyz, rpy); m and rad.
+    - `object`: body that is touched; None: the one of the `Grasp` that the contact is given to.
+    - `in_plane`: only rows within the x-z plane of the contact frame, for mechanisms that move in that plane.
+    - `name`: for errors and reports; by default that of the finger.
+
+    **Raises:** ValueError for an unknown kind or a bad pose; when used, for unknown bodies.
+
+    Source: Murray, Li & Sastry (1994), eq. 5.14; EQUATIONS section 10.
+    """
+    name = finger if name is None else name
+    _components(kind, in_plane, f"contact {name!r}")
+    return Contact(
+        name=name,
+        kind=kind,
+        finger=finger,
+        object=object,
+        in_plane=bool(in_plane),
+        pose=pose_leaf(pose, f"contact {name!r}: pose"),
+        finger_pose=pose_leaf(finger_pose, f"contact {name!r}: finger_pose"),
+    )
+
+
+def on_object(constraint: Constraint, name: str) -> Constraint:
+    """The constraint as a contact of the object `name`.
+
+    **Raises:** ValueError for a contact of another body, and for rolling that does not touch the object.
+    """
+    if isinstance(constraint, Contact):
+        if constraint.object not in (None, name):
+            raise ValueError(
+                f"contact {constraint.name!r} is on {constraint.object!r}, the object of the grasp is {name!r}; leave "
+                "object out"
+            )
+        fields = ("name", "kind", "finger", "in_plane", "pose", "finger_pose")
+        return Contact(object=name, **{field: getattr(constraint, field) for field in fields})
+    if isinstance(constraint, (RollingSphere, RollingWheel)):
+        if name not in (constraint.body, constraint.surface_body):
+            raise ValueError(
+                f"rolling contact {constraint.name!r} is between {constraint.body!r} and {constraint.surface_body!r}; "
+                f"one of them has to be the object, {name!r}"
+            )
+    return constraint

@@ -1,0 +1,120 @@
+"""A grasp: one model of the fingers and the object, with the contacts between them as constraints."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.constrained import pseudo_inverse, tolerance
+from jaxdyn.constraints.base import Pfaffian, layout, row_matrix
+from jaxdyn.grasp.contacts import on_object
+from jaxdyn.grasp.joining import joined
+from jaxdyn.model import Model
+from jaxdyn.scene import Scene
+from jaxdyn.so3 import _product
+
+
+class Grasp(Scene):
+    """Fingers that hold an object: a scene with the rows A = [-J_h  G^T], so that multipliers are forces on the object.
+
+    It is a `Scene`, so `constrained_dynamics`, `assemble`, `projections` and `simulate` act on it as on any other one.
+    For motion in the velocity of the object alone, with the joints of the fingers recovered from J_h thetadot = G^T V:
+
+        jd.simulate(grasp, q0, v0, ts, method=jd.Reduced(grasp.object_velocities))
+
+    **Arguments:**
+
+    - `fingers`: a `Model` of the hand, or a list of models that stand in the same world, one per finger.
+    - `object`: a `Model` of one body, on a joint (free, planar, or whatever holds it) to the world; or the name of such
+      a body that `fingers` has already. Models are joined into one, `grasp.system`; the order of its trees is that of
+      the names of their first joints.
+    - `contacts`: `contact(...)` for contacts fixed on the object; `jd.rolling_sphere` and `jd.rolling_wheel` between a
+      finger and the object, either of which may be the one that rolls: pressing is a positive normal force; other
+      constraints of the library.
+    - `forces`: as of a `Scene`.
+
+    **Raises:** ValueError for models that do not fit together, an object that is no single body of its own, an empty
+    list of contacts, contacts with bodies or frames that the models do not have, and contacts that prescribe a slip.
+
+    Source: Murray, Li & Sastry (1994), sections 5.5 and 6.3; EQUATIONS section 10.
+    """
+
+    object: str = eqx.field(static=True, kw_only=True)
+
+    def __init__(self, fingers: Model | Sequence[Model], object: Model | str, contacts: Sequence, forces=()):
+        models = [fingers] if isinstance(fingers, Model) else list(fingers)
+        if not models or not all(isinstance(model, Model) for model in models):
+            raise ValueError("fingers is no Model and no list of Models; pass what carries the fingertips")
+        if isinstance(object, Model):
+            if object.nb != 1:
+                raise ValueError(f"object has {object.nb} bodies, {list(object.body_names)}; pass a Model of one body")
+            models, object = [*models, object], object.body_names[0]
+        model = models[0] if len(models) == 1 else joined(models, f"grasp of {object}")
+        _check_object(model, object)
+        if not isinstance(contacts, (tuple, list)) or not contacts:
+            raise ValueError(f"contacts is {contacts!r}; pass a list with at least one contact")
+        for one in contacts:
+            if isinstance(one, Pfaffian) and one.b is not None:
+                raise ValueError(f"contact {one.name!r} prescribes a slip b; contacts of a grasp have none")
+        super().__init__(model, tuple(on_object(one, object) for one in contacts), forces)
+        self.object = object
+        layout(self)  # refuses unknown bodies
+
+    @property
+    def object_velocities(self) -> tuple[int, ...]:
+        """Indices of the object's velocity in v; for a free body its body twist."""
+        top = self.system.topology
+        place = top.v_slices[top.body_names.index(self.object)]
+        return tuple(range(place.start, place.stop))
+
+    @property
+    def hand_velocities(self) -> tuple[int, ...]:
+        """Indices of the joint velocities thetadot of all fingers in v."""
+        return tuple(i for i in range(self.nv) if i not in self.object_velocities)
+
+
+def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "nc nh"]:
+    """Hand Jacobian J_h (nc, nh): J_h thetadot are the velocities of the fingertips along the contacts' components.
+
+    Source: Murray, Li & Sastry (1994), eq. 5.28; EQUATIONS section 10.
+    """
+    return -row_matrix(grasp, q, t)[:, np.array(grasp.hand_velocities, int)]
+
+
+def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "no nc"]:
+    """Grasp map G (no, nc): G lam is the generalised force of the contact forces lam on the object.
+
+    For a free body it is the wrench (f, tau) at the origin and in the axes of the body frame, and
+    G = [Ad_{g_oc}^-T B] of all contacts. G^T V are the velocities of the object at the contacts.
+
+    Source: Murray, Li & Sastry (1994), eq. 5.11; EQUATIONS section 10.
+    """
+    return row_matrix(grasp, q, t)[:, np.array(grasp.object_velocities, int)].T
+
+
+def internal_forces(
+    grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Any = 0.0
+) -> Float[Array, " nc"]:
+    """Part of contact forces that does not move the object: (1 - G^+ G) lam, with G lam_N = 0.
+
+    The split depends on the units of forces and torques where contacts transmit both, as any orthogonal one.
+
+    **Arguments:** `lam` (nc,), contact forces, N and N m.
+
+    Source: Murray, Li & Sastry (1994), sections 5.3 and 6.3; EQUATIONS section 10.
+    """
+    G = grasp_map(grasp, q, t)
+    return lam - _product(pseudo_inverse(G, tolerance(None, G)), _product(G, lam))
+
+
+def _check_object(model: Model, name: str) -> None:
+    top = model.topology
+    if name not in top.body_names:
+        raise ValueError(f"object {name!r} is no body of model {model.name!r}; bodies are {list(top.body_names)}")
+    body = top.body_names.index(name)
+    if top.parents[body] >= 0 or body in top.parents:
+        raise ValueError(f"object {name!r} is part of a tree of bodies; give it a joint to the world and no children")
+    if top.nb == 1:
+        raise ValueError(f"there are no fingers beside the object {name!r}; pass their models")

@@ -1,0 +1,277 @@
+"""Hands that hold an object: planar ones with two fingers, and three fingers around a ball. Each scene is a `Grasp`."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn import inertia
+from jaxdyn.building import ModelBuilder
+from jaxdyn.constraints import rolling_sphere, rolling_wheel
+from jaxdyn.grasp import Grasp, contact
+from jaxdyn.scenes._named import named
+from jaxdyn.scenes.linkages import _circles, thin_bar
+
+_LINKS = (0.3, 0.25)
+_PALM = 0.5  # m, between the bases of two fingers
+_SPATIAL_LINKS = (0.2, 0.2)
+_CIRCLE = 0.25  # m, radius of the circle on which the bases of three fingers stand
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def _rates(axes, origins, point, velocity):
+    """Rates of revolute joints that give the point of the last link which is now at `point` the velocity."""
+    columns = np.cross(axes, np.asarray(point) - origins)
+    return np.linalg.lstsq(columns.T, velocity, rcond=None)[0]
+
+
+def _carried(position, velocity, omega, point):
+    """Velocity of the point of a body that is now at `point`."""
+    return np.asarray(velocity) + np.cross(omega, np.asarray(point) - position)
+
+
+def _turn(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+# Two fingers in the x-y plane, their bases on the x axis.
+
+
+def _planar_hand(name, links, masses, palm, gravity):
+    builder = ModelBuilder(name, gravity=(0.0, -gravity, 0.0))
+    first, second = links
+    for i, side in ((1, -1.0), (2, 1.0)):
+        base = (side * palm / 2, 0.0, 0.0)
+        builder.add_body(f"finger{i}_1", None, "continuous", thin_bar(masses[0], first), pose=base)
+        distal = thin_bar(masses[1], second)
+        builder.add_body(f"finger{i}_2", f"finger{i}_1", "continuous", distal, pose=(first, 0.0, 0.0))
+        builder.add_frame(f"tip{i}", f"finger{i}_2", (second, 0.0, 0.0))
+    return builder
+
+
+def _planar_object(center, angle, velocity):
+    """Position, and the velocity in the plane's axes, of an object with body velocity (vx, vy, w)."""
+    position = np.array([*center, 0.0])
+    linear = _turn(angle) @ np.array([velocity[0], velocity[1], 0.0])
+    return position, linear, np.array([0.0, 0.0, velocity[2]])
+
+
+def _planar_state(fingers, center, angle, velocity):
+    """q and v: `fingers` has base, knee, fingertip and point of contact of each, `velocity` is that of the object."""
+    moving = _planar_object(center, angle, velocity)
+    q, v = [], []
+    for base, knee, tip, point in fingers:
+        low, high = (np.arctan2(*(b - a)[1::-1]) for a, b in ((base, knee), (knee, tip)))
+        q += [low, high - low]
+        v += [*_rates(np.stack([_UP, _UP]), np.stack([base, knee]), point, _carried(*moving, point))]
+    return jnp.asarray([*q, *center, angle]), jnp.asarray([*v, *velocity])
+
+
+def _bar_start(center=(0.02, 0.38), angle=0.1, velocity=(0.2, -0.1, 0.5), links=_LINKS, palm=_PALM, length=0.3):
+    along = _turn(angle)[:, 0]
+    fingers = []
+    for side in (-1.0, 1.0):
+        base, tip = np.array([side * palm / 2, 0.0, 0.0]), np.array([*center, 0.0]) + side * length / 2 * along
+        ends = (base[:2], links[0], tip[:2], links[1])
+        knee = np.array([*(_circles(*ends) if side < 0 else _circles(*ends[2:], *ends[:2])), 0.0])
+        fingers.append((base, knee, tip, tip))
+    return _planar_state(fingers, center, angle, velocity)
+
+
+@named(_bar_start)
+def hand_with_bar(
+    *, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, length=0.3, gravity=9.81, kind="hard-finger"
+) -> Grasp:
+    """Two fingers of two joints each, in the x-y plane, whose tips hold the ends of a bar.
+
+    q = (joints of finger 1, of finger 2, x, y and angle of the bar). `links`, `masses`: of a finger's two uniform bars
+    (m, kg); `palm`: distance of the bases (m); `mass`, `length` of the bar. Contact frames have x along the bar's y.
+    Start: the bar's centre, angle and body velocity (vx, vy, w), the knees outside.
+
+    Source: Murray, Li & Sastry (1994), example 5.3 and section 6.3.
+    """
+    builder = _planar_hand("hand with a bar", links, masses, palm, gravity)
+    builder.add_body("bar", None, "planar", inertia.rod(mass, length), joint_name="object")
+    contacts = []
+    for i, side in ((1, -1.0), (2, 1.0)):
+        pose = np.eye(4)
+        pose[:3, :3] = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -side], [-side, 0.0, 0.0]]).T
+        pose[0, 3] = side * length / 2
+        contacts.append(contact(kind, f"tip{i}", pose, in_plane=True))
+    return Grasp(builder.build(), "bar", contacts)
+
+
+def _disk_start(
+    center=(0.01, 0.45),
+    tilts=(0.12, -0.05),
+    velocity=(0.1, -0.15, 1.0),
+    links=_LINKS,
+    palm=_PALM,
+    radius=0.1,
+):
+    fingers = []
+    for side, tilt in zip((-1.0, 1.0), tilts, strict=True):
+        base = np.array([side * palm / 2, 0.0, 0.0])
+        along = _turn(tilt)[:, 1]
+        point = np.array([*center, 0.0]) + side * radius * _turn(tilt)[:, 0]
+        # The knee is at the distance of the first link from the base, on the line of the face.
+        way = point - base
+        reach = way @ along
+        knee = point - (reach - np.sqrt(reach**2 - way @ way + links[0] ** 2)) * along
+        fingers.append((base, knee, knee + links[1] * along, point))
+    return _planar_state(fingers, center, 0.0, velocity)
+
+
+@named(_disk_start)
+def hand_with_disk(*, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, radius=0.1, gravity=9.81) -> Grasp:
+    """The hand of `hand_with_bar` with a disk that rolls between the flat inner faces of the outer links.
+
+    q = (joints of finger 1, of finger 2, x, y and angle of the disk). Each contact has a holonomic row, the gap, and a
+    Pfaffian one, no slip; forces are (normal, tangential). In a plane rolling is integrable: `involutive` finds
+    (3, 3). Start: the disk's centre and body velocity, `tilts` (rad) of the outer links from the vertical.
+    """
+    builder = _planar_hand("hand with a disk", links, masses, palm, gravity)
+    builder.add_body("disk", None, "planar", inertia.cylinder(mass, radius, 0.02), joint_name="object")
+    contacts = []
+    for i, side in ((1, -1.0), (2, 1.0)):
+        face = ((0.0, 0.0, 0.0), (-side * np.pi / 2, 0.0, 0.0))  # z towards the disk
+        finger = f"finger{i}_2"
+        rolling = rolling_wheel("disk", None, radius, plane=face, plane_body=finger, lateral=False, name=f"finger{i}")
+        contacts.append(rolling)
+    return Grasp(builder.build(), "disk", contacts)
+
+
+# Three fingers in space: their bases on a circle in the x-y plane, a yaw joint and two pitch joints each.
+
+
+def _directions(count=3):
+    """Horizontal directions, away from the axis, of the fingers (count, 3)."""
+    angles = np.pi / 2 + 2 * np.pi / count * np.arange(count)
+    return np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+
+
+def _base(direction, circle):
+    """Pose of a finger's base: z up, x to the axis."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([-direction, -np.cross(_UP, direction), _UP], 1)
+    pose[:3, 3] = circle * direction
+    return pose
+
+
+def _spatial_hand(name, links, masses, circle, gravity):
+    builder = ModelBuilder(name, gravity=(0.0, 0.0, -gravity))
+    first, second = links
+    for i, direction in enumerate(_directions(), 1):
+        knuckle = inertia.sphere(masses[0], 0.03)
+        builder.add_body(f"finger{i}_1", None, "continuous", knuckle, pose=_base(direction, circle))
+        pitch = (0.0, -1.0, 0.0)
+        builder.add_body(f"finger{i}_2", f"finger{i}_1", "continuous", thin_bar(masses[1], first), axis=pitch)
+        distal = thin_bar(masses[2], second)
+        builder.add_body(f"finger{i}_3", f"finger{i}_2", "continuous", distal, axis=pitch, pose=(first, 0.0, 0.0))
+        builder.add_frame(f"tip{i}", f"finger{i}_3", (second, 0.0, 0.0))
+    return builder
+
+
+def _spatial_finger(base, links, tip, point, velocity):
+    """Angles, and rates that give the point of the last link at `point` the velocity, of a finger that reaches `tip`."""
+    local = base[:3, :3].T @ (tip - base[:3, 3])
+    yaw, reach = np.arctan2(local[1], local[0]), np.hypot(local[0], local[1])
+    ahead = base[:3, :3] @ _turn(yaw)
+    knee = _circles((0.0, 0.0), links[0], (reach, local[2]), links[1])
+    low, high = np.arctan2(knee[1], knee[0]), np.arctan2(local[2] - knee[1], reach - knee[0])
+    elbow = base[:3, 3] + knee[0] * ahead[:, 0] + knee[1] * _UP
+    axes, origins = np.stack([_UP, -ahead[:, 1], -ahead[:, 1]]), np.stack([base[:3, 3], base[:3, 3], elbow])
+    return [yaw, low, high - low], _rates(axes, origins, point, velocity)
+
+
+def _quaternion(turned):
+    """Unit quaternion and matrix of a rotation vector."""
+    angle = np.linalg.norm(turned)
+    w, x, y, z = np.cos(angle / 2), *(np.sinc(angle / 2 / np.pi) / 2 * np.asarray(turned))
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return [w, x, y, z], np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
+    """q and v: fingertips at `reach` (m) from the ball's centre, in directions fixed in the ball or in the world."""
+    quaternion, rotation = _quaternion(turned)
+    position, twist = np.asarray(position, float), np.asarray(twist, float)
+    moving = position, rotation @ twist[:3], rotation @ twist[3:]
+    q, v = [], []
+    for direction in _directions():
+        outward = rotation @ direction if fixed else direction
+        tip, point = position + reach * outward, position + radius * outward
+        velocity = _carried(*moving, point)
+        angles, rates = _spatial_finger(_base(direction, circle), links, tip, point, velocity)
+        q, v = [*q, *angles], [*v, *rates]
+    return jnp.asarray([*q, *position, *quaternion]), jnp.asarray([*v, *twist])
+
+
+def _ball_start(
+    position=(0.01, -0.02, 0.28),
+    turned=(0.1, -0.15, 0.2),
+    twist=(0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
+    links=_SPATIAL_LINKS,
+    circle=_CIRCLE,
+    radius=0.1,
+):
+    return _ball_state(position, turned, twist, links, circle, radius, radius, True)
+
+
+@named(_ball_start)
+def hand_with_ball(
+    *, links=_SPATIAL_LINKS, masses=(0.1, 0.2, 0.15), circle=_CIRCLE, mass=0.4, radius=0.1, gravity=9.81
+) -> Grasp:
+    """Three fingers of three joints each, whose tips hold a ball at three points of its equator, with friction.
+
+    q = (yaw, pitch and pitch of each finger, the ball's free joint). `links`: lengths of a finger's two bars (m);
+    `masses`: of its knuckle and its bars (kg); `circle`: radius of the circle of the bases (m). Start: the ball's
+    `position`, rotation vector and body twist.
+    """
+    builder = _spatial_hand("hand with a ball", links, masses, circle, gravity)
+    builder.add_body("ball", None, "free", inertia.sphere(mass, radius), joint_name="object")
+    contacts = []
+    for i, direction in enumerate(_directions(), 1):
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([np.cross(_UP, -direction), _UP, -direction], 1)
+        pose[:3, 3] = radius * direction
+        contacts.append(contact("hard-finger", f"tip{i}", pose))
+    return Grasp(builder.build(), "ball", contacts)
+
+
+def _rolling_start(
+    position=(0.01, -0.02, 0.28),
+    turned=(0.1, -0.15, 0.2),
+    twist=(0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
+    links=_SPATIAL_LINKS,
+    circle=_CIRCLE,
+    radius=0.1,
+    tip_radius=0.02,
+):
+    return _ball_state(position, turned, twist, links, circle, radius, radius + tip_radius, False)
+
+
+@named(_rolling_start)
+def hand_rolling_ball(
+    *,
+    links=_SPATIAL_LINKS,
+    masses=(0.1, 0.2, 0.15),
+    circle=_CIRCLE,
+    mass=0.4,
+    radius=0.1,
+    tip_radius=0.02,
+    gravity=9.81,
+) -> Grasp:
+    """The hand of `hand_with_ball` with spherical fingertips, between which the ball rolls: truly nonholonomic.
+
+    Each contact has a holonomic row, the gap, and two Pfaffian ones, no slip; forces are (normal, two tangential).
+    Start: as `hand_with_ball`, the contacts at the height of the ball's centre.
+    """
+    builder = _spatial_hand("hand rolling a ball", links, masses, circle, gravity)
+    builder.add_body("ball", None, "free", inertia.sphere(mass, radius), joint_name="object")
+    contacts = [
+        rolling_sphere(
+            "ball", None, radius, on="sphere", surface_body=f"tip{i}", surface_radius=tip_radius, name=f"finger{i}"
+        )
+        for i in (1, 2, 3)
+    ]
+    return Grasp(builder.build(), "ball", contacts)
