@@ -7,7 +7,6 @@ import numpy as np
 from jaxdyn._links import (
     Body,
     Moved,
-    is_concrete,
     keep,
     keep_matrix,
     numbers,
@@ -35,6 +34,7 @@ from jaxdyn._scalar import (
     vadd,
     vanishes,
 )
+from jaxdyn._tracing import is_concrete
 from jaxdyn.model import Model
 
 

@@ -24,6 +24,7 @@ from jaxdyn._scalar import (
     vanishes,
     vsub,
 )
+from jaxdyn._tracing import is_concrete
 from jaxdyn._trig import sin_cos
 from jaxdyn.joints import SCREW_KINDS
 from jaxdyn.model import Model, geometry
@@ -63,10 +64,6 @@ def _aligning(axes, xp):
     first = xp.stack([1.0 + sign * x * x * a, sign * b, -sign * x], 1)
     second = xp.stack([b, sign + y * y * a, -y], 1)
     return xp.stack([first, second, axes], 2)
-
-
-def is_concrete(*leaves) -> bool:
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
 
 
 def _canonical(model: Model):

@@ -1,14 +1,6 @@
 """Checks of a start in concrete numbers: what would make every later number NaN is refused with its cause."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-
-
-def is_known(*values) -> bool:
-    """Whether no number is traced, nor would be when computed with."""
-    return not any(isinstance(leaf, Tracer) for leaf in (jnp.zeros(()), *jax.tree.leaves(values)))
 
 
 def place_of(q, t, v=None) -> str:

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxdyn._tracing import compiled, is_concrete
 from jaxdyn.constrained import RESULTS, _right_inverse, correction
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, row_matrix, velocity_residual
 from jaxdyn.dynamics import mass_matrix
@@ -56,10 +56,9 @@ def assemble(
 
     **Raises:** ValueError that names the constraints that stay open and by how much, if it fails and `throw`.
     """
-    concrete = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((scene, q, v, t)))
+    concrete = is_concrete(scene, q, v, t)
     v = jnp.zeros((scene.nv,), q.dtype) if v is None else v
-    staged = isinstance(jnp.zeros(()), Tracer)
-    found = (_assemble if staged else _assemble_compiled)(scene, q, v, jnp.asarray(t, q.dtype), rank_tol)
+    found = _assemble(scene, q, v, jnp.asarray(t, q.dtype), rank_tol)
     if concrete and (throw is None or throw) and not bool(found.result == RESULTS.successful):
         raise ValueError(f"not assembled: {open_constraints(scene, found.q, found.v, t)}; give a better guess")
     if throw and not concrete:
@@ -67,6 +66,7 @@ def assemble(
     return found
 
 
+@compiled
 def _assemble(scene, q, v, t, rank_tol):
     held = holonomic_rows(layout(scene))
     if held.size:
@@ -84,9 +84,6 @@ def _assemble(scene, q, v, t, rank_tol):
     residual = residuals(scene, q, v, t)
     good = jnp.all(residual <= float(jnp.finfo(q.dtype).eps) ** 0.7 * (1.0 + jnp.max(jnp.abs(v))))
     return Assembly(q, v, residual, RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled))  # pyright: ignore[reportArgumentType]
-
-
-_assemble_compiled = eqx.filter_jit(_assemble)
 
 
 def _nearest(scene, guess, t, held, rank_tol):

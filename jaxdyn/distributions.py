@@ -7,13 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.constrained import tolerance
 from jaxdyn.constraints.base import holonomic_rows, layout, row_matrix, velocity_residual
 from jaxdyn.dynamics import kinetic_energy, potential_energy
-from jaxdyn.reduced import Independent, Orthonormal, as_basis, reduce, tangent_basis
+from jaxdyn.reduced import Independent, Orthonormal, as_basis, reduce, row_matrix_compiled, tangent_basis
 from jaxdyn.scene import Scene
 from jaxdyn.so3 import _product
 from jaxdyn.systems import LagrangianSystem, velocity_to_rate
@@ -57,7 +57,7 @@ def involutive(
     """
     if not layout(scene):
         raise ValueError("the scene has no constraints; every velocity is allowed")
-    if any(isinstance(leaf, Tracer) for leaf in (jnp.zeros(()), *jax.tree.leaves((scene, q, t)))):
+    if not is_known(scene, q, t):
         raise ValueError(
             "involutive looks at ranks, which decide what it computes next; call it outside of jit and vmap"
         )
@@ -65,7 +65,7 @@ def involutive(
     reference = tangent_basis(scene, q, t, dof=dof, rank_tol=rank_tol)
     count, limit = reference.shape[1], tolerance(rank_tol, q)
     # Brackets stay tangent to the holonomic constraints.
-    held = np.asarray(_row_matrix_compiled(scene, q, t))[holonomic_rows(layout(scene))]
+    held = np.asarray(row_matrix_compiled(scene, q, t))[holonomic_rows(layout(scene))]
     most = scene.nv - (int(np.linalg.matrix_rank(held, tol=1e-9 * np.abs(held).max())) if held.size else 0)
     # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
     # bracketed with the others and spans nothing itself.
@@ -128,7 +128,6 @@ def _fields(scene, reference, q, t, levels):
 
 
 _fields_compiled = eqx.filter_jit(_fields)
-_row_matrix_compiled = eqx.filter_jit(row_matrix)
 
 
 class SpuriousTerms(NamedTuple):
@@ -178,10 +177,9 @@ def spurious_terms(
     choice = as_basis(tuple(independent), scene)
     if not isinstance(choice, Independent) or nu.shape != (choice.size(scene),):
         raise ValueError(f"nu has shape {nu.shape}, expected {(choice.size(scene),)} = (nr,)")
-    staged = isinstance(jnp.zeros(()), Tracer)
     t = jnp.asarray(t, q.dtype)
-    found, depends = (_substituted if staged else _substituted_compiled)(scene, choice, q, nu, tau, t)
-    if not isinstance(depends, Tracer) and float(depends) > 1e-9:
+    found, depends = _substituted(scene, choice, q, nu, tau, t)
+    if is_concrete(depends) and float(depends) > 1e-9:
         raise ValueError(
             f"L or the rows depend on the eliminated coordinates (by {float(depends):.3g}), or the rows prescribe a slip; "
             "choose other independent velocities, or use jd.reduced_dynamics"
@@ -189,6 +187,7 @@ def spurious_terms(
     return found
 
 
+@compiled
 def _substituted(scene, choice: Independent, q, nu, tau, t):
     kept = np.asarray(choice.velocities, int)
     rest = np.setdiff1d(np.arange(scene.nv), kept)
@@ -216,9 +215,6 @@ def _substituted(scene, choice: Independent, q, nu, tau, t):
     pull = jax.grad(lambda s: _lagrangian(scene.system, q.at[rest].set(s), right.velocity, t))(q[rest])
     slip = velocity_residual(scene, q, jnp.zeros_like(q), t)
     return value, jnp.max(jnp.abs(jnp.concatenate([forms.ravel(), pull, slip])))
-
-
-_substituted_compiled = eqx.filter_jit(_substituted)
 
 
 def _lagrangian(system, q, v, t):

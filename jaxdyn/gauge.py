@@ -19,10 +19,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from jaxdyn._tracing import compiled
 from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
 from jaxdyn.constraints.base import layout, row_matrix, rows
 from jaxdyn.dynamics import bias_force, coriolis_matrix, mass_matrix
@@ -101,10 +101,10 @@ def gauge_invariant(
     for name, value, size in (("rotation", rotation, scene.nv), ("motion_rotation", motion_rotation, dof)):
         if value is not None and value.shape != (size, size):
             raise ValueError(f"{name} has shape {value.shape}, expected {(size, size)}; give an orthogonal matrix")
-    staged = isinstance(jnp.zeros(()), Tracer)
-    return (_decouple if staged else _decouple_compiled)(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol)
+    return _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol)
 
 
+@compiled
 def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> GaugeInvariant:
     system, unit = scene.system, jnp.eye(scene.nv, dtype=q.dtype)
     motion = velocity_to_rate(system, q, v), jnp.ones_like(t)
@@ -156,6 +156,3 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
         multipliers=_product(back.T, _product(back, wanted) - free),
         result=result,
     )
-
-
-_decouple_compiled = eqx.filter_jit(_decouple)

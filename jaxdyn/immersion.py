@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn import dynamics
-from jaxdyn._start import is_known, place_of
+from jaxdyn._start import place_of
+from jaxdyn._tracing import is_known
 from jaxdyn.scene import Scene, as_pytree, checked_force
 from jaxdyn.so3 import _product
 from jaxdyn.systems import System, checked_size, rate_to_velocity

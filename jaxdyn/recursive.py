@@ -28,7 +28,6 @@ from jaxdyn._articulated import (
 from jaxdyn._links import (
     canonical_bodies,
     combine,
-    is_concrete,
     keep,
     numbers,
     place_joints,
@@ -39,6 +38,7 @@ from jaxdyn._links import (
 )
 from jaxdyn._materialize import materialize
 from jaxdyn._scalar import ZERO3, add, apply, cross, dot, scale, symmetric_rows, transpose, vadd, vanishes, vsub
+from jaxdyn._tracing import is_concrete
 from jaxdyn.model import Model, check_shapes
 
 
@@ -166,14 +166,8 @@ def mass_matrix_inverse_times(model: Model, q: Float[Array, " nq"], forces: Floa
 
 def aba_with_columns(model: Model, q, v, tau, columns):
     """Forward dynamics a (nv,) and M^-1 times `columns` (nv, k), from one factorisation of M, in O(nb k) operations."""
-    bodies = canonical_bodies(model)
-    moves = place_joints(model, bodies, q)
-    wrenches = _body_wrenches(model, bodies, moves, v)
-    factor = factorize(model, bodies, moves)
-    slices = model.topology.v_slices
-    a = stack(solve(model, moves, factor, split(tau, slices), wrenches), q)
-    times = jax.vmap(lambda column: stack(solve(model, moves, factor, split(column, slices)), q), 1, 1)
-    return a, times(columns)
+    a, times = _free_and_inverse(model, q, v, tau)
+    return a, jax.vmap(times, 1, 1)(columns)
 
 
 def aba_tangent(model: Model, q, v, tau, force_change):
@@ -182,13 +176,19 @@ def aba_tangent(model: Model, q, v, tau, force_change):
     With ID(q, v, a) = tau, a change of (model, q, v, tau) changes a by M^-1 (dtau - dID at fixed a); `force_change` returns the
     bracket. In reverse this costs one more M^-1 and one reverse pass of RNEA, instead of a reverse pass of ABA.
     """
+    a, times = _free_and_inverse(model, q, v, tau)
+    return a, times(force_change(a))
+
+
+def _free_and_inverse(model: Model, q, v, tau):
+    """Forward dynamics a (nv,) and the function f -> M^-1 f, from one factorisation of M."""
     bodies = canonical_bodies(model)
     moves = place_joints(model, bodies, q)
     wrenches = _body_wrenches(model, bodies, moves, v)
     factor = factorize(model, bodies, moves)
     slices = model.topology.v_slices
     a = stack(solve(model, moves, factor, split(tau, slices), wrenches), q)
-    return a, stack(solve(model, moves, factor, split(force_change(a), slices)), q)
+    return a, lambda force: stack(solve(model, moves, factor, split(force, slices)), q)
 
 
 def crba(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
+from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
 from jaxdyn.constraints.base import layout, row_matrix, velocity_residual
 from jaxdyn.dynamics import inverse_dynamics, mass_matrix
@@ -156,7 +156,7 @@ class Orthonormal(Basis):
 
     def advice(self, scene, q, t):
         """A reference that serves here."""
-        rank = np.linalg.matrix_rank(np.asarray(_row_matrix_compiled(scene, q, t)), tol=1e-9)
+        rank = np.linalg.matrix_rank(np.asarray(row_matrix_compiled(scene, q, t)), tol=1e-9)
         return f"take jd.tangent_basis(scene, q) for reference; the rows have rank {rank} of nv = {scene.nv}"
 
 
@@ -236,10 +236,9 @@ def reduced_dynamics(
     size = choice.size(scene)
     if size is not None and nu.shape != (size,):
         raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns")
-    staged = isinstance(jnp.zeros(()), Tracer)
-    found = (reduce if staged else _reduce_compiled)(scene, choice, q, nu, tau, jnp.asarray(t, q.dtype))
+    found = _reduce_compiled(scene, choice, q, nu, tau, jnp.asarray(t, q.dtype))
     singular = found.result == RESULTS.singular_basis
-    if not isinstance(singular, Tracer) and bool(singular):
+    if is_concrete(singular) and bool(singular):
         raise ValueError(f"basis does not serve at this q: {choice.advice(scene, q, t)}")
     return found
 
@@ -266,7 +265,7 @@ def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
     return ReducedDynamics(rate, v, _product(N, rate) + drift, mass, bias, force, N, result)
 
 
-_reduce_compiled = eqx.filter_jit(reduce)
+_reduce_compiled = compiled(reduce)
 
 
 def tangent_basis(
@@ -283,8 +282,7 @@ def tangent_basis(
     """
     t = jnp.asarray(t, q.dtype)
     dof = freedoms(scene, q, t, dof, rank_tol)
-    staged = isinstance(jnp.zeros(()), Tracer)
-    keep, _ = (_tangent_projection if staged else _tangent_projection_compiled)(scene, q, t, rank_tol)
+    keep, _ = _tangent_projection(scene, q, t, rank_tol)
     return split_directions(keep)[:, scene.nv - dof :]
 
 
@@ -298,22 +296,20 @@ def freedoms(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None 
             raise ValueError(f"dof is {dof!r}; give the number of freedoms, 1 to nv = {scene.nv}")
         return dof
     count = layout(scene)[-1].end
-    known = not any(isinstance(leaf, Tracer) for leaf in (jnp.zeros(()), *jax.tree.leaves((scene, q, t))))
-    dof = scene.nv - (int(_tangent_projection_compiled(scene, q, t, rank_tol)[1]) if known else count)
+    known = is_known(scene, q, t)
+    dof = scene.nv - (int(_tangent_projection(scene, q, t, rank_tol)[1]) if known else count)
     if dof < 1:
         fix = "leave one out" if known else "if some of them depend on others, give dof, the number of freedoms"
         raise ValueError(f"{count} constraint rows leave no freedom of nv = {scene.nv}: {fix}")
     return dof
 
 
+@compiled
 def _tangent_projection(scene, q, t, rank_tol):
     """1 - A^+ A, and the rank of A."""
     A = row_matrix(scene, q, t)
     inverse = pseudo_inverse(A, tolerance(rank_tol, A))
     return jnp.eye(scene.nv, dtype=A.dtype) - _product(inverse, A), jnp.round(jnp.sum(inverse * A.T))
-
-
-_tangent_projection_compiled = eqx.filter_jit(_tangent_projection)
 
 
 def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -323,7 +319,7 @@ def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 def independent_velocities(scene: Scene, q, t=0.0) -> tuple[int, ...]:
     """Indices of velocities that determine the others at a concrete place: those left by the pivots of A's columns."""
-    A = np.asarray(_row_matrix_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
+    A = np.asarray(row_matrix_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
     rest, found = A.copy(), []
     for _ in range(min(A.shape)):
         sizes = np.linalg.norm(rest, axis=0)
@@ -354,7 +350,7 @@ def least_quality(dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.4
 
 
-_row_matrix_compiled = eqx.filter_jit(row_matrix)
+row_matrix_compiled = compiled(row_matrix)
 
 
 def _affine_rows(scene, q, t):

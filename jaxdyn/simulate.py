@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
+from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.assembly import project_state, residuals
 from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves
 from jaxdyn.constraints.base import state_dtype
@@ -27,7 +28,6 @@ from jaxdyn.solvers.choice import (
     checked_adjoint,
     checked_method,
     checked_step_limit,
-    is_concrete,
     is_fixed,
     progress_meter,
     stepping,
@@ -60,7 +60,8 @@ _ADVICE = {
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
     "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
     "method='projected' needs none",
-    "open_constraints": "tighten rtol and atol, or look for constraints that contradict each other on the way",
+    "open_constraints": "take smaller steps (stepsize, or rtol and atol), or look for constraints that contradict each other "
+    "on the way",
 }
 
 
@@ -193,10 +194,8 @@ def simulate(
     dtype = state_dtype(scene.system)
     numbers = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
     numbers.append(jnp.asarray(stepsize, dtype) if is_fixed(stepsize) else stepsize)
-    # In a trace, numbers that are known stay known; a nested `jit` would hide them. Elsewhere, compile once per shape.
-    staged = isinstance(jnp.zeros(()), Tracer)
-    concrete = not staged and is_concrete((scene, control, method, numbers))
-    solution = (_run if staged else _run_compiled)(scene, control, method, numbers, options)
+    concrete = is_known(scene, control, method, numbers)
+    solution = _run(scene, control, method, numbers, options)
     if throw is None:
         throw = concrete
     if throw and concrete:
@@ -206,6 +205,7 @@ def simulate(
     return solution
 
 
+@compiled
 def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     q0, v0, ts, *steps = numbers
     system, outputs = scene.system, options["outputs"]
@@ -306,9 +306,6 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     stats = {name: jnp.asarray(solved.stats[name], jnp.int32) for name in _COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     return Solution(ts=ts, result=result, stats=stats, **jax.tree.map(or_nan, rows))
-
-
-_run_compiled = eqx.filter_jit(_run)
 
 
 def _integrate(derivative, project, quality, method, y0, ts, args, steps, options):

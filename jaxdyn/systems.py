@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn._small import solve_positive
-from jaxdyn._start import check_mass_matrix, is_known, place_of
+from jaxdyn._start import check_mass_matrix, place_of
+from jaxdyn._tracing import is_known
 from jaxdyn.model import Model, configuration_rate, integrate, normalize
 from jaxdyn.scene import as_pytree
 from jaxdyn.so3 import _product

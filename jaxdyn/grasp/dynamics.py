@@ -13,10 +13,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
+from jaxdyn._tracing import compiled
 from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
 from jaxdyn.constraints.base import Layout, layout, row_matrix
 from jaxdyn.dynamics import coriolis_matrix, gravity_force, mass_matrix
@@ -80,10 +80,10 @@ def object_dynamics(
         raise ValueError(
             f"V has shape {V.shape}, expected {(len(grasp.object_velocities),)}, the velocity of {grasp.object!r}"
         )
-    staged = isinstance(jnp.zeros(()), Tracer)
-    return (_solve if staged else _solve_compiled)(grasp, q, V, tau, jnp.asarray(t, q.dtype))
+    return _solve(grasp, q, V, tau, jnp.asarray(t, q.dtype))
 
 
+@compiled
 def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     hands, objects = (np.array(x, int) for x in (grasp.hand_velocities, grasp.object_velocities))
     system = grasp.system
@@ -113,6 +113,3 @@ def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     condition = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
     result = RESULTS.where(whole & (condition * least_quality(q.dtype) < 1), result, RESULTS.singular_basis)
     return ObjectDynamics(mass, coriolis, held, driven, rate, v, a, lam, result, layout(grasp))
-
-
-_solve_compiled = eqx.filter_jit(_solve)

@@ -48,7 +48,7 @@ def minimise(
         best, lowest, history = jnp.asarray(start), np.inf, []
         while True:
             path, value, gradient = _begin(loss, args, best, scaling(best))
-            before, stalled = lowest, False
+            before = lowest
             z = jnp.zeros_like(best)
             state = optimizer.init(z)
             # A round begins where the last one ended: the point is in the history already.
@@ -71,13 +71,12 @@ def minimise(
                 if searching:
                     found = _line_search(path.evaluate, z, value, gradient, update)
                     if found is None:  # no decrease that rounding lets one see
-                        stalled = True
                         break
                     z, value, gradient = found
                 else:
                     z = z + update
                     value, gradient = path.evaluate(z)
-            if searching and before - lowest <= tolerance * lowest and (before < np.inf or stalled):
+            if searching and before - lowest <= tolerance * lowest:
                 return best, np.array(history), "converged"
 
 

@@ -4,12 +4,11 @@ import importlib.util
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jax.core import Tracer
 
+from jaxdyn._tracing import is_concrete
 from jaxdyn.solvers.rk4 import RK4
 
 ADJOINTS = ("reverse", "direct", "forward", "backsolve")
@@ -32,11 +31,6 @@ class _Adaptive(diffrax.PIDController):
         """End of the first step and state of the controller."""
         first, state = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
         return jnp.where(jnp.isfinite(first), first, t1), state
-
-
-def is_concrete(tree) -> bool:
-    """Whether every leaf is known, so that its value can be looked at."""
-    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def is_fixed(stepsize) -> bool:

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn._tracing import is_concrete
 from jaxdyn.scene import Scene
-from jaxdyn.solvers.choice import is_concrete
 from jaxdyn.systems import has_quaternions
 
 
