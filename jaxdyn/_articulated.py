@@ -154,6 +154,11 @@ def factorize(model: Model, bodies, moves) -> Factor:
 
 def solve(model: Model, moves, factor: Factor, tau, wrenches=None):
     """M^-1 (tau - forces that `wrenches` on the bodies ask for): inward for the residual forces, outward for accelerations."""
+    return outward(model, moves, factor, inward(model, moves, factor, tau, wrenches))
+
+
+def inward(model: Model, moves, factor: Factor, tau, wrenches=None):
+    """What is left of tau at each joint once the wrenches on the bodies that it carries have been met: D^(1/2) W^-1 tau."""
     topology = model.topology
     bias: list = list(wrenches) if wrenches is not None else [(ZERO3, ZERO3)] * model.nb
     residual: list = [None] * model.nb
@@ -172,6 +177,12 @@ def solve(model: Model, moves, factor: Factor, tau, wrenches=None):
                 force = tuple(keep(part) for part in force)
             up = wrench_to_parent(moves[i], force)
             bias[parent] = (vadd(bias[parent][0], up[0]), vadd(bias[parent][1], up[1]))
+    return residual
+
+
+def outward(model: Model, moves, factor: Factor, residual):
+    """Accelerations of the joints from what `inward` left at each."""
+    topology = model.topology
     twists: list = [None] * model.nb
     out: list = [None] * model.nb
     carries = {parent for parent in topology.parents}

@@ -25,7 +25,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from jaxdyn import matrix_form, recursive
+from jaxdyn import closed_recursion, matrix_form, recursive
 from jaxdyn._materialize import at_least
 from jaxdyn.model import Model
 
@@ -60,17 +60,26 @@ def _traced_once(function: Callable) -> Callable:
     return jax.jit(run, static_argnums=0)
 
 
+def is_large_batch(*trees):
+    """Whether the batch over which the trees vary has at least `LEAST_BATCH` samples: a bool, or a traced one that is known
+    when the program is compiled."""
+    traced = [x for x in jax.tree.leaves(trees) if isinstance(x, jax.core.Tracer)]
+    return _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1) if traced else False
+
+
+def _is_given(model: Model) -> bool:
+    # A mechanism whose numbers are known is traced in place: inside a jit of its own its zeros would be hidden.
+    return isinstance(model.home, jax.core.Tracer) and isinstance(model.screws, jax.core.Tracer)
+
+
 def _choose(model: Model, recursion: Callable, matrices: Callable, *args):
     """`recursion(model, *args)` for large batches of mechanisms of moderate size, else `matrices(model, *args)`."""
     if model.nb > MOST_BODIES or model.nb == 0:
         return matrices(model, *args)
-    traced = [x for x in jax.tree.leaves((model, *args[:3])) if isinstance(x, jax.core.Tracer)]
-    large = _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1) if traced else False
-    # A mechanism whose numbers are known is traced in place: inside a jit of its own its zeros would be hidden.
-    given = isinstance(model.home, jax.core.Tracer) and isinstance(model.screws, jax.core.Tracer)
+    large = is_large_batch(model, *args[:3])
 
     def recursion_from(least):
-        if given:
+        if _is_given(model):
             return _traced_once(recursion)(least, model, *args)
         with at_least(least):
             return recursion(model, *args)
@@ -108,32 +117,14 @@ def mass_matrix(model: Model, q: Array) -> Array:
 
 def forward_dynamics(model: Model, q: Array, v: Array, tau: Array) -> Array:
     """a = M^-1 (tau - C v - N), (nv,), differentiated by the implicit function theorem and not through the algorithm."""
-    leaves, structure = jax.tree.flatten(model)
-    # Leaves with known values stay outside the differentiated function: inside it they would be traced, and the
-    # recursion could not see their zeros any more.
-    places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.core.Tracer)]
 
-    def rebuild(traced):
-        full = list(leaves)
-        for place, leaf in zip(places, traced, strict=True):
-            full[place] = leaf
-        return jax.tree.unflatten(structure, full)
+    def solve(model, *args):
+        return _choose(model, recursive.aba, matrix_form.forward_dynamics, *args)
 
-    @jax.custom_jvp
-    def solve(traced, q, v, tau):
-        return _choose(rebuild(traced), recursive.aba, matrix_form.forward_dynamics, q, v, tau)
+    def tangent(model, *args):
+        return _choose(model, _tangent_by_recursion, _tangent_by_matrices, *args)
 
-    def rule(primals, tangents):
-        traced, q, v, tau = primals
-        zero = jax.custom_derivatives.SymbolicZero
-        steps = [None] * len(leaves)
-        for place, step in zip(places, tangents[0], strict=True):
-            steps[place] = step
-        steps = [None if isinstance(step, zero) else step for step in (*steps, *tangents[1:])]
-        return _choose(rebuild(traced), _tangent_by_recursion, _tangent_by_matrices, q, v, tau, steps)
-
-    solve.defjvp(rule, symbolic_zeros=True)
-    return solve([leaves[i] for i in places], q, v, tau)
+    return _implicit(model, (q, v, tau), solve, tangent)
 
 
 def _tangent_by_recursion(model, q, v, tau, steps):
@@ -147,23 +138,96 @@ def _tangent_by_matrices(model, q, v, tau, steps):
 
 
 def _force_change(inverse: Callable, model, q, v, tau, steps) -> Callable:
-    """a -> dtau - dID(q, v, a) at fixed a, for `steps` in the model's leaves, q, v and tau; None where nothing moves."""
-    leaves, structure = jax.tree.flatten(model)
+    """a -> dtau - dID(q, v, a) at fixed a."""
     *steps, tau_step = steps
-    base = [*leaves, q, v]
-    moving = [i for i, step in enumerate(steps) if step is not None]
 
     def change(a):
         total = jnp.zeros_like(tau) if tau_step is None else tau_step
-        if not moving:
-            return total
-
-        def along(*values):
-            here = list(base)
-            for i, value in zip(moving, values, strict=True):
-                here[i] = value
-            return inverse(jax.tree.unflatten(structure, here[:-2]), here[-2], here[-1], a)
-
-        return total - jax.jvp(along, [base[i] for i in moving], [steps[i] for i in moving])[1]
+        moved = _along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
+        return total if moved is None else total - moved
 
     return change
+
+
+def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tuple[Array, Array, Array]:
+    """`closed_recursion.closed_dynamics`, without derivatives; for large batches."""
+    # Only what is traced has a gradient to be stopped; what is known has to stay so.
+    args = jax.tree.map(
+        lambda x: lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x, (model, loops, q, v, tau)
+    )
+    if _is_given(model):
+        return _traced_once(closed_recursion.closed_dynamics)(LEAST_BATCH, *args)
+    with at_least(LEAST_BATCH):
+        return closed_recursion.closed_dynamics(*args)
+
+
+def with_derivatives(model: Model, loops, q: Array, v: Array, tau: Array, a: Array, lam: Array) -> tuple[Array, Array]:
+    """(a, lam) that `closed_dynamics` has found, differentiated by the implicit function theorem."""
+
+    def found(tree, q, v, tau, a, lam):
+        return a, lam
+
+    def tangent(tree, q, v, tau, a, lam, steps):
+        model, loops = tree
+        *steps, tau_step, _, _ = steps
+
+        def change(a, lam):
+            def needed(tree, q, v):
+                model, loops = tree
+                return closed_recursion.closed_inverse(model, loops, q, v, a, lam)
+
+            moved = _along(needed, (tree, q, v), steps)
+            force, along = (jnp.zeros_like(v), jnp.zeros_like(lam)) if moved is None else moved
+            return (-force if tau_step is None else tau_step - force), -along
+
+        with at_least(LEAST_BATCH):
+            return closed_recursion.closed_tangent(model, loops, q, v, tau, change)
+
+    return _implicit((model, loops), (q, v, tau, a, lam), found, tangent)
+
+
+def _implicit(tree, args: tuple, solve: Callable, tangent: Callable):
+    """solve(tree, *args), whose derivative is given by tangent(tree, *args, steps) -> (value, its change).
+
+    `steps` are those of the tree's leaves and of the args, None where nothing moves. Leaves with known values stay outside of
+    the differentiated function: inside it they would be traced, and a recursion could not see their zeros any more.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.core.Tracer)]
+
+    def rebuild(traced):
+        full = list(leaves)
+        for place, leaf in zip(places, traced, strict=True):
+            full[place] = leaf
+        return jax.tree.unflatten(structure, full)
+
+    @jax.custom_jvp
+    def run(traced, *args):
+        return solve(rebuild(traced), *args)
+
+    def rule(primals, tangents):
+        traced, *args = primals
+        zero = jax.custom_derivatives.SymbolicZero
+        steps = [None] * len(leaves)
+        for place, step in zip(places, tangents[0], strict=True):
+            steps[place] = step
+        return tangent(rebuild(traced), *args, [None if isinstance(x, zero) else x for x in (*steps, *tangents[1:])])
+
+    run.defjvp(rule, symbolic_zeros=True)
+    return run([leaves[i] for i in places], *args)
+
+
+def _along(function: Callable, args: tuple, steps):
+    """The change of function(*args) for `steps` in the leaves of args, None where one does not move; None if none does."""
+    base, structure = jax.tree.flatten(args)
+    moving = [i for i, step in enumerate(steps) if step is not None]
+    if not moving:
+        return None
+
+    def moved(*values):
+        here = list(base)
+        for i, value in zip(moving, values, strict=True):
+            here[i] = value
+        return function(*jax.tree.unflatten(structure, here))
+
+    return jax.jvp(moved, [base[i] for i in moving], [steps[i] for i in moving])[1]

@@ -66,8 +66,8 @@ def _aligning(axes, xp):
     return xp.stack([first, second, axes], 2)
 
 
-def _canonical(model: Model):
-    """Home poses, screws and inertias in canonical frames, as arrays; by numpy where the values are known."""
+def _axes(model: Model):
+    """Home poses, screws, their rates, and canonical axes in body axes, as arrays; by numpy where the values are known."""
     topology = model.topology
     if is_concrete(model.home, model.screws):
         xp, home, screws = np, np.asarray(model.home), np.asarray(model.screws) * topology.screw_mask
@@ -78,7 +78,13 @@ def _canonical(model: Model):
     up = xp.asarray(np.eye(3)[2:], home.dtype)
     direction = xp.where(angular[:, None], screws[:, 3:], xp.where(linear[:, None], screws[:, :3], up))
     rate = xp.sqrt(xp.sum(direction**2, 1))
-    turn = _aligning(direction / rate[:, None], xp)
+    return xp, home, screws, rate, _aligning(direction / rate[:, None], xp)
+
+
+def _canonical(model: Model):
+    """Home poses, screws and inertias in canonical frames, as arrays; by numpy where the values are known."""
+    topology = model.topology
+    xp, home, screws, rate, turn = _axes(model)
     turn_t = xp.swapaxes(turn, 1, 2)
     outer = xp.concatenate([turn_t, xp.eye(3, dtype=home.dtype)[None]])[np.array(topology.parents, int)]
     rotation = outer @ home[:, :3, :3] @ turn
@@ -90,6 +96,20 @@ def _canonical(model: Model):
     full = inertias[:, 4:][:, np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])]
     inertia = (turn_t @ full @ turn)[:, np.array(UPPER)[:, 0], np.array(UPPER)[:, 1]]
     return (xp is np, rotation, shift, rate, slide), (known, inertias[:, 0], first, inertia)
+
+
+def canonical_poses(model: Model, bodies, poses) -> list:
+    """Rotations and positions of poses (4, 4) given in bodies (-1: the world), in these bodies' canonical frames."""
+    xp, *_, turn = _axes(model)
+    known = xp is np and is_concrete(poses)
+    found = []
+    for body, pose in zip(bodies, poses, strict=True):
+        pose = np.asarray(pose) if known else pose
+        if body >= 0:
+            pose = turn[body].T @ pose[:3]
+        eps = 4 * float(np.finfo(model.home.dtype).eps)
+        found.append((numbers(pose[:3, :3], known, eps), numbers(pose[:3, 3], known)))
+    return found
 
 
 def numbers(array, concrete: bool, rounding: float = 0.0) -> Any:

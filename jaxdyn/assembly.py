@@ -51,8 +51,8 @@ def assemble(
     **Arguments:** `q` (nq,), `v` (nv,) (None: at rest), guesses; `t`, s; `rank_tol` as in `constrained_dynamics`;
     `throw`: raise when it fails, by default if all inputs are concrete.
 
-    **Returns:** `Assembly`. Derivatives with respect to the scene's numbers are those of the least correction; changes
-    of the guess pass through P_T, the projection onto admissible motions.
+    **Returns:** `Assembly`. Derivatives, of any order, with respect to the guess and the scene's numbers are those of the
+    minimum, by the implicit function theorem.
 
     **Raises:** ValueError that names the constraints that stay open and by how much, if it fails and `throw`.
     """
@@ -73,11 +73,10 @@ def _assemble(scene, q, v, t, rank_tol):
         fixed, frozen, guess = (lax.stop_gradient(x) for x in (scene, t, q))
         place = _nearest(fixed, guess, frozen, held, rank_tol)
         place = lax.stop_gradient(_newton(fixed, place, frozen, held, rank_tol))
-        # A change of the guess, zero in value, and the change of phi with the scene pass through one linear step.
-        change = difference(scene.system, guess, q) if isinstance(scene.system, Model) else q - guess
-        shifted = displace(scene.system, place, change)
-        step = _product(correction(scene, place, t, rank_tol, holonomic=True), position_residual(scene, shifted, t))
-        q = retract(scene.system, displace(scene.system, shifted, -step))
+        e = difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
+        moved = displace(scene.system, q, _stationary(scene, q, t, e, rank_tol))
+        # The way from guess to place and back again costs digits, which the place itself has not lost.
+        q = retract(scene.system, place + (moved - lax.stop_gradient(moved)))
     B = correction(scene, q, t, rank_tol, holonomic=False)
     for _ in range(2):
         v = v - _product(B, velocity_residual(scene, q, v, t))
@@ -108,6 +107,38 @@ def _nearest(scene, guess, t, held, rank_tol):
     e, _, _ = lax.while_loop(unfinished, improve, (start, jnp.asarray(jnp.inf, guess.dtype), 0))
     better = jnp.max(jnp.abs(residual(e))) < jnp.max(jnp.abs(residual(start)))
     return displace(scene.system, guess, jnp.where(better, e, start))
+
+
+def _stationary(scene, guess, t, e, rank_tol):
+    """The displacement e from the guess, known in value, as a differentiable solution of M(guess) e + A^T lam = 0, phi = 0."""
+    factor = jnp.linalg.cholesky(mass_matrix(scene.system, guess, t))
+
+    def residual(e):
+        return position_residual(scene, displace(scene.system, guess, e), t)
+
+    def conditions(z):
+        e, lam = z[: scene.nv], z[scene.nv :]
+        phi, back = jax.vjp(residual, e)
+        return jnp.concatenate([_product(factor, _product(factor.T, e)) + back(lam)[0], phi])
+
+    def solve(linear, right):
+        """By the null space of A, on which the Hessian of the Lagrangian is definite; A may have dependent rows."""
+        matrix = jax.jacfwd(linear)(jnp.zeros_like(right))
+        H, A = matrix[: scene.nv, : scene.nv], matrix[scene.nv :, : scene.nv]
+        B = _right_inverse(factor, A, rank_tol)
+        keep = jnp.eye(scene.nv, dtype=A.dtype) - _product(B, A)
+        along = _product(B, right[scene.nv :])
+        left = right[: scene.nv] - _product(H, along)
+        # Across the null space M stands in for H, so that the matrix is regular.
+        away = _product(factor.T, jnp.eye(scene.nv, dtype=A.dtype) - keep)
+        whole = _product(keep.T, _product(H, keep)) + _product(away.T, away)
+        step = along + _product(keep, jnp.linalg.solve(whole, _product(keep.T, left)))
+        return jnp.concatenate([step, _product(B.T, right[: scene.nv] - _product(H, step))])
+
+    A = jax.jacrev(residual)(e)
+    lam = -_product(_right_inverse(factor, A, rank_tol).T, _product(factor, _product(factor.T, e)))
+    known = lax.stop_gradient(jnp.concatenate([e, lam]))
+    return lax.custom_root(conditions, known, lambda conditions, known: known, solve)[: scene.nv]
 
 
 def _newton(scene, q, t, held, rank_tol):

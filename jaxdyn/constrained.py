@@ -19,11 +19,14 @@ from jax import lax
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, Int
 
+from jaxdyn._anywhere import anywhere
+from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
+from jaxdyn.closed_recursion import MOST_PRODUCTS, products
 from jaxdyn.constraints.base import Layout, Rows, holonomic_rows, layout, row_matrix, rows
 from jaxdyn.constraints.frames import relative_poses
 from jaxdyn.constraints.loops import Loop
 from jaxdyn.dynamics import bias_force, mass_matrix
-from jaxdyn.model import Model
+from jaxdyn.model import Model, body_index
 from jaxdyn.recursive import aba_with_columns
 from jaxdyn.scene import Scene, checked_force
 from jaxdyn.so3 import _product
@@ -109,7 +112,44 @@ def constrained_dynamics(
     places = layout(scene)
     if not places:
         return _free(scene, q, v, force, t)
-    return solve_rows(scene, q, v, force, t, rows(scene, q, v, t), method, rank_tol)
+
+    def dense():
+        return solve_rows(scene, q, v, force, t, rows(scene, q, v, t), method, rank_tol)
+
+    large = method != "range_space" and _has_short_recursion(scene) and is_large_batch(scene, q, v, force)
+    if isinstance(large, jax.core.Tracer):
+        return lax.cond(large, lambda: _by_recursion(scene, q, v, force, method, rank_tol, dense), dense)
+    return _by_recursion(scene, q, v, force, method, rank_tol, dense) if large else dense()
+
+
+def _has_short_recursion(scene: Scene) -> bool:
+    """Whether all constraints are loops of a tree, and few enough to be written out in single numbers."""
+    model, loops = scene.system, scene.constraints
+    if not (isinstance(model, Model) and model.nb <= 2 * MOST_BODIES and all(isinstance(loop, Loop) for loop in loops)):
+        return False
+    ends = [(body_index(model, loop.body_a), body_index(model, loop.body_b)) for loop in loops]
+    return products(model, ends, [loop.kind.count for loop in loops]) <= MOST_PRODUCTS
+
+
+def _by_recursion(scene, q, v, force, method: str, rank_tol, dense) -> ConstrainedDynamics:
+    """The Schur complement written out; what it cannot do well is left to the rank-aware solve, for all samples at once."""
+    system, loops, places = scene.system, scene.constraints, layout(scene)
+    a, lam, quality = closed_dynamics(system, loops, q, v, force)
+    rank = jnp.asarray(places[-1].end, jnp.int32)
+
+    def quick():
+        result = RESULTS.where(quality > 10 * scene.nv * _eps(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+        result = RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
+        return ConstrainedDynamics(*with_derivatives(system, loops, q, v, force, a, lam), rank, result, places)
+
+    if method == "schur":
+        return quick()
+    return lax.cond(anywhere(~(quality > _least_pivot(q, rank_tol))), dense, quick)
+
+
+def _least_pivot(like, rank_tol: float | None) -> float:
+    """Ratio of the pivots of A M^-1 A^T above which the rows are independent whatever the rounding, and Cholesky serves."""
+    return max(_eps(like) ** 0.4, (100 * tolerance(rank_tol, like)) ** 2)
 
 
 def applied(scene: Scene, q, v, tau, t) -> Array:
@@ -275,10 +315,25 @@ def _eps(like) -> float:
 def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float) -> Float[Array, "m n"]:
     """Moore-Penrose inverse of Y, singular values below `rank_tol` times the largest taken for zero.
 
-    Values: on CPU a complete orthogonal decomposition (pivoted QR, then QR of the triangle's transpose), elsewhere an
-    SVD. Derivative: the formula of Golub & Pereyra (1973), eq. 4.12, right wherever the rank is constant; neither
-    factorisation is differentiated.
+    Values: (Y^T Y)^-1 Y^T where that is as good; else on CPU a complete orthogonal decomposition (pivoted QR, then QR
+    of the triangle's transpose), elsewhere an SVD, of all samples if one in a batch needs it. Derivative: the formula of
+    Golub & Pereyra (1973), eq. 4.12, right wherever the rank is constant; no factorisation is differentiated.
     """
+    if Y.shape[1] > Y.shape[0]:
+        return _by_factors(Y, rank_tol)
+    factor = jnp.linalg.cholesky(_product(Y.T, Y))
+    pivots = jnp.diagonal(factor) ** 2
+    independent = jnp.min(pivots) > _least_pivot(Y, rank_tol) * jnp.max(pivots)
+    return lax.cond(anywhere(~independent), lambda: _by_factors(Y, rank_tol), lambda: _by_normal_equations(Y, factor))
+
+
+def _by_normal_equations(Y, factor):
+    inverse = cho_solve((factor, True), Y.T)
+    # One step of Newton and Schulz takes the squared condition number out of the error.
+    return 2 * inverse - _product(_product(inverse, Y), inverse)
+
+
+def _by_factors(Y, rank_tol):
     return lax.platform_dependent(
         Y, cpu=partial(_by_orthogonal, rank_tol=rank_tol), default=partial(_by_svd, rank_tol=rank_tol)
     )

@@ -42,7 +42,7 @@ from jaxdyn._tracing import is_concrete
 from jaxdyn.model import Model, check_shapes
 
 
-def _body_wrenches(model: Model, bodies, moves, v, a=None):
+def body_wrenches(model: Model, bodies, moves, v, a=None):
     """Wrench that each body's motion needs, gravity included: the outward pass of Newton-Euler (EQUATIONS section 4).
 
     Linear accelerations are those of the frame's origin as a point (not of the spatial velocity), so that the velocity of
@@ -89,7 +89,7 @@ def _body_wrenches(model: Model, bodies, moves, v, a=None):
     return wrenches
 
 
-def _joint_forces(model: Model, moves, wrenches):
+def joint_forces(model: Model, moves, wrenches):
     """Inward pass: tau_i = S_i^T (sum of the wrenches of the bodies that joint i carries)."""
     total = list(wrenches)
     tau: list = [None] * model.nb
@@ -116,7 +116,7 @@ def rnea(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[
     check_shapes(model, q=q, v=v, a=a)
     bodies = canonical_bodies(model)
     moves = place_joints(model, bodies, q)
-    tau = _joint_forces(model, moves, _body_wrenches(model, bodies, moves, v, a))
+    tau = joint_forces(model, moves, body_wrenches(model, bodies, moves, v, a))
     out = stack(tau, q)
     return out if model.armature is None else out + model.armature * a
 
@@ -126,7 +126,7 @@ def bias_force(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> 
     check_shapes(model, q=q, v=v)
     bodies = canonical_bodies(model)
     moves = place_joints(model, bodies, q)
-    return stack(_joint_forces(model, moves, _body_wrenches(model, bodies, moves, v)), q)
+    return stack(joint_forces(model, moves, body_wrenches(model, bodies, moves, v)), q)
 
 
 def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
@@ -134,7 +134,7 @@ def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
     check_shapes(model, q=q)
     bodies = canonical_bodies(model)
     moves = place_joints(model, bodies, q)
-    return stack(_joint_forces(model, moves, _body_wrenches(model, bodies, moves, None)), q)
+    return stack(joint_forces(model, moves, body_wrenches(model, bodies, moves, None)), q)
 
 
 def aba(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
@@ -151,7 +151,7 @@ def aba(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float
     check_shapes(model, q=q, v=v, tau=tau)
     bodies = canonical_bodies(model)
     moves = place_joints(model, bodies, q)
-    wrenches = _body_wrenches(model, bodies, moves, v)
+    wrenches = body_wrenches(model, bodies, moves, v)
     factor = factorize(model, bodies, moves)
     return stack(solve(model, moves, factor, split(tau, model.topology.v_slices), wrenches), q)
 
@@ -184,7 +184,7 @@ def _free_and_inverse(model: Model, q, v, tau):
     """Forward dynamics a (nv,) and the function f -> M^-1 f, from one factorisation of M."""
     bodies = canonical_bodies(model)
     moves = place_joints(model, bodies, q)
-    wrenches = _body_wrenches(model, bodies, moves, v)
+    wrenches = body_wrenches(model, bodies, moves, v)
     factor = factorize(model, bodies, moves)
     slices = model.topology.v_slices
     a = stack(solve(model, moves, factor, split(tau, slices), wrenches), q)

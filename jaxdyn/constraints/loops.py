@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn import _float64 as f64
-from jaxdyn import se3, so3
+from jaxdyn import se3
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import motion_by_twists, relative_poses
 from jaxdyn.joints import KINDS, SCREW_KINDS, joint_difference
@@ -35,42 +35,54 @@ def _floored(x):
     return jnp.where(x < tiny, jnp.full_like(x, tiny), x)
 
 
-def _axis(rotation):
-    return 2.0 * rotation[:2, 2] / _floored(1.0 + rotation[2, 2])
+def _axis(R):
+    height = _floored(1.0 + R[2][2])
+    return 2.0 * R[0][2] / height, 2.0 * R[1][2] / height
 
 
-def _attitude(rotation):
-    return 4.0 * so3.vee(rotation) / _floored(1.0 + jnp.trace(rotation))
+def attitude(R):
+    """Twice the tangent of half the angle, along the axis of the rotation: three numbers."""
+    size = _floored(1.0 + R[0][0] + R[1][1] + R[2][2])
+    return tuple(2.0 * (R[j][i] - R[i][j]) / size for i, j in ((1, 2), (2, 0), (0, 1)))
 
 
-def _turn(rotation):
-    """Twice the tangent of half the angle about z, when that is the only angle, (1,)."""
-    c = 0.5 * (rotation[0, 0] + rotation[1, 1])
-    return ((rotation[1, 0] - rotation[0, 1]) / _floored(1.0 + c))[None]
+def _turn(R):
+    """Twice the tangent of half the angle about z, when that is the only angle."""
+    return ((R[1][0] - R[0][1]) / _floored(1.0 + 0.5 * (R[0][0] + R[1][1])),)
 
 
-class _Kind(NamedTuple):
-    """Rows that a joint removes: how many, and their residual from (R, p)."""
+class Kind(NamedTuple):
+    """Rows that a joint removes: entries of p, then functions of the entries R[i][j]."""
 
-    count: int
-    residual: Callable
+    slides: tuple[int, ...]
+    turn: Callable | None = None
+    turns: int = 0
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(self.slides) + self.turns
+
+    def residual(self, R, p):
+        """Residual (n,) of a rotation and a position."""
+        return jnp.stack([*(p[i] for i in self.slides), *(() if self.turn is None else self.turn(R))])
 
 
 _SPATIAL = {
-    "point": _Kind(3, lambda R, p: p),
-    "spherical": _Kind(3, lambda R, p: p),
-    "revolute": _Kind(5, lambda R, p: jnp.concatenate([p, _axis(R)])),
-    "universal": _Kind(4, lambda R, p: jnp.concatenate([p, R[2:, 2]])),
-    "prismatic": _Kind(5, lambda R, p: jnp.concatenate([p[:2], _attitude(R)])),
-    "cylindrical": _Kind(4, lambda R, p: jnp.concatenate([p[:2], _axis(R)])),
-    "planar": _Kind(3, lambda R, p: jnp.concatenate([p[2:], _axis(R)])),
-    "weld": _Kind(6, lambda R, p: jnp.concatenate([p, _attitude(R)])),
+    "point": Kind((0, 1, 2)),
+    "spherical": Kind((0, 1, 2)),
+    "revolute": Kind((0, 1, 2), _axis, 2),
+    "universal": Kind((0, 1, 2), lambda R: (R[2][2],), 1),
+    "prismatic": Kind((0, 1), attitude, 3),
+    "cylindrical": Kind((0, 1), _axis, 2),
+    "planar": Kind((2,), _axis, 2),
+    "weld": Kind((0, 1, 2), attitude, 3),
 }
 _IN_PLANE = {
-    "point": _Kind(2, lambda R, p: p[:2]),
-    "revolute": _Kind(2, lambda R, p: p[:2]),
-    "prismatic": _Kind(2, lambda R, p: jnp.concatenate([p[1:2], _turn(R)])),
-    "weld": _Kind(3, lambda R, p: jnp.concatenate([p[:2], _turn(R)])),
+    "point": Kind((0, 1)),
+    "revolute": Kind((0, 1)),
+    "prismatic": Kind((1,), _turn, 1),
+    "weld": Kind((0, 1), _turn, 1),
 }
 
 
@@ -86,13 +98,14 @@ class Loop(Constraint):
     pose_b: Float[Array, "4 4"]
 
     @property
-    def _kind(self) -> _Kind:
+    def kind(self) -> Kind:
+        """The rows that the joint removes."""
         return (_IN_PLANE if self.in_plane else _SPATIAL)[self.joint]
 
     def sizes(self, system, dtype):
         """Rows that the joint removes; none are nonholonomic."""
         check_bodies(self.name, system, (self.body_a, self.body_b))
-        return self._kind.count, 0
+        return self.kind.count, 0
 
     def group(self):
         """All loops are evaluated together, on one pass of the kinematics."""
@@ -108,7 +121,7 @@ class Loop(Constraint):
         rotation, position = relative_poses(members, system, q)
         found: list = [None] * len(members)
         for places in _alike(members):
-            residual = members[places[0]]._kind.residual
+            residual = members[places[0]].kind.residual
             values = jax.vmap(residual)(take(rotation, np.array(places)), take(position, np.array(places)))
             for k, i in enumerate(places):
                 found[i] = values[k]
@@ -123,7 +136,7 @@ class Loop(Constraint):
     def _displaced(self, twist, rotation, position):
         """Residual after frame B has moved along a twist, seen from frame A."""
         moved = se3.exp(twist)
-        return self._kind.residual(_product(moved[:3, :3], rotation), se3.apply(moved, position))
+        return self.kind.residual(_product(moved[:3, :3], rotation), se3.apply(moved, position))
 
     def wrench(self, rotation, position, lam):
         """Wrench (f, tau) (6,) of the joint on body B for the multipliers lam, at the origin and in axes of frame A.

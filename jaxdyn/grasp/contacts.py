@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jaxdyn import so3
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import relative_poses
-from jaxdyn.constraints.loops import _attitude, check_bodies, pose_leaf
+from jaxdyn.constraints.loops import attitude, check_bodies, pose_leaf
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.so3 import _product
 from jaxdyn.systems import velocity_to_rate
@@ -109,7 +109,7 @@ class Contact(Constraint):
 
     def _residual(self, rotation, position):
         # The fingertip moves against the object as the object moves against the fingertip, with the other sign.
-        apart = position if self.kind != "rigid" else jnp.concatenate([position, _attitude(rotation)])
+        apart = position if self.kind != "rigid" else jnp.concatenate([position, jnp.stack(attitude(rotation))])
         return -apart[np.array([i for i in self.components if i < apart.shape[0]])]
 
     def slip(self, system, q, v, t):
