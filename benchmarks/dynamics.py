@@ -82,7 +82,7 @@ def peers(source, q, v, tau):
             pin.computeABADerivatives(source, data, q_[:, i], v_[:, i], tau_[:, i])
 
     calls = {"forward dynamics": {}, "inverse dynamics": {}}
-    for n in sorted({1, THREADS}):
+    for n in sorted({1, min(THREADS, batch)}):  # waking a second thread for one sample takes milliseconds
         calls["forward dynamics"][f"pin {n}"] = lambda n=n: pin.abaInParallel(n, pool, q_, v_, tau_, out)
         calls["inverse dynamics"][f"pin {n}"] = lambda n=n: pin.rneaInParallel(n, pool, q_, v_, tau_, out)
     calls["mass matrix"] = {"pin loop": mass}

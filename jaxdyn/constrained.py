@@ -23,7 +23,7 @@ from jaxdyn._anywhere import anywhere
 from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
 from jaxdyn.closed_recursion import MOST_PRODUCTS, products
 from jaxdyn.constraints.base import Layout, Rows, holonomic_rows, layout, row_matrix, rows
-from jaxdyn.constraints.frames import relative_poses
+from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.loops import Loop
 from jaxdyn.dynamics import bias_force, mass_matrix
 from jaxdyn.model import Model, body_index
@@ -225,13 +225,14 @@ def constraint_forces(
 def constraint_wrenches(
     scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"]
 ) -> dict[str, Float[Array, "6"]]:
-    """Wrench (f, tau) of each loop on its body B, at the origin and in the axes of its frame A (N, N m), by name.
+    """Wrench (f, tau) of each constraint between two frames on its body B, at the origin and in the axes of its frame A.
 
-    The wrench on body A is the negative of it.
+    N and N m, by name. The wrench on body A is the negative of it. A loop has its frames A and B as given; for a rolling
+    contact A is on the surface and B on the body that rolls, for a contact of a grasp A is on the object and B on the finger.
     """
     found = {}
     for constraint, place in zip(scene.constraints, layout(scene), strict=True):
-        if isinstance(constraint, Loop):
+        if isinstance(constraint, Pair):
             rotation, position = relative_poses([constraint], scene.system, q)
             found[place.name] = constraint.wrench(rotation[0], position[0], multipliers[place.start : place.end])
     return found

@@ -43,19 +43,18 @@ class Constraint(eqx.Module):
         return 0 if held is None else held.shape[0], 0 if free is None else free.shape[0]
 
     def group(self):
-        """Constraints whose groups are equal and not None are evaluated together by `grouped_position`."""
+        """Constraints whose groups are equal and not None are evaluated together, by the functions below."""
         return None
 
     @classmethod
-    def grouped_position(cls, members: Sequence["Constraint"], system, q, t):
-        """Residuals (nh,) of each of the constraints of one group."""
+    def grouped_position(cls, members: Sequence["Constraint"], system, q, t) -> list:
+        """Residuals (nh,) of each of the constraints of one group, None without a holonomic part."""
         raise NotImplementedError
 
     @classmethod
-    def grouped_motion(cls, members: Sequence["Constraint"], system, q, v, t) -> list | None:
-        """A (n, nv), gamma (n,) and A v - b (n,) of each of the constraints of one group, or None: to be had by
-        differentiation alone."""
-        return None
+    def grouped_motion(cls, members: Sequence["Constraint"], system, q, v, t) -> list:
+        """A (n, nv), gamma (n,) and A v - b (n,) of each of the constraints of one group."""
+        raise NotImplementedError
 
 
 class Holonomic(Constraint):
@@ -200,7 +199,16 @@ def velocity_residual(
     scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0
 ) -> Float[Array, " nc"]:
     """psi(q, v, t) = A v - b of all constraints, (nc,)."""
-    t = jnp.asarray(t, q.dtype)
+    found, rest, others = _split(scene, q, v, jnp.asarray(t, q.dtype))
+    if rest:
+        velocity = _by_functions(others, q, v, jnp.asarray(t, q.dtype))
+        for i, place in zip(rest, layout(others), strict=True):
+            found[i] = (velocity[place.start : place.end],)
+    return jnp.concatenate([parts[-1] for parts in found])
+
+
+def _by_functions(scene: Scene, q, v, t):
+    """psi of constraints that are functions of q and v."""
     motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
     _, rates = jax.jvp(lambda q, t: _positions(scene, q, t), (q, t), motion)
     parts: list[Any] = []
@@ -215,7 +223,7 @@ def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) ->
     found, rest, others = _split(scene, q, v, t)
     if rest:
         motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
-        velocity, rate = jax.jvp(lambda q, t: velocity_residual(others, q, v, t), (q, t), motion)
+        velocity, rate = jax.jvp(lambda q, t: _by_functions(others, q, v, t), (q, t), motion)
         A = _by_differentiation(others, q, t)
         for i, place in zip(rest, layout(others), strict=True):
             part = slice(place.start, place.end)
@@ -238,9 +246,9 @@ def _split(scene: Scene, q, v, t):
     """A, gamma and velocity of the constraints that give them themselves, which ones do not, and a scene of these."""
     layout(scene)  # refuses what is no constraint, and constraints that do not fit the system
     found: list[Any] = [None] * len(scene.constraints)
-    for (kind, _), members in _grouped(scene):
-        values = kind.grouped_motion([scene.constraints[i] for i in members], scene.system, q, v, t)
-        for i, value in zip(members, values or (), strict=False):
+    for places in _grouped(scene):
+        members = [scene.constraints[i] for i in places]
+        for i, value in zip(places, members[0].grouped_motion(members, scene.system, q, v, t), strict=True):
             found[i] = value
     rest = [i for i, value in enumerate(found) if value is None]
     return found, rest, Scene(scene.system, tuple(scene.constraints[i] for i in rest))
@@ -249,7 +257,7 @@ def _split(scene: Scene, q, v, t):
 def _by_differentiation(scene: Scene, q, t):
     # psi is affine in v, so one mode costs a pass per row and the other one per column.
     differentiate = jax.jacrev if layout(scene)[-1].end < scene.nv else jax.jacfwd
-    return differentiate(lambda v: velocity_residual(scene, q, v, t))(jnp.zeros((scene.nv,), q.dtype))
+    return differentiate(lambda v: _by_functions(scene, q, v, t))(jnp.zeros((scene.nv,), q.dtype))
 
 
 def state_dtype(system):
@@ -267,20 +275,20 @@ def _positions(scene: Scene, q, t) -> list:
     for i, constraint in enumerate(scene.constraints):
         if constraint.group() is None:
             found[i] = constraint.position(scene.system, q, t)
-    for (kind, _), members in _grouped(scene):
-        values = kind.grouped_position([scene.constraints[i] for i in members], scene.system, q, t)
-        for k, i in enumerate(members):
-            found[i] = values[k]
+    for places in _grouped(scene):
+        members = [scene.constraints[i] for i in places]
+        for i, value in zip(places, members[0].grouped_position(members, scene.system, q, t), strict=True):
+            found[i] = value
     return found
 
 
 def _grouped(scene: Scene):
-    """Pairs of ((type, group), indices of the constraints in it)."""
+    """Indices of the constraints of each group."""
     groups: dict[Any, list[int]] = {}
     for i, constraint in enumerate(scene.constraints):
         if constraint.group() is not None:
-            groups.setdefault((type(constraint), constraint.group()), []).append(i)
-    return groups.items()
+            groups.setdefault(constraint.group(), []).append(i)
+    return groups.values()
 
 
 def _own_name(name, function, default: str) -> str:

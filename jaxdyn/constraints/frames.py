@@ -1,11 +1,25 @@
-"""Frames on bodies, one seen from another, and how fast each coordinate moves them against each other."""
+"""Constraints between two frames on bodies: one pass of the kinematics gives the rows, rates and residuals of all of them.
 
-from collections.abc import Callable, Sequence
+Nothing is differentiated but the few numbers of each constraint: no pass of the kinematics for each row, none for its rates.
+
+Let V_A and V_B be the twists of the frames in the axes of A at its origin, and a dot their rates at a = 0. Seen from A, frame
+B moves along the twist t U + t^2/2 U' with U = V_B - V_A and U' = Vdot_B - Vdot_A - [V_A, V_B], up to third order in t (Baker,
+Campbell, Hausdorff). With D and H the first and second derivative of a residual along a twist:
+
+    velocity = D U,  gamma = -(D U' + H(U, U)),  A_k = D Ad(T_A)^-1 (S_k if k moves B, less S_k if it moves A).
+
+Coordinates that move both frames drop out of A exactly. A slip w(R, p, U), linear in U, has D = dw/dU and gamma = -dw/dt.
+"""
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
 from jaxdyn import se3
+from jaxdyn.constraints.base import Constraint
 from jaxdyn.kinematics import Carried, carried, take
 from jaxdyn.model import Model, frame_index
 from jaxdyn.so3 import _product
@@ -26,8 +40,8 @@ def frames_on(model: Model, q, bodies: Sequence[str | None], poses, v=None) -> C
 
 def _both_frames(members, system, q, v=None) -> Carried:
     """Frames A of all the constraints, then frames B."""
-    bodies = [m.body_a for m in members] + [m.body_b for m in members]
-    return frames_on(system, q, bodies, [m.pose_a for m in members] + [m.pose_b for m in members], v)
+    ends = [member.ends()[side] for side in (0, 1) for member in members]
+    return frames_on(system, q, [body for body, _ in ends], [pose for _, pose in ends], v)
 
 
 def _seen_from_a(frames: Carried):
@@ -42,62 +56,139 @@ def _seen_from_a(frames: Carried):
     return _product(turned, frames.pose[n:, :3, :3]), _product(turned, apart[..., None])[..., 0], across
 
 
+class Pair(Constraint):
+    """A constraint on the pose (R, p) and on the twist U of frame B seen from frame A.
+
+    Subclasses say where the frames are, and give one or both residuals.
+    """
+
+    def ends(self) -> tuple[tuple[str | None, Array], tuple[str | None, Array]]:
+        """Frames A and B, each a body or frame (None: the world) and a pose (4, 4) in it."""
+        raise NotImplementedError
+
+    def apart(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Array | None:
+        """Residual (nh,) of the holonomic part, or None without one."""
+        return None
+
+    def sliding(self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]) -> Array | None:
+        """Residual (np,) of the nonholonomic part, linear in U, or None without one."""
+        return None
+
+    def likeness(self) -> tuple:
+        """Members of one class with equal likeness differ in numbers alone, and are one batch."""
+        raise NotImplementedError
+
+    def group(self):
+        """All are evaluated on one pass of the kinematics."""
+        return "pairs"
+
+    def position(self, system, q, t):
+        """Residual of the holonomic part, (nh,)."""
+        return self.grouped_position([self], system, q, t)[0]
+
+    def slip(self, system, q, v, t):
+        """Residual of the nonholonomic part, (np,)."""
+        held, free = self.sizes(system, q.dtype)
+        return self.grouped_motion([self], system, q, v, t)[0][2][held:] if free else None
+
+    def wrench(self, R, p, lam) -> Float[Array, "6"]:
+        """Wrench (f, tau) (6,) on body B for the multipliers lam, at the origin and in the axes of frame A.
+
+        `R` (3, 3), `p` (3,): pose of frame B seen from frame A. The wrench on body A is the negative of it.
+        """
+        return _product(lam, _directions(self, R, p))
+
+    @classmethod
+    def grouped_position(cls, members: Sequence["Pair"], system, q, t):
+        """Residuals (nh,) of each constraint, None without one."""
+        rotation, position = relative_poses(members, system, q)
+        found: list = [None] * len(members)
+        for index, build, leaves in _batches(members):
+            if members[index[0]].sizes(system, q.dtype)[0]:
+                values = jax.vmap(lambda leaves, R, p, build=build: build(leaves).apart(R, p))(
+                    leaves, take(rotation, index), take(position, index)
+                )
+                for k, i in enumerate(index):
+                    found[i] = values[k]
+        return found
+
+    @classmethod
+    def grouped_motion(cls, members: Sequence["Pair"], system, q, v, t):
+        """A (r, nv), gamma (r,) and velocity (r,) of each constraint."""
+        frames, n = _both_frames(members, system, q, v), len(members)
+        rotation, position, across = _seen_from_a(frames)
+        inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
+        by_a = inverse(frames.pose[:n])
+        # The same frames A, seen from the trees of frames B.
+        by_b = inverse(frames.pose[:n].at[:, :3, 3].add(-across))
+        assert frames.twist is not None and frames.bias is not None
+        twists = jnp.stack([frames.twist, frames.bias], axis=-1)
+        moved_a, moved_b = _product(by_a, twists[:n]), _product(by_b, twists[n:])
+        apart = moved_b - moved_a
+        turning = apart[:, :, 1] - jax.vmap(se3.ad_apply)(moved_a[:, :, 0], moved_b[:, :, 0])
+        moves_a, moves_b = frames.moves[:n], frames.moves[n:]
+        sides = ((1, moves_b & ~moves_a, by_b), (-1, moves_a & ~moves_b, by_a))
+        found: list = [None] * n
+        for index, build, leaves in _batches(members):
+            at = [take(x, index) for x in (rotation, position, apart[:, :, 0], turning)]
+            rates = jax.vmap(lambda leaves, *at, build=build: _rates(build(leaves), *at))
+            D, gamma, velocity = rates(leaves, *at)
+            columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
+            for sign, mask, adjoint in sides:
+                if mask[index].any():
+                    part = _product(_product(D, take(adjoint, index)), frames.subspace.T)
+                    columns = columns + part * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
+            if len(frames.coordinates) < system.nv:
+                wide = jnp.zeros((*D.shape[:2], system.nv), q.dtype)
+                columns = wide.at[:, :, frames.coordinates].set(columns)
+            for k, i in enumerate(index):
+                found[i] = columns[k], gamma[k], velocity[k]
+        return found
+
+
 def relative_poses(members, system, q):
     """Rotations (n, 3, 3) and positions (n, 3) of frame B seen from frame A, for constraints with bodies and poses."""
     return _seen_from_a(_both_frames(members, system, q))[:2]
 
 
-def motion_by_twists(members, sets, displaced: Callable, system, q, v) -> list:
-    """A (r, nv), gamma (r,) and velocity (r,) of constraints on the relative pose of two frames.
+def _batches(members: Sequence[Pair]):
+    """Members that differ in numbers alone: their indices, a function that makes one of them of its numbers, all numbers."""
+    sets: dict = {}
+    for i, member in enumerate(members):
+        sets.setdefault((type(member), member.likeness()), []).append(i)
+    for places in sets.values():
+        structure = jax.tree.structure(members[places[0]])
+        leaves = [jnp.stack(x) for x in zip(*(jax.tree.leaves(members[i]) for i in places), strict=True)]
+        yield np.array(places), lambda leaves, structure=structure: jax.tree.unflatten(structure, leaves), leaves
 
-    Nothing is differentiated but the residual: no pass of the kinematics for each row, none for its rates. `sets` are index
-    arrays of constraints that are computed together, and `displaced(i)` the function (twist, rotation, position) -> (r,): the
-    residual of constraint i after frame B has moved along a twist, seen from frame A.
 
-    Let V_A and V_B be the twists of the frames in the axes of A at its origin, and a dot their rates at a = 0. Seen from A,
-    frame B moves along the twist t U + t^2/2 U' with U = V_B - V_A and U' = Vdot_B - Vdot_A - [V_A, V_B], up to third order
-    in t (Baker, Campbell, Hausdorff). With D and H the first and second derivative of the residual along a twist:
+def _displaced(R, p, twist):
+    """Pose of frame B after it has moved along a twist, seen from frame A."""
+    moved = se3.exp(twist)
+    return _product(moved[:3, :3], R), se3.apply(moved, p)
 
-        velocity = D U,  gamma = -(D U' + H(U, U)),  A_k = D Ad(T_A)^-1 (S_k if k moves B, less S_k if it moves A).
 
-    Coordinates that move both frames drop out of A exactly.
-    """
-    frames, n = _both_frames(members, system, q, v), len(members)
-    rotation, position, across = _seen_from_a(frames)
-    inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
-    by_a = inverse(frames.pose[:n])
-    # The same frames A, seen from the trees of frames B.
-    by_b = inverse(frames.pose[:n].at[:, :3, 3].add(-across))
-    assert frames.twist is not None and frames.bias is not None
-    twists = jnp.stack([frames.twist, frames.bias], axis=-1)
-    moved_a, moved_b = _product(by_a, twists[:n]), _product(by_b, twists[n:])
-    apart = moved_b - moved_a
-    turning = apart[:, :, 1] - jax.vmap(se3.ad_apply)(moved_a[:, :, 0], moved_b[:, :, 0])
-    moves_a, moves_b = frames.moves[:n], frames.moves[n:]
-    sides = ((1, moves_b & ~moves_a, by_b), (-1, moves_a & ~moves_b, by_a))
-    found: list = [None] * n
-    for index in sets:
-        residual = displaced(index[0])
+def _directions(pair: Pair, R, p) -> Float[Array, "r 6"]:
+    """Rows D (r, 6): the rates of the residuals are D U."""
+    zero = jnp.zeros((6,), p.dtype)
+    held = jax.eval_shape(pair.apart, R, p)
+    parts = [] if held is None else [jax.jacfwd(lambda twist: pair.apart(*_displaced(R, p, twist)))(zero)]
+    if jax.eval_shape(pair.sliding, R, p, zero) is not None:
+        parts.append(jax.jacfwd(lambda U: pair.sliding(R, p, U))(zero))
+    return jnp.concatenate(parts)
 
-        def rates(rotation, position, U, bend, residual=residual):
-            def moved(twist):
-                return residual(twist, rotation, position)
 
-            zero = jnp.zeros((6,), U.dtype)
-            D = jax.jacfwd(moved)(zero)
-            bent = jax.jvp(lambda twist: jax.jvp(moved, (twist,), (U,))[1], (zero,), (U,))[1]
-            return D, -(_product(D, bend) + bent), _product(D, U)
+def _rates(pair: Pair, R, p, U, bend):
+    """D (r, 6), gamma (r,) and velocity (r,) for the twist U and its rate `bend`."""
+    zero = jnp.zeros((6,), U.dtype)
+    D = _directions(pair, R, p)
+    parts = []
+    if jax.eval_shape(pair.apart, R, p) is not None:
 
-        at = [take(x, index) for x in (rotation, position, apart[:, :, 0], turning)]
-        D, gamma, velocity = jax.vmap(rates)(*at)
-        columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
-        for sign, mask, adjoint in sides:
-            if mask[index].any():
-                part = _product(_product(D, take(adjoint, index)), frames.subspace.T)
-                columns = columns + part * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
-        if len(frames.coordinates) < system.nv:
-            wide = jnp.zeros((*D.shape[:2], system.nv), q.dtype)
-            columns = wide.at[:, :, frames.coordinates].set(columns)
-        for k, i in enumerate(index):
-            found[i] = columns[k], gamma[k], velocity[k]
-    return found
+        def moved(twist):
+            return pair.apart(*_displaced(R, p, twist))
+
+        parts.append(jax.jvp(lambda twist: jax.jvp(moved, (twist,), (U,))[1], (zero,), (U,))[1])
+    if jax.eval_shape(pair.sliding, R, p, U) is not None:
+        parts.append(jax.jvp(lambda twist: pair.sliding(*_displaced(R, p, twist), U), (zero,), (U,))[1])
+    return D, -(_product(D, bend) + jnp.concatenate(parts)), _product(D, U)

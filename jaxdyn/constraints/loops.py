@@ -9,7 +9,7 @@ correction never ends at the false solution that a sine has there.
     attitude rows 4 vee(R) / (1 + tr R) = 2 tan(theta/2) n    axes of B along those of A
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,11 +22,9 @@ from jaxtyping import Array, Float
 from jaxdyn import _float64 as f64
 from jaxdyn import se3
 from jaxdyn.constraints.base import Constraint
-from jaxdyn.constraints.frames import motion_by_twists, relative_poses
+from jaxdyn.constraints.frames import Pair
 from jaxdyn.joints import KINDS, SCREW_KINDS, joint_difference
-from jaxdyn.kinematics import take
 from jaxdyn.model import Model, body_index
-from jaxdyn.so3 import _product
 
 
 def _floored(x):
@@ -86,7 +84,7 @@ _IN_PLANE = {
 }
 
 
-class Loop(Constraint):
+class Loop(Pair):
     """A loop closed by a joint between two bodies; made by `jd.loop`."""
 
     name: str = eqx.field(static=True)
@@ -107,51 +105,17 @@ class Loop(Constraint):
         check_bodies(self.name, system, (self.body_a, self.body_b))
         return self.kind.count, 0
 
-    def group(self):
-        """All loops are evaluated together, on one pass of the kinematics."""
-        return "loops"
+    def ends(self):
+        """As given."""
+        return (self.body_a, self.pose_a), (self.body_b, self.pose_b)
 
-    def position(self, system, q, t):
-        """Residual of the loop, (n,)."""
-        return self.grouped_position([self], system, q, t)[0]
+    def likeness(self):
+        """The joint."""
+        return self.joint, self.in_plane
 
-    @classmethod
-    def grouped_position(cls, members: Sequence["Loop"], system, q, t):
-        """Residuals (n,) of each loop; those closed by the same joint are one batch."""
-        rotation, position = relative_poses(members, system, q)
-        found: list = [None] * len(members)
-        for places in _alike(members):
-            residual = members[places[0]].kind.residual
-            values = jax.vmap(residual)(take(rotation, np.array(places)), take(position, np.array(places)))
-            for k, i in enumerate(places):
-                found[i] = values[k]
-        return found
-
-    @classmethod
-    def grouped_motion(cls, members: Sequence["Loop"], system, q, v, t):
-        """A, gamma and velocity of each loop."""
-        sets = [np.array(places) for places in _alike(members)]
-        return motion_by_twists(members, sets, lambda i: members[i]._displaced, system, q, v)
-
-    def _displaced(self, twist, rotation, position):
-        """Residual after frame B has moved along a twist, seen from frame A."""
-        moved = se3.exp(twist)
-        return self.kind.residual(_product(moved[:3, :3], rotation), se3.apply(moved, position))
-
-    def wrench(self, rotation, position, lam):
-        """Wrench (f, tau) (6,) of the joint on body B for the multipliers lam, at the origin and in axes of frame A.
-
-        `rotation`, `position`: of frame B seen from frame A. The wrench on body A is the negative of it.
-        """
-        return jax.vjp(lambda twist: self._displaced(twist, rotation, position), jnp.zeros((6,), lam.dtype))[1](lam)[0]
-
-
-def _alike(members: Sequence[Loop]) -> list[list[int]]:
-    """Loops that are closed by the same joint."""
-    found: dict[tuple[str, bool], list[int]] = {}
-    for i, member in enumerate(members):
-        found.setdefault((member.joint, member.in_plane), []).append(i)
-    return list(found.values())
+    def apart(self, R, p):
+        """Residual of the joint, (n,)."""
+        return self.kind.residual(R, p)
 
 
 def loop(
@@ -208,7 +172,7 @@ def loop(
     )
 
 
-class Distance(Constraint):
+class Distance(Pair):
     """Two points at a fixed distance; made by `jd.distance`."""
 
     name: str = eqx.field(static=True)
@@ -223,11 +187,18 @@ class Distance(Constraint):
         check_bodies(self.name, system, (self.body_a, self.body_b))
         return 1, 0
 
-    def position(self, system, q, t):
+    def ends(self):
+        """As given."""
+        return (self.body_a, self.pose_a), (self.body_b, self.pose_b)
+
+    def likeness(self):
+        """All are alike."""
+        return ()
+
+    def apart(self, R, p):
         """(|p|^2 - length^2) / (2 length), (1,), m: smooth everywhere, and the change of length to first order."""
-        _, position = relative_poses([self], system, q)
-        length = self.length.astype(q.dtype)
-        return ((jnp.sum(position[0] ** 2) - length**2) / (2.0 * length))[None]
+        length = self.length.astype(p.dtype)
+        return ((jnp.sum(p**2) - length**2) / (2.0 * length))[None]
 
 
 def distance(

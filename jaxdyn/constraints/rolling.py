@@ -19,16 +19,13 @@ import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn import so3
-from jaxdyn.constraints.base import Constraint
-from jaxdyn.constraints.frames import frames_on
+from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies, pose_leaf
 from jaxdyn.so3 import _product, cross
-from jaxdyn.systems import velocity_to_rate
 
 
 class _Contact(NamedTuple):
-    """A point of contact: where (3,), normal (3,), gap (), directions without slip (n, 3); world axes."""
+    """A point of contact: where (3,), normal (3,), gap (), directions without slip (n, 3); in the surface's frame."""
 
     point: Array
     normal: Array
@@ -36,7 +33,7 @@ class _Contact(NamedTuple):
     directions: Array
 
 
-class _Touching(Constraint):
+class _Touching(Pair):
     """A body that touches a surface. Subclasses say where, and in which directions it cannot slip."""
 
     name: eqx.AbstractVar[str]
@@ -48,38 +45,36 @@ class _Touching(Constraint):
     spin: eqx.AbstractVar[bool]
     count: eqx.AbstractVar[int]
 
-    def _touch(self, body, surface) -> _Contact:
-        """The contact for the poses (rotation, position) of the body's and the surface's frame."""
-        raise NotImplementedError
+    def ends(self):
+        """Frame A on the surface, frame B on the body."""
+        return (self.surface_body, self.surface), (self.body, self.pose)
 
-    def _poses(self, system, q):
-        pose, origin, *_ = frames_on(system, q, [self.body, self.surface_body], [self.pose, self.surface])
-        return pose[:, :3, :3], pose[:, :3, 3] + origin
+    def _touch(self, R, p) -> _Contact:
+        """The contact for the pose of the body's frame seen from the surface's."""
+        raise NotImplementedError
 
     def sizes(self, system, dtype):
         """The height, and the rows without slip and spin."""
         check_bodies(self.name, system, (self.body, self.surface_body))
         return int(self.contact), self.count + int(self.spin)
 
-    def position(self, system, q, t):
-        """Gap between body and surface, (1,), m; None when the height is not constrained."""
-        if not self.contact:
-            return None
-        rotation, position = self._poses(system, q)
-        return self._touch((rotation[0], position[0]), (rotation[1], position[1])).gap[None]
+    def likeness(self):
+        """Which rows there are."""
+        return self.contact, self.spin, self.count
 
-    def slip(self, system, q, v, t):
+    def apart(self, R, p):
+        """Gap between body and surface, (1,), m; None when the height is not constrained."""
+        return self._touch(R, p).gap[None] if self.contact else None
+
+    def sliding(self, R, p, U):
         """Velocities of slipping (m/s), and of spinning (rad/s) where it is resisted."""
-        motion = velocity_to_rate(system, q, v)
-        (rotation, position), (turning, moving) = jax.jvp(lambda q: self._poses(system, q), (q,), (motion,))
-        touch = self._touch((rotation[0], position[0]), (rotation[1], position[1]))
-        omega = jax.vmap(so3.vee)(_product(turning, jnp.swapaxes(rotation, 1, 2)))
-        lever = touch.point[None] - position
-        velocity = moving + jax.vmap(cross)(omega, lever)
-        found = _product(touch.directions, velocity[0] - velocity[1])
-        if not self.spin:
-            return found
-        return jnp.concatenate([found, jnp.sum(touch.normal * (omega[0] - omega[1]))[None]])
+        touch = self._touch(R, p)
+        found = _product(touch.directions, U[:3] + cross(U[3:], touch.point))
+        return jnp.concatenate([found, jnp.sum(touch.normal * U[3:])[None]]) if self.spin else found
+
+
+def _unit(i, like):
+    return jnp.asarray([float(i == k) for k in range(3)], like.dtype)
 
 
 def _unit_or(vector, fallback):
@@ -118,16 +113,14 @@ class RollingWheel(_Touching):
     spin: bool = eqx.field(static=True)
     count: int = eqx.field(static=True)
 
-    def _touch(self, body, surface):
-        (rotation, center), (plane, origin) = body, surface
-        axis, normal = rotation[:, 2], plane[:, 2]
+    def _touch(self, R, p):
+        axis, normal = R[:, 2], _unit(2, p)
         # Down the wheel's plane; for a wheel that lies flat there is no lowest point and any direction serves.
-        tilt = jnp.sum(axis * normal)
-        down = _unit_or(tilt * axis - normal, -rotation[:, 0])
-        point = center + self.radius.astype(center.dtype) * down
-        forward = _unit_or(cross(axis, normal), rotation[:, 1])
+        down = _unit_or(axis[2] * axis - normal, -R[:, 0])
+        point = p + self.radius.astype(p.dtype) * down
+        forward = _unit_or(cross(axis, normal), R[:, 1])
         directions = jnp.stack([forward, cross(normal, forward)])[: self.count]
-        return _Contact(point, normal, jnp.sum(normal * (point - origin)), directions)
+        return _Contact(point, normal, point[2], directions)
 
 
 def rolling_wheel(
@@ -183,11 +176,9 @@ class KnifeEdge(_Touching):
     spin: bool = eqx.field(static=True, default=False)
     count: int = eqx.field(static=True, default=1)
 
-    def _touch(self, body, surface):
-        (rotation, point), (plane, origin) = body, surface
-        normal = plane[:, 2]
-        across = _unit_or(cross(normal, rotation[:, 0]), rotation[:, 1])
-        return _Contact(point, normal, jnp.sum(normal * (point - origin)), across[None])
+    def _touch(self, R, p):
+        normal = _unit(2, p)
+        return _Contact(p, normal, p[2], _unit_or(cross(normal, R[:, 0]), R[:, 1])[None])
 
 
 def knife_edge(
@@ -227,24 +218,24 @@ class RollingSphere(_Touching):
     spin: bool = eqx.field(static=True)
     count: int = eqx.field(static=True, default=2)
 
-    def _touch(self, body, surface):
-        (_, center), (frame, origin) = body, surface
-        radius = self.radius.astype(center.dtype)
+    def likeness(self):
+        """Which rows there are, and on what."""
+        return self.on, self.inside, self.contact, self.spin
+
+    def _touch(self, R, p):
+        radius = self.radius.astype(p.dtype)
         if self.on == "plane":
-            normal = frame[:, 2]
-            gap = jnp.sum(normal * (center - origin)) - radius
-            directions = frame[:, :2].T
+            normal, gap = _unit(2, p), p[2] - radius
+            directions = jnp.eye(2, 3, dtype=p.dtype)
         else:
-            apart = center - origin
-            if self.on == "cylinder":
-                apart = apart - jnp.sum(apart * frame[:, 2]) * frame[:, 2]
-            outward = _unit_or(apart, frame[:, 0])
-            reach = self.surface_radius.astype(center.dtype)  # pyright: ignore[reportOptionalMemberAccess]
-            distance = jnp.sum(outward * apart)
+            reach = self.surface_radius.astype(p.dtype)  # pyright: ignore[reportOptionalMemberAccess]
+            away = p if self.on == "sphere" else p * jnp.asarray([1.0, 1.0, 0.0], p.dtype)
+            outward = _unit_or(away, _unit(0, p))
+            distance = jnp.sum(outward * away)
             gap = reach - distance - radius if self.inside else distance - reach - radius
             normal = -outward if self.inside else outward
             directions = _tangents(normal)
-        return _Contact(center - radius * normal, normal, gap, directions)
+        return _Contact(p - radius * normal, normal, gap, directions)
 
 
 def rolling_sphere(

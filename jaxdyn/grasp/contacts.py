@@ -8,21 +8,15 @@ columns are the wrenches that it can transmit, in that frame,
 so that the multipliers of these rows are the forces of the finger on the object along the columns of B.
 """
 
-from collections.abc import Sequence
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn import so3
 from jaxdyn.constraints.base import Constraint
-from jaxdyn.constraints.frames import relative_poses
+from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies, pose_leaf
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
-from jaxdyn.so3 import _product
-from jaxdyn.systems import velocity_to_rate
 
 # Components (fx, fy, fz, tx, ty, tz) of a wrench that each contact transmits.
 _SPATIAL = {
@@ -61,7 +55,7 @@ def _components(kind: str, in_plane: bool, what: str) -> tuple[int, ...]:
     return kinds[kind]
 
 
-class Contact(Constraint):
+class Contact(Pair):
     """A contact at a place that is fixed on the object; made by `contact`."""
 
     name: str = eqx.field(static=True)
@@ -72,11 +66,9 @@ class Contact(Constraint):
     pose: Float[Array, "4 4"]
     finger_pose: Float[Array, "4 4"]
 
-    # What `relative_poses` reads: frame B on the finger, seen from frame A on the object.
-    body_a = property(lambda self: self.object)
-    body_b = property(lambda self: self.finger)
-    pose_a = property(lambda self: self.pose)
-    pose_b = property(lambda self: self.finger_pose)
+    def ends(self):
+        """Frame A on the object, frame B on the finger."""
+        return (self.object, self.pose), (self.finger, self.finger_pose)
 
     @property
     def components(self) -> tuple[int, ...]:
@@ -93,32 +85,19 @@ class Contact(Constraint):
         check_bodies(self.name, system, (self.object, self.finger))
         return len(self.components) - int(self._spins), int(self._spins)
 
-    def group(self):
-        """All contacts are evaluated together, on one pass of the kinematics."""
-        return "contacts"
+    def likeness(self):
+        """The kind of contact."""
+        return self.kind, self.in_plane
 
-    def position(self, system, q, t):
+    def apart(self, R, p):
         """Place, and where it is held attitude, of the contact frame seen from the fingertip, (n,), m and rad."""
-        return self.grouped_position([self], system, q, t)[0]
-
-    @classmethod
-    def grouped_position(cls, members: Sequence["Contact"], system, q, t):
-        """Residuals (n,) of each contact."""
-        rotation, position = relative_poses(members, system, q)
-        return [member._residual(rotation[i], position[i]) for i, member in enumerate(members)]
-
-    def _residual(self, rotation, position):
         # The fingertip moves against the object as the object moves against the fingertip, with the other sign.
-        apart = position if self.kind != "rigid" else jnp.concatenate([position, jnp.stack(attitude(rotation))])
-        return -apart[np.array([i for i in self.components if i < apart.shape[0]])]
+        found = p if self.kind != "rigid" else jnp.concatenate([p, jnp.stack(attitude(R))])
+        return -found[np.array([i for i in self.components if i < found.shape[0]])]
 
-    def slip(self, system, q, v, t):
+    def sliding(self, R, p, U):
         """Angular velocity of the object against the finger about the normal, (1,), rad/s, for a soft finger."""
-        if not self._spins:
-            return None
-        motion = velocity_to_rate(system, q, v)
-        rotation, turning = jax.jvp(lambda q: relative_poses([self], system, q)[0][0], (q,), (motion,))
-        return -so3.vee(_product(turning, rotation.T))[2:]
+        return -U[5:] if self._spins else None
 
 
 def contact(
