@@ -85,7 +85,8 @@ def _choose(model: Model, recursion: Callable, matrices: Callable, *args):
             return recursion(model, *args)
 
     if isinstance(large, jax.core.Tracer):
-        return lax.cond(large, lambda: recursion_from(LEAST_BATCH), lambda: matrices(model, *args))
+        # The matrix form takes nothing from known numbers.
+        return lax.cond(large, lambda: recursion_from(LEAST_BATCH), lambda: _traced_once(matrices)(1, model, *args))
     return recursion_from(1) if large else matrices(model, *args)
 
 

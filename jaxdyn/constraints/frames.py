@@ -13,6 +13,7 @@ Coordinates that move both frames drop out of A exactly. A slip w(R, p, U), line
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,49 +102,60 @@ class Pair(Constraint):
     @classmethod
     def grouped_position(cls, members: Sequence["Pair"], system, q, t):
         """Residuals (nh,) of each constraint, None without one."""
-        rotation, position = relative_poses(members, system, q)
-        found: list = [None] * len(members)
-        for index, build, leaves in _batches(members):
-            if members[index[0]].sizes(system, q.dtype)[0]:
-                values = jax.vmap(lambda leaves, R, p, build=build: build(leaves).apart(R, p))(
-                    leaves, take(rotation, index), take(position, index)
-                )
-                for k, i in enumerate(index):
-                    found[i] = values[k]
-        return found
+        return _positions(tuple(members), system, q)
 
     @classmethod
     def grouped_motion(cls, members: Sequence["Pair"], system, q, v, t):
         """A (r, nv), gamma (r,) and velocity (r,) of each constraint."""
-        frames, n = _both_frames(members, system, q, v), len(members)
-        rotation, position, across = _seen_from_a(frames)
-        inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
-        by_a = inverse(frames.pose[:n])
-        # The same frames A, seen from the trees of frames B.
-        by_b = inverse(frames.pose[:n].at[:, :3, 3].add(-across))
-        assert frames.twist is not None and frames.bias is not None
-        twists = jnp.stack([frames.twist, frames.bias], axis=-1)
-        moved_a, moved_b = _product(by_a, twists[:n]), _product(by_b, twists[n:])
-        apart = moved_b - moved_a
-        turning = apart[:, :, 1] - jax.vmap(se3.ad_apply)(moved_a[:, :, 0], moved_b[:, :, 0])
-        moves_a, moves_b = frames.moves[:n], frames.moves[n:]
-        sides = ((1, moves_b & ~moves_a, by_b), (-1, moves_a & ~moves_b, by_a))
-        found: list = [None] * n
-        for index, build, leaves in _batches(members):
-            at = [take(x, index) for x in (rotation, position, apart[:, :, 0], turning)]
-            rates = jax.vmap(lambda leaves, *at, build=build: _rates(build(leaves), *at))
-            D, gamma, velocity = rates(leaves, *at)
-            columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
-            for sign, mask, adjoint in sides:
-                if mask[index].any():
-                    part = _product(_product(D, take(adjoint, index)), frames.subspace.T)
-                    columns = columns + part * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
-            if len(frames.coordinates) < system.nv:
-                wide = jnp.zeros((*D.shape[:2], system.nv), q.dtype)
-                columns = wide.at[:, :, frames.coordinates].set(columns)
+        return _motions(tuple(members), system, q, v)
+
+
+# A program that asks many times, as steps with projections do, traces each of these once.
+@eqx.filter_jit
+def _positions(members: tuple[Pair, ...], system, q) -> list:
+    rotation, position = relative_poses(members, system, q)
+    found: list = [None] * len(members)
+    for index, build, leaves in _batches(members):
+        if members[index[0]].sizes(system, q.dtype)[0]:
+            values = jax.vmap(lambda leaves, R, p, build=build: build(leaves).apart(R, p))(
+                leaves, take(rotation, index), take(position, index)
+            )
             for k, i in enumerate(index):
-                found[i] = columns[k], gamma[k], velocity[k]
-        return found
+                found[i] = values[k]
+    return found
+
+
+@eqx.filter_jit
+def _motions(members: tuple[Pair, ...], system, q, v) -> list:
+    frames, n = _both_frames(members, system, q, v), len(members)
+    rotation, position, across = _seen_from_a(frames)
+    inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
+    by_a = inverse(frames.pose[:n])
+    # The same frames A, seen from the trees of frames B.
+    by_b = inverse(frames.pose[:n].at[:, :3, 3].add(-across))
+    assert frames.twist is not None and frames.bias is not None
+    twists = jnp.stack([frames.twist, frames.bias], axis=-1)
+    moved_a, moved_b = _product(by_a, twists[:n]), _product(by_b, twists[n:])
+    apart = moved_b - moved_a
+    turning = apart[:, :, 1] - jax.vmap(se3.ad_apply)(moved_a[:, :, 0], moved_b[:, :, 0])
+    moves_a, moves_b = frames.moves[:n], frames.moves[n:]
+    sides = ((1, moves_b & ~moves_a, by_b), (-1, moves_a & ~moves_b, by_a))
+    found: list = [None] * n
+    for index, build, leaves in _batches(members):
+        at = [take(x, index) for x in (rotation, position, apart[:, :, 0], turning)]
+        rates = jax.vmap(lambda leaves, *at, build=build: _rates(build(leaves), *at))
+        D, gamma, velocity = rates(leaves, *at)
+        columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
+        for sign, mask, adjoint in sides:
+            if mask[index].any():
+                part = _product(_product(D, take(adjoint, index)), frames.subspace.T)
+                columns = columns + part * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
+        if len(frames.coordinates) < system.nv:
+            wide = jnp.zeros((*D.shape[:2], system.nv), q.dtype)
+            columns = wide.at[:, :, frames.coordinates].set(columns)
+        for k, i in enumerate(index):
+            found[i] = columns[k], gamma[k], velocity[k]
+    return found
 
 
 def relative_poses(members, system, q):
