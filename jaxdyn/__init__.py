@@ -22,6 +22,7 @@ from jaxdyn.constrained_motion import Projected as Projected
 from jaxdyn.constrained_motion import Reduced as Reduced
 from jaxdyn.constraints import Holonomic as Holonomic
 from jaxdyn.constraints import Pfaffian as Pfaffian
+from jaxdyn.constraints import constraint_jacobian as constraint_jacobian
 from jaxdyn.constraints import distance as distance
 from jaxdyn.constraints import gear as gear
 from jaxdyn.constraints import knife_edge as knife_edge

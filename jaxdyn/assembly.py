@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn._tracing import compiled, is_concrete
 from jaxdyn.constrained import RESULTS, _right_inverse, correction
-from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, row_matrix, velocity_residual
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics import mass_matrix
 from jaxdyn.model import Model, difference
 from jaxdyn.scene import Scene
@@ -230,6 +230,6 @@ def _both_residuals(scene, q, v, t):
 def start_evidence(scene: Scene, q, v, t):
     """Largest residuals (2,) and the rank of the rows at a state."""
     factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
-    A = row_matrix(scene, q, t)
+    A = constraint_jacobian(scene, q, t)
     rank = jnp.round(jnp.trace(_product(A, _right_inverse(factor, A, None)))).astype(jnp.int32)
     return residuals(scene, q, v, t), rank

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from jaxdyn._anywhere import anywhere
 from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
 from jaxdyn.closed_recursion import MOST_PRODUCTS, products
-from jaxdyn.constraints.base import Layout, Rows, holonomic_rows, layout, row_matrix, rows
+from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.loops import Loop
 from jaxdyn.dynamics import bias_force, mass_matrix
@@ -218,7 +218,7 @@ def constraint_forces(
     scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t=0.0
 ) -> dict[str, Float[Array, " nv"]]:
     """Generalised force A_i^T lam_i (nv,) of each constraint on the system, by name; N m or N."""
-    A = row_matrix(scene, q, t)
+    A = constraint_jacobian(scene, q, t)
     return {p.name: _product(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
 
 
@@ -279,7 +279,7 @@ def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
     Rows: the holonomic ones, or all.
     """
     factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
-    A = row_matrix(scene, q, t)
+    A = constraint_jacobian(scene, q, t)
     return _right_inverse(factor, A[holonomic_rows(layout(scene))] if holonomic else A, rank_tol)
 
 
@@ -290,7 +290,7 @@ def _right_inverse(factor, A, rank_tol):
 
 def _metric(scene, q, t, rank_tol):
     factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
-    Y = solve_triangular(factor, row_matrix(scene, q, t).T, lower=True)
+    Y = solve_triangular(factor, constraint_jacobian(scene, q, t).T, lower=True)
     return factor, Y, pseudo_inverse(Y, tolerance(rank_tol, Y))
 
 

@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.constrained import tolerance
-from jaxdyn.constraints.base import holonomic_rows, layout, row_matrix, velocity_residual
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, velocity_residual
 from jaxdyn.dynamics import kinetic_energy, potential_energy
-from jaxdyn.reduced import Independent, Orthonormal, as_basis, reduce, row_matrix_compiled, tangent_basis
+from jaxdyn.reduced import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, reduce, tangent_basis
 from jaxdyn.scene import Scene
 from jaxdyn.so3 import _product
 from jaxdyn.systems import LagrangianSystem, velocity_to_rate
@@ -65,7 +65,7 @@ def involutive(
     reference = tangent_basis(scene, q, t, dof=dof, rank_tol=rank_tol)
     count, limit = reference.shape[1], tolerance(rank_tol, q)
     # Brackets stay tangent to the holonomic constraints.
-    held = np.asarray(row_matrix_compiled(scene, q, t))[holonomic_rows(layout(scene))]
+    held = np.asarray(constraint_jacobian_compiled(scene, q, t))[holonomic_rows(layout(scene))]
     most = scene.nv - (int(np.linalg.matrix_rank(held, tol=1e-9 * np.abs(held).max())) if held.size else 0)
     # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
     # bracketed with the others and spans nothing itself.
@@ -211,7 +211,7 @@ def _substituted(scene, choice: Independent, q, nu, tau, t):
     rate = jnp.linalg.solve(right.mass_matrix, right.force - wrong)
     value = SpuriousTerms(terms, right.bias_force, wrong, right.nu_rate, rate, right.mass_matrix)
     # How much anything changes with s, at this velocity.
-    forms = jax.jacfwd(lambda s: row_matrix(scene, q.at[rest].set(s), t))(q[rest])
+    forms = jax.jacfwd(lambda s: constraint_jacobian(scene, q.at[rest].set(s), t))(q[rest])
     pull = jax.grad(lambda s: _lagrangian(scene.system, q.at[rest].set(s), right.velocity, t))(q[rest])
     slip = velocity_residual(scene, q, jnp.zeros_like(q), t)
     return value, jnp.max(jnp.abs(jnp.concatenate([forms.ravel(), pull, slip])))

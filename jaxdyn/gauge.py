@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn._tracing import compiled
 from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
-from jaxdyn.constraints.base import layout, row_matrix, rows
+from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.dynamics import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.reduced import freedoms, orthonormal, split_directions
 from jaxdyn.scene import Scene
@@ -114,7 +114,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
         return _product(jnp.linalg.cholesky(mass_matrix(system, q, t)), turn)
 
     W, Wdot = jax.jvp(root, (q, t), motion)
-    A, Adot = jax.jvp(lambda q, t: row_matrix(scene, q, t), (q, t), motion)
+    A, Adot = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), (q, t), motion)
     inverse = _product(turn.T, solve_triangular(_product(W, turn.T), unit, lower=True))
     C = coriolis_matrix(system, q, v, t)
     w = _product(W.T, v)

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
-from jaxdyn.constraints.base import layout, row_matrix, velocity_residual
+from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.dynamics import inverse_dynamics, mass_matrix
 from jaxdyn.scene import Scene, as_pytree
 from jaxdyn.so3 import _product
@@ -121,7 +121,7 @@ class Given(Basis):
 
     def advice(self, scene, q, t):
         """The residual of its columns."""
-        A, N = row_matrix(scene, q, t), self.at(scene, q, t).N
+        A, N = constraint_jacobian(scene, q, t), self.at(scene, q, t).N
         most = scene.nv - np.linalg.matrix_rank(np.asarray(A), tol=1e-9 * float(jnp.max(jnp.abs(A))))
         return (
             f"return {most} independent columns with A N = 0 and, where b != 0, a v0 with A v0 = b (rank "
@@ -156,7 +156,7 @@ class Orthonormal(Basis):
 
     def advice(self, scene, q, t):
         """A reference that serves here."""
-        rank = np.linalg.matrix_rank(np.asarray(row_matrix_compiled(scene, q, t)), tol=1e-9)
+        rank = np.linalg.matrix_rank(np.asarray(constraint_jacobian_compiled(scene, q, t)), tol=1e-9)
         return f"take jd.tangent_basis(scene, q) for reference; the rows have rank {rank} of nv = {scene.nv}"
 
 
@@ -307,7 +307,7 @@ def freedoms(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None 
 @compiled
 def _tangent_projection(scene, q, t, rank_tol):
     """1 - A^+ A, and the rank of A."""
-    A = row_matrix(scene, q, t)
+    A = constraint_jacobian(scene, q, t)
     inverse = pseudo_inverse(A, tolerance(rank_tol, A))
     return jnp.eye(scene.nv, dtype=A.dtype) - _product(inverse, A), jnp.round(jnp.sum(inverse * A.T))
 
@@ -319,7 +319,7 @@ def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 def independent_velocities(scene: Scene, q, t=0.0) -> tuple[int, ...]:
     """Indices of velocities that determine the others at a concrete place: those left by the pivots of A's columns."""
-    A = np.asarray(row_matrix_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
+    A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
     rest, found = A.copy(), []
     for _ in range(min(A.shape)):
         sizes = np.linalg.norm(rest, axis=0)
@@ -350,11 +350,11 @@ def least_quality(dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.4
 
 
-row_matrix_compiled = compiled(row_matrix)
+constraint_jacobian_compiled = compiled(constraint_jacobian)
 
 
 def _affine_rows(scene, q, t):
-    return row_matrix(scene, q, t), -velocity_residual(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
+    return constraint_jacobian(scene, q, t), -velocity_residual(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
 
 
 def _least_pivot(columns):

@@ -73,31 +73,36 @@ def test_derivatives_are_those_of_the_dense_solve():
     rng = np.random.default_rng(3)
     weights = jnp.asarray(rng.normal(size=scene.nv)), jnp.asarray(rng.normal(size=4))
 
-    def value(inertias, twist, dq, v, tau, recursion):
+    def value(inertias, twist, dq, v, tau, method):
         # Poses and quaternions move on their manifolds: off them the two are different functions.
         first, *others = scene.constraints
         pose, q = first.pose_a @ se3.exp(twist), integrate(scene.system, q0, dq)
         first = type(first)(first.name, first.joint, first.body_a, first.body_b, first.in_plane, pose, first.pose_b)
         here = Scene(scene.system.replace(inertias=inertias), (first, *others))
-        if recursion:
+        if method == "recursion":
             fixed = jax.lax.stop_gradient((here.system, here.constraints, q, v, tau))
             a, lam, _ = closed_recursion.closed_dynamics(*fixed)
             a, lam = _dispatch.with_derivatives(here.system, here.constraints, q, v, tau, a, lam)
         else:
-            found = solve_rows(here, q, v, tau, 0.0, rows(here, q, v))
+            found = solve_rows(here, q, v, tau, 0.0, rows(here, q, v), method)
             a, lam = found.acceleration, found.multipliers
         return jnp.vdot(weights[0], a) + jnp.vdot(weights[1], lam)
 
     at = scene.system.inertias, jnp.zeros(6), jnp.zeros(scene.nv), v, tau
     steps = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in at)
-    found, want = (
-        quick(lambda *at, r=r: (jax.grad(value, (0, 1, 2, 3, 4))(*at, r), jax.jvp(lambda *x: value(*x, r), at, steps)))(
-            *at
-        )
-        for r in (True, False)
-    )
-    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
-        assert_close(x, y, 1e-8)  # derivatives of the dense solve lose the square of the rows' condition number
+
+    def derivatives(method):
+        return quick(
+            lambda *at: (
+                jax.grad(value, (0, 1, 2, 3, 4))(*at, method),
+                jax.jvp(lambda *x: value(*x, method), at, steps),
+            )
+        )(*at)
+
+    want = jax.tree.leaves(derivatives("rank_aware"))
+    for method in ("recursion", "range_space"):
+        for x, y in zip(jax.tree.leaves(derivatives(method)), want, strict=True):
+            assert_close(x, y, 1e-8)  # derivatives of the dense solve lose the square of the rows' condition number
 
 
 def test_large_batches_run_on_it_and_a_singular_sample_is_solved_with_its_rank(monkeypatch):

@@ -20,7 +20,7 @@ from jaxdyn.constraints import (
     rolling_sphere,
     rolling_wheel,
 )
-from jaxdyn.constraints.base import layout, position_residual, row_matrix, rows, velocity_residual
+from jaxdyn.constraints.base import constraint_jacobian, layout, position_residual, rows, velocity_residual
 from jaxdyn.kinematics import forward_kinematics
 from jaxdyn.model import configuration_rate, difference, integrate
 from jaxdyn.scene import Scene
@@ -227,7 +227,9 @@ def test_a_wheel_lying_flat_has_finite_rows_and_derivatives():
     model = builder.build()
     scene = Scene(model, (rolling_wheel("wheel", None, 0.3), knife_edge("wheel", ((0, 0, 0), (0, -np.pi / 2, 0)))))
     q, v = jnp.asarray([0, 0, 0.0, 1, 0, 0, 0]), jnp.ones(6)
-    total = quick(jax.value_and_grad(lambda q: jnp.sum(rows(scene, q, v, 0.0).gamma) + jnp.sum(row_matrix(scene, q))))
+    total = quick(
+        jax.value_and_grad(lambda q: jnp.sum(rows(scene, q, v, 0.0).gamma) + jnp.sum(constraint_jacobian(scene, q)))
+    )
     value, slope = total(q)
     assert np.isfinite(value) and np.isfinite(slope).all()
 
@@ -247,7 +249,7 @@ def test_quaternion_rates_enter_rows_on_the_manifold(pair, state):
     q, v = state
     scene = Scene(pair, (Holonomic(lambda q, t: jnp.sum(q**3), name="cubes"),))
     want = 3 * jnp.sum(q**2 * configuration_rate(pair, q, v))
-    assert_close(quick(lambda q, v: row_matrix(scene, q) @ v)(q, v), want[None], 1e-13)
+    assert_close(quick(lambda q, v: constraint_jacobian(scene, q) @ v)(q, v), want[None], 1e-13)
 
 
 def test_names_and_refusals(pair):

@@ -9,7 +9,7 @@ from pinocchio_bridge import assert_close, quick
 from jaxdyn import scenes
 from jaxdyn.constrained import RESULTS, constrained_dynamics, projections
 from jaxdyn.constraints import Pfaffian
-from jaxdyn.constraints.base import row_matrix
+from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.dynamics import mass_matrix
 from jaxdyn.gauge import gauge_invariant
 from jaxdyn.scene import Scene
@@ -155,7 +155,7 @@ def test_bodies_with_dependent_rows():
     a, m, moment = 0.3, 1.0, 0.5
     want = [a * v[2] ** 2, 0.0, -m * a * v[0] * v[2] / (moment + m * a**2)]
     assert_close(found.acceleration, want, 1e-12)
-    assert_close(found.Lambda @ found.W.T, row_matrix(sleigh, q), 1e-13)
+    assert_close(found.Lambda @ found.W.T, constraint_jacobian(sleigh, q), 1e-13)
 
 
 def test_derivatives_and_float32(state):

@@ -12,7 +12,7 @@ from jaxdyn import dynamics, geometry
 from jaxdyn.building import ModelBuilder
 from jaxdyn.constrained import constrained_dynamics
 from jaxdyn.constraints import Holonomic
-from jaxdyn.constraints.base import row_matrix
+from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.forces import JointDamping
 from jaxdyn.immersion import constrain_by_immersion, pull_back, reaction_force
 from jaxdyn.model import configuration_rate
@@ -245,7 +245,7 @@ def test_immersion_of_a_body_with_a_quaternion_equals_multipliers():
         return {
             "rate": (configuration_rate(model, helix(s), twist), rate),
             "acceleration": (whole, other.acceleration),
-            "reaction": (reaction_force(immersed, s, v), row_matrix(held, helix(s)).T @ other.multipliers),
+            "reaction": (reaction_force(immersed, s, v), constraint_jacobian(held, helix(s)).T @ other.multipliers),
         }
 
     for name, (got, want) in both(*(jnp.asarray(x) for x in STATES[:2])).items():

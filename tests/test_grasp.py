@@ -16,7 +16,7 @@ from jaxdyn.building import ModelBuilder
 from jaxdyn.constrained import RESULTS, constrained_dynamics
 from jaxdyn.constrained_motion import Reduced
 from jaxdyn.constraints import Pfaffian, rolling_sphere
-from jaxdyn.constraints.base import row_matrix
+from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.distributions import involutive
 from jaxdyn.dynamics import kinetic_energy, mass_matrix, potential_energy
 from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian, internal_forces, object_dynamics, wrench_basis
@@ -63,7 +63,7 @@ def solved(name):
             "mass": mass_matrix(grasp.system, q),
             "potential": jax.jvp(lambda q: potential_energy(grasp.system, q), (q,), along)[1],
             "kinetic": kinetic_energy(grasp.system, q, v),
-            "A": row_matrix(grasp, q),
+            "A": constraint_jacobian(grasp, q),
             "Jh": hand_jacobian(grasp, q),
             "G": grasp_map(grasp, q),
             "internal": internal_forces(grasp, q, lam),
@@ -171,7 +171,7 @@ def test_planar_hand_by_hand():
 def disk_rows():
     """q, v and the rows A of the disk between two fingers, at the start."""
     grasp, (q, v) = scenes.hand_with_disk(), scenes.hand_with_disk.start()
-    return np.asarray(q), np.asarray(v), np.asarray(quick(lambda q: row_matrix(grasp, q))(q))
+    return np.asarray(q), np.asarray(v), np.asarray(quick(lambda q: constraint_jacobian(grasp, q))(q))
 
 
 def test_maps_of_rolling_contacts():

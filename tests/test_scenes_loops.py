@@ -12,7 +12,7 @@ from jaxdyn import scenes
 from jaxdyn.assembly import assemble, residuals
 from jaxdyn.constrained import RESULTS, constrained_dynamics, projections
 from jaxdyn.constrained_motion import Projected
-from jaxdyn.constraints.base import row_matrix
+from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.simulate import simulate
 from jaxdyn.systems import ExplicitSystem, LagrangianSystem
@@ -29,7 +29,7 @@ def parallel():
     @quick
     def solve(taus):
         found = jax.vmap(lambda tau: constrained_dynamics(scene, q, v, tau))(taus)
-        return found, residuals(scene, q, v), row_matrix(scene, q), projections(scene, q).P_omega
+        return found, residuals(scene, q, v), constraint_jacobian(scene, q), projections(scene, q).P_omega
 
     M, h, J, carried = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 2)), np.zeros(6)
     unit = mass * length**2
@@ -91,7 +91,9 @@ def test_ring_of_bars():
     count, mass, length, rate = 6, 1.2, 0.8, 1.7
     scene = scenes.closed_ring(count=count, mass=mass, length=length)
     solve = quick(
-        jax.vmap(lambda q, v: (residuals(scene, q, v), constrained_dynamics(scene, q, v), row_matrix(scene, q)))
+        jax.vmap(
+            lambda q, v: (residuals(scene, q, v), constrained_dynamics(scene, q, v), constraint_jacobian(scene, q))
+        )
     )
     polygon = scenes.closed_ring.start(count=count, length=length, rate=rate)
     # A centrally symmetric hexagon closes; the rates close if sum w_i (-sin, cos) = 0.

@@ -3,6 +3,7 @@
 from jaxdyn.constraints.base import Constraint as Constraint
 from jaxdyn.constraints.base import Holonomic as Holonomic
 from jaxdyn.constraints.base import Pfaffian as Pfaffian
+from jaxdyn.constraints.base import constraint_jacobian as constraint_jacobian
 from jaxdyn.constraints.loops import distance as distance
 from jaxdyn.constraints.loops import gear as gear
 from jaxdyn.constraints.loops import lock_joint as lock_joint

@@ -231,8 +231,20 @@ def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) ->
     return Rows(*(jnp.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-def row_matrix(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "nc nv"]:
-    """A(q, t) of all constraints, (nc, nv)."""
+def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "nc nv"]:
+    """A(q, t) (nc, nv) of all constraints: admissible velocities satisfy A v = b, constraint forces are A^T lam.
+
+    **Arguments:** `q` (nq,); `t`, s.
+
+    **Returns:** rows in the scene's order, those of a constraint's residual phi before those of its slip. A acts on the
+    velocity v, which is dq/dt only where nq = nv.
+
+    **Raises:** ValueError for constraints that do not fit the system, and a scene without any.
+
+    Source: EQUATIONS section 7.
+    """
+    if not layout(scene):
+        raise ValueError("the scene has no constraints; add some to have rows")
     t = jnp.asarray(t, q.dtype)
     found, rest, others = _split(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
     if rest:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn._tracing import compiled
 from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
-from jaxdyn.constraints.base import Layout, layout, row_matrix
+from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.dynamics import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp
 from jaxdyn.reduced import least_quality
@@ -87,7 +87,7 @@ def object_dynamics(
 def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     hands, objects = (np.array(x, int) for x in (grasp.hand_velocities, grasp.object_velocities))
     system = grasp.system
-    A, push = jax.linearize(lambda q, t: row_matrix(grasp, q, t), q, t)
+    A, push = jax.linearize(lambda q, t: constraint_jacobian(grasp, q, t), q, t)
     Jh = -A[:, hands]
     inverse = pseudo_inverse(Jh, tolerance(None, Jh))
     X = _product(inverse, A[:, objects])

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constrained import pseudo_inverse, tolerance
-from jaxdyn.constraints.base import Pfaffian, layout, row_matrix
+from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.grasp.joining import joined
 from jaxdyn.model import Model
@@ -80,7 +80,7 @@ def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[A
 
     Source: Murray, Li & Sastry (1994), eq. 5.28; EQUATIONS section 10.
     """
-    return -row_matrix(grasp, q, t)[:, np.array(grasp.hand_velocities, int)]
+    return -constraint_jacobian(grasp, q, t)[:, np.array(grasp.hand_velocities, int)]
 
 
 def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "no nc"]:
@@ -91,7 +91,7 @@ def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array
 
     Source: Murray, Li & Sastry (1994), eq. 5.11; EQUATIONS section 10.
     """
-    return row_matrix(grasp, q, t)[:, np.array(grasp.object_velocities, int)].T
+    return constraint_jacobian(grasp, q, t)[:, np.array(grasp.object_velocities, int)].T
 
 
 def internal_forces(
