@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxdyn._small import solve_positive
 from jaxdyn._start import check_mass_matrix, place_of
 from jaxdyn._tracing import is_known
-from jaxdyn.model import Model, configuration_rate, integrate, normalize
+from jaxdyn.model import Model, configuration_rate, difference, integrate, normalize
 from jaxdyn.scene import as_pytree
 from jaxdyn.so3 import _product
 
@@ -352,6 +352,11 @@ def rate_to_velocity(system, q: Float[Array, " nq"], rate: Float[Array, " nq"]) 
 def displace(system, q: Float[Array, " nq"], step: Float[Array, " nv"]) -> Float[Array, " nq"]:
     """Configuration reached from q by the displacement `step` (nv,) of any system, on the manifold of a `Model`."""
     return integrate(system, q, step) if isinstance(system, Model) else q + step
+
+
+def displacement(system, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """Displacement (nv,) from q0 to q1 of any system, the inverse of `displace`."""
+    return difference(system, q0, q1) if isinstance(system, Model) else q1 - q0
 
 
 def has_quaternions(system) -> bool:
