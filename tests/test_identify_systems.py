@@ -10,9 +10,11 @@ from jax.tree_util import Partial
 from jaxdyn import dynamics, identify, scenes
 from jaxdyn.building import ModelBuilder
 from jaxdyn.forces import JointDamping
+from jaxdyn.identify.chart import check_bodies
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import simulate
-from jaxdyn.systems import ExplicitSystem, LagrangianSystem, MetricSystem
+from jaxdyn.systems import ExplicitSystem, MetricSystem
 
 G = 9.81
 TRUE = dict(masses=(1.3, 0.7), length=1.1, reaches=(0.45, 0.4), moments=(0.09, 0.03))
@@ -49,8 +51,10 @@ WANTED = (*TRUE["masses"], *TRUE["moments"])
 NAMES = tuple(f"parameters['{key}'][{i}]" for key in ("masses", "moments") for i in (0, 1))
 
 
-@pytest.mark.parametrize("error", ["torque", "trajectory"])
-def test_parameters_of_a_lagrangian_are_recovered(swung, error):
+@pytest.mark.parametrize(
+    ("error", "method"), [("torque", "gauss-newton"), ("torque", "lbfgs"), ("trajectory", "gauss-newton")]
+)
+def test_parameters_of_a_lagrangian_are_recovered(swung, error, method):
     """Masses and moments of both links, which the motion determines with known lengths; and they stay positive."""
     lowest = []
     options = dict(horizon=20, substeps=4) if error == "trajectory" else {}
@@ -59,6 +63,7 @@ def test_parameters_of_a_lagrangian_are_recovered(swung, error):
         swung,
         positive=masses_and_moments,
         error=error,
+        method=method,
         tolerance=0.0,
         callback=lambda step, loss, system: lowest.append(min(map(float, jax.tree.leaves(masses_and_moments(system))))),
         **options,
@@ -68,7 +73,7 @@ def test_parameters_of_a_lagrangian_are_recovered(swung, error):
     np.testing.assert_allclose(jax.tree.leaves(masses_and_moments(fit.system)), WANTED, rtol=1e-8)
     assert fit.names == NAMES and fit.result == "converged"
     assert min(lowest) > 0 and len(lowest) == len(fit.history)
-    assert np.all(fit.deviation < 1e-6)
+    assert fit.deviation is None if method == "lbfgs" else np.all(fit.deviation < 1e-6)
     assert (
         fit.error(swung)
         < 1e-5
@@ -102,7 +107,7 @@ def test_parameters_of_joined_bodies_are_recovered(swung):
 
 
 def inertia(q, t, p):
-    return p["inertia"] * jnp.eye(1)
+    return p["inertia"][None, None]
 
 
 def driven(q, v, t, p):
@@ -113,9 +118,9 @@ def driven(q, v, t, p):
 LINEAR = {"inertia": 0.8, "stiffness": 5.0, "offset": -0.6, "drive": 0.9}
 
 
-def oscillator(**changes):
+def oscillator(damping=0.3, **changes):
     system = ExplicitSystem(inertia, driven, 1, parameters=LINEAR | changes)
-    return Scene(system, forces=(JointDamping(changes.get("damping", 0.3)),))
+    return Scene(system, forces=(JointDamping(damping),))
 
 
 @pytest.fixture(scope="module")
@@ -125,28 +130,26 @@ def oscillation():
     return log_of(oscillator(), jnp.ones(1), jnp.zeros(1), t, jnp.sin(2 * t)[:, None])
 
 
-def everything(scene):
-    return scene.system.parameters
-
-
 def test_linear_parameters_and_their_deviations_are_those_of_least_squares(oscillation):
     """Equation error with noise, linear in what is fitted: numpy's solution and its covariance."""
     log, rng = oscillation, np.random.default_rng(3)
     noisy = identify.Log(log.t, log.q, log.v, log.a, np.asarray(log.tau) + 0.05 * rng.normal(size=log.tau.shape))
     start = oscillator(inertia=2.0, stiffness=1.0, offset=0.0, drive=2.0, damping=0.1)
     fit = identify.fit_parameters(
-        start, noisy, free=lambda s: [s.system.parameters, s.forces[0].damping], error="torque", tolerance=0.0
+        start, noisy, free=lambda s: [s.system.parameters, s.forces[0].coefficient], error="torque", tolerance=0.0
     )
     t, q, v, a, tau = (np.asarray(x).reshape(-1) for x in (noisy.t, noisy.q, noisy.v, noisy.a, noisy.tau))
     columns = {"drive": -np.sin(3 * t), "inertia": a, "offset": -np.ones_like(t), "stiffness": q, "damping": v}
     A = np.stack(list(columns.values()), axis=1)
     want, (rest,) = np.linalg.lstsq(A, tau)[:2]
     std = np.sqrt(rest / (len(t) - 5) * np.diag(np.linalg.inv(A.T @ A)))
-    assert [name.split("'")[1] for name in fit.names[:4]] == list(columns)[:4] and fit.names[4] == "forces[0].damping"
+    assert [name.split("'")[1] for name in fit.names[:4]] == list(columns)[:4] and fit.names[
+        4
+    ] == "forces[0].coefficient"
     np.testing.assert_allclose(fit.values, want, rtol=1e-7)  # the loss is flat to rounding nearer than that
     np.testing.assert_allclose(fit.deviation, std, rtol=1e-6)
     assert np.all(np.abs(fit.values - [0.9, 0.8, -0.6, 5.0, 0.3]) < 4 * std)
-    assert "torque fit by lbfgs, ExplicitSystem" in fit.summary(noisy) and "forces[0].damping" in fit.summary()
+    assert "torque fit by gauss-newton, ExplicitSystem" in fit.summary(noisy) and "forces[0].coefficient" in fit.summary()
 
 
 def test_trajectories_with_noise_and_free_starts(oscillation):
@@ -156,7 +159,8 @@ def test_trajectories_with_noise_and_free_starts(oscillation):
         oscillator(stiffness=4.0, drive=0.5), log, positive=everything_but_offset, horizon=20, substeps=4, tolerance=0.0
     )
     np.testing.assert_allclose(exact.values, [0.9, 0.8, 5.0], rtol=1e-8)
-    noise = 0.01 * np.random.default_rng(5).normal(size=(2, *log.q.shape))
+    # Noise everywhere, and far more of it where the segments start.
+    noise = np.random.default_rng(5).normal(size=(2, *log.q.shape)) * np.where(np.arange(81) % 20, 1e-4, 3e-2)[:, None]
     noisy = identify.Log(log.t, np.asarray(log.q) + noise[0], np.asarray(log.v) + noise[1], None, log.tau)
     fits = [
         identify.fit_parameters(
@@ -170,9 +174,8 @@ def test_trajectories_with_noise_and_free_starts(oscillation):
         for initial in ("measured", "free")
     ]
     off = [np.abs(fit.values - [0.9, 0.8, 5.0]) for fit in fits]
-    assert np.all(off[1] < 4 * fits[1].deviation) and np.linalg.norm(off[1]) < np.linalg.norm(off[0])
-    assert np.all(fits[1].deviation < 0.1 * fits[1].values) and np.all(fits[1].deviation > 1e-3)
-    assert fits[1].history[-1] < fits[0].history[-1]
+    assert np.all(off[1] < 4 * fits[1].deviation) and np.all(fits[1].deviation < 0.1 * fits[1].values)
+    assert np.linalg.norm(off[1]) < 0.5 * np.linalg.norm(off[0]) and fits[1].history[-1] < fits[0].history[-1]
 
 
 def everything_but_offset(scene):
@@ -203,7 +206,9 @@ def test_what_the_log_does_not_determine_is_said(swung):
 
 def test_float32(oscillation):
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), oscillator(stiffness=4.0))
-    fit = identify.fit_parameters(scene, oscillation, positive=lambda s: s.system.parameters["stiffness"], horizon=40)
+    fit = identify.fit_parameters(
+        scene, oscillation, positive=lambda s: s.system.parameters["stiffness"], error="torque"
+    )
     assert fit.system.system.parameters["stiffness"].dtype == jnp.float32
     np.testing.assert_allclose(fit.values, [5.0], rtol=1e-4)
 
@@ -235,7 +240,7 @@ def test_bad_choices_are_refused(swung, oscillation):
         ),
         "positive picks inertias, the inertias of bodies": fit(model, positive=lambda m: m.inertias),
         "error is 'position'": fit(metric, positive=lambda s: s.parameters, error="position"),
-        "hold, horizon with error='torque', which simulates nothing": fit(
+        "horizon, hold with error='torque', which simulates nothing": fit(
             oscillator(), free=parameters, error="torque", hold="previous", horizon=3
         ),
         "the log has 2 columns of q, the MetricSystem has 1; give one column": fit(
@@ -257,6 +262,5 @@ def test_bad_choices_are_refused(swung, oscillation):
         with pytest.raises(ValueError, match=message):
             call()
     free = LagrangianSystem(lambda q, v: 0.5 * v[0] ** 2, 1)
-    for call in (identify.fit_torques, identify.fit_trajectory):
-        with pytest.raises(ValueError, match="model is a LagrangianSystem; .* with jd.identify.fit_parameters"):
-            call(free, oscillation)
+    with pytest.raises(ValueError, match=r"model is a LagrangianSystem; .* with jd\.identify\.fit_parameters"):
+        check_bodies(free)

@@ -116,7 +116,7 @@ class ParameterFit(AbstractFit):
     - `system`: the system or the scene, as given, with what was fitted; `nominal`: the same as the fit started.
     - `names` (p,): where the fitted numbers stand, as one writes it after the system: "parameters['mass']".
     - `deviation` (p,): standard deviation of each, for independent noise of one size in all that was compared, in the
-      fit's units; infinite for what the log does not determine.
+      fit's units; infinite for what the log does not determine. None where the method finds none.
     - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps" or "not_finite".
     """
 
@@ -125,7 +125,7 @@ class ParameterFit(AbstractFit):
     names: tuple[str, ...] = eqx.field(static=True)
     values: np.ndarray
     nominal_values: np.ndarray
-    deviation: np.ndarray
+    deviation: np.ndarray | None
     history: np.ndarray
     result: str = eqx.field(static=True)
     method: str = eqx.field(static=True)
@@ -137,8 +137,9 @@ class ParameterFit(AbstractFit):
 
     @property
     def parameters(self) -> list[tuple[str, float, float, float]]:
-        """Rows (name, nominal, fitted, standard deviation)."""
-        columns = (self.nominal_values, self.values, self.deviation)
+        """Rows (name, nominal, fitted, standard deviation), the last NaN where the method finds none."""
+        deviation = np.full_like(self.values, np.nan) if self.deviation is None else self.deviation
+        columns = (self.nominal_values, self.values, deviation)
         return list(zip(self.names, *(column.tolist() for column in columns), strict=True))
 
     def _table(self):
