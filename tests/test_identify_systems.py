@@ -149,7 +149,9 @@ def test_linear_parameters_and_their_deviations_are_those_of_least_squares(oscil
     np.testing.assert_allclose(fit.values, want, rtol=1e-7)  # the loss is flat to rounding nearer than that
     np.testing.assert_allclose(fit.deviation, std, rtol=1e-6)
     assert np.all(np.abs(fit.values - [0.9, 0.8, -0.6, 5.0, 0.3]) < 4 * std)
-    assert "torque fit by gauss-newton, ExplicitSystem" in fit.summary(noisy) and "forces[0].coefficient" in fit.summary()
+    assert (
+        "torque fit by gauss-newton, ExplicitSystem" in fit.summary(noisy) and "forces[0].coefficient" in fit.summary()
+    )
 
 
 def test_trajectories_with_noise_and_free_starts(oscillation):
