@@ -161,6 +161,13 @@ def test_trajectories_with_noise_and_free_starts(oscillation):
         oscillator(stiffness=4.0, drive=0.5), log, positive=everything_but_offset, horizon=20, substeps=4, tolerance=0.0
     )
     np.testing.assert_allclose(exact.values, [0.9, 0.8, 5.0], rtol=1e-8)
+    # A motion that runs away from the start: the loss is not finite, and the scene given comes back.
+    broken = identify.Log(log.t, log.q, log.v, None, 1e300 * log.tau)
+    failed = identify.fit_parameters(
+        oscillator(stiffness=4.0, drive=0.5), broken, positive=everything_but_offset, horizon=20, substeps=4
+    )
+    assert failed.result == "not_finite" and np.isnan(failed.deviation).all()
+    np.testing.assert_allclose(failed.values, [0.5, 0.8, 4.0])
     # Noise everywhere, and far more of it where the segments start.
     noise = np.random.default_rng(5).normal(size=(2, *log.q.shape)) * np.where(np.arange(81) % 20, 1e-4, 3e-2)[:, None]
     noisy = identify.Log(log.t, np.asarray(log.q) + noise[0], np.asarray(log.v) + noise[1], None, log.tau)
@@ -204,6 +211,34 @@ def test_what_the_log_does_not_determine_is_said(swung):
     g, l, m, c = fit.values
     np.testing.assert_allclose([m * l * l, m * g * l, c], [1.3 * 0.49, 1.3 * G * 0.7, 0.2], rtol=1e-8)
     assert np.isinf(fit.deviation[:3]).all() and fit.deviation[3] < 1e-6
+    short = identify.fit_parameters(
+        scene, log, positive=lambda s: s.system.parameters, free=lambda s: s.forces[0].args, error="torque", steps=2
+    )
+    assert short.result == "max_steps" and len(short.history) == 3
+
+
+def test_damping_of_a_model():
+    builder = ModelBuilder("arm").add_body("a", axis=(0, 1, 0), inertia=(1.0, (0, 0, -0.5), (0.1, 0.1, 0.1)))
+    t = jnp.linspace(0, 1, 21)
+    arm = Scene(builder.build(), forces=(JointDamping(0.4),))
+    log = log_of(arm, jnp.ones(1), jnp.zeros(1), t, jnp.sin(5 * t)[:, None])
+    damping = lambda scene: scene.forces[0].coefficient  # noqa: E731
+    fit = identify.fit_parameters(eqx.tree_at(damping, arm, jnp.asarray(1.0)), log, positive=damping, error="torque")
+    np.testing.assert_allclose(fit.values, [0.4], rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_trajectories_on_constraints():
+    """Gravity and drag of a particle on a rod by its motion."""
+    t = jnp.linspace(0, 1, 21)
+    rod = scenes.pendulum_in_plane()
+    held = Scene(rod.system, rod.constraints, (JointDamping(0.3),))
+    motion = simulate(held, *scenes.pendulum_in_plane.start(), t, rtol=1e-12, atol=1e-12)
+    log = identify.Log(t, motion.q, motion.v, None, jnp.zeros((21, 2)))
+    chosen = lambda scene: [scene.system.parameters["gravity"], scene.forces[0].coefficient]  # noqa: E731
+    wrong = eqx.tree_at(chosen, held, [jnp.asarray(7.0), jnp.asarray(0.1)])
+    fit = identify.fit_parameters(wrong, log, positive=chosen, horizon=10, substeps=10, tolerance=0.0)
+    np.testing.assert_allclose(fit.values, [G, 0.3], rtol=1e-8)
 
 
 def test_float32(oscillation):

@@ -42,6 +42,11 @@ class Linear(NamedTuple):
     gain: Any = None
     by_starts: float = 0.0  # what the starts alone would take from the loss
 
+    @property
+    def finite(self) -> bool:
+        """Whether a step can be computed from here."""
+        return bool(np.isfinite(self.loss) and np.isfinite(self.rows).all())
+
     def step(self, damping: float) -> tuple[np.ndarray, float]:
         """dy (p,), and by how much the loss should fall; `damping` in shares of the largest curvature."""
         hessian, gradient = self.rows.T @ self.rows, self.rows.T @ self.errors
@@ -59,9 +64,15 @@ class Linear(NamedTuple):
 
 
 def linear(errors, by_y, by_start) -> Linear:
-    """From the errors (pieces, n), and their slopes by y (pieces, n, p) and by the starts (pieces, n, 2 nv), or None."""
+    """From the errors (pieces, n), and their slopes by y (pieces, n, p) and by the starts (pieces, n, 2 nv), or None.
+
+    The loss is infinite where squares of the slopes are: no step could be computed from there.
+    """
     errors, by_y = np.asarray(errors, np.float64), np.asarray(by_y, np.float64)
-    loss, p = float(np.sum(errors**2)), by_y.shape[-1]
+    p, largest = by_y.shape[-1], max(float(np.abs(x).max(initial=0)) for x in (errors, by_y))
+    if not largest < 1e150:
+        return Linear(np.inf, errors.reshape(-1), by_y.reshape(-1, p))
+    loss = float(np.sum(errors**2))
     if by_start is None:
         return Linear(loss, errors.reshape(-1), by_y.reshape(-1, p))
     basis, triangular = np.linalg.qr(np.asarray(by_start, np.float64))
@@ -94,7 +105,7 @@ def gauss_newton(
     while True:
         history.append(here.loss)
         callback(len(history) - 1, here.loss, found)
-        if not np.isfinite(here.rows).all():
+        if not here.finite:
             return found, here, np.array(history), "not_finite"
         if here.loss <= (10 * rounding) ** 2:
             return found, here, np.array(history), "converged"
@@ -106,7 +117,7 @@ def gauss_newton(
                 return found, here, np.array(history), "converged"
             trial = here.moved(found, dy)
             there = linearise(trial)
-            if there.loss < here.loss and np.isfinite(there.rows).all():
+            if there.finite and there.loss < here.loss:
                 break
             damping *= 10
         found, here, damping = trial, there, max(damping / 10, _LEAST_DAMPING)
@@ -117,7 +128,7 @@ def standard_deviation(end: Linear) -> np.ndarray:
 
     NaN when the errors are not finite, or no more than the unknowns.
     """
-    if not np.isfinite(end.rows).all():
+    if not end.finite:
         return np.full(end.rows.shape[-1], np.nan)
     fit = truncated(end.rows, end.errors, _RANK_TOLERANCE)
     spare = end.errors.size - fit.rank - (0 if end.offset is None else end.offset.size)
