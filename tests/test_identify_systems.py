@@ -228,6 +228,27 @@ def test_damping_of_a_model():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("method", ["lbfgs", "adam"])
+def test_descent_in_reverse_mode(oscillation, method):
+    """For many numbers: a force that is a small network learns what the nominal scene lacks, stiffness and drive."""
+    rng = np.random.default_rng(0)
+    weights = {name: jnp.asarray(rng.normal(size=size)) for name, size in (("in", (8, 2)), ("bias", (8,)))}
+    weights["out"] = jnp.zeros((1, 8))
+
+    def network(w, system, q, v, t):
+        x = jnp.stack([q[0], jnp.sin(3.0 * t)])
+        return w["out"] @ jnp.tanh(w["in"] @ x + w["bias"])
+
+    lacking = oscillator(stiffness=4.0, drive=0.0)
+    scene = Scene(lacking.system, (), (*lacking.forces, Partial(network, weights)))
+    options: dict = dict(horizon=20, substeps=4)
+    fit = identify.fit_parameters(scene, oscillation, free=lambda s: s.forces[1], method=method, steps=60, **options)
+    errors = [max(identify.trajectory_error(x, oscillation, **options)) for x in (scene, fit.system)]
+    assert len(fit.names) == 32 and fit.deviation is None
+    assert errors[1] < 0.2 * errors[0]
+
+
+@pytest.mark.slow
 def test_trajectories_on_constraints():
     """Gravity and drag of a particle on a rod by its motion."""
     t = jnp.linspace(0, 1, 21)

@@ -92,7 +92,8 @@ def fit_parameters(
       the log's.
     - `method`: "gauss-newton" for up to some tens of numbers: damped Gauss-Newton steps with Jacobians by forward mode,
       until the next one promises to lower the loss by less than `tolerance` of it. For more, those of a network say, "lbfgs",
-      "adam" or an optax.GradientTransformation, by reverse mode, with `learning_rate` and `tolerance` as in `fit_trajectory`.
+      "adam" or an optax.GradientTransformation, by reverse mode. `learning_rate`: of adam, a share of each number (of one
+      where it starts at zero); `tolerance` of "lbfgs" as in `fit_trajectory`.
       `steps`: the most steps. `callback(step, loss, system)` is called before every step with the system at that point.
 
     **Returns:** `ParameterFit`. Its `result` is "not_finite" when a simulation failed; the system is then the best before.
@@ -151,7 +152,8 @@ def fit_parameters(
             steps=steps,
             learning_rate=learning_rate,
             tolerance=tolerance,
-            scaling=lambda z: jnp.eye(z.size, dtype=z.dtype),
+            # No curvature is known: everything may move as far as it ever may, by about one unit.
+            scaling=lambda z: 1e6 * jnp.eye(z.size, dtype=z.dtype),
             callback=lambda step, value, z: report(step, value, unflatten(z)),
         )
         found = unflatten(z)
