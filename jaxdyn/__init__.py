@@ -65,6 +65,7 @@ from jaxdyn.kinematics import forward_kinematics as forward_kinematics
 from jaxdyn.kinematics import frame_pose as frame_pose
 from jaxdyn.kinematics import jacobian_dot_v as jacobian_dot_v
 from jaxdyn.kinematics import spatial_jacobian as spatial_jacobian
+from jaxdyn.lagrange import LagrangianSystem as LagrangianSystem
 from jaxdyn.link_form import NewtonEulerMatrices as NewtonEulerMatrices
 from jaxdyn.link_form import newton_euler_matrices as newton_euler_matrices
 from jaxdyn.model import Model as Model
@@ -86,7 +87,6 @@ from jaxdyn.simulate import RESULTS as RESULTS
 from jaxdyn.simulate import Solution as Solution
 from jaxdyn.simulate import simulate as simulate
 from jaxdyn.systems import ExplicitSystem as ExplicitSystem
-from jaxdyn.systems import LagrangianSystem as LagrangianSystem
 from jaxdyn.systems import MetricSystem as MetricSystem
 
 __version__ = "0.1.0"

@@ -13,10 +13,11 @@ from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.constrained import tolerance
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, velocity_residual
 from jaxdyn.dynamics import kinetic_energy, potential_energy
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.reduced import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, reduce, tangent_basis
 from jaxdyn.scene import Scene
 from jaxdyn.so3 import _product
-from jaxdyn.systems import LagrangianSystem, velocity_to_rate
+from jaxdyn.systems import velocity_to_rate
 
 
 class Involutivity(NamedTuple):

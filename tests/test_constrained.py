@@ -23,9 +23,9 @@ from jaxdyn.constraints import Holonomic, Pfaffian, lock_joint, loop, rolling_wh
 from jaxdyn.constraints.base import rows
 from jaxdyn.dynamics import bias_force, coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.kinematics import forward_kinematics
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.model import difference, integrate
 from jaxdyn.scene import Scene
-from jaxdyn.systems import LagrangianSystem
 
 KINDS = ("free", "revolute", "spherical", "prismatic", "revolute", "helical", "revolute")
 

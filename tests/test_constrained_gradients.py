@@ -14,9 +14,9 @@ from pinocchio_bridge import assert_close, quick
 from jaxdyn import scenes
 from jaxdyn.constrained_motion import Reduced
 from jaxdyn.constraints import Holonomic
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import simulate
-from jaxdyn.systems import LagrangianSystem
 
 TS = jnp.asarray([0.0, 0.3])
 METHODS = {"projected": "projected", "multipliers": "multipliers", "reduced": "reduced", "crank": Reduced((0,))}

@@ -10,9 +10,9 @@ from jaxdyn import scenes
 from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import Holonomic, Pfaffian
 from jaxdyn.distributions import involutive, spurious_terms
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.reduced import reduced_dynamics
 from jaxdyn.scene import Scene
-from jaxdyn.systems import LagrangianSystem
 
 
 def free(count):

@@ -12,8 +12,8 @@ from jaxdyn.constraints import Pfaffian
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.dynamics import mass_matrix
 from jaxdyn.gauge import gauge_invariant
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.scene import Scene
-from jaxdyn.systems import LagrangianSystem
 
 
 def turned(n, seed=0):

@@ -15,10 +15,11 @@ from jaxdyn.constraints import Holonomic
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.forces import JointDamping
 from jaxdyn.immersion import constrain_by_immersion, pull_back, reaction_force
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.model import configuration_rate
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import simulate
-from jaxdyn.systems import LagrangianSystem, MetricSystem
+from jaxdyn.systems import MetricSystem
 
 STATES = np.random.default_rng(4).normal(size=(4, 20, 3))
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
-from jaxdyn import dynamics, geometry, inertia, scenes, se3
+from jaxdyn import dynamics, geometry, scenes, se3
 from jaxdyn.building import ModelBuilder
 from jaxdyn.constrained import constrained_dynamics
 from jaxdyn.forces import JointDamping
 from jaxdyn.immersion import constrain_by_immersion, reaction_force
-from jaxdyn.kinematics import body_jacobian, frame_pose
+from jaxdyn.kinematics import body_jacobian, frame_pose, spatial_jacobian
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import simulate
 from jaxdyn.so3 import hat
-from jaxdyn.systems import LagrangianSystem
 
 G = 9.81
 STATES = np.random.default_rng(8).normal(size=(3, 20, 4))
@@ -44,6 +44,18 @@ def first_pages(q, v, a):
     particle = scenes.particle_in_plane(mass=1.3).system
     newton = 1.3 * a[:2] + jnp.asarray([0.0, 1.3 * G])
     pairs["particle"] = dynamics.inverse_dynamics(particle, q[:2], v[:2], a[:2]), newton
+    pairs["particle P"] = geometry.flat(particle, q[:2], v[:2]), 1.3 * v[:2]
+
+    swing = scenes.pendulum(mass=1.3, length=0.7).system
+    angle, rate, turn = q[:1], v[:1], a[:1]
+    pairs |= {
+        "swing": (
+            dynamics.inverse_dynamics(swing, angle, rate, turn),
+            1.3 * 0.49 * turn + 1.3 * G * 0.7 * jnp.sin(angle),
+        ),
+        "swing T": (dynamics.kinetic_energy(swing, angle, rate), 1.3 * 0.49 * rate[0] ** 2 / 2),
+        "swing V": (dynamics.potential_energy(swing, angle), 1.3 * G * 0.7 * (1 - jnp.cos(angle[0]))),
+    }
 
     q, v, a = q[:2], v[:2], a[:2]
     sphere = scenes.spherical_pendulum_in_angles(mass=1.3, length=0.7).system
@@ -51,7 +63,9 @@ def first_pages(q, v, a):
     printed = ml * 0.7 * jnp.stack([a[0] - s * c * v[1] ** 2 + G / 0.7 * s, s**2 * a[1] + 2 * s * c * v[0] * v[1]])
     moving = dynamics.forward_dynamics(sphere, q, v, jnp.zeros(2))
     momentum = lambda q, v: ml * 0.7 * jnp.sin(q[0]) ** 2 * v[1]  # noqa: E731
+    printed_lagrangian = ml * 0.7 / 2 * (v[0] ** 2 + s**2 * v[1] ** 2) + ml * G * c
     pairs |= {
+        "sphere L": (sphere.value(q, v, jnp.zeros(())), printed_lagrangian),
         "sphere": (dynamics.inverse_dynamics(sphere, q, v, a), printed),
         "sphere M": (dynamics.mass_matrix(sphere, q), ml * 0.7 * jnp.diag(jnp.stack([1 + 0 * s, s**2]))),
         "sphere N": (dynamics.gravity_force(sphere, q), ml * G * jnp.stack([s, 0 * s])),
@@ -89,6 +103,8 @@ def test_first_pages_of_mechanics():
     arm = scenes.planar_arm().system
     q, v, a = jnp.asarray([0.0, np.pi / 3]), jnp.asarray([1.0, 2.0]), jnp.asarray([1.0, -1.0])
     assert_close(dynamics.inverse_dynamics(arm, q, v, a), [-0.90702503, 0.43712813], 1e-8)  # as many digits are given
+    assert_close(dynamics.mass_matrix(arm, q), [[1.648, 0.338], [0.338, 0.178]], 1e-13)
+    assert_close(dynamics.coriolis_matrix(arm, q, v), [[-0.55425626, -0.83138439], [0.27712813, 0]], 1e-8)
 
 
 def printed_spatial_arm(theta):
@@ -116,6 +132,7 @@ def printed_spatial_arm(theta):
 
 
 LINK_MASSES = (3.0, 2.0, 1.0)
+CENTRES = ((0.0, 0.0, 0.2), (0.0, 0.25, 0.0), (0.0, 0.15, 0.0))
 LINK_MOMENTS = ((0.01, 0.02, 0.03), (0.03, 0.01, 0.04), (0.02, 0.015, 0.025))
 
 
@@ -134,12 +151,27 @@ def spatial_arm(q, v, a):
     links, rates = jax.jvp(in_space, (q,), (v,))
     found = [jnp.concatenate([R.T @ Jt, R.T @ JR]) for R, Jt, JR in links]
     by_links, bias, weight = jnp.zeros((3, 3)), jnp.zeros(3), jnp.zeros(3)
-    for i, ((R, Jt, JR), (_, Jt_rate, JR_rate)) in enumerate(zip(links, rates, strict=True)):
-        mass, inertia = LINK_MASSES[i], R @ jnp.diag(jnp.asarray(LINK_MOMENTS[i])) @ R.T
+    in_space_axes, in_body_axes, pushed, wrenches = jnp.zeros((3, 3)), jnp.zeros((3, 3)), jnp.zeros(3), []
+    for i, ((R, Jt, JR), (R_rate, Jt_rate, JR_rate)) in enumerate(zip(links, rates, strict=True)):
+        mass, moments = LINK_MASSES[i], jnp.diag(jnp.asarray(LINK_MOMENTS[i]))
+        inertia, w = R @ moments @ R.T, JR @ v
         by_links = by_links + mass * Jt.T @ Jt + JR.T @ inertia @ JR
-        turning = JR.T @ inertia @ JR_rate - JR.T @ hat(inertia @ JR @ v) @ JR
-        bias = bias + (mass * Jt.T @ Jt_rate + turning) @ v
+        even = mass * Jt.T @ Jt_rate + JR.T @ inertia @ JR_rate
+        bias = bias + (even - JR.T @ hat(inertia @ w) @ JR) @ v
+        in_space_axes = in_space_axes + even + JR.T @ hat(w) @ inertia @ JR
+        Jv, Jw = R.T @ Jt, R.T @ JR
+        Jv_rate, Jw_rate = R_rate.T @ Jt + R.T @ Jt_rate, R_rate.T @ JR + R.T @ JR_rate
+        in_body_axes = in_body_axes + mass * Jv.T @ (Jv_rate + hat(Jw @ v) @ Jv)
+        in_body_axes = in_body_axes + Jw.T @ moments @ Jw_rate - Jw.T @ hat(moments @ Jw @ v) @ Jw
         weight = weight + mass * Jt.T @ jnp.asarray([0.0, 0.0, -G])
+        force, torque = jnp.roll(a, i), jnp.roll(v, -i)
+        pushed = pushed + Jt.T @ force + JR.T @ torque
+        at_joint = R.T @ torque + jnp.cross(jnp.asarray(CENTRES[i]), R.T @ force)
+        wrenches.append(jnp.concatenate([R.T @ force, at_joint]))
+    whole = jax.jacfwd(lambda q: dynamics.center_of_mass(model, q))(q)
+    mass_rate = jax.jvp(lambda q: dynamics.mass_matrix(model, q), (q,), (v,))[1]
+    h1, h2 = 0.2, 0.5 - 0.25 * jnp.sin(q[1])
+    h3 = 0.5 - 0.4 * jnp.sin(q[1]) - 0.15 * jnp.sin(q[1] + q[2])
     mass_matrix, gravity = dynamics.mass_matrix(model, q), dynamics.gravity_force(model, q)
     coriolis = dynamics.bias_force(model, q, v) - gravity
     pairs = {
@@ -151,7 +183,14 @@ def spatial_arm(q, v, a):
         "symbols": (dynamics.christoffel_symbols(model, q), gamma),
         "C v": (coriolis, jnp.einsum("ijk,j,k->i", gamma, v, v)),
         "C v by link Jacobians": (bias, coriolis),
+        "tensor": (jnp.einsum("ijk,j,k->i", gamma, v, v), in_space_axes @ v),
+        "in space axes": (in_space_axes + in_space_axes.T, mass_rate),
+        "in body axes": (in_body_axes + in_body_axes.T, mass_rate),
+        "in body axes C v": (in_body_axes @ v, coriolis),
+        "V": (dynamics.potential_energy(model, q), G * (3.0 * h1 + 2.0 * h2 + 1.0 * h3)),
         "N": (gravity, N),
+        "weight at the centre of mass": (-sum(LINK_MASSES) * whole.T @ jnp.asarray([0.0, 0.0, -G]), N),
+        "wrenches": (dynamics.generalized_force(model, q, jnp.stack(wrenches)), pushed),
         "weights through centre-of-mass Jacobians": (-weight, N),
     }
     return pairs, (mass_matrix, coriolis, gravity)
@@ -165,6 +204,8 @@ def test_spatial_arm():
     assert_close(M[-1][(0, 1, 1, 2), (0, 1, 2, 2)], [0.457483792, 0.449281062, 0.088390531, 0.0425], 2e-9)
     assert_close(coriolis[-1], [0.08628446, 0.01508056, -0.02029184], 1e-7)
     assert_close(N[-1], [0, -9.53782516, -1.40577764], 1e-8)
+    twists = spatial_jacobian(scenes.spatial_arm().system, jnp.zeros(3), "centre3").T
+    assert_close(twists, [[0, 0, 0, 0, 0, 1], [0, -0.5, 0, -1, 0, 0], [0, -0.5, 0.4, -1, 0, 0]], 1e-15)
 
 
 def euler_quaternion(angles):
@@ -172,6 +213,13 @@ def euler_quaternion(angles):
     half, plus, minus = angles[1] / 2, (angles[0] + angles[2]) / 2, (angles[0] - angles[2]) / 2
     c, s = jnp.cos(half), jnp.sin(half)
     return jnp.stack([c * jnp.cos(plus), -s * jnp.sin(minus), s * jnp.cos(minus), c * jnp.sin(plus)])
+
+
+def matrix_of(angles):
+    """Rz(phi) Ry(theta) Rz(psi)."""
+    (sf, st, sp), (cf, ct, cp) = jnp.sin(angles), jnp.cos(angles)
+    first, last = ([[c, -s, 0], [s, c, 0], [0, 0, 1]] for s, c in ((sf, cf), (sp, cp)))
+    return matrix(first) @ matrix([[ct, 0, st], [0, 1, 0], [-st, 0, ct]]) @ matrix(last)
 
 
 def test_rigid_body_in_euler_angles():
@@ -197,7 +245,14 @@ def test_rigid_body_in_euler_angles():
         st, ct, sp, cp = jnp.sin(q[1]), jnp.cos(q[1]), jnp.sin(q[2]), jnp.cos(q[2])
         printed = matrix([[-cp / st, sp, cp * ct / st], [sp / st, cp, -sp * ct / st], [0, 0, 1]])
         acceleration = dynamics.forward_dynamics(system, q, v, about_axes)
+        sphi, cphi = jnp.sin(q[0]), jnp.cos(q[0])
+        in_space = matrix([[0, -sphi, st * cphi], [0, cphi, st * sphi], [1, 0, ct]])
+        b = jnp.cross(moments * w, w) / moments  # Arnold's B(w, w)
+        free = dynamics.forward_dynamics(model, euler_quaternion(q), w, jnp.zeros(3))
         return {
+            "turned": (matrix_of(q) @ E, in_space),
+            "determinant": (jnp.linalg.det(E), -st),
+            "free": (free, b),
             "metric": (dynamics.mass_matrix(system, q), E.T @ jnp.diag(moments) @ E),
             "torque": (about_axes, E.T @ torque),
             "body axes": (printed @ about_axes, torque),
@@ -210,6 +265,13 @@ def test_rigid_body_in_euler_angles():
         }
 
     check(both(*states(3)))
+    q, w = jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray([0.3, 0.5, -0.7])
+    assert_close(dynamics.forward_dynamics(model, q, w, jnp.zeros(3)), [0.35, -0.21, -0.05], 1e-14)
+
+
+def hanging(angle):
+    """End of a rod of length 1 at an angle from the downward vertical."""
+    return jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
 
 
 FORMULATIONS = ("lagrangian", "immersion", "model", "loop")
@@ -247,7 +309,17 @@ def test_double_pendulum_in_four_formulations():
         turning = m2 * l1 * l2 * s * jnp.stack([rates[1] ** 2, -(rates[0] ** 2)])
         pairs = {f"acceleration by {name}": (other, found[0]) for name, other in zip(built, found, strict=True)}
         pairs |= {f"energy by {name}": (other, energies[0]) for name, other in zip(built, energies, strict=True)}
+        # The first link by its angle, the second by its angle and its end: the metric of the separate bodies is singular.
+        ends = lambda s: jnp.append(s, l1 * hanging(s[0]) + l2 * hanging(s[1]))  # noqa: E731
+        separate = lambda x: jnp.diag(jnp.asarray([m1 * l1**2, 0.0, m2, m2]))  # noqa: E731
+        hinge = a  # (Fx, Fy), with which the first link holds the second
+        sines, cosines = jnp.sin(angles), jnp.cos(angles)
+        lever = lambda i, l: l * (hinge[1] * sines[i] - hinge[0] * cosines[i])  # noqa: E731
+        forces = jnp.stack([-m1 * G * l1 * sines[0] + lever(0, l1), lever(1, l2), hinge[0], -hinge[1] - m2 * G])
         return pairs | {
+            "metric by pull-back": (geometry.pull_back(separate, ends)(angles), rho),
+            "symbols by pull-back": (geometry.christoffel_symbols(geometry.pull_back(separate, ends), angles), gamma),
+            "forces by pull-back": (geometry.pull_back(lambda x: forces, ends)(angles), -pull),
             "metric": (dynamics.mass_matrix(points, angles), rho),
             "symbols": (geometry.christoffel_symbols(points, angles), gamma),
             "motion": (dynamics.inverse_dynamics(points, angles, rates, a), rho @ a + turning + pull),
@@ -305,7 +377,10 @@ def test_disk_and_link_in_contact():
         disk, link = reaction_force(scene, q, v)
         nu, u = link[1] / c, disk[1] + link[1]
         zero = jnp.zeros(())
+        (z1, height, _), (y1, y2, _) = scene.system.place(q, zero)
         return {
+            "touching": (jnp.stack([(y1 - z1) * s + (y2 - height) * c, height]), jnp.ones(2)),
+            "along": ((y1 - z1) * c - (y2 - height) * s, -along),
             "metric": (dynamics.mass_matrix(scene.system, q), rho),
             "force": (pulled, dry + friction),
             "reaction on the disk": (disk, jnp.stack([-nu * s, u - nu * c, zero])),
@@ -397,15 +472,21 @@ def test_separate_scenes_are_joined_with_their_forces():
 
 
 def test_inertia_of_a_box_and_its_change_of_frame():
-    """Printed moments of a box, and M_2 = Ad^T M_1 Ad for frames fixed to one body."""
+    """Printed moments of a box, and M_2 = Ad^T M_1 Ad, V_1 = Ad V_2 for frames fixed to one body."""
     mass, (l, w, h) = 2.4, (0.3, 0.5, 0.8)
     moments = mass / 12 * np.array([w * w + h * h, l * l + h * h, l * l + w * w])
-    numbers = jnp.asarray(inertia.box(mass, (l, w, h)))
-    M = inertia.spatial_inertia(numbers)
-    assert_close(M, np.diag([mass] * 3 + list(moments)), 1e-15)
+    M = np.diag([mass] * 3 + list(moments))
     pose = se3.exp(jnp.asarray([0.3, -0.2, 0.5, 0.4, 1.1, -0.6]))
-    moved = inertia.spatial_inertia(inertia.transform_inertia(se3.inverse(pose), numbers))
-    assert_close(moved, se3.Ad(pose).T @ M @ se3.Ad(pose), 1e-13)
+    centred, moved = (scenes.free_box(mass=mass, size=(l, w, h), frame=frame).system for frame in (None, pose))
+    q, V = scenes.free_box.start(velocity=(0.3, -1.0, 0.4))
+    found = quick(
+        lambda q, V: [(dynamics.mass_matrix(m, q), dynamics.kinetic_energy(m, q, V)) for m in (centred, moved)]
+    )
+    ((at_centre, energy), (away, other)), Ad = found(q, V), se3.Ad(pose)
+    assert_close(at_centre, M, 1e-15)
+    assert_close(energy, mass * V[:3] @ V[:3] / 2 + V[3:] @ (moments * V[3:]) / 2, 1e-14)
+    assert_close(away, Ad.T @ M @ Ad, 1e-13)
+    assert_close(other, (Ad @ V) @ M @ (Ad @ V) / 2, 1e-13)
 
 
 def test_unknown_formulations_are_refused():

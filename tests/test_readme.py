@@ -1,24 +1,40 @@
-"""The README's examples run as they are printed."""
+"""The examples of the README and of the page on systems run as they are printed."""
 
 import re
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-README = Path(__file__).resolve().parent.parent / "README.md"
+ROOT = Path(__file__).resolve().parent.parent
 
 
-def test_examples_of_the_readme_run():
-    """All blocks in one namespace, as a reader pastes them one after another."""
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+def run(page: str) -> dict:
+    """All blocks in one namespace, as a reader pastes them one after another; the names they leave."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
     assert len(blocks) >= 3
     names: dict = {}
     # A reader has jax's own settings, not the strict ones of the tests.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         for block in blocks:
-            exec(compile(block, str(README), "exec"), names)
+            exec(compile(block, page, "exec"), names)
+    return names
+
+
+def test_examples_of_the_readme_run():
+    names = run("README.md")
     assert np.abs(names["a"]).max() < 1e-10, "gravity compensation holds the arm still"
     assert names["accelerations"].shape == (1000, 7)
     assert np.isfinite(names["gradient"]).all()
     assert 0 < names["drift"] < 1e-6
+
+
+def test_examples_of_the_page_on_systems_run():
+    names = run("docs/systems.md")
+    assert abs(names["lost"] + names["motion"].work[-1]) < 1e-7 < 0.1 < names["lost"]
+    assert abs(names["curvature"] - 1) < 1e-12 and np.abs(names["force"]).max() < 1e-12
+    # The rods pull along themselves.
+    s, lower = names["angles"], names["lower"]
+    assert abs(lower @ jnp.stack([jnp.cos(s[1]), jnp.sin(s[1])])) < 1e-12 < 1 < np.linalg.norm(lower)
+    np.testing.assert_allclose(names["fit"].values, [0.5, 2.0, 0.8], rtol=1e-8)  # bob, cart, length

@@ -11,12 +11,12 @@ from jaxdyn.constrained import RESULTS, constrained_dynamics
 from jaxdyn.constrained_motion import Baumgarte, Reduced
 from jaxdyn.constraints import Pfaffian
 from jaxdyn.kinematics import forward_kinematics
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.model import configuration_rate
 from jaxdyn.reduced import as_basis, independent_velocities, reduced_dynamics, tangent_basis
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import RESULTS as SIMULATION
 from jaxdyn.simulate import simulate
-from jaxdyn.systems import LagrangianSystem
 
 RHO = 0.5
 

@@ -14,8 +14,9 @@ from jaxdyn.constrained import RESULTS, constrained_dynamics, projections
 from jaxdyn.constrained_motion import Projected
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.dynamics import kinetic_energy, potential_energy
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.simulate import simulate
-from jaxdyn.systems import ExplicitSystem, LagrangianSystem
+from jaxdyn.systems import ExplicitSystem
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,10 @@ from jaxdyn._small import solve_positive
 from jaxdyn.building import ModelBuilder
 from jaxdyn.dissipation import RayleighDissipation, SlidingFriction
 from jaxdyn.forces import JointDamping
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import simulate
-from jaxdyn.systems import ExplicitSystem, LagrangianSystem, MetricSystem
+from jaxdyn.systems import ExplicitSystem, MetricSystem
 
 # Planar 2R arm of EQUATIONS section 1: m, l1, r, I.
 MASS, LENGTH, REACH, MOMENT = (1.0, 0.8), 1.0, (0.5, 0.4), (0.1, 0.05)

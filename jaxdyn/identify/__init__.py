@@ -6,6 +6,7 @@ from jaxdyn.identify.friction import Friction as Friction
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import from_raw as from_raw
 from jaxdyn.identify.logs import split as split
+from jaxdyn.identify.parameters import fit_parameters as fit_parameters
 from jaxdyn.identify.regression import BaseParameters as BaseParameters
 from jaxdyn.identify.regression import LeastSquares as LeastSquares
 from jaxdyn.identify.regression import base_parameters as base_parameters
@@ -14,8 +15,9 @@ from jaxdyn.identify.regression import nominal_parameters as nominal_parameters
 from jaxdyn.identify.regression import parameter_names as parameter_names
 from jaxdyn.identify.regression import regressor as regressor
 from jaxdyn.identify.regression import torque_error as torque_error
+from jaxdyn.identify.replay import SampledTorque as SampledTorque
+from jaxdyn.identify.replay import rollout as rollout
+from jaxdyn.identify.replay import trajectory_error as trajectory_error
 from jaxdyn.identify.result import Fit as Fit
-from jaxdyn.identify.trajectory import SampledTorque as SampledTorque
+from jaxdyn.identify.result import ParameterFit as ParameterFit
 from jaxdyn.identify.trajectory import fit_trajectory as fit_trajectory
-from jaxdyn.identify.trajectory import rollout as rollout
-from jaxdyn.identify.trajectory import trajectory_error as trajectory_error

@@ -103,6 +103,15 @@ class Chart(eqx.Module):
         return Coordinates(point.theta, jnp.where(tiny, jnp.zeros_like(point.s), point.s))
 
 
+def check_bodies(model) -> None:
+    """**Raises:** ValueError for a system that is no `Model`."""
+    if not isinstance(model, Model):
+        raise ValueError(
+            f"model is a {type(model).__name__}; this fit searches the inertias of a Model's bodies: fit numbers of other "
+            "systems and of scenes with jd.identify.fit_parameters"
+        )
+
+
 def make_chart(model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_scale) -> tuple[Chart, Coordinates]:
     """Chart around a model, and the point to start from: the model's own numbers, a tenth of a unit where it has none.
 

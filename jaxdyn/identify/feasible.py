@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxdyn import inertia as _inertia
-from jaxdyn.identify.chart import Chart, Coordinates, make_chart, positive_terms
+from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart, positive_terms
 from jaxdyn.identify.friction import TERMS, check_terms
 from jaxdyn.identify.logs import Log, check_log, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
@@ -88,6 +88,7 @@ def fit_torques(
     Source: Rucker & Wensing (2022), log-Cholesky coordinates; Lee, Wensing & Park (2020), "Geometric robot dynamic
     identification: a convex programming approach", divergence and convexity.
     """
+    check_bodies(model)
     check_log(log, model)
     terms = check_terms(terms, v_s)
     if not prior > 0:
@@ -121,7 +122,16 @@ def fit_torques(
         point = unflatten(y)
     fitted, friction = chart.fitted(model, chart.settled(point))
     name = method if isinstance(method, str) else type(method).__name__
-    return Fit(fitted, friction, model, history, result, f"torque fit by {name}", terms, sigma)
+    return Fit(
+        model=fitted,
+        friction=friction,
+        nominal=model,
+        history=history,
+        result=result,
+        method=f"torque fit by {name}",
+        terms=terms,
+        sigma=sigma,
+    )
 
 
 def _problem(model, log, terms, v_s, inertia, weights, prior, sigma):

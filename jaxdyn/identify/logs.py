@@ -8,6 +8,8 @@ import jax.core
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.model import Model
+
 
 class Log(eqx.Module):
     """Samples of one motion: time, configuration, velocity, acceleration and joint torque, one row per sample.
@@ -68,24 +70,26 @@ def split(log: Log, fraction: float = 0.7) -> tuple[Log, Log]:
     return log[:cut], log[cut:]
 
 
-def check_log(log: Log, model, *, needs=("v", "a")) -> None:
-    """Raise a ValueError unless the log has the model's joints in its order, and the signals of `needs`."""
+def check_log(log: Log, system, *, needs=("v", "a")) -> None:
+    """Raise a ValueError unless the log has the system's coordinates in their order, and the signals of `needs`."""
+    is_model = isinstance(system, Model)
     for name in ("q", "v", "a", "tau"):
         value = getattr(log, name)
         if value is None:
             if name in needs:
                 raise ValueError(f"the log has no {name}; measure it, or make it from q with jd.identify.from_raw")
             continue
-        want = model.nq if name == "q" else model.nv
+        want = system.nq if name == "q" else system.nv
         if value.shape[1] != want:
-            raise ValueError(
-                f"the log has {value.shape[1]} columns of {name}, model {model.name!r} has {want} "
-                f"(joints {', '.join(model.joint_names)}); lock the joints that were not logged"
-            )
-    if log.joint_names is not None and model.nv == model.nb and log.joint_names != model.joint_names:
+            known = f"the {type(system).__name__} has {want}; give one column for each of its coordinates"
+            if is_model:
+                joints = ", ".join(system.joint_names)
+                known = f"model {system.name!r} has {want} (joints {joints}); lock the joints that were not logged"
+            raise ValueError(f"the log has {value.shape[1]} columns of {name}, {known}")
+    if is_model and log.joint_names is not None and system.nv == system.nb and log.joint_names != system.joint_names:
         raise ValueError(
-            f"the log's joints are {', '.join(log.joint_names)}, those of model {model.name!r} "
-            f"{', '.join(model.joint_names)}; read the log with read_log(path, joint_names=model.joint_names)"
+            f"the log's joints are {', '.join(log.joint_names)}, those of model {system.name!r} "
+            f"{', '.join(system.joint_names)}; read the log with read_log(path, joint_names=model.joint_names)"
         )
 
 

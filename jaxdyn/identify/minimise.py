@@ -67,7 +67,7 @@ def minimise(
                     return best, np.array(history), "max_steps"
                 if step == length or (searching and step >= 10 and _slow(history, tolerance)):
                     break
-                update, state = _update(optimizer, gradient, state, z)
+                update, state = _update(optimizer, path.size * gradient, state, z)
                 if searching:
                     found = _line_search(path.evaluate, z, value, gradient, update)
                     if found is None:  # no decrease that rounding lets one see
@@ -87,6 +87,7 @@ class _Path(NamedTuple):
     args: Any
     center: Array
     scaling: Array
+    size: Any = 1.0
 
     def point(self, z):
         return self.center + self.scaling @ z
@@ -100,14 +101,19 @@ def _begin(loss: Callable, args, center, scaling):
     """A path from `center`, with the loss and its gradient there.
 
     A unit of z is the way that `scaling` foresees, but no column is longer than one unit of y: beyond that, where exponentials
-    take over, what holds at the center says nothing.
+    take over, what holds at the center says nothing. `size` makes the first gradient one unit long for the optimiser, however
+    small the loss.
     """
     path = _Path(loss, args, center, scaling)
     value, gradient = path.evaluate(jnp.zeros_like(center))
     way = jnp.sqrt(gradient @ gradient)
     way = jnp.where((way > 0) & jnp.isfinite(way), way, jnp.ones_like(way))
     units = way * jnp.minimum(1, 1 / (way * jnp.linalg.norm(scaling, axis=0)))
-    return path._replace(scaling=scaling * units[None, :]), value, gradient * units
+    gradient = gradient * units
+    length = jnp.sqrt(gradient @ gradient)
+    good = (length > 0) & jnp.isfinite(length)
+    size = 1 / jnp.where(good, length, jnp.ones_like(length))
+    return path._replace(scaling=scaling * units[None, :], size=size), value, gradient
 
 
 def _slow(history, tolerance) -> bool:

@@ -294,7 +294,7 @@ def least_squares(
     columns = free_columns(model.nb, model.nv, terms)
     # What is not fitted (friction terms left out) stays at the model's value, on the other side.
     residual = condensed.d - condensed.R @ x0
-    fit = _truncated(condensed.R[:, columns[base.independent]], residual, rcond)
+    fit = truncated(condensed.R[:, columns[base.independent]], residual, rcond)
     rest = condensed.rest + fit.rest
     sigma = float(np.sqrt(rest / (condensed.rows - fit.rank)))
     covariance = sigma**2 * fit.half @ fit.half.T
@@ -324,7 +324,7 @@ def noise_level(condensed: Condensed, *, rcond: float = 1e-9) -> float:
     **Raises:** ValueError when the log has no more rows than the regressor's rank: then nothing is left to tell the
     noise.
     """
-    fit = _truncated(condensed.R, condensed.d, rcond)
+    fit = truncated(condensed.R, condensed.d, rcond)
     if condensed.rows <= fit.rank:
         raise ValueError(
             f"the log has {condensed.rows} torques for {fit.rank} unknowns; log more, or give sigma yourself"
@@ -332,8 +332,11 @@ def noise_level(condensed: Condensed, *, rcond: float = 1e-9) -> float:
     return float(np.sqrt((condensed.rest + fit.rest) / (condensed.rows - fit.rank)))
 
 
-class _Truncated(NamedTuple):
-    """min |A change - b| with columns scaled to unit length and directions below rcond left at zero."""
+class Truncated(NamedTuple):
+    """min |A change - b| with columns scaled to unit length and directions below rcond left at zero.
+
+    `half` half^T is the covariance of `change` for noise of size 1 in b; `unknown` marks what the rows do not determine.
+    """
 
     change: np.ndarray
     rest: float
@@ -343,7 +346,8 @@ class _Truncated(NamedTuple):
     rank: int
 
 
-def _truncated(A: np.ndarray, b: np.ndarray, rcond: float) -> _Truncated:
+def truncated(A: np.ndarray, b: np.ndarray, rcond: float) -> Truncated:
+    """`Truncated` of a matrix (n, p) and a vector (n,)."""
     scale = np.linalg.norm(A, axis=0)
     # A column of rounding errors is no column: scaled up it would count as excited.
     scale[scale <= 1e-12 * scale.max(initial=0.0)] = np.inf
@@ -354,7 +358,7 @@ def _truncated(A: np.ndarray, b: np.ndarray, rcond: float) -> _Truncated:
     # Any share in a direction that is not excited leaves a parameter unknown.
     unknown = np.sum(Vt[rank:] ** 2, axis=0) > 1e-12
     condition = float(s[0] / s[rank - 1]) if rank else np.inf
-    return _Truncated(change, float(np.sum((b - A @ change) ** 2)), half, unknown, condition, rank)
+    return Truncated(change, float(np.sum((b - A @ change) ** 2)), half, unknown, condition, rank)
 
 
 def torque_error(predicted, measured) -> float:

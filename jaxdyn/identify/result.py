@@ -1,4 +1,7 @@
-"""What a feasible fit returns."""
+"""What the fits return."""
+
+import abc
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -6,13 +9,65 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import dynamics
+from jaxdyn.constraints.base import state_dtype
 from jaxdyn.identify.friction import Friction
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
 from jaxdyn.model import Model
+from jaxdyn.scene import Scene
 
 
-class Fit(eqx.Module):
+class AbstractFit(eqx.Module):
+    """What all fits tell: how they ended, and how well what they found explains the torques of a log."""
+
+    history: eqx.AbstractVar[np.ndarray]
+    result: eqx.AbstractVar[str]
+    method: eqx.AbstractVar[str]
+
+    @property
+    @abc.abstractmethod
+    def scene(self) -> Scene:
+        """What was found, with its forces."""
+
+    @abc.abstractmethod
+    def _table(self) -> list[tuple]:
+        """Header and rows of the parameters."""
+
+    def torques(self, log: Log) -> np.ndarray:
+        """Torques (n, nv) that the fitted system needs along a log, over and above its forces and friction (N m, N)."""
+        scene = self.scene
+        check_log(log, scene.system)
+        dtype = state_dtype(scene.system)
+        return np.asarray(_torques(scene, *(jnp.asarray(x, dtype) for x in (log.t, log.q, log.v, log.a))), np.float64)
+
+    def error(self, log: Log) -> float:
+        """Torque error along a log in per cent, 100 |tau_fit - tau| / |tau| over all samples and joints."""
+        return torque_error(self.torques(log), log.tau)
+
+    def rms(self, log: Log) -> np.ndarray:
+        """Root mean square of the torque error of each coordinate (nv,)."""
+        return np.sqrt(np.mean((self.torques(log) - np.asarray(log.tau)) ** 2, axis=0))
+
+    def summary(self, *logs: Log) -> str:
+        """The fit in words: how it ended, the error on each log given, and the parameters."""
+        system = self.scene.system
+        lines = [
+            f"{self.method}, {system.name if isinstance(system, Model) else type(system).__name__}: {self.result} after "
+            f"{len(self.history) - 1} steps, loss {self.history[0]:.6g} -> {self.history[-1]:.6g}"
+        ]
+        for i, log in enumerate(logs):
+            per_joint = ", ".join(f"{x:.3g}" for x in self.rms(log))
+            lines.append(
+                f"log {i + 1}: {len(log)} samples, torque error {self.error(log):.3f} %, rms per joint {per_joint}"
+            )
+        (name, *columns), *rows = self._table()
+        width = max((len(row[0]) for row in rows), default=0)
+        lines.append(f"{name:{width}}" + "".join(f"  {column:>12}" for column in columns))
+        lines += [f"{row[0]:{width}}" + "".join(f"  {x:12.5g}" for x in row[1:]) for row in rows]
+        return "\n".join(lines)
+
+
+class Fit(AbstractFit):
     """A fitted, physically feasible model.
 
     - `model`: with the fitted inertias, armature, damping and friction. `friction`: the friction law, with its offset;
@@ -32,6 +87,11 @@ class Fit(eqx.Module):
     sigma: float | None = None
 
     @property
+    def scene(self) -> Scene:
+        """The model with its friction."""
+        return Scene(self.model, forces=(self.friction,))
+
+    @property
     def vector(self) -> np.ndarray:
         """All parameters x (10 nb + 4 nv,) in the order of `jd.identify.parameter_names(model)`."""
         friction = self.friction
@@ -46,40 +106,53 @@ class Fit(eqx.Module):
         names = parameter_names(self.model)
         return list(zip(names, nominal_parameters(self.nominal).tolist(), self.vector.tolist(), strict=True))
 
-    def torques(self, log: Log) -> np.ndarray:
-        """Joint torques (n, nv) that the fitted model needs along a log, friction included (N m, N)."""
-        check_log(log, self.model)
-        samples = (jnp.asarray(np.asarray(x, self.model.home.dtype)) for x in (log.q, log.v, log.a))
-        return np.asarray(_torques(self.model, self.friction, *samples), np.float64)
+    def _table(self):
+        return [("parameter", "nominal", "fitted"), *self.parameters]
 
-    def error(self, log: Log) -> float:
-        """Torque error along a log in per cent, 100 |tau_fit - tau| / |tau| over all samples and joints."""
-        return torque_error(self.torques(log), log.tau)
 
-    def rms(self, log: Log) -> np.ndarray:
-        """Root mean square of the torque error of each joint (nv,)."""
-        return np.sqrt(np.mean((self.torques(log) - np.asarray(log.tau)) ** 2, axis=0))
+class ParameterFit(AbstractFit):
+    """A system or a scene with fitted numbers.
 
-    def summary(self, *logs: Log) -> str:
-        """The fit in words: how it ended, the error on each log given, and the parameters."""
-        lines = [
-            f"{self.method}, {self.model.name}: {self.result} after {len(self.history) - 1} steps, "
-            f"loss {self.history[0]:.6g} -> {self.history[-1]:.6g}"
-        ]
-        for i, log in enumerate(logs):
-            per_joint = ", ".join(f"{x:.3g}" for x in self.rms(log))
-            lines.append(
-                f"log {i + 1}: {len(log)} samples, torque error {self.error(log):.3f} %, rms per joint {per_joint}"
-            )
-        width = max((len(name) for name, *_ in self.parameters), default=0)
-        lines.append(f"{'parameter':{width}}  {'nominal':>12}  {'fitted':>12}")
-        lines += [f"{name:{width}}  {x0:12.5g}  {x:12.5g}" for name, x0, x in self.parameters]
-        return "\n".join(lines)
+    - `system`: the system or the scene, as given, with what was fitted; `nominal`: the same as the fit started.
+    - `names` (p,): where the fitted numbers stand, as one writes it after the system: "parameters['mass']".
+    - `deviation` (p,): standard deviation of each, for independent noise of one size in all that was compared, in the
+      fit's units; infinite for what the log does not determine. None where the method finds none.
+    - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps" or "not_finite".
+    """
+
+    system: Any
+    nominal: Any
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: np.ndarray
+    nominal_values: np.ndarray
+    deviation: np.ndarray | None
+    history: np.ndarray
+    result: str = eqx.field(static=True)
+    method: str = eqx.field(static=True)
+
+    @property
+    def scene(self) -> Scene:
+        """The fitted scene; of a system, the scene of it alone."""
+        return self.system if isinstance(self.system, Scene) else Scene(self.system)
+
+    @property
+    def parameters(self) -> list[tuple[str, float, float, float]]:
+        """Rows (name, nominal, fitted, standard deviation), the last NaN where the method finds none."""
+        deviation = np.full_like(self.values, np.nan) if self.deviation is None else self.deviation
+        columns = (self.nominal_values, self.values, deviation)
+        return list(zip(self.names, *(column.tolist() for column in columns), strict=True))
+
+    def _table(self):
+        return [("parameter", "nominal", "fitted", "std"), *self.parameters]
+
+
+def needed_torque(scene: Scene, q, v, a, t):
+    """tau (nv,) with which a scene without constraints moves so: that of its system, less the scene's forces."""
+    tau = dynamics.inverse_dynamics(scene.system, q, v, a, t)
+    force = scene.applied_force(q, v, t)
+    return tau if force is None else tau - force
 
 
 @eqx.filter_jit
-def _torques(model, friction, q, v, a):
-    def one(q, v, a):
-        return dynamics.inverse_dynamics(model, q, v, a) + friction.torque(v)
-
-    return jax.vmap(one)(q, v, a)
+def _torques(scene: Scene, t, q, v, a):
+    return jax.vmap(lambda t, q, v, a: needed_torque(scene, q, v, a, t))(t, q, v, a)

@@ -11,6 +11,7 @@ from jaxdyn.scenes.hands import hand_with_bar as hand_with_bar
 from jaxdyn.scenes.hands import hand_with_disk as hand_with_disk
 from jaxdyn.scenes.immersions import disk_and_link as disk_and_link
 from jaxdyn.scenes.immersions import double_pendulum as double_pendulum
+from jaxdyn.scenes.lagrangian import free_box as free_box
 from jaxdyn.scenes.lagrangian import particle_in_plane as particle_in_plane
 from jaxdyn.scenes.lagrangian import pendulum as pendulum
 from jaxdyn.scenes.lagrangian import planar_arm as planar_arm

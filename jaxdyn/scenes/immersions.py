@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import loop
 from jaxdyn.immersion import constrain_by_immersion
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.scene import Scene
 from jaxdyn.scenes._named import as_leaf, named
-from jaxdyn.systems import LagrangianSystem, MetricSystem
+from jaxdyn.systems import MetricSystem
 
 
 def _planar_metric(q, t, p):

@@ -5,9 +5,11 @@ import numpy as np
 
 from jaxdyn.building import ModelBuilder
 from jaxdyn.dissipation import SlidingFriction
+from jaxdyn.inertia import box, displaced
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.scene import Scene
 from jaxdyn.scenes._named import named
-from jaxdyn.systems import LagrangianSystem, MetricSystem
+from jaxdyn.systems import MetricSystem
 
 
 def _given(position, velocity):
@@ -179,6 +181,30 @@ def rigid_body_in_euler_angles(*, moments=(1.0, 2.0, 3.0)) -> Scene:
     Source: EQUATIONS section 12 with errata E50 to E52.
     """
     return Scene(MetricSystem(_euler_metric, 3, parameters={"moments": moments}))
+
+
+def _box_start(
+    position=(0.0, 0.0, 0.0), orientation=(1.0, 0.0, 0.0, 0.0), velocity=(0.0,) * 3, turning=(0.1, 4.0, 0.2)
+):
+    return _given((*position, *orientation), (*velocity, *turning))
+
+
+@named(_box_start)
+def free_box(*, mass=1.0, size=(0.3, 0.2, 0.1), frame=None, gravity=None) -> Scene:
+    """Box in free motion, its edges `size` (3,) along x, y, z: M = diag(m, m, m, Ix, Iy, Iz), Ix = m (y^2 + z^2)/12.
+
+    `frame` (4, 4): pose of the body's frame in that of the centre, which makes it M' = Ad^T M Ad; None for the centre. The start,
+    `position` and `orientation` of the frame and its body twist, turns about the middle axis, which is unstable. `gravity`
+    along -z (m/s^2); None for none.
+
+    Source: EQUATIONS section 1.
+    """
+    numbers = box(mass, size)
+    if frame is not None:
+        rotation, place = np.asarray(frame, float)[:3, :3], np.asarray(frame, float)[:3, 3]
+        numbers = displaced(numbers, -rotation.T @ place, rotation.T)
+    builder = ModelBuilder("box", gravity=None if gravity is None else (0.0, 0.0, -gravity))
+    return Scene(builder.add_body("box", None, "free", numbers).build())
 
 
 def _block_start(position=0.0, velocity=2.0):

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import Holonomic, loop
 from jaxdyn.kinematics import frame_pose
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.scene import Scene
 from jaxdyn.scenes._named import as_leaf, named
-from jaxdyn.systems import ExplicitSystem, LagrangianSystem
+from jaxdyn.systems import ExplicitSystem
 
 # Names as printed; m, I are lists m1..m7 and I1..I7. SI units.
 _ANDREWS = {

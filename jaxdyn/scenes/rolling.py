@@ -7,9 +7,9 @@ from jaxtyping import Array, Float
 
 from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
+from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.scene import Scene
 from jaxdyn.scenes._named import as_leaf, named
-from jaxdyn.systems import LagrangianSystem
 
 
 class _DiskRows(eqx.Module):

@@ -1,0 +1,172 @@
+"""Logs replayed: the motion under the measured torques, simulated in segments, and how far it is from the measured one."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.base import state_dtype
+from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.model import Model
+from jaxdyn.scene import Scene
+from jaxdyn.simulate import simulate
+from jaxdyn.systems import displace, displacement
+
+HOLDS = ("linear", "previous")
+INITIAL = ("measured", "free")
+
+
+class SampledTorque(eqx.Module):
+    """A control that replays torques: linear between the samples, or held from each sample to the next ("previous").
+
+    `t` (n,) s; `tau` (n, nv) N m.
+    """
+
+    t: Float[Array, " n"]
+    tau: Float[Array, "n nv"]
+    hold: str = eqx.field(static=True, default="linear")
+
+    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+        last = self.t.shape[0] - 2
+        i = jnp.clip(jnp.searchsorted(self.t, t, side="right") - 1, 0, last)
+        if self.hold == "previous":
+            return self.tau[i]
+        share = jnp.clip((t - self.t[i]) / (self.t[i + 1] - self.t[i]), 0, 1)
+        return self.tau[i] + share * (self.tau[i + 1] - self.tau[i])
+
+
+class Segments(eqx.Module):
+    """A log cut into segments that are simulated side by side; each starts on the last sample of the one before.
+
+    Under `jax.vmap` it is one of them, without the first axis.
+    """
+
+    t: Float[Array, "*segments n"]
+    q: Float[Array, "*segments n nq"]
+    v: Float[Array, "*segments n nv"]
+    tau: Float[Array, "*segments n nv"]
+
+
+def segments(log: Log, horizon: int | None, dtype, *, restart: bool = True) -> Segments:
+    """Cut a log into segments of `horizon` steps (None: one segment); samples left over at the end are not used.
+
+    Time starts at zero in each, or goes on as in the log (`restart=False`), for systems that depend on it.
+
+    **Raises:** ValueError for a log without velocities or a horizon that does not fit.
+    """
+    if log.v is None:
+        raise ValueError(
+            "the log has no v; a simulation starts from velocities: measure them or use jd.identify.from_raw"
+        )
+    horizon = len(log) - 1 if horizon is None else int(horizon)
+    if not 1 <= horizon <= len(log) - 1:
+        raise ValueError(f"horizon={horizon} steps; a log of {len(log)} samples allows 1 to {len(log) - 1}")
+    count = (len(log) - 1) // horizon
+    rows = np.arange(count)[:, None] * horizon + np.arange(horizon + 1)
+    t = np.asarray(log.t, np.float64)[rows]
+    parts = (t - t[:, :1] if restart else t, *(np.asarray(x)[rows] for x in (log.q, log.v, log.tau)))
+    return Segments(*(jnp.asarray(part, dtype) for part in parts))
+
+
+def rollout(system: Any, log: Log, friction: Any = None, *, horizon=None, hold="linear", substeps=None, **simulation):
+    """Simulate a log's segments with its torques from its measured states: q (segments, n, nq) and v (segments, n, nv).
+
+    `system` is a `Model`, another system or a `Scene`; `friction` a force besides its own. The other arguments are as in
+    `fit_trajectory`. The time of a `Model` starts at zero in every segment, that of anything else is the log's.
+    """
+    check_replay(INITIAL[0], hold)
+    scene, data = replayed(system, log, horizon, friction)
+    return _rollout(scene, data, hold, simulation_options(substeps, simulation))
+
+
+def trajectory_error(
+    system: Any, log: Log, friction: Any = None, *, horizon=None, hold="linear", substeps=None, **simulation
+):
+    """Error of the simulated motion along a log, of positions and of velocities, each in per cent of the motion.
+
+    100 sqrt(mean(((q_sim - q) / q_rms)^2)), and the same of v. Arguments as in `rollout`.
+    """
+    check_replay(INITIAL[0], hold)
+    scene, data = replayed(system, log, horizon, friction)
+    q, v = _rollout(scene, data, hold, simulation_options(substeps, simulation))
+    scale = motion_scale(scene.system, data)
+    errors = _batched_errors(scene.system, data, q, v, scale)
+    return tuple(100 * float(jnp.sqrt(jnp.mean(error**2))) for error in errors)
+
+
+def replayed(system: Any, log: Log, horizon: int | None, friction: Any = None) -> tuple[Scene, Segments]:
+    """The scene of a `Model`, another system or a `Scene`, with one more force; and the log's segments for it."""
+    scene = system if isinstance(system, Scene) else Scene(system)
+    check_log(log, scene.system, needs=("v",))
+    if friction is not None:
+        scene = Scene(scene.system, scene.constraints, (*scene.forces, friction))
+    return scene, segments(log, horizon, state_dtype(scene.system), restart=isinstance(system, Model))
+
+
+def check_replay(initial: str, hold: str) -> None:
+    """**Raises:** ValueError for where segments start, or torques between samples, that are none of those known."""
+    for name, value, allowed in (("initial", initial, INITIAL), ("hold", hold, HOLDS)):
+        if value not in allowed:
+            raise ValueError(f"{name} is {value!r}; take one of {allowed}")
+
+
+def simulation_options(substeps: int | None, simulation: dict) -> dict:
+    """Options of `simulate_segment`: those of `jd.simulate`, and `substeps` between two samples unless it is None.
+
+    **Raises:** ValueError for substeps that are no positive integer, or a `stepsize` beside them.
+    """
+    if substeps is None:
+        return dict(simulation)
+    if isinstance(substeps, bool) or not isinstance(substeps, int) or substeps < 1:
+        raise ValueError(f"substeps is {substeps!r}; give a positive integer, or None for adaptive steps")
+    if "stepsize" in simulation:
+        raise ValueError("substeps and stepsize both say how to step; give one of them")
+    return {"solver": diffrax.Tsit5(), "substeps": substeps} | simulation
+
+
+def simulate_segment(scene: Scene, one: Segments, change: Float[Array, "2 nv"] | None, hold: str, options: dict):
+    """Motion (n, nq), (n, nv) of one segment from its first state, displaced by `change`; NaN from where it fails."""
+    t, given = one.t, dict(options)
+    substeps = given.pop("substeps", None)
+    if substeps is not None:
+        shares = jnp.arange(substeps, dtype=t.dtype) / substeps
+        steps = t[:-1, None] + (t[1:] - t[:-1])[:, None] * shares[None, :]
+        given.setdefault("max_steps", steps.size + 1)
+        given["stepsize"] = diffrax.StepTo(ts=jnp.append(steps.reshape(-1), t[-1]))
+    q0, v0 = one.q[0], one.v[0]
+    if change is not None:
+        q0, v0 = displace(scene.system, q0, change[0]), v0 + change[1]
+    motion = simulate(scene, q0, v0, t, control=SampledTorque(t, one.tau, hold), throw=False, **given)
+    return motion.q, motion.v
+
+
+def motion_errors(system: Any, one: Segments, q: Float[Array, "n nq"], v: Float[Array, "n nv"], scale):
+    """Errors of the positions and of the velocities of one segment, each (n, nv), in units of `scale` (2, nv)."""
+    far = jax.vmap(lambda a, b: displacement(system, a, b))(one.q, q)
+    return far / scale[0][None], (v - one.v) / scale[1][None]
+
+
+def motion_scale(system: Any, data: Segments) -> Float[Array, "2 nv"]:
+    """Root mean square of each coordinate's way from the first sample, and of its velocity; the largest at rest."""
+    way = jax.vmap(jax.vmap(lambda q: displacement(system, data.q[0, 0], q)))(data.q)
+    return jnp.stack([moving_scale(jnp.sqrt(jnp.mean(x**2, axis=(0, 1)))) for x in (way, data.v)])
+
+
+def moving_scale(scale: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Sizes to divide by: as they are, the largest in place of those below a thousandth of it, one where all are zero."""
+    largest = jnp.max(scale, keepdims=True)
+    return jnp.where(scale > 1e-3 * largest, scale, jnp.where(largest > 0, largest, jnp.ones_like(largest)))
+
+
+@eqx.filter_jit
+def _rollout(scene: Scene, data: Segments, hold: str, options: dict):
+    return jax.vmap(lambda one: simulate_segment(scene, one, None, hold, options))(data)
+
+
+@eqx.filter_jit
+def _batched_errors(system, data: Segments, q, v, scale):
+    return jax.vmap(lambda one, q, v: motion_errors(system, one, q, v, scale))(data, q, v)
