@@ -1,10 +1,12 @@
-"""Which implementation a call runs on: the matrix form or the recursion, for the same answer.
+"""Which implementation a call runs on: the matrix form, the recursion or its loops, for the same answer.
 
 The rule, measured by benchmarks/dynamics.py on CPU:
 
 - batches of at least `LEAST_BATCH` samples of a mechanism with at most `MOST_BODIES` bodies run on the recursion, whose
   numbers become vectors over the batch;
-- single samples, small batches and larger mechanisms run on the world-frame matrix form, whose program is short.
+- single samples and small batches run on the world-frame matrix form, whose program is short;
+- forward dynamics of more than `MOST_BODIES` bodies, and inverse dynamics of more than `MOST_IN_MASK`, run as loops over the
+  bodies, whose program is as short and whose time grows with the number of bodies instead of its third power or its square.
 
 How large the batch is, is known only after every enclosing `jax.vmap` has been applied, which may be long after this code
 has been traced (a `vmap` around a `jit` or around a loop). A primitive therefore stands for the question "is the batch this
@@ -25,12 +27,13 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from jaxdyn import closed_recursion, matrix_form, recursive
+from jaxdyn import closed_recursion, looped, matrix_form, recursive
 from jaxdyn._materialize import at_least
 from jaxdyn.model import Model
 
 LEAST_BATCH = 256
 MOST_BODIES = 64
+MOST_IN_MASK = 128
 
 _large_batch_p = Primitive("large_batch")
 _large_batch_p.def_impl(lambda *arrays, count: np.bool_(count >= LEAST_BATCH))
@@ -92,11 +95,15 @@ def _choose(model: Model, recursion: Callable, matrices: Callable, *args):
 
 def inverse_dynamics(model: Model, q: Array, v: Array, a: Array) -> Array:
     """tau = M a + C v + N, (nv,)."""
+    if model.nb > MOST_IN_MASK:
+        return looped.inverse_dynamics(model, q, v, a)
     return _choose(model, recursive.rnea, matrix_form.inverse_dynamics, q, v, a)
 
 
 def bias_force(model: Model, q: Array, v: Array) -> Array:
     """h = C v + N, (nv,)."""
+    if model.nb > MOST_IN_MASK:
+        return looped.inverse_dynamics(model, q, v, None)
     return _choose(model, recursive.bias_force, _bias_by_matrices, q, v)
 
 
@@ -120,9 +127,13 @@ def forward_dynamics(model: Model, q: Array, v: Array, tau: Array) -> Array:
     """a = M^-1 (tau - C v - N), (nv,), differentiated by the implicit function theorem and not through the algorithm."""
 
     def solve(model, *args):
+        if model.nb > MOST_BODIES:
+            return looped.forward_dynamics(model, *args)
         return _choose(model, recursive.aba, matrix_form.forward_dynamics, *args)
 
     def tangent(model, *args):
+        if model.nb > MOST_BODIES:
+            return _tangent_by_loops(model, *args)
         return _choose(model, _tangent_by_recursion, _tangent_by_matrices, *args)
 
     return _implicit(model, (q, v, tau), solve, tangent)
@@ -136,6 +147,11 @@ def _tangent_by_recursion(model, q, v, tau, steps):
 def _tangent_by_matrices(model, q, v, tau, steps):
     change = _force_change(matrix_form.inverse_dynamics, model, q, v, tau, steps)
     return matrix_form.forward_dynamics_tangent(model, q, v, tau, change)
+
+
+def _tangent_by_loops(model, q, v, tau, steps):
+    change = _force_change(looped.inverse_dynamics, model, q, v, tau, steps)
+    return looped.forward_dynamics_tangent(model, q, v, tau, change)
 
 
 def _force_change(inverse: Callable, model, q, v, tau, steps) -> Callable:
