@@ -144,7 +144,9 @@ def _by_recursion(scene, q, v, force, method: str, rank_tol, dense) -> Constrain
 
     if method == "schur":
         return quick()
-    return lax.cond(anywhere(~(quality > _least_pivot(q, rank_tol))), dense, quick)
+    # Derivatives keep what a branch needs for them in either case; this one, which hardly ever runs, computes it again.
+    careful = jax.checkpoint(dense, prevent_cse=False)
+    return lax.cond(anywhere(~(quality > _least_pivot(q, rank_tol))), careful, quick)
 
 
 def _least_pivot(like, rank_tol: float | None) -> float:
