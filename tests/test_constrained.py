@@ -437,7 +437,7 @@ def test_assemble_fails_clearly():
         assemble(Scene(system, both), jnp.asarray([0.2, 0.1]))
 
 
-@pytest.mark.parametrize("in_plane", [True, False])
+@pytest.mark.parametrize("in_plane", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_assembling_from_afar_is_differentiable(in_plane):
     """The guess is half a radian off, where the curvature of the constraint counts; dependent rows change nothing."""
     scene = scenes.four_bar(in_plane=in_plane)

@@ -45,7 +45,7 @@ def test_derivatives():
         assert_close(x, y, 1e-9)  # M is factored in two ways
 
 
-@pytest.mark.parametrize("branching", [1, 2])
+@pytest.mark.parametrize("branching", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_five_hundred_links(branching):
     """A chain and a binary tree: residual at rounding, Pinocchio's accelerations, and derivatives by the implicit function."""
     model = chain(1, 500, branching=branching, skew=0.3, taper=1.0, kinds=("revolute",))
