@@ -57,8 +57,8 @@ class Journal:
                 entry = json.loads(line)
             except json.JSONDecodeError:  # cut by an interruption
                 continue
-            known = Known(**entry["known"] | {"published": tuple(entry["known"]["published"])})
-            self._entries[entry["key"]] = _Entry(entry["scene"], known, [Record(**x) for x in entry["records"]])
+            records = [Record(**x) for x in entry["records"]]
+            self._entries[entry["key"]] = _Entry(entry["scene"], Known.from_dict(entry["known"]), records)
 
     def __contains__(self, key: str) -> bool:
         return key in self._entries

@@ -70,7 +70,6 @@ def evaluations(solver: str, steps: int, projected: bool) -> int | None:
     """Evaluations of the vector field in so many steps; None for implicit methods, whose iterations are not counted.
 
     A method whose last evaluation of a step is the first of the next one saves it, unless the step is projected.
-    Adaptive steps need two more to choose the first one.
     """
     if solver in FIXED:
         return 4 * steps
@@ -78,7 +77,7 @@ def evaluations(solver: str, steps: int, projected: bool) -> int | None:
     if tableau.implicit:
         return None
     saved = steps - 1 if tableau.fsal and not projected else 0
-    return tableau.num_stages * steps - saved + 2
+    return tableau.num_stages * steps - saved
 
 
 def flop_counter(prepared: Prepared, method: str) -> Callable[[Motion], float | None]:

@@ -4,6 +4,7 @@ import html
 import io
 import math
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 from jaxdyn.plotting import GREY, SERIES, new_figure
@@ -29,8 +30,16 @@ methods are not counted.
 """
 
 
-def page(report: Report) -> str:
-    """The report as HTML."""
+def write(report: Report, directory: str | Path) -> None:
+    """Write report.json, report.txt and report.html."""
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    for kind, text in (("json", report.to_json()), ("txt", report.table() + "\n"), ("html", html_page(report))):
+        (directory / f"report.{kind}").write_text(text, encoding="utf-8")
+
+
+def html_page(report: Report) -> str:
+    """The report as one HTML page without anything outside it: plots as SVG, tables, the machine."""
     head = report.head
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Error against run time</title>",

@@ -1,9 +1,8 @@
-"""What a report holds: one record a run, the machine it ran on, as JSON, as text and as a page."""
+"""What a report holds: one record a run, and the machine it ran on; as JSON and as text."""
 
 import dataclasses
 import json
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from jaxdyn._table import short, table
@@ -64,6 +63,12 @@ class Known:
     error: float
     published: tuple[dict, ...] = ()
 
+    @staticmethod
+    def from_dict(data: dict) -> "Known":
+        """Back from `dataclasses.asdict`, also by way of JSON, which has no tuples."""
+        values: dict[str, Any] = data | {"published": tuple(data["published"])}
+        return Known(**values)
+
 
 @dataclasses.dataclass(frozen=True)
 class Report:
@@ -85,8 +90,7 @@ class Report:
     def from_json(text: str) -> "Report":
         """The report that `to_json` wrote."""
         data = json.loads(text)
-        scenes = {name: Known(**known) for name, known in data["scenes"].items()}
-        scenes = {name: dataclasses.replace(x, published=tuple(x.published)) for name, x in scenes.items()}
+        scenes = {name: Known.from_dict(known) for name, known in data["scenes"].items()}
         return Report(data["head"], scenes, tuple(Record(**record) for record in data["records"]))
 
     def table(self, scene: str | None = None) -> str:
@@ -98,22 +102,6 @@ class Report:
         known, records = self.scenes[name], self.of(name)
         head = f"{known.text}\nReference: {known.kind}, {known.source}; its own error about {short(known.error, 1)}"
         return f"{head}\n{table(COLUMNS, rows(records))}" if records else head
-
-    def html(self) -> str:
-        """The report as one page without anything outside it: plots as SVG, tables, the machine."""
-        from jaxdyn.report.page import page
-
-        return page(self)
-
-    def write(self, directory: str | Path) -> dict[str, Path]:
-        """Write report.json, report.txt and report.html; their paths by kind."""
-        directory = Path(directory)
-        directory.mkdir(parents=True, exist_ok=True)
-        texts = {"json": self.to_json(), "txt": self.table() + "\n", "html": self.html()}
-        paths = {kind: directory / f"report.{kind}" for kind in texts}
-        for kind, text in texts.items():
-            paths[kind].write_text(text, encoding="utf-8")
-        return paths
 
 
 COLUMNS = (

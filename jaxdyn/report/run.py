@@ -11,6 +11,7 @@ import numpy as np
 from jaxdyn.report.cases import Case, cases
 from jaxdyn.report.journal import Journal
 from jaxdyn.report.measure import Contestant, flop_counter, ladder, measure
+from jaxdyn.report.page import write
 from jaxdyn.report.programs import FIXED, Prepared, prepare
 from jaxdyn.report.records import Known, Record, Report
 from jaxdyn.report.timing import commit, machine
@@ -69,7 +70,7 @@ def report(
     - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.report.measure`.
     - `echo`: takes lines of progress, e.g. `print`.
 
-    **Returns:** a `Report`; `print(report.table())`, `report.html()`.
+    **Returns:** a `Report`; `print(report.table())`; `jaxdyn.report.write(report, directory)` makes its page.
 
     **Raises:** ValueError for a name that is not known, a dtype or batch that cannot be, float64 that is not enabled,
     and a directory that holds another commit's or another machine's records.
@@ -105,7 +106,7 @@ def report(
         say(f"{done}/{len(todo)} {key}: {len(records)} runs; {passed:.0f} s, about {left:.0f} s left")
     found = journal.report(keys)
     if out is not None:
-        found.write(out)
+        write(found, out)
     return found
 
 

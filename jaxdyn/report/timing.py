@@ -44,7 +44,9 @@ def machine(packages: Sequence[str] = ()) -> dict:
     processor = platform.processor()
     try:
         processor = next(
-            line.split(":", 1)[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")
+            line.split(":", 1)[1].strip()
+            for line in Path("/proc/cpuinfo").read_text().splitlines()
+            if line.startswith("model name")
         )
     except (OSError, StopIteration):
         pass
