@@ -3,8 +3,8 @@
     python -m benchmarks.scene_cost [--batch 1024] [--rounds 20] [--steps 50]
 
 The ladder takes one thing away at a time: outputs, friction, rows of the loop that depend on others in a plane, the loop,
-gravity, float64. Per rung: operations that XLA counts in one evaluation of the accelerations, and the time of it and of a
-simulation with fixed steps, per trajectory, best and median of interleaved rounds. Below it, pairs of scenes that differ in one
+gravity, float64. Per rung: operations that XLA counts in one evaluation of the accelerations, and the time of it, of one
+projection onto the constraints and of a simulation with fixed steps, per trajectory, best and median of interleaved rounds. Below it, pairs of scenes that differ in one
 thing which one of them lacks. XLA counts neither calls of LAPACK nor repetitions of inner loops.
 """
 
@@ -18,18 +18,21 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks import timing
+from jaxdyn.assembly import project_state
 
+STEP = 0.005  # s
 ALL = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
 
 
 class Rung(NamedTuple):
-    """A scene, its start, the outputs asked for, and the dtype."""
+    """A scene, its start, the outputs asked for, the dtype, and how multipliers are found."""
 
     name: str
     scene: Any
     start: tuple
     outputs: tuple[str, ...] = ()
     dtype: str = "float64"
+    method: str = "rank_aware"
 
 
 def _four_bar(*, loop: bool = True, in_plane: bool = True, friction: bool = False, **parameters):
@@ -79,13 +82,14 @@ def pairs() -> list[tuple[str, Rung, Rung]]:
     arm = jd.scenes.double_pendulum(formulation="model", **parameters)
     lagrangian = jd.scenes.double_pendulum(formulation="lagrangian", **parameters)
     state = jd.scenes.double_pendulum.start()
+    linkage, closed = jd.scenes.four_bar(), jd.scenes.four_bar.start()
     return [
         ("motion out of a plane", rung("chain in space", _chain(axes=mixed)), rung("chain in a plane", _chain(axes=z))),
         ("gravity", rung("with", _chain(axes=mixed, gravity=down)), rung("None", _chain(axes=mixed))),
         (
             "rotational inertia",
-            rung("bodies", _chain(axes=mixed)),
-            rung("point masses", _chain(axes=mixed, moments=(0.0, 0.0, 0.0), center=(0.2, 0.1, 0.3))),
+            rung("bodies", _chain(axes=mixed, center=(0.2, 0.1, 0.3))),
+            rung("point masses", _chain(axes=mixed, center=(0.2, 0.1, 0.3), moments=(0.0, 0.0, 0.0))),
         ),
         (
             "an offset of the centre",
@@ -98,6 +102,11 @@ def pairs() -> list[tuple[str, Rung, Rung]]:
             rung("ball joint", _chain(center=(0.0, 0.0, 0.0), **single)),
         ),
         ("bodies", Rung("double pendulum of bodies", arm, state), Rung("its Lagrangian", lagrangian, state)),
+        (
+            "rows that may depend on each other",
+            Rung("four-bar, rank_aware", linkage, closed),
+            Rung("four-bar, schur", linkage, closed, method="schur"),
+        ),
     ]
 
 
@@ -105,63 +114,66 @@ def _cast(scene, dtype):
     return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, scene)
 
 
-def _acceleration(scene):
+def _acceleration(scene, method):
     def accelerate(q, v):
         force = scene.applied_force(q, v)
         force = jnp.zeros_like(v) if force is None else force
         if scene.constraints:
             bare = jd.Scene(scene.system, scene.constraints)
-            return jd.constrained_dynamics(bare, q, v, force).acceleration
+            return jd.constrained_dynamics(bare, q, v, force, method=method).acceleration
         return jd.forward_dynamics(scene.system, q, v, force)
 
     return accelerate
 
 
 def programs(rung: Rung, batch: int, steps: int):
-    """Operations of one acceleration, and calls of a batch of them and of a batch of simulations."""
+    """Operations of one acceleration, alone and in a batch; calls of a batch of them, of projections and of simulations."""
     scene, dtype = _cast(rung.scene, rung.dtype), jnp.dtype(rung.dtype)
     q, v = (jnp.tile(jnp.asarray(x, dtype), (batch, 1)) for x in rung.start)
     v = v * jnp.linspace(0.8, 1.2, batch, dtype=dtype)[:, None]
-    accelerate = _acceleration(scene)
-    one = jax.jit(accelerate).lower(q[0], v[0]).compile().cost_analysis() or {}
-    many = jax.jit(jax.vmap(accelerate)).lower(q, v).compile()
-    span, last = 0.005 * steps, jnp.asarray([0.0, 0.005 * steps], dtype)
 
-    def simulate(q, v):
-        options = {"stepsize": span / steps, "outputs": rung.outputs, "throw": False, "max_steps": 2 * steps}
-        return jd.simulate(scene, q, v, last, **options)
+    def built(function):
+        return jax.jit(jax.vmap(function)).lower(q, v).compile()
 
-    rolled = jax.jit(jax.vmap(simulate)).lower(q, v).compile()
-    flops = float(one.get("flops", 0.0)), float((many.cost_analysis() or {}).get("flops", 0.0)) / batch
-    calls = {
-        "acceleration": lambda: jax.block_until_ready(many(q, v)),
-        "simulation": lambda: jax.block_until_ready(rolled(q, v)),
-    }
+    accelerate = _acceleration(scene, rung.method)
+    one, many = jax.jit(accelerate).lower(q[0], v[0]).compile(), built(accelerate)
+    flops = [float((x.cost_analysis() or {}).get("flops", 0.0)) / n for x, n in ((one, 1), (many, batch))]
+    made = {"acceleration": many}
+    if steps:
+        ts = jnp.asarray([0.0, STEP * steps], dtype)
+        options = {"stepsize": STEP, "outputs": rung.outputs, "throw": False, "max_steps": 2 * steps}
+        made["simulation"] = built(lambda q, v: jd.simulate(scene, q, v, ts, **options))
+        if scene.constraints:
+            made["projection"] = built(lambda q, v: project_state(scene, q, v, jnp.zeros((), dtype)))
+    calls = {kind: lambda run=run: jax.block_until_ready(run(q, v)) for kind, run in made.items()}
     return flops, calls
 
 
 def measure(rungs: list[Rung], batch: int, steps: int, rounds: int) -> list[dict]:
-    """A row per rung, all timed in turn."""
-    made = {}
-    for i, rung in enumerate(rungs):
-        made[i] = programs(rung, batch, steps)
-        print(f"compiled: {rung.name}", flush=True)
-    calls = {(i, kind): call for i, (_, both) in made.items() for kind, call in both.items()}
+    """A row per rung, all timed in turn; simulations where there are steps."""
+    made = [programs(rung, batch, steps) for rung in rungs]
+    calls = {(i, kind): call for i, (_, both) in enumerate(made) for kind, call in both.items()}
     times = timing.interleaved(calls, rounds, most=20.0)
     rows = []
-    for i, rung in enumerate(rungs):
-        row = {"name": rung.name, "flops": made[i][0][0], "flops in a batch": made[i][0][1]}
-        for kind in ("acceleration", "simulation"):
-            row[f"{kind} us"] = [1e6 * times[i, kind][key] / batch for key in ("best", "median")]
+    for i, (rung, (flops, _)) in enumerate(zip(rungs, made, strict=True)):
+        row: dict[str, Any] = {"scene": rung.name, "flops": flops[0], "flops in a batch": flops[1]}
+        for kind in ("acceleration", "projection", "simulation") if steps else ("acceleration",):
+            found = times.get((i, kind))
+            row[f"{kind} us"] = None if found is None else [1e6 * found[key] / batch for key in ("best", "median")]
         rows.append(row)
     return rows
 
 
+def _cell(value) -> str:
+    if isinstance(value, list):
+        return "{:.3g} ({:.3g})".format(*value)
+    return "" if value is None else value if isinstance(value, str) else f"{value:.0f}"
+
+
 def _print(rows) -> None:
-    print("| scene | flops | in a batch | acceleration us | simulation us |\n|---|---|---|---|---|")
+    print(f"\n| {' | '.join(rows[0])} |\n|{'---|' * len(rows[0])}")
     for row in rows:
-        a, s = ("{:.3g} ({:.3g})".format(*row[f"{kind} us"]) for kind in ("acceleration", "simulation"))
-        print(f"| {row['name']} | {row['flops']:.0f} | {row['flops in a batch']:.0f} | {a} | {s} |")
+        print(f"| {' | '.join(map(_cell, row.values()))} |", flush=True)
 
 
 def main(argv=None) -> None:
@@ -172,16 +184,11 @@ def main(argv=None) -> None:
     parser.add_argument("--steps", type=int, default=50)
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
-    run = options.batch, options.steps, options.rounds
-    rows = measure(ladder(), *run)
-    lacking = pairs()
-    flat = measure([rung for _, *both in lacking for rung in both], *run)
-    print(f"\nfloat64, batch {options.batch}, {options.steps} steps of RK4\n")
+    print(f"float64 but for the last rung, batch {options.batch}, {options.steps} steps of RK4")
+    rows = measure(ladder(), options.batch, options.steps, options.rounds)
     _print(rows)
-    print()
-    for i, (what, _, _) in enumerate(lacking):
-        for row in flat[2 * i : 2 * i + 2]:
-            row["name"] = f"{what}: {row['name']}"
+    flat = [rung._replace(name=f"{what}: {rung.name}") for what, *both in pairs() for rung in both]
+    flat = measure(flat, options.batch, 0, options.rounds)
     _print(flat)
     head = {"machine": timing.machine(), "batch": options.batch, "steps": options.steps}
     print("written to", timing.write("scene_cost", head | {"ladder": rows, "pairs": flat}))
