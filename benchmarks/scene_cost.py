@@ -4,8 +4,9 @@
 
 The ladder takes one thing away at a time: outputs, friction, rows of the loop that depend on others in a plane, the loop,
 gravity, float64. Per rung: operations that XLA counts in one evaluation of the accelerations, and the time of it, of one
-projection onto the constraints and of a simulation with fixed steps, per trajectory, best and median of interleaved rounds. Below it, pairs of scenes that differ in one
-thing which one of them lacks. XLA counts neither calls of LAPACK nor repetitions of inner loops.
+projection onto the constraints and of a simulation with fixed steps, per trajectory, best and median of interleaved rounds.
+Below it, pairs of scenes that differ in one thing which one of them lacks. XLA counts neither calls of LAPACK nor repetitions of
+inner loops.
 """
 
 import argparse
