@@ -140,7 +140,7 @@ def _mujoco(prepared, twin, starts):
     span = float(prepared.reference.ts[1] - prepared.reference.ts[0])
     points = len(prepared.reference.ts) - 1
     for name, kind in MUJOCO.items():
-        for between in _steps_between(prepared):
+        for between in _steps_between(prepared)[: 4 if batch == 1 else 3]:
             model = to_mujoco(twin.model)
             model.opt.timestep, model.opt.integrator = span / between, kind
             threads = 0 if batch == 1 else CORES

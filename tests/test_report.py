@@ -229,6 +229,12 @@ def test_records_hold_what_a_motion_says(body, rungs, records):
     assert records[1].compile_seconds == record.compile_seconds  # one program
 
 
+def test_a_slow_run_is_timed_once(body, rungs):
+    (record,) = measure(body, rungs[:1], "float64", 1, rounds=2, most=0.0)
+    assert record.rounds == 1
+    assert record.seconds_best == record.seconds_median > 0
+
+
 def test_peers_and_failures_are_recorded(records):
     exact, failed = records[2:]
     assert exact.error_path == 0.0
