@@ -229,6 +229,13 @@ def test_records_hold_what_a_motion_says(body, rungs, records):
     assert records[1].compile_seconds == record.compile_seconds  # one program
 
 
+def test_operations_are_those_of_the_batch(body):
+    """A large batch of a ball joint runs on Euler's equations, 30 operations; all that is besides is the quaternion's."""
+    motion = Motion(body.reference.q, body.reference.v, steps=0, evaluations=1)
+    single, many = (flop_counter(body, "free", batch)(motion) for batch in (1, 256))
+    assert 30 < many < 150 < single
+
+
 def test_a_slow_run_is_timed_once(body, rungs):
     (record,) = measure(body, rungs[:1], "float64", 1, rounds=2, most=0.0)
     assert record.rounds == 1

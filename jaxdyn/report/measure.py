@@ -81,10 +81,11 @@ def evaluations(solver: str, steps: int, projected: bool) -> int | None:
     return tableau.num_stages * steps - saved
 
 
-def flop_counter(prepared: Prepared, method: str) -> Callable[[Motion], float | None]:
+def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[Motion], float | None]:
     """Floating-point operations of a motion: those of its evaluations and of the projections after its steps.
 
-    XLA counts those of the compiled expressions; calls of LAPACK and repetitions of loops inside them are left out.
+    Per sample of a batch, as large ones run on another program. XLA counts those of the compiled expressions; calls of LAPACK
+    and repetitions of loops inside them are left out.
     """
     scene = prepared.scene
     chosen = chosen_method(scene, method)
@@ -98,8 +99,11 @@ def flop_counter(prepared: Prepared, method: str) -> Callable[[Motion], float | 
         return chosen.rates(scene, y, q, v, t, scene.applied_force(q, v, t))
 
     def cost(function):
-        found = jax.jit(function).lower(state, t).compile().cost_analysis() or {}
-        return float(found.get("flops", 0.0))
+        many, inputs = function, (state, t)
+        if batch > 1:
+            many, inputs = jax.vmap(function), jax.tree.map(lambda x: jnp.tile(x, (batch, *[1] * x.ndim)), inputs)
+        found = jax.jit(many).lower(*inputs).compile().cost_analysis() or {}
+        return float(found.get("flops", 0.0)) / batch
 
     once = cost(rates)
     again = cost(lambda y, t: chosen.corrected(scene, y, t)) if chosen.corrects(scene) else 0.0

@@ -105,7 +105,7 @@ class Report:
 
 
 COLUMNS = (
-    "method", "dtype", "batch", "setting", "error", "at end", "residual", "energy", "us", "median", "steps", "evals",
+    "method", "dtype", "batch", "setting", "error", "at end", "residual", "energy", "us", "median", "rounds", "steps", "evals",
     "Mflop", "compile s", "result",
 )  # fmt: skip
 
@@ -123,7 +123,7 @@ def rows(records: Iterable[Record]) -> list[list[str]]:
                 f"{'h ' if r.fixed else ''}{r.setting:.1e}",
                 *(short(x, 2) for x in (r.error_path, r.error_end, max(residuals, default=None), r.energy_error)),
                 *(f"{1e6 * x:.4g}" for x in (r.seconds_best, r.seconds_median)),
-                *("-" if x is None else str(x) for x in (r.steps, r.evaluations)),
+                *("-" if x is None else str(x) for x in (r.rounds, r.steps, r.evaluations)),
                 short(None if r.flops is None else r.flops / 1e6, 3),
                 short(r.compile_seconds, 2),
                 "" if r.result == "successful" else r.result,

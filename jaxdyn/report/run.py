@@ -116,7 +116,7 @@ def _group(prepared: Prepared, dtype, batch, full, rounds, peers) -> list[Record
     starts = prepared.programs.lanes(batch)
     plain = dtype == "float64" and batch == 1
     pairs = combinations(case, bool(scene.constraints), full=full, plain=plain)
-    counters = {method: flop_counter(prepared, method) for method, _ in pairs}
+    counters = {method: flop_counter(prepared, method, batch) for method in dict(pairs)}
     contestants = [
         rung
         for method, solver in pairs
