@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 import jaxdyn as jd
 from jaxdyn.cli import main
+from jaxdyn.constrained_motion import chosen_method
 from jaxdyn.report import Record, Report, cases, html_page, pareto_front, standings
 from jaxdyn.report import run as running
 from jaxdyn.report.front import cost_at
 from jaxdyn.report.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
-from jaxdyn.report.programs import prepare
+from jaxdyn.report.programs import FIXED, SOLVERS, prepare
 from jaxdyn.report.records import Known
 from jaxdyn.report.references import (
     car_axis,
@@ -31,6 +32,7 @@ from jaxdyn.report.references import (
 from jaxdyn.report.timing import interleaved
 from jaxdyn.scene import Scene
 from jaxdyn.solvers import RK4
+from jaxdyn.solvers.choice import checked_method
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
 
@@ -187,6 +189,21 @@ def test_evaluations_are_those_that_are_made(name, solver, projected):
 
 def test_evaluations_of_implicit_methods_are_not_known():
     assert evaluations("Kvaerno5", 10, False) is None
+
+
+def test_every_way_can_be_simulated():
+    """Solvers suit the steps they get, methods the scene, and ladders go from coarse to fine."""
+    for case in cases().values():
+        scene, _ = case.build()
+        for full, plain in ((False, True), (True, True), (True, False)):
+            pairs = running.combinations(case, bool(scene.constraints), full=full, plain=plain)
+            assert len(set(pairs)) == len(pairs) >= 3
+            for method, solver in pairs:
+                chosen_method(scene, method)
+                checked_method(SOLVERS[solver](), 0.1 if solver in FIXED else None)
+                for dtype in ("float64", "float32"):
+                    rungs = running.settings(case, solver, dtype, full=full)
+                    assert np.all(np.diff(rungs) < 0)
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,8 @@ SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "Dopri8": diffrax.Dopri8,
     "Dopri5": diffrax.Dopri5,
     "Tsit5": diffrax.Tsit5,
+    "Kvaerno3": diffrax.Kvaerno3,
     "Kvaerno5": diffrax.Kvaerno5,
-    "KenCarp5": diffrax.KenCarp5,
     "RK4": RK4,
 }
 FIXED = frozenset({"RK4"})

@@ -22,7 +22,7 @@ Peers = Callable[[Prepared, str, tuple], Sequence[Contestant]]
 
 def combinations(case: Case, constrained: bool, *, full: bool, plain: bool = True) -> list[tuple[str, str]]:
     """Methods with solvers: the usual ones, or every sensible pair; `plain` is float64 and one trajectory."""
-    stiff = ["Kvaerno5", "KenCarp5"] if full else ["Kvaerno5"]
+    stiff = ["Kvaerno5", "Kvaerno3"] if full else ["Kvaerno5"]
     implicit = stiff if case.stiff or (full and plain) else []
     explicit = ["Dopri8", "Tsit5", "RK4"]
     if not constrained:
