@@ -82,6 +82,7 @@ from jaxdyn.recursive import mass_matrix_sqrt as mass_matrix_sqrt
 from jaxdyn.recursive import rnea as rnea
 from jaxdyn.reduced import reduced_dynamics as reduced_dynamics
 from jaxdyn.reduced import tangent_basis as tangent_basis
+from jaxdyn.report import report as report
 from jaxdyn.scene import Scene as Scene
 from jaxdyn.simulate import RESULTS as RESULTS
 from jaxdyn.simulate import Solution as Solution

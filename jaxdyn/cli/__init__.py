@@ -1,4 +1,4 @@
-"""The command line: `jaxdyn info`, `jaxdyn simulate` and `jaxdyn identify`."""
+"""The command line: `jaxdyn info`, `jaxdyn simulate`, `jaxdyn identify` and `jaxdyn report`."""
 
 import argparse
 import sys
@@ -7,14 +7,15 @@ from collections.abc import Sequence
 import jax
 
 from jaxdyn import __version__
-from jaxdyn.cli import identify, info, simulate
+from jaxdyn.cli import identify, info, report, simulate
 
-COMMANDS = (info, simulate, identify)
+COMMANDS = (info, simulate, identify, report)
 _EPILOG = """\
 examples:
   jaxdyn info panda.urdf
   jaxdyn simulate panda.urdf --duration 2 --torque gravity --out motion.csv
   jaxdyn identify --urdf panda.urdf --log log.csv --out fitted.urdf
+  jaxdyn report four_bar --out report
 
 All numbers are in SI units and radians, in float64. `jaxdyn COMMAND --help` explains a command.
 Exit status: 0 done; 1 the computation failed; 2 wrong input or arguments.
@@ -25,7 +26,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command with the arguments given (those of the process by default) and return the exit status."""
     parser = argparse.ArgumentParser(
         prog="jaxdyn",
-        description="Rigid-body dynamics of robots: look at a URDF, simulate it, identify its inertias from a log.",
+        description="Rigid-body dynamics of robots: look at a URDF, simulate it, identify its inertias from a log; and "
+        "report error against run time.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

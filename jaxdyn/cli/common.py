@@ -1,4 +1,4 @@
-"""What the commands share: options of the model, vectors on the command line, tables, files to write."""
+"""What the commands share: options of the model, vectors on the command line, files to write."""
 
 import argparse
 import contextlib
@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxdyn._table import short as short
+from jaxdyn._table import table as table
 from jaxdyn.io import load_urdf
 from jaxdyn.joints import KINDS
 from jaxdyn.model import Model
@@ -101,27 +103,6 @@ def coordinate_labels(model: Model) -> tuple[list[str], list[str]]:
     return labels, torque_units
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], indent: str = "  ") -> str:
-    """Columns aligned to the left where they hold words and to the right where they hold numbers."""
-    rows = [[str(cell) for cell in row] for row in rows]
-    columns = list(zip(header, *rows, strict=True))
-    widths = [max(map(len, column)) for column in columns]
-    numeric = [all(_is_number(cell) for cell in column[1:]) for column in columns]
-    lines = []
-    for row in ([*header], *rows):
-        cells = [
-            cell.rjust(width) if right else cell.ljust(width)
-            for cell, width, right in zip(row, widths, numeric, strict=True)
-        ]
-        lines.append((indent + "  ".join(cells)).rstrip())
-    return "\n".join(lines)
-
-
-def short(value: float, digits: int = 4) -> str:
-    """A number for a table; a dash for infinity (no limit) and for what is not there."""
-    return "-" if value is None or not np.isfinite(value) else f"{value:.{digits}g}"
-
-
 def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathlib.Path | None:
     """A file to write, checked before any work is done: its type is known and its directory exists."""
     if text is None:
@@ -142,7 +123,3 @@ class Stopwatch:
 
     def __str__(self):
         return f"{time.perf_counter() - self._start:.1f} s"
-
-
-def _is_number(cell: str) -> bool:
-    return cell in ("", "-") or cell.replace(".", "").replace("-", "").replace("+", "").replace("e", "").isdecimal()

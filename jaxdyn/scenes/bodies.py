@@ -1,0 +1,25 @@
+"""A rigid body without forces."""
+
+import jax.numpy as jnp
+
+from jaxdyn.building import ModelBuilder
+from jaxdyn.scene import Scene
+from jaxdyn.scenes._named import named
+
+
+def _free_start(rates=(0.3, 0.8, -0.5)):
+    return jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray(rates, float)
+
+
+@named(_free_start)
+def free_body(*, moments=(1.0, 2.0, 3.0)) -> Scene:
+    """Rigid body that turns freely about its centre of mass: I w' = (I w) x w, by Jacobi's elliptic functions.
+
+    q = (w, x, y, z), a unit quaternion, v = angular velocity in the body's axes, principal ones; `moments`, kg m^2.
+    Start: turned by nothing, with body `rates` (rad/s).
+
+    Source: Celledoni, Fasso, Safstrom & Zanna (2008), The exact computation of the free rigid body motion.
+    """
+    builder = ModelBuilder("free body", gravity=None)
+    builder.add_body("body", None, "spherical", (1.0, (0.0, 0.0, 0.0), tuple(moments)))
+    return Scene(builder.build())

@@ -1,0 +1,416 @@
+"""The report of error against run time: references, counts, errors, the front, the page and the command."""
+
+import dataclasses
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import jaxdyn as jd
+from jaxdyn.cli import main
+from jaxdyn.constrained_motion import chosen_method
+from jaxdyn.report import Record, Report, cases, html_page, pareto_front, standings
+from jaxdyn.report import run as running
+from jaxdyn.report.front import cost_at
+from jaxdyn.report.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
+from jaxdyn.report.programs import FIXED, SOLVERS, prepare
+from jaxdyn.report.records import Known
+from jaxdyn.report.references import (
+    car_axis,
+    coin,
+    free_top,
+    integral,
+    plane_pendulum,
+    sleigh,
+    sphere_pendulum,
+    windows,
+)
+from jaxdyn.report.timing import interleaved
+from jaxdyn.scene import Scene
+from jaxdyn.solvers import RK4
+from jaxdyn.solvers.choice import checked_method
+
+MOMENTS = np.array([1.0, 2.0, 3.0])
+
+
+def test_references_start_where_the_scenes_do():
+    for name, case in cases().items():
+        _, (q, v) = case.build()
+        if case.reference is None:
+            continue
+        reference = case.reference((q, v))
+        assert reference.q.shape == (len(reference.ts), len(q)), name
+        np.testing.assert_allclose(reference.q[0], q, atol=1e-14, err_msg=name)
+        np.testing.assert_allclose(reference.v[0], v, atol=1e-14, err_msg=name)
+
+
+def test_plane_pendulum_has_the_printed_digits():
+    """Problem A01, 18 digits by mpmath."""
+    ts = np.array([0.0, 1.0, 5.0, 9.99, 10.0])
+    want = [
+        (-1.0, 0.0),
+        (0.986291751131875319, -0.165010853125541169),
+        (-0.942305435043757335, -0.334754338414000581),
+        (-0.316436469913032291, -0.948613704575776519),
+        (-0.27508746257611686, -0.961419205099125064),
+    ]
+    found = plane_pendulum(ts)
+    np.testing.assert_allclose(found.q, want, atol=1e-13)
+    energy = 0.5 * np.sum(found.v**2, 1) + 9.81 * found.q[:, 1]
+    np.testing.assert_allclose(energy, 0.0, atol=1e-13)
+
+
+def test_free_top_has_the_printed_rates_and_turns_as_they_say():
+    """Problem 4.1; and R' = R hat(w), integrated by scipy, with R I w constant."""
+    printed = {
+        (0.3, 0.8, -0.5): (-0.51657677863999, 0.6805500949746, -0.55583317887956),
+        (1.0, 0.2, 0.1): (1.0190650695036, -0.038812164557891, 0.1510999844279),
+        (0.2, 0.1, 1.0): (0.0019375747348129, 0.22359840295527, 0.99331159162938),
+    }
+    ts = np.linspace(0.0, 20.0, 6)
+
+    def rate(t, y):
+        turned, w = y[:9].reshape(3, 3), y[9:]
+        return np.concatenate([(turned @ np.cross(np.eye(3), w)).ravel(), np.cross(MOMENTS * w, w) / MOMENTS])
+
+    for start, end in printed.items():
+        found = free_top(ts, start=start)
+        np.testing.assert_allclose(found.v[-1], end, atol=1e-12)
+        turned = Rotation.from_quat(np.roll(found.q, -1, 1)).as_matrix()
+        momentum = np.einsum("tij,tj->ti", turned, MOMENTS * found.v)
+        np.testing.assert_allclose(momentum, np.tile(MOMENTS * start, (6, 1)), atol=1e-12)
+        solved = solve_ivp(rate, (0, 20), [*np.eye(3).ravel(), *start], "DOP853", ts, rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(turned.reshape(6, 9), solved.y[:9].T, atol=1e-9)
+
+
+def test_sphere_pendulum_against_angles():
+    """theta'' = sin cos phi'^2 - g sin theta, phi' = h/sin^2, by scipy; energy and angular momentum are constant."""
+    ts = np.linspace(0.0, 10.0, 5)
+    h = np.sin(1.0) ** 2
+
+    def rate(t, y):
+        sine, cosine = np.sin(y[0]), np.cos(y[0])
+        return [y[1], h**2 * cosine / sine**3 - 9.81 * sine, h / sine**2]
+
+    for turn in (1.0, 4.5):  # the start is the highest, then the lowest point
+        h = np.sin(1.0) ** 2 * turn
+        found = sphere_pendulum(ts, turn=turn)
+        theta, _, phi = solve_ivp(rate, (0, 10), [1.0, 0.0, 0.0], "DOP853", ts, rtol=1e-12, atol=1e-13).y
+        want = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), -np.cos(theta)], 1)
+        np.testing.assert_allclose(found.q, want, atol=1e-9)
+        np.testing.assert_allclose(np.cross(found.q, found.v)[:, 2], h, atol=1e-12)
+        energy = 0.5 * np.sum(found.v**2, 1) + 9.81 * found.q[:, 2]
+        np.testing.assert_allclose(energy, energy[0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("count", "t", "place", "velocity"),
+    [
+        (2, 1.0, (-0.1950203, -0.98079921), (-6.67667804, 1.32757833)),
+        (2, 10.0, (0.32845811, 0.94451854), (1.42305147, -0.49486885)),
+        (40, 10.0, (0.18051223, 0.98357274), (1.14844128, -0.21077007)),
+    ],
+)
+def test_windows_have_the_printed_digits(count, t, place, velocity):
+    """Problem A02: place and velocity of the first top, 8 digits; and energy."""
+    found = windows(np.array([0.0, t]), count)
+    angle, turn = -found.q[-1, 0], -found.v[-1, 0]
+    top = np.array([np.sin(angle), np.cos(angle)])
+    np.testing.assert_allclose(top, place, atol=2e-8)
+    np.testing.assert_allclose(turn * np.array([top[1], -top[0]]), velocity, atol=2e-8)
+    inertia, weight = (count + 1) / 3 + count, 9.81 * ((count + 1) / 2 + count)
+    np.testing.assert_allclose(0.5 * inertia * turn**2 + weight * np.cos(angle), 0.5 * inertia + weight, rtol=1e-13)
+
+
+def test_sleigh_and_coin_have_the_printed_digits():
+    """Problems 3.4 and 3.10, where integrals and one turn of the circle are printed."""
+    found = sleigh(np.array([0.0, 1.0, 10.0]))
+    want = [
+        (0.3134115046418, 0.3477380366348, 1.356093732499),
+        (-8.600842105481, -0.4306517115655, 3.570508149338),
+    ]
+    np.testing.assert_allclose(found.q[1:], want, atol=2e-12)
+    np.testing.assert_allclose(found.v[1:, 0], (0.7547057324456, 1.169390226108), atol=1e-12)
+    np.testing.assert_allclose(found.v[1:, 2], (1.162929714574, 0.00670176830728), atol=1e-12)
+
+    period = 5.852173782956319
+    found = coin(np.array([0.0, period / 4, period]))
+    np.testing.assert_allclose(
+        found.q[[0, 2], :3], np.tile([0.0, 0.4956422128626671, found.q[0, 2]], (2, 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(np.hypot(*found.q[:, :2].T), 0.4956422128626671, atol=1e-14)
+
+
+def test_integral_knows_its_error():
+    ts = np.array([0.0, 1.0, 4.0])
+    found, error = integral(np.cos, ts, 1.0)
+    np.testing.assert_allclose(found, np.sin(ts), atol=1e-15)
+    assert error < 1e-15
+    found, error = integral(lambda t: np.exp(-((6 * (t - 2)) ** 2)), ts, 4.0)  # too long for this one
+    assert 0.1 * abs(found[-1] - np.sqrt(np.pi) / 6) < error < 1e-2
+
+
+class Counter:
+    """A force of zero that counts how often it is asked for."""
+
+    def __init__(self):
+        self.count = 0
+
+    def add(self):
+        self.count += 1
+
+    def __call__(self, system, q, v, t):
+        jax.debug.callback(self.add)
+        return jnp.zeros_like(v)
+
+
+@pytest.mark.parametrize(
+    ("name", "solver", "projected"),
+    [
+        ("pendulum", "Tsit5", False),
+        ("pendulum_in_plane", "Tsit5", True),
+        ("pendulum", "Dopri8", False),
+        ("pendulum", "RK4", False),
+    ],
+)
+def test_evaluations_are_those_that_are_made(name, solver, projected):
+    scene, counter = getattr(jd.scenes, name), Counter()
+    counted = Scene(scene().system, scene().constraints, (counter,))
+    method = {"Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8, "RK4": RK4}[solver]()
+    steps = {"stepsize": 0.05} if solver == "RK4" else {"rtol": 1e-6, "atol": 1e-6}
+    found = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, **steps)
+    jax.effects_barrier()
+    assert counter.count == evaluations(solver, int(found.stats["num_steps"]), projected)
+
+
+def test_evaluations_of_implicit_methods_are_not_known():
+    assert evaluations("Kvaerno5", 10, False) is None
+
+
+def test_every_way_can_be_simulated():
+    """Solvers suit the steps they get, methods the scene, and ladders go from coarse to fine."""
+    for case in cases().values():
+        scene, _ = case.build()
+        for full, plain in ((False, True), (True, True), (True, False)):
+            pairs = running.combinations(case, bool(scene.constraints), full=full, plain=plain)
+            assert len(set(pairs)) == len(pairs) >= 3
+            for method, solver in pairs:
+                chosen_method(scene, method)
+                checked_method(SOLVERS[solver](), 0.1 if solver in FIXED else None)
+                for dtype in ("float64", "float32"):
+                    rungs = running.settings(case, solver, dtype, full=full)
+                    assert np.all(np.diff(rungs) < 0)
+
+
+@pytest.fixture(scope="module")
+def body():
+    return prepare(cases()["free_body"])
+
+
+@pytest.fixture(scope="module")
+def rungs(body):
+    return ladder(body, "free", "Tsit5", [1e-4, 1e-7], "float64", body.programs.lanes(1), flop_counter(body, "free"))
+
+
+@pytest.fixture(scope="module")
+def records(body, rungs):
+    """Two rungs of a ladder, a peer that is exact and one that failed."""
+    exact = Motion(body.reference.q, body.reference.v)
+    failed = Motion(np.nan * exact.q, np.nan * exact.v, "max_steps_reached")
+    peers = [Contestant("peer", "by hand", "exact", 1.0, True, lambda: None, lambda _, m=m: m) for m in (exact, failed)]
+    return measure(body, [*rungs, *peers], "float64", 1, rounds=2)
+
+
+def test_records_hold_what_a_motion_says(body, rungs, records):
+    """Errors, energy and counts of a rung, from its motion by numpy and scipy."""
+    motion, record = rungs[0].motion(rungs[0].call()), records[0]
+    known, found = (
+        np.concatenate([Rotation.from_quat(np.roll(q, -1, 1)).as_matrix().reshape(len(q), 9), v], 1)
+        for q, v in ((body.reference.q, body.reference.v), (motion.q, motion.v))
+    )
+    error = np.max(np.abs(found - known) / (1 + np.abs(known)), 1)
+    np.testing.assert_allclose([record.error_path, record.error_end], [error.max(), error[-1]], rtol=1e-9)
+    energy = 0.5 * np.sum(MOMENTS * motion.v**2, 1)
+    np.testing.assert_allclose(record.energy_error, np.abs(energy - energy[0]).max(), rtol=1e-9)
+    assert record.residual_position is None
+    assert record.steps == motion.steps
+    assert record.evaluations == 7 * motion.steps  # quaternions are projected
+    assert record.flops > record.evaluations
+    assert record.seconds_best <= record.seconds_median
+    assert record.rounds == 2
+    assert records[1].error_path < 1e-2 * record.error_path
+    assert records[1].compile_seconds == record.compile_seconds  # one program
+
+
+def test_operations_are_those_of_the_batch(body):
+    """A large batch of a ball joint runs on Euler's equations, 30 operations; all that is besides is the quaternion's."""
+    motion = Motion(body.reference.q, body.reference.v, steps=0, evaluations=1)
+    single, many = (flop_counter(body, "free", batch)(motion) for batch in (1, 256))
+    assert 30 < many < 150 < single
+
+
+def test_a_slow_run_is_timed_once(body, rungs):
+    (record,) = measure(body, rungs[:1], "float64", 1, rounds=2, most=0.0)
+    assert record.rounds == 1
+    assert record.seconds_best == record.seconds_median > 0
+
+
+def test_peers_and_failures_are_recorded(records):
+    exact, failed = records[2:]
+    assert exact.error_path == 0.0
+    assert exact.label == "peer, exact"
+    assert (failed.result, failed.error_path, failed.energy_error) == ("max_steps_reached", None, None)
+
+
+def test_batches_start_along_the_motion(body):
+    """Lanes of a batch are later states of the reference's motion, with their times."""
+    q, v, ts = body.programs.lanes(25)
+    assert np.ptp(ts - body.reference.ts, axis=1).max() < 1e-14
+    np.testing.assert_allclose(ts[:, 0], 2.0 * np.arange(25) / 25)
+    want = free_top(ts[:, 0])
+    turned = [Rotation.from_quat(np.roll(x, -1, 1)).as_matrix() for x in (q, want.q)]
+    np.testing.assert_allclose(turned[0], turned[1], atol=1e-10)
+    np.testing.assert_allclose(v, want.v, atol=1e-10)
+
+
+def made(error, seconds, solver="A", kind="free", scene="one", **changes):
+    values = dict.fromkeys(field.name for field in dataclasses.fields(Record))
+    values |= {"source": "jaxdyn", "method": "m", "dtype": "float64", "batch": 1, "setting": 1.0, "fixed": False}
+    values |= {"result": "successful", "rounds": 1, "seconds_median": seconds, "seconds_best": seconds}
+    values |= {"error_path": error, "solver": solver, "kind": kind, "scene": scene}
+    return Record(**values | changes)
+
+
+def test_front_and_cost_at_an_error():
+    a, b, c = made(1e-2, 1.0), made(1e-4, 10.0), made(1e-3, 20.0)
+    assert pareto_front([c, b, a, made(None, 0.1)]) == [a, b]
+    assert cost_at([a, b], 1e-3) == pytest.approx(10**0.5)  # half way in the log-log plot
+    assert cost_at([a, b], 1e-1) == 1.0
+    assert cost_at([a, b], 1e-4) == 10.0
+    assert cost_at([a, b], 1e-5) == np.inf
+
+
+def test_standings_compare_within_a_class():
+    """B costs twice as much as A where both come, and comes further."""
+    ladders = [made(10.0**-k, float(k), "A") for k in (2, 6)] + [made(10.0**-k, 2.0 * k, "B") for k in (2, 6, 10)]
+    first, second = standings([*ladders, made(1e-3, 1.0, "C", source="peer")], targets=(1e-2, 1e-6, 1e-10))
+    assert (first.label, first.reached, first.wanted) == ("m, B", 3, 3)
+    assert first.ratio == pytest.approx(4 ** (1 / 3))
+    assert (second.label, second.reached, second.ratio) == ("m, A", 2, pytest.approx(1.0))
+
+
+def test_interleaved_drops_who_is_slow():
+    calls = {"slow": 0, "fast": 0}
+
+    def call(name):
+        calls[name] += 1
+
+    found = interleaved({name: lambda name=name: call(name) for name in calls}, 5, least=0.0, most=-1.0)
+    assert found["slow"]["rounds"] == found["fast"]["rounds"] == 3
+    assert calls == {"slow": 5, "fast": 5}  # two to see how long it takes
+    assert found["slow"]["best"] <= found["slow"]["median"]
+
+
+@pytest.fixture
+def small(monkeypatch, body):
+    """Reports of the free body by one solver, its program made already; counts how often a scene is prepared."""
+    prepared = []
+    monkeypatch.setattr(running, "combinations", lambda *args, **options: [("free", "Tsit5")])
+    monkeypatch.setattr(running, "settings", lambda *args, **options: [1e-4, 1e-7])
+    monkeypatch.setattr(running, "prepare", lambda case: prepared.append(case.name) or body)
+    return prepared
+
+
+def test_report_resumes_and_writes(small, rungs, tmp_path, capsys, monkeypatch):
+    lines = []
+    found = jd.report("free_body", rounds=1, out=tmp_path, echo=lines.append)
+    assert small == ["free_body"]
+    assert "about 0 s left" in lines[-1]
+    assert Report.from_json((tmp_path / "report.json").read_text()) == found
+    text = (tmp_path / "report.txt").read_text()
+    assert "Free rigid body" in text
+    assert "free, Tsit5" in text
+
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<svg") == 1
+    assert "src=" not in page
+    assert "<link" not in page
+    assert 'href="http' not in page
+    for words in (
+        "Free rigid body",
+        "time per trajectory",
+        "energy error",
+        "free, Tsit5",
+        found.head["machine"]["device"],
+    ):
+        assert words in page
+
+    # A second call takes what is there, also after the last line was cut; another commit's records are refused.
+    assert jd.report("free_body", rounds=1, out=tmp_path) == found
+    assert small == ["free_body"]
+    path = tmp_path / "records.jsonl"
+    path.write_text(path.read_text() + '{"key": "cut')
+    assert jd.report("free_body", rounds=1, out=tmp_path).records == found.records
+    assert len(path.read_text().splitlines()) == 2
+    monkeypatch.setattr(running, "commit", lambda: "another")
+    assert main(["report", "free_body", "--rounds", "1", "--out", str(tmp_path)]) == 2
+    assert "another" in capsys.readouterr().err
+
+
+def test_command(small, rungs, capsys):
+    assert main(["report", "--list"]) == 0
+    assert set(cases()) == {line.split()[0] for line in capsys.readouterr().out.splitlines()}
+    assert main(["report", "free_body", "--rounds", "1"]) == 0
+    text = capsys.readouterr().out
+    assert "1.0e-07" in text
+    assert "2 runs in" in text
+    for wrong, word in (
+        (["report"], "free_body"),
+        (["report", "pendulums"], "pendulums"),
+        (["report", "free_body", "--batch", "0"], "batches"),
+        (["report", "free_body", "--dtype", "float16"], "float16"),
+        (["report", "free_body", "--rounds", "0"], "rounds"),
+    ):
+        assert main(wrong) == 2
+        assert word in capsys.readouterr().err
+
+
+def test_report_needs_float64():
+    with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
+        jd.report("free_body")
+
+
+def test_page_marks_published_figures_and_escapes():
+    """Stars with their labels, failures without a plot, names that are no HTML."""
+    head = {"machine": {"processor": "<cpu>", "cores": 1, "device": "cpu", "load": 0.0, "versions": {}}}
+    head |= {"commit": None, "date": "today"}
+    point = {"label": "Somebody (old machine)", "seconds": 0.5, "error": 1e-3, "energy_error": None}
+    known = Known("One & only", "printed", "x", 1e-9, (point,))
+    report = Report(
+        head, {"one": known}, (made(1e-3, 1.0), made(0.0, 2.0, evaluations=10), made(None, 1.0, result="bad"))
+    )
+    page = html_page(report)
+    assert "&lt;cpu&gt;" in page
+    assert "One &amp; only" in page
+    assert "Somebody (old machine)" in page
+    failed = dataclasses.replace(report, records=(made(None, 1.0, result="bad"),))
+    assert "No run succeeded" in html_page(failed)
+
+
+def test_printed_ends_are_as_printed():
+    """Published digits of Andrews' mechanism agree with the reference as far as they go: q to 1e-9, rates to 6e-8."""
+    case = cases()["andrews"]
+    reference = case.reference(case.build()[1])
+    q = (15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948, 0.5244099658805304)
+    rates = (1139.920302151208, -1424.379294994111, 11.03291221937134, 19.29337464421385, 0.5735699284790808)
+    np.testing.assert_allclose(reference.q[-1, :5], q, rtol=1e-9)
+    np.testing.assert_allclose(reference.v[-1, :5], rates, rtol=6e-8)
+    # The chassis of the car axis has its length, and its speed along it is zero.
+    found = car_axis(cases()["car_axis"].build()[1])
+    (xl, yl, xr, yr), (vxl, vyl, vxr, vyr) = found.q[-1], found.v[-1]
+    assert (xl - xr) ** 2 + (yl - yr) ** 2 == pytest.approx(1.0, abs=1e-14)
+    assert (xl - xr) * (vxl - vxr) + (yl - yr) * (vyl - vyr) == pytest.approx(0.0, abs=1e-14)
