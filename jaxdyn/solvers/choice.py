@@ -108,11 +108,12 @@ def stepping(solver, term, ts, rtol, atol, stepsize):
     """Method, controller and first step for diffrax, with tolerances that the dtype can hold."""
     eps = float(jnp.finfo(ts.dtype).eps)
     rtol, atol = jnp.maximum(rtol, 10 * eps), jnp.maximum(atol, 10 * eps)
+    # The default of diffrax keeps the Jacobian of the step's start, gives up after two iterations and relies on a shorter step:
+    # fixed ones cannot have it, and adaptive ones lose more by it than by new Jacobians (the car axis takes 9 times the steps).
+    if isinstance(solver, diffrax.AbstractImplicitSolver) and not eqx.is_array_like(solver.root_finder.rtol):
+        newton = optimistix.Newton(rtol, atol)  # pyright: ignore[reportArgumentType]
+        solver = eqx.tree_at(lambda s: s.root_finder, solver, newton)
     if is_fixed(stepsize):
-        # The default of diffrax gives up after two iterations and relies on a shorter step, which is not to be had here.
-        if isinstance(solver, diffrax.AbstractImplicitSolver) and not eqx.is_array_like(solver.root_finder.rtol):
-            newton = optimistix.Newton(rtol, atol)  # pyright: ignore[reportArgumentType]
-            solver = eqx.tree_at(lambda s: s.root_finder, solver, newton)
         return solver, diffrax.ConstantStepSize(), stepsize
     controller = stepsize
     if controller is None:
