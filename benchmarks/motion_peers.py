@@ -210,7 +210,7 @@ def _scipy(prepared, twin, starts) -> list[Contestant]:
 
 def _batched(prepared, twin, starts) -> list[Contestant]:
     """Runge-Kutta of order 4 over the whole batch: accelerations by Pinocchio's threads, sums by numpy."""
-    # One row of numbers is taken for a vector there, and memory beyond it is written.
+    # With one degree of freedom the rows of one number are taken for vectors there, and the call fails.
     if twin.model.nq != twin.model.nv or twin.model.nv == 1:
         return []
     source, _ = to_pinocchio(jd.Scene(twin.model))
