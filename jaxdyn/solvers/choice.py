@@ -23,8 +23,9 @@ _INTERPOLATION_DEGREE = {
 class _Adaptive(diffrax.PIDController):
     """Step-size control that starts with the whole span when the first derivative is NaN.
 
-    The first step is chosen from the derivative, and a NaN one would make every step NaN: rejected, and tried again
-    until the last of `max_steps`. A finite one is halved and halved again until the least step ends the run.
+    A first step chosen from the derivative, as diffrax does for terms that it knows (others start with 0.01 s), would be NaN
+    and make every step NaN: rejected, and tried again until the last of `max_steps`. A finite one is halved and halved
+    again until the least step ends the run.
     """
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
