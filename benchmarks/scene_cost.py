@@ -19,7 +19,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks import timing
-from jaxdyn.assembly import project_state
+from jaxdyn.projection import project_state
 
 STEP = 0.005  # s
 ALL = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")

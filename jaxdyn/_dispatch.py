@@ -5,6 +5,9 @@ The rule, measured by benchmarks/dynamics.py on CPU:
 - batches of at least `LEAST_BATCH` samples of a mechanism with at most `MOST_BODIES` bodies run on the recursion, whose
   numbers become vectors over the batch;
 - single samples and small batches run on the world-frame matrix form, whose program is short;
+- single bodies and mechanisms of at most `FEW_FREEDOMS` degrees of freedom run on the recursion in any batch: below `LEAST_BATCH`
+  samples it is written into a few calls that compute some values again and again (see `_materialize`), which for them is
+  little: 0.1 to 0.3 us a sample instead of 3 to 5;
 - forward dynamics of more than `MOST_BODIES` bodies, and inverse dynamics of more than `MOST_IN_MASK`, run as loops over the
   bodies, whose program is as short and whose time grows with the number of bodies instead of its third power or its square.
 
@@ -28,10 +31,12 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
 from jaxdyn import closed_recursion, looped, matrix_form, recursive
+from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn.model import Model
 
 LEAST_BATCH = 256
+FEW_FREEDOMS = 3
 MOST_BODIES = 64
 MOST_IN_MASK = 128
 
@@ -75,11 +80,15 @@ def _is_given(model: Model) -> bool:
     return isinstance(model.home, jax.core.Tracer) and isinstance(model.screws, jax.core.Tracer)
 
 
+def _is_tiny(model: Model) -> bool:
+    return model.nb == 1 or model.nv <= FEW_FREEDOMS
+
+
 def _choose(model: Model, recursion: Callable, matrices: Callable, *args):
     """`recursion(model, *args)` for large batches of mechanisms of moderate size, else `matrices(model, *args)`."""
     if model.nb > MOST_BODIES or model.nb == 0:
         return matrices(model, *args)
-    large = is_large_batch(model, *args[:3])
+    large = True if _is_tiny(model) else is_large_batch(model, *args[:3])
 
     def recursion_from(least):
         if _is_given(model):
@@ -90,7 +99,7 @@ def _choose(model: Model, recursion: Callable, matrices: Callable, *args):
     if isinstance(large, jax.core.Tracer):
         # The matrix form takes nothing from known numbers.
         return lax.cond(large, lambda: recursion_from(LEAST_BATCH), lambda: _traced_once(matrices)(1, model, *args))
-    return recursion_from(1) if large else matrices(model, *args)
+    return recursion_from(LEAST_BATCH) if large else matrices(model, *args)
 
 
 def inverse_dynamics(model: Model, q: Array, v: Array, a: Array) -> Array:
@@ -136,7 +145,7 @@ def forward_dynamics(model: Model, q: Array, v: Array, tau: Array) -> Array:
             return _tangent_by_loops(model, *args)
         return _choose(model, _tangent_by_recursion, _tangent_by_matrices, *args)
 
-    return _implicit(model, (q, v, tau), solve, tangent)
+    return implicit(model, (q, v, tau), solve, tangent)
 
 
 def _tangent_by_recursion(model, q, v, tau, steps):
@@ -160,7 +169,7 @@ def _force_change(inverse: Callable, model, q, v, tau, steps) -> Callable:
 
     def change(a):
         total = jnp.zeros_like(tau) if tau_step is None else tau_step
-        moved = _along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
+        moved = along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
         return total if moved is None else total - moved
 
     return change
@@ -193,58 +202,11 @@ def with_derivatives(model: Model, loops, q: Array, v: Array, tau: Array, a: Arr
                 model, loops = tree
                 return closed_recursion.closed_inverse(model, loops, q, v, a, lam)
 
-            moved = _along(needed, (tree, q, v), steps)
-            force, along = (jnp.zeros_like(v), jnp.zeros_like(lam)) if moved is None else moved
-            return (-force if tau_step is None else tau_step - force), -along
+            moved = along(needed, (tree, q, v), steps)
+            force, rate = (jnp.zeros_like(v), jnp.zeros_like(lam)) if moved is None else moved
+            return (-force if tau_step is None else tau_step - force), -rate
 
         with at_least(LEAST_BATCH):
             return closed_recursion.closed_tangent(model, loops, q, v, tau, change)
 
-    return _implicit((model, loops), (q, v, tau, a, lam), found, tangent)
-
-
-def _implicit(tree, args: tuple, solve: Callable, tangent: Callable):
-    """solve(tree, *args), whose derivative is given by tangent(tree, *args, steps) -> (value, its change).
-
-    `steps` are those of the tree's leaves and of the args, None where nothing moves. Leaves with known values stay outside of
-    the differentiated function: inside it they would be traced, and a recursion could not see their zeros any more.
-    """
-    leaves, structure = jax.tree.flatten(tree)
-    places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.core.Tracer)]
-
-    def rebuild(traced):
-        full = list(leaves)
-        for place, leaf in zip(places, traced, strict=True):
-            full[place] = leaf
-        return jax.tree.unflatten(structure, full)
-
-    @jax.custom_jvp
-    def run(traced, *args):
-        return solve(rebuild(traced), *args)
-
-    def rule(primals, tangents):
-        traced, *args = primals
-        zero = jax.custom_derivatives.SymbolicZero
-        steps = [None] * len(leaves)
-        for place, step in zip(places, tangents[0], strict=True):
-            steps[place] = step
-        return tangent(rebuild(traced), *args, [None if isinstance(x, zero) else x for x in (*steps, *tangents[1:])])
-
-    run.defjvp(rule, symbolic_zeros=True)
-    return run([leaves[i] for i in places], *args)
-
-
-def _along(function: Callable, args: tuple, steps):
-    """The change of function(*args) for `steps` in the leaves of args, None where one does not move; None if none does."""
-    base, structure = jax.tree.flatten(args)
-    moving = [i for i, step in enumerate(steps) if step is not None]
-    if not moving:
-        return None
-
-    def moved(*values):
-        here = list(base)
-        for i, value in zip(moving, values, strict=True):
-            here[i] = value
-        return function(*jax.tree.unflatten(structure, here))
-
-    return jax.jvp(moved, [base[i] for i in moving], [steps[i] for i in moving])[1]
+    return implicit((model, loops), (q, v, tau, a, lam), found, tangent)

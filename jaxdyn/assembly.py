@@ -1,4 +1,4 @@
-"""Putting a scene on its constraints: `assemble` from a rough guess, `project_state` for small drift."""
+"""Putting a scene on its constraints: `assemble` from a rough guess."""
 
 from typing import Any
 
@@ -20,8 +20,6 @@ from jaxdyn.systems import displace, retract
 
 _NEAREST_STEPS = 30
 _NEWTON_STEPS = 40
-_POSITION_STEPS = 4
-_VELOCITY_STEPS = 3
 _STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
 
 
@@ -162,36 +160,6 @@ def _newton(scene, q, t, held, rank_tol):
         return falls & (error > 0) & (count < _NEWTON_STEPS)
 
     return lax.while_loop(unfinished, improve, (q, size(q), jnp.asarray(True), 0))[0]
-
-
-def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
-    """q and v moved by the least change, in the metric M(q), onto the constraints, from a small distance.
-
-    One factorisation serves all steps: with B fixed, each step multiplies the residual by the size of the correction
-    times the curvature of the constraint, 1e-8 -> 1e-16 after one. The steps are a fixed number and differentiated as
-    they are. A projection that does not reduce the residual is not applied.
-    """
-    q = retract(scene.system, q)
-    held = holonomic_rows(layout(scene))
-    B = correction(scene, q, t, rank_tol, holonomic=False)
-    if held.size:
-        only = held.size == B.shape[1]
-        B_held = B if only else correction(scene, q, t, rank_tol, holonomic=True)
-
-        def move(place, _):
-            step = _product(B_held, position_residual(scene, place, t))
-            return displace(scene.system, place, -step), None
-
-        moved, _ = lax.scan(move, q, None, length=_POSITION_STEPS)
-        before, after = (jnp.max(jnp.abs(position_residual(scene, x, t))) for x in (q, moved))
-        q = jnp.where(after <= before, retract(scene.system, moved), q)
-
-    def slow(v, _):
-        return v - _product(B, velocity_residual(scene, q, v, t)), None
-
-    projected, _ = lax.scan(slow, v, None, length=_VELOCITY_STEPS)
-    before, after = (jnp.max(jnp.abs(velocity_residual(scene, q, x, t))) for x in (v, projected))
-    return q, jnp.where(after <= before, projected, v)
 
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:

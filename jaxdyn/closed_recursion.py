@@ -31,6 +31,7 @@ from jaxdyn._links import (
     wrench_to_parent,
 )
 from jaxdyn._materialize import materialize
+from jaxdyn._row_pattern import path, pattern
 from jaxdyn._scalar import (
     EYE3,
     ZERO3,
@@ -50,8 +51,6 @@ from jaxdyn._scalar import (
 from jaxdyn._tracing import is_concrete
 from jaxdyn.model import Model, body_index, frame_index
 from jaxdyn.recursive import body_wrenches, joint_forces
-
-MOST_PRODUCTS = 6000  # of the rows' matrix and its factor; the program grows with them
 
 
 class Side(NamedTuple):
@@ -80,45 +79,6 @@ class Factored(NamedTuple):
     parts: list  # per row, entries of D^(1/2) y by (body, joint coordinate)
     lower: list  # per column of L, its entries by row
     pivots: list  # of L D L^T
-
-
-def path(model: Model, body: int, common: int = -1) -> list[int]:
-    """Bodies from the one after `common` to `body`, outward."""
-    found = []
-    while body != common:
-        found.append(body)
-        body = model.topology.parents[body]
-    return found[::-1]
-
-
-def supports(model: Model, bodies: Sequence[tuple[int, int]], counts: Sequence[int]) -> list[frozenset]:
-    """For each row the bodies on whose joints it has entries, from the bodies of each loop and its number of rows."""
-    found = []
-    for ends, count in zip(bodies, counts, strict=True):
-        joints = frozenset(i for body in ends for i in path(model, body))
-        found += [joints] * count
-    return found
-
-
-def pattern(rows: Sequence[frozenset]) -> list[list[int]]:
-    """Columns of each row of the Cholesky factor of the rows' matrix, the diagonal left out; fill included."""
-    below = [{s for s in range(r) if rows[r] & rows[s]} for r in range(len(rows))]
-    for r, columns in enumerate(below):
-        # What is eliminated with s couples the rows after it that s is coupled with.
-        for s in range(r):
-            if s in columns:
-                columns |= {k for k in range(s + 1, r) if s in below[k]}
-    return [sorted(columns) for columns in below]
-
-
-def products(model: Model, bodies: Sequence[tuple[int, int]], counts: Sequence[int]) -> int:
-    """About how many products make the rows' matrix and its factor."""
-    rows = supports(model, bodies, counts)
-    columns = [set(row) for row in pattern(rows)]
-    return sum(
-        len(rows[r]) + sum(len(rows[r] & rows[s]) + 1 + len(here & columns[s]) for s in here)
-        for r, here in enumerate(columns)
-    )
 
 
 def close(model: Model, loops: Sequence) -> list[Closed]:
@@ -157,13 +117,13 @@ class _Motion(NamedTuple):
 _AT_REST = _Motion(EYE3, ZERO3, ZERO3, ZERO3, ZERO3, ZERO3, ZERO3)
 
 
-class _Walk:
-    """Motions of bodies seen from the last common body of a loop; what loops share is computed once."""
+class Walk:
+    """Motions of bodies seen from the last common body of a loop; what loops share is computed once. v None: at rest."""
 
-    def __init__(self, model: Model, moves, v, a=None):
+    def __init__(self, model: Model, moves, v=None, a=None):
         slices = model.topology.v_slices
         self.model, self.moves = model, moves
-        self.speeds = split(v, slices)
+        self.speeds = split([0] * model.nv if v is None else v, slices)
         self.rates = None if a is None else split(a, slices)
         self.found: dict = {}
 
@@ -193,7 +153,7 @@ class _Walk:
             dv_rel, dw_rel = combine(moved.columns, self.rates[body])
             dv, dw = vadd(dv, dv_rel), vadd(dw, dw_rel)
         w = vadd(carried, w_rel)
-        return _keep_all(_Motion(rotation, origin, position, v, w, dv, dw))
+        return keep_all(_Motion(rotation, origin, position, v, w, dv, dw))
 
     def frame(self, side: Side, common: int) -> _Motion:
         at = self.body(side.body, common)
@@ -210,39 +170,56 @@ class _Walk:
         )
 
 
-def _rows_of(loop: Closed, walk: _Walk, dtype):
-    """Wrenches on the two bodies, and the acceleration along each row of a loop.
+class Across(NamedTuple):
+    """Frame B seen from frame A: pose, and in the axes of A how its origin moves and how it turns; and the two frames."""
 
-    Per row ((wrench on A's body, wrench on B's body), d2 phi/dt2).
-    """
+    R: tuple
+    p: tuple
+    slide: tuple
+    turning: tuple
+    a: _Motion
+    b: _Motion
+
+
+def across(loop: Closed, walk: Walk) -> Across:
+    """The two frames of a loop against each other."""
     a, b = walk.frame(loop.a, loop.common), walk.frame(loop.b, loop.common)
     down = transpose(a.rotation)
     R = matmul(down, b.rotation)
     p = apply(down, vadd(vsub(b.position, a.position), vsub(b.origin, a.origin)))
-    R, p = _keep_all((R, p))
-    across = cross(a.w, p)
-    slide = vsub(vsub(apply(R, b.v), a.v), across)
-    bend = vsub(vsub(apply(R, b.dv), a.dv), vadd(cross(a.dw, p), cross(a.w, across), scale(2, cross(a.w, slide))))
+    R, p = keep_all((R, p))
+    slide = vsub(vsub(apply(R, b.v), a.v), cross(a.w, p))
+    return Across(R, p, slide, vsub(apply(R, b.w), a.w), a, b)
+
+
+def rows_of(loop: Closed, walk: Walk, dtype):
+    """Wrenches on the two bodies, and the acceleration along each row of a loop.
+
+    Per row ((wrench on A's body, wrench on B's body), d2 phi/dt2).
+    """
+    R, p, slide, turning, a, b = across(loop, walk)
+    lever = cross(a.w, p)
+    bend = vsub(vsub(apply(R, b.dv), a.dv), vadd(cross(a.dw, p), cross(a.w, lever), scale(2, cross(a.w, slide))))
     found = []
     for i in loop.slides:
         force = tuple(int(k == i) for k in range(3))
         found.append((_pair(loop, R, p, force, ZERO3), bend[i]))
     if loop.turn is not None:
-        spun = apply(R, b.w)
-        turning = vsub(spun, a.w)
-        swirl = vsub(vsub(apply(R, b.dw), a.dw), cross(a.w, spun))
+        swirl = vsub(vsub(apply(R, b.dw), a.dw), cross(a.w, vadd(turning, a.w)))
         moments, rates = _turned(loop.turn, R, turning, swirl, dtype)
         found += [(_pair(loop, R, p, ZERO3, n), rate) for n, rate in zip(moments, rates, strict=True)]
     return found
 
 
+def as_arrays(numbers, dtype):
+    """Nested tuples of numbers as arrays ()."""
+    return jax.tree.map(lambda entry: jnp.asarray(entry, dtype), numbers)
+
+
 def _turned(turn, R, turning, swirl, dtype):
     """For rows on the rotation R of frame B in A that turns at `turning`: moments about the axes of A, and d2/dt2."""
 
-    def arrays(x):
-        return jax.tree.map(lambda entry: jnp.asarray(entry, dtype), x)
-
-    R, turning, swirl = arrays((R, turning, swirl))
+    R, turning, swirl = as_arrays((R, turning, swirl), dtype)
     columns = transpose(R)
     rate = transpose([cross(turning, c) for c in columns])
     bend = transpose([vadd(cross(swirl, c), cross(turning, cross(turning, c))) for c in columns])
@@ -275,7 +252,7 @@ def _pair(loop: Closed, R, p, force, moment):
     return on_a, on_b
 
 
-def _pending(loop: Closed, pair) -> dict:
+def pending_of(loop: Closed, pair) -> dict:
     wrenches: dict = {}
     for body, wrench in ((loop.a.body, pair[0]), (loop.b.body, pair[1])):
         if wrench is not None:
@@ -284,7 +261,7 @@ def _pending(loop: Closed, pair) -> dict:
     return wrenches
 
 
-def _keep_all(numbers):
+def keep_all(numbers):
     """The same nested tuples, each number computed once."""
     leaves, structure = jax.tree.flatten(numbers)
     return jax.tree.unflatten(structure, materialize(*leaves))
@@ -296,7 +273,7 @@ def _carry(model: Model, moves, factor: Factor, pending: list[dict]) -> list[dic
     parts: list[dict] = [{} for _ in pending]
     for i in reversed(range(model.nb)):
         here = [r for r, wrenches in enumerate(left) if i in wrenches]
-        forces = dict(zip(here, _keep_all([left[r].pop(i) for r in here]), strict=True))
+        forces = dict(zip(here, keep_all([left[r].pop(i) for r in here]), strict=True))
         for j, column in enumerate(moves[i].columns):
             met = materialize(*(power(column, forces[r]) for r in here))
             gain = factor.gains[i][j]
@@ -313,10 +290,10 @@ def _carry(model: Model, moves, factor: Factor, pending: list[dict]) -> list[dic
     return parts
 
 
-def _factored(model: Model, moves, factor: Factor, pending) -> Factored:
+def factored(model: Model, moves, factor: Factor, pending) -> Factored:
     """L D L^T of the rows' matrix, column by column, where it has entries."""
     parts = _carry(model, moves, factor, pending)
-    weighted = _keep_all([{key: mul(u, factor.inverses[key[0]][key[1]]) for key, u in part.items()} for part in parts])
+    weighted = keep_all([{key: mul(u, factor.inverses[key[0]][key[1]]) for key, u in part.items()} for part in parts])
     columns = pattern([frozenset(part) for part in parts])
     scaled: list[dict] = []  # L D
     lower: list[dict] = []
@@ -340,10 +317,10 @@ def _factored(model: Model, moves, factor: Factor, pending) -> Factored:
     return Factored(moves, factor, parts, lower, pivots)
 
 
-def _solve(model: Model, f: Factored, tau, wrenches, wanted, like):
+def solve(model: Model, f: Factored, tau, wrenches, wanted, like):
     """a and lam with M a = tau - (forces that the wrenches ask for) + A^T lam, A a = wanted."""
     residual = inward(model, f.moves, f.factor, split(tau, model.topology.v_slices), wrenches)
-    free = _keep_all(
+    free = keep_all(
         [[mul(x, d) for x, d in zip(*pair, strict=True)] for pair in zip(residual, f.factor.inverses, strict=True)]
     )
     x = [
@@ -359,46 +336,46 @@ def _solve(model: Model, f: Factored, tau, wrenches, wanted, like):
     for part, multiplier in zip(f.parts, x, strict=True):
         for (i, j), u in part.items():
             residual[i][j] = add(residual[i][j], mul(u, multiplier))
-    return stack(outward(model, f.moves, f.factor, _keep_all(residual)), like), stack([x], like)
+    return stack(outward(model, f.moves, f.factor, keep_all(residual)), like), stack([x], like)
 
 
 def _prepared(model: Model, loops, q, v):
     bodies = canonical_bodies(model)
     moves = place_joints(model, bodies, q)
     closed = close(model, loops)
-    walk = _Walk(model, moves, v)
-    rows = [(loop, *row) for loop in closed for row in _rows_of(loop, walk, q.dtype)]
-    pending = [_pending(loop, pair) for loop, pair, _ in rows]
-    factored = _factored(model, moves, factorize(model, bodies, moves), pending)
-    return bodies, moves, factored, [sub(0, rate) for _, _, rate in rows]
+    walk = Walk(model, moves, v)
+    rows = [(loop, *row) for loop in closed for row in rows_of(loop, walk, q.dtype)]
+    pending = [pending_of(loop, pair) for loop, pair, _ in rows]
+    found = factored(model, moves, factorize(model, bodies, moves), pending)
+    return bodies, moves, found, [sub(0, rate) for _, _, rate in rows]
 
 
 def closed_dynamics(model: Model, loops, q, v, tau) -> tuple[Array, Array, Array]:
     """Acceleration (nv,), multipliers (nc,) and the least pivot of the rows' matrix over its largest one, ()."""
-    bodies, moves, factored, wanted = _prepared(model, loops, q, v)
-    a, lam = _solve(model, factored, tau, body_wrenches(model, bodies, moves, v), wanted, q)
-    pivots = jnp.stack(factored.pivots)
+    bodies, moves, known, wanted = _prepared(model, loops, q, v)
+    a, lam = solve(model, known, tau, body_wrenches(model, bodies, moves, v), wanted, q)
+    pivots = jnp.stack(known.pivots)
     return a, lam, jnp.min(pivots) / jnp.max(pivots)
 
 
 def closed_tangent(model: Model, loops, q, v, tau, change):
     """(a, lam) of `closed_dynamics`, and the change of them that `change(a, lam)` of the forces and along the rows makes."""
-    bodies, moves, factored, wanted = _prepared(model, loops, q, v)
-    a, lam = _solve(model, factored, tau, body_wrenches(model, bodies, moves, v), wanted, q)
+    bodies, moves, known, wanted = _prepared(model, loops, q, v)
+    a, lam = solve(model, known, tau, body_wrenches(model, bodies, moves, v), wanted, q)
     force, along = change(a, lam)
-    return (a, lam), _solve(model, factored, force, None, list(along), q)
+    return (a, lam), solve(model, known, force, None, list(along), q)
 
 
 def closed_inverse(model: Model, loops, q, v, a, lam) -> tuple[Array, Array]:
     """Forces tau (nv,) that the motion needs beside the multipliers, and the accelerations along the rows (nc,)."""
     bodies = canonical_bodies(model)
     moves = place_joints(model, bodies, q)
-    walk = _Walk(model, moves, v, a)
+    walk = Walk(model, moves, v, a)
     total = list(body_wrenches(model, bodies, moves, v, a))
     rates, k = [], 0
     for loop in close(model, loops):
-        for pair, rate in _rows_of(loop, walk, q.dtype):
-            for body, wrench in _pending(loop, pair).items():
+        for pair, rate in rows_of(loop, walk, q.dtype):
+            for body, wrench in pending_of(loop, pair).items():
                 total[body] = tuple(vsub(x, scale(lam[k], y)) for x, y in zip(total[body], wrench, strict=True))
             rates.append(rate)
             k += 1

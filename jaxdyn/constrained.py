@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn._anywhere import anywhere
 from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
-from jaxdyn.closed_recursion import MOST_PRODUCTS, products
+from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.loops import Loop
@@ -116,13 +116,13 @@ def constrained_dynamics(
     def dense():
         return solve_rows(scene, q, v, force, t, rows(scene, q, v, t), method, rank_tol)
 
-    large = method != "range_space" and _has_short_recursion(scene) and is_large_batch(scene, q, v, force)
+    large = method != "range_space" and has_short_recursion(scene) and is_large_batch(scene, q, v, force)
     if isinstance(large, jax.core.Tracer):
         return lax.cond(large, lambda: _by_recursion(scene, q, v, force, method, rank_tol, dense), dense)
     return _by_recursion(scene, q, v, force, method, rank_tol, dense) if large else dense()
 
 
-def _has_short_recursion(scene: Scene) -> bool:
+def has_short_recursion(scene: Scene) -> bool:
     """Whether all constraints are loops of a tree, and few enough to be written out in single numbers."""
     model, loops = scene.system, scene.constraints
     if not (isinstance(model, Model) and model.nb <= 2 * MOST_BODIES and all(isinstance(loop, Loop) for loop in loops)):
@@ -146,10 +146,10 @@ def _by_recursion(scene, q, v, force, method: str, rank_tol, dense) -> Constrain
         return quick()
     # Derivatives keep what a branch needs for them in either case; this one, which hardly ever runs, computes it again.
     careful = jax.checkpoint(dense, prevent_cse=False)
-    return lax.cond(anywhere(~(quality > _least_pivot(q, rank_tol))), careful, quick)
+    return lax.cond(anywhere(~(quality > least_pivot(q, rank_tol))), careful, quick)
 
 
-def _least_pivot(like, rank_tol: float | None) -> float:
+def least_pivot(like, rank_tol: float | None) -> float:
     """Ratio of the pivots of A M^-1 A^T above which the rows are independent whatever the rounding, and Cholesky serves."""
     return max(_eps(like) ** 0.4, (100 * tolerance(rank_tol, like)) ** 2)
 
@@ -184,10 +184,7 @@ def solve_rows(
         pushed = _product(Y, lam)
         rank = jnp.asarray(Y.shape[1], jnp.int32)
     else:
-        inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
-        pushed = _product(inverse.T, wanted)
-        lam = _product(inverse, pushed)
-        rank = jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
+        lam, pushed, rank = _shortest(Y, wanted, rank_tol)
         # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
         missed = jnp.abs(wanted - _product(Y.T, pushed))
         sizes = jnp.abs(row.gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
@@ -196,6 +193,35 @@ def solve_rows(
     a = solve_triangular(factor, free + pushed, lower=True, trans=1)
     result = RESULTS.where(jnp.isfinite(factor).all(), result, RESULTS.singular_mass_matrix)
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+
+
+def _shortest(Y, wanted, rank_tol):
+    """lam and w = Y lam, the shortest w with Y^T w = wanted, and the rank of Y."""
+
+    def by_rank(Y, wanted):
+        inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
+        pushed = _product(inverse.T, wanted)
+        return _product(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
+
+    if Y.shape[1] > Y.shape[0]:
+        return by_rank(Y, wanted)
+    factor, independent = normal_factor(Y, rank_tol)
+
+    def by_normal_equations(Y, wanted):
+        lam = cho_solve((factor, True), wanted)
+        # One correction takes the squared condition number out of the error.
+        lam = lam + cho_solve((factor, True), wanted - _product(Y.T, _product(Y, lam)))
+        return lam, _product(Y, lam), jnp.asarray(Y.shape[1], jnp.int32)
+
+    careful = jax.checkpoint(by_rank, prevent_cse=False)
+    return lax.cond(anywhere(~independent), careful, by_normal_equations, Y, wanted)
+
+
+def normal_factor(Y, rank_tol):
+    """Cholesky factor of Y^T Y, and whether the columns of Y are so independent that it may stand for the pseudo-inverse."""
+    factor = jnp.linalg.cholesky(_product(Y.T, Y))
+    pivots = jnp.diagonal(factor) ** 2
+    return factor, jnp.min(pivots) > least_pivot(Y, rank_tol) * jnp.max(pivots)
 
 
 def _by_range_space(scene, q, v, force, row: Rows) -> ConstrainedDynamics:
@@ -324,9 +350,7 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float) -> Float[Array, "m n
     """
     if Y.shape[1] > Y.shape[0]:
         return _by_factors(Y, rank_tol)
-    factor = jnp.linalg.cholesky(_product(Y.T, Y))
-    pivots = jnp.diagonal(factor) ** 2
-    independent = jnp.min(pivots) > _least_pivot(Y, rank_tol) * jnp.max(pivots)
+    factor, independent = normal_factor(Y, rank_tol)
     return lax.cond(anywhere(~independent), lambda: _by_factors(Y, rank_tol), lambda: _by_normal_equations(Y, factor))
 
 

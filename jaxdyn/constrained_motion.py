@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.assembly import open_constraints, project_state, residuals, start_evidence
+from jaxdyn.assembly import open_constraints, residuals, start_evidence
 from jaxdyn.constrained import checked_tolerance, constrained_dynamics, solve_rows
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
 from jaxdyn.dynamics import forward_dynamics
+from jaxdyn.projection import project_state
 from jaxdyn.reduced import Basis, Given, Orthonormal, as_basis, least_quality, minimal_velocity, reduce, tangent_basis
 from jaxdyn.scene import Scene, as_pytree
 from jaxdyn.so3 import _product

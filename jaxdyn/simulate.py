@@ -16,14 +16,15 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn._tracing import compiled, is_concrete, is_known
-from jaxdyn.assembly import project_state, residuals
+from jaxdyn.assembly import residuals
 from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves
 from jaxdyn.constraints.base import state_dtype
 from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import Model, frame_index, neutral
+from jaxdyn.projection import project_state
 from jaxdyn.scene import Scene, as_pytree, checked_force
-from jaxdyn.solvers import ProjectedSolver
+from jaxdyn.solvers import ExplicitSteps, ProjectedSolver
 from jaxdyn.solvers.choice import (
     checked_adjoint,
     checked_method,
@@ -312,7 +313,9 @@ def _integrate(derivative, project, quality, method, y0, ts, args, steps, option
     """diffrax's solution at ts[1:], and the time it came to."""
     term, adjoint = diffrax.ODETerm(derivative), options["adjoint"]
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
-    if project:
+    if isinstance(solver, diffrax.AbstractERK):
+        solver = ExplicitSteps(solver, project, method.jumping)
+    elif project:
         solver = ProjectedSolver(solver, project, method.jumping)
     saves = diffrax.SubSaveAt(ts=ts[1:])
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else

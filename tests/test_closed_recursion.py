@@ -8,9 +8,10 @@ from pinocchio_bridge import assert_close, quick, random_states, random_tree
 
 from jaxdyn import _dispatch, closed_recursion, constrained, scenes, se3
 from jaxdyn._anywhere import anywhere
+from jaxdyn.closed_projection import Closing
 from jaxdyn.constrained import constrained_dynamics, solve_rows
 from jaxdyn.constraints import loop
-from jaxdyn.constraints.base import rows
+from jaxdyn.constraints.base import position_residual, rows
 from jaxdyn.dynamics import bias_force, mass_matrix
 from jaxdyn.model import integrate
 from jaxdyn.scene import Scene
@@ -45,13 +46,15 @@ def solved(request):
         found = closed_recursion.closed_dynamics(scene.system, scene.constraints, q, v, tau)
         dense = solve_rows(scene, q, v, tau, 0.0, row)
         M, h = mass_matrix(scene.system, q), bias_force(scene.system, q, v)
-        return found, (dense.acceleration, dense.multipliers), (M, h, row.A, row.gamma)
+        closing = Closing(scene.system, scene.constraints, q)
+        residuals = closing.apart(q), closing.slip(q, v), closing.step(row.gamma), closing.quality
+        return (*found, residuals), (dense.acceleration, dense.multipliers), (M, h, row.A, row.gamma)
 
     return scene, (q, v, tau), quick(jax.vmap(both))(q, v, tau)
 
 
 def test_accelerations_and_multipliers_are_those_of_the_dense_solve(solved):
-    _, _, ((a, lam, quality), (want_a, want_lam), _) = solved
+    _, _, ((a, lam, quality, _), (want_a, want_lam), _) = solved
     assert float(jnp.min(quality)) > 1e-6
     # The rows' matrix squares the condition number of the rows, 1e3 at worst here.
     assert_close(a, want_a, 1e-9)
@@ -59,11 +62,25 @@ def test_accelerations_and_multipliers_are_those_of_the_dense_solve(solved):
 
 
 def test_equations_of_motion_and_rows_hold(solved):
-    _, (_, _, tau), ((a, lam, _), _, (M, h, A, gamma)) = solved
+    _, (_, _, tau), ((a, lam, *_), _, (M, h, A, gamma)) = solved
     a, lam, M, h, A, gamma = (np.asarray(x) for x in (a, lam, M, h, A, gamma))
     pushed = np.einsum("nij,ni->nj", A, lam)
     assert_close(np.einsum("nij,nj->ni", M, a) + h, np.asarray(tau) + pushed, 1e-9)
     assert_close(np.einsum("nij,nj->ni", A, a), gamma, 1e-9)
+
+
+def test_residuals_are_those_of_the_rows_and_a_step_is_the_least_one(solved):
+    scene, (q, v, _), ((_, _, quality, residuals), _, (M, _, A, gamma)) = solved
+    phi, psi, step, alone = (np.asarray(x) for x in residuals)
+    M, A, gamma = (np.asarray(x) for x in (M, A, gamma))
+    assert_close(phi, jax.vmap(lambda q: position_residual(scene, q))(q), 1e-12)
+    assert_close(psi, np.einsum("nij,nj->ni", A, v), 1e-11)
+    assert_close(np.einsum("nij,nj->ni", A, step), gamma, 1e-9)
+    # The least step in the metric M is a combination of the rows: M step = A^T x.
+    for m, a, s in zip(M, A, step, strict=True):
+        force = m @ s
+        assert_close(a.T @ np.linalg.lstsq(a.T, force, rcond=None)[0], force, 1e-9)
+    assert_close(alone, quality, 1e-9)
 
 
 def test_derivatives_are_those_of_the_dense_solve():
@@ -146,11 +163,11 @@ def test_pattern_has_every_entry_of_the_factor():
 
 def test_long_programs_are_left_to_matrices():
     scene = scenes.windows(count=40)
-    assert constrained._has_short_recursion(scene)
+    assert constrained.has_short_recursion(scene)
     model = random_tree(0, ("revolute",) * 30, parents=tuple(range(-1, 29)))
     names = model.body_names
     many = [loop(names[i], None, names[i + 3], None, "spherical") for i in range(26)]
-    assert not constrained._has_short_recursion(Scene(model, many))
+    assert not constrained.has_short_recursion(Scene(model, many))
 
 
 def test_anywhere_asks_the_whole_batch():

@@ -176,6 +176,15 @@ def test_dispatch_follows_the_batch():
     assert_close(f(q[0], v[0], tau[0]), want[0], 1e-12)
 
 
+def test_tiny_mechanisms_run_in_a_few_calls_whatever_the_batch():
+    model = random_tree(8, ["revolute", "prismatic", "revolute"])
+    q, v, _, tau, _ = (x[0] for x in random_states(model, 1, 3))
+    program = quick(lambda *x: _dispatch.forward_dynamics(model, *x)).lower(q, v, tau).compile()
+    text = program.as_text()
+    assert text.count(" fusion(") < 20 and " dot(" not in text and " conditional(" not in text
+    assert_close(program(q, v, tau), matrix_form.forward_dynamics(model, q, v, tau), 1e-12)
+
+
 def test_derivatives_of_forward_dynamics():
     """Both implementations, every argument and leaf, forward and reverse, order 2, against finite differences."""
     model = random_tree(9, ["spherical", "helical"])

@@ -1,4 +1,5 @@
 """Time-stepping methods in diffrax's interface."""
 
+from jaxdyn.solvers.explicit import ExplicitSteps as ExplicitSteps
 from jaxdyn.solvers.projected import ProjectedSolver as ProjectedSolver
 from jaxdyn.solvers.rk4 import RK4 as RK4

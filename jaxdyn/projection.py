@@ -1,0 +1,158 @@
+"""Putting a state that has drifted from its constraints by little back onto them, by the least change."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.core
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array
+
+from jaxdyn._anywhere import anywhere
+from jaxdyn._dispatch import LEAST_BATCH, is_large_batch
+from jaxdyn._implicit import along, implicit
+from jaxdyn._materialize import at_least
+from jaxdyn.closed_projection import Closing
+from jaxdyn.constrained import correction, has_short_recursion, least_pivot, normal_factor, pseudo_inverse, tolerance
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
+from jaxdyn.dynamics import mass_matrix
+from jaxdyn.scene import Scene
+from jaxdyn.so3 import _product
+from jaxdyn.systems import displace, retract
+
+_MOST_STEPS = 4
+
+
+def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
+    """q and v moved by the least change, in the metric M(q), onto the constraints, from a small distance.
+
+    One factorisation serves all steps: with B fixed, each step multiplies the residual by the size of the correction
+    times the curvature of the constraint, 1e-8 -> 1e-16 after one. The steps end when the next one would be lost in rounding.
+    Those that are differentiated are a fixed number, so that derivatives converge as far. A projection that does not
+    reduce the residual is not applied.
+    """
+
+    def project(scene, q, v, t):
+        q = retract(scene.system, q)
+        short, long = (partial(way, scene, rank_tol) for way in (_by_recursion, _by_matrices))
+        large = has_short_recursion(scene) and is_large_batch(scene, q, v)
+        if isinstance(large, jax.core.Tracer):
+            return lax.cond(large, short, long, q, v, t)
+        return (short if large else long)(q, v, t)
+
+    def careful(scene, q, v, t):
+        return _in_fixed_steps(scene, q, v, t, rank_tol)
+
+    def tangent(scene, q, v, t, steps):
+        found = careful(scene, q, v, t)
+        moved = along(careful, (scene, q, v, t), steps)
+        return found, jax.tree.map(jnp.zeros_like, found) if moved is None else moved
+
+    return implicit(scene, (q, v, t), project, tangent)
+
+
+class _Correction(NamedTuple):
+    """B r = L^-T Z (C C^T)^-1 r, the shortest step in the metric M = L L^T that removes the residual r."""
+
+    L: Array
+    Z: Array
+    C: Array
+
+    def step(self, residual):
+        along_rows = _product(self.Z, cho_solve((self.C, True), residual))
+        return solve_triangular(self.L, along_rows, lower=True, trans=1)
+
+
+def _correction(L, Y, rank_tol) -> _Correction:
+    """From Y = L^-1 A^T: by its normal equations, or by its pseudo-inverse where the rows are close to dependent."""
+    if Y.shape[1] > Y.shape[0]:
+        return _Correction(L, pseudo_inverse(Y, tolerance(rank_tol, Y)).T, jnp.eye(Y.shape[1], dtype=Y.dtype))
+    C, independent = normal_factor(Y, rank_tol)
+
+    def by_rank():
+        return pseudo_inverse(Y, tolerance(rank_tol, Y)).T, jnp.eye(Y.shape[1], dtype=Y.dtype)
+
+    return _Correction(L, *lax.cond(anywhere(~independent), by_rank, lambda: (Y, C)))
+
+
+def _by_matrices(scene: Scene, rank_tol, q, v, t):
+    held = holonomic_rows(layout(scene))
+    L = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
+    Y = solve_triangular(L, constraint_jacobian(scene, q, t).T, lower=True)
+    every = _correction(L, Y, rank_tol)
+    if held.size:
+        some = every if held.size == Y.shape[1] else _correction(L, Y[:, held], rank_tol)
+        q = _closed(scene, q, some.step, lambda place: position_residual(scene, place, t))
+    return q, _descend(v, every.step, lambda v: velocity_residual(scene, q, v, t), lambda v, step: v - step)
+
+
+def _by_recursion(scene: Scene, rank_tol, q, v, t):
+    """Loops of a tree in a large batch; all samples by matrices if one of them has rows that are close to dependent."""
+    with at_least(LEAST_BATCH):
+        closing = Closing(scene.system, scene.constraints, q)
+
+        def quick():
+            place = _closed(scene, q, closing.step, closing.apart)
+            slip = partial(closing.slip, place)
+            return place, _descend(v, closing.step, slip, lambda v, step: v - step)
+
+        dependent = ~(closing.quality > least_pivot(q, rank_tol))
+        return lax.cond(anywhere(dependent), lambda: _by_matrices(scene, rank_tol, q, v, t), quick)
+
+
+def _closed(scene: Scene, q, step, residual):
+    """q on the holonomic constraints."""
+
+    def move(place, change):
+        return retract(scene.system, displace(scene.system, place, -change))
+
+    return _descend(q, step, residual, move)
+
+
+def _descend(x, step, residual, move):
+    """x moved by x -> move(x, step(residual(x))) until that would change it by rounding alone, `_MOST_STEPS` times at most."""
+    rounding = float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.abs(x))
+
+    def improve(state):
+        x, r, _ = state
+        change = step(r)
+        tried = move(x, change)
+        left = residual(tried)
+        before, after = jnp.max(jnp.abs(r)), jnp.max(jnp.abs(left))
+        falls = after < before
+        # The next step is about this one times what it has left of the residual.
+        more = falls & (jnp.max(jnp.abs(change)) * after > rounding * before)
+        return jnp.where(falls, tried, x), jnp.where(falls, left, r), more
+
+    def maybe(state, _):
+        return lax.cond(anywhere(state[2]), improve, lambda state: state, state), None
+
+    first = residual(x)
+    (x, *_), _ = lax.scan(maybe, (x, first, jnp.max(jnp.abs(first)) > 0), None, length=_MOST_STEPS)
+    return x
+
+
+def _in_fixed_steps(scene: Scene, q, v, t, rank_tol):
+    """The same for derivatives, which are those of the steps as they are."""
+    q = retract(scene.system, q)
+    held = holonomic_rows(layout(scene))
+    B = correction(scene, q, t, rank_tol, holonomic=False)
+    if held.size:
+        B_held = B if held.size == B.shape[1] else correction(scene, q, t, rank_tol, holonomic=True)
+
+        def move(place, _):
+            step = _product(B_held, position_residual(scene, place, t))
+            return displace(scene.system, place, -step), None
+
+        moved, _ = lax.scan(move, q, None, length=_MOST_STEPS)
+        before, after = (jnp.max(jnp.abs(position_residual(scene, x, t))) for x in (q, moved))
+        q = jnp.where(after <= before, retract(scene.system, moved), q)
+
+    def slow(v, _):
+        return v - _product(B, velocity_residual(scene, q, v, t)), None
+
+    projected, _ = lax.scan(slow, v, None, length=_MOST_STEPS)
+    before, after = (jnp.max(jnp.abs(velocity_residual(scene, q, x, t))) for x in (v, projected))
+    return q, jnp.where(after <= before, projected, v)

@@ -1,0 +1,93 @@
+"""Steps of explicit Runge-Kutta methods on one flat state, with a projection inside the step.
+
+diffrax gathers the stages of a step in buffers, one for each part of the state, and takes products with rows of the tableau.
+For states as small as those of mechanisms that costs more than the dynamics. Here the state is one vector, and each stage is
+added, as soon as it is known, to the sums of all that need it.
+"""
+
+from collections.abc import Callable
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+
+from jaxdyn._anywhere import anywhere
+from jaxdyn.solvers.projected import ProjectedSolver
+
+
+class ExplicitSteps(ProjectedSolver):
+    """The steps of an explicit Runge-Kutta method of diffrax, the same but for rounding.
+
+    A projection acts before the last stage where that is the first one of the next step, which then need not be computed anew
+    (it is in `ProjectedSolver`). Entries that are `jumping` change with the projection, and the stage with them.
+
+    **Arguments:** as of `ProjectedSolver`; `project` None for none.
+    """
+
+    solver: diffrax.AbstractERK
+    project: Callable | None = None
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Dense output of the wrapped method, ending at the projected point if there is one."""
+        return self.solver.interpolation_cls if self.project is None else super().interpolation_cls
+
+    def init(self, terms, t0, t1, y0, args):
+        """The last stage of the step before, and whether there is one."""
+        return jnp.zeros_like(ravel_pytree(y0)[0]), jnp.asarray(False)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """One step, projected where it ends."""
+        tableau = self.solver.tableau
+        count, start, structure = tableau.num_stages, *ravel_pytree(y0)
+        dt = jnp.asarray(t1 - t0, start.dtype)
+        # Rows: what is added for each stage, for the result, and for the error.
+        sums = np.zeros((count + 2, count))
+        for i, row in enumerate(tableau.a_lower):
+            sums[i + 1, : i + 1] = row
+        sums[count], sums[count + 1] = tableau.b_sol, tableau.b_error
+        times = jnp.asarray(np.concatenate([[0.0], tableau.c]), jnp.result_type(t0, t1))
+        # For the whole batch: a branch that differs between samples would be computed for all.
+        kept, ready = solver_state
+        ready = ~anywhere(~ready | made_jump) if tableau.fsal else jnp.asarray(False)
+        lasts = self.project is not None and tableau.fsal and not self.jumping
+
+        def ended(y):
+            projected, result = self.project(t1, structure(y), args)  # pyright: ignore[reportOptionalCall]
+            return ravel_pytree(projected)[0], result
+
+        def rate(y, c):
+            t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+            return dt * ravel_pytree(terms.vf(t, structure(y), args))[0]
+
+        def stage(carry, known):
+            total, end, result = carry
+            i, weights, c = known
+            y = start + total[i]
+            if lasts:
+                end, result = lax.cond(i == count - 1, ended, lambda y: (y, diffrax.RESULTS.successful), y)
+                y = end
+            k = lax.cond(ready & (i == 0), lambda y: dt * kept, lambda y: rate(y, c), y)
+            return (total + weights[:, None] * k[None], end, result), k
+
+        known = jnp.arange(count), jnp.asarray(sums.T, start.dtype), times
+        first = jnp.zeros((count + 2, start.size), start.dtype), start, diffrax.RESULTS.successful
+        (total, end, result), k = lax.scan(stage, first, known)
+        raw = start + total[count]
+        if self.project is None:
+            end = raw
+        elif not lasts:
+            end, result = ended(raw)
+        y1, stages = structure(end), jax.vmap(structure)(k)
+        dense = {"y0": y0, "y1": structure(raw), "k": stages}
+        if self.project is not None:
+            shift = structure(end - raw)
+            for name in self.jumping:
+                shift = shift | {name: jnp.zeros_like(shift[name])}
+            dense = {"dense_info": dense, "shift": shift}
+        reusable = jnp.asarray(tableau.fsal and (self.project is None or lasts))
+        last = k[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt)
+        return y1, structure(total[count + 1]), dense, (last, reusable), result

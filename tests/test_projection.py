@@ -1,0 +1,95 @@
+"""Drifted states put back onto their constraints: by matrices, body by body in batches, and in fixed steps for derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close, quick
+
+from jaxdyn import _dispatch, projection, scenes
+from jaxdyn.assembly import residuals
+from jaxdyn.constraints.base import constraint_jacobian
+from jaxdyn.dynamics import mass_matrix
+from jaxdyn.projection import project_state
+from jaxdyn.scene import Scene
+from jaxdyn.systems import displace
+
+DRIFTS = (0.0, 1e-12, 1e-9, 1e-6, 1e-4)
+
+
+def drifted(name, **parameters):
+    """The scene, and states off its constraints by about `DRIFTS`."""
+    scene = getattr(scenes, name)
+    q, v = (jnp.asarray(x) for x in scene.start(**parameters))
+    scene = scene(**parameters)
+    rng = np.random.default_rng(2)
+    off = jnp.asarray(rng.normal(size=(2, len(DRIFTS), scene.nv))) * jnp.asarray(DRIFTS)[None, :, None]
+    return scene, jax.vmap(lambda e: displace(scene.system, q, e))(off[0]), v[None] + off[1]
+
+
+@pytest.mark.parametrize("name, parameters", [("windows", {"count": 2}), ("rolling_coin", {}), ("bennett", {})])
+def test_states_come_back_by_the_least_change(name, parameters):
+    scene, q, v = drifted(name, **parameters)
+    zero = jnp.asarray(0.0)
+    rank_tol = 1e-4 if name == "bennett" else None  # its rows depend on each other only where the loop is closed
+
+    def both(q, v):
+        found = project_state(scene, q, v, zero, rank_tol)
+        fixed = projection._in_fixed_steps(scene, q, v, zero, rank_tol)
+        M, A = mass_matrix(scene.system, found[0]), constraint_jacobian(scene, found[0])
+        return found, fixed, residuals(scene, *found), (M, A)
+
+    (place, speed), fixed, left, (M, A) = quick(jax.vmap(both))(q, v)
+    assert float(jnp.max(left)) < 1e-14 * (1 + float(jnp.max(jnp.abs(speed))))
+    assert_close(place, fixed[0], 1e-13)
+    assert_close(speed, fixed[1], 1e-13)
+    for k, drift in enumerate(DRIFTS):
+        # v changed by M^-1 A^T x, to first order in the drift of q, where the metric is taken.
+        force = np.asarray(M[k]) @ np.asarray(speed[k] - v[k])
+        rows = np.asarray(A[k]).T
+        across = force - rows @ np.linalg.lstsq(rows, force, rcond=1e-6)[0]
+        assert np.linalg.norm(across) <= 20 * drift * max(np.linalg.norm(force), 1e-12) + 1e-13
+
+
+def test_large_batches_are_projected_body_by_body_and_a_singular_one_by_matrices(monkeypatch):
+    monkeypatch.setattr(_dispatch, "LEAST_BATCH", len(DRIFTS))
+    scene, q, v = drifted("windows", count=2)
+    zero = jnp.asarray(0.0)
+    program = jax.jit(jax.vmap(lambda q, v: project_state(scene, q, v, zero))).lower(q, v).compile()
+    matrices = jax.jit(jax.vmap(lambda q, v: projection._in_fixed_steps(scene, q, v, zero, None)))
+    # Uprights and couplers in one line: the rows of the windows lose rank.
+    flat = jnp.asarray([-np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, -np.pi / 2])
+    for states in (q, q.at[1].set(flat)):
+        for x, y in zip(program(states, v), matrices(states, v), strict=True):
+            assert_close(x, y, 1e-12)
+    assert "lapack" in program.as_text()  # for the singular one
+
+
+def test_derivatives_are_those_of_the_steps():
+    scene, q, v = drifted("windows", count=2)
+    q, v = q[3], v[3]
+    rng = np.random.default_rng(4)
+    weights = [jnp.asarray(rng.normal(size=x.shape)) for x in (q, v)]
+
+    def value(inertias, q, v, way):
+        here = Scene(scene.system.replace(inertias=inertias), scene.constraints)
+        return sum(jnp.vdot(w, x) for w, x in zip(weights, way(here, q, v, jnp.asarray(0.0)), strict=True))
+
+    def fixed(scene, q, v, t):
+        return projection._in_fixed_steps(scene, q, v, t, None)
+
+    at = scene.system.inertias, q, v
+    steps = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in at)
+    program = quick(
+        lambda *at: [
+            (jax.grad(value, (0, 1, 2))(*at, way), jax.jvp(lambda *x, way=way: value(*x, way), at, steps))
+            for way in (project_state, fixed)
+        ]
+    )
+    found, want = program(*at)
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+        assert_close(x, y, 1e-12)
+    # Differences of the values themselves, which end their steps earlier.
+    move = jax.jit(lambda h: value(*(x + h * s for x, s in zip(at, steps, strict=True)), project_state))
+    slope = (move(1e-5) - move(-1e-5)) / 2e-5
+    assert_close(found[1][1], slope, 1e-7)
