@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -37,12 +38,14 @@ from jaxdyn.constraints.base import (
     slip_rows,
     velocity_residual,
 )
-from jaxdyn.dynamics import bias_force, kinetic_energy, mass_matrix, potential_energy
+from jaxdyn.dynamics import bias_force, mass_matrix
 from jaxdyn.joints import SCREW_KINDS
+from jaxdyn.kinematics import body_twists, sum_to_coordinates, take, tree_frame
 from jaxdyn.lagrange import LagrangianSystem
+from jaxdyn.matrix_form import momentum, tree_inertias
 from jaxdyn.model import Model
 from jaxdyn.scene import Scene
-from jaxdyn.so3 import _product
+from jaxdyn.so3 import _product, cross
 from jaxdyn.systems import displace
 
 _GROUPS: dict[str, Any] = {"planar": se2, "spherical": so3, "free": se3}
@@ -97,12 +100,12 @@ def step(scene: Scene, q, v, carried: Carried, t0, t1, effort: Callable, rank_to
     def balance(z):
         """2 dL/dxi - J^T (p0+ + a + c), and Ad^T (a + c)."""
         xi, x = z[:n], 0.5 * h * z[:n]
-        momentum, push = _slopes(system, halfway(xi), xi, middle)
+        own, push = _slopes(system, halfway(xi), xi, middle)
         force = effort(halfway(xi), xi, middle)
         push = h * (push if force is None else push + force)
         left = carried.momentum if A is None else carried.momentum + _product(A.T, z[n:])
         arrived = _turned(system, x, left)
-        return 2 * momentum - _gathered(system, x, left + arrived + push), _turned(system, x, arrived + push)
+        return 2 * own - _gathered(system, x, left + arrived + push), _turned(system, x, arrived + push)
 
     def conditions(z):
         xi, moved = z[:n], balance(z)[0]
@@ -133,13 +136,13 @@ def step(scene: Scene, q, v, carried: Carried, t0, t1, effort: Callable, rank_to
     # Rounding of positions, of size q, is one of velocities, of size q/h.
     size = jnp.max(jnp.abs(xi)) + jnp.max(jnp.abs(q)) / h
     solved = change <= float(jnp.finfo(q.dtype).eps) ** 0.75 * size
-    end, momentum = displace(system, q, h * xi), balance(z)[1]
-    velocity = _velocity(system, end, momentum, t1)
+    end, last = displace(system, q, h * xi), balance(z)[1]
+    velocity = _velocity(system, end, last, t1)
     rows, right_inverse, spare = _rows(scene, end, t1, rank_tol)
     if right_inverse is not None:
         for _ in range(2):
             velocity = velocity - _product(right_inverse, velocity_residual(scene, end, velocity, t1))
-    return Step(end, velocity, Carried(momentum, xi, rows, spare), effort(halfway(xi), xi, middle), solved)
+    return Step(end, velocity, Carried(last, xi, rows, spare), effort(halfway(xi), xi, middle), solved)
 
 
 def _newton(function, slope, z, n: int):
@@ -181,19 +184,38 @@ def _newton(function, slope, z, n: int):
 
 def _slopes(system, q, v, t):
     """Momentum dL/dv (nv,), and dL/dq (nv,) along the velocity coordinates."""
-    if not isinstance(system, (Model, LagrangianSystem)):
-        # M and h are all there is: dL/dq is what makes M a + h of the Euler-Lagrange equations.
-        p, rate = jax.jvp(lambda q, t: _product(mass_matrix(system, q, t), v), (q, t), (v, jnp.ones_like(t)))
-        return p, rate - bias_force(system, q, v, t)
+    if isinstance(system, Model):
+        return _tree_slopes(system, q, v)
+    if isinstance(system, LagrangianSystem):
+        pull, momentum = jax.grad(system.value, argnums=(0, 1))(q, v, t)
+        return momentum, pull
+    # M and h are all there is: dL/dq is what makes M a + h of the Euler-Lagrange equations.
+    p, rate = jax.jvp(lambda q, t: _product(mass_matrix(system, q, t), v), (q, t), (v, jnp.ones_like(t)))
+    return p, rate - bias_force(system, q, v, t)
 
-    def lagrangian(shift, v):
-        at = displace(system, q, shift)
-        if isinstance(system, LagrangianSystem):
-            return system.value(at, v, t)
-        return kinetic_energy(system, at, v) - potential_energy(system, at)
 
-    pull, momentum = jax.grad(lagrangian, argnums=(0, 1))(jnp.zeros_like(v), v)
-    return momentum, pull
+def _tree_slopes(model: Model, q, v):
+    """p_k = S_k . H_k and dL/dq_k = ad_V(S_k) . H_k + S_k . W_k, in the tree frame.
+
+    H_k and W_k are momentum and weight of all bodies that coordinate k moves, V the twist of the body that carries its
+    joint: a displacement along S_k turns these bodies as one, and leaves V as it is.
+    """
+    topology = model.topology
+    frame = tree_frame(model, q)
+    inertias = tree_inertias(model, frame)
+    twists = body_twists(model, frame, v)
+    wrenches = [jax.vmap(momentum)(inertias, twists)]
+    if model.gravity is not None:
+        g = jnp.broadcast_to(model.gravity.astype(q.dtype)[None], (topology.nb, 3))
+        wrenches += [inertias[:, :1] * g, jax.vmap(cross)(inertias[:, 1:4], g)]
+    moved = sum_to_coordinates(model, jnp.concatenate(wrenches, axis=1))
+    carrier = np.array(topology.parents)[topology.dof_body]
+    still = jnp.zeros((1, 6), q.dtype)
+    bent = jax.vmap(se3.ad_apply)(take(jnp.concatenate([twists, still]), carrier % (topology.nb + 1)), frame.subspace)
+    p, pull = (jnp.sum(rows * moved[:, :6], axis=1) for rows in (frame.subspace, bent))
+    if model.gravity is not None:
+        pull = pull + jnp.sum(frame.subspace * moved[:, 6:], axis=1)
+    return p if model.armature is None else p + model.armature * v, pull
 
 
 def _velocity(system, q, p, t):
