@@ -183,7 +183,9 @@ def simulate(
     solver = checked_method(method.stepper(solver, stepsize), stepsize)
     adjoint = checked_adjoint(adjoint, solver)
     if isinstance(solver, Stepper) and isinstance(adjoint, diffrax.BacksolveAdjoint):
-        raise ValueError("adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method")
+        raise ValueError(
+            "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
+        )
     if method.jumping and isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards; take 'reverse', or "

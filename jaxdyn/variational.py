@@ -68,7 +68,7 @@ class Carried(NamedTuple):
 
 
 class Step(NamedTuple):
-    """State (q, v) at the end of a step, what is carried on, the momentum balance's force f, whether it was `solved`."""
+    """State (q, v) at the end of a step, what is carried on, the force f at the midpoint, and whether it was solved."""
 
     q: Float[Array, " nq"]
     v: Float[Array, " nv"]
@@ -134,7 +134,7 @@ def step(scene: Scene, q, v, carried: Carried, t0, t1, effort: Callable, rank_to
     )
     xi = z[:n]
     # Rounding of positions, of size q, is one of velocities, of size q/h.
-    size = jnp.max(jnp.abs(xi)) + jnp.max(jnp.abs(q)) / h
+    size = jnp.max(jnp.abs(xi)) + jnp.max(jnp.abs(q)) / jnp.abs(h)
     solved = change <= float(jnp.finfo(q.dtype).eps) ** 0.75 * size
     end, last = displace(system, q, h * xi), balance(z)[1]
     velocity = _velocity(system, end, last, t1)
@@ -174,7 +174,7 @@ def _newton(function, slope, z, n: int):
         return z, change, before, count + 1
 
     def unfinished(state):
-        z, change, before, count = state
+        z, change, _, count = state
         return (change > eps**0.75 * size(z)) & (count < _MOST_JACOBIANS)
 
     unknown = jnp.asarray(jnp.inf, z.dtype)

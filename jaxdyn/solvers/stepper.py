@@ -56,7 +56,7 @@ class Stepper(diffrax.AbstractSolver):
         """Dense output from the step's ends and its mean velocity."""
 
         def interpolation(**given):
-            return _Interpolation(displace=self.displace, **given)
+            return _Interpolation(displace=self.displace, **given)  # pyright: ignore[reportArgumentType]
 
         return interpolation
 
@@ -76,6 +76,6 @@ class Stepper(diffrax.AbstractSolver):
         """One step from t0 to t1; NaN where it failed."""
         y1, mean, carried, solved = self.advance(t0, t1, y0, args, solver_state)  # pyright: ignore[reportOptionalCall]
         y1 = jax.tree.map(lambda y: jnp.where(solved, y, jnp.full_like(y, jnp.nan)), y1)
-        codes = diffrax.RESULTS
-        result = codes.where(solved, codes.successful, codes.nonlinear_divergence)  # pyright: ignore[reportAttributeAccessIssue]
+        codes: Any = diffrax.RESULTS
+        result = codes.where(solved, codes.successful, codes.nonlinear_divergence)
         return y1, None, {"y0": y0, "y1": y1, "mean": mean}, carried, result
