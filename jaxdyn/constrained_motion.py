@@ -317,7 +317,7 @@ def chosen_method(scene: Scene, method: str | Method) -> Method:
             return Free()
         if method == "variational" or isinstance(method, Variational):
             return Variational() if isinstance(method, str) else method
-        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto', 'free' or 'variational'")
+        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free', or 'variational'")
     if method == "auto":
         return Projected()
     if isinstance(method, Method) and not isinstance(method, Free):
