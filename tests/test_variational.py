@@ -311,9 +311,9 @@ def test_a_step_that_cannot_be_solved_ends_the_run():
     [
         ("free_body", 0.05, 1e6),  # energy error 4.7108e-5 J in the first tenth, 4.7108e-5 J in the last one
         ("double_pendulum", 0.02, 1e6),  # 1.70e-3 J, 1.65e-3 J
-        ("pendulum_in_plane", 0.01, 1e6),
-        ("four_bar", 0.02, 1e5),
-        ("suslov", 0.05, 1e5),
+        ("pendulum_in_plane", 0.01, 1e6),  # 3.6094e-3 J, 3.6094e-3 J
+        ("four_bar", 0.02, 1e5),  # 0.13761 J, 0.13759 J
+        ("suslov", 0.05, 1e5),  # 4.7739e-5 J, 4.7739e-5 J
     ],
 )
 def test_a_million_steps(name, stepsize, steps):
