@@ -20,6 +20,7 @@ from jaxdyn.constrained_motion import Baumgarte as Baumgarte
 from jaxdyn.constrained_motion import Multipliers as Multipliers
 from jaxdyn.constrained_motion import Projected as Projected
 from jaxdyn.constrained_motion import Reduced as Reduced
+from jaxdyn.constrained_motion import Variational as Variational
 from jaxdyn.constraints import Holonomic as Holonomic
 from jaxdyn.constraints import Pfaffian as Pfaffian
 from jaxdyn.constraints import constraint_jacobian as constraint_jacobian

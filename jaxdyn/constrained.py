@@ -205,12 +205,19 @@ def _shortest(Y, wanted, rank_tol):
 
     if Y.shape[1] > Y.shape[0]:
         return by_rank(Y, wanted)
-    factor, independent = normal_factor(Y, rank_tol)
+    # The factor is not differentiated: where it is not used it may be NaN, which would reach derivatives even times zero.
+    factor, independent = normal_factor(lax.stop_gradient(Y), rank_tol)
 
     def by_normal_equations(Y, wanted):
-        lam = cho_solve((factor, True), wanted)
-        # One correction takes the squared condition number out of the error.
-        lam = lam + cho_solve((factor, True), wanted - _product(Y.T, _product(Y, lam)))
+        def normal(x):
+            return _product(Y.T, _product(Y, x))
+
+        def solve(normal, right):
+            # One correction takes the squared condition number out of the error.
+            x = cho_solve((factor, True), right)
+            return x + cho_solve((factor, True), right - normal(x))
+
+        lam = lax.custom_linear_solve(normal, wanted, solve, symmetric=True)
         return lam, _product(Y, lam), jnp.asarray(Y.shape[1], jnp.int32)
 
     careful = jax.checkpoint(by_rank, prevent_cse=False)

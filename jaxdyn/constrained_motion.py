@@ -7,8 +7,10 @@ A method says what the state y of the equation is, how it changes, and what is d
     projected    the same, and q and v put back on the constraints after every step
     baumgarte    the same as multipliers, with A a = gamma - 2 alpha psi - beta^2 phi
     reduced      y = (q, nu), v = N(q, t) nu + v0(q, t)
+    variational  no differential equation: steps of its own, for y = (q, v)
 """
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -16,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn import variational
 from jaxdyn.assembly import open_constraints, residuals, start_evidence
 from jaxdyn.constrained import checked_tolerance, constrained_dynamics, solve_rows
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
@@ -24,6 +27,8 @@ from jaxdyn.projection import project_state
 from jaxdyn.reduced import Basis, Given, Orthonormal, as_basis, least_quality, minimal_velocity, reduce, tangent_basis
 from jaxdyn.scene import Scene, as_pytree
 from jaxdyn.so3 import _product
+from jaxdyn.solvers import Stepper
+from jaxdyn.solvers.choice import is_fixed
 from jaxdyn.systems import has_quaternions, retract, velocity_to_rate
 
 
@@ -32,6 +37,10 @@ class Method(eqx.Module):
 
     name: ClassVar[str] = "free"
     projects: ClassVar[bool] = False
+
+    def stepper(self, solver: Any, stepsize: Any) -> Any:
+        """The solver to take: the one given, or the method's own."""
+        return solver
 
     def start(self, scene: Scene, q, v, t) -> dict[str, Array]:
         """State of the equation at (q, v)."""
@@ -225,7 +234,75 @@ class Reduced(Method):
         return self._at(scene, y, retract(scene.system, y["q"]), t).quality
 
 
-METHODS: dict[str, type[Method]] = {kind.name: kind for kind in (Multipliers, Projected, Reduced, Baumgarte)}
+class Variational(Multipliers):
+    """Steps of a fixed length that follow a discrete principle of d'Alembert (see `jaxdyn.variational`), for long motions.
+
+    Order 2. Without forces and rows on velocities the steps are symplectic: the error of the energy stays as it is after
+    a few oscillations, of the order h^2, however many steps follow, and momenta that symmetries conserve are conserved
+    to rounding. Rows on positions are closed at the end of every step, and velocities projected. For rows on velocities
+    (rolling, knife edges) the steps are those of the discrete Lagrange-d'Alembert principle, equal to their inverse with
+    -h; energy is then kept well in reversible motions and not in general.
+
+    Each step solves for its mean velocity by Newton's method, with the exact Jacobian; where that fails the run ends with
+    the code `nonlinear_divergence`. Derivatives are those of the solved equations.
+
+    **Arguments:** `rank_tol`, as in `Multipliers`.
+
+    Sources: Marsden & West (2001); Hairer, Lubich & Wanner (2006), chapters VI and VII; Cortes & Martinez (2001).
+
+    ```python
+    motion = jd.simulate(scene, q0, v0, ts, method="variational", stepsize=0.01)
+    ```
+    """
+
+    name: ClassVar[str] = "variational"
+    projects: ClassVar[bool] = True
+
+    def stepper(self, solver, stepsize):
+        """Its own. **Raises:** ValueError for another one, and for steps that are not fixed."""
+        if solver is not None:
+            raise ValueError(
+                f"solver is {type(solver).__name__}; method 'variational' makes its steps itself: leave solver out"
+            )
+        if not is_fixed(stepsize):
+            raise ValueError(
+                f"stepsize is {stepsize!r}; method 'variational' takes fixed steps, as changing ones lose what it "
+                "conserves: pass a number (s), e.g. stepsize=0.01"
+            )
+        return Stepper()
+
+    def begin(self, scene: Scene, y, t) -> variational.Carried:
+        """What the first step takes beside y."""
+        return variational.begin(scene, *self.place(scene, y, t), t, self.rank_tol)
+
+    def advance(self, scene: Scene, y, t0, t1, carried: variational.Carried, effort: Callable):
+        """y at t1, the mean velocity on the way, what is carried on, and whether the step succeeded."""
+        found = variational.step(scene, y["q"], y["v"], carried, t0, t1, effort, self.rank_tol)
+        mean, y1 = found.carried.mean, {"q": found.q, "v": found.v}
+        if "work" in y:
+            done = 0.0 if found.force is None else (t1 - t0) * jnp.sum(found.force * mean)
+            y1 = y1 | {"work": y["work"] + done}
+        return y1, mean, found.carried, found.solved
+
+    def acceleration(self, scene, q, v, t, force):
+        """Of the continuous motion."""
+        return (super() if scene.constraints else Free()).acceleration(scene, q, v, t, force)
+
+    def corrects(self, scene):
+        """No: steps end on the constraints."""
+        return False
+
+    def corrected(self, scene, y, t):
+        """Between steps: q and v on the constraints."""
+        if not scene.constraints:
+            return y
+        q, v = project_state(scene, y["q"], y["v"], t, self.rank_tol)
+        return y | {"q": q, "v": v}
+
+
+METHODS: dict[str, type[Method]] = {
+    kind.name: kind for kind in (Multipliers, Projected, Reduced, Baumgarte, Variational)
+}
 
 
 def chosen_method(scene: Scene, method: str | Method) -> Method:
@@ -239,7 +316,9 @@ def chosen_method(scene: Scene, method: str | Method) -> Method:
     if not scene.constraints:
         if method in ("auto", "free") or isinstance(method, Free):
             return Free()
-        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free'")
+        if method == "variational" or isinstance(method, Variational):
+            return Variational() if isinstance(method, str) else method
+        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free', or 'variational'")
     if method == "auto":
         return Projected()
     if isinstance(method, Method) and not isinstance(method, Free):

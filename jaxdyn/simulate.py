@@ -5,6 +5,7 @@ returned to unit length at the end of every step (`ProjectedSolver`), which keep
 without quaternions gets no projection at all.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,7 +25,7 @@ from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import Model, frame_index, neutral
 from jaxdyn.projection import project_state
 from jaxdyn.scene import Scene, as_pytree, checked_force
-from jaxdyn.solvers import ExplicitSteps, ProjectedSolver
+from jaxdyn.solvers import ExplicitSteps, ProjectedSolver, Stepper
 from jaxdyn.solvers.choice import (
     checked_adjoint,
     checked_method,
@@ -34,7 +35,7 @@ from jaxdyn.solvers.choice import (
     stepping,
 )
 from jaxdyn.solvers.inputs import as_array, check_state, check_times
-from jaxdyn.systems import System, retract
+from jaxdyn.systems import System, displace, retract
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
 _POSE = "pose:"
@@ -61,6 +62,7 @@ _ADVICE = {
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
     "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
     "method='projected' needs none",
+    "nonlinear_divergence": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
     "open_constraints": "take smaller steps (stepsize, or rtol and atol), or look for constraints that contradict each other "
     "on the way",
 }
@@ -130,11 +132,12 @@ def simulate(
     - `control(q, v, t) -> (nv,)`: tau (N m or N); q comes with unit quaternions. An equinox Module or a
       `jax.tree_util.Partial` carries leaves that can be differentiated and batched; a plain function is static: define
       it once.
-    - `method`: "free" for a scene without constraints. With them
+    - `method`: "free" or "variational" for a scene without constraints. With them
       "projected": accelerations with multipliers, and q and v put back on the constraints after every step and at save
       points, by the least change in the mass metric;
       "multipliers": the same without the projection, so that the constraints open as the local errors add up;
       "reduced": minimal velocities are integrated, and q by v = N nu + v0; `jd.Reduced(basis)` chooses them;
+      "variational": steps of fixed length that keep the energy over long times, with a solver of their own;
       "baumgarte": violated rows are pulled back, for comparison; `jd.Baumgarte(alpha, beta)` sets how fast.
       "auto" takes "free", or "projected", which takes dependent rows and rank loss in passing and needs no choice.
     - `solver`: any diffrax method of an `ODETerm`. Default `Dopri8` for adaptive steps, `RK4` for fixed ones.
@@ -178,8 +181,12 @@ def simulate(
         with jax.ensure_compile_time_eval():
             scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
     control = None if control is None else as_pytree(control, "control")
-    solver = checked_method(solver, stepsize)
+    solver = checked_method(method.stepper(solver, stepsize), stepsize)
     adjoint = checked_adjoint(adjoint, solver)
+    if isinstance(solver, Stepper) and isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
+        )
     if method.jumping and isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards; take 'reverse', or "
@@ -250,6 +257,17 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
         scene, _, method = given(args)
         return method.quality(scene, y, t)
 
+    def begin(t, y, args):
+        scene, _, method = given(args)
+        return method.begin(scene, y, t)
+
+    @jax.jit
+    def advance(t0, t1, y, args, carried):
+        scene, _, method = given(args)
+        return method.advance(scene, y, t0, t1, carried, lambda q, v, t: effort(args, q, v, t))
+
+    if isinstance(options["solver"], Stepper):
+        options = options | {"solver": Stepper(begin, advance, functools.partial(displace, system))}
     q0 = retract(system, q0)
     good = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
     # A bad lane of a batch takes a harmless start, so that it does not make the others wait.
@@ -276,7 +294,7 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     result = RESULTS.promote(solved.result)
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
     result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
-    if method.projects:
+    if method.projects and scene.constraints:
         closed = jax.vmap(consistent, (None, 0, 0, 0))(scene, q, v, ts)
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
     if first is not None:

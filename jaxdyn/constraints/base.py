@@ -188,6 +188,11 @@ def holonomic_rows(places: Sequence[Layout]) -> np.ndarray:
     return np.concatenate([np.arange(place.start, place.slip) for place in places] or [np.zeros(0, int)])
 
 
+def slip_rows(places: Sequence[Layout]) -> np.ndarray:
+    """Indices of the rows that are slip velocities, in order."""
+    return np.concatenate([np.arange(place.slip, place.end) for place in places] or [np.zeros(0, int)])
+
+
 def position_residual(scene: Scene, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nh"]:
     """phi(q, t) of all holonomic parts, stacked in the scene's order; (0,) when there are none."""
     t = jnp.asarray(t, q.dtype)

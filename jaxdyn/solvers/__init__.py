@@ -3,3 +3,4 @@
 from jaxdyn.solvers.explicit import ExplicitSteps as ExplicitSteps
 from jaxdyn.solvers.projected import ProjectedSolver as ProjectedSolver
 from jaxdyn.solvers.rk4 import RK4 as RK4
+from jaxdyn.solvers.stepper import Stepper as Stepper

@@ -1,0 +1,112 @@
+"""Energy error against run time of long motions: variational steps beside RK4 with fixed and Dopri8 with adaptive steps.
+
+    python -m benchmarks.long_runs [--length 1.0] [SCENE ...]
+
+Per scene: variational steps of three lengths, RK4 with steps that cost about the same, Dopri8 at three tolerances, over the
+same time. Printed are the largest energy error (relative to the largest kinetic energy) in the first and in the last tenth of
+the motion, whether the constraints stayed closed, and the time of one run. An error that grows from the first
+tenth to the last one will go on growing; a method of bounded error keeps it. Methods keep constraints by projection but for the
+variational one.
+"""
+
+import argparse
+import time
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxdyn as jd
+from benchmarks import timing
+
+# Length of the motion (s), and the longest variational step.
+SCENES = {
+    "free_body": (2400.0, 0.1),
+    "double_pendulum": (1500.0, 0.02),
+    "four_bar": (300.0, 0.04),
+    "chaplygin_sleigh": (500.0, 0.1),
+}
+SAVES = 2001
+
+
+class Run(NamedTuple):
+    """One way to integrate: its name, and the options of `simulate`."""
+
+    name: str
+    options: dict[str, Any]
+
+
+def runs(step: float) -> list[Run]:
+    """Variational steps, RK4 steps (four evaluations to about eight in a variational step), and tolerances."""
+    variational = [
+        Run(f"variational, {h:g} s", {"method": "variational", "stepsize": h}) for h in (step, step / 2, step / 4)
+    ]
+    fixed = [Run(f"RK4, {h:g} s", {"stepsize": h}) for h in (step / 2, step / 4, step / 8)]
+    adaptive = [Run(f"Dopri8, {tol:g}", {"rtol": tol, "atol": tol}) for tol in (1e-6, 1e-8, 1e-10)]
+    return variational + fixed + adaptive
+
+
+def measure(name: str, length: float) -> list[dict]:
+    """Errors and times of all ways to integrate one scene."""
+    scene, (q, v) = getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()
+    duration, step = SCENES[name]
+    ts = jnp.linspace(0.0, length * duration, SAVES)
+    outputs = ("energy", "constraint_residual") if scene.constraints else ("energy",)
+    found, seconds = {}, {}
+    for run in runs(step):
+        program = jax.jit(
+            lambda q, v, options=run.options: jd.simulate(
+                scene, q, v, ts, outputs=outputs, max_steps=2**24, throw=False, **options
+            )
+        )
+        compiled = program.lower(q, v).compile()
+        start = time.perf_counter()
+        found[run.name] = jax.block_until_ready(compiled(q, v))
+        seconds[run.name] = time.perf_counter() - start
+    rows = []
+    for key, motion in found.items():
+        energy, tenth = np.asarray(motion.energy), SAVES // 10
+        kinetic = np.asarray(jax.vmap(lambda q, v: jd.kinetic_energy(scene.system, q, v))(motion.q, motion.v))
+        error = np.abs(energy - energy[0]) / np.nanmax(kinetic)
+        rows.append(
+            {
+                "scene": name,
+                "run": key,
+                "first": float(error[:tenth].max()),
+                "last": float(error[-tenth:].max()),
+                "residual": float(motion.constraint_residual.max()) if scene.constraints else None,
+                "steps": int(motion.stats["num_steps"]),
+                "seconds": seconds[key],
+            }
+        )
+    return rows
+
+
+def main(argv=None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", default=list(SCENES), metavar="SCENE")
+    parser.add_argument("--length", type=float, default=1.0, help="factor on the length of the motions")
+    options = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    print(
+        "| scene | method | energy error, first tenth | last tenth | residual | steps | s | us a step |\n"
+        + "|---" * 8
+        + "|"
+    )
+    rows = []
+    for name in options.scenes:
+        for row in measure(name, options.length):
+            residual = "" if row["residual"] is None else f"{row['residual']:.1e}"
+            print(
+                f"| {row['scene']} | {row['run']} | {row['first']:.1e} | {row['last']:.1e} | {residual} | {row['steps']} "
+                f"| {row['seconds']:.3g} | {1e6 * row['seconds'] / row['steps']:.3g} |",
+                flush=True,
+            )
+            rows.append(row)
+    timing.write("long_runs", {"machine": timing.machine(), "length": options.length, "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
