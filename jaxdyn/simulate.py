@@ -29,11 +29,13 @@ from jaxdyn.solvers.choice import (
     checked_method,
     checked_step_limit,
     is_fixed,
+    is_split,
     progress_meter,
     stepping,
 )
 from jaxdyn.solvers.inputs import as_array, check_state, check_times
-from jaxdyn.systems import System, retract
+from jaxdyn.solvers.lie import LieGroup
+from jaxdyn.systems import System, retract, velocity_to_rate
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
 _POSE = "pose:"
@@ -240,6 +242,28 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
         rates = method.rates(scene, y, q, v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
 
+    @jax.jit
+    def explicit_part(t, y, args):
+        """All rates but those of `implicit_part`."""
+        scene, control, method = given(args)
+        q, v = method.place(scene, y, t)
+        tau = None if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
+        rates = method.rates(scene, y, q, v, t, tau) | {"q": jnp.zeros_like(y["q"])}
+        return rates | {"work": power(effort(args, q, v, t), v)} if "work" in y else rates
+
+    @jax.jit
+    def implicit_part(t, y, args):
+        """dq/dt = H v, and what the scene's forces add to the rates of velocity, on which they act linearly."""
+        scene, _, method = given(args)
+        q, v = method.place(scene, y, t)
+        rates = jax.tree.map(jnp.zeros_like, y)
+        force = scene.applied_force(q, v, t)
+        if force is not None:
+            by_force = {name: y[name] for name in y if name != "work"}
+            _, added = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
+            rates = rates | added
+        return rates | {"q": velocity_to_rate(scene.system, q, v)}
+
     def project(t, y, args):
         scene, _, method = given(args)
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
@@ -263,8 +287,17 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     y0 = method.start(scene, q0, v0, ts[0])
     first = method.quality(scene, y0, ts[0])
     y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
-    corrector = project if method.corrects(scene) else None
-    solved, time_reached = _integrate(derivative, corrector, quality, method, y0, ts, args, steps, options)
+    solver = options["solver"]
+    if isinstance(solver, LieGroup):
+        solver = solver.fitted(system)
+    # Of what a projection does, local coordinates leave nothing to be done about quaternions.
+    corrects = method.projects or bool(method.jumping) if isinstance(solver, LieGroup) else method.corrects(scene)
+    term = diffrax.ODETerm(derivative)
+    if is_split(solver):
+        term = diffrax.MultiTerm(diffrax.ODETerm(explicit_part), diffrax.ODETerm(implicit_part))
+    options = options | {"solver": solver}
+    corrector = project if corrects else None
+    solved, time_reached = _integrate(term, corrector, quality, method, y0, ts, args, steps, options)
 
     y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, solved.ys)
     finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]
@@ -308,9 +341,9 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     return Solution(ts=ts, result=result, stats=stats, **jax.tree.map(or_nan, rows))
 
 
-def _integrate(derivative, project, quality, method, y0, ts, args, steps, options):
+def _integrate(term, project, quality, method, y0, ts, args, steps, options):
     """diffrax's solution at ts[1:], and the time it came to."""
-    term, adjoint = diffrax.ODETerm(derivative), options["adjoint"]
+    adjoint = options["adjoint"]
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
     if project:
         solver = ProjectedSolver(solver, project, method.jumping)
