@@ -12,6 +12,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
@@ -23,18 +24,20 @@ from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import Model, frame_index, neutral
 from jaxdyn.scene import Scene, as_pytree, checked_force
-from jaxdyn.solvers import ProjectedSolver
+from jaxdyn.solvers import LieGroup, ProjectedSolver, Rodas5P
 from jaxdyn.solvers.choice import (
     checked_adjoint,
     checked_method,
     checked_step_limit,
+    for_stiff,
     is_fixed,
     is_split,
+    label,
     progress_meter,
     stepping,
 )
 from jaxdyn.solvers.inputs import as_array, check_state, check_times
-from jaxdyn.solvers.lie import LieGroup
+from jaxdyn.stiffness import Stiffness, stiffness
 from jaxdyn.systems import System, retract, velocity_to_rate
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
@@ -71,7 +74,7 @@ class Solution(eqx.Module):
     """A simulated motion; every row belongs to one save point. Rows not reached are NaN.
 
     - `ts` (nt,) in s, as given; `q` (nt, nq); `v` (nt, nv), body-fixed.
-    - `result`, a `RESULTS` code; `success` tells whether all went well.
+    - `result`, a `RESULTS` code; `success` tells whether all went well; `solver`, the name of the method that was used.
     - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
     - What `outputs` asked for, else None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
       scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
@@ -91,6 +94,7 @@ class Solution(eqx.Module):
     multipliers: Float[Array, "nt nc"] | None = None
     constraint_residual: Float[Array, "nt 2"] | None = None
     poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
+    solver: str = eqx.field(static=True, default="")
 
     @property
     def success(self) -> Bool[Array, "..."]:
@@ -138,7 +142,11 @@ def simulate(
       "reduced": minimal velocities are integrated, and q by v = N nu + v0; `jd.Reduced(basis)` chooses them;
       "baumgarte": violated rows are pulled back, for comparison; `jd.Baumgarte(alpha, beta)` sets how fast.
       "auto" takes "free", or "projected", which takes dependent rows and rank loss in passing and needs no choice.
-    - `solver`: any diffrax method of an `ODETerm`. Default `Dopri8` for adaptive steps, `RK4` for fixed ones.
+    - `solver`: any diffrax method of an `ODETerm`, `jd.Rodas5P()`, `jd.LieGroup(...)` of one of them, or a method that takes an
+      implicit and an explicit part (`diffrax.KenCarp4`): implicit are dq/dt = H v and what the scene's forces add to the
+      acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps; for adaptive
+      ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at the start says
+      that explicit steps would have to be shorter than a thousandth of the time.
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to and besides the size of each entry of (q, v). Values below ten
       times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
@@ -179,6 +187,9 @@ def simulate(
         with jax.ensure_compile_time_eval():
             scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
     control = None if control is None else as_pytree(control, "control")
+    backwards = adjoint == "backsolve" or isinstance(adjoint, diffrax.BacksolveAdjoint)
+    if solver is None and scene.forces and not (is_fixed(stepsize) or backwards):
+        solver = _for_start(scene, control, q0, v0, ts)
     solver = checked_method(solver, stepsize)
     adjoint = checked_adjoint(adjoint, solver)
     if method.jumping and isinstance(adjoint, diffrax.BacksolveAdjoint):
@@ -201,7 +212,7 @@ def simulate(
     if throw is None:
         throw = concrete
     if throw and concrete:
-        _raise_failure(solution, options["max_steps"])
+        _raise_failure(solution, scene, control, options)
     elif throw:
         solution = solution.result.error_if(solution, ~solution.success)
     return solution
@@ -338,7 +349,7 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     rows = {"q": q, "v": v} | jax.vmap(report)(q, v, ts) | ({} if work is None else {"work": work})
     stats = {name: jnp.asarray(solved.stats[name], jnp.int32) for name in _COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
-    return Solution(ts=ts, result=result, stats=stats, **jax.tree.map(or_nan, rows))
+    return Solution(ts=ts, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
 
 
 def _integrate(term, project, quality, method, y0, ts, args, steps, options):
@@ -396,12 +407,37 @@ def _checked_outputs(scene: Scene, outputs) -> tuple[str, ...]:
     return tuple(sorted(set(outputs)))
 
 
-def _raise_failure(solution: Solution, max_steps: int) -> None:
+def _for_start(scene: Scene, control, q0, v0, ts) -> diffrax.AbstractSolver | None:
+    """The method for stiff equations where the start is one, as far as is known; else None."""
+    if not is_known(scene, control, q0, v0, ts):
+        return None
+    rates = _known_stiffness(scene, q0, v0, ts[0], control)
+    return Rodas5P() if rates is not None and for_stiff(rates, float(ts[-1] - ts[0])) else None
+
+
+def _known_stiffness(scene: Scene, q, v, t, control) -> Stiffness | None:
+    """Rates at a state; None where they are not finite, or the forces have no forward derivative (as callbacks have none)."""
+    try:
+        rates = stiffness(scene, q, v, t, control)
+    except (TypeError, ValueError, NotImplementedError, np.linalg.LinAlgError):
+        return None  # what is wrong with the forces themselves, the integration says
+    return rates if np.isfinite(rates.decay) else None
+
+
+def _raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     if bool(solution.success):
         return
     name = next(name for name in RESULTS._name_to_item if bool(solution.result == getattr(RESULTS, name)))
     reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])
-    advice = _ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(max_steps=max_steps)
+    advice = _ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
+    if name == "max_steps_reached":
+        last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
+        rates = _known_stiffness(scene, solution.q[last], solution.v[last], solution.ts[last], control)
+        if rates is not None and for_stiff(rates, end - float(solution.ts[0])):
+            advice = (
+                f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
+                f"{float(rates.explicit_step):.3g} s; pass solver=jd.Rodas5P(), or raise max_steps (now {options['max_steps']})"
+            )
     raise RuntimeError(
         f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: {advice}. "
         "With throw=False, what was reached is returned."

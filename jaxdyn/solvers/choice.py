@@ -13,6 +13,7 @@ from jaxdyn._tracing import is_concrete
 from jaxdyn.solvers.first_step import Adaptive
 from jaxdyn.solvers.lie import LieGroup
 from jaxdyn.solvers.rk4 import RK4
+from jaxdyn.stiffness import Stiffness
 
 ADJOINTS = ("reverse", "direct", "forward", "backsolve")
 # Degree of the dense output of methods that do not bring their own.
@@ -29,7 +30,7 @@ def is_fixed(stepsize) -> bool:
 
 
 def checked_method(solver, stepsize):
-    """Method (default: `Dopri8`, or `RK4` for fixed steps), refused when it does not suit the step size or the problem.
+    """Method (default: `Dopri8`, or `RK4` for fixed steps), refused when it does not suit the step size.
 
     **Raises:** ValueError that names `solver` or `stepsize` and the fix.
     """
@@ -55,6 +56,21 @@ def checked_method(solver, stepsize):
         name = type(solver).__name__
         raise ValueError(f"solver {name} does not take a single ODETerm; choose another, e.g. diffrax.Tsit5()")
     return solver
+
+
+def for_stiff(rates: Stiffness, span: float) -> bool:
+    """Whether explicit steps would be held short by stability alone.
+
+    Dopri8 would take 1000 steps and more for a decay that is over at once. Of the springs and dampers in docs/stiff.md, that is
+    where Rodas5P takes 7 to 20 times fewer steps, more than one of its steps costs for a dozen velocities.
+    """
+    return bool(span > 1000 * rates.explicit_step)
+
+
+def label(solver: diffrax.AbstractSolver) -> str:
+    """Name of a method, with that of the one in it."""
+    name, inner = type(solver).__name__, getattr(solver, "solver", None)
+    return f"{name}({label(inner)})" if isinstance(inner, diffrax.AbstractSolver) else name
 
 
 def is_split(solver: diffrax.AbstractSolver) -> bool:

@@ -17,7 +17,9 @@ class Adaptive(diffrax.PIDController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """End of the first step and state of the controller."""
         if dt0 is None and _is_ordinary(terms):
-            dt0 = first_step(terms, t0, t1, y0, args, self._get_error_order(error_order), self.rtol, self.atol, self.norm)
+            dt0 = first_step(
+                terms, t0, t1, y0, args, self._get_error_order(error_order), self.rtol, self.atol, self.norm
+            )
         first, state = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
         return jnp.where(jnp.isfinite(first), jnp.minimum(first, t1), t1), state
 

@@ -18,8 +18,8 @@ class LieGroup(diffrax.AbstractWrappedSolver):
     """A method that steps in local coordinates: q = q_k exp(e), with q_k the start of the step.
 
     The wrapped method integrates e, one number for every velocity, from e = 0 by de/dt = J_r(e)^-1 v, J_r the right
-    Jacobian of each joint's group. So q stays on its manifold without projection, errors are those of rotations, and implicit methods
-    solve for 2 nv unknowns instead of nq + nv. The order is that of the wrapped method. For systems without
+    Jacobian of each joint's group. So q stays on its manifold without projection, errors are those of rotations, and
+    implicit methods solve for 2 nv unknowns instead of nq + nv. The order is that of the wrapped method. For systems without
     quaternions or planar joints the wrapped method is used as it is. A step may turn a body by less than a full turn.
 
     **Arguments:** `solver`, any diffrax method that `simulate` takes. The rest is filled in by `simulate`.
@@ -84,14 +84,15 @@ class LieGroup(diffrax.AbstractWrappedSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step of the wrapped method in the coordinates about its start."""
+        topology: Any = self.topology
         local, z0 = self._local(terms, y0)
         # A first-same-as-last method carries the vector field in the coordinates of the step before. It is evaluated anew.
         z1, error, dense_info, solver_state, result = self.solver.step(
             local, t0, t1, z0, args, solver_state, made_jump=True
         )
-        y1 = _placed(self.topology, y0["q"], z1)
+        y1 = _placed(topology, y0["q"], z1)
         if error is not None:
-            error = error | {"q": _per_joint(self.topology, joint_rate, y1["q"], (error["q"], False))}
+            error = error | {"q": _per_joint(topology, joint_rate, y1["q"], (error["q"], False))}
         return y1, error, {"dense_info": dense_info, "q0": y0["q"]}, solver_state, result
 
     def _local(self, terms, y0):

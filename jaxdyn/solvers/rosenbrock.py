@@ -73,16 +73,17 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
         step = self.t1 - self.t0
         x = (t0 - self.t0) / jnp.where(step == 0, jnp.ones_like(step), step)
         z = 1 - x
-        return jax.tree.map(lambda a, b, k: z * a + x * (b + z * (k[0] + x * (k[1] + x * k[2]))), self.y0, self.y1, self.k)
+        return jax.tree.map(
+            lambda a, b, k: z * a + x * (b + z * (k[0] + x * (k[1] + x * k[2]))), self.y0, self.y1, self.k
+        )
 
 
 class Rodas5P(diffrax.AbstractAdaptiveSolver):
     """Rosenbrock method of order 5(4) for stiff equations: eight linear systems a step with one matrix.
 
-    (1 - gamma h J) U_i = gamma (h f(t0 + c_i h, y0 + sum_j A_ij U_j) + sum_j C_ij U_j + h^2 d_i df/dt), y1 = y0 + sum_j A_8j U_j +
-    U_8, with the error estimate U_8 and J = df/dy at the start. The Jacobian and df/dt come from forward-mode
-    differentiation. Stiffly accurate and L-stable; nothing is iterated, so nothing can fail to converge. The order stays
-    5 for equations that become differential-algebraic ones of index 1 as the stiffness grows.
+    (1 - gamma h J) U_i = gamma (h f(t0 + c_i h, y0 + sum_j A_ij U_j) + sum_j C_ij U_j + h^2 d_i df/dt),
+    y1 = y0 + sum_j A_8j U_j + U_8, with the error estimate U_8 and J = df/dy at the start. The Jacobian and df/dt come from
+    forward-mode differentiation. Stiffly accurate and L-stable; nothing is iterated, so nothing can fail to converge.
 
     The state is any pytree of floating arrays of one dtype. A step costs 9 evaluations, one derivative by each of its numbers
     and time, and one LU factorisation.
@@ -115,7 +116,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
             """h f at (y, t)."""
             return ravel_pytree(terms.vf_prod(point[-1], unravel(point[:-1]), args, control))[0]
 
-        slope = jax.jacfwd(change)(jnp.append(start, t0.astype(start.dtype)))
+        slope = jax.jacfwd(change)(jnp.append(start, jnp.asarray(t0, start.dtype)))
         factors = lu_factor(jnp.eye(start.size, dtype=start.dtype) - _GAMMA * slope[:, :-1])
 
         def stage(stages, row):
