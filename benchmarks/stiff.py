@@ -14,8 +14,8 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
-from scipy.linalg import expm
 
 import jaxdyn as jd
 from jaxdyn.report.references import car_axis
@@ -87,7 +87,8 @@ def _sliders(masses: tuple, gravity: bool) -> jd.Model:
     builder = jd.ModelBuilder("sliders", **({} if gravity else {"gravity": None}))
     for i, mass in enumerate(masses):
         builder.add_body(f"body{i}", joint="prismatic", axis=(0, 0, 1), inertia=(mass, (0, 0, 0), (0, 0, 0)))
-    return builder.build()
+    with jax.ensure_compile_time_eval():
+        return builder.build()
 
 
 @functools.cache
@@ -97,7 +98,8 @@ def _light_arm() -> jd.Model:
     builder.add_body("link", joint="revolute", axis=(0, 1, 0), inertia=rod)
     tip = (1e-3, (0.05, 0, 0), (1e-7, 1e-6, 1e-6))
     builder.add_body("tip", "link", "revolute", axis=(0, 1, 0), inertia=tip, pose=(0.5, 0, 0))
-    return builder.build()
+    with jax.ensure_compile_time_eval():
+        return builder.build()
 
 
 def _spring(k):
@@ -122,18 +124,23 @@ def _flexible(k):
 
 
 def _flexible_exact(k, ts):
-    d, inverse = 0.1 * np.sqrt(k * 0.1 / 1.1), np.diag([10.0, 1.0])
-    pair = np.array([[1.0, -1.0], [-1.0, 1.0]])
-    system = np.zeros((6, 6))  # (q, v) and (sin 3t, cos 3t)
-    system[:2, 2:4] = np.eye(2)
-    system[2:4, :2], system[2:4, 2:4] = -k * inverse @ pair, -inverse @ (d * pair + np.diag([0.5, 0.0]))
-    system[2, 4] = 10.0
-    system[4, 5], system[5, 4] = 3.0, -3.0
-    return np.array([(expm(system * t) @ np.eye(6)[5])[:2] for t in ts])
+    # In 40 digits: those of float64 are lost in the exponential of a matrix of norm 1e10.
+    with mpmath.workdps(40):
+        k = mpmath.mpf(float(k))
+        d = mpmath.sqrt(k * mpmath.mpf("0.1") / mpmath.mpf("1.1")) / 10
+        rows = mpmath.zeros(6)  # (q, v) and (sin 3t, cos 3t)
+        rows[0, 2] = rows[1, 3] = 1
+        for i, m in ((2, mpmath.mpf("0.1")), (3, mpmath.mpf(1))):
+            sign = 1 if i == 2 else -1
+            rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = (sign * x / m for x in (-k, k, -d, d))
+        rows[2, 2] -= 5
+        rows[2, 4], rows[4, 5], rows[5, 4] = 10, 3, -3
+        ends = [mpmath.expm(rows * mpmath.mpf(float(t)))[:2, 5] for t in ts]
+        return np.array([[float(x) for x in end] for end in ends])
 
 
 def _drive(kd):
-    drive = jd.Drive(100 * kd, kd, jnp.asarray(0.5), joints=("tip",))
+    drive = jd.Drive(100 * kd, kd, jnp.asarray(0.5), joints=("tip_joint",))
     return jd.Scene(_light_arm(), forces=(drive,)), None, np.array([0.3, 0.0]), np.zeros(2)
 
 
@@ -143,10 +150,10 @@ def _press(k):
 
 
 def _car(scale):
-    scene = jd.scenes.car_axis()
+    with jax.ensure_compile_time_eval():
+        scene, start = jd.scenes.car_axis(), [np.asarray(x) for x in jd.scenes.car_axis.start()]
     mass = scene.system.parameters["k"] * scale
-    scene = eqx.tree_at(lambda s: s.system.parameters["k"], scene, mass)
-    return scene, None, *map(np.asarray, jd.scenes.car_axis.start())
+    return eqx.tree_at(lambda s: s.system.parameters["k"], scene, mass), None, *start
 
 
 def cases() -> dict[str, Case]:

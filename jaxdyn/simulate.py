@@ -24,20 +24,21 @@ from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import Model, frame_index, neutral
 from jaxdyn.scene import Scene, as_pytree, checked_force
-from jaxdyn.solvers import LieGroup, ProjectedSolver, Rodas5P
+from jaxdyn.solvers import LieGroup, ProjectedSolver
 from jaxdyn.solvers.choice import (
     checked_adjoint,
     checked_method,
     checked_step_limit,
+    for_start,
     for_stiff,
     is_fixed,
     is_split,
+    known_stiffness,
     label,
     progress_meter,
     stepping,
 )
 from jaxdyn.solvers.inputs import as_array, check_state, check_times
-from jaxdyn.stiffness import Stiffness, stiffness
 from jaxdyn.systems import System, retract, velocity_to_rate
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
@@ -189,7 +190,7 @@ def simulate(
     control = None if control is None else as_pytree(control, "control")
     backwards = adjoint == "backsolve" or isinstance(adjoint, diffrax.BacksolveAdjoint)
     if solver is None and scene.forces and not (is_fixed(stepsize) or backwards):
-        solver = _for_start(scene, control, q0, v0, ts)
+        solver = for_start(scene, control, q0, v0, ts)
     solver = checked_method(solver, stepsize)
     adjoint = checked_adjoint(adjoint, solver)
     if method.jumping and isinstance(adjoint, diffrax.BacksolveAdjoint):
@@ -407,23 +408,6 @@ def _checked_outputs(scene: Scene, outputs) -> tuple[str, ...]:
     return tuple(sorted(set(outputs)))
 
 
-def _for_start(scene: Scene, control, q0, v0, ts) -> diffrax.AbstractSolver | None:
-    """The method for stiff equations where the start is one, as far as is known; else None."""
-    if not is_known(scene, control, q0, v0, ts):
-        return None
-    rates = _known_stiffness(scene, q0, v0, ts[0], control)
-    return Rodas5P() if rates is not None and for_stiff(rates, float(ts[-1] - ts[0])) else None
-
-
-def _known_stiffness(scene: Scene, q, v, t, control) -> Stiffness | None:
-    """Rates at a state; None where they are not finite, or the forces have no forward derivative (as callbacks have none)."""
-    try:
-        rates = stiffness(scene, q, v, t, control)
-    except (TypeError, ValueError, NotImplementedError, np.linalg.LinAlgError):
-        return None  # what is wrong with the forces themselves, the integration says
-    return rates if np.isfinite(rates.decay) else None
-
-
 def _raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     if bool(solution.success):
         return
@@ -432,7 +416,7 @@ def _raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     advice = _ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
     if name == "max_steps_reached":
         last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
-        rates = _known_stiffness(scene, solution.q[last], solution.v[last], solution.ts[last], control)
+        rates = known_stiffness(scene, solution.q[last], solution.v[last], solution.ts[last], control)
         if rates is not None and for_stiff(rates, end - float(solution.ts[0])):
             advice = (
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "

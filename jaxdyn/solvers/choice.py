@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 
-from jaxdyn._tracing import is_concrete
+from jaxdyn._tracing import is_concrete, is_known
+from jaxdyn.scene import Scene
 from jaxdyn.solvers.first_step import Adaptive
 from jaxdyn.solvers.lie import LieGroup
 from jaxdyn.solvers.rk4 import RK4
-from jaxdyn.stiffness import Stiffness
+from jaxdyn.solvers.rosenbrock import Rodas5P
+from jaxdyn.stiffness import Stiffness, stiffness
 
 ADJOINTS = ("reverse", "direct", "forward", "backsolve")
 # Degree of the dense output of methods that do not bring their own.
@@ -65,6 +67,23 @@ def for_stiff(rates: Stiffness, span: float) -> bool:
     where Rodas5P takes 7 to 20 times fewer steps, more than one of its steps costs for a dozen velocities.
     """
     return bool(span > 1000 * rates.explicit_step)
+
+
+def for_start(scene: Scene, control, q0, v0, ts) -> diffrax.AbstractSolver | None:
+    """The method for stiff equations where the start is one, as far as is known; else None."""
+    if not is_known(scene, control, q0, v0, ts):
+        return None
+    rates = known_stiffness(scene, q0, v0, ts[0], control)
+    return Rodas5P() if rates is not None and for_stiff(rates, float(ts[-1] - ts[0])) else None
+
+
+def known_stiffness(scene: Scene, q, v, t, control) -> Stiffness | None:
+    """Rates at a state; None where they are not finite, or the forces have no forward derivative (as callbacks have none)."""
+    try:
+        rates = stiffness(scene, q, v, t, control)
+    except (TypeError, ValueError, NotImplementedError, np.linalg.LinAlgError):
+        return None  # what is wrong with the forces themselves, the integration says
+    return rates if np.isfinite(rates.decay) else None
 
 
 def label(solver: diffrax.AbstractSolver) -> str:
