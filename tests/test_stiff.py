@@ -184,7 +184,9 @@ IMPLICIT = diffrax.Kvaerno3(root_finder=optimistix.Newton(1e-13, 1e-13))
 
 
 @pytest.mark.parametrize(
-    ("solver", "order"), [(diffrax.Dopri5(), 5), (jd.Rodas5P(), 5), (IMPLICIT, 3)], ids=["5", "R", "K"]
+    ("solver", "order"),
+    [(diffrax.Dopri5(), 5), (jd.Rodas5P(), 5), pytest.param(IMPLICIT, 3, marks=pytest.mark.slow)],
+    ids=["Dopri5", "Rodas5P", "Kvaerno3"],
 )
 def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
     """The order is kept, at steps and between them, and quaternions are of unit length without a projection."""
@@ -193,7 +195,8 @@ def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
     np.testing.assert_allclose(np.linalg.norm(found[..., :4], axis=-1), 1, rtol=1e-14)
     error = np.abs(found - turned_exactly).max(2)
     assert np.log2(error[:-1, 1] / error[1:, 1]).min() > order - 0.35, error
-    assert np.log2(error[:-1, 0] / error[1:, 0]).min() > order - 0.8, error
+    # Between steps the error depends on where the point is in its step, so over both halvings.
+    assert np.log2(error[0, 0] / error[2, 0]) / 2 > order - 0.8, error
 
 
 def test_gradient_of_an_implicit_step_in_local_coordinates(ball):
