@@ -88,6 +88,10 @@ from jaxdyn.scene import Scene as Scene
 from jaxdyn.simulate import RESULTS as RESULTS
 from jaxdyn.simulate import Solution as Solution
 from jaxdyn.simulate import simulate as simulate
+from jaxdyn.solvers import LieGroup as LieGroup
+from jaxdyn.solvers import Rodas5P as Rodas5P
+from jaxdyn.stiffness import Stiffness as Stiffness
+from jaxdyn.stiffness import stiffness as stiffness
 from jaxdyn.systems import ExplicitSystem as ExplicitSystem
 from jaxdyn.systems import MetricSystem as MetricSystem
 

@@ -13,6 +13,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
@@ -25,17 +26,22 @@ from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import Model, frame_index, neutral
 from jaxdyn.projection import project_state
 from jaxdyn.scene import Scene, as_pytree, checked_force
-from jaxdyn.solvers import ExplicitSteps, ProjectedSolver, Stepper
+from jaxdyn.solvers import ExplicitSteps, LieGroup, ProjectedSolver, Stepper
 from jaxdyn.solvers.choice import (
     checked_adjoint,
     checked_method,
     checked_step_limit,
+    for_start,
+    for_stiff,
     is_fixed,
+    is_split,
+    known_stiffness,
+    label,
     progress_meter,
     stepping,
 )
 from jaxdyn.solvers.inputs import as_array, check_state, check_times
-from jaxdyn.systems import System, displace, retract
+from jaxdyn.systems import System, displace, retract, velocity_to_rate
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
 _POSE = "pose:"
@@ -72,7 +78,7 @@ class Solution(eqx.Module):
     """A simulated motion; every row belongs to one save point. Rows not reached are NaN.
 
     - `ts` (nt,) in s, as given; `q` (nt, nq); `v` (nt, nv), body-fixed.
-    - `result`, a `RESULTS` code; `success` tells whether all went well.
+    - `result`, a `RESULTS` code; `success` tells whether all went well; `solver`, the name of the method that was used.
     - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
     - What `outputs` asked for, else None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
       scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
@@ -92,6 +98,7 @@ class Solution(eqx.Module):
     multipliers: Float[Array, "nt nc"] | None = None
     constraint_residual: Float[Array, "nt 2"] | None = None
     poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
+    solver: str = eqx.field(static=True, default="")
 
     @property
     def success(self) -> Bool[Array, "..."]:
@@ -140,7 +147,11 @@ def simulate(
       "variational": steps of fixed length that keep the energy over long times, with a solver of their own;
       "baumgarte": violated rows are pulled back, for comparison; `jd.Baumgarte(alpha, beta)` sets how fast.
       "auto" takes "free", or "projected", which takes dependent rows and rank loss in passing and needs no choice.
-    - `solver`: any diffrax method of an `ODETerm`. Default `Dopri8` for adaptive steps, `RK4` for fixed ones.
+    - `solver`: any diffrax method of an `ODETerm`, `jd.Rodas5P()`, `jd.LieGroup(...)` of one of them, or a method that takes an
+      implicit and an explicit part (`diffrax.KenCarp4`): implicit are dq/dt = H v and what the scene's forces add to the
+      acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps; for adaptive
+      ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at the start says
+      that explicit steps would have to be shorter than a thousandth of the time.
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to and besides the size of each entry of (q, v). Values below ten
       times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
@@ -181,6 +192,9 @@ def simulate(
         with jax.ensure_compile_time_eval():
             scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
     control = None if control is None else as_pytree(control, "control")
+    backwards = adjoint == "backsolve" or isinstance(adjoint, diffrax.BacksolveAdjoint)
+    if solver is None and scene.forces and not (is_fixed(stepsize) or backwards):
+        solver = for_start(scene, control, q0, v0, ts)
     solver = checked_method(method.stepper(solver, stepsize), stepsize)
     adjoint = checked_adjoint(adjoint, solver)
     if isinstance(solver, Stepper) and isinstance(adjoint, diffrax.BacksolveAdjoint):
@@ -207,7 +221,7 @@ def simulate(
     if throw is None:
         throw = concrete
     if throw and concrete:
-        _raise_failure(solution, options["max_steps"])
+        _raise_failure(solution, scene, control, options)
     elif throw:
         solution = solution.result.error_if(solution, ~solution.success)
     return solution
@@ -248,6 +262,28 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
         rates = method.rates(scene, y, q, v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
 
+    @jax.jit
+    def explicit_part(t, y, args):
+        """All rates but those of `implicit_part`."""
+        scene, control, method = given(args)
+        q, v = method.place(scene, y, t)
+        tau = None if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
+        rates = method.rates(scene, y, q, v, t, tau) | {"q": jnp.zeros_like(y["q"])}
+        return rates | {"work": power(effort(args, q, v, t), v)} if "work" in y else rates
+
+    @jax.jit
+    def implicit_part(t, y, args):
+        """dq/dt = H v, and what the scene's forces add to the rates of velocity, on which they act linearly."""
+        scene, _, method = given(args)
+        q, v = method.place(scene, y, t)
+        rates = jax.tree.map(jnp.zeros_like, y)
+        force = scene.applied_force(q, v, t)
+        if force is not None:
+            by_force = {name: y[name] for name in y if name != "work"}
+            _, added = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
+            rates = rates | added
+        return rates | {"q": velocity_to_rate(scene.system, q, v)}
+
     def project(t, y, args):
         scene, _, method = given(args)
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
@@ -282,8 +318,17 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     y0 = method.start(scene, q0, v0, ts[0])
     first = method.quality(scene, y0, ts[0])
     y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
-    corrector = project if method.corrects(scene) else None
-    solved, time_reached = _integrate(derivative, corrector, quality, method, y0, ts, args, steps, options)
+    solver = options["solver"]
+    if isinstance(solver, LieGroup):
+        solver = solver.fitted(system)
+    # Of what a projection does, local coordinates leave nothing to be done about quaternions.
+    corrects = method.projects or bool(method.jumping) if isinstance(solver, LieGroup) else method.corrects(scene)
+    term = diffrax.ODETerm(derivative)
+    if is_split(solver):
+        term = diffrax.MultiTerm(diffrax.ODETerm(explicit_part), diffrax.ODETerm(implicit_part))
+    options = options | {"solver": solver}
+    corrector = project if corrects else None
+    solved, time_reached = _integrate(term, corrector, quality, method, y0, ts, args, steps, options)
 
     y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, solved.ys)
     finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]
@@ -324,12 +369,12 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     rows = {"q": q, "v": v} | jax.vmap(report)(q, v, ts) | ({} if work is None else {"work": work})
     stats = {name: jnp.asarray(solved.stats[name], jnp.int32) for name in _COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
-    return Solution(ts=ts, result=result, stats=stats, **jax.tree.map(or_nan, rows))
+    return Solution(ts=ts, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
 
 
-def _integrate(derivative, project, quality, method, y0, ts, args, steps, options):
+def _integrate(term, project, quality, method, y0, ts, args, steps, options):
     """diffrax's solution at ts[1:], and the time it came to."""
-    term, adjoint = diffrax.ODETerm(derivative), options["adjoint"]
+    adjoint = options["adjoint"]
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
     if isinstance(solver, diffrax.AbstractERK):
         solver = ExplicitSteps(solver, project, method.jumping)
@@ -384,12 +429,20 @@ def _checked_outputs(scene: Scene, outputs) -> tuple[str, ...]:
     return tuple(sorted(set(outputs)))
 
 
-def _raise_failure(solution: Solution, max_steps: int) -> None:
+def _raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     if bool(solution.success):
         return
     name = next(name for name in RESULTS._name_to_item if bool(solution.result == getattr(RESULTS, name)))
     reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])
-    advice = _ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(max_steps=max_steps)
+    advice = _ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
+    if name == "max_steps_reached":
+        last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
+        rates = known_stiffness(scene, solution.q[last], solution.v[last], solution.ts[last], control)
+        if rates is not None and for_stiff(rates, end - float(solution.ts[0])):
+            advice = (
+                f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
+                f"{float(rates.explicit_step):.3g} s; pass solver=jd.Rodas5P(), or raise max_steps (now {options['max_steps']})"
+            )
     raise RuntimeError(
         f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: {advice}. "
         "With throw=False, what was reached is returned."

@@ -274,14 +274,14 @@ def test_reverse_mode_against_finite_differences(leg):
     """Masses, start, coefficients and control, with adaptive steps; and finite at rest, where error estimates vanish."""
 
     def function(z, q0):
-        return leg_end(leg, z, q0, rtol=1e-11, atol=1e-11)
+        return leg_end(leg, z, q0, rtol=1e-13, atol=1e-13)
 
     q0 = jnp.asarray(Q0)
     slope = central_difference(quick(jax.vmap(lambda z: function(z, q0))), POINT)
     reverse = quick(jax.grad(function))
     gradient = np.asarray(reverse(jnp.asarray(POINT), q0))
     assert np.abs(slope).min() > 1e-3  # every input matters
-    # The steps are chosen anew at every shifted point, so the tolerance 1e-11 is seen through the step 1e-4.
+    # The steps are chosen anew at every shifted point, so the tolerance 1e-13 is seen through the step 1e-4.
     np.testing.assert_allclose(gradient, slope, rtol=1e-6, atol=1e-6)
     hanging = POINT * (np.arange(POINT.size) < 2)
     at_rest = np.asarray(reverse(jnp.asarray(hanging), neutral(leg)))

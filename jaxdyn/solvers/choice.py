@@ -1,6 +1,7 @@
 """What to integrate with: the user's options checked and turned into diffrax's objects."""
 
 import importlib.util
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -8,8 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 
-from jaxdyn._tracing import is_concrete
+from jaxdyn._tracing import is_concrete, is_known
+from jaxdyn.scene import Scene
+from jaxdyn.solvers.first_step import Adaptive
+from jaxdyn.solvers.lie import LieGroup
 from jaxdyn.solvers.rk4 import RK4
+from jaxdyn.solvers.rosenbrock import Rodas5P
+from jaxdyn.stiffness import Stiffness, stiffness
 
 ADJOINTS = ("reverse", "direct", "forward", "backsolve")
 # Degree of the dense output of methods that do not bring their own.
@@ -20,27 +26,13 @@ _INTERPOLATION_DEGREE = {
 }
 
 
-class _Adaptive(diffrax.PIDController):
-    """Step-size control that starts with the whole span when the first derivative is NaN.
-
-    A first step chosen from the derivative, as diffrax does for terms that it knows (others start with 0.01 s), would be NaN
-    and make every step NaN: rejected, and tried again until the last of `max_steps`. A finite one is halved and halved
-    again until the least step ends the run.
-    """
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """End of the first step and state of the controller."""
-        first, state = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return jnp.where(jnp.isfinite(first), first, t1), state
-
-
 def is_fixed(stepsize) -> bool:
     """Whether `stepsize` is a number."""
     return not (stepsize is None or isinstance(stepsize, diffrax.AbstractStepSizeController))
 
 
 def checked_method(solver, stepsize):
-    """Method (default: `Dopri8`, or `RK4` for fixed steps), refused when it does not suit the step size or the problem.
+    """Method (default: `Dopri8`, or `RK4` for fixed steps), refused when it does not suit the step size.
 
     **Raises:** ValueError that names `solver` or `stepsize` and the fix.
     """
@@ -61,17 +53,65 @@ def checked_method(solver, stepsize):
             name = type(solver).__name__
             raise ValueError(f"solver {name} has no error estimate for adaptive steps; pass stepsize=, a number (s)")
     structure = solver.term_structure
-    if not (isinstance(structure, type) and issubclass(diffrax.ODETerm, structure)):
+    single = isinstance(structure, type) and issubclass(diffrax.ODETerm, structure)
+    if not (single or is_split(solver)):
         name = type(solver).__name__
         raise ValueError(f"solver {name} does not take a single ODETerm; choose another, e.g. diffrax.Tsit5()")
+    return solver
+
+
+def for_stiff(rates: Stiffness, span: float) -> bool:
+    """Whether explicit steps would be held short by stability alone.
+
+    Dopri8 would take 1000 steps and more for a decay that is over at once. Of the springs and dampers in docs/stiff.md, that is
+    where Rodas5P takes 7 to 20 times fewer steps, more than one of its steps costs for a dozen velocities.
+    """
+    return bool(span > 1000 * rates.explicit_step)
+
+
+def for_start(scene: Scene, control, q0, v0, ts) -> diffrax.AbstractSolver | None:
+    """The method for stiff equations where the start is one, as far as is known; else None."""
+    if not is_known(scene, control, q0, v0, ts):
+        return None
+    rates = known_stiffness(scene, q0, v0, ts[0], control)
+    return Rodas5P() if rates is not None and for_stiff(rates, float(ts[-1] - ts[0])) else None
+
+
+def known_stiffness(scene: Scene, q, v, t, control) -> Stiffness | None:
+    """Rates at a state; None where they are not finite, or the forces have no forward derivative (as callbacks have none)."""
+    try:
+        rates = stiffness(scene, q, v, t, control)
+    except (TypeError, ValueError, NotImplementedError, np.linalg.LinAlgError):
+        return None  # what is wrong with the forces themselves, the integration says
+    return rates if np.isfinite(rates.decay) else None
+
+
+def label(solver: diffrax.AbstractSolver) -> str:
+    """Name of a method, with that of the one in it."""
+    name, inner = type(solver).__name__, getattr(solver, "solver", None)
+    return f"{name}({label(inner)})" if isinstance(inner, diffrax.AbstractSolver) else name
+
+
+def is_split(solver: diffrax.AbstractSolver) -> bool:
+    """Whether the method takes an explicit and an implicit part, as `diffrax.KenCarp4` does."""
+    return isinstance(getattr(unwrapped(solver), "tableau", None), diffrax.MultiButcherTableau)
+
+
+def unwrapped(solver: diffrax.AbstractSolver) -> Any:
+    """The method inside of wrappers."""
+    while isinstance(inner := getattr(solver, "solver", None), diffrax.AbstractSolver):
+        solver = inner
     return solver
 
 
 def checked_adjoint(adjoint, solver) -> diffrax.AbstractAdjoint:
     """Way of differentiation by name; None is reverse mode with checkpoints.
 
-    **Raises:** ValueError for an unknown name.
+    **Raises:** ValueError for an unknown name, and for the continuous adjoint of a method that has none.
     """
+    backsolve = adjoint == "backsolve" or isinstance(adjoint, diffrax.BacksolveAdjoint)
+    if backsolve and (is_split(solver) or isinstance(solver, LieGroup)):
+        raise ValueError(f"adjoint is 'backsolve', which {type(solver).__name__} cannot serve; take 'reverse'")
     if isinstance(adjoint, diffrax.AbstractAdjoint):
         return adjoint
     if adjoint is None or adjoint == "reverse":
@@ -119,7 +159,7 @@ def stepping(solver, term, ts, rtol, atol, stepsize):
     controller = stepsize
     if controller is None:
         smallest = 16 * eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-        controller = _Adaptive(rtol, atol, norm=_error_size, dtmin=smallest, force_dtmin=False)
+        controller = Adaptive(rtol, atol, norm=_error_size, dtmin=smallest, force_dtmin=False)
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController) and _has_coarse_dense_output(solver, term):
         controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
     return solver, controller, None
@@ -139,8 +179,10 @@ def progress_meter(progress: bool) -> diffrax.AbstractProgressMeter:
 
 def _has_coarse_dense_output(solver, term) -> bool:
     """Whether save points between steps would be less accurate than the steps."""
-    interpolation, order = solver.interpolation_cls, solver.order(term)
+    interpolation, order = unwrapped(solver).interpolation_cls, solver.order(term)
     if not isinstance(interpolation, type) or order is None:
         return False
     degrees = [degree for cls, degree in _INTERPOLATION_DEGREE.items() if issubclass(interpolation, cls)]
+    if is_split(solver) and hasattr(interpolation, "coeffs"):
+        degrees.append(interpolation.coeffs.shape[1])  # of the methods of Kennedy and Carpenter
     return bool(degrees) and max(degrees) + 1 < order

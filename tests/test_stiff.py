@@ -1,0 +1,307 @@
+"""Stiff motion: the first step, methods for stiff equations, detection of stiffness, and what each solver makes of the cases."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+from pinocchio_bridge import quick
+
+import jaxdyn as jd
+from benchmarks.stiff import cases, program
+from jaxdyn.model import _per_joint
+from jaxdyn.solvers.lie import _local_rate
+from jaxdyn.solvers.rosenbrock import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P
+
+
+def slider(mass=1.0):
+    """A body on a rail."""
+    builder = jd.ModelBuilder("slider", gravity=None)
+    builder.add_body("box", joint="prismatic", axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
+    return builder.build()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The first step
+
+
+def test_first_step_is_the_same_in_any_unit_of_time():
+    """Ten radians of an oscillation of rate w: the same steps for every w, none of them rejected.
+
+    A first step of a fixed length would be rejected at w = 1e6 until it is short enough, and be lost at w = 1e-6.
+    """
+    model = slider()
+
+    @quick
+    @jax.vmap
+    def run(w):
+        scene = jd.Scene(model, forces=(jd.JointSpring(w * w),))
+        start = jnp.ones(1), 0.5 * w[None]
+        # Without atol, which is not the same for m/s in all units of time; powers of two make the numbers the same.
+        return jd.simulate(scene, *start, jnp.stack([0 * w, 10 / w]), atol=1e-30, throw=False)
+
+    found = run(2.0 ** np.array([0, 20, -20]))
+    assert found.success.all()
+    assert len({int(n) for n in found.stats["num_steps"]}) == 1
+    np.testing.assert_array_equal(found.stats["num_rejected_steps"], 0)
+    np.testing.assert_allclose(found.q[:, -1, 0], np.cos(10) + 0.5 * np.sin(10), rtol=1e-7)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The Rosenbrock method
+
+
+def test_coefficients_of_the_rosenbrock_method():
+    """Order conditions, in the form k_i = f(y0 + h sum alpha k) + h J sum beta' k: U = Gamma k h."""
+    gamma = np.linalg.inv(np.eye(8) / _GAMMA - _C)
+    alpha, b = _A @ gamma, (_A[-1] + np.eye(8)[-1]) @ gamma
+    embedded = _A[-1] @ gamma
+    beta, one = alpha + gamma, np.ones(8)
+    np.testing.assert_allclose(alpha @ one, _TIME, atol=2e-13)
+    np.testing.assert_allclose(gamma @ one, _RATE, atol=2e-13)
+    np.testing.assert_allclose(np.diag(gamma), _GAMMA, rtol=1e-14)
+    # Stiffly accurate: the last row of beta is b.
+    np.testing.assert_allclose(beta[-1], b, atol=1e-12)
+    c, bb = alpha @ one, beta @ one
+    trees = {
+        1: [(one, 1)],
+        2: [(bb, 1 / 2)],
+        3: [(c**2, 1 / 3), (beta @ bb, 1 / 6)],
+        4: [
+            (c**3, 1 / 4),
+            (c * (alpha @ bb), 1 / 8),
+            (beta @ c**2, 1 / 12),
+            (beta @ beta @ bb, 1 / 24),
+        ],
+        5: [
+            (c**4, 1 / 5),
+            (c**2 * (alpha @ bb), 1 / 10),
+            ((alpha @ bb) ** 2, 1 / 20),
+            (c * (alpha @ c**2), 1 / 15),
+            (c * (alpha @ beta @ bb), 1 / 30),
+            (beta @ c**3, 1 / 20),
+            (beta @ (c * (alpha @ bb)), 1 / 40),
+            (beta @ beta @ c**2, 1 / 60),
+            (beta @ beta @ beta @ bb, 1 / 120),
+        ],
+    }
+    for order, conditions in trees.items():
+        for vector, value in conditions:
+            assert abs(b @ vector - value) < 1e-11, (order, b @ vector, value)
+            if order < 5:
+                assert abs(embedded @ vector - value) < 1e-11, (order, embedded @ vector, value)
+    assert max(abs(embedded @ vector - value) for vector, value in trees[5]) > 1e-4  # the estimate is of order 4
+    # L-stable: R(z) = 1 + z b (1 - z beta)^-1 1 is at most 1 on the imaginary axis, and goes to 0.
+    z = 1j * np.logspace(-2, 6, 200)
+    size = [abs(1 + x * b @ np.linalg.solve(np.eye(8) - x * beta, one)) for x in z]
+    assert max(size) < 1 + 1e-9 and size[-1] < 1e-4
+
+
+def test_order_of_the_rosenbrock_method():
+    """A nonautonomous equation of two arrays: the end and the dense output."""
+
+    def rate(t, y, args):
+        a, b = y["a"], y["b"]
+        turned = jnp.stack([a[1] * jnp.cos(t) + b[0], -a[0] * a[1] + jnp.sin(3 * t)])
+        return {"a": turned, "b": -b * a[:1] * t}
+
+    start, times = {"a": jnp.asarray([1.0, 0.5]), "b": jnp.asarray([0.7])}, jnp.linspace(0.0, 2.0, 34)
+
+    def run(h, solver=Rodas5P()):  # noqa: B008
+        saveat, term = diffrax.SaveAt(ts=times), diffrax.ODETerm(rate)
+        ys = diffrax.diffeqsolve(term, solver, 0.0, 2.0, h, start, saveat=saveat, max_steps=None).ys
+        return jnp.concatenate(jax.tree.leaves(ys), axis=1)
+
+    exact = np.asarray(quick(lambda h: run(h, diffrax.Dopri8()))(1e-3))
+    found = np.asarray(quick(jax.vmap(run))(0.1 / 2.0 ** np.arange(4)))
+    for error in (np.abs(found[:, -1] - exact[-1]).max(1), np.abs(found - exact).max((1, 2))):
+        assert np.log2(error[:-1] / error[1:]).min() > 4.7, error
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Steps in local coordinates
+
+
+@pytest.fixture(scope="module")
+def bodies():
+    """A joint of every group."""
+    builder = jd.ModelBuilder("bodies", gravity=None)
+    for kind in ("revolute", "planar", "spherical", "free"):
+        axis = {"axis": (0, 0, 1)} if kind == "revolute" else {}
+        builder.add_body(kind, joint=kind, inertia=(1.0, (0, 0, 0), (1.0, 2.0, 2.5)), **axis)
+    return builder.build()
+
+
+def test_local_coordinates_move_as_the_velocity_says(bodies):
+    """The derivative of q0 exp(e) along de/dt is the dq/dt that it was made from."""
+    rng = np.random.default_rng(0)
+    q0, (e, v) = jd.random_configuration(bodies, jax.random.key(0)), rng.normal(size=(2, bodies.nv))
+
+    @quick
+    def both(e, v):
+        q = jd.integrate(bodies, q0, e)
+        rate = jd.configuration_rate(bodies, q, v)
+        local = _per_joint(bodies.topology, _local_rate, q, (rate, True), (e, False))
+        return rate, jax.jvp(lambda e: jd.integrate(bodies, q0, e), (e,), (local,))[1]
+
+    np.testing.assert_allclose(*both(e, v), rtol=1e-13, atol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A body on a ball joint."""
+    builder = jd.ModelBuilder("ball", gravity=None)
+    builder.add_body("ball", joint="spherical", inertia=(1.0, (0, 0, 0), (1.0, 2.0, 2.5)))
+    return builder.build()
+
+
+def turning(ball):
+    """A made-up motion on the manifold of a model that ends with a quaternion."""
+
+    def rates(t, y, args):
+        q, v = y["q"], y["v"]
+        push = jnp.sin(3 * t) + jnp.sum(q[-4:] * jnp.asarray([0.3, -0.2, 0.5, 0.1])) + jnp.cos(q[0])
+        return {"q": jd.configuration_rate(ball, q, v), "v": args * jnp.roll(v, 1) * v[0] + push}
+
+    return diffrax.ODETerm(rates)
+
+
+def turned(ball, h, solver):
+    """The state at two times from a fixed start, by steps of length h."""
+    y0 = {"q": jnp.asarray([0.5, 0.5, -0.5, 0.5]), "v": jnp.asarray([1.0, 1.5, 2.0])}
+    saveat = diffrax.SaveAt(ts=jnp.asarray([0.33, 1.0]))
+    found = diffrax.diffeqsolve(turning(ball), solver, 0.0, 1.0, h, y0, 0.2, saveat=saveat, max_steps=64)
+    return jnp.concatenate([found.ys["q"], found.ys["v"]], 1)
+
+
+@pytest.fixture(scope="module")
+def turned_exactly(ball):
+    return np.asarray(quick(lambda h: turned(ball, h, diffrax.Dopri8()))(1 / 60))
+
+
+IMPLICIT = diffrax.Kvaerno3(root_finder=optimistix.Newton(1e-13, 1e-13))
+
+
+@pytest.mark.parametrize(
+    ("solver", "order"),
+    [(diffrax.Dopri5(), 5), (jd.Rodas5P(), 5), pytest.param(IMPLICIT, 3, marks=pytest.mark.slow)],
+    ids=["Dopri5", "Rodas5P", "Kvaerno3"],
+)
+def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
+    """The order is kept, at steps and between them, and quaternions are of unit length without a projection."""
+    run = quick(jax.vmap(lambda h: turned(ball, h, jd.LieGroup(solver).fitted(ball))))
+    found = np.asarray(run(jnp.asarray([1 / 10, 1 / 20, 1 / 40])))
+    np.testing.assert_allclose(np.linalg.norm(found[..., :4], axis=-1), 1, rtol=1e-14)
+    error = np.abs(found - turned_exactly).max(2)
+    assert np.log2(error[:-1, 1] / error[1:, 1]).min() > order - 0.35, error
+    # Between steps the error depends on where the point is in its step, so over both halvings.
+    assert np.log2(error[0, 0] / error[2, 0]) / 2 > order - 0.8, error
+
+
+def test_gradient_of_an_implicit_step_in_local_coordinates(ball):
+    """Both modes through one step of Rodas5P against differences, and finite at rest."""
+    solver, term = jd.LieGroup(jd.Rodas5P()).fitted(ball), turning(ball)
+
+    def end(z):
+        y0, h = {"q": z[:4] / jnp.sqrt(jnp.sum(z[:4] ** 2)), "v": z[4:]}, jnp.asarray(0.2)
+        y1 = solver.step(term, jnp.zeros(()), h, y0, jnp.asarray(0.2), None, False)[0]
+        return jnp.sum(jnp.concatenate([y1["q"], y1["v"]]) * jnp.arange(1.0, 8.0))
+
+    point = jnp.asarray([0.9, 0.3, -0.1, 0.3, 1.0, -2.0, 3.0])
+    offsets = 1e-3 * np.array([1, -1, 2, -2])[:, None, None] * np.eye(7)
+    one, minus, two, minus_two = np.asarray(
+        quick(jax.vmap(end))(jnp.asarray((np.asarray(point) + offsets).reshape(-1, 7)))
+    ).reshape(4, 7)
+    slope = (8 * (one - minus) - (two - minus_two)) / 0.012
+    rest = jnp.asarray([1.0, 0, 0, 0, 0, 0, 0])
+    reverse, forward = quick(jax.vmap(lambda z: (jax.grad(end)(z), jax.jacfwd(end)(z))))(jnp.stack([point, rest]))
+    np.testing.assert_allclose(reverse[0], slope, rtol=0, atol=1e-9 * np.abs(slope).max())
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-12)
+    assert np.isfinite(reverse).all() and np.any(reverse[1])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Stiffness, and what is made of it
+
+
+def roots(mass, damping, spring):
+    """Rates of m a + d v + k q = 0."""
+    values = np.roots([mass, damping, spring])
+    return max(0.0, -values.real.min()), np.abs(values.imag).max()
+
+
+@pytest.mark.parametrize("damping", [0.0, 3.0, 4e3])
+def test_stiffness_is_that_of_the_linear_system(damping):
+    scene = jd.Scene(slider(2.0), forces=(jd.JointSpring(200.0), jd.JointDamping(damping)))
+    np.testing.assert_allclose(jd.stiffness(scene, [0.3], [1.0]), roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12)
+    found = jd.stiffness(jd.Scene(slider(2.0)), [0.0], [0.0], 0.0, lambda q, v, t: -200.0 * q - damping * v)
+    np.testing.assert_allclose(found, roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12)
+
+
+def test_stiffness_on_constraints():
+    """Two masses that a gear holds together move as one; with a ratio the damper of the second counts by its square."""
+    builder = jd.ModelBuilder("pair", gravity=None)
+    for name, mass in (("a", 1.0), ("b", 3.0)):
+        builder.add_body(name, joint="prismatic", axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
+    forces = (jd.JointSpring(1e4), jd.JointDamping(jnp.asarray([0.0, 5e3])))
+    scene = jd.Scene(builder.build(), (jd.Pfaffian(two_to_one),), forces)
+    found = jd.stiffness(scene, [0.0, 0.0], [0.0, 0.0])
+    np.testing.assert_allclose(found, roots(1 + 4 * 3, 4 * 5e3, 5 * 1e4), rtol=1e-10)
+    with pytest.raises(ValueError, match=r"q has shape \(1,\), expected \(2,\)"):
+        jd.stiffness(scene, [0.0], [0.0, 0.0])
+
+
+def two_to_one(q, t):
+    """Velocities with v1 = 2 v0."""
+    return jnp.asarray([[2.0, -1.0]], q.dtype)
+
+
+def test_default_solver_and_advice_follow_stiffness():
+    """A spring with twice the critical damping: Dopri8 as long as it is slow, Rodas5P where it is not, and the numbers said."""
+    case = cases()["spring"]
+
+    def run(stiffness, **options):
+        scene, control, q0, v0 = case.build(jnp.asarray(stiffness))
+        return jd.simulate(scene, q0, v0, case.ts, control=control, max_steps=400, **options)
+
+    for stiffness, solver in ((1e3, "Dopri8"), (1e9, "Rodas5P")):
+        found = run(stiffness)
+        assert found.solver == solver
+        np.testing.assert_allclose(found.q, case.exact(stiffness), rtol=0, atol=1e-10)
+    with pytest.raises(
+        RuntimeError, match=r"is stiff: the fastest decay is 1.18e\+05 1/s.*above 4.24e-05 s; pass solver=jd.Ro"
+    ):
+        run(1e9, solver=diffrax.Dopri8())
+
+
+def test_implicit_explicit_split():
+    """A released spring with twice the critical damping, decays of 3e2 to 4e3 1/s: springs and dampers are implicit."""
+    k = 1e6
+    scene = jd.Scene(slider(), forces=(jd.JointSpring(k), jd.JointDamping(4 * k**0.5)))
+    times = np.array([0.0, 1e-3, 1e-2, 1.0])
+    found = quick(lambda q: jd.simulate(scene, q, jnp.zeros(1), times, solver=diffrax.KenCarp4()))(jnp.ones(1))
+    rate = k**0.5 * (-2 + np.sqrt(3) * np.array([1, -1]))
+    weights = np.linalg.solve([[1, 1], rate], [1, 0])
+    np.testing.assert_allclose(found.q[:, 0], np.exp(np.outer(times, rate)) @ weights, rtol=0, atol=1e-6)
+    assert found.success and found.solver == "KenCarp4" and found.stats["num_steps"] < 400
+    with pytest.raises(ValueError, match="adjoint is 'backsolve', which KenCarp4 cannot serve"):
+        jd.simulate(scene, [1.0], [0.0], times, solver=diffrax.KenCarp4(), adjoint="backsolve")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Verdicts
+
+
+def test_rodas_serves_at_every_stiffness():
+    """Springs of 1e2 to 1e9 N/m in one program: positions and their derivatives against closed forms."""
+    case = cases()["flexible_joint"]
+    case = case._replace(values=case.values[[0, 2, 5, 7]])
+    run = quick(jax.vmap(program(case, jd.Rodas5P(), max_steps=1024), (0, None)))
+    q, slope, steps, success = run(case.values, 1e-8)
+    step = 1e-3
+    ends = [np.stack([case.exact(k * np.exp(n * step)) for k in case.values]) for n in (0, 1, -1, 2, -2)]
+    expected = (8 * (ends[1] - ends[2]) - (ends[3] - ends[4])) / (12 * step)
+    assert success.all() and steps.max() < 300
+    np.testing.assert_allclose(q, ends[0], rtol=0, atol=1e-6 * case.size)
+    np.testing.assert_allclose(slope, expected, rtol=0, atol=1e-5 * case.size)
