@@ -17,17 +17,19 @@ def rates(dtypes, gradient):
     """Angular rates up to 1e4 rad/s: a free body, 10 rad of its time"""
     base, (q, start) = jd.scenes.free_body(), jd.scenes.free_body.start()
     factors = np.array([1e-4, 1.0, 1e2, 1e4])
+    reference = references.free_top(np.array([0.0, 5.0, 10.0]))
+    turned = jnp.asarray(reference.q[-1])
 
     def run(factor, x):
         dtype = factor.dtype
         ts = jnp.asarray([0.0, 5.0, 10.0], dtype) / factor
         v = start.astype(dtype).at[0].add(x) * factor
         found = jd.simulate(as_dtype(base, dtype), q.astype(dtype), v, ts)
-        end = jnp.concatenate([found.q[-1], found.v[-1] / factor])
+        quaternion = found.q[-1] * jnp.sign(jnp.sum(found.q[-1] * turned.astype(dtype)))
+        end = jnp.concatenate([quaternion, found.v[-1] / factor])
         return outcome(found, end=end, value=jnp.sum(end))
 
     studied = study(run, jnp.asarray(factors), dtypes, gradient)
-    reference = references.free_top(np.array([0.0, 5.0, 10.0]))
     exact = np.tile(np.concatenate([reference.q[-1], reference.v[-1]]), (len(factors), 1))
     labels = [f"{np.linalg.norm(start) * f:.0e} rad/s" for f in factors]
     return table("rates", labels, studied, exact, LOOSE, "Jacobi's functions", residual=False, advice=RATES)
@@ -36,7 +38,7 @@ def rates(dtypes, gradient):
 @case
 def turns(dtypes, gradient):
     """Angles of up to 1e6 turns: a double pendulum of rods that starts there, 1 s"""
-    count = np.array([0.0, 1.0, 1e3, 1e6])
+    count = np.array([0.0, 10.0, 30.0, 100.0, 300.0, 1e3, 1e6])
 
     def run(turned, x):
         dtype = turned.dtype
@@ -144,24 +146,23 @@ def steps(dtypes, gradient):
                 measured = near[i, np.argmin(stable[i]) - 1]
                 at = f"{name}, {kind}: {measured:.3f}"
                 error = abs(measured / theory[i] - 1)
-                rows.append(Row("steps", at, dtype, error, 1e-3, f"R(z): {theory[i]:.3f}", None, False, "successful", None, True, STEPS))
+                rows.append(Row("steps", at, dtype, error, {"float64": 1e-3, "float32": 5e-3}[dtype], f"R(z): {theory[i]:.3f}", None, False, "successful", None, True, STEPS))
     return rows
 
 
 @case
 def beyond(dtypes, gradient):
     """Fixed steps of RK4 beyond the limit on an oscillator: the size that should stay 1"""
-    factors = np.array([0.5, 0.99, 1.01, 1.1, 2.0])
+    factors = np.array([0.05, 0.5, 0.99, 1.01, 1.1, 2.0])
     limit = stability_limits(None)[1]
 
     def run(rate, x):
-        sizes, found = run_oscillator(rate, 0 * rate, None, 4000)
+        sizes, found = run_oscillator(rate, 0 * rate, None, 2000)
         return Outcome(jnp.minimum(sizes[1], jnp.full_like(rate, 1e30)), x, found.result._value, x)
 
     studied = study(run, jnp.asarray(factors * limit), dtypes, False)
     labels = [f"{f} of the limit" for f in factors]
-    # Within the limit the method damps: what it does there is inaccurate, and stable.
-    return table("beyond", labels, studied, np.ones((5, 1)), {d: 1.0 for d in dtypes}, "1", residual=False, advice=STEPS)
+    return table("beyond", labels, studied, np.ones((6, 1)), {d: 1e-2 for d in dtypes}, "1", residual=False, advice=STEPS, tolerance=False)
 
 
 @case
@@ -228,8 +229,9 @@ def million(dtypes, gradient, count=1_000_000):
         found = program(*(jnp.asarray(x, dtype) for x in (*start, ts)))
         code = name_of(found.result._value)
         q, v, energy = (np.asarray(x, float) for x in (found.q, found.v, found.energy))
+        signs = np.sign(np.sum(q * reference.q, 1, keepdims=True))
         checks = {
-            "state": np.abs(np.concatenate([q - reference.q, v - reference.v], 1)).max(1),
+            "state": np.maximum(np.abs(q * signs - reference.q).max(1), np.abs(v - reference.v).max(1)),
             "energy": np.abs(energy / energy[0] - 1),
             "length of the quaternion": np.abs(np.linalg.norm(q, axis=1) - 1),
         }

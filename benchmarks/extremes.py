@@ -3,7 +3,8 @@
     python -m benchmarks.extremes [CASE ...] [--out docs/extremes_table.md]
 
 A row is "right" where the run succeeded within the error that the case allows, "refused" where a result code or an exception says that
-there is no answer, and "SILENT" where a wrong answer came with success: none may be. Gradients are reverse mode, compared
+there is no answer, and "SILENT" where a wrong answer came with success: none may be. Fixed steps have no tolerance to keep; where they
+are wrong the row says "no code". Gradients are reverse mode, compared
 with central differences of order 4 in float64; "digits" counts those that agree.
 """
 
@@ -45,15 +46,16 @@ class Row(NamedTuple):
     digits: float | None
     gradient_finite: bool
     advice: str
+    tolerance: bool = True
 
     @property
     def verdict(self) -> str:
-        """right, refused or SILENT."""
+        """right, refused, SILENT, or, where no tolerance was asked for, "no code"."""
         if self.code != "successful":
             return "refused"
         wrong = self.nan or not self.error <= self.allowed
         lost = self.digits is not None and (not self.gradient_finite or self.digits < 1)
-        return "SILENT" if wrong or lost else "right"
+        return "right" if not (wrong or lost) else "SILENT" if self.tolerance else "no code"
 
     def cells(self) -> tuple[str, ...]:
         """The row as text."""
@@ -163,7 +165,7 @@ def digits_of(found: float, want: float) -> float:
     return 16.0 if apart == 0 else min(16.0, -math.log10(apart))
 
 
-def table(name, labels, studied: Study, exact, allowed, against, *, size=None, advice="", residual=True, wanted=None):
+def table(name, labels, studied: Study, exact, allowed, against, *, size=None, advice="", residual=True, wanted=None, tolerance=True):
     """Rows of a study. `exact` (points, .) is what the ends are compared with, relative to `size` (default: its largest).
 
     `allowed`: by dtype a number or one a point. `wanted` (points,): the gradient in place of the difference quotient.
@@ -192,6 +194,7 @@ def table(name, labels, studied: Study, exact, allowed, against, *, size=None, a
                     digits,
                     slope is None or bool(np.isfinite(slope[i])),
                     advice,
+                    tolerance,
                 )
             )
     return rows

@@ -32,7 +32,7 @@ from jaxdyn.solvers.choice import (
     progress_meter,
     stepping,
 )
-from jaxdyn.solvers.inputs import as_array, check_state, check_times
+from jaxdyn.solvers.inputs import as_array, check_state, check_times, check_turns, most_turned, turning
 from jaxdyn.systems import System, retract
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
@@ -41,10 +41,11 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a simulation ended: diffrax's codes and five more."""
+    """How a simulation ended: diffrax's codes and six more."""
 
     nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
     nonfinite_state = "The state became NaN or infinite."
+    coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
     inconsistent_start = "The initial state is not on the constraints."
     open_constraints = "The constraints opened, and the projection could not close them."
     singular_basis = "The minimal velocities no longer determine the others."
@@ -57,6 +58,7 @@ _ADVICE = {
     "which fixed steps pass (stepsize=0.01); or rtol and atol are below the rounding error",
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+    "coarse_start": "subtract whole turns from q0, use float64, or take fixed steps",
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
     "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
     "method='projected' needs none",
@@ -176,6 +178,8 @@ def simulate(
     if isinstance(scene.system, System) and is_concrete((scene, q0, v0, ts)):
         with jax.ensure_compile_time_eval():
             scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
+    if not is_fixed(stepsize) and is_concrete(q0):
+        check_turns(scene, q0, state_dtype(scene.system))
     control = None if control is None else as_pytree(control, "control")
     solver = checked_method(solver, stepsize)
     adjoint = checked_adjoint(adjoint, solver)
@@ -281,6 +285,10 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     if first is not None:
         result = RESULTS.where(serves(first), result, RESULTS.singular_basis)
     result = RESULTS.where(held, result, RESULTS.inconsistent_start)
+    angles = turning(system)
+    if angles.size and not is_fixed(steps[-1]):
+        coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
+        result = RESULTS.where(coarse, RESULTS.coarse_start, result)
     result = RESULTS.where(good, result, RESULTS.nonfinite_start)
 
     def report(q, v, t):
