@@ -2,7 +2,6 @@
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
@@ -45,15 +44,17 @@ RATIOS = np.array([1e-8, 1e-4, 1.0, 1e4, 1e8])
 _Q = np.array([0.3, -0.2, 0.4, 0.1, -0.3, 0.2])
 _V = np.array([0.5, -0.3, 0.2, 0.6, -0.4, 0.1])
 MASSES = (
-    "A light link that carries a heavy one is left with eps times the ratio of the masses: 1e8 leaves eight digits in float64; in "
-    "float32 1e4 leaves three and 1e8 none. `forward_dynamics` returns an acceleration and no code; `simulate` ends with one. "
-    "Use float64; give light links the armature that their motors have; leave out a body of no consequence. A joint that moves no "
-    "inertia is refused when the model is built; made so afterwards, it gives NaN and the code `dt_min_reached`."
+    "A light link that carries a heavy one is left with eps times the ratio of the masses: 1e8 leaves eight "
+    "digits in float64; in float32 1e4 leaves three and 1e8 none. `forward_dynamics` returns an acceleration and "
+    "no code; `simulate` ends with one. Use float64; give light links the armature that their motors have; leave "
+    "out a body of no consequence. A joint that moves no inertia is refused when the model is built; made so "
+    "afterwards, it gives NaN and the code `dt_min_reached`."
 )
 LINKS_ADVICE = "Nothing. Energies are relative to the total weight times 1 m."
 TWINS = (
-    "`atol` is in the units of the state: an error of 1e-8 m is coarse for a slide of 1e-6 m and below rounding for one of 1e6 m. Scale "
-    "`atol` with the mechanism, or choose units in which it has size one. Angles need nothing, and fixed steps know no units."
+    "`atol` is in the units of the state: an error of 1e-8 m is coarse for a slide of 1e-6 m and below rounding "
+    "for one of 1e6 m. Scale `atol` with the mechanism, or choose units in which it has size one. Angles need "
+    "nothing, and fixed steps know no units."
 )
 
 
@@ -129,7 +130,17 @@ def links(dtypes, gradient, counts=LINKS):
             studied = study(run, jnp.ones(1), dtypes, gradient)
             name = f"{'chain' if branching == 1 else 'tree'} of {count}"
             allowed = {"float64": 1e-8, "float32": 1e-5 * count}
-            rows += table("links", [name], studied, np.zeros((1, 1)), allowed, "energy", size=1.0, residual=False, advice=LINKS_ADVICE)
+            rows += table(
+                "links",
+                [name],
+                studied,
+                np.zeros((1, 1)),
+                allowed,
+                "energy",
+                size=1.0,
+                residual=False,
+                advice=LINKS_ADVICE,
+            )
     return rows
 
 
@@ -174,7 +185,13 @@ def twins(dtypes, gradient):
         same = np.asarray(studied.outcomes["float64"].end)[2]
         how = "adaptive" if stepsize is None else "fixed"
         rows += table(
-            "twins", [f"{label}, {how}" for label in labels], studied, np.tile(same, (len(twins), 1)), allowed,
-            "the twin of 1 m and 1 kg", residual=False, advice=TWINS,
+            "twins",
+            [f"{label}, {how}" for label in labels],
+            studied,
+            np.tile(same, (len(twins), 1)),
+            allowed,
+            "the twin of 1 m and 1 kg",
+            residual=False,
+            advice=TWINS,
         )
     return rows

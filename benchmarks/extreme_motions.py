@@ -38,7 +38,7 @@ def rates(dtypes, gradient):
 @case
 def turns(dtypes, gradient):
     """Angles of up to 1e6 turns: a double pendulum of rods that starts there, 1 s"""
-    count = np.array([0.0, 10.0, 30.0, 100.0, 300.0, 1e3, 1e6])
+    count = np.array([0.0, 1.0, 100.0, 1e3, 1e6])
 
     def run(turned, x):
         dtype = turned.dtype
@@ -124,10 +124,10 @@ def run_oscillator(rate, damping, solver, count):
 
 
 @case
-def steps(dtypes, gradient):
+def steps(dtypes, gradient, solvers=None):
     """Fixed steps up to instability: the largest stable step times the rate of a damper and of an oscillator"""
     count, rows = 400, []
-    for name, solver in SOLVERS.items():
+    for name, solver in (solvers or SOLVERS).items():
         # Growth by a factor 1.001 in 200 steps counts as unstable, in theory and as measured.
         theory = stability_limits(solver, 1.001 ** (1 / 200))
         near = np.stack([np.linspace(0.9, 1.1, 401) * limit for limit in theory])
@@ -146,7 +146,22 @@ def steps(dtypes, gradient):
                 measured = near[i, np.argmin(stable[i]) - 1]
                 at = f"{name}, {kind}: {measured:.3f}"
                 error = abs(measured / theory[i] - 1)
-                rows.append(Row("steps", at, dtype, error, {"float64": 1e-3, "float32": 5e-3}[dtype], f"R(z): {theory[i]:.3f}", None, False, "successful", None, True, STEPS))
+                rows.append(
+                    Row(
+                        "steps",
+                        at,
+                        dtype,
+                        error,
+                        {"float64": 1e-3, "float32": 5e-3}[dtype],
+                        f"R(z): {theory[i]:.3f}",
+                        None,
+                        False,
+                        "successful",
+                        None,
+                        True,
+                        STEPS,
+                    )
+                )
     return rows
 
 
@@ -162,7 +177,17 @@ def beyond(dtypes, gradient):
 
     studied = study(run, jnp.asarray(factors * limit), dtypes, False)
     labels = [f"{f} of the limit" for f in factors]
-    return table("beyond", labels, studied, np.ones((6, 1)), {d: 1e-2 for d in dtypes}, "1", residual=False, advice=STEPS, tolerance=False)
+    return table(
+        "beyond",
+        labels,
+        studied,
+        np.ones((6, 1)),
+        {d: 1e-2 for d in dtypes},
+        "1",
+        residual=False,
+        advice=STEPS,
+        tolerance=False,
+    )
 
 
 @case
@@ -176,7 +201,16 @@ def chaos(dtypes, gradient):
 
         def motion(x):
             q = jnp.asarray(q0, dtype) + x * jnp.asarray(side, dtype)
-            return jd.simulate(model, q, jnp.zeros(2, dtype), jnp.asarray(ts, dtype), rtol=tol, atol=tol, outputs=("energy",), adjoint="forward")
+            return jd.simulate(
+                model,
+                q,
+                jnp.zeros(2, dtype),
+                jnp.asarray(ts, dtype),
+                rtol=tol,
+                atol=tol,
+                outputs=("energy",),
+                adjoint="forward",
+            )
 
         def state(x):
             found = motion(x)
@@ -193,12 +227,27 @@ def chaos(dtypes, gradient):
     rows = [_grown("two starts 1e-12 apart", "float64", apart, stretch, small, 1.0, 0.1, "successful")]
     loose, _, found = quick(jax.vmap(run("float64", 1e-8)))(jnp.zeros(1))
     error = np.linalg.norm(np.asarray(loose)[0] - states[0], axis=1)
-    rows.append(_grown("rtol 1e-8", "float64", error, stretch, stretch * 1e-7 < 0.1, 1e-8, 100.0, name_of(found.result._value[0])))
+    rows.append(
+        _grown(
+            "rtol 1e-8", "float64", error, stretch, stretch * 1e-7 < 0.1, 1e-8, 100.0, name_of(found.result._value[0])
+        )
+    )
     rows.append(_kept("rtol 1e-8", "float64", found.energy[0], 1e-6))
     if "float32" in dtypes:
         single, _, found = quick(jax.vmap(run("float32", 1e-6)))(jnp.zeros(1, jnp.float32))
         error = np.linalg.norm(np.asarray(single, float)[0] - states[0], axis=1)
-        rows.append(_grown("rtol 1e-6", "float32", error, stretch, stretch * 1e-5 < 0.1, 1e-6, 100.0, name_of(found.result._value[0])))
+        rows.append(
+            _grown(
+                "rtol 1e-6",
+                "float32",
+                error,
+                stretch,
+                stretch * 1e-5 < 0.1,
+                1e-6,
+                100.0,
+                name_of(found.result._value[0]),
+            )
+        )
         rows.append(_kept("rtol 1e-6", "float32", found.energy[0], 1e-3))
     return rows
 
@@ -208,7 +257,20 @@ def _grown(what, dtype, error, stretch, small, unit, allowed, code):
     ratio = float((error[small][1:] / stretch[small][1:]).max() / unit)
     ratio = abs(ratio - 1) if unit == 1.0 else ratio
     last = np.flatnonzero(small)[-1]
-    return Row("chaos", f"{what}, to {last / 2:.0f} s", dtype, ratio, allowed, "tangent map", None, False, code, None, True, CHAOS)
+    return Row(
+        "chaos",
+        f"{what}, to {last / 2:.0f} s",
+        dtype,
+        ratio,
+        allowed,
+        "tangent map",
+        None,
+        False,
+        code,
+        None,
+        True,
+        CHAOS,
+    )
 
 
 def _kept(what, dtype, energy, allowed):
@@ -225,7 +287,11 @@ def million(dtypes, gradient, count=1_000_000):
     reference = references.free_top(ts)
     rows = []
     for dtype in dtypes:
-        program = quick(lambda q, v, ts: jd.simulate(as_dtype(base, q.dtype), q, v, ts, stepsize=0.01, max_steps=2 * count, outputs=("energy",)))
+        program = quick(
+            lambda q, v, ts: jd.simulate(
+                as_dtype(base, q.dtype), q, v, ts, stepsize=0.01, max_steps=2 * count, outputs=("energy",)
+            )
+        )
         found = program(*(jnp.asarray(x, dtype) for x in (*start, ts)))
         code = name_of(found.result._value)
         q, v, energy = (np.asarray(x, float) for x in (found.q, found.v, found.energy))
@@ -235,13 +301,32 @@ def million(dtypes, gradient, count=1_000_000):
             "energy": np.abs(energy / energy[0] - 1),
             "length of the quaternion": np.abs(np.linalg.norm(q, axis=1) - 1),
         }
-        allowed = {"state": MILLION_STATE[dtype], "energy": MILLION_ENERGY[dtype], "length of the quaternion": 4 * np.finfo(dtype).eps}
+        allowed = {
+            "state": MILLION_STATE[dtype],
+            "energy": MILLION_ENERGY[dtype],
+            "length of the quaternion": 4 * np.finfo(dtype).eps,
+        }
         for what, error in checks.items():
             for i in (1, 2, 3):
                 n = f"{ts[i] / 0.01:.0e} steps"
                 against = "Jacobi's functions" if what == "state" else "what is conserved"
                 bound = allowed[what] * (1.0 if what.startswith("length") else max(ts[i] / ts[3], 1e-2))
-                rows.append(Row("million", f"{what}, {n}", dtype, float(error[i]), bound, against, None, bool(np.isnan(error[i])), code, None, True, MILLION))
+                rows.append(
+                    Row(
+                        "million",
+                        f"{what}, {n}",
+                        dtype,
+                        float(error[i]),
+                        bound,
+                        against,
+                        None,
+                        bool(np.isnan(error[i])),
+                        code,
+                        None,
+                        True,
+                        MILLION,
+                    )
+                )
     return rows
 
 
@@ -249,20 +334,23 @@ MILLION_STATE = {"float64": 1e-6, "float32": 1.0}
 MILLION_ENERGY = {"float64": 1e-8, "float32": 1e-2}
 RATES = "Nothing."
 TURNS = (
-    "An angle of n turns is rounded to 6 n eps: after 1e6 turns 1e-9 rad in float64, and half a radian in float32. Start with the whole turns "
-    "of continuous joints subtracted; nothing but the angle itself depends on them. A quaternion has no such limit."
+    "An angle of n turns is rounded to 6 n eps: after 1e6 turns 1e-9 rad in float64, and half a radian in "
+    "float32. Adaptive steps refuse to start beyond 150 turns in float32 (3.5e6 in float64). Subtract the whole "
+    "turns; nothing but springs and limits depends on them. A quaternion has no such limit."
 )
 GRAVITY = "Nothing; `atol` and the span in s belong to the time scale sqrt(l/g)."
 STEPS = (
-    "Fixed steps have no error estimate, so a step that is too long carries no code before the state overflows (`nonfinite_state`). "
-    "Ask for outputs=('energy', 'work'): their difference is constant. Or compare with half the step, or take adaptive steps, which "
-    "keep to the limit by themselves. The limit divided by the fastest rate sqrt(k/m) or c/m of the mechanism is the longest step."
+    "Fixed steps have no error estimate, so a step that is too long carries no code before the state overflows "
+    "(`nonfinite_state`). Ask for outputs=('energy', 'work'): their difference is constant. Or compare with half "
+    "the step, or take adaptive steps, which keep to the limit by themselves. The limit divided by the fastest "
+    "rate sqrt(k/m) or c/m of the mechanism is the longest step."
 )
 CHAOS = (
-    "Errors grow as the motion makes any difference grow, whatever the method: one digit less of the start or of the tolerance shortens by "
-    "ln(10)/rate the time for which the state is known. Energy is kept all the same. Gradients grow with it: take short spans."
+    "Errors grow as the motion makes any difference grow, whatever the method: one digit less of the start or of "
+    "the tolerance shortens by ln(10)/rate the time for which the state is known. Energy is kept all the same. "
+    "Gradients grow with it: take short spans."
 )
 MILLION = (
-    "Take adaptive steps or a shorter step where the phase matters: the error of RK4 grows in proportion to time. In float32 rounding of each step "
-    "adds up as well."
+    "Take adaptive steps or a shorter step where the phase matters: the error of RK4 grows in proportion to time. "
+    "In float32 rounding of each step adds up as well."
 )

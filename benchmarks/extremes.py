@@ -1,11 +1,11 @@
 """Extreme cases: for each the error, the residual, the result code, the gradient, a verdict, and what a user should do.
 
-    python -m benchmarks.extremes [CASE ...] [--out docs/extremes_table.md]
+    python -m benchmarks.extremes [CASE ...] [--out docs/extremes.md]
 
-A row is "right" where the run succeeded within the error that the case allows, "refused" where a result code or an exception says that
-there is no answer, and "SILENT" where a wrong answer came with success: none may be. Fixed steps have no tolerance to keep; where they
-are wrong the row says "no code". Gradients are reverse mode, compared
-with central differences of order 4 in float64; "digits" counts those that agree.
+A row is "right" where the run succeeded within the error that the case allows, "refused" where a result code says that
+there is no answer, and "SILENT" where a wrong answer came with success: none may be. Fixed steps have no tolerance to
+keep; where they are wrong the row says "no code". Gradients are reverse mode, compared with central differences of
+order 4 in float64; "digits" counts those that agree.
 """
 
 import argparse
@@ -165,7 +165,21 @@ def digits_of(found: float, want: float) -> float:
     return 16.0 if apart == 0 else min(16.0, -math.log10(apart))
 
 
-def table(name, labels, studied: Study, exact, allowed, against, *, size=None, advice="", residual=True, wanted=None, tolerance=True):
+def table(
+    name,
+    labels,
+    studied: Study,
+    exact,
+    allowed,
+    against,
+    *,
+    size=None,
+    advice="",
+    residual=True,
+    wanted=None,
+    tolerance=True,
+    results=None,
+):
     """Rows of a study. `exact` (points, .) is what the ends are compared with, relative to `size` (default: its largest).
 
     `allowed`: by dtype a number or one a point. `wanted` (points,): the gradient in place of the difference quotient.
@@ -190,7 +204,7 @@ def table(name, labels, studied: Study, exact, allowed, against, *, size=None, a
                     against,
                     float(found.residual[i]) if residual else None,
                     bool(np.isnan(end[i]).any()),
-                    name_of(found.code[i]),
+                    name_of(found.code[i], results),
                     digits,
                     slope is None or bool(np.isfinite(slope[i])),
                     advice,
@@ -216,6 +230,16 @@ def markdown(name: str, rows: Sequence[Row]) -> str:
     return "\n".join([*lines, "", *(f"**What to do.** {text}" for text in advice), ""])
 
 
+def replace_section(path: Path, name: str, text: str) -> None:
+    """Put the table of a case between its marks in a document, at the end where it has none."""
+    document = path.read_text() if path.exists() else ""
+    begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->\n"
+    if begin not in document:
+        document += f"\n{begin}{end}"
+    before, rest = document.split(begin)
+    path.write_text(f"{before}{begin}{text}{end}{rest.split(end)[1]}")
+
+
 def _number(x: float) -> str:
     return "-" if math.isnan(x) else "0" if x == 0 else f"{x:.1e}"
 
@@ -224,19 +248,19 @@ def main() -> None:
     """Run the cases and print their tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("cases", nargs="*", help="names of cases; default: all")
-    parser.add_argument("--out", type=Path, help="also write the tables into this file")
+    parser.add_argument("--out", type=Path, help="also put the tables into this document")
     parser.add_argument("--no-gradient", action="store_true", help="leave gradients out")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    cases, parts, silent = load(), [], 0
+    cases, silent = load(), 0
     for name in options.cases or cases:
         begin = time.perf_counter()
         rows = cases[name](DTYPES, not options.no_gradient)
-        parts.append(markdown(name, rows))
-        print(parts[-1], f"({time.perf_counter() - begin:.0f} s)\n", sep="\n", flush=True)
+        text = markdown(name, rows)
+        print(text, f"({time.perf_counter() - begin:.0f} s)\n", sep="\n", flush=True)
         silent += sum(row.verdict == "SILENT" for row in rows)
-    if options.out:
-        options.out.write_text("\n".join(parts))
+        if options.out:
+            replace_section(options.out, name, text)
     print(f"{silent} silent failures")
 
 

@@ -43,8 +43,8 @@ def check_state(scene: Scene, q0, v0) -> None:
 def most_turned(dtype) -> float:
     """Largest angle (rad) that adaptive steps start from: 150 turns in float32, 3.5e6 in float64.
 
-    Beyond it the angle moves by steps of sqrt(eps)/3 and more, which the error estimates of the rates take for errors of the method,
-    and shorter steps make worse.
+    Beyond it the angle moves by steps of sqrt(eps)/3 and more. Error estimates of the rates take them for errors of the
+    method, and shorter steps make them worse.
     """
     return 1 / (3 * float(jnp.finfo(dtype).eps) ** 0.5)
 
@@ -66,8 +66,8 @@ def check_turns(scene: Scene, q0, dtype) -> None:
         index = int(angles[np.argmax(turned)])
         value, eps = float(q0[index]), float(jnp.finfo(dtype).eps)
         raise ValueError(
-            f"q0 is {value:.6g} rad at index {index}, which {jnp.dtype(dtype).name} holds only to {eps * abs(value):.1g} rad; subtract "
-            f"the {round(value / (2 * np.pi))} whole turns, use float64, or fixed steps (stepsize=0.01)"
+            f"q0 is {value:.6g} rad at index {index}, which {jnp.dtype(dtype).name} holds only to {eps * abs(value):.1g} rad; "
+            f"subtract the {round(value / (2 * np.pi))} whole turns, use float64, or fixed steps (stepsize=0.01)"
         )
 
 
