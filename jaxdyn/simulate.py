@@ -156,9 +156,9 @@ def simulate(
     **Returns:** a `Solution`. Save points between steps come from the method's dense output. Where that is less
     accurate than the steps (Kvaerno5), adaptive steps end on every save point.
 
-    **Raises:** ValueError for wrong shapes, NaN, times that do not increase, quaternions far from unit length, a start
-    off the constraints or without a motion (a singular mass matrix of a `System`), constraints that remove all freedom,
-    unknown options, with names and values.
+    **Raises:** ValueError for wrong shapes, NaN, times that do not increase, quaternions far from unit length, angles of
+    too many turns for the dtype, a start off the constraints or without a motion (a singular mass matrix of a
+    `System`), constraints that remove all freedom, unknown options, with names and values.
     RuntimeError with the time reached, the cause and the fix, if it fails and `throw`.
 
     ```python
