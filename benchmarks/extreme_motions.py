@@ -351,6 +351,6 @@ CHAOS = (
     "Gradients grow with it: take short spans."
 )
 MILLION = (
-    "Take adaptive steps or a shorter step where the phase matters: the error of RK4 grows in proportion to time. "
-    "In float32 rounding of each step adds up as well."
+    "Take adaptive steps or a shorter step where the phase matters: the energy error of RK4 grows in proportion to time "
+    "and the phase with its square. In float32 the rounding of each step adds up as well."
 )

@@ -73,14 +73,14 @@ def test_too_many_turns_are_refused_by_name():
 
 
 SLOW = {
-    "mass_motion": (BOTH, True),
+    "mass_motion": (ONE, True),
     "twins": (BOTH, False),
     "gravity": (BOTH, True),
-    "planes": (BOTH, True),
+    "planes": (ONE, True),
     "bases": (ONE, False),
-    "starts": (ONE, True),
+    "starts": (ONE, False),
     "chaos": (BOTH, False),
-    "million": (BOTH, False),
+    "million": (ONE, False),
 }
 
 
@@ -95,17 +95,15 @@ def test_verdicts_of_long_runs(name):
 
 @pytest.mark.slow
 def test_grasps_near_loss_of_closure():
-    expected = refused("singular_basis", ["float32"], *KNEES) | refused("singular_basis", ONE, *KNEES[2:])
-    assert verdicts(CASES["grasps"](BOTH, True)) == expected
+    assert verdicts(CASES["grasps"](ONE, True)) == refused("singular_basis", ONE, *KNEES[2:])
 
 
 @pytest.mark.slow
 def test_five_hundred_links_in_motion():
-    assert not verdicts(CASES["links"](ONE, True, counts=(1, 500)))
+    assert not verdicts(CASES["links"](ONE, False, counts=(1, 500)))
 
 
 @pytest.mark.slow
 def test_through_the_flat_position():
-    runs = ((1, "projected", None), (1, "reduced", None), (2, "projected", 0.005))
-    found = verdicts(CASES["flat"](BOTH, False, runs=runs))
+    found = verdicts(CASES["flat"](BOTH, False, runs=((1, "projected", None), (1, "projected", 0.005))))
     assert found == refused("dt_min_reached", ["float32"], "1 window, projected, adaptive")
