@@ -40,7 +40,7 @@ from jaxdyn.solvers.choice import (
     progress_meter,
     stepping,
 )
-from jaxdyn.solvers.inputs import as_array, check_state, check_times
+from jaxdyn.solvers.inputs import as_array, check_state, check_times, check_turns, most_turned, turning
 from jaxdyn.systems import System, displace, retract, velocity_to_rate
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
@@ -49,10 +49,11 @@ _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a simulation ended: diffrax's codes and five more."""
+    """How a simulation ended: diffrax's codes and six more."""
 
     nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
     nonfinite_state = "The state became NaN or infinite."
+    coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
     inconsistent_start = "The initial state is not on the constraints."
     open_constraints = "The constraints opened, and the projection could not close them."
     singular_basis = "The minimal velocities no longer determine the others."
@@ -65,6 +66,7 @@ _ADVICE = {
     "which fixed steps pass (stepsize=0.01); or rtol and atol are below the rounding error",
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+    "coarse_start": "subtract whole turns from q0, use float64, or take fixed steps",
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
     "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
     "method='projected' needs none",
@@ -169,9 +171,9 @@ def simulate(
     **Returns:** a `Solution`. Save points between steps come from the method's dense output. Where that is less
     accurate than the steps (Kvaerno5), adaptive steps end on every save point.
 
-    **Raises:** ValueError for wrong shapes, NaN, times that do not increase, quaternions far from unit length, a start
-    off the constraints or without a motion (a singular mass matrix of a `System`), constraints that remove all freedom,
-    unknown options, with names and values.
+    **Raises:** ValueError for wrong shapes, NaN, times that do not increase, quaternions far from unit length, angles of
+    too many turns for the dtype, a start off the constraints or without a motion (a singular mass matrix of a
+    `System`), constraints that remove all freedom, unknown options, with names and values.
     RuntimeError with the time reached, the cause and the fix, if it fails and `throw`.
 
     ```python
@@ -191,6 +193,8 @@ def simulate(
     if isinstance(scene.system, System) and is_concrete((scene, q0, v0, ts)):
         with jax.ensure_compile_time_eval():
             scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
+    if not is_fixed(stepsize) and is_concrete(q0):
+        check_turns(scene, q0, state_dtype(scene.system))
     control = None if control is None else as_pytree(control, "control")
     backwards = adjoint == "backsolve" or isinstance(adjoint, diffrax.BacksolveAdjoint)
     if solver is None and scene.forces and not (is_fixed(stepsize) or backwards):
@@ -345,6 +349,10 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     if first is not None:
         result = RESULTS.where(serves(first), result, RESULTS.singular_basis)
     result = RESULTS.where(held, result, RESULTS.inconsistent_start)
+    angles = turning(system)
+    if angles.size and not is_fixed(steps[-1]):
+        coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
+        result = RESULTS.where(coarse, RESULTS.coarse_start, result)
     result = RESULTS.where(good, result, RESULTS.nonfinite_start)
 
     def report(q, v, t):

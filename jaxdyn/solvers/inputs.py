@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn._tracing import is_concrete
+from jaxdyn.model import Model
 from jaxdyn.scene import Scene
 from jaxdyn.systems import has_quaternions
 
@@ -37,6 +38,37 @@ def check_state(scene: Scene, q0, v0) -> None:
                     f"q0 has a quaternion of length {norm:.6g} at joint {joint!r}, expected 1; "
                     "divide it by its length (order w, x, y, z)"
                 )
+
+
+def most_turned(dtype) -> float:
+    """Largest angle (rad) that adaptive steps start from: 150 turns in float32, 3.5e6 in float64.
+
+    Beyond it the angle moves by steps of sqrt(eps)/3 and more. Error estimates of the rates take them for errors of the
+    method, and shorter steps make them worse.
+    """
+    return 1 / (3 * float(jnp.finfo(dtype).eps) ** 0.5)
+
+
+def turning(system) -> np.ndarray:
+    """Indices in q of the angles of a `Model` that come back after a turn."""
+    if not isinstance(system, Model):
+        return np.zeros(0, int)
+    top = system.topology
+    places = zip(top.kinds, top.q_slices, strict=True)
+    return np.array([at.stop - 1 for kind, at in places if kind in ("revolute", "continuous", "planar")], int)
+
+
+def check_turns(scene: Scene, q0, dtype) -> None:
+    """Refuse angles of so many turns that their dtype holds too little of the rest."""
+    angles = turning(scene.system)
+    turned = np.abs(np.asarray(q0, float)[angles])
+    if turned.size and turned.max() > most_turned(dtype):
+        index = int(angles[np.argmax(turned)])
+        value, eps = float(q0[index]), float(jnp.finfo(dtype).eps)
+        raise ValueError(
+            f"q0 is {value:.6g} rad at index {index}, which {jnp.dtype(dtype).name} holds only to {eps * abs(value):.1g} rad; "
+            f"subtract the {round(value / (2 * np.pi))} whole turns, use float64, or fixed steps (stepsize=0.01)"
+        )
 
 
 def check_times(ts) -> None:

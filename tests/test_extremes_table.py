@@ -1,0 +1,109 @@
+"""The table of extreme cases: what is right, what is refused and by which code; nothing wrong comes with success."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import extremes
+from benchmarks.extreme_motions import SOLVERS, stability_limits
+from jaxdyn import robots
+from jaxdyn.simulate import simulate
+
+CASES = extremes.load()
+BOTH, ONE = ("float64", "float32"), ("float64",)
+
+
+def verdicts(rows):
+    """The rows that are not right, by place and dtype, with their codes."""
+    return {
+        (row.at, row.dtype): row.verdict if row.verdict != "refused" else row.code
+        for row in rows
+        if row.verdict != "right"
+    }
+
+
+def refused(code, dtypes, *places):
+    """Expected refusals."""
+    return {(place, dtype): code for dtype in dtypes for place in places}
+
+
+KNEES = [f"knee 1e-{n} rad from straight" for n in ("02", "04", "06", "08", "10", "12")]
+QUICK = {
+    "masses": (ONE, {}),
+    "rates": (BOTH, {}),
+    "turns": (BOTH, refused("coarse_start", ["float32"], "1e+03 turns", "1e+06 turns")),
+    "planes": (("float32",), {}),
+}
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_verdicts(name):
+    dtypes, expected = QUICK[name]
+    rows = CASES[name](dtypes, False)
+    assert verdicts(rows) == expected
+    assert len(rows) >= 5
+
+
+def test_the_longest_stable_step():
+    """2.785 and 2.828 for RK4 on the negative real and the imaginary axis, as in every book; the rest from the tableaux."""
+    real, imaginary = stability_limits(None)
+    assert abs(real - 2.78529) < 2e-5
+    assert abs(imaginary - 2 * np.sqrt(2)) < 2e-5
+    assert not verdicts(CASES["steps"](ONE, False, solvers={"RK4": SOLVERS["RK4"], "Tsit5": SOLVERS["Tsit5"]}))
+
+
+def test_beyond_the_longest_stable_step():
+    """Fixed steps say nothing before the state overflows: the documented limit."""
+    found = verdicts(CASES["beyond"](ONE, False))
+    assert found == {
+        ("0.5 of the limit", "float64"): "no code",
+        ("0.99 of the limit", "float64"): "no code",
+        ("1.01 of the limit", "float64"): "no code",
+        ("1.1 of the limit", "float64"): "nonfinite_state",
+        ("2.0 of the limit", "float64"): "nonfinite_state",
+    }
+
+
+def test_too_many_turns_are_refused_by_name():
+    model = robots.chain(2, dtype=jnp.float32)
+    with pytest.raises(
+        ValueError, match=r"q0 is 6283.19 rad at index 1, which float32 holds only to .* the 1000 whole turns"
+    ):
+        simulate(model, [0.0, 2000 * np.pi], [0.0, 0.0], [0.0, 1.0])
+
+
+SLOW = {
+    "mass_motion": (ONE, True),
+    "twins": (BOTH, False),
+    "gravity": (BOTH, True),
+    "planes": (ONE, True),
+    "bases": (ONE, False),
+    "starts": (ONE, False),
+    "chaos": (BOTH, False),
+    "million": (ONE, False),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SLOW)
+def test_verdicts_of_long_runs(name):
+    dtypes, gradient = SLOW[name]
+    rows = CASES[name](dtypes, gradient)
+    assert "SILENT" not in verdicts(rows).values()
+    assert sum(row.verdict == "right" for row in rows) >= 2
+
+
+@pytest.mark.slow
+def test_grasps_near_loss_of_closure():
+    assert verdicts(CASES["grasps"](ONE, True)) == refused("singular_basis", ONE, *KNEES[2:])
+
+
+@pytest.mark.slow
+def test_five_hundred_links_in_motion():
+    assert not verdicts(CASES["links"](ONE, False, counts=(1, 500)))
+
+
+@pytest.mark.slow
+def test_through_the_flat_position():
+    found = verdicts(CASES["flat"](BOTH, False, runs=((1, "projected", None), (1, "projected", 0.005))))
+    assert found == refused("dt_min_reached", ["float32"], "1 window, projected, adaptive")
