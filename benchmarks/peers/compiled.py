@@ -1,8 +1,8 @@
 """CasADi and C: equations by hand, differentiated by CasADi, and integrated in compiled code from start to end.
 
-SUNDIALS' CVODES runs within CasADi, for one trajectory. `runge_kutta.c` runs diffrax's own tableau of Dopri8, and RK4, on the C code
-that CasADi writes of the equations; the C compiler of the machine makes both into one library, and OpenMP shares a batch
-among the cores. That is the fastest way to run these methods that we know of, and no user of a library of multibody
+SUNDIALS' CVODES runs within CasADi, for one trajectory. `runge_kutta.c` runs diffrax's own tableau of Dopri8, and RK4, on the
+C code that CasADi writes of the equations; the C compiler of the machine makes both into one library, and OpenMP shares a
+batch among the cores. That is the fastest way to run these methods that we know of, and no user of a library of multibody
 dynamics gets it without writing equations. Constrained equations are solved with their multipliers, unprojected, by sparse QR
 where they are many.
 """

@@ -168,7 +168,9 @@ def windows(count=2) -> Equations:
             found.append(m.cos(q[i]) + m.sin(q[i + 1]) - m.cos(q[i + 2]))
         return found
 
-    return Equations(size, size, mass, force, rows, **_absolute([None, *(i if i % 2 == 0 else None for i in range(size - 1))]))
+    return Equations(
+        size, size, mass, force, rows, **_absolute([None, *(i if i % 2 == 0 else None for i in range(size - 1))])
+    )
 
 
 def andrews() -> Equations:

@@ -14,7 +14,7 @@ import sympy
 from scipy.integrate import ode, odeint
 
 from benchmarks.peers.equations import EQUATIONS, Equations
-from benchmarks.peers.steps import TOLERANCES, rk4, steps_between
+from benchmarks.peers.steps import TOLERANCES, rk4
 from jaxdyn.report.measure import Contestant, Motion
 
 # Beyond this many unknowns dense NumPy code, filled entry by entry, is no sensible way to write equations.
@@ -103,7 +103,7 @@ def _back(equations: Equations) -> Callable:
     return lambda y: equations.back(y[:, : equations.nq], y[:, equations.nq :])
 
 
-def dop853(prepared, source: str, slope: Callable, start, back: Callable) -> list[Contestant]:
+def dop853(prepared, source: str, slope: Callable, start, back: Callable, method: str = "by hand") -> list[Contestant]:
     """SciPy's compiled DOP853 on dy/dt = slope(t, y); `back(y (nt, n))` -> q, v of the scene."""
     ts = prepared.reference.ts
 
@@ -116,9 +116,7 @@ def dop853(prepared, source: str, slope: Callable, start, back: Callable) -> lis
                 calls += 1
                 return slope(t, y)
 
-            solver = ode(counted).set_integrator(
-                "dop853", rtol=max(tolerance, 3e-14), atol=tolerance, nsteps=10**6
-            )
+            solver = ode(counted).set_integrator("dop853", rtol=max(tolerance, 3e-14), atol=tolerance, nsteps=10**6)
             solver.set_initial_value(start, ts[0])
             rows = [start, *(solver.integrate(t) for t in ts[1:])]
             return np.stack(rows), solver.successful(), calls
@@ -127,7 +125,7 @@ def dop853(prepared, source: str, slope: Callable, start, back: Callable) -> lis
             rows, good, calls = found
             return Motion(*back(rows), "successful" if good else "stopped", evaluations=calls)
 
-        return Contestant(source, "by hand", f"SciPy {scipy.__version__} dop853", tolerance, False, call, motion)
+        return Contestant(source, method, f"SciPy {scipy.__version__} dop853", tolerance, False, call, motion)
 
     return [contestant(tolerance) for tolerance in TOLERANCES]
 
@@ -142,6 +140,8 @@ def _lsoda(prepared, source, slope, start, back, tolerance) -> Contestant:
     def motion(found) -> Motion:
         rows, info = found
         good = info["message"] == "Integration successful."
-        return Motion(*back(rows), "successful" if good else "stopped", int(info["nst"][-1]), None, int(info["nfe"][-1]))
+        return Motion(
+            *back(rows), "successful" if good else "stopped", int(info["nst"][-1]), None, int(info["nfe"][-1])
+        )
 
     return Contestant(source, "by hand", f"SciPy {scipy.__version__} LSODA", tolerance, False, call, motion)
