@@ -1,9 +1,11 @@
-"""Tolerances and steps of the peers' ladders, and a Runge-Kutta method in Python for those without one."""
+"""Tolerances and steps of the peers' ladders, and integrators for those without one: SciPy's, and RK4 in Python."""
 
 import os
 from collections.abc import Callable
 
 import numpy as np
+import scipy
+from scipy.integrate import ode, odeint
 
 from jaxdyn.report.measure import Contestant, Motion
 
@@ -51,3 +53,49 @@ def rk4(
         return Contestant(source, method, "RK4", step, True, call, motion)
 
     return [contestant(between) for between in steps_between(prepared, rungs)]
+
+
+def dop853(prepared, source: str, slope: Callable, start, back: Callable, method: str = "by hand") -> list[Contestant]:
+    """SciPy's compiled DOP853 on dy/dt = slope(t, y); `back(y (nt, n))` -> q, v of the scene."""
+    ts = prepared.reference.ts
+
+    def contestant(tolerance):
+        def call():
+            calls = 0
+
+            def counted(t, y):
+                nonlocal calls
+                calls += 1
+                return slope(t, y)
+
+            solver = ode(counted).set_integrator("dop853", rtol=max(tolerance, 3e-14), atol=tolerance, nsteps=10**6)
+            solver.set_initial_value(start, ts[0])
+            rows = [start, *(solver.integrate(t) for t in ts[1:])]
+            return np.stack(rows), solver.successful(), calls
+
+        def motion(found) -> Motion:
+            rows, good, calls = found
+            return Motion(*back(rows), "successful" if good else "stopped", evaluations=calls)
+
+        return Contestant(source, method, f"SciPy {scipy.__version__} dop853", tolerance, False, call, motion)
+
+    return [contestant(tolerance) for tolerance in TOLERANCES]
+
+
+def lsoda(prepared, source: str, slope: Callable, start, back: Callable) -> list[Contestant]:
+    """ODEPACK's LSODA on dy/dt = slope(t, y), by SciPy's `odeint`; `back` as in `dop853`."""
+    ts = prepared.reference.ts
+
+    def contestant(tolerance):
+        def call():
+            options = {"rtol": max(tolerance, 3e-14), "atol": tolerance, "mxstep": 10**6, "full_output": True}
+            return odeint(slope, start, ts, tfirst=True, **options)
+
+        def motion(found) -> Motion:
+            rows, info = found
+            result = "successful" if info["message"] == "Integration successful." else "stopped"
+            return Motion(*back(rows), result, int(info["nst"][-1]), None, int(info["nfe"][-1]))
+
+        return Contestant(source, "by hand", f"SciPy {scipy.__version__} LSODA", tolerance, False, call, motion)
+
+    return [contestant(tolerance) for tolerance in TOLERANCES]

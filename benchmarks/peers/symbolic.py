@@ -9,13 +9,11 @@ import functools
 from collections.abc import Callable
 
 import numpy as np
-import scipy
 import sympy
-from scipy.integrate import ode, odeint
 
 from benchmarks.peers.equations import EQUATIONS, Equations
-from benchmarks.peers.steps import TOLERANCES, rk4
-from jaxdyn.report.measure import Contestant, Motion
+from benchmarks.peers.steps import dop853, lsoda, rk4
+from jaxdyn.report.measure import Contestant
 
 # Beyond this many unknowns dense NumPy code, filled entry by entry, is no sensible way to write equations.
 LARGEST = 20
@@ -94,54 +92,11 @@ def contestants(prepared, starts) -> list[Contestant]:
     states, source = np.concatenate([q, v], 1), f"NumPy {np.__version__}"
     if len(states) > 1:
         return rk4(prepared, source, slope(name), states.T, starts[2], _back(equations))
-    return dop853(prepared, source, slope(name), states[0], _back(equations)) + [
-        _lsoda(prepared, source, slope(name), states[0], _back(equations), tolerance) for tolerance in TOLERANCES
+    return [
+        *dop853(prepared, source, slope(name), states[0], _back(equations)),
+        *lsoda(prepared, source, slope(name), states[0], _back(equations)),
     ]
 
 
 def _back(equations: Equations) -> Callable:
     return lambda y: equations.back(y[:, : equations.nq], y[:, equations.nq :])
-
-
-def dop853(prepared, source: str, slope: Callable, start, back: Callable, method: str = "by hand") -> list[Contestant]:
-    """SciPy's compiled DOP853 on dy/dt = slope(t, y); `back(y (nt, n))` -> q, v of the scene."""
-    ts = prepared.reference.ts
-
-    def contestant(tolerance):
-        def call():
-            calls = 0
-
-            def counted(t, y):
-                nonlocal calls
-                calls += 1
-                return slope(t, y)
-
-            solver = ode(counted).set_integrator("dop853", rtol=max(tolerance, 3e-14), atol=tolerance, nsteps=10**6)
-            solver.set_initial_value(start, ts[0])
-            rows = [start, *(solver.integrate(t) for t in ts[1:])]
-            return np.stack(rows), solver.successful(), calls
-
-        def motion(found) -> Motion:
-            rows, good, calls = found
-            return Motion(*back(rows), "successful" if good else "stopped", evaluations=calls)
-
-        return Contestant(source, method, f"SciPy {scipy.__version__} dop853", tolerance, False, call, motion)
-
-    return [contestant(tolerance) for tolerance in TOLERANCES]
-
-
-def _lsoda(prepared, source, slope, start, back, tolerance) -> Contestant:
-    ts = prepared.reference.ts
-
-    def call():
-        options = {"rtol": max(tolerance, 3e-14), "atol": tolerance, "mxstep": 10**6, "full_output": True}
-        return odeint(slope, start, ts, tfirst=True, **options)
-
-    def motion(found) -> Motion:
-        rows, info = found
-        good = info["message"] == "Integration successful."
-        return Motion(
-            *back(rows), "successful" if good else "stopped", int(info["nst"][-1]), None, int(info["nfe"][-1])
-        )
-
-    return Contestant(source, "by hand", f"SciPy {scipy.__version__} LSODA", tolerance, False, call, motion)

@@ -12,8 +12,7 @@ import pinocchio as pin
 
 import jaxdyn as jd
 from benchmarks.constraints import to_pinocchio
-from benchmarks.peers.steps import CORES, rk4
-from benchmarks.peers.symbolic import dop853
+from benchmarks.peers.steps import CORES, dop853, rk4
 from benchmarks.peers.twins import TWINS, Twin
 from jaxdyn.report.measure import Contestant
 

@@ -15,7 +15,7 @@ from pydy.codegen.ode_function_generators import generate_ode_function
 from scipy.spatial.transform import Rotation
 from sympy.physics.mechanics import KanesMethod, Point, ReferenceFrame, RigidBody, dynamicsymbols, inertia
 
-from benchmarks.peers.symbolic import dop853
+from benchmarks.peers.steps import dop853
 from jaxdyn.report.measure import Contestant
 
 # Generated code has to have a constant.
