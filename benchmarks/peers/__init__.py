@@ -24,7 +24,7 @@ MODULES = ("symbolic", "compiled", "with_mujoco", "with_pinocchio", "with_mjx", 
 COMPILED = ("C,", "CasADi")
 
 # Seconds.
-LONGEST = 6.0
+LONGEST = 4.0
 
 
 class Peers:

@@ -7,6 +7,8 @@ dynamics gets it without writing equations. Constrained equations are solved wit
 where they are many.
 """
 
+import atexit
+import contextlib
 import ctypes
 import functools
 import os
@@ -123,7 +125,8 @@ def contestants(prepared, starts) -> list[Contestant]:
     equations = EQUATIONS[name]()
     q, v = equations.there(*starts[:2])
     states = np.concatenate([q, v], 1)
-    found = _cvodes(prepared, equations, states[0]) if len(states) == 1 else []
+    # Derivatives of large systems through their sparse solution take CasADi minutes to build.
+    found = _cvodes(prepared, equations, states[0]) if len(states) == 1 and equations.nv <= 2 * LARGEST else []
     if COMPILER is None:
         return found
     for solver, settings in (("Dopri8", TOLERANCES), ("RK4", steps_between(prepared, 3))):
@@ -151,6 +154,14 @@ def _in_c(prepared, equations: Equations, solver: str, setting, times, states) -
     return Contestant(f"{source}, CasADi {casadi.__version__}", "by hand", solver, setting, fixed, call, motion)
 
 
+@functools.cache
+def _folder() -> str:
+    """Where CasADi's compiler leaves its files, until the interpreter ends."""
+    folder = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
 def _cvodes(prepared, equations: Equations, state) -> list[Contestant]:
     """CVODES: Adams' methods, or BDF for a stiff scene."""
     name, ts = prepared.case.name, prepared.reference.ts
@@ -162,7 +173,8 @@ def _cvodes(prepared, equations: Equations, state) -> list[Contestant]:
 
     def contestant(tolerance) -> Contestant:
         accuracy = {"reltol": tolerance, "abstol": tolerance}
-        solver = casadi.integrator("solver", "cvodes", problem, ts[0], list(ts[1:]), options | accuracy)
+        with contextlib.chdir(_folder()):
+            solver = casadi.integrator("solver", "cvodes", problem, ts[0], list(ts[1:]), options | accuracy)
 
         def call():
             try:
