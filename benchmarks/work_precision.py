@@ -1,40 +1,110 @@
-"""Error against run time beside MuJoCo, Pinocchio and SciPy, all timed in turn within one loop.
+"""Error against run time beside other tools, all timed in turn within one loop, and who lies below our front.
 
     python -m benchmarks.work_precision [SCENE ...] [--batch 1 1024] [--rounds 20] [--full] [--out out/work_precision]
 
-The page is that of `jaxdyn report`, with the peers' ladders as dashed lines on scenes that they can do.
+The page is that of `jaxdyn report`, with the peers of `benchmarks.peers` as dashed lines on scenes that they can do. A run
+that was interrupted goes on where it stopped. Then, for each plot: the peers' points that lie below jaxdyn's front, and the
+time at equal error relative to the best of them. A peer without a batched call
+counts in a batch with its time for one trajectory over the number of cores, as if it made perfect use of them.
 """
 
 import argparse
+import dataclasses
+import math
+from collections.abc import Iterable
 
 import jax
 
-from benchmarks import motion_peers, timing
-from jaxdyn.report import report
+from benchmarks import peers, timing
+from jaxdyn._table import table
+from jaxdyn.report import Record, Report, beaten_by, report
+from jaxdyn.report.front import TARGETS, cost_at
+
+SCENES = ("andrews", "car_axis", "windows_40", "free_body", "rolling_disk")
+
+
+def plots(found: Report) -> list[tuple[Record, ...]]:
+    """Records by scene, dtype and batch, with peers that have no batched call brought over from one trajectory."""
+    cores, made = found.head["machine"]["cores"], []
+    for scene in found.scenes:
+        records = found.of(scene)
+        for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
+            group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
+            if batch > 1:
+                there = {(family(r), r.solver) for r in group}
+                group += [
+                    dataclasses.replace(r, batch=batch, seconds_best=r.seconds_best / cores)
+                    for r in records
+                    if (r.dtype, r.batch) == (dtype, 1) and (family(r), r.solver) not in there and r.source != "jaxdyn"
+                ]
+            made.append(tuple(group))
+    return made
+
+
+def family(record: Record) -> str:
+    """The tool of a record, whether in threads or not."""
+    return record.source.split()[0].rstrip(",")
+
+
+def verdict(records: Iterable[Record]) -> tuple[list[list[str]], list[str]]:
+    """Rows of the table of verdicts for one plot, and lines for the points that lie below our front.
+
+    One row against tools that take equations, by those in compiled code alone, one against tools that take mechanisms.
+    """
+    records = [r for r in records if r.error_path is not None]
+    ours, below, rows = [r for r in records if r.source == "jaxdyn"], beaten_by(records), []
+    for kind, theirs in (
+        ("equations, compiled", [r for r in records if r.source.startswith(peers.COMPILED)]),
+        ("mechanisms", [r for r in records if r.source != "jaxdyn" and r.method != "by hand"]),
+    ):
+        if not theirs:
+            continue
+        points = f"{sum(r in theirs for r, _ in below)} of {len(theirs)}"
+        rows.append([theirs[0].scene, str(theirs[0].batch), kind, points])
+        for target in TARGETS:
+            labels = {r.label for r in theirs}
+            best, who = min((cost_at([r for r in theirs if r.label == label], target), label) for label in labels)
+            factor = cost_at(ours, target) / best
+            rows[-1].append(f"{factor:.2g} ({who})" if 0 < factor < math.inf else "-")
+    lines = [
+        f"  {r.scene}, batch {r.batch}: {r.label} at {r.setting:.0e}: error {r.error_path:.1e}, {1e6 * r.seconds_best:.4g} us; "
+        + (f"jaxdyn takes {factor:.2g} times as long" if math.isfinite(factor) else "jaxdyn has no run as exact")
+        for r, factor in below
+    ]
+    return rows, lines
 
 
 def main(argv=None) -> None:
-    """Measure, print the tables, write the page."""
+    """Measure, print the tables, write the page, judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", default=None, metavar="SCENE")
+    parser.add_argument("scenes", nargs="*", default=[], metavar="SCENE")
     parser.add_argument("--batch", nargs="+", type=int, default=(1,))
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--out", default=str(timing.OUT / "work_precision"))
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
-    scenes = options.scenes or (None if options.full else tuple(motion_peers.twins()))
+
+    def say(line):
+        print(line, flush=True)
+
     found = report(
-        scenes,
+        options.scenes or (None if options.full else SCENES),
         full=options.full,
         dtypes=("float64",),
         batches=tuple(options.batch),
         rounds=options.rounds,
         out=options.out,
-        peers=motion_peers.contestants,
-        echo=lambda line: print(line, flush=True),
+        peers=peers.Peers(say),
+        echo=say,
     )
-    print(f"\n{found.table()}\n\nWritten to {options.out}/report.html")
+    print(f"\n{found.table()}\n\nWritten to {options.out}/report.html\n")
+    judged = [verdict(group) for group in plots(found)]
+    print("Time relative to the best peer, at an error of")
+    header = ["scene", "batch", "peers that take", "points below", *(f"{x:.0e}" for x in TARGETS)]
+    print(table(header, [row for rows, _ in judged for row in rows]))
+    print("\nPeers' points below jaxdyn's front:")
+    print("\n".join(line for _, lines in judged for line in lines) or "  none")
 
 
 if __name__ == "__main__":

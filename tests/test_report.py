@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import jaxdyn as jd
 from jaxdyn.cli import main
 from jaxdyn.constrained_motion import chosen_method
-from jaxdyn.report import Record, Report, cases, html_page, pareto_front, standings
+from jaxdyn.report import Record, Report, beaten_by, cases, html_page, pareto_front, standings
 from jaxdyn.report import run as running
 from jaxdyn.report.front import cost_at
 from jaxdyn.report.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
@@ -112,6 +112,7 @@ def test_sphere_pendulum_against_angles():
     [
         (2, 1.0, (-0.1950203, -0.98079921), (-6.67667804, 1.32757833)),
         (2, 10.0, (0.32845811, 0.94451854), (1.42305147, -0.49486885)),
+        (40, 1.0, (-0.11535688, -0.99332411), (-6.66998752, 0.7746001)),
         (40, 10.0, (0.18051223, 0.98357274), (1.14844128, -0.21077007)),
     ],
 )
@@ -292,6 +293,32 @@ def test_front_and_cost_at_an_error():
     assert cost_at([a, b], 1e-1) == 1.0
     assert cost_at([a, b], 1e-4) == 10.0
     assert cost_at([a, b], 1e-5) == np.inf
+
+
+def test_beaten_by_whom():
+    """Points below the front by how far, the worst first; failed ones and those above it are left out."""
+    ours = [made(1e-2, 1.0), made(1e-4, 10.0), made(1e-3, 20.0)]
+    peers = {
+        "cheaper": made(1e-3, 1.0, source="peer"),  # the front is at 10**0.5 there
+        "dearer": made(1e-3, 5.0, source="peer"),
+        "exact": made(1e-6, 100.0, source="peer"),
+        "rough": made(1e-1, 0.5, source="peer"),
+        "failed": made(None, 0.1, source="peer"),
+    }
+    found = beaten_by([*ours, *peers.values()])
+    assert [r for r, _ in found] == [peers[name] for name in ("exact", "cheaper", "rough")]
+    assert [factor for _, factor in found] == pytest.approx([np.inf, 10**0.5, 2.0])
+    assert beaten_by(ours) == []
+    with pytest.raises(ValueError, match="2 plots"):
+        beaten_by([*ours, made(1e-3, 1.0, batch=2)])
+
+
+def test_batches_above_the_largest_are_left_out(small, rungs, monkeypatch):
+    lines = []
+    monkeypatch.setattr(running, "cases", lambda: {"free_body": cases()["free_body"]._replace(largest=1)})
+    found = jd.report("free_body", rounds=1, batches=(1, 64), echo=lines.append)
+    assert {r.batch for r in found.records} == {1}
+    assert "batches above 1 are left out" in lines[0]
 
 
 def test_standings_compare_within_a_class():

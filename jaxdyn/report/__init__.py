@@ -2,6 +2,7 @@
 
 from jaxdyn.report.cases import Case as Case
 from jaxdyn.report.cases import cases as cases
+from jaxdyn.report.front import beaten_by as beaten_by
 from jaxdyn.report.front import pareto_front as pareto_front
 from jaxdyn.report.front import standings as standings
 from jaxdyn.report.page import html_page as html_page

@@ -27,6 +27,7 @@ class Case(NamedTuple):
       - `build()` -> (scene, (q0, v0)); `reference(start)` -> `Reference`, or None where a
     converged solution at `ts` serves.
       - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
+      - `largest`: the most trajectories at once whose runs take seconds and no minutes; None for any number.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Case(NamedTuple):
     steps: int
     conserves: bool = True
     stiff: bool = False
+    largest: int | None = None
     published: tuple[Published, ...] = ()
 
 
@@ -156,6 +158,18 @@ def _cases() -> tuple[Case, ...]:
             ),
         ),
         Case(
+            "windows_40",
+            "Forty four-bar windows, 1 s of the 20 s of problem A02 of the IFToMM library, through one position where rows "
+            "lose rank",
+            "holonomic, losing rank",
+            named("windows", count=40),
+            lambda start: references.windows(ten / 10, 40),
+            ten / 10,
+            10,
+            # 81 bodies and 80 rows by dense linear algebra.
+            largest=1,
+        ),
+        Case(
             "andrews",
             "Andrews' squeezing mechanism, 0.03 s (test set for IVP solvers)",
             "holonomic",
@@ -163,7 +177,10 @@ def _cases() -> tuple[Case, ...]:
             references.andrews,
             np.array([0.0, 0.03]),
             250,
-            published=(Published("PSIDE at 1e-14 (Cray C90, 1990s)", 56.74, error=3e-8),),
+            published=(
+                Published("PSIDE at 1e-14 (Cray C90, 1990s)", 56.74, error=3e-8),
+                Published(f"OpenSim 3.2 on 0.05 s, problem A03 ({i5})", 0.384),
+            ),
         ),
         Case(
             "car_axis",

@@ -39,6 +39,30 @@ def cost_at(
     return math.inf
 
 
+def beaten_by(
+    records: Iterable[Record], *, error: str = "error_path", cost: str = "seconds_best"
+) -> list[tuple[Record, float]]:
+    """Peers' runs that lie below our front, each with how many times its cost we take to its error; the worst first.
+
+    Between our rungs the front goes on straight lines in the log-log plot. The number is infinite where no run of ours
+    is as exact. `records` are of one plot: one scene, dtype and batch.
+
+    **Raises:** ValueError for records of several plots.
+    """
+    records = list(records)
+    plots = {(r.scene, r.dtype, r.batch) for r in records}
+    if len(plots) > 1:
+        raise ValueError(f"records has runs of {len(plots)} plots; give those of one scene, dtype and batch")
+    ours = [r for r in records if r.source == "jaxdyn"]
+    found = []
+    for r in records:
+        if r.source != "jaxdyn" and getattr(r, error) is not None:
+            factor = cost_at(ours, getattr(r, error), error=error, cost=cost) / getattr(r, cost)
+            if factor > 1:
+                found.append((r, factor))
+    return sorted(found, key=lambda pair: -pair[1])
+
+
 class Standing(NamedTuple):
     """How one way to integrate does in a class of scenes.
 

@@ -82,7 +82,13 @@ def report(
     chosen = _checked(scenes, dtypes, batches, rounds)
     dtypes = dtypes or (("float64", "float32") if full else ("float64",))
     batches = batches or ((1, 256) if full else (1,))
-    groups = [(case, dtype, batch) for case in chosen for dtype in dtypes for batch in batches]
+    say = echo or (lambda line: None)
+    groups = []
+    for case in chosen:
+        sizes = [batch for batch in batches if case.largest is None or batch <= case.largest]
+        groups += [(case, dtype, batch) for dtype in dtypes for batch in sizes]
+        if len(sizes) < len(batches):
+            say(f"{case.name}: batches above {case.largest} are left out, as they take minutes")
     head = {
         "machine": machine(),
         "commit": commit(),
@@ -90,7 +96,6 @@ def report(
         "full": full,
     }
     journal = Journal(None if out is None else Path(out), head)
-    say = echo or (lambda line: None)
     prepared, began = None, time.perf_counter()
     keys = [f"{case.name}, {dtype}, batch {batch}, {rounds} rounds" for case, dtype, batch in groups]
     todo = [(key, *group) for key, group in zip(keys, groups, strict=True) if key not in journal]
