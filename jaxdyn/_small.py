@@ -1,11 +1,14 @@
-"""Solutions with small positive definite matrices, written out in single numbers.
+"""Factors of small positive definite matrices and solutions with them, written out in single numbers.
 
-Under `jax.vmap` XLA calls LAPACK once for each sample; what is written out becomes vectors over the batch instead.
+Under `jax.vmap` XLA calls LAPACK once for each sample; what is written out becomes vectors over the batch instead. For single
+samples it saves the call.
 """
 
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
+from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
+
+from jaxdyn._materialize import materialize
 
 MOST = 6  # operations grow with the third power, and XLA repeats part of them in every consumer
 
@@ -15,7 +18,42 @@ def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> 
     n = matrix.shape[0]
     if n > MOST:
         return cho_solve((jnp.linalg.cholesky(matrix), True), right)
-    # matrix = L L^T; `scale` holds the reciprocals of L's diagonal.
+    lower, scale = _factored(matrix)
+    return jnp.stack(_backward(lower, scale, _forward(lower, scale, list(right))))
+
+
+def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Lower triangular L with L L^T = matrix; not finite where the matrix is not positive definite."""
+    n = matrix.shape[0]
+    if not 0 < n <= MOST:
+        return jnp.linalg.cholesky(matrix)
+    lower, scale = _factored(matrix)
+    zero = jnp.zeros((), matrix.dtype)
+    rows = [[*row[:i], 1 / scale[i], *[zero] * (n - 1 - i)] for i, row in enumerate(lower)]
+    return materialize(jnp.stack([jnp.stack(row) for row in rows]))[0]
+
+
+def solve_lower(
+    factor: Float[Array, "n n"], right: Float[Array, "n *k"], *, transposed: bool = False
+) -> Float[Array, "n *k"]:
+    """L^-1 right, or L^-T right."""
+    n = factor.shape[0]
+    if not 0 < n <= MOST:
+        return solve_triangular(factor, right, lower=True, trans=int(transposed))
+    sweep = _backward if transposed else _forward
+    return materialize(jnp.stack(sweep(factor, [1 / factor[i, i] for i in range(n)], list(right))))[0]
+
+
+def solve_factored(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """(L L^T)^-1 right."""
+    if not 0 < factor.shape[0] <= MOST:
+        return cho_solve((factor, True), right)
+    return solve_lower(factor, solve_lower(factor, right), transposed=True)
+
+
+def _factored(matrix):
+    """L without its diagonal, by rows, and the reciprocals of that."""
+    n = matrix.shape[0]
     lower: list[list] = [[] for _ in range(n)]
     scale = []
     for j in range(n):
@@ -28,15 +66,23 @@ def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> 
                 lower[j].append(None)
             else:
                 lower[i].append(entry * scale[j])
-    x = []
-    for i in range(n):
-        value = right[i]
+    return lower, scale
+
+
+def _forward(lower, scale, right: list) -> list:
+    x: list = []
+    for i, value in enumerate(right):
         for k in range(i):
             value = value - lower[i][k] * x[k]
         x.append(value * scale[i])
-    for i in reversed(range(n)):
+    return x
+
+
+def _backward(lower, scale, right: list) -> list:
+    x = list(right)
+    for i in reversed(range(len(x))):
         value = x[i]
-        for k in range(i + 1, n):
+        for k in range(i + 1, len(x)):
             value = value - lower[k][i] * x[k]
         x[i] = value * scale[i]
-    return jnp.stack(x)
+    return x

@@ -16,12 +16,13 @@ import jax.core
 import jax.numpy as jnp
 import lineax as lx
 from jax import lax
-from jax.scipy.linalg import cho_solve, solve_triangular
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
 from jaxdyn._anywhere import anywhere
 from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
+from jaxdyn._small import cholesky, solve_factored, solve_lower
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.loops import Loop
@@ -162,8 +163,8 @@ def applied(scene: Scene, q, v, tau, t) -> Array:
 
 
 def _free(scene, q, v, force, t) -> ConstrainedDynamics:
-    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
-    a = cho_solve((factor, True), force - bias_force(scene.system, q, v, t))
+    factor = cholesky(mass_matrix(scene.system, q, t))
+    a = solve_factored(factor, force - bias_force(scene.system, q, v, t))
     result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
 
@@ -174,9 +175,9 @@ def solve_rows(
     """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
     if method == "range_space" and isinstance(scene.system, Model):
         return _by_range_space(scene, q, v, force, row)
-    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
+    factor = cholesky(mass_matrix(scene.system, q, t))
     columns = jnp.concatenate([row.A, (force - bias_force(scene.system, q, v, t))[None]]).T
-    solved = solve_triangular(factor, columns, lower=True)
+    solved = solve_lower(factor, columns)
     Y, free = solved[:, :-1], solved[:, -1]
     wanted = row.gamma - _product(Y.T, free)
     if method != "rank_aware":
@@ -190,7 +191,7 @@ def solve_rows(
         sizes = jnp.abs(row.gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
         met = jnp.all(missed <= _eps(Y) ** 0.5 * (sizes + jnp.max(sizes)))
         result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
-    a = solve_triangular(factor, free + pushed, lower=True, trans=1)
+    a = solve_lower(factor, free + pushed, transposed=True)
     result = RESULTS.where(jnp.isfinite(factor).all(), result, RESULTS.singular_mass_matrix)
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
 
@@ -214,8 +215,8 @@ def _shortest(Y, wanted, rank_tol):
 
         def solve(normal, right):
             # One correction takes the squared condition number out of the error.
-            x = cho_solve((factor, True), right)
-            return x + cho_solve((factor, True), right - normal(x))
+            x = solve_factored(factor, right)
+            return x + solve_factored(factor, right - normal(x))
 
         lam = lax.custom_linear_solve(normal, wanted, solve, symmetric=True)
         return lam, _product(Y, lam), jnp.asarray(Y.shape[1], jnp.int32)
@@ -226,7 +227,7 @@ def _shortest(Y, wanted, rank_tol):
 
 def normal_factor(Y, rank_tol):
     """Cholesky factor of Y^T Y, and whether the columns of Y are so independent that it may stand for the pseudo-inverse."""
-    factor = jnp.linalg.cholesky(_product(Y.T, Y))
+    factor = cholesky(_product(Y.T, Y))
     pivots = jnp.diagonal(factor) ** 2
     return factor, jnp.min(pivots) > least_pivot(Y, rank_tol) * jnp.max(pivots)
 
@@ -242,11 +243,11 @@ def _by_range_space(scene, q, v, force, row: Rows) -> ConstrainedDynamics:
 
 def _by_delassus(delassus, wanted, nv: int):
     """lam with A M^-1 A^T lam = wanted by Cholesky, and whether the rows were independent."""
-    factor = jnp.linalg.cholesky(0.5 * (delassus + delassus.T))
+    factor = cholesky(0.5 * (delassus + delassus.T))
     pivots = jnp.diagonal(factor)
     # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
     fine = jnp.min(pivots) > (10 * nv * _eps(delassus)) ** 0.5 * jnp.max(pivots)
-    return cho_solve((factor, True), wanted), RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    return solve_factored(factor, wanted), RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
 
 
 def constraint_forces(
@@ -286,7 +287,7 @@ def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float 
     """
     factor, Y, inverse = _metric(scene, q, t, rank_tol)
     keep = jnp.eye(Y.shape[0], dtype=Y.dtype) - _product(Y, inverse)
-    P_T = solve_triangular(factor, _product(keep, factor.T), lower=True, trans=1)
+    P_T = solve_lower(factor, _product(keep, factor.T), transposed=True)
     return Projections(P_T, P_T.T)
 
 
@@ -304,8 +305,8 @@ def second_fundamental_form(
     """
     coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
     factor, Y, inverse = _metric(scene, q, t, rank_tol)
-    wanted = rows(scene, q, v, t).gamma + _product(Y.T, solve_triangular(factor, coriolis, lower=True))
-    return solve_triangular(factor, _product(inverse.T, wanted), lower=True, trans=1)
+    wanted = rows(scene, q, v, t).gamma + _product(Y.T, solve_lower(factor, coriolis))
+    return solve_lower(factor, _product(inverse.T, wanted), transposed=True)
 
 
 def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
@@ -313,19 +314,19 @@ def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
 
     Rows: the holonomic ones, or all.
     """
-    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
+    factor = cholesky(mass_matrix(scene.system, q, t))
     A = constraint_jacobian(scene, q, t)
     return _right_inverse(factor, A[holonomic_rows(layout(scene))] if holonomic else A, rank_tol)
 
 
 def _right_inverse(factor, A, rank_tol):
-    Y = solve_triangular(factor, A.T, lower=True)
-    return solve_triangular(factor, pseudo_inverse(Y, tolerance(rank_tol, Y)).T, lower=True, trans=1)
+    Y = solve_lower(factor, A.T)
+    return solve_lower(factor, pseudo_inverse(Y, tolerance(rank_tol, Y)).T, transposed=True)
 
 
 def _metric(scene, q, t, rank_tol):
-    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
-    Y = solve_triangular(factor, constraint_jacobian(scene, q, t).T, lower=True)
+    factor = cholesky(mass_matrix(scene.system, q, t))
+    Y = solve_lower(factor, constraint_jacobian(scene, q, t).T)
     return factor, Y, pseudo_inverse(Y, tolerance(rank_tol, Y))
 
 
@@ -362,7 +363,7 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float) -> Float[Array, "m n
 
 
 def _by_normal_equations(Y, factor):
-    inverse = cho_solve((factor, True), Y.T)
+    inverse = solve_factored(factor, Y.T)
     # One step of Newton and Schulz takes the squared condition number out of the error.
     return 2 * inverse - _product(_product(inverse, Y), inverse)
 

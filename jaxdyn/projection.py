@@ -7,13 +7,13 @@ import jax
 import jax.core
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array
 
 from jaxdyn._anywhere import anywhere
 from jaxdyn._dispatch import LEAST_BATCH, is_large_batch
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
+from jaxdyn._small import cholesky, solve_factored, solve_lower
 from jaxdyn.closed_projection import Closing
 from jaxdyn.constrained import correction, has_short_recursion, least_pivot, normal_factor, pseudo_inverse, tolerance
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
@@ -61,8 +61,8 @@ class _Correction(NamedTuple):
     C: Array
 
     def step(self, residual):
-        along_rows = _product(self.Z, cho_solve((self.C, True), residual))
-        return solve_triangular(self.L, along_rows, lower=True, trans=1)
+        along_rows = _product(self.Z, solve_factored(self.C, residual))
+        return solve_lower(self.L, along_rows, transposed=True)
 
 
 def _correction(L, Y, rank_tol) -> _Correction:
@@ -79,8 +79,8 @@ def _correction(L, Y, rank_tol) -> _Correction:
 
 def _by_matrices(scene: Scene, rank_tol, q, v, t):
     held = holonomic_rows(layout(scene))
-    L = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
-    Y = solve_triangular(L, constraint_jacobian(scene, q, t).T, lower=True)
+    L = cholesky(mass_matrix(scene.system, q, t))
+    Y = solve_lower(L, constraint_jacobian(scene, q, t).T)
     every = _correction(L, Y, rank_tol)
     if held.size:
         some = every if held.size == Y.shape[1] else _correction(L, Y[:, held], rank_tol)

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
+from jaxdyn._small import cholesky, solve_factored, solve_lower
 from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
@@ -257,8 +257,8 @@ def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
     mass = _product(N.T, _product(mass_matrix(scene.system, q, t), N))
     bias = _product(N.T, inverse_dynamics(scene.system, q, v, drift, t))
     force = _product(N.T, applied(scene, q, v, tau, t))
-    factor = jnp.linalg.cholesky(mass)
-    rate = cho_solve((factor, True), force - bias)
+    factor = cholesky(mass)
+    rate = solve_factored(factor, force - bias)
     result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     serves = jnp.abs(quality) > least_quality(q.dtype)
     result = RESULTS.where(serves, result, RESULTS.singular_basis)
@@ -334,15 +334,15 @@ def independent_velocities(scene: Scene, q, t=0.0) -> tuple[int, ...]:
 
 def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, ""]]:
     """X T^-1 with T^T T = X^T X for columns X, and the least pivot of T relative to the largest; smooth in X."""
-    factor = jnp.linalg.cholesky(_product(columns.T, columns))
+    factor = cholesky(_product(columns.T, columns))
     pivots = jnp.diagonal(factor)
-    return solve_triangular(factor, columns.T, lower=True).T, jnp.min(pivots) / jnp.max(pivots)
+    return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots)
 
 
 def minimal_velocity(place: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
     """nu (nr,) with N nu + v0 = v for an admissible v: its coefficients in the columns of N."""
-    factor = jnp.linalg.cholesky(_product(place.N.T, place.N))
-    return cho_solve((factor, True), _product(place.N.T, v - place.v0))
+    factor = cholesky(_product(place.N.T, place.N))
+    return solve_factored(factor, _product(place.N.T, v - place.v0))
 
 
 def least_quality(dtype) -> float:
@@ -359,7 +359,7 @@ def _affine_rows(scene, q, t):
 
 def _least_pivot(columns):
     """Least pivot of the triangle T with T^T T = columns^T columns, and 0 where they depend on each other."""
-    pivot = jnp.min(jnp.diagonal(jnp.linalg.cholesky(lax.stop_gradient(_product(columns.T, columns)))))
+    pivot = jnp.min(jnp.diagonal(cholesky(lax.stop_gradient(_product(columns.T, columns)))))
     return jnp.where(jnp.isfinite(pivot), pivot, jnp.zeros_like(pivot))
 
 

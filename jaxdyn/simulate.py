@@ -13,9 +13,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float
 
 from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.assembly import residuals
@@ -26,16 +24,15 @@ from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import Model, frame_index, neutral
 from jaxdyn.projection import project_state
 from jaxdyn.scene import Scene, as_pytree, checked_force
+from jaxdyn.solution import RESULTS, Solution, raise_failure
 from jaxdyn.solvers import ExplicitSteps, LieGroup, ProjectedSolver, Stepper
 from jaxdyn.solvers.choice import (
     checked_adjoint,
     checked_method,
     checked_step_limit,
     for_start,
-    for_stiff,
     is_fixed,
     is_split,
-    known_stiffness,
     label,
     progress_meter,
     stepping,
@@ -46,66 +43,6 @@ from jaxdyn.systems import System, displace, retract, velocity_to_rate
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
 _POSE = "pose:"
 _COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
-
-
-class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a simulation ended: diffrax's codes and six more."""
-
-    nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
-    nonfinite_state = "The state became NaN or infinite."
-    coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
-    inconsistent_start = "The initial state is not on the constraints."
-    open_constraints = "The constraints opened, and the projection could not close them."
-    singular_basis = "The minimal velocities no longer determine the others."
-
-
-_ADVICE = {
-    "max_steps_reached": "raise max_steps (now {max_steps}), loosen rtol and atol, or take an implicit solver if stiff",
-    "dt_min_reached": "the acceleration is NaN or grows without bound: look for a singular mass matrix (a joint that "
-    "moves no inertia) or a force or control that is not finite there; or constraints whose rows lose rank on the way, "
-    "which fixed steps pass (stepsize=0.01); or rtol and atol are below the rounding error",
-    "nonfinite_start": "give finite q0 and v0 and unit quaternions",
-    "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
-    "coarse_start": "subtract whole turns from q0, use float64, or take fixed steps",
-    "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
-    "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
-    "method='projected' needs none",
-    "nonlinear_divergence": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
-    "open_constraints": "take smaller steps (stepsize, or rtol and atol), or look for constraints that contradict each other "
-    "on the way",
-}
-
-
-class Solution(eqx.Module):
-    """A simulated motion; every row belongs to one save point. Rows not reached are NaN.
-
-    - `ts` (nt,) in s, as given; `q` (nt, nq); `v` (nt, nv), body-fixed.
-    - `result`, a `RESULTS` code; `success` tells whether all went well; `solver`, the name of the method that was used.
-    - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
-    - What `outputs` asked for, else None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
-      scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
-      (nt, nc); `constraint_residual` (nt, 2), the largest |phi| and |A v - b|; `poses`, one array
-      (nt, 4, 4) by name for each frame asked for as "pose:<frame>".
-    """
-
-    ts: Float[Array, " nt"]
-    q: Float[Array, "nt nq"]
-    v: Float[Array, "nt nv"]
-    result: Any
-    stats: dict[str, Array]
-    energy: Float[Array, " nt"] | None = None
-    power: Float[Array, " nt"] | None = None
-    work: Float[Array, " nt"] | None = None
-    acceleration: Float[Array, "nt nv"] | None = None
-    multipliers: Float[Array, "nt nc"] | None = None
-    constraint_residual: Float[Array, "nt 2"] | None = None
-    poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
-    solver: str = eqx.field(static=True, default="")
-
-    @property
-    def success(self) -> Bool[Array, "..."]:
-        """Whether the motion was computed to its end."""
-        return self.result == RESULTS.successful
 
 
 def simulate(
@@ -225,7 +162,7 @@ def simulate(
     if throw is None:
         throw = concrete
     if throw and concrete:
-        _raise_failure(solution, scene, control, options)
+        raise_failure(solution, scene, control, options)
     elif throw:
         solution = solution.result.error_if(solution, ~solution.success)
     return solution
@@ -435,23 +372,3 @@ def _checked_outputs(scene: Scene, outputs) -> tuple[str, ...]:
         elif name not in _OUTPUTS:
             raise ValueError(f"outputs has {name!r}; choose from {', '.join(_OUTPUTS)} and '{_POSE}<frame>'")
     return tuple(sorted(set(outputs)))
-
-
-def _raise_failure(solution: Solution, scene: Scene, control, options) -> None:
-    if bool(solution.success):
-        return
-    name = next(name for name in RESULTS._name_to_item if bool(solution.result == getattr(RESULTS, name)))
-    reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])
-    advice = _ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
-    if name == "max_steps_reached":
-        last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
-        rates = known_stiffness(scene, solution.q[last], solution.v[last], solution.ts[last], control)
-        if rates is not None and for_stiff(rates, end - float(solution.ts[0])):
-            advice = (
-                f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
-                f"{float(rates.explicit_step):.3g} s; pass solver=jd.Rodas5P(), or raise max_steps (now {options['max_steps']})"
-            )
-    raise RuntimeError(
-        f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: {advice}. "
-        "With throw=False, what was reached is returned."
-    )

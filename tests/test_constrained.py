@@ -153,7 +153,8 @@ def test_gauss_principle(solved):
 
 
 def test_range_space_forms_no_mass_matrix(tree):
-    """Three rows on nv = 13: only A M^-1 A^T is factorised; dependent rows are reported."""
+    """Three rows on nv = 13: only A M^-1 A^T is factorised, and it is so small that no call is made for it; dependent rows are
+    reported."""
     scene = tree[0]
     few, n = Scene(scene.system, scene.constraints[:1]), scene.nv
     shapes = {}
@@ -162,8 +163,8 @@ def test_range_space_forms_no_mass_matrix(tree):
             *tree[1:3]
         )
         shapes[method] = factorised(found.jaxpr)
-    assert (n, n) in shapes["schur"]
-    assert shapes["range_space"] == {(3, 3)}
+    assert shapes["schur"] == {(n, n)}
+    assert not shapes["range_space"]
     broken = Scene(few.system, few.constraints * 2)
     result = quick(lambda q, v: constrained_dynamics(broken, q, v, method="range_space").result)(*tree[1:3])
     assert bool(result == RESULTS.dependent_rows)

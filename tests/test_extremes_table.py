@@ -73,7 +73,7 @@ def test_too_many_turns_are_refused_by_name():
 
 
 SLOW = {
-    "mass_motion": (ONE, True),
+    "mass_motion": (BOTH, True),
     "twins": (BOTH, False),
     "gravity": (BOTH, True),
     "planes": (ONE, True),

@@ -32,7 +32,7 @@ LAYERS = (
     "constraints constrained reduced gauge distributions",
     "contact grasp",
     "control excitation",
-    "solvers simulate",
+    "solvers solution simulate",
     "identify",
     "scenes",
     "io scale",

@@ -27,7 +27,10 @@ def drifted(name, **parameters):
     return scene, jax.vmap(lambda e: displace(scene.system, q, e))(off[0]), v[None] + off[1]
 
 
-@pytest.mark.parametrize("name, parameters", [("windows", {"count": 2}), ("rolling_coin", {}), ("bennett", {})])
+@pytest.mark.parametrize(
+    "name, parameters",
+    [("windows", {"count": 2}), ("rolling_coin", {}), pytest.param("bennett", {}, marks=pytest.mark.slow)],
+)
 def test_states_come_back_by_the_least_change(name, parameters):
     scene, q, v = drifted(name, **parameters)
     zero = jnp.asarray(0.0)

@@ -170,22 +170,22 @@ class Counter:
 
 
 @pytest.mark.parametrize(
-    ("name", "solver", "projected"),
+    ("name", "solver"),
     [
-        ("pendulum", "Tsit5", False),
-        ("pendulum_in_plane", "Tsit5", True),
-        ("pendulum", "Dopri8", False),
-        ("pendulum", "RK4", False),
+        ("pendulum", "Tsit5"),
+        ("pendulum_in_plane", "Tsit5"),
+        ("pendulum", "Dopri8"),
+        ("pendulum", "RK4"),
     ],
 )
-def test_evaluations_are_those_that_are_made(name, solver, projected):
+def test_evaluations_are_those_that_are_made(name, solver):
     scene, counter = getattr(jd.scenes, name), Counter()
     counted = Scene(scene().system, scene().constraints, (counter,))
     method = {"Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8, "RK4": RK4}[solver]()
     steps = {"stepsize": 0.05} if solver == "RK4" else {"rtol": 1e-6, "atol": 1e-6}
     found = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, **steps)
     jax.effects_barrier()
-    assert counter.count == evaluations(solver, int(found.stats["num_steps"]), projected)
+    assert counter.count == evaluations(solver, int(found.stats["num_steps"]), False)
 
 
 def test_evaluations_of_implicit_methods_are_not_known():
@@ -248,10 +248,11 @@ def test_records_hold_what_a_motion_says(body, rungs, records):
 
 
 def test_operations_are_those_of_the_batch(body):
-    """A large batch of a ball joint runs on Euler's equations, 30 operations; all that is besides is the quaternion's."""
+    """A ball joint runs on Euler's equations in any batch, 30 operations; all that is besides is the quaternion's."""
     motion = Motion(body.reference.q, body.reference.v, steps=0, evaluations=1)
     single, many = (flop_counter(body, "free", batch)(motion) for batch in (1, 256))
-    assert 30 < many < 150 < single
+    assert 30 < many < 150
+    assert 30 < single < 150
 
 
 def test_a_slow_run_is_timed_once(body, rungs):

@@ -133,7 +133,7 @@ def _charge(q, v):
     return 0.5 * jnp.sum(v * v) + (1 + q[0] ** 2) * (q[0] * v[1] - q[1] * v[0]) - 0.5 * jnp.sum(q**4)
 
 
-@pytest.mark.parametrize("system", ["tree", "magnetic"])
+@pytest.mark.parametrize("system", [pytest.param("tree", marks=pytest.mark.slow), "magnetic"])
 def test_steps_are_symplectic(system):
     """J^T Omega(p1) J = Omega(p0) in left-trivialised (q, p), Omega((e, s), (e', s')) = e s' - e' s + p [e, e']."""
     if system == "tree":

@@ -51,13 +51,13 @@ def ladder(
     batch = len(starts[0])
     run, seconds = prepared.programs.get(method, solver, dtype, batch)
     inputs = [jnp.asarray(x[0] if batch == 1 else x, dtype) for x in starts]
-    projected = chosen_method(prepared.scene, method).corrects(prepared.scene)
+    renewed = bool(chosen_method(prepared.scene, method).jumping)
 
     def motion(found) -> Motion:
         q, v, result, stats = jax.tree.map(lambda x: np.asarray(x if batch == 1 else x[0]), found)
         name = next(name for name in RESULTS._name_to_item if bool(result == getattr(RESULTS, name)))
         steps = int(stats["num_steps"])
-        return Motion(q, v, name, steps, int(stats["num_rejected_steps"]), evaluations(solver, steps, projected))
+        return Motion(q, v, name, steps, int(stats["num_rejected_steps"]), evaluations(solver, steps, renewed))
 
     def contestant(setting):
         number = jnp.asarray(setting, dtype)
@@ -67,18 +67,18 @@ def ladder(
     return [contestant(setting) for setting in settings]
 
 
-def evaluations(solver: str, steps: int, projected: bool) -> int | None:
+def evaluations(solver: str, steps: int, renewed: bool) -> int | None:
     """Evaluations of the vector field in so many steps; None for implicit methods, whose iterations are not counted.
 
-    A method whose last evaluation of a step is the first of the next one saves it, unless the step is projected. Two more
-    choose the first step.
+    A method whose last evaluation of a step is the first of the next one saves it, unless the state is `renewed` between
+    steps. Two more choose the first step.
     """
     if solver in FIXED:
         return 4 * steps
     tableau = SOLVERS[solver]().tableau  # pyright: ignore[reportAttributeAccessIssue]
     if tableau.implicit:
         return None
-    saved = steps - 1 if tableau.fsal and not projected else 0
+    saved = steps - 1 if tableau.fsal and not renewed else 0
     return tableau.num_stages * steps - saved + 2
 
 

@@ -6,6 +6,7 @@ added, as soon as it is known, to the sums of all that need it.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import diffrax
 import jax
@@ -41,7 +42,7 @@ class ExplicitSteps(ProjectedSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step, projected where it ends."""
-        tableau = self.solver.tableau
+        tableau: Any = self.solver.tableau  # of one term
         count, start, structure = tableau.num_stages, *ravel_pytree(y0)
         dt = jnp.asarray(t1 - t0, start.dtype)
         # Rows: what is added for each stage, for the result, and for the error.
