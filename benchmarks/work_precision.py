@@ -12,6 +12,7 @@ import argparse
 import dataclasses
 import math
 from collections.abc import Iterable
+from pathlib import Path
 
 import jax
 
@@ -19,6 +20,7 @@ from benchmarks import peers, timing
 from jaxdyn._table import table
 from jaxdyn.report import Record, Report, beaten_by, report
 from jaxdyn.report.front import TARGETS, cost_at
+from jaxdyn.report.page import figure
 
 SCENES = ("andrews", "car_axis", "windows_40", "free_body", "rolling_disk")
 
@@ -74,6 +76,16 @@ def verdict(records: Iterable[Record]) -> tuple[list[list[str]], list[str]]:
     return rows, lines
 
 
+def draw(found: Report, directory: Path) -> None:
+    """An image of each plot, `SCENE_BATCH.png`."""
+    directory.mkdir(parents=True, exist_ok=True)
+    for group in plots(found):
+        scene, batch = group[0].scene, group[0].batch
+        drawn = figure(f"{found.scenes[scene].text}: {batch} at once", found.scenes[scene], group)
+        if drawn is not None:
+            drawn.savefig(directory / f"{scene}_{batch}.png", dpi=110)
+
+
 def main(argv=None) -> None:
     """Measure, print the tables, write the page, judge."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -82,6 +94,7 @@ def main(argv=None) -> None:
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--out", default=str(timing.OUT / "work_precision"))
+    parser.add_argument("--figures", type=Path, help="directory for an image of each plot")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
 
@@ -99,6 +112,8 @@ def main(argv=None) -> None:
         echo=say,
     )
     print(f"\n{found.table()}\n\nWritten to {options.out}/report.html\n")
+    if options.figures:
+        draw(found, options.figures)
     judged = [verdict(group) for group in plots(found)]
     print("Time relative to the best peer, at an error of")
     header = ["scene", "batch", "peers that take", "points below", *(f"{x:.0e}" for x in TARGETS)]
