@@ -200,7 +200,7 @@ def _shortest(Y, wanted, rank_tol):
     """lam and w = Y lam, the shortest w with Y^T w = wanted, and the rank of Y."""
 
     def by_rank(Y, wanted):
-        inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
+        inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), True)
         pushed = _product(inverse.T, wanted)
         return _product(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
 
@@ -348,15 +348,16 @@ def _eps(like) -> float:
     return float(jnp.finfo(like.dtype).eps)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
-def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float) -> Float[Array, "m n"]:
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = False) -> Float[Array, "m n"]:
     """Moore-Penrose inverse of Y, singular values below `rank_tol` times the largest taken for zero.
 
     Values: (Y^T Y)^-1 Y^T where that is as good; else on CPU a complete orthogonal decomposition (pivoted QR, then QR
-    of the triangle's transpose), elsewhere an SVD, of all samples if one in a batch needs it. Derivative: the formula of
-    Golub & Pereyra (1973), eq. 4.12, right wherever the rank is constant; no factorisation is differentiated.
+    of the triangle's transpose), elsewhere an SVD, of all samples if one in a batch needs it; at once where the columns are
+    known to be `dependent`. Derivative: the formula of Golub & Pereyra (1973), eq. 4.12, right wherever the rank is
+    constant; no factorisation is differentiated.
     """
-    if Y.shape[1] > Y.shape[0]:
+    if dependent or Y.shape[1] > Y.shape[0]:
         return _by_factors(Y, rank_tol)
     factor, independent = normal_factor(Y, rank_tol)
     return lax.cond(anywhere(~independent), lambda: _by_factors(Y, rank_tol), lambda: _by_normal_equations(Y, factor))
@@ -399,9 +400,9 @@ def _by_svd(Y, rank_tol):
 
 
 @pseudo_inverse.defjvp
-def _pseudo_inverse_jvp(rank_tol, primals, tangents):
+def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
     (Y,), (dY,) = primals, tangents
-    P = pseudo_inverse(Y, rank_tol)
+    P = pseudo_inverse(Y, rank_tol, dependent)
     across = dY.T - _product(_product(dY.T, Y), P)  # dY^T (1 - Y P)
     along = dY.T - _product(P, _product(Y, dY.T))  # (1 - P Y) dY^T
     dP = -_product(_product(P, dY), P)

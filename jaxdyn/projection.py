@@ -68,11 +68,11 @@ class _Correction(NamedTuple):
 def _correction(L, Y, rank_tol) -> _Correction:
     """From Y = L^-1 A^T: by its normal equations, or by its pseudo-inverse where the rows are close to dependent."""
     if Y.shape[1] > Y.shape[0]:
-        return _Correction(L, pseudo_inverse(Y, tolerance(rank_tol, Y)).T, jnp.eye(Y.shape[1], dtype=Y.dtype))
+        return _Correction(L, pseudo_inverse(Y, tolerance(rank_tol, Y), True).T, jnp.eye(Y.shape[1], dtype=Y.dtype))
     C, independent = normal_factor(Y, rank_tol)
 
     def by_rank():
-        return pseudo_inverse(Y, tolerance(rank_tol, Y)).T, jnp.eye(Y.shape[1], dtype=Y.dtype)
+        return pseudo_inverse(Y, tolerance(rank_tol, Y), True).T, jnp.eye(Y.shape[1], dtype=Y.dtype)
 
     return _Correction(L, *lax.cond(anywhere(~independent), by_rank, lambda: (Y, C)))
 
