@@ -12,9 +12,10 @@ from jaxdyn import se2, se3, so3
 from jaxdyn.joints import SCREW_KINDS, joint_integrate, joint_rate
 from jaxdyn.model import Model, Topology, _per_joint
 from jaxdyn.so3 import _product
+from jaxdyn.solvers.wrapped import Wrapped
 
 
-class LieGroup(diffrax.AbstractWrappedSolver):
+class LieGroup(Wrapped):
     """A method that steps in local coordinates: q = q_k exp(e), with q_k the start of the step.
 
     The wrapped method integrates e, one number for every velocity, from e = 0 by de/dt = J_r(e)^-1 v, J_r the right
@@ -31,7 +32,6 @@ class LieGroup(diffrax.AbstractWrappedSolver):
     ```
     """
 
-    solver: diffrax.AbstractSolver
     topology: Topology | None = eqx.field(static=True, default=None)
 
     def fitted(self, system) -> diffrax.AbstractSolver:
@@ -40,47 +40,14 @@ class LieGroup(diffrax.AbstractWrappedSolver):
         return self.solver if flat else LieGroup(self.solver, system.topology)
 
     @property
-    def term_structure(self):
-        """As the wrapped method's."""
-        return self.solver.term_structure
-
-    @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         """Dense output of the wrapped method in the coordinates of the step."""
         return functools.partial(_Interpolation, self.solver.interpolation_cls, self.topology)
-
-    # diffrax sets these on the method that it is given; they belong to the wrapped one.
-    @property
-    def root_finder(self):
-        """Of the wrapped method, if it is implicit."""
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self):
-        """Of the wrapped method, if it is implicit."""
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def scan_kind(self):
-        """Of the wrapped method, if it is of Runge-Kutta type."""
-        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
-
-    def order(self, terms):
-        """Order of convergence, that of the wrapped method."""
-        return self.solver.order(terms)
-
-    def error_order(self, terms):
-        """Order of the error estimate, that of the wrapped method."""
-        return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
         """State of the wrapped method."""
         terms, z0 = self._local(terms, y0)
         return self.solver.init(terms, t0, t1, z0, args)
-
-    def func(self, terms, t0, y0, args):
-        """Vector field at one point."""
-        return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step of the wrapped method in the coordinates about its start."""

@@ -9,6 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxdyn.solvers.wrapped import Wrapped
+
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
     """Dense output of the wrapped method, bent so that the step ends where the projection put it.
@@ -37,7 +39,7 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
         return jax.tree.map(lambda y, s: y + bend.astype(y.dtype) * s, self.inner.evaluate(t0), self.shift)
 
 
-class ProjectedSolver(diffrax.AbstractWrappedSolver):
+class ProjectedSolver(Wrapped):
     """A method whose every step is followed by a projection onto a manifold that holds the solution.
 
     The exact solution stays on the manifold, so the projection moves a step's result by no more than its local error,
@@ -50,14 +52,8 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     within the step the dense output keeps the old ones.
     """
 
-    solver: diffrax.AbstractSolver
     project: Callable
     jumping: tuple[str, ...] = eqx.field(static=True, default=())
-
-    @property
-    def term_structure(self):
-        """As the wrapped method's."""
-        return self.solver.term_structure
 
     @property
     def term_compatible_contr_kwargs(self):
@@ -69,37 +65,9 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         """Dense output of the wrapped method, ending at the projected point."""
         return functools.partial(_Interpolation, self.solver.interpolation_cls)
 
-    # diffrax sets these on the method that it is given; they belong to the wrapped one.
-    @property
-    def root_finder(self):
-        """Of the wrapped method, if it is implicit."""
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self):
-        """Of the wrapped method, if it is implicit."""
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def scan_kind(self):
-        """Of the wrapped method, if it is of Runge-Kutta type."""
-        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
-
-    def order(self, terms):
-        """Order of convergence, kept by the projection."""
-        return self.solver.order(terms)
-
-    def error_order(self, terms):
-        """Order of the error estimate, that of the wrapped method."""
-        return self.solver.error_order(terms)
-
     def init(self, terms, t0, t1, y0, args):
         """State of the wrapped method."""
         return self.solver.init(terms, t0, t1, y0, args)
-
-    def func(self, terms, t0, y0, args):
-        """Vector field at one point."""
-        return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step of the wrapped method, projected."""
