@@ -17,7 +17,6 @@ large?"; its batching rule counts the samples, and what is left unbatched answer
 branch that is not taken.
 """
 
-import functools
 from collections.abc import Callable
 
 import jax
@@ -33,6 +32,7 @@ from jaxtyping import Array
 from jaxdyn import closed_recursion, looped, matrix_form, recursive
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
+from jaxdyn._tracing import is_one_sample, traced_once
 from jaxdyn.model import Model
 
 LEAST_BATCH = 256
@@ -57,27 +57,13 @@ def _count_samples(arrays, axes, *, count):
 batching.primitive_batchers[_large_batch_p] = _count_samples
 
 
-@functools.cache
-def _traced_once(function: Callable) -> Callable:
-    """`function` behind a `jit` of its own, so that a program which calls it many times traces it once per mechanism."""
-
-    def run(least, *args):
-        with at_least(least):
-            return function(*args)
-
-    return jax.jit(run, static_argnums=0)
-
-
 def is_large_batch(*trees):
     """Whether the batch over which the trees vary has at least `LEAST_BATCH` samples: a bool, or a traced one that is known
     when the program is compiled."""
     traced = [x for x in jax.tree.leaves(trees) if isinstance(x, jax.core.Tracer)]
-    return _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1) if traced else False
-
-
-def _is_given(model: Model) -> bool:
-    # A mechanism whose numbers are known is traced in place: inside a jit of its own its zeros would be hidden.
-    return isinstance(model.home, jax.core.Tracer) and isinstance(model.screws, jax.core.Tracer)
+    large = _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1) if traced else False
+    # What no batch encloses is not made large any more.
+    return False if is_one_sample() and isinstance(large, jax.core.Tracer) else large
 
 
 def _is_tiny(model: Model) -> bool:
@@ -90,16 +76,13 @@ def _choose(model: Model, recursion: Callable, matrices: Callable, *args):
         return matrices(model, *args)
     large = True if _is_tiny(model) else is_large_batch(model, *args[:3])
 
-    def recursion_from(least):
-        if _is_given(model):
-            return _traced_once(recursion)(least, model, *args)
-        with at_least(least):
-            return recursion(model, *args)
+    def by_recursion():
+        with at_least(LEAST_BATCH):
+            return traced_once(recursion, model, *args)
 
     if isinstance(large, jax.core.Tracer):
-        # The matrix form takes nothing from known numbers.
-        return lax.cond(large, lambda: recursion_from(LEAST_BATCH), lambda: _traced_once(matrices)(1, model, *args))
-    return recursion_from(LEAST_BATCH) if large else matrices(model, *args)
+        return lax.cond(large, by_recursion, lambda: traced_once(matrices, model, *args))
+    return by_recursion() if large else matrices(model, *args)
 
 
 def inverse_dynamics(model: Model, q: Array, v: Array, a: Array) -> Array:
@@ -169,7 +152,7 @@ def _force_change(inverse: Callable, model, q, v, tau, steps) -> Callable:
 
     def change(a):
         total = jnp.zeros_like(tau) if tau_step is None else tau_step
-        moved = along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
+        _, moved = along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
         return total if moved is None else total - moved
 
     return change
@@ -179,12 +162,14 @@ def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tupl
     """`closed_recursion.closed_dynamics`, without derivatives; for large batches."""
     # Only what is traced has a gradient to be stopped; what is known has to stay so.
     args = jax.tree.map(
-        lambda x: lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x, (model, loops, q, v, tau)
+        lambda x: lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x, ((model, loops), q, v, tau)
     )
-    if _is_given(model):
-        return _traced_once(closed_recursion.closed_dynamics)(LEAST_BATCH, *args)
     with at_least(LEAST_BATCH):
-        return closed_recursion.closed_dynamics(*args)
+        return traced_once(_closed, *args)
+
+
+def _closed(tree, q, v, tau):
+    return closed_recursion.closed_dynamics(*tree, q, v, tau)
 
 
 def with_derivatives(model: Model, loops, q: Array, v: Array, tau: Array, a: Array, lam: Array) -> tuple[Array, Array]:
@@ -202,7 +187,7 @@ def with_derivatives(model: Model, loops, q: Array, v: Array, tau: Array, a: Arr
                 model, loops = tree
                 return closed_recursion.closed_inverse(model, loops, q, v, a, lam)
 
-            moved = along(needed, (tree, q, v), steps)
+            _, moved = along(needed, (tree, q, v), steps)
             force, rate = (jnp.zeros_like(v), jnp.zeros_like(lam)) if moved is None else moved
             return (-force if tau_step is None else tau_step - force), -rate
 

@@ -3,7 +3,8 @@
 from collections.abc import Callable
 
 import jax
-import jax.core
+
+from jaxdyn._tracing import split
 
 
 def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
@@ -12,37 +13,30 @@ def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
     `steps` are those of the tree's leaves and of the args, None where nothing moves. Leaves with known values stay outside of
     the differentiated function: inside it they would be traced, and a recursion could not see their zeros any more.
     """
-    leaves, structure = jax.tree.flatten(tree)
-    places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.core.Tracer)]
-
-    def rebuild(traced):
-        full = list(leaves)
-        for place, leaf in zip(places, traced, strict=True):
-            full[place] = leaf
-        return jax.tree.unflatten(structure, full)
+    unknown, known = split(tree)
 
     @jax.custom_jvp
     def run(traced, *args):
-        return solve(rebuild(traced), *args)
+        return solve(known(traced), *args)
 
     def rule(primals, tangents):
         traced, *args = primals
         zero = jax.custom_derivatives.SymbolicZero
-        steps = [None] * len(leaves)
-        for place, step in zip(places, tangents[0], strict=True):
+        steps: list = [None] * known.structure.num_leaves
+        for place, step in zip(known.places, tangents[0], strict=True):
             steps[place] = step
-        return tangent(rebuild(traced), *args, [None if isinstance(x, zero) else x for x in (*steps, *tangents[1:])])
+        return tangent(known(traced), *args, [None if isinstance(x, zero) else x for x in (*steps, *tangents[1:])])
 
     run.defjvp(rule, symbolic_zeros=True)
-    return run([leaves[i] for i in places], *args)
+    return run(unknown, *args)
 
 
 def along(function: Callable, args: tuple, steps):
-    """The change of function(*args) for `steps` in the leaves of args, None where one does not move; None if none does."""
+    """function(*args), and its change for `steps` in the leaves of args, None where one does not move; None if none does."""
     base, structure = jax.tree.flatten(args)
     moving = [i for i, step in enumerate(steps) if step is not None]
     if not moving:
-        return None
+        return function(*args), None
 
     def moved(*values):
         here = list(base)
@@ -50,4 +44,4 @@ def along(function: Callable, args: tuple, steps):
             here[i] = value
         return function(*jax.tree.unflatten(structure, here))
 
-    return jax.jvp(moved, [base[i] for i in moving], [steps[i] for i in moving])[1]
+    return jax.jvp(moved, [base[i] for i in moving], [steps[i] for i in moving])

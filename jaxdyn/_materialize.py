@@ -45,14 +45,17 @@ def at_least(size: int):
         _least_size.reset(token)
 
 
+def least_size() -> int:
+    """The size that `at_least` has set."""
+    return _least_size.get()
+
+
 def materialize(*values):
     """The same values, each computed once (see the module's text). Entries that are plain Python numbers pass through."""
     arrays = [i for i, value in enumerate(values) if isinstance(value, jax.Array)]
     kept = list(values)
     if arrays:
-        for i, value in zip(
-            arrays, _materialize_p.bind(*[values[i] for i in arrays], least=_least_size.get()), strict=True
-        ):
+        for i, value in zip(arrays, _materialize_p.bind(*[values[i] for i in arrays], least=least_size()), strict=True):
             kept[i] = value
     return kept
 

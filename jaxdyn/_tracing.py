@@ -1,12 +1,17 @@
-"""Whether numbers are known while Python runs, and compiling what is called with known ones."""
+"""Whether numbers are known while Python runs, and tracing or compiling once what is called many times."""
 
+import contextvars
 import functools
+import operator
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
+
+from jaxdyn._materialize import at_least, least_size
 
 
 def is_concrete(*trees) -> bool:
@@ -24,12 +29,89 @@ def is_known(*trees) -> bool:
     return not is_staged() and is_concrete(*trees)
 
 
+_one_sample = contextvars.ContextVar("one_sample", default=False)
+
+
+def is_one_sample() -> bool:
+    """Whether the program that is traced was called with known numbers, so that no batch encloses it."""
+    return _one_sample.get()
+
+
+def _on_one_sample(function: Callable) -> Callable:
+    def run(*args):
+        token = _one_sample.set(True)
+        try:
+            return function(*args)
+        finally:
+            _one_sample.reset(token)
+
+    return run
+
+
 def compiled(function: Callable) -> Callable:
     """`function`, compiled once per shape; within a trace as it is, where a nested `jit` would hide what is known."""
-    program = eqx.filter_jit(function)
+    program, for_one = eqx.filter_jit(function), eqx.filter_jit(_on_one_sample(function))
 
     @functools.wraps(function)
     def call(*args):
-        return (function if is_staged() else program)(*args)
+        return (function if is_staged() else for_one if is_concrete(args) else program)(*args)
 
     return call
+
+
+class _Leaves:
+    """Leaves that are equal to others if they are the same objects; held, so that no other ones come to their places."""
+
+    def __init__(self, leaves):
+        self.leaves = leaves
+
+    def __eq__(self, other):
+        return len(self.leaves) == len(other.leaves) and all(map(operator.is_, self.leaves, other.leaves))
+
+    def __hash__(self):
+        return hash(tuple(map(id, self.leaves)))
+
+
+class Known(NamedTuple):
+    """A pytree without its traced leaves; called with such leaves, it is the tree with them."""
+
+    structure: Any
+    places: tuple[int, ...]
+    leaves: _Leaves
+
+    def __call__(self, traced):
+        full = list(self.leaves.leaves)
+        for place, leaf in zip(self.places, traced, strict=True):
+            full[place] = leaf
+        return jax.tree.unflatten(self.structure, full)
+
+
+def split(tree) -> tuple[list, Known]:
+    """The traced leaves of a tree, and all the rest of it.
+
+    What jax traces as an argument it does not know. Known leaves that go around its functions in a `Known` stay known.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    places = tuple(i for i, leaf in enumerate(leaves) if isinstance(leaf, Tracer))
+    known = _Leaves([None if isinstance(leaf, Tracer) else leaf for leaf in leaves])
+    return [leaves[i] for i in places], Known(structure, places, known)
+
+
+def traced_once(function: Callable, tree, *args, static: tuple = ()):
+    """function(tree, *args, *static), traced once in all programs that call it for the same tree and the same shapes.
+
+    Leaves of the tree with known values stay known. Without a program that is traced it is a plain call.
+    """
+    if not is_staged():
+        return function(tree, *args, *static)
+    traced, known = split(tree)
+    return _program(function, known, static, least_size(), is_one_sample())(traced, *args)
+
+
+@functools.lru_cache(maxsize=256)  # programs hold their trees
+def _program(function, known: Known, static, least: int, _one_sample: bool):
+    def run(traced, *args):
+        with at_least(least):
+            return function(known(traced), *args, *static)
+
+    return jax.jit(run)

@@ -23,6 +23,7 @@ from jaxdyn._anywhere import anywhere
 from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, solve_factored, solve_lower
+from jaxdyn._tracing import traced_once
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.loops import Loop
@@ -115,12 +116,17 @@ def constrained_dynamics(
         return _free(scene, q, v, force, t)
 
     def dense():
-        return solve_rows(scene, q, v, force, t, rows(scene, q, v, t), method, rank_tol)
+        bare = Scene(scene.system, scene.constraints)
+        return traced_once(_by_matrices, bare, q, v, force, jnp.asarray(t, q.dtype), static=(method, rank_tol))
 
     large = method != "range_space" and has_short_recursion(scene) and is_large_batch(scene, q, v, force)
     if isinstance(large, jax.core.Tracer):
         return lax.cond(large, lambda: _by_recursion(scene, q, v, force, method, rank_tol, dense), dense)
     return _by_recursion(scene, q, v, force, method, rank_tol, dense) if large else dense()
+
+
+def _by_matrices(scene: Scene, q, v, force, t, method: str, rank_tol) -> ConstrainedDynamics:
+    return solve_rows(scene, q, v, force, t, rows(scene, q, v, t), method, rank_tol)
 
 
 def has_short_recursion(scene: Scene) -> bool:

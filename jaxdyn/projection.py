@@ -14,6 +14,7 @@ from jaxdyn._dispatch import LEAST_BATCH, is_large_batch
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn._small import cholesky, solve_factored, solve_lower
+from jaxdyn._tracing import traced_once
 from jaxdyn.closed_projection import Closing
 from jaxdyn.constrained import correction, has_short_recursion, least_pivot, normal_factor, pseudo_inverse, tolerance
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
@@ -35,22 +36,25 @@ def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
     """
 
     def project(scene, q, v, t):
-        q = retract(scene.system, q)
-        short, long = (partial(way, scene, rank_tol) for way in (_by_recursion, _by_matrices))
-        large = has_short_recursion(scene) and is_large_batch(scene, q, v)
-        if isinstance(large, jax.core.Tracer):
-            return lax.cond(large, short, long, q, v, t)
-        return (short if large else long)(q, v, t)
-
-    def careful(scene, q, v, t):
-        return _in_fixed_steps(scene, q, v, t, rank_tol)
+        return traced_once(_by_the_batch, scene, q, v, t, static=(rank_tol,))
 
     def tangent(scene, q, v, t, steps):
-        found = careful(scene, q, v, t)
-        moved = along(careful, (scene, q, v, t), steps)
+        def careful(scene, q, v, t):
+            return traced_once(_in_fixed_steps, scene, q, v, t, static=(rank_tol,))
+
+        found, moved = along(careful, (scene, q, v, t), steps)
         return found, jax.tree.map(jnp.zeros_like, found) if moved is None else moved
 
-    return implicit(scene, (q, v, t), project, tangent)
+    return implicit(Scene(scene.system, scene.constraints), (q, v, t), project, tangent)
+
+
+def _by_the_batch(scene: Scene, q, v, t, rank_tol):
+    q = retract(scene.system, q)
+    short, long = (partial(way, scene, rank_tol) for way in (_by_recursion, _by_matrices))
+    large = has_short_recursion(scene) and is_large_batch(scene, q, v)
+    if isinstance(large, jax.core.Tracer):
+        return lax.cond(large, short, long, q, v, t)
+    return (short if large else long)(q, v, t)
 
 
 class _Correction(NamedTuple):

@@ -13,9 +13,8 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 
-from jaxdyn._tracing import compiled, is_concrete, is_known
+from jaxdyn._tracing import compiled, is_concrete, is_known, split
 from jaxdyn.assembly import residuals
 from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves
 from jaxdyn.constraints.base import state_dtype
@@ -174,14 +173,12 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     system, outputs = scene.system, options["outputs"]
     # diffrax compiles its arguments, which hides their values. What is known stays in closures, the rest is `args`:
     # flat, because its continuous adjoint takes no empty tuples.
-    leaves, structure = jax.tree.flatten((scene, control, method))
-    unknown = [i for i, leaf in enumerate(leaves) if isinstance(leaf, Tracer)]
-    args = tuple(leaves[i] for i in unknown) or None
+    unknown, known = split((scene, control, method))
+    args = tuple(unknown) or None
 
     def given(args):
         """The scene, the control and the method."""
-        filled = dict(enumerate(leaves)) | dict(zip(unknown, args or (), strict=True))
-        return jax.tree.unflatten(structure, filled.values())
+        return known(args or ())
 
     def effort(args, q, v, t):
         """Tau plus the scene's forces, or None when there are none."""

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn import se3
+from jaxdyn import se3, so3
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.kinematics import Carried, carried, take
 from jaxdyn.model import Model, frame_index
@@ -175,9 +175,14 @@ def _batches(members: Sequence[Pair]):
 
 
 def _displaced(R, p, twist):
-    """Pose of frame B after it has moved along a twist, seen from frame A."""
-    moved = se3.exp(twist)
-    return _product(moved[:3, :3], R), se3.apply(moved, p)
+    """Pose of frame B after it has moved along a small twist, seen from frame A: exp(twist) up to second order.
+
+    Only first and second derivatives at twist = 0 are taken, and these are exact.
+    """
+    turn = so3.hat(twist[3:])
+    first = twist[:3] + _product(turn, p)
+    turned = _product(turn, R)
+    return R + turned + 0.5 * _product(turn, turned), p + first + 0.5 * _product(turn, first)
 
 
 def _directions(pair: Pair, R, p) -> Float[Array, "r 6"]:
