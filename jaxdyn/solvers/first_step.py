@@ -14,10 +14,10 @@ class Adaptive(diffrax.PIDController):
     NaN, rejected and tried again until the last of `max_steps`. A finite one is halved and halved again until the least
     step ends the run.
 
-    Lengths are rounded to four binary digits. Else the rounding errors of an error estimate reach the times of all later steps and
-    grow there: reverse mode, which computes steps anew from checkpoints by another program, would then put together pieces
-    of two different sequences. The least step, `dtmin` at the end of the run, is shorter at earlier times: no longer than
-    those can be told apart.
+    Lengths are rounded to four binary digits. Else the rounding errors of an error estimate reach the times of all later
+    steps and grow there: reverse mode, which computes steps anew from checkpoints by another program, would then put
+    together pieces of two different sequences. The least step, `dtmin` at the end of the run, is shorter at earlier
+    times, which can be told apart better.
     """
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
@@ -32,8 +32,8 @@ class Adaptive(diffrax.PIDController):
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         """Whether the step is kept, and the next one."""
-        eps = jnp.finfo(jnp.result_type(t1)).eps
-        least = jnp.clip(16 * eps * jnp.abs(t0), eps * self.dtmin, self.dtmin)
+        eps, at_end = jnp.finfo(jnp.result_type(t1)).eps, jnp.asarray(self.dtmin)
+        least = jnp.clip(16 * eps * jnp.abs(t0), eps * at_end, at_end)
         local = eqx.tree_at(lambda c: c.dtmin, self, least)
         kept, start, end, jumped, state, result = diffrax.PIDController.adapt_step_size(
             local, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
