@@ -70,11 +70,11 @@ class Between(eqx.Module):
 
 
 class Ground(eqx.Module):
-    """One-sided spring and damper under a body that moves along z: depth of a smoothed step of width eps."""
+    """One-sided spring and damper under a body that moves along z: depth of a smoothed step of width `eps`."""
 
     stiffness: jax.Array
     damping: jax.Array
-    eps: float = eqx.field(static=True, default=1e-4)
+    eps: jax.Array
 
     def __call__(self, system, q, v, t):
         root = jnp.sqrt(q * q + self.eps**2)
@@ -145,7 +145,7 @@ def _drive(kd):
 
 
 def _press(k):
-    ground = Ground(k, 2 * jnp.sqrt(k))
+    ground = Ground(k, 2 * jnp.sqrt(k), 1 / k)  # smoothed over a tenth of the depth at rest
     return jd.Scene(_sliders((1.0,), True), forces=(ground,)), None, np.array([0.05]), np.zeros(1)
 
 
@@ -166,7 +166,7 @@ def cases() -> dict[str, Case]:
             "N/m",
             _spring,
             two,
-            10.0 ** np.arange(2, 10),
+            10.0 ** np.array([2, 4, 6, 7, 9]),
             lambda k: _spring_exact(k, two),
             0.01,
         ),
@@ -176,7 +176,7 @@ def cases() -> dict[str, Case]:
             "N/m",
             _flexible,
             two,
-            10.0 ** np.arange(2, 10),
+            10.0 ** np.array([2, 4, 6, 7, 9]),
             lambda k: _flexible_exact(k, two),
             0.3,
         ),
@@ -186,7 +186,7 @@ def cases() -> dict[str, Case]:
             "N m s/rad",
             _drive,
             one,
-            10.0 ** np.arange(-5, 2),
+            10.0 ** np.arange(-5, 2, 2),
             None,
             1.0,
         ),
@@ -196,7 +196,7 @@ def cases() -> dict[str, Case]:
             "N/m",
             _press,
             one,
-            10.0 ** np.arange(2, 8),
+            10.0 ** np.arange(2, 9, 2),
             None,
             0.05,
         ),
@@ -244,8 +244,11 @@ def carried_out(case: Case, solver, tolerance=1e-8, dtype=float):
 
 def reference(case: Case):
     """Positions at all stiffnesses, closed form where there is one, derivatives, and a bound of their errors."""
-    one, other = (carried_out(case, solver, 1e-11) for solver in (jd.Rodas5P(), diffrax.Kvaerno5()))
-    differ = [np.abs(a - b).max() / case.size for a, b in zip(one[:2], other[:2], strict=True)]
+    one, other = (carried_out(case, solver, 1e-10) for solver in (jd.Rodas5P(), diffrax.Kvaerno5()))
+    both = one[3] & other[3]
+    if not one[3].all():
+        raise RuntimeError(f"{case.name}: the reference needs more than {MOST_STEPS} steps at {case.values[~one[3]]}")
+    differ = [np.abs(a - b)[both].max() / case.size for a, b in zip(one[:2], other[:2], strict=True)]
     q = one[0] if case.exact is None else np.stack([case.exact(k) for k in case.values])
     return q, one[1], differ
 
@@ -255,7 +258,7 @@ def table(case: Case) -> str:
     q, slope, differ = reference(case)
     kind = "converged solution" if case.exact is None else "closed form" if case.values.size > 1 else "published"
     lines = [
-        f"**{case.name}.** {case.text} (over {case.ts[-1]:g} s). Reference: {kind}; two methods at 1e-11 differ by "
+        f"**{case.name}.** {case.text} (over {case.ts[-1]:g} s). Reference: {kind}; two methods at 1e-10 differ by "
     ]
     lines[0] += f"{differ[0]:.0e}, in the derivative by {differ[1]:.0e}."
     lines += ["", f"| {case.unit} | " + " | ".join(f"{k:.0e}" for k in case.values) + " | derivative |"]
