@@ -347,7 +347,7 @@ def test_transient_at_the_start_in_single_precision():
 def test_rodas_serves_at_every_stiffness():
     """Springs of 1e2 to 1e9 N/m in one program: positions and their derivatives against closed forms."""
     case = cases()["flexible_joint"]
-    case = case._replace(values=case.values[[0, 2, 5, 7]])
+    case = case._replace(values=case.values[[0, 1, 3, 4]])
     run = quick(jax.vmap(program(case, jd.Rodas5P(), max_steps=1024), (0, None)))
     q, slope, steps, success = run(case.values, 1e-8)
     step = 1e-3
