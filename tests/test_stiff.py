@@ -290,13 +290,64 @@ def test_implicit_explicit_split():
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# Step sizes that do not depend on rounding
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [diffrax.Dopri8(), pytest.param(jd.Rodas5P(), marks=pytest.mark.slow)],
+    ids=["Dopri8", "Rodas5P"],
+)
+def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
+    """Reverse mode over 200 to 900 steps from 45 checkpoints, forward mode, and differences, by a spring's stiffness.
+
+    Reverse and forward mode differentiate the same steps, so only rounding is between them: a relative 1e-12 for Dopri8. Were the
+    steps computed from a checkpoint others than the first time, it would be up to 3 % here.
+    """
+    builder = jd.ModelBuilder("pendulum")
+    builder.add_body("rod", joint="revolute", axis=(0, 1, 0), inertia=(1.0, (0, 0, -0.5), (0.1, 0.1, 0.01)))
+    model, ts = builder.build(), np.linspace(0.0, 10.0, 11)
+
+    def end(log, adjoint=None):
+        scene = jd.Scene(model, forces=(jd.JointSpring(jnp.exp(log)), jd.JointDamping(0.01)))
+        options = {"solver": solver, "adjoint": adjoint, "max_steps": 1024, "throw": False}
+        found = jd.simulate(scene, jnp.asarray([2.5]), jnp.asarray([0.1]), ts, **options)
+        return jnp.sum(found.q * found.v), found.stats["num_steps"]
+
+    def forward(log):
+        return jax.jvp(lambda x: end(x, "forward"), (log,), (jnp.ones_like(log),), has_aux=True)
+
+    logs, step = np.log([1.0, 10.0]), 1e-3
+    reverse, steps = quick(jax.vmap(jax.grad(end, has_aux=True)))(logs)
+    places = (logs + step * np.array([0.0, 1, -1, 2, -2])[:, None]).reshape(-1)
+    values, slopes, counts = (np.asarray(x).reshape(5, 2) for x in quick(jax.vmap(forward))(places))
+    np.testing.assert_array_equal(steps, counts[0])
+    assert steps.max() > 4 * 45 and steps.max() < 1024
+    np.testing.assert_allclose(reverse, slopes[0], rtol=1e-11)
+    # Errors of the motion at tolerances of 1e-8, which differ between neighbours.
+    differences = (8 * (values[1] - values[2]) - (values[3] - values[4])) / (12 * step)
+    np.testing.assert_allclose(reverse, differences, rtol=1e-4)
+
+
+def test_transient_at_the_start_in_single_precision():
+    """A start that is over within a microsecond: steps there may be shorter than the end of the run could tell apart."""
+    scene = jd.Scene(slider(), forces=(jd.JointDamping(4e6), jd.JointSpring(4e6)))
+    single, start, ts = jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float32), (scene, (1.0, 50.0), np.linspace(0, 2.0, 3))
+    )
+    found = jd.simulate(single, start[0][None], start[1][None], ts, solver=jd.Rodas5P())
+    assert found.q.dtype == jnp.float32
+    np.testing.assert_allclose(found.q[:, 0], np.exp([0.0, -1.0, -2.0]), rtol=0, atol=3e-5)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Verdicts
 
 
 def test_rodas_serves_at_every_stiffness():
     """Springs of 1e2 to 1e9 N/m in one program: positions and their derivatives against closed forms."""
     case = cases()["flexible_joint"]
-    case = case._replace(values=case.values[[0, 2, 5, 7]])
+    case = case._replace(values=case.values[[0, 1, 3, 4]])
     run = quick(jax.vmap(program(case, jd.Rodas5P(), max_steps=1024), (0, None)))
     q, slope, steps, success = run(case.values, 1e-8)
     step = 1e-3

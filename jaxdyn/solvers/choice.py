@@ -180,6 +180,7 @@ def progress_meter(progress: bool) -> diffrax.AbstractProgressMeter:
 def _has_coarse_dense_output(solver, term) -> bool:
     """Whether save points between steps would be less accurate than the steps."""
     interpolation, order = unwrapped(solver).interpolation_cls, solver.order(term)
+    interpolation = getattr(interpolation, "__self__", interpolation)  # Kvaerno's name a constructor of the class
     if not isinstance(interpolation, type) or order is None:
         return False
     degrees = [degree for cls, degree in _INTERPOLATION_DEGREE.items() if issubclass(interpolation, cls)]
