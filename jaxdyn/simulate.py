@@ -280,6 +280,9 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     result = RESULTS.promote(solved.result)
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
     result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
+    # Fixed steps go on from what is not finite: all that is known is the last state before it that was kept.
+    kept = jnp.max(jnp.where(reached, ts, ts[0]))
+    time_reached = jnp.where(result == RESULTS.nonfinite_state, kept, time_reached)
     if method.projects and scene.constraints:
         closed = jax.vmap(consistent, (None, 0, 0, 0))(scene, q, v, ts)
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
@@ -351,7 +354,12 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
     if continuous:
         return solved, jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
     (times, end), (ys, _) = solved.ts, solved.ys
-    return eqx.tree_at(lambda s: (s.ts, s.ys), solved, (times, ys)), end[0]
+    reached = end[0]
+    if is_fixed(steps[-1]):
+        # diffrax is at the end of the step that could not be solved; what is known ends where it began.
+        began = ts[0] + (solved.stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
+        reached = jnp.where(solved.result == diffrax.RESULTS.nonlinear_divergence, began, reached)
+    return eqx.tree_at(lambda s: (s.ts, s.ys), solved, (times, ys)), reached
 
 
 def _along(mask, rows):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks import extremes
-from benchmarks.extreme_motions import SOLVERS, stability_limits
+from benchmarks.extreme_motions import SOLVERS, run_oscillator, stability_limits
 from jaxdyn import robots
 from jaxdyn.simulate import simulate
 
@@ -62,6 +62,11 @@ def test_beyond_the_longest_stable_step():
         ("1.1 of the limit", "float64"): "nonfinite_state",
         ("2.0 of the limit", "float64"): "nonfinite_state",
     }
+    # It overflows after about 1100 of 2000 steps; what was kept at 1000 is the last that is known.
+    rate = 1.1 * stability_limits(None)[1]
+    _, found = extremes.quick(lambda rate: run_oscillator(rate, 0 * rate, None, 2000))(jnp.asarray(rate))
+    assert float(found.stats["time_reached"]) == 1000.0
+    np.testing.assert_array_equal(np.isnan(found.q[:, 0]), [False, False, True])
 
 
 def test_too_many_turns_are_refused_by_name():
