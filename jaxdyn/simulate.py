@@ -17,7 +17,7 @@ from jax.core import Tracer
 
 from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.assembly import residuals
-from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves
+from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves, start_limit
 from jaxdyn.constraints.base import state_dtype
 from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.kinematics import frame_pose
@@ -254,7 +254,13 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     if scene.constraints:
         held = consistent(scene, q0, v0, ts[0])
         if method.projects:
+            given_start = q0, v0
             q0, v0 = project_state(scene, q0, v0, ts[0])
+            # Residuals of a small mechanism are small numbers of metres: how far it moves onto the constraints tells more.
+            ways = [
+                jnp.max(jnp.abs(x - y)) / (1 + jnp.max(jnp.abs(x))) for x, y in zip(given_start, (q0, v0), strict=True)
+            ]
+            held = held & (jnp.maximum(*ways) <= 10 * start_limit(q0.dtype))
     eqx.filter_eval_shape(effort, args, q0, v0, ts[0])  # refuses callbacks of a wrong shape before diffrax meets them
     y0 = method.start(scene, q0, v0, ts[0])
     first = method.quality(scene, y0, ts[0])
