@@ -29,7 +29,7 @@ def refused(code, dtypes, *places):
 
 KNEES = [f"knee 1e-{n} rad from straight" for n in ("02", "04", "06", "08", "10", "12")]
 QUICK = {
-    "masses": (ONE, {}),
+    "masses": (ONE, refused("singular_mass_matrix", ONE, "tip 0 kg, constrained_dynamics")),
     "rates": (BOTH, {}),
     "turns": (BOTH, refused("coarse_start", ["float32"], "1e+03 turns", "1e+06 turns")),
     "planes": (("float32",), {}),
