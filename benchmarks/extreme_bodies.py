@@ -51,7 +51,10 @@ MASSES = (
     "light links the armature that their motors have; leave out a body of no consequence. A joint that moves no "
     "inertia is refused when the model is built; made so afterwards, it gives NaN and the code `dt_min_reached`."
 )
-LINKS_ADVICE = "Nothing. Energies are relative to the total weight times 1 m."
+LINKS_ADVICE = (
+    "Nothing. Energies are relative to the total weight times 1 m. The gradient is that of a sum over all positions and "
+    "velocities with respect to a common rate of the joints."
+)
 TWINS = (
     "`atol` is in the units of the state: an error of 1e-8 m is coarse for a slide of 1e-6 m and below rounding "
     "for one of 1e6 m. Scale `atol` with the mechanism, or choose units in which it has size one. Angles need "

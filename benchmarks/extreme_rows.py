@@ -267,8 +267,8 @@ def starts(dtypes, gradient):
 
 FLAT = (
     "Adaptive steps in float64 pass the position where the rows lose rank, by every method. In float32 rounding "
-    "next to it is larger than the tolerance and the run ends with `dt_min_reached`: take float64, or fixed steps "
-    "with method='projected' (the others may miss the branch by a percent there, and fixed steps do not say so). "
+    "next to it is larger than the tolerance and the run ends with `dt_min_reached`: take float64, or fixed steps, "
+    "which pass it without a code: with two windows they are off by 2e-3 then, so ask for outputs=('energy', 'work'). "
     "Gradients through the position itself are those of the steps taken."
 )
 PLANES = (
