@@ -7,8 +7,8 @@ import mpmath
 import numpy as np
 
 import jaxdyn as jd
-from benchmarks.extremes import Outcome, as_dtype, case, outcome, study, table
-from jaxdyn import looped, matrix_form, recursive
+from benchmarks.extremes import Outcome, Study, as_dtype, case, outcome, study, table
+from jaxdyn import constrained, looped, matrix_form, recursive
 
 FORMS = (matrix_form.forward_dynamics, recursive.aba, looped.forward_dynamics)
 
@@ -41,16 +41,20 @@ def graded(ratio: float, links: int = 6):
 
 
 RATIOS = np.array([1e-8, 1e-4, 1.0, 1e4, 1e8])
+SERIES = np.concatenate([np.stack([graded(r) for r in RATIOS]), [[1.0] * 5 + [0.0]]])
 _Q = np.array([0.3, -0.2, 0.4, 0.1, -0.3, 0.2])
 _V = np.array([0.5, -0.3, 0.2, 0.6, -0.4, 0.1])
 MASSES = (
     "A light link that carries a heavy one is left with eps times the ratio of the masses: 1e8 leaves eight "
     "digits in float64; in float32 1e4 leaves three and 1e8 none. `forward_dynamics` returns an acceleration and "
-    "no code; `simulate` ends with one. Use float64; give light links the armature that their motors have; leave "
-    "out a body of no consequence. A joint that moves no inertia is refused when the model is built; made so "
-    "afterwards, it gives NaN and the code `dt_min_reached`."
+    "no code; `constrained_dynamics` of a scene, without constraints too, and `simulate` have one. Use float64; give "
+    "light links the armature that their motors have; leave out a body of no consequence. A joint that moves no "
+    "inertia is refused when the model is built; made so afterwards, it gives NaN and the code `dt_min_reached`."
 )
-LINKS_ADVICE = "Nothing. Energies are relative to the total weight times 1 m."
+LINKS_ADVICE = (
+    "Nothing. Energies are relative to the total weight times 1 m. The gradient is that of a sum over all positions and "
+    "velocities with respect to a common rate of the joints."
+)
 TWINS = (
     "`atol` is in the units of the state: an error of 1e-8 m is coarse for a slide of 1e-6 m and below rounding "
     "for one of 1e6 m. Scale `atol` with the mechanism, or choose units in which it has size one. Angles need "
@@ -60,8 +64,8 @@ TWINS = (
 
 @case
 def masses(dtypes, gradient):
-    """Mass ratios along a chain of six rods, a geometric series from 1 kg: accelerations by all three implementations"""
-    exact = np.stack([chain_acceleration(graded(r), _Q, _V) for r in RATIOS])[:, None]
+    """Mass ratios along a chain of six rods, a geometric series from 1 kg: accelerations, plain and with a code"""
+    exact = np.stack([chain_acceleration(graded(r), _Q, _V) for r in RATIOS])
 
     def run(mass, x):
         dtype = mass.dtype
@@ -69,20 +73,34 @@ def masses(dtypes, gradient):
         here = here.replace(inertias=here.inertias * mass[:, None])
         q, v = jnp.asarray(_Q, dtype), jnp.asarray(_V, dtype)
         found = jnp.stack([form(here, q, v, jnp.zeros_like(v)) for form in FORMS])
-        return Outcome(found, x, jnp.asarray(jd.RESULTS.successful._value), x)
+        coded = jd.constrained_dynamics(jd.Scene(here), q, v)
+        return Outcome((found, coded.acceleration), x, coded.result._value, x)
 
-    studied = study(run, jnp.asarray(np.stack([graded(r) for r in RATIOS])), dtypes, False)
-    allowed = {d: 1000 * np.finfo(d).eps * np.maximum(RATIOS, 1.0) for d in dtypes}
+    outcomes = study(run, jnp.asarray(SERIES), dtypes, False).outcomes
+    # What the ratio costs, but no more than leaves two digits.
+    allowed = {d: np.minimum(1000 * np.finfo(d).eps * np.maximum(RATIOS, 1.0), 1e-2) for d in dtypes}
     labels = [f"tip {r:.0e} kg" for r in RATIOS]
-    return table("masses", labels, studied, exact, allowed, "60 digits", residual=False, advice=MASSES)
+    plain, coded = {}, {}
+    for dtype, found in outcomes.items():
+        fine = jnp.full(len(labels), jd.RESULTS.successful._value)
+        plain[dtype] = Outcome(found.end[0][:-1], found.residual[:-1], fine, found.value[:-1])
+        coded[dtype] = found._replace(end=found.end[1])
+    none = dict.fromkeys(dtypes)
+    options = {"residual": False, "advice": MASSES}
+    rows = table(
+        "masses", labels, Study(plain, none, None), exact[:, None], allowed, "60 digits", tolerance=False, **options
+    )
+    labels = [f"{label}, constrained_dynamics" for label in (*labels, "tip 0 kg")]
+    exact, allowed = np.vstack([exact, exact[:1]]), {d: np.append(x, x[-1]) for d, x in allowed.items()}
+    options["results"] = constrained.RESULTS
+    return rows + table("masses", labels, Study(coded, none, None), exact, allowed, "60 digits", **options)
 
 
 @case
 def mass_motion(dtypes, gradient):
     """The same chains and one whose tip has no mass through `simulate`, over 0.2 s of their own time"""
-    series = np.concatenate([np.stack([graded(r) for r in RATIOS]), [[1.0] * 5 + [0.0]]])
     # A heavy tip stands still while the light links swing under its pull, faster by the root of the ratio: chaos in no time.
-    spans = 0.2 / np.sqrt(np.maximum(series[:, -1], 1.0))
+    spans = 0.2 / np.sqrt(np.maximum(SERIES[:, -1], 1.0))
 
     def run(point, x):
         mass, span = point
@@ -94,7 +112,7 @@ def mass_motion(dtypes, gradient):
         found = jd.simulate(here, q, v, ts, outputs=("energy",), max_steps=1024)
         return outcome(found, end=(found.energy[1:] - found.energy[0]) / (9.81 * jnp.sum(mass)))
 
-    studied = study(run, (jnp.asarray(series), jnp.asarray(spans)), dtypes, gradient)
+    studied = study(run, (jnp.asarray(SERIES), jnp.asarray(spans)), dtypes, gradient)
     labels = [f"tip {r:.0e} kg" for r in RATIOS] + ["tip 0 kg"]
     allowed = {"float64": 1e-6, "float32": 1e-3}
     exact = np.zeros((len(labels), 2))

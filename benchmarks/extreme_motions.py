@@ -233,7 +233,7 @@ def chaos(dtypes, gradient):
             "rtol 1e-8", "float64", error, stretch, stretch * 1e-7 < 0.1, 1e-8, 100.0, name_of(found.result._value[0])
         )
     )
-    rows.append(_kept("rtol 1e-8", "float64", found.energy[0], 1e-6))
+    rows.append(_kept("rtol 1e-8", "float64", found, 1e-6))
     if "float32" in dtypes:
         single, _, found = quick(jax.vmap(run("float32", 1e-6)))(jnp.zeros(1, jnp.float32))
         error = np.linalg.norm(np.asarray(single, float)[0] - states[0], axis=1)
@@ -249,7 +249,7 @@ def chaos(dtypes, gradient):
                 name_of(found.result._value[0]),
             )
         )
-        rows.append(_kept("rtol 1e-6", "float32", found.energy[0], 1e-3))
+        rows.append(_kept("rtol 1e-6", "float32", found, 1e-3))
     return rows
 
 
@@ -274,10 +274,12 @@ def _grown(what, dtype, error, stretch, small, unit, allowed, code):
     )
 
 
-def _kept(what, dtype, energy, allowed):
-    energy = np.asarray(energy, float)
+def _kept(what, dtype, found, allowed):
+    energy, code = np.asarray(found.energy[0], float), name_of(found.result._value[0])
     drift = float(np.abs(energy - energy[0]).max() / (2 * 9.81))
-    return Row("chaos", f"{what}, 20 s", dtype, drift, allowed, "energy", None, False, "successful", None, True, CHAOS)
+    return Row(
+        "chaos", f"{what}, 20 s", dtype, drift, allowed, "energy", None, bool(np.isnan(drift)), code, None, True, CHAOS
+    )
 
 
 @case
@@ -311,7 +313,7 @@ def million(dtypes, gradient, count=1_000_000):
             for i in (1, 2, 3):
                 n = f"{ts[i] / 0.01:.0e} steps"
                 against = "Jacobi's functions" if what == "state" else "what is conserved"
-                bound = allowed[what] * (1.0 if what.startswith("length") else max(ts[i] / ts[3], 1e-2))
+                bound = allowed[what] * (max(ts[i] / ts[3], 1e-2) if what == "energy" else 1.0)
                 rows.append(
                     Row(
                         "million",
@@ -326,12 +328,13 @@ def million(dtypes, gradient, count=1_000_000):
                         None,
                         True,
                         MILLION,
+                        False,
                     )
                 )
     return rows
 
 
-MILLION_STATE = {"float64": 1e-6, "float32": 1.0}
+MILLION_STATE = {"float64": 1e-6, "float32": 1e-2}
 MILLION_ENERGY = {"float64": 1e-8, "float32": 1e-2}
 RATES = "Nothing."
 TURNS = (
@@ -353,5 +356,6 @@ CHAOS = (
 )
 MILLION = (
     "Take adaptive steps or a shorter step where the phase matters: the energy error of RK4 grows in proportion to time "
-    "and the phase with its square. In float32 the rounding of each step adds up as well."
+    "and the phase with its square. In float32 the rounding of each step adds up as well: after "
+    "1e6 steps the state is off by 0.14, and no code says so."
 )

@@ -39,8 +39,8 @@ def flat(dtypes, gradient, runs=FALLS):
             found = jd.simulate(as_dtype(base, dtype), q0.astype(dtype), v, at, **options)
             return outcome(found, residual=jnp.max(found.constraint_residual[:, 0]))
 
-        # Gradients of one window tell enough, and compile for minutes.
-        studied = study(run, jnp.ones(1), dtypes, gradient and count == 1 and method in ("projected", "reduced"))
+        # Gradients of one window by the default method tell enough, and compile for minutes.
+        studied = study(run, jnp.ones(1), dtypes, gradient and count == 1 and method == "projected")
         label = f"{count} window{'s' * (count > 1)}, {method}, {'adaptive' if stepsize is None else 'fixed'}"
         close = {"tolerance": stepsize is None, "advice": FLAT}
         rows += table("flat", [label], studied, exact, LOOSE, "Jacobi's functions", **close)
@@ -267,8 +267,8 @@ def starts(dtypes, gradient):
 
 FLAT = (
     "Adaptive steps in float64 pass the position where the rows lose rank, by every method. In float32 rounding "
-    "next to it is larger than the tolerance and the run ends with `dt_min_reached`: take float64, or fixed steps "
-    "with method='projected' (the others may miss the branch by a percent there, and fixed steps do not say so). "
+    "next to it is larger than the tolerance and the run ends with `dt_min_reached`: take float64, or fixed steps, "
+    "which pass it without a code: with two windows they are off by 2e-3 then, so ask for outputs=('energy', 'work'). "
     "Gradients through the position itself are those of the steps taken."
 )
 PLANES = (

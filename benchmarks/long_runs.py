@@ -11,6 +11,7 @@ variational one.
 
 import argparse
 import time
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -30,57 +31,50 @@ SCENES = {
 SAVES = 2001
 
 
-class Run(NamedTuple):
-    """One way to integrate: its name, and the options of `simulate`."""
+class Way(NamedTuple):
+    """One way to integrate: its name, the options of `simulate`, and the numbers for which it is run by their names."""
 
     name: str
     options: dict[str, Any]
+    numbers: dict[str, dict[str, float]]
 
 
-def runs(step: float) -> list[Run]:
+def ways(step: float) -> list[Way]:
     """Variational steps, RK4 steps (four evaluations to about eight in a variational step), and tolerances."""
-    variational = [
-        Run(f"variational, {h:g} s", {"method": "variational", "stepsize": h}) for h in (step, step / 2, step / 4)
-    ]
-    fixed = [Run(f"RK4, {h:g} s", {"stepsize": h}) for h in (step / 2, step / 4, step / 8)]
-    adaptive = [Run(f"Dopri8, {tol:g}", {"rtol": tol, "atol": tol}) for tol in (1e-6, 1e-8, 1e-10)]
-    return variational + fixed + adaptive
+    steps = {f"{h:g} s": {"stepsize": h} for h in (step, step / 2, step / 4)}
+    halves = {f"{h:g} s": {"stepsize": h} for h in (step / 2, step / 4, step / 8)}
+    tolerances = {f"{tol:g}": {"rtol": tol, "atol": tol} for tol in (1e-6, 1e-8, 1e-10)}
+    return [Way("variational", {"method": "variational"}, steps), Way("RK4", {}, halves), Way("Dopri8", {}, tolerances)]
 
 
-def measure(name: str, length: float) -> list[dict]:
+def measure(name: str, length: float) -> Iterator[dict]:
     """Errors and times of all ways to integrate one scene."""
     scene, (q, v) = getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()
     duration, step = SCENES[name]
     ts = jnp.linspace(0.0, length * duration, SAVES)
     outputs = ("energy", "constraint_residual") if scene.constraints else ("energy",)
-    found, seconds = {}, {}
-    for run in runs(step):
-        program = jax.jit(
-            lambda q, v, options=run.options: jd.simulate(
-                scene, q, v, ts, outputs=outputs, max_steps=2**24, throw=False, **options
-            )
-        )
-        compiled = program.lower(q, v).compile()
-        start = time.perf_counter()
-        found[run.name] = jax.block_until_ready(compiled(q, v))
-        seconds[run.name] = time.perf_counter() - start
-    rows = []
-    for key, motion in found.items():
-        energy, tenth = np.asarray(motion.energy), SAVES // 10
-        kinetic = np.asarray(jax.vmap(lambda q, v: jd.kinetic_energy(scene.system, q, v))(motion.q, motion.v))
-        error = np.abs(energy - energy[0]) / np.nanmax(kinetic)
-        rows.append(
-            {
+    for way in ways(step):
+
+        def run(q, v, numbers, options=way.options):
+            return jd.simulate(scene, q, v, ts, outputs=outputs, max_steps=2**24, throw=False, **options, **numbers)
+
+        compiled = jax.jit(run).lower(q, v, next(iter(way.numbers.values()))).compile()
+        for label, numbers in way.numbers.items():
+            start = time.perf_counter()
+            motion = jax.block_until_ready(compiled(q, v, numbers))
+            seconds = time.perf_counter() - start
+            energy, tenth = np.asarray(motion.energy), SAVES // 10
+            kinetic = np.asarray(jax.vmap(lambda q, v: jd.kinetic_energy(scene.system, q, v))(motion.q, motion.v))
+            error = np.abs(energy - energy[0]) / np.nanmax(kinetic)
+            yield {
                 "scene": name,
-                "run": key,
+                "run": f"{way.name}, {label}",
                 "first": float(error[:tenth].max()),
                 "last": float(error[-tenth:].max()),
                 "residual": float(motion.constraint_residual.max()) if scene.constraints else None,
                 "steps": int(motion.stats["num_steps"]),
-                "seconds": seconds[key],
+                "seconds": seconds,
             }
-        )
-    return rows
 
 
 def main(argv=None) -> None:

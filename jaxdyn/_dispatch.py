@@ -160,12 +160,12 @@ def _force_change(inverse: Callable, model, q, v, tau, steps) -> Callable:
 
 def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tuple[Array, Array, Array]:
     """`closed_recursion.closed_dynamics`, without derivatives; for large batches."""
-    # Only what is traced has a gradient to be stopped; what is known has to stay so.
-    args = jax.tree.map(
-        lambda x: lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x, ((model, loops), q, v, tau)
-    )
+    def still(tree):
+        # Only what is traced has a gradient to be stopped; what is known has to stay so.
+        return jax.tree.map(lambda x: lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x, tree)
+
     with at_least(LEAST_BATCH):
-        return traced_once(_closed, *args)
+        return traced_once(_closed, still((model, loops)), *still((q, v, tau)))
 
 
 def _closed(tree, q, v, tau):

@@ -6,7 +6,7 @@ samples it saves the call.
 
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdyn._materialize import materialize
 
@@ -23,7 +23,7 @@ def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> 
 
 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower triangular L with L L^T = matrix; not finite where the matrix is not positive definite."""
+    """Lower triangular L with L L^T = matrix; not `definite` where the matrix is not."""
     n = matrix.shape[0]
     if not 0 < n <= MOST:
         return jnp.linalg.cholesky(matrix)
@@ -31,6 +31,16 @@ def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     zero = jnp.zeros((), matrix.dtype)
     rows = [[*row[:i], 1 / scale[i], *[zero] * (n - 1 - i)] for i, row in enumerate(lower)]
     return materialize(jnp.stack([jnp.stack(row) for row in rows]))[0]
+
+
+def definite(matrix: Float[Array, "n n"], factor: Float[Array, "n n"]) -> Bool[Array, ""]:
+    """Whether the Cholesky factor is that of a positive definite matrix, with more than rounding left in every pivot.
+
+    A pivot L_ii^2 is what M_ii is after others are taken from it, with an error of eps M_ii: of a quotient by 16 of them
+    hardly a digit is right.
+    """
+    least = 16 * float(jnp.finfo(matrix.dtype).eps)
+    return jnp.all(jnp.diagonal(factor) ** 2 > least * jnp.diagonal(matrix)) & jnp.isfinite(factor).all()
 
 
 def solve_lower(

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from jaxdyn._anywhere import anywhere
 from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
-from jaxdyn._small import cholesky, solve_factored, solve_lower
+from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
 from jaxdyn._tracing import traced_once
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
@@ -39,7 +39,9 @@ METHODS = ("rank_aware", "schur", "range_space")
 class RESULTS(lx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """How a constrained computation ended."""
 
-    singular_mass_matrix = "The mass matrix is not positive definite: a joint moves no inertia."
+    singular_mass_matrix = (
+        "The mass matrix is not positive definite to rounding: a joint moves no inertia, or next to none."
+    )
     dependent_rows = "The constraint rows are dependent; take method='rank_aware'."
     contradictory_rows = "No acceleration satisfies the constraint rows: they contradict each other."
     singular_basis = "The minimal velocities do not determine the others here; choose another basis."
@@ -169,9 +171,10 @@ def applied(scene: Scene, q, v, tau, t) -> Array:
 
 
 def _free(scene, q, v, force, t) -> ConstrainedDynamics:
-    factor = cholesky(mass_matrix(scene.system, q, t))
+    mass = mass_matrix(scene.system, q, t)
+    factor = cholesky(mass)
     a = solve_factored(factor, force - bias_force(scene.system, q, v, t))
-    result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
 
 
@@ -181,7 +184,8 @@ def solve_rows(
     """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
     if method == "range_space" and isinstance(scene.system, Model):
         return _by_range_space(scene, q, v, force, row)
-    factor = cholesky(mass_matrix(scene.system, q, t))
+    mass = mass_matrix(scene.system, q, t)
+    factor = cholesky(mass)
     columns = jnp.concatenate([row.A, (force - bias_force(scene.system, q, v, t))[None]]).T
     solved = solve_lower(factor, columns)
     Y, free = solved[:, :-1], solved[:, -1]
@@ -198,7 +202,7 @@ def solve_rows(
         met = jnp.all(missed <= _eps(Y) ** 0.5 * (sizes + jnp.max(sizes)))
         result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
     a = solve_lower(factor, free + pushed, transposed=True)
-    result = RESULTS.where(jnp.isfinite(factor).all(), result, RESULTS.singular_mass_matrix)
+    result = RESULTS.where(definite(mass, factor), result, RESULTS.singular_mass_matrix)
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn._small import cholesky, solve_factored, solve_lower
+from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
 from jaxdyn._tracing import compiled, is_concrete, is_known
 from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
@@ -259,7 +259,7 @@ def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
     force = _product(N.T, applied(scene, q, v, tau, t))
     factor = cholesky(mass)
     rate = solve_factored(factor, force - bias)
-    result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     serves = jnp.abs(quality) > least_quality(q.dtype)
     result = RESULTS.where(serves, result, RESULTS.singular_basis)
     return ReducedDynamics(rate, v, _product(N, rate) + drift, mass, bias, force, N, result)

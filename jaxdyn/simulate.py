@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from jaxdyn._tracing import compiled, is_concrete, is_known, split
 from jaxdyn.assembly import residuals
-from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves
+from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves, start_limit
 from jaxdyn.constraints.base import state_dtype
 from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.kinematics import frame_pose
@@ -251,7 +251,13 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     if scene.constraints:
         held = consistent(scene, q0, v0, ts[0])
         if method.projects:
+            given_start = q0, v0
             q0, v0 = project_state(scene, q0, v0, ts[0])
+            # Residuals of a small mechanism are small numbers of metres: how far it moves onto the constraints tells more.
+            ways = [
+                jnp.max(jnp.abs(x - y)) / (1 + jnp.max(jnp.abs(x))) for x, y in zip(given_start, (q0, v0), strict=True)
+            ]
+            held = held & (jnp.maximum(*ways) <= 10 * start_limit(q0.dtype))
     eqx.filter_eval_shape(effort, args, q0, v0, ts[0])  # refuses callbacks of a wrong shape before diffrax meets them
     y0 = method.start(scene, q0, v0, ts[0])
     first = method.quality(scene, y0, ts[0])
@@ -277,6 +283,9 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     result = RESULTS.promote(solved.result)
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
     result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
+    # Fixed steps go on from what is not finite: all that is known is the last state before it that was kept.
+    kept = jnp.max(jnp.where(reached, ts, ts[0]))
+    time_reached = jnp.where(result == RESULTS.nonfinite_state, kept, time_reached)
     if method.projects and scene.constraints:
         closed = jax.vmap(consistent, (None, 0, 0, 0))(scene, q, v, ts)
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
@@ -348,7 +357,12 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
     if continuous:
         return solved, jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
     (times, end), (ys, _) = solved.ts, solved.ys
-    return eqx.tree_at(lambda s: (s.ts, s.ys), solved, (times, ys)), end[0]
+    reached = end[0]
+    if is_fixed(steps[-1]):
+        # diffrax is at the end of the step that could not be solved; what is known ends where it began.
+        began = ts[0] + (solved.stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
+        reached = jnp.where(solved.result == diffrax.RESULTS.nonlinear_divergence, began, reached)
+    return eqx.tree_at(lambda s: (s.ts, s.ys), solved, (times, ys)), reached
 
 
 def _along(mask, rows):

@@ -295,14 +295,25 @@ def test_bad_input_is_refused():
 
 
 def test_a_step_that_cannot_be_solved_ends_the_run():
-    """Steps far too long for the rod: no point of the circle can be reached. Rows after that are NaN."""
+    """Steps far too long for the rod: no point of the circle can be reached. Rows after that are NaN.
+
+    The time reached is where that step began: the start, or the seventh step of 0.125 s if a push comes with it.
+    """
     scene = scenes.pendulum_in_plane()
-    q, v = jnp.array([0.0, -1.0]), jnp.array([30.0, 0.0])
-    with pytest.raises(RuntimeError, match="smaller stepsize"):
-        simulate(scene, q, v, [0.0, 1.0, 2.0], method=Variational(), stepsize=0.5)
-    found = simulate(scene, q, v, [0.0, 1.0, 2.0], method="variational", stepsize=0.5, throw=False)
-    assert found.result == RESULTS.nonlinear_divergence
+    q, v, ts = jnp.array([0.0, -1.0]), jnp.array([30.0, 0.0]), [0.0, 1.0, 2.0]
+    with pytest.raises(RuntimeError, match=r"stopped at t = 0 s.*smaller stepsize"):
+        simulate(scene, q, v, ts, method=Variational(), stepsize=0.5)
+    found = simulate(scene, q, v, ts, method="variational", stepsize=0.5, throw=False)
+    assert found.result == RESULTS.nonlinear_divergence and float(found.stats["time_reached"]) == 0.0
     assert np.isnan(found.q[1:]).all() and np.isfinite(found.q[0]).all()
+
+    def push(q, v, t):
+        return jnp.where(t > 0.75, 1e4, 0.0) * jnp.array([1.0, 0.0])
+
+    ts = [0.0, 0.5, 0.75, 1.0]
+    found = simulate(scene, q, 0 * v, ts, method="variational", stepsize=0.125, control=push, throw=False)
+    assert found.result == RESULTS.nonlinear_divergence and float(found.stats["time_reached"]) == 0.75
+    np.testing.assert_array_equal(np.isnan(found.q[:, 0]), [False, False, False, True])
 
 
 @pytest.mark.slow
