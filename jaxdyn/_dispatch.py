@@ -160,6 +160,7 @@ def _force_change(inverse: Callable, model, q, v, tau, steps) -> Callable:
 
 def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tuple[Array, Array, Array]:
     """`closed_recursion.closed_dynamics`, without derivatives; for large batches."""
+
     def still(tree):
         # Only what is traced has a gradient to be stopped; what is known has to stay so.
         return jax.tree.map(lambda x: lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x, tree)
@@ -169,7 +170,8 @@ def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tupl
 
 
 def _closed(tree, q, v, tau):
-    return closed_recursion.closed_dynamics(*tree, q, v, tau)
+    model, loops = tree
+    return closed_recursion.closed_dynamics(model, loops, q, v, tau)
 
 
 def with_derivatives(model: Model, loops, q: Array, v: Array, tau: Array, a: Array, lam: Array) -> tuple[Array, Array]:
