@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.scene import Scene
-from jaxdyn.solvers.choice import for_stiff, known_stiffness
+from jaxdyn.solvers.choice import for_stiff, known_stiffness, unwrapped
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -77,7 +77,7 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     name = next(name for name in RESULTS._name_to_item if bool(solution.result == getattr(RESULTS, name)))
     reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])
     advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
-    if name == "max_steps_reached":
+    if name == "max_steps_reached" and isinstance(unwrapped(options["solver"]), diffrax.AbstractERK):
         last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
         rates = known_stiffness(scene, solution.q[last], solution.v[last], solution.ts[last], control)
         if rates is not None and for_stiff(rates, end - float(solution.ts[0])):

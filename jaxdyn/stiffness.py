@@ -47,7 +47,7 @@ def stiffness(scene: Any, q: Any, v: Any, t: Any = 0.0, control: Any = None) -> 
 
     **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `v` (nv,); `t`, s.
 
-    **Raises:** ValueError for wrong shapes.
+    **Raises:** ValueError for wrong shapes, and where forces or masses are not finite (NaN where numbers are traced).
 
     **Returns:** `Stiffness`, from the eigenvalues of [[0, 1], [-M^-1 K, -M^-1 D]]. An explicit method needs steps below
     `explicit_step`; where the motion itself would allow much longer ones, it is stiff.
@@ -65,11 +65,16 @@ def stiffness(scene: Any, q: Any, v: Any, t: Any = 0.0, control: Any = None) -> 
         if value.shape != (size,):
             raise ValueError(f"{name} has shape {value.shape}, expected {(size,)} of the scene's system")
     matrix = _linearised(scene, q, v, t, control)
-    # LAPACK by numpy where the numbers are known, which compiles nothing.
-    lib = np if is_known(matrix) else jnp
-    values = lib.linalg.eigvals(lib.asarray(matrix))
-    fastest = jnp.asarray(-values.real).max(), jnp.asarray(values.imag).max()
-    return Stiffness(*(jnp.maximum(x, jnp.zeros_like(x)).astype(q.dtype) for x in fastest))
+    if is_known(matrix):
+        # LAPACK by numpy, which compiles nothing.
+        known = np.asarray(matrix, float)
+        if not np.isfinite(known).all():
+            raise ValueError(f"forces or masses are not finite at q = {q}, v = {v}, t = {t}; look at another state")
+        values = np.linalg.eigvals(known)
+    else:
+        values = jnp.linalg.eigvals(matrix)
+    fastest = (jnp.max(jnp.asarray(x), initial=0.0) for x in (-values.real, values.imag))
+    return Stiffness(*(x.astype(q.dtype) for x in fastest))
 
 
 @compiled

@@ -252,6 +252,15 @@ def test_stiffness_on_constraints():
         jd.stiffness(scene, [0.0], [0.0, 0.0])
 
 
+def test_stiffness_of_odd_states():
+    """Nothing that moves, and forces that are not finite."""
+    fixed = jd.ModelBuilder("fixed").add_body("base", joint="fixed").build()
+    found = jd.stiffness(fixed, jnp.zeros(0), jnp.zeros(0))
+    assert found.decay == 0 and found.frequency == 0 and found.explicit_step == np.inf
+    with pytest.raises(ValueError, match=r"not finite at q = \[nan\]"):
+        jd.stiffness(jd.Scene(slider(), forces=(jd.JointSpring(np.nan),)), [np.nan], [0.0])
+
+
 def two_to_one(q, t):
     """Velocities with v1 = 2 v0."""
     return jnp.asarray([[2.0, -1.0]], q.dtype)
