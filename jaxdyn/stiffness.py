@@ -81,6 +81,8 @@ def stiffness(scene: Any, q: Any, v: Any, t: Any = 0.0, control: Any = None) -> 
 def _linearised(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
     """The matrix (2 nv, 2 nv) of d(dq, dv)/dt."""
     system, n = scene.system, scene.nv
+    if n == 0:
+        return jnp.zeros((0, 0), q.dtype)
 
     def force(dq, dv):
         at, speed = displace(system, q, dq), v + dv

@@ -286,6 +286,7 @@ def test_derivatives_in_states_and_masses_where_rows_depend():
     np.testing.assert_allclose(slope @ direction, differences(quick(value), direction), rtol=1e-7)  # h^4
 
 
+@pytest.mark.slow
 def test_second_derivatives_where_rows_depend():
     """Hessians of the same motion with a row listed once (both methods) and twice (rank-aware) agree, also at rest."""
     q, v = scenes.spherical_pendulum.start(length=1.2, theta=0.8, theta_rate=0.3)
@@ -438,7 +439,8 @@ def test_assemble_fails_clearly():
         assemble(Scene(system, both), jnp.asarray([0.2, 0.1]))
 
 
-@pytest.mark.parametrize("in_plane", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("in_plane", [False, True])
 def test_assembling_from_afar_is_differentiable(in_plane):
     """The guess is half a radian off, where the curvature of the constraint counts; dependent rows change nothing."""
     scene = scenes.four_bar(in_plane=in_plane)

@@ -89,6 +89,7 @@ def differences(run, count, h=1e-3):
     return (8 * (steps[2] - steps[1]) - (steps[3] - steps[0])).T / (12 * h)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_derivatives_against_differences(slopes, name):
     """Inertia, mass, lengths, start, control: each by differences of the method itself, and not zero."""
@@ -97,6 +98,7 @@ def test_derivatives_against_differences(slopes, name):
     assert (np.abs(slopes[name]).max(0) > 1e-3).all()
 
 
+@pytest.mark.slow
 def test_methods_agree_on_derivatives(slopes):
     """The motion is one, so its derivatives are, up to the integration's error with steps of 0.01 s."""
     for name in METHODS:

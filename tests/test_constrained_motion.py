@@ -132,6 +132,7 @@ def window_angle(count, ts):
     return solve_ivp(system, (0.0, ts[-1]), [0.0, 1.0], method="DOP853", rtol=1e-13, atol=1e-13, t_eval=ts).y[0]
 
 
+@pytest.mark.slow
 def test_a02_windows_pass_their_singular_positions():
     """N = 2 over 10 s and four singular passages, top 0 to 1e-7. Fixed steps: near the singular position the stages of
     a step, a little off the constraints, make an error estimate that small tolerances cannot meet.

@@ -20,6 +20,7 @@ def free(count):
     return LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), count)
 
 
+@pytest.mark.slow
 def test_growth_of_known_distributions():
     """Nonholonomic: disk 2, 3, 4, knife edge 2, 3. Integrable: a loop, x dy + y dx, a gear between two angles."""
     place = jnp.asarray([0.3, -0.2, 0.7, 0.4])

@@ -196,6 +196,7 @@ def spatial_arm(q, v, a):
     return pairs, (mass_matrix, coriolis, gravity)
 
 
+@pytest.mark.slow
 def test_spatial_arm():
     """Twenty random states and the one of EQUATIONS, whose numbers have eight or nine digits."""
     drawn = zip(states(3), (*scenes.spatial_arm.start(), jnp.zeros(3)), strict=True)

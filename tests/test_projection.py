@@ -68,6 +68,7 @@ def test_large_batches_are_projected_body_by_body_and_a_singular_one_by_matrices
     assert "lapack" in program.as_text()  # for the singular one
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_steps():
     scene, q, v = drifted("windows", count=2)
     q, v = q[3], v[3]

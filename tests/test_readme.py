@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -30,6 +31,7 @@ def test_examples_of_the_readme_run():
     assert 0 < names["drift"] < 1e-6
 
 
+@pytest.mark.slow
 def test_examples_of_the_page_on_systems_run():
     names = run("docs/systems.md")
     assert abs(names["lost"] + names["motion"].work[-1]) < 1e-7 < 0.1 < names["lost"]

@@ -42,7 +42,9 @@ def everything(model):
     return at
 
 
-@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize(
+    "name", ["every kind", *(pytest.param(n, marks=pytest.mark.slow) for n in TREES if n != "every kind")]
+)
 def test_against_pinocchio(name):
     model = TREES[name]()
     source, bridge = to_pinocchio(model)

@@ -346,6 +346,7 @@ def test_four_bar_in_one_velocity():
     np.testing.assert_allclose(found.v, want.v, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_basis_that_becomes_singular_ends_the_run():
     """A pendulum that swings to the level: x serves until there; adaptive steps stop before, fixed ones just behind."""
     scene, state = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(angle=0.0, rate=6.0)

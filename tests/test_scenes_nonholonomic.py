@@ -35,6 +35,7 @@ def solved(scene, state, tau):
     return found
 
 
+@pytest.mark.slow
 def test_stability_of_the_upright_disk():
     """Rolling upright is stable if w^2 > g/(3 r), spinning about the diameter if w^2 > 4 g/(5 r) (problem 3.10).
 

@@ -163,6 +163,7 @@ def test_steps_are_symplectic(system):
     np.testing.assert_allclose(J.T @ omega(np.asarray(last)) @ J, omega(np.asarray(p)), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_step_back_returns():
     """A planar joint and a revolute one, with a row on positions and one on velocities."""
     constraints = (
@@ -220,6 +221,7 @@ def test_forces():
     np.testing.assert_allclose(found.work[:, -1], found.energy[:, -1] - found.energy[:, 0], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_gradients():
     """Pendulum in the plane in a field: reverse mode against forward mode and differences, also in the field's number."""
     pendulum = scenes.pendulum_in_plane()
