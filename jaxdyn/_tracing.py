@@ -2,13 +2,13 @@
 
 import contextvars
 import functools
-import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 
 from jaxdyn._materialize import at_least, least_size
@@ -60,16 +60,26 @@ def compiled(function: Callable) -> Callable:
 
 
 class _Leaves:
-    """Leaves that are equal to others if they are the same objects; held, so that no other ones come to their places."""
+    """Leaves that equal others if they are the same objects; held, so that no other ones come to their places.
+
+    Arrays of numpy, whose entries may be set, are copied and compared by what they hold.
+    """
 
     def __init__(self, leaves):
-        self.leaves = leaves
+        self.leaves = [leaf.copy() if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
 
     def __eq__(self, other):
-        return len(self.leaves) == len(other.leaves) and all(map(operator.is_, self.leaves, other.leaves))
+        return len(self.leaves) == len(other.leaves) and all(map(_is_same, self.leaves, other.leaves))
 
     def __hash__(self):
-        return hash(tuple(map(id, self.leaves)))
+        return hash(tuple(leaf.shape if isinstance(leaf, np.ndarray) else id(leaf) for leaf in self.leaves))
+
+
+def _is_same(mine, theirs) -> bool:
+    if not (isinstance(mine, np.ndarray) and isinstance(theirs, np.ndarray)):
+        return mine is theirs
+    kinds = (mine.shape, mine.dtype) == (theirs.shape, theirs.dtype)
+    return kinds and mine.tobytes() == theirs.tobytes()
 
 
 class Known(NamedTuple):
