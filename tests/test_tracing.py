@@ -16,7 +16,7 @@ def test_a_tree_is_traced_once_and_its_known_leaves_stay_known():
         seen.append([is_concrete(leaf) for leaf in tree])
         return tree[0] * x**power + tree[1]
 
-    known, x, y = jnp.asarray(2.0), jnp.asarray(3.0), jnp.asarray(1.0)
+    known, x, y = (jnp.asarray(number, float) for number in (2.0, 3.0, 1.0))
 
     def program(x, y):
         return traced_once(times, (known, y), x, static=(3,)) + traced_once(times, (known, y), 2 * x, static=(3,))
