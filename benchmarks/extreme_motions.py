@@ -344,10 +344,9 @@ TURNS = (
 )
 GRAVITY = "Nothing; `atol` and the span in s belong to the time scale sqrt(l/g)."
 STEPS = (
-    "Fixed steps have no error estimate, so a step that is too long carries no code before the state overflows "
-    "(`nonfinite_state`). Ask for outputs=('energy', 'work'): their difference is constant. Or compare with half "
-    "the step, or take adaptive steps, which keep to the limit by themselves. The limit divided by the fastest "
-    "rate sqrt(k/m) or c/m of the mechanism is the longest step."
+    "Fixed steps that are too long end with `coarse_steps`, from an estimate that overrates the error somewhat, or, where the "
+    "state overflows, with `nonfinite_state`. Take a shorter step, or adaptive ones, which keep to the limit by "
+    "themselves. The limit divided by the fastest rate sqrt(k/m) or c/m of the mechanism is the longest step."
 )
 CHAOS = (
     "Errors grow as the motion makes any difference grow, whatever the method: one digit less of the start or of "
@@ -356,6 +355,6 @@ CHAOS = (
 )
 MILLION = (
     "Take adaptive steps or a shorter step where the phase matters: the energy error of RK4 grows in proportion to time "
-    "and the phase with its square. In float32 the rounding of each step adds up as well: after "
-    "1e6 steps the state is off by 0.14, and no code says so."
+    "and the phase with its square. In float32 the rounding of each step adds up as well: after 1e6 steps the state is "
+    "off by 0.14, and `coarse_steps` says so."
 )

@@ -4,8 +4,8 @@
 
 A row is "right" where the run succeeded within the error that the case allows, "refused" where a result code says that
 there is no answer, and "SILENT" where a wrong answer came with success: none may be. Fixed steps have no tolerance to
-keep; where they are wrong the row says "no code". Gradients are reverse mode, compared with central differences of
-order 4 in float64; "digits" counts those that agree.
+keep; where they are off by more than the case allows, and by less than they refuse, the row says "no code". Gradients are
+reverse mode, compared with central differences of order 4 in float64; "digits" counts those that agree.
 """
 
 import argparse

@@ -36,6 +36,8 @@ from jaxdyn.solvers.choice import (
     progress_meter,
     stepping,
 )
+from jaxdyn.solvers.differentiable import run, run_adaptively
+from jaxdyn.solvers.fixed_steps import Watched, too_coarse
 from jaxdyn.solvers.inputs import as_array, check_state, check_times, check_turns, most_turned, turning
 from jaxdyn.systems import System, displace, retract, velocity_to_rate
 
@@ -101,7 +103,8 @@ def simulate(
       "pose:<frame>". They are computed only if asked for.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
-      4096 with "direct".
+      4096 with "direct". Reverse mode through adaptive steps remembers where each one ends: the first 8192, or `max_steps`
+      if given, at 8 bytes each and trajectory; a longer run ends there, with a result code.
     - `throw`: raise when the integration fails. Default: yes if all inputs are concrete, else see `Solution.result`.
 
     **Returns:** a `Solution`. Save points between steps come from the method's dense output. Where that is less
@@ -152,6 +155,7 @@ def simulate(
         "outputs": _checked_outputs(scene, outputs),
         "progress": bool(progress),
         "max_steps": checked_step_limit(max_steps, ts, stepsize, adjoint),
+        "limit_is_given": max_steps is not None,
     }
     dtype = state_dtype(scene.system)
     numbers = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
@@ -272,17 +276,17 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
         term = diffrax.MultiTerm(diffrax.ODETerm(explicit_part), diffrax.ODETerm(implicit_part))
     options = options | {"solver": solver}
     corrector = project if corrects else None
-    solved, time_reached = _integrate(term, corrector, quality, method, y0, ts, args, steps, options)
+    rows, result, counts, time_reached = _integrate(term, corrector, quality, method, y0, ts, args, steps, options)
 
-    y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, solved.ys)
+    y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, rows)
     finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]
     reached = good & jnp.stack(finite).all(0)
     y = jax.tree.map(lambda rows, start: jnp.where(_along(reached, rows), rows, start[None]), y, y0)
     work = y.pop("work", None)
     q, v = jax.vmap(lambda y, t: method.place(scene, method.corrected(scene, y, t), t))(y, ts)
-    result = RESULTS.promote(solved.result)
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
-    result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
+    ended = (result == RESULTS.successful) | (result == RESULTS.coarse_steps)
+    result = RESULTS.where(ended & ~reached.all(), RESULTS.nonfinite_state, result)
     # Fixed steps go on from what is not finite: all that is known is the last state before it that was kept.
     kept = jnp.max(jnp.where(reached, ts, ts[0]))
     time_reached = jnp.where(result == RESULTS.nonfinite_state, kept, time_reached)
@@ -318,60 +322,53 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
         return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
 
     rows = {"q": q, "v": v} | jax.vmap(report)(q, v, ts) | ({} if work is None else {"work": work})
-    stats = {name: jnp.asarray(solved.stats[name], jnp.int32) for name in _COUNTS}
+    stats = {name: jnp.asarray(counts[name], jnp.int32) for name in _COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     return Solution(ts=ts, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
 
 
 def _integrate(term, project, quality, method, y0, ts, args, steps, options):
-    """diffrax's solution at ts[1:], and the time it came to."""
+    """Rows of the state at ts[1:], how it ended, counts, and the time it came to."""
     adjoint = options["adjoint"]
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
     if isinstance(solver, diffrax.AbstractERK):
         solver = ExplicitSteps(solver, project, method.jumping)
     elif project:
         solver = ProjectedSolver(solver, project, method.jumping)
-    saves = diffrax.SubSaveAt(ts=ts[1:])
-    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else
-    saveat = diffrax.SaveAt(subs=saves if continuous else (saves, diffrax.SubSaveAt(t1=True, fn=_nothing)))
+    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)
+    if continuous and isinstance(controller, Watched):
+        controller = diffrax.ConstantStepSize()  # backwards the state is another one
     event = None
     if isinstance(method, Reduced) and not continuous:
         # Near a singular basis steps become short; a long one may pass it, which the sign shows.
         event = diffrax.Event((lambda t, y, args, **_: ~serves(quality(t, y, args)), quality))
-    solved: Any = diffrax.diffeqsolve(
-        term,
-        solver,
-        t0=ts[0],
-        t1=ts[-1],
-        dt0=dt0,
-        y0=y0,
-        args=args,
-        saveat=saveat,
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        event=event,
-        max_steps=options["max_steps"],
-        throw=False,
-        progress_meter=progress_meter(options["progress"]),
-    )
-    if continuous:
-        return solved, jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
-    (times, end), (ys, _) = solved.ts, solved.ys
-    reached = end[0]
+    how = {
+        "term": term,
+        "solver": solver,
+        "controller": controller,
+        "event": event,
+        "adjoint": adjoint,
+        "max_steps": options["max_steps"],
+        "progress": progress_meter(options["progress"]),
+    }
     if is_fixed(steps[-1]):
+        rows, facts, watched = run((y0, args, ts), dt0=dt0, **how)
+    else:
+        rows, facts = run_adaptively((y0, args, ts), how, options["limit_is_given"])
+    result, stats, reached = facts
+    result = RESULTS.promote(result)
+    if is_fixed(steps[-1]):
+        if isinstance(controller, Watched):
+            result = RESULTS.where((result == RESULTS.successful) & too_coarse(watched), RESULTS.coarse_steps, result)
         # diffrax is at the end of the step that could not be solved; what is known ends where it began.
-        began = ts[0] + (solved.stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
-        reached = jnp.where(solved.result == diffrax.RESULTS.nonlinear_divergence, began, reached)
-    return eqx.tree_at(lambda s: (s.ts, s.ys), solved, (times, ys)), reached
+        began = ts[0] + (stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
+        reached = jnp.where(result == RESULTS.nonlinear_divergence, began, reached)
+    return rows, result, stats, reached
 
 
 def _along(mask, rows):
     """The mask (nt,) shaped so that it applies to the rows (nt, ...)."""
     return mask.reshape(-1, *[1] * (rows.ndim - 1))
-
-
-def _nothing(t, y, args):
-    return None
 
 
 def _checked_outputs(scene: Scene, outputs) -> tuple[str, ...]:

@@ -12,10 +12,13 @@ from jaxdyn.solvers.choice import for_stiff, known_stiffness, unwrapped
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a simulation ended: diffrax's codes and six more."""
+    """How a simulation ended: diffrax's codes and seven more."""
 
     nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
     nonfinite_state = "The state became NaN or infinite."
+    coarse_steps = (
+        "The fixed steps are too long, or too many for the dtype: the motion may be wrong by a tenth of it or more."
+    )
     coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
     inconsistent_start = "The initial state is not on the constraints."
     open_constraints = "The constraints opened, and the projection could not close them."
@@ -29,6 +32,8 @@ ADVICE = {
     "which fixed steps pass (stepsize=0.01); or rtol and atol are below the rounding error",
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+    "coarse_steps": "take a smaller stepsize, or None for steps that keep a tolerance; if stiff, solver=jd.Rodas5P(); beyond "
+    "some 1e5 steps, float64",
     "coarse_start": "subtract whole turns from q0, use float64, or take fixed steps",
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
     "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "

@@ -54,12 +54,12 @@ def test_the_longest_stable_step():
 
 
 def test_beyond_the_longest_stable_step():
-    """Fixed steps say nothing before the state overflows: the documented limit."""
+    """Steps that are too long are refused before the state overflows, and then too."""
     found = verdicts(CASES["beyond"](ONE, False))
     assert found == {
-        ("0.5 of the limit", "float64"): "no code",
-        ("0.99 of the limit", "float64"): "no code",
-        ("1.01 of the limit", "float64"): "no code",
+        ("0.5 of the limit", "float64"): "coarse_steps",
+        ("0.99 of the limit", "float64"): "coarse_steps",
+        ("1.01 of the limit", "float64"): "coarse_steps",
         ("1.1 of the limit", "float64"): "nonfinite_state",
         ("2.0 of the limit", "float64"): "nonfinite_state",
     }
@@ -86,7 +86,7 @@ SLOW = {
     "bases": (ONE, False),
     "starts": (ONE, False),
     "chaos": (BOTH, False),
-    "million": (ONE, False),
+    "million": (BOTH, False),
 }
 
 

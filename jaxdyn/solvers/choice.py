@@ -12,6 +12,7 @@ import optimistix
 from jaxdyn._tracing import is_concrete, is_known
 from jaxdyn.scene import Scene
 from jaxdyn.solvers.first_step import Adaptive
+from jaxdyn.solvers.fixed_steps import Watched
 from jaxdyn.solvers.lie import LieGroup
 from jaxdyn.solvers.rk4 import RK4
 from jaxdyn.solvers.rosenbrock import Rodas5P
@@ -155,7 +156,7 @@ def stepping(solver, term, ts, rtol, atol, stepsize):
         newton = optimistix.Newton(rtol, atol)  # pyright: ignore[reportArgumentType]
         solver = eqx.tree_at(lambda s: s.root_finder, solver, newton)
     if is_fixed(stepsize):
-        return solver, diffrax.ConstantStepSize(), stepsize
+        return solver, Watched(solver.order(term)), stepsize
     controller = stepsize
     if controller is None:
         smallest = 16 * eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))

@@ -14,10 +14,7 @@ class Adaptive(diffrax.PIDController):
     NaN, rejected and tried again until the last of `max_steps`. A finite one is halved and halved again until the least
     step ends the run.
 
-    Lengths are rounded to four binary digits. Else the rounding errors of an error estimate reach the times of all later
-    steps and grow there: reverse mode, which computes steps anew from checkpoints by another program, would then put
-    together pieces of two different sequences. The least step, `dtmin` at the end of the run, is shorter at earlier
-    times, which can be told apart better.
+    The least step, `dtmin` at the end of the run, is shorter at earlier times, which can be told apart better.
     """
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
@@ -27,7 +24,6 @@ class Adaptive(diffrax.PIDController):
                 terms, t0, t1, y0, args, self._get_error_order(error_order), self.rtol, self.atol, self.norm
             )
         first, state = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
-        first = t0 + rounded(first - t0)
         return jnp.where(jnp.isfinite(first), jnp.minimum(first, t1), t1), state
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
@@ -35,16 +31,9 @@ class Adaptive(diffrax.PIDController):
         eps, at_end = jnp.finfo(jnp.result_type(t1)).eps, jnp.asarray(self.dtmin)
         least = jnp.clip(16 * eps * jnp.abs(t0), eps * at_end, at_end)
         local = eqx.tree_at(lambda c: c.dtmin, self, least)
-        kept, start, end, jumped, state, result = diffrax.PIDController.adapt_step_size(
+        return diffrax.PIDController.adapt_step_size(
             local, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
         )
-        return kept, start, start + rounded(end - start), jumped, state, result
-
-
-def rounded(step):
-    """A length to four binary digits."""
-    fraction, exponent = jnp.frexp(jax.lax.stop_gradient(step))
-    return jnp.ldexp(jnp.round(16 * fraction) / 16, exponent)
 
 
 def first_step(terms, t0, t1, y0, args, order, rtol, atol, norm):

@@ -1,0 +1,150 @@
+"""Reverse mode through adaptive steps takes the steps of the forward run, whatever controls them."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+import pytest
+
+from jaxdyn.solvers import differentiable
+from jaxdyn.solvers.first_step import Adaptive
+
+TS = np.linspace(0.0, 6.0, 5)
+
+
+def lorenz(t, y, args):
+    """The chaotic system: over 6 s a difference grows two hundredfold, so other steps would show."""
+    x = y["x"]
+    rate = jnp.stack([10 * (x[1] - x[0]), x[0] * (args - x[2]) - x[1], x[0] * x[1] - 8 / 3 * x[2]])
+    return {"x": rate + 5.0 * jnp.where(t < 2.5, 0.0, 1.0) * jnp.asarray([1.0, 0.0, 0.0])}
+
+
+def control(kind, ts, tolerance=1e-9):
+    adaptive = Adaptive(tolerance, tolerance, norm=optimistix.rms_norm, dtmin=1e-12, force_dtmin=False)
+    if kind == "own":
+        return adaptive
+    if kind == "save points":
+        return diffrax.ClipStepSizeController(adaptive, step_ts=ts)
+    return diffrax.ClipStepSizeController(
+        diffrax.PIDController(tolerance, tolerance, pcoeff=0.4), jump_ts=jnp.asarray([2.5])
+    )
+
+
+def options(kind, solver, ts, **changes):
+    return {
+        "term": diffrax.ODETerm(lorenz),
+        "solver": solver,
+        "controller": control(kind, jax.lax.stop_gradient(ts)),
+        "event": None,
+        "adjoint": diffrax.RecursiveCheckpointAdjoint(),
+        "max_steps": 4096,
+        "progress": diffrax.NoProgressMeter(),
+    } | changes
+
+
+def moving(x, r, ts):
+    return {"x": x}, r, ts
+
+
+WEIGHTS = np.sin(np.arange(12.0)).reshape(4, 3)
+START = jnp.asarray([1.0, 2.0, 20.0]), jnp.asarray(28.0), jnp.asarray(TS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "solver"),
+    [
+        ("own", diffrax.Tsit5()),
+        pytest.param("save points", diffrax.Tsit5(), marks=pytest.mark.slow),
+        ("jump", diffrax.Dopri5()),
+    ],
+    ids=["own", "save points", "jump"],
+)
+def test_reverse_mode_takes_the_steps_of_the_forward_run(kind, solver):
+    """Reverse mode of a chaotic motion, "direct", and forward mode over the very steps that were written down.
+
+    Only the rounding of the sums is between them, over motions that magnify it two hundredfold. Derivatives by the save
+    points are those of the dense output and, where steps end on them, of the steps' ends.
+    """
+
+    def total(x, r, ts, adjoint):
+        how = options(kind, solver, ts, adjoint=adjoint)
+        rows, facts = differentiable.run_adaptively(moving(x, r, ts), how, True)
+        return jnp.sum(WEIGHTS * rows["x"]), facts[:2]
+
+    def repeated(x, r, ts):
+        how = options(kind, solver, ts)
+        fixed = jax.lax.stop_gradient((x, r, ts))
+        taken = differentiable._recorded(moving(*fixed), how, 4096)[2]
+        again = differentiable._again(how, taken) | {"adjoint": diffrax.ForwardMode()}
+        return jnp.sum(WEIGHTS * differentiable.run(moving(x, r, ts), **again)[0]["x"])
+
+    @jax.jit
+    def both(x, r, ts):
+        reverse, (result, stats) = jax.grad(total, (0, 1, 2), has_aux=True)(
+            x, r, ts, diffrax.RecursiveCheckpointAdjoint()
+        )
+        return reverse, jax.jacfwd(repeated, (0, 1, 2))(x, r, ts), result == diffrax.RESULTS.successful, stats
+
+    reverse, forward, fine, stats = both(*START)
+    assert fine and stats["num_accepted_steps"] > 150
+    for mine, theirs in zip(reverse, forward, strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-10 * np.abs(theirs).max())
+    # Differences of the run itself, as good as its tolerance after the growth of errors allows.
+    step = 1e-3
+    values = [total(START[0], START[1] + s * step, START[2], diffrax.ForwardMode())[0] for s in (1, -1)]
+    np.testing.assert_allclose(reverse[1], (values[0] - values[1]) / (2 * step), rtol=5e-3)
+    if kind == "own":
+        direct = jax.jit(jax.grad(lambda r: total(START[0], r, START[2], diffrax.DirectAdjoint())[0]))(START[1])
+        np.testing.assert_allclose(direct, reverse[1], rtol=1e-5)  # a run of its own
+
+
+def test_room_for_steps(monkeypatch):
+    """Where the limit is not given, steps are written down up to a limit of their own, and beyond it the run says so."""
+    monkeypatch.setattr(differentiable, "ROOM", 64)
+
+    def end(r, ts, given):
+        how = options("own", diffrax.Tsit5(), ts)
+        rows, (result, stats, reached) = differentiable.run_adaptively(moving(START[0], r, ts), how, given)
+        return rows["x"][-1, 0], (rows["x"], result, stats, reached)
+
+    @jax.jit
+    @jax.vmap
+    def several(t):
+        ts, r = t * START[2], START[1]
+        plain = end(r, ts, False)[1]
+        slope, limited = jax.grad(end, has_aux=True)(r, ts, False)
+        wide, free = jax.grad(end, has_aux=True)(r, ts, True)
+        return plain, limited, free, slope, wide
+
+    plain, limited, free, slope, wide = several(jnp.asarray([0.02, 1.0]))
+    codes = diffrax.RESULTS
+    np.testing.assert_array_equal(plain[1] == codes.successful, [True, True])
+    np.testing.assert_array_equal(free[1] == codes.successful, [True, True])
+    np.testing.assert_array_equal(limited[1] == codes.successful, [True, False])
+    np.testing.assert_array_equal(limited[1] == codes.max_steps_reached, [False, True])
+    assert free[2]["num_accepted_steps"][1] > 64 and plain[2]["num_steps"][1] == free[2]["num_steps"][1]
+    assert limited[2]["num_accepted_steps"][1] == 65 and limited[3][1] < TS[-1]
+    assert not np.isfinite(limited[0][1, -1]).any() and np.isfinite(limited[0][0]).all()
+    assert slope[0] == wide[0] and np.isfinite(wide[1])
+    np.testing.assert_array_equal(plain[0], free[0])
+
+
+@pytest.mark.parametrize("case", ["no step", "one step"])
+def test_runs_that_end_early(case):
+    """No step kept, as the rates after the start are no numbers, or one: codes, and derivatives of what was reached."""
+
+    def rates(t, y, r):
+        return jax.tree.map(lambda f: f * jnp.where((t > 0) & (case == "no step"), jnp.nan, 1.0), lorenz(t, y, r))
+
+    def total(r):
+        ts = jnp.asarray([0.0, 1e-6, 6.0])
+        how = options("own", diffrax.Tsit5(), ts, max_steps=1 if case == "one step" else 8, term=diffrax.ODETerm(rates))
+        rows, (result, stats, _) = differentiable.run_adaptively(moving(START[0], r, ts), how, True)
+        return jnp.sum(jnp.where(jnp.isfinite(rows["x"]), rows["x"], 0.0)), (result, stats)
+
+    slope, (result, stats) = jax.jit(jax.grad(total, has_aux=True))(START[1])
+    assert result != diffrax.RESULTS.successful
+    assert stats["num_accepted_steps"] == int(case == "one step")
+    # At 1e-6 s, x_1 has changed by 1e-6 x_0 r.
+    np.testing.assert_allclose(slope, 1e-6 if case == "one step" else 0.0, rtol=1e-3)

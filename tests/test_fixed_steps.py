@@ -1,0 +1,114 @@
+"""Fixed steps that are too long say so, and others do not."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import quick
+
+import jaxdyn as jd
+from jaxdyn.solution import RESULTS
+
+SOLVERS = {"RK4": None, "Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8(), "Rodas5P": jd.Rodas5P()}
+
+
+def slider():
+    builder = jd.ModelBuilder("slider", gravity=None)
+    builder.add_body("box", joint="prismatic", axis=(1, 0, 0), inertia=(1.0, (0, 0, 0), (0, 0, 0)))
+    return builder.build()
+
+
+def codes(result):
+    return np.asarray(result == RESULTS.successful), np.asarray(result == RESULTS.coarse_steps)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_steps_that_are_too_long_are_refused(name):
+    """A spring of rate w from q = 1, 400 steps of 1/100 s: cos(w t), w h from 0.005 to 5.
+
+    An error of a tenth and more carries a code always, one below a thousandth never. Between them the estimate may overrate it.
+    """
+    model, ts = slider(), np.linspace(0.0, 4.0, 41)
+
+    def run(rate):
+        scene = jd.Scene(model, forces=(jd.JointSpring(rate**2),))
+        found = jd.simulate(scene, jnp.ones(1), jnp.zeros(1), ts, solver=SOLVERS[name], stepsize=0.01, throw=False)
+        return found.q[:, 0], found.result
+
+    rates = np.geomspace(0.5, 500.0, 61)
+    q, result = quick(jax.vmap(run))(jnp.asarray(rates))
+    fine, coarse = codes(result)
+    error = np.abs(np.asarray(q) - np.cos(rates[:, None] * ts)).max(1)
+    assert not fine[~(error < 0.1)].any()
+    assert fine[error < 1e-3].all()
+    assert coarse.any() and fine.any()
+    # What is refused for being too coarse is given all the same.
+    assert np.isfinite(q[coarse]).all()
+
+
+def test_stiff_decay_within_the_limit_is_right():
+    """A damper whose steps are near the limit of stability: what has decayed does not count, what grows does."""
+    model = slider()
+
+    def run(rate):
+        scene = jd.Scene(model, forces=(jd.JointDamping(rate),))
+        ts = np.linspace(0.0, 1.0, 3)
+        found = jd.simulate(scene, jnp.zeros(1), jnp.full(1, 1e-3), ts, stepsize=0.01, throw=False)
+        return found.q[-1, 0] * rate / 1e-3, found.result
+
+    rates = jnp.asarray([50.0, 300.0, 1000.0])
+    ways, result = quick(jax.vmap(run))(rates)
+    fine, coarse = codes(result)
+    np.testing.assert_array_equal(fine, [True, False, False])
+    np.testing.assert_array_equal(coarse, [False, True, True])
+    assert abs(ways[0] - 1) < 1e-3
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_rest_is_not_coarse(dtype):
+    """Nothing moves, or only by rounding: hanging still, upside down, and turned to a cosine that is not zero exactly."""
+    model = jd.robots.chain(3, dtype=dtype)
+    starts = jnp.asarray([[0.0, 0.0, 0.0], [np.pi, 0.0, 0.0], [0.0, np.pi, -np.pi]], dtype)
+    ts = jnp.linspace(0.0, 0.5, 3, dtype=dtype)
+    run = quick(jax.vmap(lambda q: jd.simulate(model, q, jnp.zeros(3, dtype), ts, stepsize=0.001, throw=False)))
+    fine, _ = codes(run(starts).result)
+    assert fine.all()
+
+
+@pytest.mark.slow
+def test_steps_that_are_too_many_for_the_dtype():
+    """In float32 the rounding of two million steps is a tenth of the motion; in float64 it is nothing."""
+    model = slider()
+
+    def run(dtype):
+        start = jnp.ones(1, dtype), jnp.ones(1, dtype)
+        ts = jnp.asarray([0.0, 2000.0], dtype)
+        single = jax.tree.map(lambda x: jnp.asarray(x, dtype), model)
+        return jd.simulate(single, *start, ts, stepsize=0.001, throw=False).result
+
+    assert run(jnp.float64) == RESULTS.successful
+    assert run(jnp.float32) == RESULTS.coarse_steps
+
+
+def test_what_to_do_is_said():
+    """Contact by penalty at 1e8 N/m with steps of 1 ms, which ended at a wrong place without a word."""
+    scene = jd.Scene(slider(), forces=(jd.JointSpring(1e8), jd.JointDamping(1e4)))
+    with pytest.raises(
+        RuntimeError, match=r"stopped at t = 0.002 s of 0.002 s. The fixed steps are too long.*Fix: take a smaller"
+    ):
+        jd.simulate(scene, [0.01], [0.0], [0.0, 0.002], stepsize=0.001)
+
+
+def test_reduced_and_projected_steps_are_watched():
+    """A four-bar loop by both methods, at a step that serves and at one that is as long as the motion."""
+    scene = jd.scenes.windows(count=1)
+    q, v = jd.scenes.windows.start(count=1)
+    for method in ("projected", "reduced"):
+
+        def run(h, method=method):
+            found = jd.simulate(scene, q, v, [0.0, 1.2], method=method, stepsize=h, throw=False, max_steps=256)
+            return found.result
+
+        fine, _ = codes(quick(jax.vmap(run))(jnp.asarray([0.01, 0.6])))
+        np.testing.assert_array_equal(fine, [True, False], err_msg=method)
