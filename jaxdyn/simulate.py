@@ -103,8 +103,8 @@ def simulate(
       "pose:<frame>". They are computed only if asked for.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
-      4096 with "direct". Reverse mode through adaptive steps remembers where each one ends: the first 8192, or `max_steps`
-      if given, at 8 bytes each and trajectory; a longer run ends there, with a result code.
+      4096 with "direct", and where reverse mode goes through adaptive steps: it remembers where each one ends, at 8 bytes a
+      step and trajectory.
     - `throw`: raise when the integration fails. Default: yes if all inputs are concrete, else see `Solution.result`.
 
     **Returns:** a `Solution`. Save points between steps come from the method's dense output. Where that is less
@@ -352,14 +352,16 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
         "progress": progress_meter(options["progress"]),
     }
     if is_fixed(steps[-1]):
-        rows, facts, watched = run((y0, args, ts), dt0=dt0, **how)
+        rows, facts, solved = run((y0, args, ts), dt0=dt0, **how)
     else:
         rows, facts = run_adaptively((y0, args, ts), how, options["limit_is_given"])
     result, stats, reached = facts
     result = RESULTS.promote(result)
     if is_fixed(steps[-1]):
         if isinstance(controller, Watched):
-            result = RESULTS.where((result == RESULTS.successful) & too_coarse(watched), RESULTS.coarse_steps, result)
+            result = RESULTS.where(
+                (result == RESULTS.successful) & too_coarse(solved.controller_state), RESULTS.coarse_steps, result
+            )
         # diffrax is at the end of the step that could not be solved; what is known ends where it began.
         began = ts[0] + (stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
         reached = jnp.where(result == RESULTS.nonlinear_divergence, began, reached)

@@ -6,29 +6,29 @@ are put together are those of two different runs. With the ends written down not
 error estimates and no refused steps either.
 """
 
-import dataclasses
-from typing import Any, cast
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-ROOM = 8192  # steps that are written down where the user gives no limit: 64 kB a trajectory
+ROOM = 4096  # steps that are written down where the user gives no limit: 32 kB a trajectory
 
 
-def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress, dt0=None):
+def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress, dt0=None, record=False):
     """diffrax's solution from one end of the save points to the other.
 
     **Arguments:** `moving`, what may be differentiated: the initial state, `args`, and the save points (nt,), of which the first
     is the start; the rest as diffrax's.
 
-    **Returns:** rows of the state at ts[1:]; the result, the counts and the time reached; the state of the controller.
+    **Returns:** rows of the state at ts[1:]; the result, the counts and the time reached; all that diffrax returned, where
+    `record` the times at which steps ended among it.
     """
     y0, args, ts = moving
     saves = diffrax.SubSaveAt(ts=ts[1:])
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else
-    last = diffrax.SubSaveAt(t1=True, fn=lambda t, y, args: None)
+    further = [diffrax.SubSaveAt(t1=True, fn=_nothing)] + [diffrax.SubSaveAt(steps=True, fn=_nothing)] * record
     solved: Any = diffrax.diffeqsolve(
         term,
         solver,
@@ -37,7 +37,9 @@ def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress
         dt0=dt0,
         y0=y0,
         args=args,
-        saveat=diffrax.SaveAt(subs=saves) if continuous else diffrax.SaveAt(subs=(saves, last), controller_state=True),
+        saveat=diffrax.SaveAt(subs=saves)
+        if continuous
+        else diffrax.SaveAt(subs=(saves, *further), controller_state=True),
         stepsize_controller=controller,
         adjoint=adjoint,
         event=event,
@@ -47,12 +49,12 @@ def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress
     )
     if continuous:
         reached = jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
-        return solved.ys, (solved.result, solved.stats, reached), None
-    return solved.ys[0], (solved.result, solved.stats, solved.ts[1][0]), solved.controller_state
+        return solved.ys, (solved.result, solved.stats, reached), solved
+    return solved.ys[0], (solved.result, solved.stats, solved.ts[1][0]), solved
 
 
 def run_adaptively(moving, options, limit_is_given: bool):
-    """`run` with adaptive steps whose ends are constants to reverse mode; without the state of the controller."""
+    """`run` with adaptive steps whose ends are constants to reverse mode; without the last of what it returns."""
     if not isinstance(options["controller"], diffrax.AbstractAdaptiveStepSizeController):
         return run(moving, **options)[:2]  # whose steps are given, as those of `diffrax.StepTo`
     numbers, rest = eqx.partition(options, eqx.is_array)
@@ -87,68 +89,24 @@ def _(taken, gradients, perturbed, moving, options, room):
 
 
 def _recorded(moving, options, room):
-    """As `run`, with the steps taken in place of the state of the controller."""
-    controller = _Recording(options["controller"], room)  # pyright: ignore[reportCallIssue]
-    rows, facts, state = run(moving, **options | {"controller": controller, "adjoint": diffrax.ForwardMode()})
-    _, *taken = cast(tuple, state)
-    return rows, facts, taken
+    """As `run`, with the controller that repeats the steps in place of diffrax's solution."""
+    changed = {"adjoint": diffrax.ForwardMode(), "max_steps": room, "record": True}
+    rows, facts, solved = run(moving, **options | changed)
+    starts, jumps = solved.ts[2], _jumps(options["controller"])
+    ends = starts
+    if jumps is not None:
+        # A step ends at the number before a jump, and the next one starts at the second one after it.
+        before, after = _beside(jumps, -1), _beside(_beside(jumps, 1), 1)
+        passed = (starts[:, None] > before[None]) & (starts[:, None] <= after[None])
+        ends = jnp.where(passed.any(1), before[passed.argmax(1)], starts)
+    controller = _Repeating(ends, None if jumps is None else starts, solved.stats["num_accepted_steps"])
+    return rows, facts, jax.lax.stop_gradient(controller)
 
 
-def _again(options, taken):
+def _again(options, controller):
     """What repeats these steps."""
-    controller = _Repeating(*taken)
     changed = {"controller": controller, "max_steps": controller.ends.shape[0], "progress": diffrax.NoProgressMeter()}
     return options | changed | {"event": None}
-
-
-class _Recording(diffrax.AbstractAdaptiveStepSizeController):
-    """A step-size control that writes down the steps that are kept, and stops where there is no more room.
-
-    Only a control that knows of jumps in time may begin a step elsewhere than where the last one ended.
-    """
-
-    controller: Any
-    room: int = eqx.field(static=True)
-
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.norm
-
-    def wrap(self, direction):
-        return dataclasses.replace(self, controller=self.controller.wrap(direction))
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        end, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        times = jnp.zeros(self.room, jnp.result_type(t1))
-        return end, (inner, times, times if _jumps(self.controller) else None, jnp.asarray(0))
-
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        inner, ends, starts, count = controller_state
-        kept, start, end, jumped, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, inner
-        )
-        row = jnp.where(kept, count, self.room)
-        ends = ends.at[row].set(jax.lax.stop_gradient(t1), mode="drop")
-        starts = None if starts is None else starts.at[row].set(jax.lax.stop_gradient(t0), mode="drop")
-        count = count + jnp.where(kept, 1, 0)
-        codes: Any = diffrax.RESULTS
-        full = (result == codes.successful) & (count > self.room)
-        return (
-            kept,
-            start,
-            end,
-            jumped,
-            (inner, ends, starts, count),
-            codes.where(full, codes.max_steps_reached, result),
-        )
 
 
 class _Repeating(diffrax.AbstractStepSizeController):
@@ -168,7 +126,7 @@ class _Repeating(diffrax.AbstractStepSizeController):
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         row = jnp.minimum(controller_state, self.ends.shape[0] - 1)
         over = controller_state >= self.count
-        start = t1 if self.starts is None else jnp.where(over, t1, _along(self.starts[row], t1))
+        start = t1 if self.starts is None else jnp.where(over, t1, _along(self.starts[controller_state - 1], t1))
         end = jnp.where(over, t1, _along(self.ends[row], t1))
         codes: Any = diffrax.RESULTS
         result = codes.where(over, codes.max_steps_reached, codes.successful)
@@ -176,13 +134,23 @@ class _Repeating(diffrax.AbstractStepSizeController):
         return True, start, end, self.starts is not None, controller_state + 1, result
 
 
-def _jumps(controller) -> bool:
-    """Whether a step-size control may know of times at which the derivative jumps."""
+def _jumps(controller):
+    """Times before and after which a step-size control ends and begins a step, if any."""
     if isinstance(controller, diffrax.ClipStepSizeController):
-        return controller.jump_ts is not None or _jumps(controller.controller)
-    return not isinstance(controller, diffrax.PIDController)
+        return _jumps(controller.controller) if controller.jump_ts is None else controller.jump_ts
+    return None
+
+
+def _beside(t, side: int):
+    """The next number on a side, as diffrax has it: none is denormal."""
+    tiny = jnp.full_like(t, side * jnp.finfo(t.dtype).tiny)
+    return jnp.where(t == 0, tiny, jnp.nextafter(t, jnp.full_like(t, side * jnp.inf)))
 
 
 def _along(t, base):
     """The time `t`, which moves with `base` where that is differentiated."""
     return t + (base - jax.lax.stop_gradient(base))
+
+
+def _nothing(t, y, args):
+    return None

@@ -27,8 +27,8 @@ class Watched(diffrax.ConstantStepSize):
     def init(self, terms, t0, t1, y0: Any, dt0, args, func, error_order):
         """End of the first step; besides diffrax's state the start, sums of errors, and how far the motion came."""
         end, inner = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
-        start = jax.lax.stop_gradient({name: y for name, y in y0.items() if name not in _PASSED_OVER})
-        none = {name: jnp.zeros((), y.dtype) for name, y in start.items()}
+        start = jax.lax.stop_gradient(_rows(y0))
+        none = jnp.zeros(start.shape[0], start.dtype)
         return end, (inner, start, none, none)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order: Any, controller_state: Any):
@@ -36,16 +36,17 @@ class Watched(diffrax.ConstantStepSize):
         inner, start, errors, ways = controller_state
         *step, inner, result = super().adapt_step_size(t0, t1, y0, y1_candidate, args, y_error, error_order, inner)
         if y_error is not None:
-            before, after, error = jax.lax.stop_gradient((y0, y1_candidate, y_error))
+            before, after, error = (jax.lax.stop_gradient(_rows(y)) for y in (y0, y1_candidate, y_error))
+            # One reduction: for a pendulum it is as dear as its dynamics.
+            sizes = jnp.max(jnp.abs(jnp.stack([error, after - before, after - start])), -1)
+            error, moved, way = sizes[0], sizes[1], sizes[2]
             order: Any = self.order
-            power = (order + 1 - error_order) / (error_order - 1) if error_order < order else 0.0
-            way = {name: _largest(after[name] - start[name]) for name in start}
-            errors = {
-                name: errors[name]
-                + _lost(_largest(error[name]), _largest(after[name] - before[name]), way[name], power)
-                for name in start
-            }
-            ways = {name: jnp.maximum(ways[name], way[name]) for name in start}
+            if error_order < order:
+                share = jnp.minimum(error / jnp.maximum(moved, jnp.finfo(moved.dtype).tiny), 1.0)
+                power = (order + 1 - error_order) / (error_order - 1)
+                error = error * (share if power == 1 else share**power)
+            errors = errors + error + jnp.where(moved > 0, jnp.finfo(way.dtype).eps * way, jnp.zeros_like(way))
+            ways = jnp.maximum(ways, way)
         return *step, (inner, start, errors, ways), result
 
 
@@ -53,16 +54,11 @@ def too_coarse(controller_state):
     """Whether a motion by `Watched` steps may be wrong by more than a tenth, ()."""
     _, _, errors, ways = controller_state
     # Below the root of eps, of what rests, all is rounding.
-    least = {name: jnp.sqrt(jnp.finfo(way.dtype).eps) for name, way in ways.items()}
-    return jnp.stack([errors[name] > ALLOWED * jnp.maximum(ways[name], least[name]) for name in ways]).any()
+    return (errors > ALLOWED * jnp.maximum(ways, jnp.sqrt(jnp.finfo(ways.dtype).eps))).any()
 
 
-def _lost(error, step, way, power: float):
-    """What a step may be wrong by."""
-    if power:
-        error = error * jnp.minimum(error / jnp.maximum(step, jnp.finfo(step.dtype).tiny), 1.0) ** power
-    return error + jnp.where(step > 0, jnp.finfo(step.dtype).eps * way, jnp.zeros_like(way))
-
-
-def _largest(x):
-    return jnp.max(jnp.abs(x), initial=0.0)
+def _rows(y):
+    """Entries of a state, a row for each name, filled up with zeros."""
+    rows = [value.reshape(-1) for name, value in y.items() if name not in _PASSED_OVER]
+    longest = max(row.size for row in rows)
+    return jnp.stack([jnp.pad(row, (0, longest - row.size)) if row.size < longest else row for row in rows])
