@@ -54,6 +54,11 @@ class Method(eqx.Module):
         """dy/dt; q and v are those of `place`, `force` (nv,) is tau plus the scene's forces, or None."""
         return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
 
+    def evaluated(self, scene: Scene, y, t, effort) -> dict[str, Array]:
+        """dy/dt with effort(q, v, t) for the force."""
+        q, v = self.place(scene, y, t)
+        return self.rates(scene, y, q, v, t, effort(q, v, t))
+
     def acceleration(self, scene: Scene, q, v, t, force) -> Array:
         """Rate of v, (nv,)."""
         return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force, t)
@@ -203,12 +208,16 @@ class Reduced(Method):
         found = self._at(scene, y, q, t)
         return q, _product(found.N, y["nu"]) + found.v0
 
+    def evaluated(self, scene, y, t, effort):
+        """From the reduced equations, which give v and its rate from one factorisation of the rows."""
+        return self.rates(scene, y, retract(scene.system, y["q"]), None, t, effort)
+
     def rates(self, scene, y, q, v, t, force):
-        """From the reduced equations."""
+        """From the reduced equations; v is found anew, and `force` may be a function of (q, v, t)."""
         basis = Orthonormal(y["frame"]) if self.jumping else self.basis
         found = reduce(Scene(scene.system, scene.constraints), basis, q, y["nu"], force, t)
         fixed = {name: jnp.zeros_like(y[name]) for name in self.jumping}
-        return {"q": velocity_to_rate(scene.system, q, v), "nu": found.nu_rate} | fixed
+        return {"q": velocity_to_rate(scene.system, q, found.velocity), "nu": found.nu_rate} | fixed
 
     def acceleration(self, scene, q, v, t, force):
         """Rate of v."""

@@ -147,8 +147,10 @@ class Orthonormal(Basis):
     def at(self, scene, q, t):
         """The reference, projected and made orthonormal."""
         A, b = _affine_rows(scene, q, t)
-        inverse = pseudo_inverse(A, tolerance(None, A))
         reference = self.reference.astype(A.dtype)
+        # A factorisation waits for that which gave the reference: two of a large batch at once can block jaxlib 0.10 for ever.
+        A = A + 0 * reference[0, 0]
+        inverse = pseudo_inverse(A, tolerance(None, A))
         N, pivot = orthonormal(reference - _product(inverse, _product(A, reference)))
         free = scene.nv - jnp.round(jnp.sum(inverse * A.T))
         quality = jnp.where(free == N.shape[1], pivot, jnp.zeros_like(pivot))
@@ -244,7 +246,7 @@ def reduced_dynamics(
 
 
 def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
-    """`reduced_dynamics` in traced numbers, for a `Basis` that fits."""
+    """`reduced_dynamics` in traced numbers, for a `Basis` that fits; `tau` may be a function of (q, v, t)."""
 
     def velocity(q, t):
         place = choice.at(scene, q, t)
@@ -256,7 +258,7 @@ def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
     drift = push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t))
     mass = _product(N.T, _product(mass_matrix(scene.system, q, t), N))
     bias = _product(N.T, inverse_dynamics(scene.system, q, v, drift, t))
-    force = _product(N.T, applied(scene, q, v, tau, t))
+    force = _product(N.T, applied(scene, q, v, tau(q, v, t) if callable(tau) else tau, t))
     factor = cholesky(mass)
     rate = solve_factored(factor, force - bias)
     result = RESULTS.where(definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]

@@ -199,10 +199,11 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     @jax.jit  # traced once for all the places where diffrax and differentiation call it
     def derivative(t, y, args):
         scene, _, method = given(args)
+        rates = method.evaluated(scene, y, t, functools.partial(effort, args))
+        if "work" not in y:
+            return rates
         q, v = method.place(scene, y, t)
-        force = effort(args, q, v, t)
-        rates = method.rates(scene, y, q, v, t, force)
-        return rates | {"work": power(force, v)} if "work" in y else rates
+        return rates | {"work": power(effort(args, q, v, t), v)}
 
     @jax.jit
     def explicit_part(t, y, args):
@@ -341,7 +342,7 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
     event = None
     if isinstance(method, Reduced) and not continuous:
         # Near a singular basis steps become short; a long one may pass it, which the sign shows.
-        event = diffrax.Event((lambda t, y, args, **_: ~serves(quality(t, y, args)), quality))
+        event = diffrax.Event(lambda t, y, args, **_: _signed(quality(t, y, args)))
     how = {
         "term": term,
         "solver": solver,
@@ -366,6 +367,11 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
         began = ts[0] + (stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
         reached = jnp.where(result == RESULTS.nonlinear_divergence, began, reached)
     return rows, result, stats, reached
+
+
+def _signed(quality):
+    """The quality of a basis, of which a change of sign ends the run: zero where it no longer serves."""
+    return jnp.where(serves(quality), quality, jnp.zeros_like(quality))
 
 
 def _along(mask, rows):

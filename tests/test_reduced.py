@@ -1,5 +1,8 @@
 """Reduced dynamics against Kane's equations body by body, the saddle-point solve, and closed forms; motions against them."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -386,3 +389,26 @@ def test_baumgarte_pulls_back_but_errs():
         for method in ("multipliers", "baumgarte", "projected")
     )
     assert held < 1e-14 < pulled < 0.1 * opened
+
+
+@pytest.mark.slow
+def test_large_batches_end():
+    """Two LAPACK calls of a large batch at once can wait for each other for ever (jaxlib 0.10): there are never two.
+
+    In a process of its own, as one that is blocked cannot be stopped from within.
+    """
+    program = """
+import jax, numpy as np, jaxdyn as jd
+jax.config.update("jax_enable_x64", True)
+scene = jd.scenes.andrews()
+q, v = jd.scenes.andrews.start()
+
+def success(share):
+    ts, tolerances = jax.numpy.stack([0 * share, 0.002 * share]), {"rtol": 1e-4, "atol": 1e-4}
+    return jd.simulate(scene, q, v, ts, method="reduced", max_steps=4096, throw=False, **tolerances).success
+
+found = jax.jit(jax.vmap(success))
+for _ in range(4):
+    assert np.all(found(np.linspace(0.5, 1.0, 1024)))
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=600)

@@ -17,7 +17,7 @@ class Watched(diffrax.ConstantStepSize):
     A method of order p estimates its error in a step by some e of h^k. The estimates of embedded methods, k = p, overrate it and
     are taken as they are. That of `RK4`, k = 3, overrates it too much; but if all moves at one rate and the step is d,
     of h, e^2/d goes with h^5 as the error does: for y' = i y it is 3.3 times that. The rounding of a step adds eps times the
-    way from the start.
+    longest way from the start.
 
     **Arguments:** `order`, p.
     """
@@ -45,8 +45,8 @@ class Watched(diffrax.ConstantStepSize):
                 share = jnp.minimum(error / jnp.maximum(moved, jnp.finfo(moved.dtype).tiny), 1.0)
                 power = (order + 1 - error_order) / (error_order - 1)
                 error = error * (share if power == 1 else share**power)
-            errors = errors + error + jnp.where(moved > 0, jnp.finfo(way.dtype).eps * way, jnp.zeros_like(way))
             ways = jnp.maximum(ways, way)
+            errors = errors + error + jnp.where(moved > 0, jnp.finfo(way.dtype).eps * ways, jnp.zeros_like(ways))
         return *step, (inner, start, errors, ways), result
 
 
