@@ -356,5 +356,5 @@ CHAOS = (
 MILLION = (
     "Take adaptive steps or a shorter step where the phase matters: the energy error of RK4 grows in proportion to time "
     "and the phase with its square. In float32 the rounding of each step adds up as well: after 1e6 steps the state is "
-    "off by 0.14, and `coarse_steps` says so."
+    "off by a tenth, and `coarse_steps` says so."
 )
