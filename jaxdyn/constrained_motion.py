@@ -24,7 +24,17 @@ from jaxdyn.constrained import checked_tolerance, constrained_dynamics, solve_ro
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
 from jaxdyn.dynamics import forward_dynamics
 from jaxdyn.projection import project_state
-from jaxdyn.reduced import Basis, Given, Orthonormal, as_basis, least_quality, minimal_velocity, reduce, tangent_basis
+from jaxdyn.reduced import (
+    Basis,
+    Given,
+    Orthonormal,
+    as_basis,
+    least_quality,
+    minimal_velocity,
+    moving,
+    solve_reduced,
+    tangent_basis,
+)
 from jaxdyn.scene import Scene, as_pytree
 from jaxdyn.so3 import _product
 from jaxdyn.solvers import Stepper
@@ -54,10 +64,11 @@ class Method(eqx.Module):
         """dy/dt; q and v are those of `place`, `force` (nv,) is tau plus the scene's forces, or None."""
         return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
 
-    def evaluated(self, scene: Scene, y, t, effort) -> dict[str, Array]:
-        """dy/dt with effort(q, v, t) for the force."""
+    def evaluated(self, scene: Scene, y, t, effort) -> tuple[dict[str, Array], Array | None, Array]:
+        """dy/dt with effort(q, v, t) for the force; the force (nv,) or None; and v (nv,)."""
         q, v = self.place(scene, y, t)
-        return self.rates(scene, y, q, v, t, effort(q, v, t))
+        force = effort(q, v, t)
+        return self.rates(scene, y, q, v, t, force), force, v
 
     def acceleration(self, scene: Scene, q, v, t, force) -> Array:
         """Rate of v, (nv,)."""
@@ -191,8 +202,11 @@ class Reduced(Method):
         """The reference of an orthonormal basis."""
         return ("frame",) if self.basis is None or isinstance(self.basis, Orthonormal) else ()
 
+    def _basis(self, y):
+        return Orthonormal(y["frame"]) if self.jumping else self.basis
+
     def _at(self, scene, y, q, t):
-        return (Orthonormal(y["frame"]) if self.jumping else self.basis).at(scene, q, t)
+        return self._basis(y).at(scene, q, t)
 
     def start(self, scene, q, v, t):
         """q, nu and, for an orthonormal basis, its reference."""
@@ -209,15 +223,20 @@ class Reduced(Method):
         return q, _product(found.N, y["nu"]) + found.v0
 
     def evaluated(self, scene, y, t, effort):
-        """From the reduced equations, which give v and its rate from one factorisation of the rows."""
-        return self.rates(scene, y, retract(scene.system, y["q"]), None, t, effort)
+        """From the reduced equations, which share one factorisation of the rows with v."""
+        q = retract(scene.system, y["q"])
+        place = moving(scene, self._basis(y), q, y["nu"], t)
+        force = effort(q, place.v, t)
+        return self._rates(scene, y, place, q, t, force), force, place.v
 
     def rates(self, scene, y, q, v, t, force):
-        """From the reduced equations; v is found anew, and `force` may be a function of (q, v, t)."""
-        basis = Orthonormal(y["frame"]) if self.jumping else self.basis
-        found = reduce(Scene(scene.system, scene.constraints), basis, q, y["nu"], force, t)
+        """From the reduced equations; v is found anew."""
+        return self._rates(scene, y, moving(scene, self._basis(y), q, y["nu"], t), q, t, force)
+
+    def _rates(self, scene, y, place, q, t, force):
+        found = solve_reduced(Scene(scene.system, scene.constraints), place, q, force, t)
         fixed = {name: jnp.zeros_like(y[name]) for name in self.jumping}
-        return {"q": velocity_to_rate(scene.system, q, found.velocity), "nu": found.nu_rate} | fixed
+        return {"q": velocity_to_rate(scene.system, q, place.v), "nu": found.nu_rate} | fixed
 
     def acceleration(self, scene, q, v, t, force):
         """Rate of v."""

@@ -246,7 +246,21 @@ def reduced_dynamics(
 
 
 def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
-    """`reduced_dynamics` in traced numbers, for a `Basis` that fits; `tau` may be a function of (q, v, t)."""
+    """`reduced_dynamics` in traced numbers, for a `Basis` that fits."""
+    return solve_reduced(scene, moving(scene, choice, q, nu, t), q, tau, t)
+
+
+class Moving(NamedTuple):
+    """Velocity v (nv,) by minimal velocities, its rate (nv,) as these stay, N (nv, nr) and its quality ()."""
+
+    v: Array
+    drift: Array
+    N: Array
+    quality: Array
+
+
+def moving(scene: Scene, choice: Basis, q, nu, t) -> Moving:
+    """v = N nu + v0 and Ndot nu + v0dot, from one factorisation of the rows."""
 
     def velocity(q, t):
         place = choice.at(scene, q, t)
@@ -255,10 +269,15 @@ def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
         return _product(place.N, nu) + place.v0, place
 
     v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
-    drift = push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t))
+    return Moving(v, push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t)), N, quality)
+
+
+def solve_reduced(scene: Scene, place: Moving, q, tau, t) -> ReducedDynamics:
+    """The equations of motion in the minimal velocities of a `Moving` place, and their solution."""
+    v, drift, N, quality = place
     mass = _product(N.T, _product(mass_matrix(scene.system, q, t), N))
     bias = _product(N.T, inverse_dynamics(scene.system, q, v, drift, t))
-    force = _product(N.T, applied(scene, q, v, tau(q, v, t) if callable(tau) else tau, t))
+    force = _product(N.T, applied(scene, q, v, tau, t))
     factor = cholesky(mass)
     rate = solve_factored(factor, force - bias)
     result = RESULTS.where(definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]

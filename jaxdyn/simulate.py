@@ -199,11 +199,8 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     @jax.jit  # traced once for all the places where diffrax and differentiation call it
     def derivative(t, y, args):
         scene, _, method = given(args)
-        rates = method.evaluated(scene, y, t, functools.partial(effort, args))
-        if "work" not in y:
-            return rates
-        q, v = method.place(scene, y, t)
-        return rates | {"work": power(effort(args, q, v, t), v)}
+        rates, force, v = method.evaluated(scene, y, t, functools.partial(effort, args))
+        return rates | {"work": power(force, v)} if "work" in y else rates
 
     @jax.jit
     def explicit_part(t, y, args):
@@ -360,9 +357,8 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
     result = RESULTS.promote(result)
     if is_fixed(steps[-1]):
         if isinstance(controller, Watched):
-            result = RESULTS.where(
-                (result == RESULTS.successful) & too_coarse(solved.controller_state), RESULTS.coarse_steps, result
-            )
+            coarse = (result == RESULTS.successful) & too_coarse(solved.controller_state)
+            result = RESULTS.where(coarse, RESULTS.coarse_steps, result)
         # diffrax is at the end of the step that could not be solved; what is known ends where it began.
         began = ts[0] + (stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
         reached = jnp.where(result == RESULTS.nonlinear_divergence, began, reached)

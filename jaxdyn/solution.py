@@ -72,7 +72,7 @@ class Solution(eqx.Module):
 
     @property
     def success(self) -> Bool[Array, "..."]:
-        """Whether the motion was computed to its end."""
+        """Whether the motion was computed to its end, by steps short enough."""
         return self.result == RESULTS.successful
 
 

@@ -26,9 +26,10 @@ def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress
     `record` the times at which steps ended among it.
     """
     y0, args, ts = moving
-    saves = diffrax.SubSaveAt(ts=ts[1:])
+    saves, last = diffrax.SubSaveAt(ts=ts[1:]), diffrax.SubSaveAt(t1=True, fn=_nothing)
+    ends = (diffrax.SubSaveAt(steps=True, fn=_nothing),) if record else ()
+    saveat = diffrax.SaveAt(subs=(saves, last, *ends), controller_state=True)
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else
-    further = [diffrax.SubSaveAt(t1=True, fn=_nothing)] + [diffrax.SubSaveAt(steps=True, fn=_nothing)] * record
     solved: Any = diffrax.diffeqsolve(
         term,
         solver,
@@ -37,9 +38,7 @@ def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress
         dt0=dt0,
         y0=y0,
         args=args,
-        saveat=diffrax.SaveAt(subs=saves)
-        if continuous
-        else diffrax.SaveAt(subs=(saves, *further), controller_state=True),
+        saveat=diffrax.SaveAt(subs=saves) if continuous else saveat,
         stepsize_controller=controller,
         adjoint=adjoint,
         event=event,
