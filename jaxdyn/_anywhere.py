@@ -1,14 +1,24 @@
-"""`anywhere`: a question to the whole batch, so that what few samples need is computed only when one of them does.
+"""What only some samples of a batch need: computed when one of them does, or for those alone.
 
 Under `jax.vmap` a `lax.cond` whose predicate differs between samples computes both branches. A predicate that has gone
-through `anywhere` is one for all samples, however many `vmap`s enclose it, and the branch stays a branch.
+through `anywhere` is one for all samples, however many `vmap`s enclose it, and the branch stays a branch. `mended` computes
+samples that need it again and leaves the others alone.
 """
 
+from collections.abc import Callable
+
+import jax
 import jax.core
 import jax.numpy as jnp
+from jax import lax
 from jax.core import ShapedArray
+from jax.custom_batching import custom_vmap
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
+
+from jaxdyn._materialize import at_least
+
+AT_ONCE = 32  # samples that are computed again together
 
 _anywhere_p = Primitive("anywhere")
 _anywhere_p.def_impl(lambda flag: flag)
@@ -26,3 +36,90 @@ batching.primitive_batchers[_anywhere_p] = _over_samples
 def anywhere(flag):
     """Whether a flag () is set for this sample or for any other one of the batch."""
     return _anywhere_p.bind(flag) if isinstance(flag, jax.core.Tracer) else flag
+
+
+def mended(flag, careful: Callable, found: tuple, args: tuple):
+    """`found` where the flag () is not set, else `careful(*args)`; in a batch only the samples that need it, a few at a time.
+
+    **Arguments:**
+
+    - `careful(*args)` -> what `found` is: a pair of pytrees, of which the first is differentiated. It depends on nothing traced
+      but `args`.
+
+    Derivatives are those of `found` if the flag is set in no sample of the batch, else those of `careful` for all of them.
+    """
+
+    @jax.custom_jvp
+    def run(flag, found, args):
+        return _one(careful)(flag, found, args)
+
+    @run.defjvp
+    def _(primals, tangents):
+        flag, _, args = primals
+        _, (smooth_step, plain_step), args_step = tangents
+
+        def again():
+            return jax.jvp(lambda *args: careful(*args)[0], args, args_step)[1]
+
+        step = lax.cond(anywhere(flag), again, lambda: smooth_step)
+        return run(*primals), (step, plain_step)
+
+    return run(flag, found, args)
+
+
+def _one(careful: Callable):
+    @custom_vmap
+    def one(flag, found, args):
+        return lax.cond(flag, lambda: careful(*args), lambda: found)
+
+    @one.def_vmap
+    def _(size, batched, flag, found, args):
+        leaves, structure = jax.tree.flatten(args)
+        axes = [0 if varies else None for varies in jax.tree.leaves(batched[2])]
+        flag, found = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, found), tuple(batched[:2]))
+        fixed = _many(lambda *leaves: careful(*jax.tree.unflatten(structure, leaves)), axes)(flag, found, leaves)
+        return fixed, jax.tree.map(lambda _: True, fixed)
+
+    return one
+
+
+def _many(careful: Callable, axes: list):
+    """The same for samples along the leading axis; `axes` says which of the arguments have it."""
+
+    @custom_vmap
+    def many(flag, found, args):
+        size = flag.shape[0]
+        places = jnp.nonzero(flag, size=size + AT_ONCE, fill_value=size)[0]
+
+        def mend(i, found):
+            here = lax.dynamic_slice_in_dim(places, i * AT_ONCE, AT_ONCE)
+            taken = [x if axis is None else x.at[here].get(mode="clip") for x, axis in zip(args, axes, strict=True)]
+            # Values of a few samples are kept from being computed again; those of one are in a branch that is not taken.
+            with at_least(AT_ONCE):
+                new = jax.vmap(careful, axes)(*taken)
+            return jax.tree.map(lambda old, new: old.at[here].set(new, mode="drop"), found, new)
+
+        return lax.fori_loop(0, (jnp.sum(flag) + AT_ONCE - 1) // AT_ONCE, mend, found)
+
+    @many.def_vmap
+    def _(size, batched, flag, found, args):
+        flag, found = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, found), tuple(batched[:2]))
+        shape = flag.shape
+        flat, over = [], []
+        for x, axis, varies in zip(args, axes, batched[2], strict=True):
+            if axis == 0:
+                x = _rows(x, varies, size).reshape(-1, *x.shape[1 + varies :])
+            elif varies:
+                x = jnp.repeat(x, shape[1], 0)
+            flat.append(x)
+            over.append(0 if axis == 0 or varies else None)
+        flag, found = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (flag, found))
+        found = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), _many(careful, over)(flag, found, flat))
+        return found, jax.tree.map(lambda _: True, found)
+
+    return many
+
+
+def _rows(x, varies: bool, size: int):
+    """With a leading axis of the batch."""
+    return x if varies else jnp.broadcast_to(x, (size, *x.shape))

@@ -19,11 +19,11 @@ from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
-from jaxdyn._anywhere import anywhere
+from jaxdyn._anywhere import anywhere, mended
 from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
-from jaxdyn._tracing import traced_once
+from jaxdyn._tracing import split, traced_once
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.loops import Loop
@@ -117,14 +117,15 @@ def constrained_dynamics(
     if not places:
         return _free(scene, q, v, force, t)
 
+    bare, state = Scene(scene.system, scene.constraints), (q, v, force, jnp.asarray(t, q.dtype))
+
     def dense():
-        bare = Scene(scene.system, scene.constraints)
-        return traced_once(_by_matrices, bare, q, v, force, jnp.asarray(t, q.dtype), static=(method, rank_tol))
+        return traced_once(_by_matrices, bare, *state, static=(method, rank_tol))
 
     large = method != "range_space" and has_short_recursion(scene) and is_large_batch(scene, q, v, force)
     if isinstance(large, jax.core.Tracer):
-        return lax.cond(large, lambda: _by_recursion(scene, q, v, force, method, rank_tol, dense), dense)
-    return _by_recursion(scene, q, v, force, method, rank_tol, dense) if large else dense()
+        return lax.cond(large, lambda: _by_recursion(bare, *state, method, rank_tol), dense)
+    return _by_recursion(bare, *state, method, rank_tol) if large else dense()
 
 
 def _by_matrices(scene: Scene, q, v, force, t, method: str, rank_tol) -> ConstrainedDynamics:
@@ -140,22 +141,28 @@ def has_short_recursion(scene: Scene) -> bool:
     return products(model, ends, [loop.kind.count for loop in loops]) <= MOST_PRODUCTS
 
 
-def _by_recursion(scene, q, v, force, method: str, rank_tol, dense) -> ConstrainedDynamics:
-    """The Schur complement written out; what it cannot do well is left to the rank-aware solve, for all samples at once."""
+def _by_recursion(scene: Scene, q, v, force, t, method: str, rank_tol) -> ConstrainedDynamics:
+    """The Schur complement written out; the samples with which it cannot do well are left to the rank-aware solve."""
     system, loops, places = scene.system, scene.constraints, layout(scene)
     a, lam, quality = closed_dynamics(system, loops, q, v, force)
     rank = jnp.asarray(places[-1].end, jnp.int32)
-
-    def quick():
-        result = RESULTS.where(quality > 10 * scene.nv * _eps(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
-        result = RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
-        return ConstrainedDynamics(*with_derivatives(system, loops, q, v, force, a, lam), rank, result, places)
-
+    result = RESULTS.where(quality > 10 * scene.nv * _eps(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
+    smooth = with_derivatives(system, loops, q, v, force, a, lam)
     if method == "schur":
-        return quick()
-    # Derivatives keep what a branch needs for them in either case; this one, which hardly ever runs, computes it again.
-    careful = jax.checkpoint(dense, prevent_cse=False)
-    return lax.cond(anywhere(~(quality > least_pivot(q, rank_tol))), careful, quick)
+        return ConstrainedDynamics(*smooth, rank, result, places)
+    unknown, known = split(scene)
+
+    def careful(unknown, state):
+        found = traced_once(_by_matrices, known(unknown), *state, static=(method, rank_tol))
+        return (found.acceleration, found.multipliers), (found.rank, found.result)
+
+    # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
+    careful = jax.checkpoint(careful, prevent_cse=False)
+    found = smooth, (rank, result)
+    doubtful = ~(quality > least_pivot(q, rank_tol))
+    (a, lam), (rank, result) = mended(doubtful, careful, found, (unknown, (q, v, force, t)))
+    return ConstrainedDynamics(a, lam, rank, result, places)
 
 
 def least_pivot(like, rank_tol: float | None) -> float:

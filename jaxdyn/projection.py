@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn._anywhere import anywhere
+from jaxdyn._anywhere import anywhere, mended
 from jaxdyn._dispatch import LEAST_BATCH, is_large_batch
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn._small import cholesky, solve_factored, solve_lower
-from jaxdyn._tracing import traced_once
+from jaxdyn._tracing import split, traced_once
 from jaxdyn.closed_projection import Closing
 from jaxdyn.constrained import correction, has_short_recursion, least_pivot, normal_factor, pseudo_inverse, tolerance
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
@@ -93,17 +93,18 @@ def _by_matrices(scene: Scene, rank_tol, q, v, t):
 
 
 def _by_recursion(scene: Scene, rank_tol, q, v, t):
-    """Loops of a tree in a large batch; all samples by matrices if one of them has rows that are close to dependent."""
+    """Loops of a tree in a large batch; by matrices the samples with rows that are close to dependent."""
     with at_least(LEAST_BATCH):
         closing = Closing(scene.system, scene.constraints, q)
+        place = _closed(scene, q, closing.step, closing.apart)
+        slip = partial(closing.slip, place)
+        found = place, _descend(v, closing.step, slip, lambda v, step: v - step)
+    unknown, known = split(scene)
 
-        def quick():
-            place = _closed(scene, q, closing.step, closing.apart)
-            slip = partial(closing.slip, place)
-            return place, _descend(v, closing.step, slip, lambda v, step: v - step)
+    def careful(unknown, q, v, t):
+        return _by_matrices(known(unknown), rank_tol, q, v, t), ()
 
-        dependent = ~(closing.quality > least_pivot(q, rank_tol))
-        return lax.cond(anywhere(dependent), lambda: _by_matrices(scene, rank_tol, q, v, t), quick)
+    return mended(~(closing.quality > least_pivot(q, rank_tol)), careful, (found, ()), (unknown, q, v, t))[0]
 
 
 def _closed(scene: Scene, q, step, residual):

@@ -7,13 +7,14 @@ import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree
 
 from jaxdyn import _dispatch, closed_recursion, constrained, scenes, se3
-from jaxdyn._anywhere import anywhere
+from jaxdyn._anywhere import anywhere, mended
 from jaxdyn.closed_projection import Closing
 from jaxdyn.constrained import constrained_dynamics, solve_rows
 from jaxdyn.constraints import loop
 from jaxdyn.constraints.base import position_residual, rows
 from jaxdyn.dynamics import bias_force, mass_matrix
 from jaxdyn.model import integrate
+from jaxdyn.projection import project_state
 from jaxdyn.scene import Scene
 
 POSE = ((0.1, -0.2, 0.3), (0.5, 0.2, -0.4))
@@ -182,3 +183,56 @@ def test_anywhere_asks_the_whole_batch():
     assert jax.vmap(jax.grad(pick))(grid[1]).tolist() == [1, 1]
     assert pick(jnp.asarray(3.0)) == 13 and pick(jnp.asarray(1.0)) == 1
     assert "select" not in str(jax.make_jaxpr(jax.vmap(pick))(grid[0]))
+
+
+def _root(x, scale):
+    """sqrt(scale x) that is computed another way where x is below 1."""
+    smooth, plain = jnp.sqrt(scale * x), (jnp.asarray(0, jnp.int32),)
+    careful = lambda x, scale: (jnp.exp(0.5 * jnp.log(scale * x)), (jnp.asarray(1, jnp.int32),))  # noqa: E731
+    return mended(x < 1, careful, (smooth, plain), (x, scale))
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("few", [0, 1, 50, 96])
+def test_samples_that_need_it_are_mended(nested, few):
+    x = jnp.where(jnp.arange(96) % 96 < few, 0.5, 2.0) + jnp.arange(96) / 1000
+    shape = (8, 12) if nested else (96,)
+    run = jax.vmap(_root, (0, None))
+    scales = jnp.asarray(3.0)
+    if nested:
+        run = jax.vmap(jax.vmap(_root, (0, None)), (0, 0))
+        scales = jnp.arange(1.0, 9.0)
+    y, (way,) = jax.jit(run)(x.reshape(shape), scales)
+    want = np.sqrt(np.asarray(x).reshape(shape) * (np.asarray(scales)[:, None] if nested else 3.0))
+    assert_close(y, want, 1e-14)
+    assert way.reshape(-1).tolist() == [1] * few + [0] * (96 - few)
+    slope = jax.grad(lambda x: jnp.sum(run(x, scales)[0]))(x.reshape(shape))
+    moved = jax.jvp(lambda s: run(x.reshape(shape), s)[0], (scales,), (jnp.ones_like(scales),))[1]
+    assert_close(slope, want / (2 * np.asarray(x).reshape(shape)), 1e-13)
+    assert_close(moved, want / (2 * (np.asarray(scales)[:, None] if nested else 3.0)), 1e-13)
+
+
+def test_one_sample_is_mended():
+    for run in (_root, jax.jit(_root)):
+        for x, way in ((0.25, 1), (4.0, 0)):
+            y, (found,) = run(jnp.asarray(x), jnp.asarray(1.0))
+            assert found == way
+            assert_close(y, np.sqrt(x), 1e-15)
+
+
+def test_a_sample_is_not_changed_by_a_singular_one_beside_it(monkeypatch):
+    monkeypatch.setattr(_dispatch, "LEAST_BATCH", 4)
+    scene = scenes.windows(count=2)
+    q0, v0 = scenes.windows.start(count=2)
+    q = jnp.stack([q0, q0.at[0].add(0.1), q0 - 0.3, q0 + 0.2])
+    flat = jnp.asarray([-np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, -np.pi / 2])
+
+    @jax.jit
+    @jax.vmap
+    def run(q):
+        found = constrained_dynamics(scene, q, v0, jnp.zeros(5))
+        return found.acceleration, found.multipliers, project_state(scene, q, v0, 0.0)
+
+    others = np.array([0, 2, 3])
+    for x, y in zip(jax.tree.leaves(run(q)), jax.tree.leaves(run(q.at[1].set(flat))), strict=True):
+        assert np.array_equal(x[others], y[others])

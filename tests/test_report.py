@@ -321,6 +321,8 @@ def test_batches_above_the_largest_are_left_out(small, rungs, monkeypatch):
     found = jd.report("free_body", rounds=1, batches=(1, 64), echo=lines.append)
     assert {r.batch for r in found.records} == {1}
     assert "batches above 1 are left out" in lines[0]
+    found = jd.report("free_body", rounds=1, batches=(1, 4), ways=[("free", "Tsit5")])
+    assert {(r.batch, r.label) for r in found.records} == {(1, "free, Tsit5"), (4, "free, Tsit5")}
 
 
 def test_standings_compare_within_a_class():
@@ -403,6 +405,8 @@ def test_command(small, rungs, capsys):
         (["report", "free_body", "--batch", "0"], "batches"),
         (["report", "free_body", "--dtype", "float16"], "float16"),
         (["report", "free_body", "--rounds", "0"], "rounds"),
+        (["report", "free_body", "--way", "Dopri8"], "ways"),
+        (["report", "free_body", "--way", "free:Euler"], "Euler"),
     ):
         assert main(wrong) == 2
         assert word in capsys.readouterr().err

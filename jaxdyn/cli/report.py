@@ -37,6 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", help="directory for the page, the data and the text")
     parser.add_argument("--dtype", nargs="+", metavar="T", help="float64, float32 (default: float64; both with --full)")
     parser.add_argument("--batch", nargs="+", type=int, metavar="N", help="trajectories at once (default: 1; 1 256)")
+    parser.add_argument(
+        "--way", nargs="+", metavar="W", help="method:solver, e.g. projected:Dopri8, in place of the usual ones"
+    )
     parser.add_argument("--rounds", type=int, default=20, metavar="N", help="timings of each run (default: 20)")
 
 
@@ -50,7 +53,8 @@ def run(args: argparse.Namespace) -> int:
     if not (args.scenes or args.full):
         raise ValueError(f"no scene is named; name one of {', '.join(known)}, or give --full for all")
     watch = Stopwatch()
-    options = {"dtypes": args.dtype, "batches": args.batch, "rounds": args.rounds, "out": args.out}
+    ways = None if args.way is None else [tuple(way.split(":")) for way in args.way]
+    options = {"dtypes": args.dtype, "batches": args.batch, "ways": ways, "rounds": args.rounds, "out": args.out}
     found = report(args.scenes or None, full=args.full, echo=lambda line: print(line, flush=True), **options)
     print(f"\n{found.table()}\n\n{len(found.records)} runs in {watch}, compilation included.")
     if args.out:

@@ -27,7 +27,7 @@ class Case(NamedTuple):
       - `build()` -> (scene, (q0, v0)); `reference(start)` -> `Reference`, or None where a
     converged solution at `ts` serves.
       - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
-      - `largest`: the most trajectories at once whose runs take seconds and no minutes; None for any number.
+      - `largest`: the most trajectories at once that are measured unless `ways` are chosen; None for any number.
     """
 
     name: str
@@ -166,7 +166,7 @@ def _cases() -> tuple[Case, ...]:
             lambda start: references.windows(ten / 10, 40),
             ten / 10,
             10,
-            # Where one sample loses rank, all of a batch are solved by pivoted QR of 81 x 80 matrices.
+            # The program for a batch compiles for six minutes.
             largest=1,
         ),
         Case(

@@ -12,7 +12,7 @@ from jaxdyn.report.cases import Case, cases
 from jaxdyn.report.journal import Journal
 from jaxdyn.report.measure import Contestant, flop_counter, ladder, measure
 from jaxdyn.report.page import write
-from jaxdyn.report.programs import FIXED, Prepared, prepare
+from jaxdyn.report.programs import FIXED, SOLVERS, Prepared, prepare
 from jaxdyn.report.records import Known, Record, Report
 from jaxdyn.report.timing import commit, machine
 
@@ -49,6 +49,7 @@ def report(
     full: bool = False,
     dtypes: Sequence[str] | None = None,
     batches: Sequence[int] | None = None,
+    ways: Sequence[tuple[str, str]] | None = None,
     rounds: int = 20,
     out: str | Path | None = None,
     peers: Peers | None = None,
@@ -64,7 +65,8 @@ def report(
     - `scenes`: a name or names of `jaxdyn.report.cases()`; None for all.
     - `full`: many methods, solvers and rungs, in float64 and float32, one trajectory and 256 at once; else a quick
       ladder of the usual ones in float64, one trajectory.
-    - `dtypes`, `batches`: others than those. `rounds`: timings of each run, at least 20 for a figure to be quoted.
+    - `dtypes`, `batches`: others than those. `ways`: pairs of a method and a solver in place of those.
+    - `rounds`: timings of each run, at least 20 for a figure to be quoted.
     - `out`: directory for report.json, report.txt and report.html, and for records.jsonl, from which a call that was
       interrupted goes on.
     - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.report.measure`.
@@ -72,23 +74,23 @@ def report(
 
     **Returns:** a `Report`; `print(report.table())`; `jaxdyn.report.write(report, directory)` makes its page.
 
-    **Raises:** ValueError for a name that is not known, a dtype or batch that cannot be, float64 that is not enabled,
+    **Raises:** ValueError for a name that is not known, a dtype, batch or way that cannot be, float64 that is not enabled,
     and a directory that holds another commit's or another machine's records.
 
     ```python
     quick = jd.report("pendulum_in_plane")
     ```
     """
-    chosen = _checked(scenes, dtypes, batches, rounds)
+    chosen = _checked(scenes, dtypes, batches, ways, rounds)
     dtypes = dtypes or (("float64", "float32") if full else ("float64",))
     batches = batches or ((1, 256) if full else (1,))
     say = echo or (lambda line: None)
     groups = []
     for case in chosen:
-        sizes = [batch for batch in batches if case.largest is None or batch <= case.largest]
+        sizes = [batch for batch in batches if ways or case.largest is None or batch <= case.largest]
         groups += [(case, dtype, batch) for dtype in dtypes for batch in sizes]
         if len(sizes) < len(batches):
-            say(f"{case.name}: batches above {case.largest} are left out, as they take minutes")
+            say(f"{case.name}: batches above {case.largest} are left out: they take minutes, unless `ways` are chosen")
     head = {
         "machine": machine(),
         "commit": commit(),
@@ -97,14 +99,15 @@ def report(
     }
     journal = Journal(None if out is None else Path(out), head)
     prepared, began = None, time.perf_counter()
-    keys = [f"{case.name}, {dtype}, batch {batch}, {rounds} rounds" for case, dtype, batch in groups]
+    only = "".join(f", {method} {solver}" for method, solver in ways or ())
+    keys = [f"{case.name}, {dtype}, batch {batch}, {rounds} rounds{only}" for case, dtype, batch in groups]
     todo = [(key, *group) for key, group in zip(keys, groups, strict=True) if key not in journal]
     if len(todo) < len(groups):
         say(f"{len(groups) - len(todo)} of {len(groups)} are finished already, in {journal.path}")
     for done, (key, case, dtype, batch) in enumerate(todo, 1):
         if prepared is None or prepared.case is not case:
             prepared = prepare(case)
-        records = _group(prepared, dtype, batch, full, rounds, peers)
+        records = _group(prepared, dtype, batch, ways, full, rounds, peers)
         journal.add(key, case.name, _known(prepared), records)
         passed = time.perf_counter() - began
         left = passed / done * (len(todo) - done)
@@ -115,12 +118,12 @@ def report(
     return found
 
 
-def _group(prepared: Prepared, dtype, batch, full, rounds, peers) -> list[Record]:
+def _group(prepared: Prepared, dtype, batch, ways, full, rounds, peers) -> list[Record]:
     """Records of one scene in one dtype and number of trajectories: what is timed in one loop."""
     case, scene = prepared.case, prepared.scene
     starts = prepared.programs.lanes(batch)
     plain = dtype == "float64" and batch == 1
-    pairs = combinations(case, bool(scene.constraints), full=full, plain=plain)
+    pairs = list(ways) if ways else combinations(case, bool(scene.constraints), full=full, plain=plain)
     counters = {method: flop_counter(prepared, method, batch) for method in dict(pairs)}
     contestants = [
         rung
@@ -140,7 +143,7 @@ def _known(prepared: Prepared) -> Known:
     return Known(prepared.case.text, reference.kind, reference.source, reference.error, published)
 
 
-def _checked(scenes, dtypes, batches, rounds) -> list[Case]:
+def _checked(scenes, dtypes, batches, ways, rounds) -> list[Case]:
     """The cases, after a check of the arguments of `report`."""
     known = cases()
     names = list(known) if scenes is None else [scenes] if isinstance(scenes, str) else list(scenes)
@@ -150,6 +153,11 @@ def _checked(scenes, dtypes, batches, rounds) -> list[Case]:
     for dtype in dtypes or ():
         if dtype not in ("float64", "float32"):
             raise ValueError(f"dtypes has {dtype!r}; choose from float64, float32")
+    for pair in ways or ():
+        if not isinstance(pair, tuple | list) or len(pair) != 2 or pair[1] not in SOLVERS:
+            raise ValueError(
+                f'ways has {pair!r}; give pairs such as ("projected", "Dopri8"), solvers: {", ".join(SOLVERS)}'
+            )
     for batch in batches or ():
         if isinstance(batch, bool) or not isinstance(batch, int) or batch < 1:
             raise ValueError(f"batches has {batch!r}; give positive integers")
