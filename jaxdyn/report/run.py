@@ -49,7 +49,7 @@ def report(
     full: bool = False,
     dtypes: Sequence[str] | None = None,
     batches: Sequence[int] | None = None,
-    ways: Sequence[tuple[str, str]] | None = None,
+    ways: Sequence[Sequence[str]] | None = None,
     rounds: int = 20,
     out: str | Path | None = None,
     peers: Peers | None = None,
