@@ -38,15 +38,17 @@ def anywhere(flag):
     return _anywhere_p.bind(flag) if isinstance(flag, jax.core.Tracer) else flag
 
 
-def mended(flag, careful: Callable, found: tuple, args: tuple):
+def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | None = None):
     """`found` where the flag () is not set, else `careful(*args)`; in a batch only the samples that need it, a few at a time.
 
     **Arguments:**
 
     - `careful(*args)` -> what `found` is: a pair of pytrees, of which the first is differentiated. It depends on nothing traced
       but `args`.
+    - `same(found[0], *args)` -> found[0], to be differentiated by the args; None where nothing is.
 
-    Derivatives are those of `found` if the flag is set in no sample of the batch, else those of `careful` for all of them.
+    Derivatives are those of `same` if the flag is set in no sample of the batch, else those of `careful` for all of them: in a
+    branch, as what a singular sample makes of the other way is no number, and would reach gradients even times zero.
     """
 
     @jax.custom_jvp
@@ -55,16 +57,21 @@ def mended(flag, careful: Callable, found: tuple, args: tuple):
 
     @run.defjvp
     def _(primals, tangents):
-        flag, _, args = primals
-        _, (smooth_step, plain_step), args_step = tangents
+        flag, (smooth, _), args = primals
+        _, (_, plain_step), args_step = tangents
 
-        def again():
-            return jax.jvp(lambda *args: careful(*args)[0], args, args_step)[1]
+        def as_found(*args):
+            if same is None:
+                raise TypeError("what is mended here has no derivative")
+            return same(smooth, *args)
 
-        step = lax.cond(anywhere(flag), again, lambda: smooth_step)
+        def by(function):
+            return lambda: jax.jvp(function, args, args_step)[1]
+
+        step = lax.cond(anywhere(flag), by(lambda *args: careful(*args)[0]), by(as_found))
         return run(*primals), (step, plain_step)
 
-    return run(flag, found, args)
+    return run(flag, lax.stop_gradient(found), args)
 
 
 def _one(careful: Callable):

@@ -148,10 +148,14 @@ def _by_recursion(scene: Scene, q, v, force, t, method: str, rank_tol) -> Constr
     rank = jnp.asarray(places[-1].end, jnp.int32)
     result = RESULTS.where(quality > 10 * scene.nv * _eps(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
-    smooth = with_derivatives(system, loops, q, v, force, a, lam)
     if method == "schur":
-        return ConstrainedDynamics(*smooth, rank, result, places)
+        a, lam = with_derivatives(system, loops, q, v, force, a, lam)
+        return ConstrainedDynamics(a, lam, rank, result, places)
     unknown, known = split(scene)
+
+    def same(found, unknown, state):
+        here = known(unknown)
+        return with_derivatives(here.system, here.constraints, *state[:3], *found)
 
     def careful(unknown, state):
         found = traced_once(_by_matrices, known(unknown), *state, static=(method, rank_tol))
@@ -159,9 +163,8 @@ def _by_recursion(scene: Scene, q, v, force, t, method: str, rank_tol) -> Constr
 
     # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
     careful = jax.checkpoint(careful, prevent_cse=False)
-    found = smooth, (rank, result)
-    doubtful = ~(quality > least_pivot(q, rank_tol))
-    (a, lam), (rank, result) = mended(doubtful, careful, found, (unknown, (q, v, force, t)))
+    found, doubtful = ((a, lam), (rank, result)), ~(quality > least_pivot(q, rank_tol))
+    (a, lam), (rank, result) = mended(doubtful, careful, found, (unknown, (q, v, force, t)), same)
     return ConstrainedDynamics(a, lam, rank, result, places)
 
 

@@ -16,7 +16,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn._anywhere import anywhere
-from jaxdyn.solvers.projected import ProjectedSolver
+from jaxdyn.solvers.projected import ProjectedSolver, enlarged
 
 
 class ExplicitSteps(ProjectedSolver):
@@ -83,12 +83,10 @@ class ExplicitSteps(ProjectedSolver):
         elif not lasts:
             end, result = ended(raw)
         y1, stages = structure(end), jax.vmap(structure)(k)
-        dense = {"y0": y0, "y1": structure(raw), "k": stages}
+        dense, error = {"y0": y0, "y1": structure(raw), "k": stages}, structure(total[count + 1])
         if self.project is not None:
-            shift = structure(end - raw)
-            for name in self.jumping:
-                shift = shift | {name: jnp.zeros_like(shift[name])}
-            dense = {"dense_info": dense, "shift": shift}
+            shift = self.shift(structure(end), structure(raw))
+            dense, error = {"dense_info": dense, "shift": shift}, enlarged(error, shift)
         reusable = jnp.asarray(tableau.fsal and (self.project is None or lasts))
         last = k[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt)
-        return y1, structure(total[count + 1]), dense, (last, reusable), result
+        return y1, error, dense, (last, reusable), result

@@ -44,7 +44,9 @@ class ProjectedSolver(Wrapped):
 
     The exact solution stays on the manifold, so the projection moves a step's result by no more than its local error,
     and the order of convergence is that of the wrapped method (Hairer, Lubich & Wanner 2006, section IV.4). The
-    projection is part of the step: it acts on every result the step-size control sees, and on no other.
+    projection is part of the step: it acts on every result the step-size control sees, and on no other. How far it moves
+    the result is added to the error estimate. That is small beside it, except where rounding decides to which of
+    several branches of a manifold a point is put back: there no step is short enough, and the run ends with a code.
 
     **Arguments:** `solver`, any diffrax method of an `ODETerm`. `project(t, y, args) -> (y, diffrax.RESULTS)`, which
     says whether it succeeded; everything it depends on comes through `args`, so that gradients reach it. `jumping` names
@@ -65,6 +67,11 @@ class ProjectedSolver(Wrapped):
         """Dense output of the wrapped method, ending at the projected point."""
         return functools.partial(_Interpolation, self.solver.interpolation_cls)
 
+    def shift(self, projected, y):
+        """What the projection adds to a step's result, zero in entries that are `jumping`."""
+        shift = jax.tree.map(lambda a, b: a - b, projected, y)
+        return shift | {name: jnp.zeros_like(shift[name]) for name in self.jumping} if self.jumping else shift
+
     def init(self, terms, t0, t1, y0, args):
         """State of the wrapped method."""
         return self.solver.init(terms, t0, t1, y0, args)
@@ -76,8 +83,12 @@ class ProjectedSolver(Wrapped):
             terms, t0, t1, y0, args, solver_state, made_jump=True
         )
         projected, projection_result = self.project(t1, y1, args)
-        shift = jax.tree.map(lambda a, b: a - b, projected, y1)
-        for name in self.jumping:
-            shift = shift | {name: jnp.zeros_like(shift[name])}
+        shift = self.shift(projected, y1)
+        error = None if error is None else enlarged(error, shift)
         result = diffrax.RESULTS.where(diffrax.is_successful(result), projection_result, result)
         return projected, error, {"dense_info": dense_info, "shift": shift}, solver_state, result
+
+
+def enlarged(error, shift):
+    """An error estimate with the sizes of what a projection added to the step."""
+    return jax.tree.map(lambda e, s: e + jnp.where(e < 0, -jnp.abs(s), jnp.abs(s)), error, shift)
