@@ -276,7 +276,7 @@ FLAT = (
     "Adaptive steps in float64 pass the position where the rows lose rank, by every method, as long as steps are long "
     "enough to leap over it. On the spot rounding decides on which of two ways the mechanism leaves; where tolerances are so "
     "tight that steps end there (1e-11, and 1e-6 in float32), the run ends with `dt_min_reached`: take float64 and 1e-8, or "
-    "fixed steps. In float32 these are off by 2e-3 with two windows, so ask for outputs=('energy', 'work'). "
+    "fixed steps. In float32 these are off by 3e-3 or refused, so ask for outputs=('energy', 'work'). "
     "Gradients through the position itself are those of the steps taken."
 )
 PLANES = (
