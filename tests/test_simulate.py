@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
-from pinocchio_bridge import ROBOTS, quick, to_jaxdyn
+from pinocchio_bridge import ROBOTS, assert_close, quick, to_jaxdyn
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from jaxdyn import scenes
 from jaxdyn.building import ModelBuilder
 from jaxdyn.dynamics import forward_dynamics, kinetic_energy, potential_energy
 from jaxdyn.forces import CoulombFriction, JointDamping, JointSpring
@@ -20,7 +21,7 @@ from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import integrate, neutral
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import RESULTS, simulate
-from jaxdyn.solvers import RK4, ProjectedSolver
+from jaxdyn.solvers import RK4, LieGroup, ProjectedSolver
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
 SYMMETRIC = np.array([0.4, 0.4, 0.2])
@@ -514,3 +515,16 @@ def test_quaternions_near_unit_length_are_normalised(leg):
     run = eqx.filter_jit(lambda q: simulate(leg, q, V0, [0.0, 0.1], stepsize=0.05).q)
     scaled = jnp.asarray(Q0 * np.array([1.0005] * 4 + [1.0]))
     np.testing.assert_allclose(run(scaled), run(jnp.asarray(Q0)), rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "wrapped", [LieGroup(diffrax.Tsit5()), diffrax.HalfSolver(diffrax.Tsit5())], ids=["Lie", "half"]
+)
+@pytest.mark.parametrize("name", ["free_body", "rolling_coin"])
+def test_methods_that_wrap_an_explicit_one(wrapped, name):
+    """In local coordinates, and with errors by halved steps: the motion is that of Dopri8, with and without constraints."""
+    found = getattr(scenes, name)
+    state, ts = found.start(), jnp.linspace(0.0, 0.5, 3)
+    ways = [simulate(found(), *state, ts, solver=solver) for solver in (diffrax.Dopri8(), wrapped)]
+    assert_close(ways[1].q, ways[0].q, 1e-6)  # local errors of 1e-8 along the way
+    assert_close(ways[1].v, ways[0].v, 1e-6)
