@@ -329,8 +329,8 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
     """Rows of the state at ts[1:], how it ended, counts, and the time it came to."""
     adjoint = options["adjoint"]
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
-    # diffrax's `isinstance` is true of methods that wrap one, too.
-    if issubclass(type(solver), diffrax.AbstractERK):
+    # Of a method that wraps an explicit one, diffrax says that it is one.
+    if isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver):
         solver = ExplicitSteps(solver, project, method.jumping)
     elif project:
         solver = ProjectedSolver(solver, project, method.jumping)
