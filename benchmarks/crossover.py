@@ -53,7 +53,7 @@ def program(way, model, batch: int, calls: int):
 
 
 def rows(kind: str, cases, rounds: int):
-    """Cells for (label, model, batch, names of ways): microseconds per sample, the best one marked."""
+    """Cells for (label, model, batch, names of ways): microseconds per sample by each way, and the cheapest one's name."""
     for label, model, batch, names in cases:
         calls = max(1, 512 // (batch * model.nb))
         runs = {name: program(WAYS[kind][name], model, batch, calls) for name in names}

@@ -274,9 +274,9 @@ def starts(dtypes, gradient):
 
 FLAT = (
     "Adaptive steps in float64 pass the position where the rows lose rank, by every method, as long as steps are long "
-    "enough to leap over it. On the spot rounding decides on which of two ways the mechanism leaves; where tolerances are so "
-    "tight that steps end there (1e-11, and 1e-6 in float32), the run ends with `dt_min_reached`: take float64 and 1e-8, or "
-    "fixed steps. In float32 these are off by 3e-3 or refused, so ask for outputs=('energy', 'work'). "
+    "enough to leap over it. On the spot rounding decides on which of two ways the mechanism leaves; a run whose steps end "
+    "there, as tight tolerances and float32 make likely, ends with `dt_min_reached` or `max_steps_reached`: take float64 and "
+    "1e-8, or fixed steps. In float32 these are off by 3e-3 or refused, so ask for outputs=('energy', 'work'). "
     "Gradients through the position itself are those of the steps taken."
 )
 PLANES = (
