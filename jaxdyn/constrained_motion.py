@@ -23,7 +23,7 @@ from jaxdyn.assembly import open_constraints, residuals, start_evidence
 from jaxdyn.constrained import checked_tolerance, constrained_dynamics, solve_rows
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
 from jaxdyn.dynamics import forward_dynamics
-from jaxdyn.projection import project_state
+from jaxdyn.projection import project_state, project_step
 from jaxdyn.reduced import (
     Basis,
     Given,
@@ -39,7 +39,7 @@ from jaxdyn.scene import Scene, as_pytree
 from jaxdyn.so3 import _product
 from jaxdyn.solvers import Stepper
 from jaxdyn.solvers.choice import is_fixed
-from jaxdyn.systems import has_quaternions, retract, velocity_to_rate
+from jaxdyn.systems import has_quaternions, rate_to_velocity, retract, velocity_to_rate
 
 
 class Method(eqx.Module):
@@ -83,8 +83,12 @@ class Method(eqx.Module):
         return self.projects or has_quaternions(scene.system)
 
     def corrected(self, scene: Scene, y, t) -> dict[str, Array]:
-        """The state put back after a step, or between steps where it is saved."""
-        return y | {"q": retract(scene.system, y["q"])}
+        """The state put back between steps, where it is saved."""
+        return self.stepped(scene, y, t, None)[0]
+
+    def stepped(self, scene: Scene, y, t, error):
+        """The state put back after a step, and its estimated error (a state, or None) less what constraints remove."""
+        return y | {"q": retract(scene.system, y["q"])}, error
 
     def continued(self, scene: Scene, y, t) -> dict[str, Array]:
         """The state as the next step starts from it: entries in `jumping` may have changed."""
@@ -135,10 +139,13 @@ class Projected(Multipliers):
     name: ClassVar[str] = "projected"
     projects: ClassVar[bool] = True
 
-    def corrected(self, scene, y, t):
-        """q and v on the constraints, quaternions of unit length."""
-        q, v = project_state(scene, y["q"], y["v"], t, self.rank_tol)
-        return y | {"q": q, "v": v}
+    def stepped(self, scene, y, t, error):
+        """q and v on the constraints, quaternions of unit length; the error without its part normal to the constraints."""
+        errors = () if error is None else (_error_of_place(scene, y["q"], error), error["v"])
+        q, v, errors = project_step(scene, y["q"], y["v"], t, errors, self.rank_tol)
+        if error is not None:
+            error = error | {"q": velocity_to_rate(scene.system, q, errors[0]), "v": errors[1]}
+        return y | {"q": q, "v": v}, error
 
 
 class Baumgarte(Multipliers):
@@ -246,12 +253,15 @@ class Reduced(Method):
         """Where there are holonomic rows, quaternions, or a reference to be renewed."""
         return bool(holonomic_rows(layout(scene)).size or self.jumping or has_quaternions(scene.system))
 
-    def corrected(self, scene, y, t):
-        """q on the holonomic constraints; nu stays."""
+    def stepped(self, scene, y, t, error):
+        """q on the holonomic constraints, its error without the part normal to them; nu stays."""
         if not holonomic_rows(layout(scene)).size:
-            return super().corrected(scene, y, t)
-        q, _ = project_state(scene, y["q"], jnp.zeros((scene.nv,), y["q"].dtype), t)
-        return y | {"q": q}
+            return super().stepped(scene, y, t, error)
+        errors = () if error is None else (_error_of_place(scene, y["q"], error),)
+        q, _, errors = project_step(scene, y["q"], jnp.zeros((scene.nv,), y["q"].dtype), t, errors)
+        if error is not None:
+            error = error | {"q": velocity_to_rate(scene.system, q, errors[0])}
+        return y | {"q": q}, error
 
     def continued(self, scene, y, t):
         """N(q) as the new reference, which leaves N(q) and nu as they are."""
@@ -359,6 +369,11 @@ def chosen_method(scene: Scene, method: str | Method) -> Method:
             f"method is {method!r}; a scene with constraints takes 'auto' or {names}, or e.g. jd.Reduced(...)"
         )
     return chosen.fitted(scene, None) if isinstance(chosen, Reduced) else chosen
+
+
+def _error_of_place(scene: Scene, q, error) -> Array:
+    """Estimated error of q as a displacement (nv,)."""
+    return rate_to_velocity(scene.system, retract(scene.system, q), error["q"])
 
 
 def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):

@@ -34,27 +34,39 @@ def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
     Those that are differentiated are a fixed number, so that derivatives converge as far. A projection that does not
     reduce the residual is not applied.
     """
+    return project_step(scene, q, v, t, (), rank_tol)[:2]
 
-    def project(scene, q, v, t):
-        return traced_once(_by_the_batch, scene, q, v, t, static=(rank_tol,))
 
-    def tangent(scene, q, v, t, steps):
-        def careful(scene, q, v, t):
-            return traced_once(_in_fixed_steps, scene, q, v, t, static=(rank_tol,))
+def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | None = None):
+    """The same for the end of a step with estimated errors (nv,) of q, and of v: (q, v, errors).
 
-        found, moved = along(careful, (scene, q, v, t), steps)
+    Errors come back without their parts normal to the constraints: as far as small ones go, those are what is removed from
+    q and v. Near a singular position they are large, and shorter steps make them no smaller.
+    """
+
+    def project(scene, q, v, t, *errors):
+        return traced_once(_by_the_batch, scene, q, v, t, errors, static=(rank_tol,))
+
+    def tangent(scene, q, v, t, *rest):
+        *errors, steps = rest
+
+        def careful(scene, q, v, t, *errors):
+            return traced_once(_in_fixed_steps, scene, q, v, t, errors, static=(rank_tol,))
+
+        found, moved = along(careful, (scene, q, v, t, *errors), steps)
         return found, jax.tree.map(jnp.zeros_like, found) if moved is None else moved
 
-    return implicit(Scene(scene.system, scene.constraints), (q, v, t), project, tangent)
+    errors = lax.stop_gradient(tuple(errors))
+    return implicit(Scene(scene.system, scene.constraints), (q, v, t, *errors), project, tangent)
 
 
-def _by_the_batch(scene: Scene, q, v, t, rank_tol):
+def _by_the_batch(scene: Scene, q, v, t, errors, rank_tol):
     q = retract(scene.system, q)
     short, long = (partial(way, scene, rank_tol) for way in (_by_recursion, _by_matrices))
     large = has_short_recursion(scene) and is_large_batch(scene, q, v)
     if isinstance(large, jax.core.Tracer):
-        return lax.cond(large, short, long, q, v, t)
-    return (short if large else long)(q, v, t)
+        return lax.cond(large, short, long, q, v, t, errors)
+    return (short if large else long)(q, v, t, errors)
 
 
 class _Correction(NamedTuple):
@@ -81,30 +93,44 @@ def _correction(L, Y, rank_tol) -> _Correction:
     return _Correction(L, *lax.cond(anywhere(~independent), by_rank, lambda: (Y, C)))
 
 
-def _by_matrices(scene: Scene, rank_tol, q, v, t):
+def _by_matrices(scene: Scene, rank_tol, q, v, t, errors):
     held = holonomic_rows(layout(scene))
-    L = cholesky(mass_matrix(scene.system, q, t))
-    Y = solve_lower(L, constraint_jacobian(scene, q, t).T)
+    L, A = cholesky(mass_matrix(scene.system, q, t)), constraint_jacobian(scene, q, t)
+    Y = solve_lower(L, A.T)
     every = _correction(L, Y, rank_tol)
+    some = every if held.size in (0, Y.shape[1]) else _correction(L, Y[:, held], rank_tol)
     if held.size:
-        some = every if held.size == Y.shape[1] else _correction(L, Y[:, held], rank_tol)
         q = _closed(scene, q, some.step, lambda place: position_residual(scene, place, t))
-    return q, _descend(v, every.step, lambda v: velocity_residual(scene, q, v, t), lambda v, step: v - step)
+    if errors:
+        A = constraint_jacobian(scene, q, t)
+        errors = _allowed(errors, (some.step, A[held]) if held.size else None, (every.step, A))
+    v = _descend(v, every.step, lambda v: velocity_residual(scene, q, v, t), lambda v, step: v - step)
+    return q, v, errors
 
 
-def _by_recursion(scene: Scene, rank_tol, q, v, t):
+def _by_recursion(scene: Scene, rank_tol, q, v, t, errors):
     """Loops of a tree in a large batch; by matrices the samples with rows that are close to dependent."""
     with at_least(LEAST_BATCH):
         closing = Closing(scene.system, scene.constraints, q)
         place = _closed(scene, q, closing.step, closing.apart)
         slip = partial(closing.slip, place)
-        found = place, _descend(v, closing.step, slip, lambda v, step: v - step)
+        allowed = tuple(error - closing.step(slip(error)) for error in errors)
+        found = place, _descend(v, closing.step, slip, lambda v, step: v - step), allowed
     unknown, known = split(scene)
 
-    def careful(unknown, q, v, t):
-        return _by_matrices(known(unknown), rank_tol, q, v, t), ()
+    def careful(unknown, q, v, t, errors):
+        return _by_matrices(known(unknown), rank_tol, q, v, t, errors), ()
 
-    return mended(~(closing.quality > least_pivot(q, rank_tol)), careful, (found, ()), (unknown, q, v, t))[0]
+    doubtful = ~(closing.quality > least_pivot(q, rank_tol))
+    return mended(doubtful, careful, (found, ()), (unknown, q, v, t, errors))[0]
+
+
+def _allowed(errors: tuple, *ways) -> tuple:
+    """Errors less the least change that removes what they add to the rows A; a way is (step, A), None for no rows."""
+    return tuple(
+        error if way is None else error - way[0](_product(way[1], error))
+        for error, way in zip(errors, ways, strict=False)
+    )
 
 
 def _closed(scene: Scene, q, step, residual):
@@ -139,13 +165,17 @@ def _descend(x, step, residual, move):
     return x
 
 
-def _in_fixed_steps(scene: Scene, q, v, t, rank_tol):
+def _in_fixed_steps(scene: Scene, q, v, t, errors, rank_tol):
     """The same for derivatives, which are those of the steps as they are."""
     q = retract(scene.system, q)
     held = holonomic_rows(layout(scene))
     B = correction(scene, q, t, rank_tol, holonomic=False)
+    B_held = B if held.size in (0, B.shape[1]) else correction(scene, q, t, rank_tol, holonomic=True)
+    if errors:
+        A = constraint_jacobian(scene, q, t)
+        of_places = (partial(_product, B_held), A[held]) if held.size else None
+        errors = lax.stop_gradient(_allowed(errors, of_places, (partial(_product, B), A)))
     if held.size:
-        B_held = B if held.size == B.shape[1] else correction(scene, q, t, rank_tol, holonomic=True)
 
         def move(place, _):
             step = _product(B_held, position_residual(scene, place, t))
@@ -160,4 +190,4 @@ def _in_fixed_steps(scene: Scene, q, v, t, rank_tol):
 
     projected, _ = lax.scan(slow, v, None, length=_MOST_STEPS)
     before, after = (jnp.max(jnp.abs(velocity_residual(scene, q, x, t))) for x in (v, projected))
-    return q, jnp.where(after <= before, projected, v)
+    return q, jnp.where(after <= before, projected, v), errors

@@ -224,10 +224,11 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
             rates = rates | added
         return rates | {"q": velocity_to_rate(scene.system, q, v)}
 
-    def project(t, y, args):
+    def project(t, y, error, args):
         scene, _, method = given(args)
+        y, error = method.stepped(scene, y, t, error)
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
-        return method.continued(scene, method.corrected(scene, y, t), t), diffrax.RESULTS.successful
+        return method.continued(scene, y, t), error, diffrax.RESULTS.successful
 
     def quality(t, y, args, **_):
         scene, _, method = given(args)
@@ -331,9 +332,9 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
     # Of a method that wraps an explicit one, diffrax says that it is one.
     if isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver):
-        solver = ExplicitSteps(solver, project, method.jumping)
+        solver = ExplicitSteps(solver, project, method.jumping, method.projects)
     elif project:
-        solver = ProjectedSolver(solver, project, method.jumping)
+        solver = ProjectedSolver(solver, project, method.jumping, method.projects)
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)
     if continuous and isinstance(controller, Watched):
         controller = diffrax.ConstantStepSize()  # backwards the state is another one

@@ -8,9 +8,9 @@ from pinocchio_bridge import assert_close, quick
 
 from jaxdyn import _dispatch, projection, scenes
 from jaxdyn.assembly import residuals
-from jaxdyn.constraints.base import constraint_jacobian
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
 from jaxdyn.dynamics import mass_matrix
-from jaxdyn.projection import project_state
+from jaxdyn.projection import project_state, project_step
 from jaxdyn.scene import Scene
 from jaxdyn.systems import displace
 
@@ -38,7 +38,7 @@ def test_states_come_back_by_the_least_change(name, parameters):
 
     def both(q, v):
         found = project_state(scene, q, v, zero, rank_tol)
-        fixed = projection._in_fixed_steps(scene, q, v, zero, rank_tol)
+        fixed = projection._in_fixed_steps(scene, q, v, zero, (), rank_tol)
         M, A = mass_matrix(scene.system, found[0]), constraint_jacobian(scene, found[0])
         return found, fixed, residuals(scene, *found), (M, A)
 
@@ -54,12 +54,44 @@ def test_states_come_back_by_the_least_change(name, parameters):
         assert np.linalg.norm(across) <= 20 * drift * max(np.linalg.norm(force), 1e-12) + 1e-13
 
 
+@pytest.mark.parametrize(
+    "name, parameters, least",
+    [("windows", {"count": 2}, 1 << 30), ("windows", {"count": 2}, 1), ("rolling_coin", {}, 1)],
+)
+def test_errors_of_a_step_lose_what_the_projection_removes(name, parameters, least, monkeypatch):
+    """e - M^-1 A^T (A M^-1 A^T)^+ A e in numpy: by matrices, body by body, and with rows on velocities alone for v."""
+    monkeypatch.setattr(_dispatch, "LEAST_BATCH", least)
+    scene, (q, v) = getattr(scenes, name)(**parameters), getattr(scenes, name).start(**parameters)
+    rng = np.random.default_rng(7)
+    errors = tuple(jnp.asarray(rng.normal(size=(3, scene.nv))) for _ in "qv")
+    zero = jnp.asarray(0.0)
+
+    @quick
+    def both(errors):
+        def step(*errors):
+            return project_step(scene, q, v, zero, errors)
+
+        by_derivative = jax.jvp(lambda q: jax.vmap(lambda *e: project_step(scene, q, v, zero, e))(*errors), (q,), (q,))
+        return jax.vmap(step)(*errors), by_derivative, (mass_matrix(scene.system, q), constraint_jacobian(scene, q))
+
+    found, by_derivative, (M, A) = both(errors)
+    M, A = np.asarray(M), np.asarray(A)
+    held = holonomic_rows(layout(scene))
+    for place, (error, rows) in enumerate(zip(errors, (A[held], A), strict=True)):
+        lift = np.linalg.solve(M, rows.T)
+        want = np.asarray(error) - np.asarray(error) @ rows.T @ np.linalg.pinv(rows @ lift) @ lift.T
+        assert_close(found[2][place], want, 1e-12)
+        assert_close(by_derivative[0][2][place], want, 1e-12)
+        assert not np.any(by_derivative[1][2][place])  # step lengths are not differentiated
+    assert_close(found[0], jnp.stack([q] * 3), 1e-14)
+
+
 def test_large_batches_are_projected_body_by_body_and_a_singular_one_by_matrices(monkeypatch):
     monkeypatch.setattr(_dispatch, "LEAST_BATCH", len(DRIFTS))
     scene, q, v = drifted("windows", count=2)
     zero = jnp.asarray(0.0)
     program = jax.jit(jax.vmap(lambda q, v: project_state(scene, q, v, zero))).lower(q, v).compile()
-    matrices = jax.jit(jax.vmap(lambda q, v: projection._in_fixed_steps(scene, q, v, zero, None)))
+    matrices = jax.jit(jax.vmap(lambda q, v: projection._in_fixed_steps(scene, q, v, zero, (), None)[:2]))
     # Uprights and couplers in one line: the rows of the windows lose rank.
     flat = jnp.asarray([-np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, -np.pi / 2])
     for states in (q, q.at[1].set(flat)):
@@ -80,7 +112,7 @@ def test_derivatives_are_those_of_the_steps():
         return sum(jnp.vdot(w, x) for w, x in zip(weights, way(here, q, v, jnp.asarray(0.0)), strict=True))
 
     def fixed(scene, q, v, t):
-        return projection._in_fixed_steps(scene, q, v, t, None)
+        return projection._in_fixed_steps(scene, q, v, t, (), None)[:2]
 
     at = scene.system.inertias, q, v
     steps = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in at)

@@ -63,35 +63,40 @@ V0 = np.array([0.5, -1.0, 0.7, 0.4])
 # Projection
 
 
-def circle(t, y, args):
-    return y / jnp.sqrt(jnp.sum(y * y)), diffrax.RESULTS.successful
+def circle(t, y, error, args):
+    x = y["x"] / jnp.sqrt(jnp.sum(y["x"] ** 2))
+    return {"x": x}, {"x": error["x"] - x * jnp.sum(x * error["x"])}, diffrax.RESULTS.successful
 
 
 def turning(t, y, args):
-    return jnp.stack([-y[1], y[0]]) * (1 + 0.5 * y[0])
+    x = y["x"]
+    return {"x": jnp.stack([-x[1], x[0]]) * (1 + 0.5 * x[0])}
 
 
 def test_projected_solver_steps_on_the_manifold_and_evaluates_the_first_stage_anew():
     """The carried stage of a first-same-as-last method belongs to the point before projection and must not be used."""
     term, solver = diffrax.ODETerm(turning), ProjectedSolver(diffrax.Tsit5(), circle)
-    y0, h = jnp.asarray([0.6, 0.8]), 0.7
+    y0, h = {"x": jnp.asarray([0.6, 0.8])}, 0.7
 
     @quick
     def two_steps(y0):
         state = solver.init(term, 0.0, h, y0, None)
         out = []
         for k in range(2):
-            y1, _, dense, state, _ = solver.step(term, k * h, (k + 1) * h, y0, None, state, False)
+            y1, error, dense, state, _ = solver.step(term, k * h, (k + 1) * h, y0, None, state, False)
             interpolation = solver.interpolation_cls(t0=jnp.asarray(k * h), t1=jnp.asarray((k + 1) * h), **dense)
             ends = [interpolation.evaluate(jnp.asarray(x)) for x in (k * h, (k + 1) * h)]
-            out.append((y0, y1, dense["dense_info"]["k"][0] / h, dense["shift"], *ends))
+            found = (y0, y1, error, jax.tree.map(lambda k: k[0] / h, dense["dense_info"]["k"]), dense["shift"], *ends)
+            out.append([y["x"] for y in found])
             y0 = y1
         return out
 
-    for before, y1, first_stage, shift, start, end in two_steps(y0):
+    for before, y1, error, first_stage, shift, start, end in two_steps(y0):
         np.testing.assert_allclose(np.linalg.norm(y1), 1, rtol=1e-15)
         assert np.abs(shift).max() > 1e-6  # the projection does something
-        np.testing.assert_allclose(first_stage, turning(0.0, before, None), rtol=1e-14)
+        assert np.abs(error).max() > 1e-6
+        assert abs(y1 @ error) < 1e-15  # and what it removes is no error
+        np.testing.assert_allclose(first_stage, turning(0.0, {"x": before}, None)["x"], rtol=1e-14)
         np.testing.assert_allclose(start, before, rtol=1e-14)
         np.testing.assert_allclose(end, y1, rtol=1e-14)
 

@@ -23,7 +23,8 @@ class ExplicitSteps(ProjectedSolver):
     """The steps of an explicit Runge-Kutta method of diffrax, the same but for rounding.
 
     A projection acts before the last stage where that is the first one of the next step, which then need not be computed anew
-    (it is in `ProjectedSolver`). Entries that are `jumping` change with the projection, and the stage with them.
+    (it is in `ProjectedSolver`). It also acts on the error, which must not need the last stage then, unless the manifold has
+    no branches. Entries that are `jumping` change with the projection, and the stage with them.
 
     **Arguments:** as of `ProjectedSolver`; `project` None for none.
     """
@@ -50,43 +51,48 @@ class ExplicitSteps(ProjectedSolver):
         for i, row in enumerate(tableau.a_lower):
             sums[i + 1, : i + 1] = row
         sums[count], sums[count + 1] = tableau.b_sol, tableau.b_error
+        known = tableau.b_error[-1] == 0
+        lasts = tableau.fsal and self.project is not None and not self.jumping and (known or not self.branching)
         times = jnp.asarray(np.concatenate([[0.0], tableau.c]), jnp.result_type(t0, t1))
         # For the whole batch: a branch that differs between samples would be computed for all.
         kept, ready = solver_state
         ready = ~anywhere(~ready | made_jump) if tableau.fsal else jnp.asarray(False)
-        lasts = self.project is not None and tableau.fsal and not self.jumping
 
-        def ended(y):
-            projected, result = self.project(t1, structure(y), args)  # pyright: ignore[reportOptionalCall]
-            return ravel_pytree(projected)[0], result
+        def ended(y, error):
+            projected, shift, error, result = self.ended(t1, structure(y), structure(error), args)
+            return *(ravel_pytree(x)[0] for x in (projected, shift, error)), result
 
         def rate(y, c):
             t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
             return dt * ravel_pytree(terms.vf(t, structure(y), args))[0]
 
-        def stage(carry, known):
-            total, end, result = carry
-            i, weights, c = known
+        def stage(carry, row):
+            total, *end = carry
+            i, weights, c = row
             y = start + total[i]
             if lasts:
-                end, result = lax.cond(i == count - 1, ended, lambda y: (y, diffrax.RESULTS.successful), y)
-                y = end
+                error = total[count + 1] if known else none
+                end = lax.cond(i == count - 1, ended, lambda y, _: (y, *end[1:]), y, error)
+                y = end[0]
             k = lax.cond(ready & (i == 0), lambda y: dt * kept, lambda y: rate(y, c), y)
-            return (total + weights[:, None] * k[None], end, result), k
+            return (total + weights[:, None] * k[None], *end), k
 
-        known = jnp.arange(count), jnp.asarray(sums.T, start.dtype), times
-        first = jnp.zeros((count + 2, start.size), start.dtype), start, diffrax.RESULTS.successful
-        (total, end, result), k = lax.scan(stage, first, known)
-        raw = start + total[count]
+        none = jnp.zeros_like(start)
+        rows = jnp.arange(count), jnp.asarray(sums.T, start.dtype), times
+        first = jnp.zeros((count + 2, start.size), start.dtype), start, none, none, diffrax.RESULTS.successful
+        (total, *found), k = lax.scan(stage, first, rows)
+        end: Any = found
+        raw, error = start + total[count], total[count + 1]
         if self.project is None:
-            end = raw
+            end = raw, none, error, diffrax.RESULTS.successful
         elif not lasts:
-            end, result = ended(raw)
-        y1, stages = structure(end), jax.vmap(structure)(k)
-        dense, error = {"y0": y0, "y1": structure(raw), "k": stages}, structure(total[count + 1])
+            end = ended(raw, error)
+        projected, shift, left, result = end
+        error = enlarged(error, left) if lasts and not known else left
+        y1, stages = structure(projected), jax.vmap(structure)(k)
+        dense, error = {"y0": y0, "y1": structure(raw), "k": stages}, structure(error)
         if self.project is not None:
-            shift = self.shift(structure(end), structure(raw))
-            dense, error = {"dense_info": dense, "shift": shift}, enlarged(error, shift)
+            dense = {"dense_info": dense, "shift": structure(shift)}
         reusable = jnp.asarray(tableau.fsal and (self.project is None or lasts))
         last = k[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt)
         return y1, error, dense, (last, reusable), result

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 
 from jaxdyn.solvers.wrapped import Wrapped
 
+_EXPECTED = 10  # times the normal part of the estimated error a projection may move a step
+
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
     """Dense output of the wrapped method, bent so that the step ends where the projection put it.
@@ -44,18 +46,21 @@ class ProjectedSolver(Wrapped):
 
     The exact solution stays on the manifold, so the projection moves a step's result by no more than its local error,
     and the order of convergence is that of the wrapped method (Hairer, Lubich & Wanner 2006, section IV.4). The
-    projection is part of the step: it acts on every result the step-size control sees, and on no other. How far it moves
-    the result is added to the error estimate. That is small beside it, except where rounding decides to which of
-    several branches of a manifold a point is put back: there no step is short enough, and the run ends with a code.
+    projection is part of the step: it acts on every result the step-size control sees, and on no other. What it removes
+    is no error of the step, unless that is more than the method expects: where rounding decides to which of several
+    branches of a manifold a point is put back, the result moves by much more than its estimated error.
 
-    **Arguments:** `solver`, any diffrax method of an `ODETerm`. `project(t, y, args) -> (y, diffrax.RESULTS)`, which
-    says whether it succeeded; everything it depends on comes through `args`, so that gradients reach it. `jumping` names
-    entries of a state that is a dictionary: constants of a step that `project` may change for the next one, so that
-    within the step the dense output keeps the old ones.
+    **Arguments:** `solver`, any diffrax method of an `ODETerm`. `project(t, y, error, args) -> (y, error, diffrax.RESULTS)`:
+    the state put back, the error estimate (None if there is none) without its part normal to the manifold, and whether it
+    succeeded; everything it depends on comes through `args`, so that gradients reach it. The state is a dictionary. `jumping`
+    names entries of it: constants of a step that `project` may change for the next one, so that within the step the dense
+    output keeps the old ones. `branching`: whether the manifold may have branches that meet. If not, `project` leaves
+    errors as they are.
     """
 
     project: Callable
     jumping: tuple[str, ...] = eqx.field(static=True, default=())
+    branching: bool = eqx.field(static=True, default=True)
 
     @property
     def term_compatible_contr_kwargs(self):
@@ -67,10 +72,16 @@ class ProjectedSolver(Wrapped):
         """Dense output of the wrapped method, ending at the projected point."""
         return functools.partial(_Interpolation, self.solver.interpolation_cls)
 
-    def shift(self, projected, y):
-        """What the projection adds to a step's result, zero in entries that are `jumping`."""
+    def ended(self, t, y, error, args):
+        """A step's result y projected, what that adds to it (zero in entries that are `jumping`), its error, and a result."""
+        projected, left, result = self.project(t, y, error, args)
         shift = jax.tree.map(lambda a, b: a - b, projected, y)
-        return shift | {name: jnp.zeros_like(shift[name]) for name in self.jumping} if self.jumping else shift
+        shift = shift | {name: jnp.zeros_like(shift[name]) for name in self.jumping}
+        if error is not None:
+            left = jax.tree.map(
+                lambda left, error, shift: enlarged(left, _unexpected(shift, error - left)), left, error, shift
+            )
+        return projected, shift, left, result
 
     def init(self, terms, t0, t1, y0, args):
         """State of the wrapped method."""
@@ -82,13 +93,17 @@ class ProjectedSolver(Wrapped):
         y1, error, dense_info, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump=True
         )
-        projected, projection_result = self.project(t1, y1, args)
-        shift = self.shift(projected, y1)
-        error = None if error is None else enlarged(error, shift)
+        projected, shift, error, projection_result = self.ended(t1, y1, error, args)
         result = diffrax.RESULTS.where(diffrax.is_successful(result), projection_result, result)
         return projected, error, {"dense_info": dense_info, "shift": shift}, solver_state, result
 
 
-def enlarged(error, shift):
-    """An error estimate with the sizes of what a projection added to the step."""
-    return jax.tree.map(lambda e, s: e + jnp.where(e < 0, -jnp.abs(s), jnp.abs(s)), error, shift)
+def _unexpected(shift, removed):
+    """How far a projection moved a result, if that is beyond what it removed of the error, else zero."""
+    beyond = jnp.max(jnp.abs(shift), initial=0.0) > _EXPECTED * jnp.max(jnp.abs(removed), initial=0.0)
+    return jnp.where(beyond, shift, jnp.zeros_like(shift))
+
+
+def enlarged(error, by):
+    """An error of either sign, larger by the size of another one."""
+    return error + jnp.where(error < 0, -jnp.abs(by), jnp.abs(by))
