@@ -95,8 +95,8 @@ def _correction(L, Y, rank_tol) -> _Correction:
 
 def _by_matrices(scene: Scene, rank_tol, q, v, t, errors):
     held = holonomic_rows(layout(scene))
-    L, A = cholesky(mass_matrix(scene.system, q, t)), constraint_jacobian(scene, q, t)
-    Y = solve_lower(L, A.T)
+    L = cholesky(mass_matrix(scene.system, q, t))
+    Y = solve_lower(L, constraint_jacobian(scene, q, t).T)
     every = _correction(L, Y, rank_tol)
     some = every if held.size in (0, Y.shape[1]) else _correction(L, Y[:, held], rank_tol)
     if held.size:

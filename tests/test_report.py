@@ -175,6 +175,7 @@ class Counter:
         ("pendulum", "Tsit5"),
         ("pendulum_in_plane", "Tsit5"),
         ("pendulum", "Dopri8"),
+        ("pendulum_in_plane", "Dopri8"),
         ("pendulum", "RK4"),
     ],
 )
@@ -185,11 +186,12 @@ def test_evaluations_are_those_that_are_made(name, solver):
     steps = {"stepsize": 0.05} if solver == "RK4" else {"rtol": 1e-6, "atol": 1e-6}
     found = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, **steps)
     jax.effects_barrier()
-    assert counter.count == evaluations(solver, int(found.stats["num_steps"]), False)
+    assert counter.count == evaluations(solver, int(found.stats["num_steps"]), scene(), chosen_method(scene(), "auto"))
 
 
 def test_evaluations_of_implicit_methods_are_not_known():
-    assert evaluations("Kvaerno5", 10, False) is None
+    scene = jd.scenes.pendulum_in_plane()
+    assert evaluations("Kvaerno5", 10, scene, chosen_method(scene, "auto")) is None
 
 
 def test_every_way_can_be_simulated():

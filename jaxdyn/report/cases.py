@@ -28,7 +28,6 @@ class Case(NamedTuple):
     converged solution at `ts` serves.
       - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
       - `largest`: the most trajectories at once that are measured unless `ways` are chosen; None for any number.
-      - `tightest`: the least tolerance that is of use.
     """
 
     name: str
@@ -41,7 +40,6 @@ class Case(NamedTuple):
     conserves: bool = True
     stiff: bool = False
     largest: int | None = None
-    tightest: float = 1e-12
     published: tuple[Published, ...] = ()
 
 
@@ -154,7 +152,6 @@ def _cases() -> tuple[Case, ...]:
             lambda start: references.windows(ten, 2),
             ten,
             500,
-            tightest=1e-10,  # steps that are still shorter end where rows lose rank
             published=(
                 Published(f"OpenSim 3.2 ({i5})", 0.455),
                 Published("Exudyn, step 10 ms (date not stated)", 0.0776, energy_error=0.114),
@@ -171,7 +168,6 @@ def _cases() -> tuple[Case, ...]:
             10,
             # The program for a batch compiles for six minutes.
             largest=1,
-            tightest=1e-10,
         ),
         Case(
             "andrews",

@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.constrained_motion import Reduced, chosen_method
+from jaxdyn.constrained_motion import Method, Reduced, chosen_method
 from jaxdyn.report.programs import FIXED, SOLVERS, Prepared
 from jaxdyn.report.records import Record
 from jaxdyn.report.timing import interleaved
+from jaxdyn.scene import Scene
 from jaxdyn.simulate import RESULTS
+from jaxdyn.solvers.explicit import passes_last_stage_on
 
 
 class Motion(NamedTuple):
@@ -51,13 +53,14 @@ def ladder(
     batch = len(starts[0])
     run, seconds = prepared.programs.get(method, solver, dtype, batch)
     inputs = [jnp.asarray(x[0] if batch == 1 else x, dtype) for x in starts]
-    renewed = bool(chosen_method(prepared.scene, method).jumping)
+    chosen = chosen_method(prepared.scene, method)
 
     def motion(found) -> Motion:
         q, v, result, stats = jax.tree.map(lambda x: np.asarray(x if batch == 1 else x[0]), found)
         name = next(name for name in RESULTS._name_to_item if bool(result == getattr(RESULTS, name)))
         steps = int(stats["num_steps"])
-        return Motion(q, v, name, steps, int(stats["num_rejected_steps"]), evaluations(solver, steps, renewed))
+        count = evaluations(solver, steps, prepared.scene, chosen)
+        return Motion(q, v, name, steps, int(stats["num_rejected_steps"]), count)
 
     def contestant(setting):
         number = jnp.asarray(setting, dtype)
@@ -67,18 +70,19 @@ def ladder(
     return [contestant(setting) for setting in settings]
 
 
-def evaluations(solver: str, steps: int, renewed: bool) -> int | None:
+def evaluations(solver: str, steps: int, scene: Scene, method: Method) -> int | None:
     """Evaluations of the vector field in so many steps; None for implicit methods, whose iterations are not counted.
 
-    A method whose last evaluation of a step is the first of the next one saves it, unless the state is `renewed` between
-    steps. Two more choose the first step.
+    A solver whose last evaluation of a step is the first of the next one saves it, unless the state is corrected after it.
+    Two more choose the first step.
     """
     if solver in FIXED:
         return 4 * steps
     tableau = SOLVERS[solver]().tableau  # pyright: ignore[reportAttributeAccessIssue]
     if tableau.implicit:
         return None
-    saved = steps - 1 if tableau.fsal and not renewed else 0
+    saves = passes_last_stage_on(tableau, method.jumping, method.projects) if method.corrects(scene) else tableau.fsal
+    saved = steps - 1 if saves else 0
     return tableau.num_stages * steps - saved + 2
 
 

@@ -40,8 +40,7 @@ def settings(case: Case, solver: str, dtype: str, *, full: bool) -> list[float]:
         doublings = (range(5) if single else range(7)) if full else ((0, 2) if single else (0, 2, 4))
         return [float(np.ptp(case.ts)) / case.steps / 2**k for k in doublings]
     digits = (range(2, 7) if single else range(3, 13)) if full else ((2, 4, 6) if single else (4, 6, 8, 11))
-    # Powers of ten are rounded.
-    return [10.0**-k for k in digits if 10.0**-k > 0.9 * case.tightest]
+    return [10.0**-k for k in digits]
 
 
 def report(

@@ -52,7 +52,7 @@ class ExplicitSteps(ProjectedSolver):
             sums[i + 1, : i + 1] = row
         sums[count], sums[count + 1] = tableau.b_sol, tableau.b_error
         known = tableau.b_error[-1] == 0
-        lasts = tableau.fsal and self.project is not None and not self.jumping and (known or not self.branching)
+        lasts = self.project is not None and passes_last_stage_on(tableau, self.jumping, self.branching)
         times = jnp.asarray(np.concatenate([[0.0], tableau.c]), jnp.result_type(t0, t1))
         # For the whole batch: a branch that differs between samples would be computed for all.
         kept, ready = solver_state
@@ -96,3 +96,8 @@ class ExplicitSteps(ProjectedSolver):
         reusable = jnp.asarray(tableau.fsal and (self.project is None or lasts))
         last = k[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt)
         return y1, error, dense, (last, reusable), result
+
+
+def passes_last_stage_on(tableau, jumping: tuple[str, ...], branching: bool) -> bool:
+    """Whether the last stage of a projected step is the first one of the next: see `ExplicitSteps`."""
+    return tableau.fsal and not jumping and bool(tableau.b_error[-1] == 0 or not branching)
