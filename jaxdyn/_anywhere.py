@@ -2,7 +2,7 @@
 
 Under `jax.vmap` a `lax.cond` whose predicate differs between samples computes both branches. A predicate that has gone
 through `anywhere` is one for all samples, however many `vmap`s enclose it, and the branch stays a branch. `mended` computes
-samples that need it again and leaves the others alone.
+samples that need it again and leaves the others alone. `flattened` makes one batch of several that are nested.
 """
 
 from collections.abc import Callable
@@ -112,19 +112,61 @@ def _many(careful: Callable, axes: list):
     def _(size, batched, flag, found, args):
         flag, found = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, found), tuple(batched[:2]))
         shape = flag.shape
-        flat, over = [], []
-        for x, axis, varies in zip(args, axes, batched[2], strict=True):
-            if axis == 0:
-                x = _rows(x, varies, size).reshape(-1, *x.shape[1 + varies :])
-            elif varies:
-                x = jnp.repeat(x, shape[1], 0)
-            flat.append(x)
-            over.append(0 if axis == 0 or varies else None)
+        flat, over = _along_one_axis(args, axes, batched[2], shape)
         flag, found = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (flag, found))
         found = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), _many(careful, over)(flag, found, flat))
         return found, jax.tree.map(lambda _: True, found)
 
     return many
+
+
+def flattened(function: Callable):
+    """The same function of pytrees, computed for the samples of all `vmap`s that enclose it along one axis.
+
+    Numbers become vectors over the batch. Those of two nested `vmap`s become matrices, whose rows are loops of their own.
+    Arguments are all that it depends on. It has no derivative: put it under one that is given.
+    """
+
+    @custom_vmap
+    def one(*args):
+        return function(*args)
+
+    @one.def_vmap
+    def _(size, batched, *args):
+        leaves, structure = jax.tree.flatten(args)
+        axes = [0 if varies else None for varies in jax.tree.leaves(batched)]
+        found = _flat(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), axes, size)(leaves)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return one
+
+
+def _flat(function: Callable, axes: list, rows: int):
+    @custom_vmap
+    def many(args):
+        return jax.vmap(function, axes)(*args)
+
+    @many.def_vmap
+    def _(size, batched, args):
+        flat, over = _along_one_axis(args, axes, batched[0], (size, rows))
+        found = _flat(function, over, size * rows)(flat)
+        found = jax.tree.map(lambda x: x.reshape(size, rows, *x.shape[1:]), found)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return many
+
+
+def _along_one_axis(args, axes, batched, shape):
+    """Arguments of a batch of the given shape along one axis, and which of them have it; `axes`: which have the inner one."""
+    flat, over = [], []
+    for x, axis, varies in zip(args, axes, batched, strict=True):
+        if axis == 0:
+            x = _rows(x, varies, shape[0]).reshape(-1, *x.shape[1 + varies :])
+        elif varies:
+            x = jnp.repeat(x, shape[1], 0)
+        flat.append(x)
+        over.append(0 if axis == 0 or varies else None)
+    return flat, over
 
 
 def _rows(x, varies: bool, size: int):

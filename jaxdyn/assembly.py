@@ -9,8 +9,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxdyn._dispatch import LEAST_BATCH
+from jaxdyn._materialize import at_least
 from jaxdyn._tracing import compiled, is_concrete
-from jaxdyn.constrained import RESULTS, _right_inverse, correction
+from jaxdyn.closed_projection import Residuals
+from jaxdyn.constrained import RESULTS, _right_inverse, by_the_batch, correction
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics import mass_matrix
 from jaxdyn.model import Model, difference
@@ -164,10 +167,20 @@ def _newton(scene, q, t, held, rank_tol):
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
     """Largest |phi| and |A v - b|, (2,)."""
-    phi = position_residual(scene, q, t)
-    zero = jnp.zeros((1,), q.dtype)
-    parts = jnp.concatenate([zero, phi]), jnp.concatenate([zero, velocity_residual(scene, q, v, t)])
-    return jnp.stack([jnp.max(jnp.abs(part)) for part in parts])
+
+    def largest(*parts):
+        zero = jnp.zeros((1,), q.dtype)
+        return jnp.stack([jnp.max(jnp.abs(jnp.concatenate([zero, part]))) for part in parts])
+
+    def short(q, v):
+        with at_least(LEAST_BATCH):
+            found = Residuals(scene.system, scene.constraints)
+            return largest(found.apart(q), found.slip(q, v))
+
+    def long(q, v):
+        return largest(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
+
+    return by_the_batch(scene, short, long, q, v)
 
 
 def open_constraints(scene: Scene, q, v, t=0.0, limit: float = 0.0) -> str:

@@ -25,24 +25,12 @@ from jaxdyn.closed_recursion import (
 from jaxdyn.model import Model
 
 
-class Closing:
-    """Rows of a tree's loops at q, factored, and their residuals elsewhere. `quality`: least pivot over the largest one."""
+class Residuals:
+    """Residuals of a tree's loops."""
 
-    def __init__(self, model: Model, loops, q):
+    def __init__(self, model: Model, loops):
         self.model = model
         self.bodies, self.loops = canonical_bodies(model), close(model, loops)
-        moves = place_joints(model, self.bodies, q)
-        walk = Walk(model, moves)
-        rows = [(loop, *row) for loop in self.loops for row in rows_of(loop, walk, q.dtype)]
-        pending = [pending_of(loop, pair) for loop, pair, _ in rows]
-        self.factored = factored(model, moves, factorize(model, self.bodies, moves), pending)
-        pivots = jnp.stack(self.factored.pivots)
-        self.quality = jnp.min(pivots) / jnp.max(pivots)
-
-    def step(self, residual: Array) -> Array:
-        """B r (nv,): the least change of q or v, in the metric M, that removes a residual (nc,)."""
-        still: Any = [0] * self.model.nv
-        return solve(self.model, self.factored, still, None, list(jnp.unstack(residual)), residual)[0]
 
     def apart(self, q: Array) -> Array:
         """phi(q), (nc,)."""
@@ -67,3 +55,22 @@ class Closing:
                 rate = transpose([cross(turning, column) for column in transpose(R)])
                 found += jax.jvp(loop.turn, (R,), (rate,))[1]
         return stack([found], q)
+
+
+class Closing(Residuals):
+    """The same, and rows at q, factored. `quality`: least pivot over the largest one."""
+
+    def __init__(self, model: Model, loops, q):
+        super().__init__(model, loops)
+        moves = place_joints(model, self.bodies, q)
+        walk = Walk(model, moves)
+        rows = [(loop, *row) for loop in self.loops for row in rows_of(loop, walk, q.dtype)]
+        pending = [pending_of(loop, pair) for loop, pair, _ in rows]
+        self.factored = factored(model, moves, factorize(model, self.bodies, moves), pending)
+        pivots = jnp.stack(self.factored.pivots)
+        self.quality = jnp.min(pivots) / jnp.max(pivots)
+
+    def step(self, residual: Array) -> Array:
+        """B r (nv,): the least change of q or v, in the metric M, that removes a residual (nc,)."""
+        still: Any = [0] * self.model.nv
+        return solve(self.model, self.factored, still, None, list(jnp.unstack(residual)), residual)[0]

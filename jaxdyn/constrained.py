@@ -7,6 +7,7 @@ least constraint. Its pseudo-inverse gives accelerations, multipliers and projec
     w = (Y^+)^T c,   lam = Y^+ w,   a = a0 + L^-T w,   P_T = L^-T (1 - Y Y^+) L^T,   c = gamma - A a0.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -119,13 +120,13 @@ def constrained_dynamics(
 
     bare, state = Scene(scene.system, scene.constraints), (q, v, force, jnp.asarray(t, q.dtype))
 
-    def dense():
+    def dense(*state):
         return traced_once(_by_matrices, bare, *state, static=(method, rank_tol))
 
-    large = method != "range_space" and has_short_recursion(scene) and is_large_batch(scene, q, v, force)
-    if isinstance(large, jax.core.Tracer):
-        return lax.cond(large, lambda: _by_recursion(bare, *state, method, rank_tol), dense)
-    return _by_recursion(bare, *state, method, rank_tol) if large else dense()
+    def short(q, v, force, t):
+        return _by_recursion(bare, q, v, force, t, method, rank_tol)
+
+    return dense(*state) if method == "range_space" else by_the_batch(bare, short, dense, *state)
 
 
 def _by_matrices(scene: Scene, q, v, force, t, method: str, rank_tol) -> ConstrainedDynamics:
@@ -139,6 +140,14 @@ def has_short_recursion(scene: Scene) -> bool:
         return False
     ends = [(body_index(model, loop.body_a), body_index(model, loop.body_b)) for loop in loops]
     return products(model, ends, [loop.kind.count for loop in loops]) <= MOST_PRODUCTS
+
+
+def by_the_batch(scene: Scene, short: Callable, long: Callable, *args):
+    """short(*args) in large batches of scenes that have a short recursion, else long(*args)."""
+    large = has_short_recursion(scene) and is_large_batch(scene, *args)
+    if isinstance(large, jax.core.Tracer):
+        return lax.cond(large, short, long, *args)
+    return (short if large else long)(*args)
 
 
 def _by_recursion(scene: Scene, q, v, force, t, method: str, rank_tol) -> ConstrainedDynamics:

@@ -16,9 +16,12 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn import variational
+from jaxdyn._anywhere import flattened
+from jaxdyn._tracing import split
 from jaxdyn.assembly import open_constraints, residuals, start_evidence
 from jaxdyn.constrained import checked_tolerance, constrained_dynamics, solve_rows
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
@@ -393,7 +396,10 @@ def start_limit(dtype) -> float:
 
 def consistent(scene: Scene, q, v, t):
     """Whether a state is on the constraints but for rounding."""
-    return jnp.max(residuals(scene, q, v, t)) <= start_limit(q.dtype)
+    unknown, known = split(Scene(scene.system, scene.constraints))
+    find = flattened(lambda unknown, *state: residuals(known(unknown), *state))
+    found = find(*lax.stop_gradient((unknown, q, v, t)))
+    return jnp.max(found) <= start_limit(q.dtype)
 
 
 def checked_start(scene: Scene, method: Method, q, v, t) -> Method:

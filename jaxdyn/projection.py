@@ -4,19 +4,18 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.core
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn._anywhere import anywhere, mended
-from jaxdyn._dispatch import LEAST_BATCH, is_large_batch
+from jaxdyn._anywhere import anywhere, flattened, mended
+from jaxdyn._dispatch import LEAST_BATCH
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn._small import cholesky, solve_factored, solve_lower
 from jaxdyn._tracing import split, traced_once
 from jaxdyn.closed_projection import Closing
-from jaxdyn.constrained import correction, has_short_recursion, least_pivot, normal_factor, pseudo_inverse, tolerance
+from jaxdyn.constrained import by_the_batch, correction, least_pivot, normal_factor, pseudo_inverse, tolerance
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics import mass_matrix
 from jaxdyn.scene import Scene
@@ -45,7 +44,12 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
     """
 
     def project(scene, q, v, t, *errors):
-        return traced_once(_by_the_batch, scene, q, v, t, errors, static=(rank_tol,))
+        unknown, known = split(scene)
+
+        def whole(unknown, *state):
+            return traced_once(_by_the_batch, known(unknown), *state, static=(rank_tol,))
+
+        return flattened(whole)(unknown, q, v, t, errors)
 
     def tangent(scene, q, v, t, *rest):
         *errors, steps = rest
@@ -63,10 +67,7 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 def _by_the_batch(scene: Scene, q, v, t, errors, rank_tol):
     q = retract(scene.system, q)
     short, long = (partial(way, scene, rank_tol) for way in (_by_recursion, _by_matrices))
-    large = has_short_recursion(scene) and is_large_batch(scene, q, v)
-    if isinstance(large, jax.core.Tracer):
-        return lax.cond(large, short, long, q, v, t, errors)
-    return (short if large else long)(q, v, t, errors)
+    return by_the_batch(scene, short, long, q, v, t, errors)
 
 
 class _Correction(NamedTuple):

@@ -7,9 +7,11 @@ import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree
 
 from jaxdyn import _dispatch, closed_recursion, constrained, scenes, se3
-from jaxdyn._anywhere import anywhere, mended
+from jaxdyn._anywhere import anywhere, flattened, mended
+from jaxdyn.assembly import residuals
 from jaxdyn.closed_projection import Closing
 from jaxdyn.constrained import constrained_dynamics, solve_rows
+from jaxdyn.constrained_motion import consistent
 from jaxdyn.constraints import loop
 from jaxdyn.constraints.base import position_residual, rows
 from jaxdyn.dynamics import bias_force, mass_matrix
@@ -257,3 +259,48 @@ def test_gradients_beside_a_singular_sample(monkeypatch):
     for x, y in zip(found, jax.jit(lambda: pulled(dense))(), strict=True):
         assert_close(x[others], y[others], 1e-9)  # through normal equations the condition number is lost twice
         assert np.isfinite(np.asarray(x)).all()
+
+
+def test_nested_batches_are_computed_along_one_axis():
+    """Arguments of both batches, of one of them, and of none."""
+    rng = np.random.default_rng(3)
+    x, y, z, w = (jnp.asarray(rng.normal(size=shape)) for shape in ((3, 4, 2), (3,), (4, 2), (2,)))
+
+    def plain(x, rest):
+        y, z, w = rest
+        return {"a": y * jnp.sin(x) @ w, "b": z + w}
+
+    def nested(function):
+        return jax.vmap(jax.vmap(function, (0, (None, 0, None))), (0, (0, None, None)))
+
+    found = jax.jit(nested(flattened(plain)))
+    for one, other in zip(
+        jax.tree.leaves(found(x, (y, z, w))), jax.tree.leaves(nested(plain)(x, (y, z, w))), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    text = str(jax.make_jaxpr(found)(x, (y, z, w)))
+    assert "f64[12,2] = sin" in text
+    assert "f64[3,4,2] = sin" not in text
+    single = x[0, 0], (y[0], z[0], w)
+    for one, other in zip(jax.tree.leaves(flattened(plain)(*single)), jax.tree.leaves(plain(*single)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("name", ["few", "windows", pytest.param("turning", marks=pytest.mark.slow)])
+def test_residuals_body_by_body_are_those_of_the_constraints(name, monkeypatch):
+    """Open loops under nested `vmap`s, the derivative of the output of that name, and the check of a motion's states."""
+    scene = scenes.windows() if name == "windows" else mechanism(name)
+    states = [random_states(scene.system, 2, k) for k in range(3)]
+    q, v = (jnp.stack([jnp.asarray(state[i]) for state in states]) for i in range(2))
+
+    def one(q, v):
+        return residuals(scene, q, v), jax.jacfwd(lambda v: residuals(scene, q, v))(v), consistent(scene, q, v, 0.0)
+
+    def found():
+        return jax.jit(jax.vmap(jax.vmap(one)))(q, v)
+
+    by_matrices = found()
+    monkeypatch.setattr(_dispatch, "LEAST_BATCH", 1)
+    for x, y in zip(found(), by_matrices, strict=True):
+        assert_close(x, y, 1e-12)
+    assert not np.any(by_matrices[2])
