@@ -32,7 +32,7 @@ from jaxtyping import Array
 from jaxdyn import closed_recursion, looped, matrix_form, recursive
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
-from jaxdyn._tracing import is_one_sample, traced_once
+from jaxdyn._tracing import is_one_sample, still, traced_once
 from jaxdyn.model import Model
 
 LEAST_BATCH = 256
@@ -160,11 +160,6 @@ def _force_change(inverse: Callable, model, q, v, tau, steps) -> Callable:
 
 def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tuple[Array, Array, Array]:
     """`closed_recursion.closed_dynamics`, without derivatives; for large batches."""
-
-    def still(tree):
-        # Only what is traced has a gradient to be stopped; what is known has to stay so.
-        return jax.tree.map(lambda x: lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x, tree)
-
     with at_least(LEAST_BATCH):
         return traced_once(_closed, still((model, loops)), *still((q, v, tau)))
 

@@ -107,6 +107,11 @@ def split(tree) -> tuple[list, Known]:
     return [leaves[i] for i in places], Known(structure, places, known)
 
 
+def still(tree):
+    """The tree without derivatives. Only what is traced has any; what is known stays known."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x, tree)
+
+
 def traced_once(function: Callable, tree, *args, static: tuple = ()):
     """function(tree, *args, *static), traced once in all programs that call it for the same tree and the same shapes.
 

@@ -170,7 +170,7 @@ def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
 
     def largest(*parts):
         zero = jnp.zeros((1,), q.dtype)
-        return jnp.stack([jnp.max(jnp.abs(jnp.concatenate([zero, part]))) for part in parts])
+        return jnp.stack([jnp.max(jnp.abs(jnp.concatenate([zero, part]))) for part in parts]).astype(q.dtype)
 
     def short(q, v):
         with at_least(LEAST_BATCH):

@@ -58,7 +58,7 @@ class Residuals:
 
 
 class Closing(Residuals):
-    """The same, and rows at q, factored. `quality`: least pivot over the largest one."""
+    """Residuals of a tree's loops, and their rows at q, factored. `quality`: least pivot over the largest one."""
 
     def __init__(self, model: Model, loops, q):
         super().__init__(model, loops)

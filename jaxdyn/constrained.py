@@ -20,7 +20,7 @@ from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
-from jaxdyn._anywhere import anywhere, mended
+from jaxdyn._anywhere import anywhere, flattened, mended
 from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
@@ -148,6 +148,17 @@ def by_the_batch(scene: Scene, short: Callable, long: Callable, *args):
     if isinstance(large, jax.core.Tracer):
         return lax.cond(large, short, long, *args)
     return (short if large else long)(*args)
+
+
+def in_one_batch(function: Callable, scene: Scene, *args):
+    """function(scene, *args); where a large batch would run on the short recursion, the samples of nested `vmap`s together.
+
+    Other constraints may be functions that hold traced numbers, of which `flattened` would not know.
+    """
+    if not has_short_recursion(scene):
+        return function(scene, *args)
+    unknown, known = split(scene)
+    return flattened(lambda unknown, *args: function(known(unknown), *args))(unknown, *args)
 
 
 def _by_recursion(scene: Scene, q, v, force, t, method: str, rank_tol) -> ConstrainedDynamics:

@@ -11,19 +11,18 @@ A method says what the state y of the equation is, how it changes, and what is d
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn import variational
-from jaxdyn._anywhere import flattened
-from jaxdyn._tracing import split
+from jaxdyn._tracing import still, traced_once
 from jaxdyn.assembly import open_constraints, residuals, start_evidence
-from jaxdyn.constrained import checked_tolerance, constrained_dynamics, solve_rows
+from jaxdyn.constrained import checked_tolerance, constrained_dynamics, in_one_batch, solve_rows
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
 from jaxdyn.dynamics import forward_dynamics
 from jaxdyn.projection import project_state, project_step
@@ -82,7 +81,7 @@ class Method(eqx.Module):
         return dynamics(scene, q, v, t, force).multipliers
 
     def corrects(self, scene: Scene) -> bool:
-        """Whether `corrected` changes a state."""
+        """Whether `stepped` and `corrected` change a state."""
         return self.projects or has_quaternions(scene.system)
 
     def corrected(self, scene: Scene, y, t) -> dict[str, Array]:
@@ -396,9 +395,7 @@ def start_limit(dtype) -> float:
 
 def consistent(scene: Scene, q, v, t):
     """Whether a state is on the constraints but for rounding."""
-    unknown, known = split(Scene(scene.system, scene.constraints))
-    find = flattened(lambda unknown, *state: residuals(known(unknown), *state))
-    found = find(*lax.stop_gradient((unknown, q, v, t)))
+    found = in_one_batch(partial(traced_once, residuals), *still((Scene(scene.system, scene.constraints), q, v, t)))
     return jnp.max(found) <= start_limit(q.dtype)
 
 

@@ -8,14 +8,22 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn._anywhere import anywhere, flattened, mended
+from jaxdyn._anywhere import anywhere, mended
 from jaxdyn._dispatch import LEAST_BATCH
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn._small import cholesky, solve_factored, solve_lower
 from jaxdyn._tracing import split, traced_once
 from jaxdyn.closed_projection import Closing
-from jaxdyn.constrained import by_the_batch, correction, least_pivot, normal_factor, pseudo_inverse, tolerance
+from jaxdyn.constrained import (
+    by_the_batch,
+    correction,
+    in_one_batch,
+    least_pivot,
+    normal_factor,
+    pseudo_inverse,
+    tolerance,
+)
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics import mass_matrix
 from jaxdyn.scene import Scene
@@ -40,16 +48,15 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
     """The same for the end of a step with estimated errors (nv,) of q, and of v: (q, v, errors).
 
     Errors come back without their parts normal to the constraints: as far as small ones go, those are what is removed from
-    q and v. Near a singular position they are large, and shorter steps make them no smaller.
+    q and v. Near a singular position they are large, and shorter steps make them no smaller. What the projection leaves open
+    is added.
     """
 
     def project(scene, q, v, t, *errors):
-        unknown, known = split(scene)
+        def whole(scene, *state):
+            return traced_once(_by_the_batch, scene, *state, static=(rank_tol,))
 
-        def whole(unknown, *state):
-            return traced_once(_by_the_batch, known(unknown), *state, static=(rank_tol,))
-
-        return flattened(whole)(unknown, q, v, t, errors)
+        return in_one_batch(whole, scene, q, v, t, errors)
 
     def tangent(scene, q, v, t, *rest):
         *errors, steps = rest
@@ -100,12 +107,16 @@ def _by_matrices(scene: Scene, rank_tol, q, v, t, errors):
     Y = solve_lower(L, constraint_jacobian(scene, q, t).T)
     every = _correction(L, Y, rank_tol)
     some = every if held.size in (0, Y.shape[1]) else _correction(L, Y[:, held], rank_tol)
+    apart = jnp.zeros((), q.dtype)
     if held.size:
-        q = _closed(scene, q, some.step, lambda place: position_residual(scene, place, t))
+        q, apart = _closed(scene, q, some.step, lambda place: position_residual(scene, place, t))
+    v, slip = _descend(v, every.step, lambda v: velocity_residual(scene, q, v, t), lambda v, step: v - step)
     if errors:
         A = constraint_jacobian(scene, q, t)
-        errors = _allowed(errors, (some.step, A[held]) if held.size else None, (every.step, A))
-    v = _descend(v, every.step, lambda v: velocity_residual(scene, q, v, t), lambda v, step: v - step)
+        of_place = some.step if held.size else None
+        errors = _allowed(
+            errors, (of_place, partial(_product, A[held]), apart), (every.step, partial(_product, A), slip)
+        )
     return q, v, errors
 
 
@@ -113,10 +124,10 @@ def _by_recursion(scene: Scene, rank_tol, q, v, t, errors):
     """Loops of a tree in a large batch; by matrices the samples with rows that are close to dependent."""
     with at_least(LEAST_BATCH):
         closing = Closing(scene.system, scene.constraints, q)
-        place = _closed(scene, q, closing.step, closing.apart)
+        place, apart = _closed(scene, q, closing.step, closing.apart)
         slip = partial(closing.slip, place)
-        allowed = tuple(error - closing.step(slip(error)) for error in errors)
-        found = place, _descend(v, closing.step, slip, lambda v, step: v - step), allowed
+        speed, slipping = _descend(v, closing.step, slip, lambda v, step: v - step)
+        found = place, speed, _allowed(errors, (closing.step, slip, apart), (closing.step, slip, slipping))
     unknown, known = split(scene)
 
     def careful(unknown, q, v, t, errors):
@@ -127,15 +138,24 @@ def _by_recursion(scene: Scene, rank_tol, q, v, t, errors):
 
 
 def _allowed(errors: tuple, *ways) -> tuple:
-    """Errors less the least change that removes what they add to the rows A; a way is (step, A), None for no rows."""
-    return tuple(
-        error if way is None else error - way[0](_product(way[1], error))
-        for error, way in zip(errors, ways, strict=False)
-    )
+    """Errors less the least change that removes what they add to the rows, and with what is left open.
+
+    A way is (step, rate of the rows along an error, distance left); its step is None for no rows.
+    """
+
+    def allowed(error, step, rate, left):
+        return error if step is None else enlarged(error - step(rate(error)), left)
+
+    return tuple(allowed(error, *way) for error, way in zip(errors, ways, strict=False))
+
+
+def enlarged(error, by):
+    """An error of either sign, larger by the size of another one."""
+    return error + jnp.where(error < 0, -jnp.abs(by), jnp.abs(by))
 
 
 def _closed(scene: Scene, q, step, residual):
-    """q on the holonomic constraints."""
+    """q on the holonomic constraints, and about how far it still is from them."""
 
     def move(place, change):
         return retract(scene.system, displace(scene.system, place, -change))
@@ -144,26 +164,31 @@ def _closed(scene: Scene, q, step, residual):
 
 
 def _descend(x, step, residual, move):
-    """x moved by x -> move(x, step(residual(x))) until that would change it by rounding alone, `_MOST_STEPS` times at most."""
+    """x moved by x -> move(x, step(residual(x))) until that would change it by rounding alone, `_MOST_STEPS` times at most.
+
+    Also the largest entry of the next step, which is about how far x is still away.
+    """
     rounding = float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.abs(x))
 
     def improve(state):
-        x, r, _ = state
+        x, r, _, _ = state
         change = step(r)
         tried = move(x, change)
         left = residual(tried)
-        before, after = jnp.max(jnp.abs(r)), jnp.max(jnp.abs(left))
+        before, after, way = (jnp.max(jnp.abs(y)) for y in (r, left, change))
         falls = after < before
         # The next step is about this one times what it has left of the residual.
-        more = falls & (jnp.max(jnp.abs(change)) * after > rounding * before)
-        return jnp.where(falls, tried, x), jnp.where(falls, left, r), more
+        more = falls & (way * after > rounding * before)
+        away = jnp.where(falls, way * after / before, jnp.where(before > 0, way, jnp.zeros_like(way)))
+        return jnp.where(falls, tried, x), jnp.where(falls, left, r), more, away
 
     def maybe(state, _):
         return lax.cond(anywhere(state[2]), improve, lambda state: state, state), None
 
     first = residual(x)
-    (x, *_), _ = lax.scan(maybe, (x, first, jnp.max(jnp.abs(first)) > 0), None, length=_MOST_STEPS)
-    return x
+    start = x, first, jnp.max(jnp.abs(first)) > 0, jnp.zeros((), x.dtype)
+    (x, _, _, away), _ = lax.scan(maybe, start, None, length=_MOST_STEPS)
+    return x, away
 
 
 def _in_fixed_steps(scene: Scene, q, v, t, errors, rank_tol):
@@ -172,10 +197,7 @@ def _in_fixed_steps(scene: Scene, q, v, t, errors, rank_tol):
     held = holonomic_rows(layout(scene))
     B = correction(scene, q, t, rank_tol, holonomic=False)
     B_held = B if held.size in (0, B.shape[1]) else correction(scene, q, t, rank_tol, holonomic=True)
-    if errors:
-        A = constraint_jacobian(scene, q, t)
-        of_places = (partial(_product, B_held), A[held]) if held.size else None
-        errors = lax.stop_gradient(_allowed(errors, of_places, (partial(_product, B), A)))
+    apart = jnp.zeros((), q.dtype)
     if held.size:
 
         def move(place, _):
@@ -183,12 +205,20 @@ def _in_fixed_steps(scene: Scene, q, v, t, errors, rank_tol):
             return displace(scene.system, place, -step), None
 
         moved, _ = lax.scan(move, q, None, length=_MOST_STEPS)
-        before, after = (jnp.max(jnp.abs(position_residual(scene, x, t))) for x in (q, moved))
-        q = jnp.where(after <= before, retract(scene.system, moved), q)
+        before, after = (position_residual(scene, x, t) for x in (q, moved))
+        better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
+        q = jnp.where(better, retract(scene.system, moved), q)
+        apart = jnp.max(jnp.abs(_product(B_held, jnp.where(better, after, before))))
 
     def slow(v, _):
         return v - _product(B, velocity_residual(scene, q, v, t)), None
 
     projected, _ = lax.scan(slow, v, None, length=_MOST_STEPS)
-    before, after = (jnp.max(jnp.abs(velocity_residual(scene, q, x, t))) for x in (v, projected))
-    return q, jnp.where(after <= before, projected, v), errors
+    before, after = (velocity_residual(scene, q, x, t) for x in (v, projected))
+    better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
+    if errors:
+        A, slip = constraint_jacobian(scene, q, t), jnp.max(jnp.abs(_product(B, jnp.where(better, after, before))))
+        of_place = partial(_product, B_held) if held.size else None
+        ways = (of_place, partial(_product, A[held]), apart), (partial(_product, B), partial(_product, A), slip)
+        errors = lax.stop_gradient(_allowed(errors, *ways))
+    return q, jnp.where(better, projected, v), errors

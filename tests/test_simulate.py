@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxdyn import scenes
 from jaxdyn.building import ModelBuilder
+from jaxdyn.constraints.base import Holonomic
 from jaxdyn.dynamics import forward_dynamics, kinetic_energy, potential_energy
 from jaxdyn.forces import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.kinematics import frame_pose
@@ -533,3 +534,19 @@ def test_methods_that_wrap_an_explicit_one(wrapped, name):
     ways = [simulate(found(), *state, ts, solver=solver) for solver in (diffrax.Dopri8(), wrapped)]
     assert_close(ways[1].q, ways[0].q, 1e-6)  # local errors of 1e-8 along the way
     assert_close(ways[1].v, ways[0].v, 1e-6)
+
+
+def test_constraints_may_be_functions_that_hold_numbers_of_a_batch():
+    """No leaf of the scene says that they do."""
+    builder = ModelBuilder("two slides", gravity=None)
+    for name, axis in (("a", (1, 0, 0)), ("b", (0, 1, 0))):
+        builder.add_body(name, joint="prismatic", axis=axis, inertia=(1.0, (0, 0, 0), MOMENTS))
+    model = builder.build()
+
+    def run(slope):
+        scene = Scene(model, (Holonomic(lambda q, t: (q[0] - slope * q[1])[None]),))
+        v = jnp.stack([slope, jnp.ones_like(slope)])
+        return simulate(scene, jnp.zeros(2), v, [0.0, 0.5], throw=False).q[-1]
+
+    slopes = jnp.asarray([1.0, 2.0])
+    np.testing.assert_allclose(jax.jit(jax.vmap(run))(slopes), 0.5 * jnp.stack([slopes, jnp.ones(2)], 1), rtol=1e-12)

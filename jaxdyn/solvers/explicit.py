@@ -16,7 +16,8 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn._anywhere import anywhere
-from jaxdyn.solvers.projected import ProjectedSolver, enlarged
+from jaxdyn.projection import enlarged
+from jaxdyn.solvers.projected import ProjectedSolver
 
 
 class ExplicitSteps(ProjectedSolver):

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxdyn.projection import enlarged
 from jaxdyn.solvers.wrapped import Wrapped
 
 _EXPECTED = 10  # times the normal part of the estimated error a projection may move a step
@@ -44,7 +45,7 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
 class ProjectedSolver(Wrapped):
     """A method whose every step is followed by a projection onto a manifold that holds the solution.
 
-    The exact solution stays on the manifold, so the projection moves a step's result by no more than its local error,
+    The exact solution stays on the manifold, so the projection moves the result of a short step by no more than its local error,
     and the order of convergence is that of the wrapped method (Hairer, Lubich & Wanner 2006, section IV.4). The
     projection is part of the step: it acts on every result the step-size control sees, and on no other. What it removes
     is no error of the step, unless that is more than the method expects: where rounding decides to which of several
@@ -100,10 +101,5 @@ class ProjectedSolver(Wrapped):
 
 def _unexpected(shift, removed):
     """How far a projection moved a result, if that is beyond what it removed of the error, else zero."""
-    beyond = jnp.max(jnp.abs(shift), initial=0.0) > _EXPECTED * jnp.max(jnp.abs(removed), initial=0.0)
+    beyond = ~(jnp.max(jnp.abs(shift), initial=0.0) <= _EXPECTED * jnp.max(jnp.abs(removed), initial=0.0))  # or NaN
     return jnp.where(beyond, shift, jnp.zeros_like(shift))
-
-
-def enlarged(error, by):
-    """An error of either sign, larger by the size of another one."""
-    return error + jnp.where(error < 0, -jnp.abs(by), jnp.abs(by))
