@@ -273,11 +273,10 @@ def starts(dtypes, gradient):
 
 
 FLAT = (
-    "Adaptive steps in float64 pass the position where the rows lose rank, by every method, as long as steps are long "
-    "enough to leap over it. On the spot rounding decides on which of two ways the mechanism leaves; a run whose steps end "
-    "there, as tight tolerances and float32 make likely, ends with `dt_min_reached` or `max_steps_reached`: take float64 and "
-    "1e-8, or fixed steps. In float32 these are off by 3e-3 or refused, so ask for outputs=('energy', 'work'). "
-    "Gradients through the position itself are those of the steps taken."
+    "Adaptive steps in float64 pass the position where the rows lose rank, by every method. On the spot rounding decides "
+    "on which of two ways the mechanism leaves; a run whose steps end there, as float32 makes likely, ends with "
+    "`dt_min_reached` or `max_steps_reached`: take float64, or fixed steps. In float32 these are off by 3e-3 or refused, so "
+    "ask for outputs=('energy', 'work'). Gradients through the position itself are those of the steps taken."
 )
 PLANES = (
     "Rows at an angle below `rank_tol` (1e-9 in float64, 1e-4 in float32) count as one row, because rows that "
