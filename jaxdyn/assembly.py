@@ -166,7 +166,7 @@ def _newton(scene, q, t, held, rank_tol):
 
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
-    """Largest |phi| and |A v - b|, (2,)."""
+    """Largest |phi| (m or rad) and |A v - b| (m/s or rad/s) of the state q (nq,), v (nv,) at t (s): (2,)."""
 
     def largest(*parts):
         zero = jnp.zeros((1,), q.dtype)

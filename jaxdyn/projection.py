@@ -45,7 +45,7 @@ def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
 
 
 def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | None = None):
-    """The same for the end of a step with estimated errors (nv,) of q, and of v: (q, v, errors).
+    """`project_state` for the end of a step with estimated errors of q, and of v, each (nv,): (q, v, errors).
 
     Errors come back without their parts normal to the constraints: as far as small ones go, those are what is removed from
     q and v. Near a singular position they are large, and shorter steps make them no smaller. What the projection leaves open
