@@ -6,6 +6,7 @@ samples that need it again and leaves the others alone. `flattened` makes one ba
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.core
@@ -38,7 +39,7 @@ def anywhere(flag):
     return _anywhere_p.bind(flag) if isinstance(flag, jax.core.Tracer) else flag
 
 
-def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | None = None):
+def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | None = None, dense: Any = False):
     """`found` where the flag () is not set, else `careful(*args)`; in a batch only the samples that need it, a few at a time.
 
     **Arguments:**
@@ -46,19 +47,20 @@ def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | 
     - `careful(*args)` -> what `found` is: a pair of pytrees, of which the first is differentiated. It depends on nothing traced
       but `args`.
     - `same(found[0], *args)` -> found[0], to be differentiated by the args; None where nothing is.
+    - `dense` (), for all samples alike: whether derivatives are those of `careful` anyway.
 
     Derivatives are those of `same` if the flag is set in no sample of the batch, else those of `careful` for all of them: in a
     branch, as what a singular sample makes of the other way is no number, and would reach gradients even times zero.
     """
 
     @jax.custom_jvp
-    def run(flag, found, args):
+    def run(flag, dense, found, args):
         return _one(careful)(flag, found, args)
 
     @run.defjvp
     def _(primals, tangents):
-        flag, (smooth, _), args = primals
-        _, (_, plain_step), args_step = tangents
+        flag, dense, (smooth, _), args = primals
+        _, _, (_, plain_step), args_step = tangents
 
         def as_found(*args):
             if same is None:
@@ -68,10 +70,10 @@ def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | 
         def by(function):
             return lambda: jax.jvp(function, args, args_step)[1]
 
-        step = lax.cond(anywhere(flag), by(lambda *args: careful(*args)[0]), by(as_found))
+        step = lax.cond(anywhere(flag) | dense, by(lambda *args: careful(*args)[0]), by(as_found))
         return run(*primals), (step, plain_step)
 
-    return run(flag, lax.stop_gradient(found), args)
+    return run(flag, jnp.asarray(dense), lax.stop_gradient(found), args)
 
 
 def _one(careful: Callable):
@@ -93,20 +95,25 @@ def _one(careful: Callable):
 def _many(careful: Callable, axes: list):
     """The same for samples along the leading axis; `axes` says which of the arguments have it."""
 
-    @custom_vmap
-    def many(flag, found, args):
+    def some(flag, found, args):
         size = flag.shape[0]
-        places = jnp.nonzero(flag, size=size + AT_ONCE, fill_value=size)[0]
+        count = min(AT_ONCE, size)
+        places = jnp.nonzero(flag, size=size + count, fill_value=size)[0]
 
         def mend(i, found):
-            here = lax.dynamic_slice_in_dim(places, i * AT_ONCE, AT_ONCE)
+            here = lax.dynamic_slice_in_dim(places, i * count, count)
             taken = [x if axis is None else x.at[here].get(mode="clip") for x, axis in zip(args, axes, strict=True)]
             # Values of a few samples are kept from being computed again; those of one are in a branch that is not taken.
-            with at_least(AT_ONCE):
+            with at_least(count):
                 new = jax.vmap(careful, axes)(*taken)
             return jax.tree.map(lambda old, new: old.at[here].set(new, mode="drop"), found, new)
 
-        return lax.fori_loop(0, (jnp.sum(flag) + AT_ONCE - 1) // AT_ONCE, mend, found)
+        return lax.fori_loop(0, (jnp.sum(flag) + count - 1) // count, mend, found)
+
+    @custom_vmap
+    def many(flag, found, args):
+        # A branch, as to look for places takes longer than the dynamics, and XLA takes out of a loop what does not change.
+        return lax.cond(jnp.any(flag), some, lambda flag, found, args: found, flag, found, args)
 
     @many.def_vmap
     def _(size, batched, flag, found, args):

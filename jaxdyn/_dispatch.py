@@ -18,6 +18,7 @@ branch that is not taken.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.core
@@ -32,7 +33,8 @@ from jaxtyping import Array
 from jaxdyn import closed_recursion, looped, matrix_form, recursive
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
-from jaxdyn._tracing import is_one_sample, still, traced_once
+from jaxdyn._one_kernel import Kernel, kernel_of
+from jaxdyn._tracing import is_one_sample, is_staged, still, traced_once
 from jaxdyn.model import Model
 
 LEAST_BATCH = 256
@@ -41,29 +43,44 @@ MOST_BODIES = 64
 MOST_IN_MASK = 128
 
 _large_batch_p = Primitive("large_batch")
-_large_batch_p.def_impl(lambda *arrays, count: np.bool_(count >= LEAST_BATCH))
-_large_batch_p.def_abstract_eval(lambda *avals, count: ShapedArray((), np.dtype(bool)))
-mlir.register_lowering(_large_batch_p, lambda ctx, *arrays, count: [mlir.ir_constant(np.bool_(count >= LEAST_BATCH))])
+_large_batch_p.def_impl(lambda *arrays, count, on_cpu: np.bool_(count >= LEAST_BATCH))
+_large_batch_p.def_abstract_eval(lambda *avals, count, on_cpu: ShapedArray((), np.dtype(bool)))
 
 
-def _count_samples(arrays, axes, *, count):
+def _answer(ctx, *arrays, count, on_cpu):
+    return [mlir.ir_constant(np.bool_(count >= LEAST_BATCH))]
+
+
+def _answer_on_cpu(ctx, *arrays, count, on_cpu):
+    return [mlir.ir_constant(np.bool_(on_cpu or count >= LEAST_BATCH))]
+
+
+mlir.register_lowering(_large_batch_p, _answer)
+mlir.register_lowering(_large_batch_p, _answer_on_cpu, platform="cpu")
+
+
+def _count_samples(arrays, axes, *, count, on_cpu):
     size = next(array.shape[axis] for array, axis in zip(arrays, axes, strict=True) if axis is not batching.not_mapped)
     count *= size
     # Once the batch is large enough the answer is final and needs no further tracing.
-    large = np.bool_(True) if count >= LEAST_BATCH else _large_batch_p.bind(*arrays, count=count)
+    large = np.bool_(True) if count >= LEAST_BATCH else _large_batch_p.bind(*arrays, count=count, on_cpu=on_cpu)
     return large, batching.not_mapped
 
 
 batching.primitive_batchers[_large_batch_p] = _count_samples
 
 
-def is_large_batch(*trees):
+def is_large_batch(*trees, on_cpu: bool = False):
     """Whether the batch over which the trees vary has at least `LEAST_BATCH` samples: a bool, or a traced one that is known
-    when the program is compiled."""
+    when the program is compiled. With `on_cpu`, also whether that is for CPU."""
     traced = [x for x in jax.tree.leaves(trees) if isinstance(x, jax.core.Tracer)]
-    large = _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1) if traced else False
-    # What no batch encloses is not made large any more.
-    return False if is_one_sample() and isinstance(large, jax.core.Tracer) else large
+    if not traced:
+        return False
+    large = _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1, on_cpu=on_cpu)
+    if is_one_sample() and isinstance(large, jax.core.Tracer):
+        # What no batch encloses is not made large any more.
+        return on_cpu and jax.default_backend() == "cpu"
+    return large
 
 
 def _is_tiny(model: Model) -> bool:
@@ -118,10 +135,16 @@ def mass_matrix(model: Model, q: Array) -> Array:
 def forward_dynamics(model: Model, q: Array, v: Array, tau: Array) -> Array:
     """a = M^-1 (tau - C v - N), (nv,), differentiated by the implicit function theorem and not through the algorithm."""
 
-    def solve(model, *args):
+    def by_other_ways(model, *args):
         if model.nb > MOST_BODIES:
             return looped.forward_dynamics(model, *args)
         return _choose(model, recursive.aba, matrix_form.forward_dynamics, *args)
+
+    def solve(model, *args):
+        if not 0 < model.nb <= MOST_BODIES or not is_staged():
+            return by_other_ways(model, *args)
+        kernel = kernel_of(recursive.aba, model, *args)
+        return by_other_ways(model, *args) if kernel is None else kernel(partial(by_other_ways, model), *args)
 
     def tangent(model, *args):
         if model.nb > MOST_BODIES:
@@ -159,9 +182,20 @@ def _force_change(inverse: Callable, model, q, v, tau, steps) -> Callable:
 
 
 def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tuple[Array, Array, Array]:
-    """`closed_recursion.closed_dynamics`, without derivatives; for large batches."""
-    with at_least(LEAST_BATCH):
-        return traced_once(_closed, still((model, loops)), *still((q, v, tau)))
+    """`closed_recursion.closed_dynamics`, without derivatives; for large batches, or for any on CPU if there is a kernel."""
+    tree, *state = still(((model, loops), q, v, tau))
+
+    def by_recursion(*state):
+        with at_least(LEAST_BATCH):
+            return traced_once(_closed, tree, *state)
+
+    kernel = closed_kernel(tree, *state)
+    return by_recursion(*state) if kernel is None else kernel(by_recursion, *state)
+
+
+def closed_kernel(tree, q: Array, v: Array, tau: Array) -> Kernel | None:
+    """`closed_dynamics` of a pair (model, loops), in one kernel."""
+    return kernel_of(_closed, tree, q, v, tau)
 
 
 def _closed(tree, q, v, tau):

@@ -3,7 +3,8 @@
 With M and A M^-1 A^T factored as in `closed_recursion`, a step -M^-1 A^T (A M^-1 A^T)^-1 r costs two sweeps over the bodies.
 """
 
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from jaxtyping import Array
 
 from jaxdyn._articulated import factorize
 from jaxdyn._links import canonical_bodies, place_joints, stack
+from jaxdyn._one_kernel import Kernel, kernel_of
 from jaxdyn._scalar import cross, transpose
 from jaxdyn.closed_recursion import (
     Walk,
@@ -74,3 +76,66 @@ class Closing(Residuals):
         """B r (nv,): the least change of q or v, in the metric M, that removes a residual (nc,)."""
         still: Any = [0] * self.model.nv
         return solve(self.model, self.factored, still, None, list(jnp.unstack(residual)), residual)[0]
+
+
+class Kernels(NamedTuple):
+    """What `Closing` offers, in one kernel each (see `_one_kernel`)."""
+
+    quality: Kernel
+    step: Kernel
+    apart: Kernel
+    slip: Kernel
+
+
+def kernels(model: Model, loops, q: Array, v: Array) -> Kernels | None:
+    """Those of a mechanism; None if one of them cannot be had."""
+    rows = jax.ShapeDtypeStruct((sum(loop.kind.count for loop in loops),), q.dtype)
+    tree = model, loops
+    found = (
+        kernel_of(_quality, tree, q),
+        kernel_of(_step, tree, q, rows),
+        kernel_of(_apart, tree, q),
+        kernel_of(_slip, tree, q, v),
+    )
+    return None if None in found else Kernels(*found)  # pyright: ignore[reportArgumentType]
+
+
+class ClosingInKernels:
+    """`Closing` with each of its methods in one kernel.
+
+    M and the rows are factored anew in every step, which costs less than to write some hundred factors and read them.
+    """
+
+    def __init__(self, model: Model, loops, q: Array, kernels: Kernels):
+        self.tree, self.q, self.kernels = (model, loops), q, kernels
+        self.quality = self._call(kernels.quality, _quality, q)
+
+    def _call(self, kernel: Kernel, function, *args):
+        return kernel(partial(function, self.tree), *args)
+
+    def apart(self, q: Array) -> Array:
+        return self._call(self.kernels.apart, _apart, q)
+
+    def slip(self, q: Array, v: Array) -> Array:
+        return self._call(self.kernels.slip, _slip, q, v)
+
+    def step(self, residual: Array) -> Array:
+        return self._call(self.kernels.step, _step, self.q, residual)
+
+
+def _quality(tree, q):
+    model, loops = tree
+    return Closing(model, loops, q).quality
+
+
+def _step(tree, q, residual):
+    model, loops = tree
+    return Closing(model, loops, q).step(residual)
+
+
+def _apart(tree, q):
+    return Residuals(*tree).apart(q)
+
+
+def _slip(tree, q, v):
+    return Residuals(*tree).slip(q, v)

@@ -21,7 +21,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
 from jaxdyn._anywhere import anywhere, flattened, mended
-from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
+from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, closed_kernel, is_large_batch, with_derivatives
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
 from jaxdyn._tracing import split, traced_once
@@ -126,7 +126,14 @@ def constrained_dynamics(
     def short(q, v, force, t):
         return _by_recursion(bare, q, v, force, t, method, rank_tol)
 
-    return dense(*state) if method == "range_space" else by_the_batch(bare, short, dense, *state)
+    if method == "range_space":
+        return dense(*state)
+    in_kernel = (
+        method == "rank_aware"
+        and has_short_recursion(bare)
+        and (closed_kernel((bare.system, bare.constraints), q, v, force) is not None)
+    )
+    return by_the_batch(bare, short, dense, *state, on_cpu=in_kernel)
 
 
 def _by_matrices(scene: Scene, q, v, force, t, method: str, rank_tol) -> ConstrainedDynamics:
@@ -142,9 +149,9 @@ def has_short_recursion(scene: Scene) -> bool:
     return products(model, ends, [loop.kind.count for loop in loops]) <= MOST_PRODUCTS
 
 
-def by_the_batch(scene: Scene, short: Callable, long: Callable, *args):
-    """short(*args) in large batches of scenes that have a short recursion, else long(*args)."""
-    large = has_short_recursion(scene) and is_large_batch(scene, *args)
+def by_the_batch(scene: Scene, short: Callable, long: Callable, *args, on_cpu: bool = False):
+    """short(*args) in large batches of scenes that have a short recursion, or in all `on_cpu`, else long(*args)."""
+    large = has_short_recursion(scene) and is_large_batch(scene, *args, on_cpu=on_cpu)
     if isinstance(large, jax.core.Tracer):
         return lax.cond(large, short, long, *args)
     return (short if large else long)(*args)
@@ -184,7 +191,9 @@ def _by_recursion(scene: Scene, q, v, force, t, method: str, rank_tol) -> Constr
     # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
     careful = jax.checkpoint(careful, prevent_cse=False)
     found, doubtful = ((a, lam), (rank, result)), ~(quality > least_pivot(q, rank_tol))
-    (a, lam), (rank, result) = mended(doubtful, careful, found, (unknown, (q, v, force, t)), same)
+    # The recursion's derivatives are for large batches.
+    dense = ~jnp.asarray(is_large_batch(scene, q, v, force, t))
+    (a, lam), (rank, result) = mended(doubtful, careful, found, (unknown, (q, v, force, t)), same, dense)
     return ConstrainedDynamics(a, lam, rank, result, places)
 
 

@@ -14,10 +14,11 @@ from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn._small import cholesky, solve_factored, solve_lower
 from jaxdyn._tracing import split, traced_once
-from jaxdyn.closed_projection import Closing
+from jaxdyn.closed_projection import Closing, ClosingInKernels, Kernels, kernels
 from jaxdyn.constrained import (
     by_the_batch,
     correction,
+    has_short_recursion,
     in_one_batch,
     least_pivot,
     normal_factor,
@@ -73,8 +74,9 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 
 def _by_the_batch(scene: Scene, q, v, t, errors, rank_tol):
     q = retract(scene.system, q)
-    short, long = (partial(way, scene, rank_tol) for way in (_by_recursion, _by_matrices))
-    return by_the_batch(scene, short, long, q, v, t, errors)
+    in_kernels = kernels(scene.system, scene.constraints, q, v) if has_short_recursion(scene) else None
+    short, long = partial(_by_recursion, scene, rank_tol, in_kernels), partial(_by_matrices, scene, rank_tol)
+    return by_the_batch(scene, short, long, q, v, t, errors, on_cpu=in_kernels is not None)
 
 
 class _Correction(NamedTuple):
@@ -120,10 +122,11 @@ def _by_matrices(scene: Scene, rank_tol, q, v, t, errors):
     return q, v, errors
 
 
-def _by_recursion(scene: Scene, rank_tol, q, v, t, errors):
-    """Loops of a tree in a large batch; by matrices the samples with rows that are close to dependent."""
+def _by_recursion(scene: Scene, rank_tol, in_kernels: Kernels | None, q, v, t, errors):
+    """Loops of a tree in a large batch, or in any by kernels; by matrices the samples with rows that are close to dependent."""
+    tree = scene.system, scene.constraints
     with at_least(LEAST_BATCH):
-        closing = Closing(scene.system, scene.constraints, q)
+        closing = Closing(*tree, q) if in_kernels is None else ClosingInKernels(*tree, q, in_kernels)
         place, apart = _closed(scene, q, closing.step, closing.apart)
         slip = partial(closing.slip, place)
         speed, slipping = _descend(v, closing.step, slip, lambda v, step: v - step)
