@@ -2,6 +2,8 @@
 
 The rule, measured by benchmarks/dynamics.py on CPU:
 
+- forward dynamics of a known model of at most `MOST_BODIES` bodies, if it is none of the tiny ones below, and closed loops of
+  one run in one kernel on CPU, whatever the batch, if there is one (see `_one_kernel`); what follows is for all the rest;
 - batches of at least `LEAST_BATCH` samples of a mechanism with at most `MOST_BODIES` bodies run on the recursion, whose
   numbers become vectors over the batch;
 - single samples and small batches run on the world-frame matrix form, whose program is short;
@@ -141,7 +143,7 @@ def forward_dynamics(model: Model, q: Array, v: Array, tau: Array) -> Array:
         return _choose(model, recursive.aba, matrix_form.forward_dynamics, *args)
 
     def solve(model, *args):
-        if not 0 < model.nb <= MOST_BODIES or not is_staged():
+        if not 0 < model.nb <= MOST_BODIES or _is_tiny(model) or not is_staged():
             return by_other_ways(model, *args)
         kernel = kernel_of(recursive.aba, model, *args)
         return by_other_ways(model, *args) if kernel is None else kernel(partial(by_other_ways, model), *args)

@@ -85,6 +85,8 @@ def scalar_program(function: Callable, *args):
     """The program of `function` in single numbers: its jaxpr, (shape, dtype) of the outputs and their structure."""
     jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*args)
     leaves, structure = jax.tree.flatten(out)
+    if _length(jaxpr.jaxpr) > MOST:
+        raise _TooMuch
 
     def run(*numbers):
         given, at = [], 0
@@ -104,6 +106,12 @@ def scalar_program(function: Callable, *args):
     if program.consts or len(program.eqns) > MOST:
         raise _TooMuch
     return program, tuple((leaf.shape, leaf.dtype) for leaf in leaves), structure
+
+
+def _length(jaxpr) -> int:
+    """Operations of a program and of those inside it; on arrays of several numbers each counts once, so there may be more."""
+    inner = (x.params[_INNER[x.primitive.name]] for x in jaxpr.eqns if x.primitive.name in _INNER)
+    return len(jaxpr.eqns) + sum(_length(getattr(x, "jaxpr", x)) for x in inner)
 
 
 def _known(const):

@@ -91,13 +91,14 @@ def kernels(model: Model, loops, q: Array, v: Array) -> Kernels | None:
     """Those of a mechanism; None if one of them cannot be had."""
     rows = jax.ShapeDtypeStruct((sum(loop.kind.count for loop in loops),), q.dtype)
     tree = model, loops
-    found = (
-        kernel_of(_quality, tree, q),
-        kernel_of(_step, tree, q, rows),
-        kernel_of(_apart, tree, q),
-        kernel_of(_slip, tree, q, v),
-    )
-    return None if None in found else Kernels(*found)  # pyright: ignore[reportArgumentType]
+    found = []
+    for function, *args in ((_step, q, rows), (_quality, q), (_apart, q), (_slip, q, v)):
+        kernel = kernel_of(function, tree, *args)
+        if kernel is None:
+            return None
+        found.append(kernel)
+    step, quality, apart, slip = found
+    return Kernels(quality, step, apart, slip)
 
 
 class ClosingInKernels:

@@ -24,7 +24,7 @@ from jaxdyn._anywhere import anywhere, flattened, mended
 from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, closed_kernel, is_large_batch, with_derivatives
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
-from jaxdyn._tracing import split, traced_once
+from jaxdyn._tracing import is_staged, split, traced_once
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.loops import Loop
@@ -128,11 +128,8 @@ def constrained_dynamics(
 
     if method == "range_space":
         return dense(*state)
-    in_kernel = (
-        method == "rank_aware"
-        and has_short_recursion(bare)
-        and (closed_kernel((bare.system, bare.constraints), q, v, force) is not None)
-    )
+    in_kernel = is_staged() and method == "rank_aware" and has_short_recursion(bare)
+    in_kernel = in_kernel and closed_kernel((bare.system, bare.constraints), q, v, force) is not None
     return by_the_batch(bare, short, dense, *state, on_cpu=in_kernel)
 
 

@@ -13,7 +13,7 @@ from jaxdyn._dispatch import LEAST_BATCH
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn._small import cholesky, solve_factored, solve_lower
-from jaxdyn._tracing import split, traced_once
+from jaxdyn._tracing import is_staged, split, traced_once
 from jaxdyn.closed_projection import Closing, ClosingInKernels, Kernels, kernels
 from jaxdyn.constrained import (
     by_the_batch,
@@ -74,7 +74,8 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 
 def _by_the_batch(scene: Scene, q, v, t, errors, rank_tol):
     q = retract(scene.system, q)
-    in_kernels = kernels(scene.system, scene.constraints, q, v) if has_short_recursion(scene) else None
+    staged = is_staged() and has_short_recursion(scene)
+    in_kernels = kernels(scene.system, scene.constraints, q, v) if staged else None
     short, long = partial(_by_recursion, scene, rank_tol, in_kernels), partial(_by_matrices, scene, rank_tol)
     return by_the_batch(scene, short, long, q, v, t, errors, on_cpu=in_kernels is not None)
 

@@ -158,12 +158,15 @@ def test_known_zeros_are_left_out():
 
 
 def test_dispatch_follows_the_batch():
-    """Large batches run on the recursion and small ones on matrices, wherever the vmap stands; all give the same numbers."""
+    """Large batches run on the recursion and small ones on matrices, wherever the vmap stands; all give the same numbers.
+
+    Of inverse dynamics: forward dynamics of a known model runs in a kernel, see test_one_kernel.
+    """
     model = random_tree(8, ["revolute", "prismatic", "spherical"])
     q, v, _, tau, _ = random_states(model, 256, 3)
 
-    def f(q, v, tau):
-        return _dispatch.forward_dynamics(model, q, v, tau)
+    def f(q, v, a):
+        return _dispatch.inverse_dynamics(model, q, v, a)
 
     def kept(g, *x):
         """Number of `materialize` calls in the compiled program: the mark of the recursion."""
@@ -171,7 +174,7 @@ def test_dispatch_follows_the_batch():
 
     assert kept(f, q[0], v[0], tau[0]) == kept(jax.vmap(f), q[:4], v[:4], tau[:4]) == 0
     split = [x.reshape(16, 16, -1) for x in (q, v, tau)]
-    want = quick(jax.vmap(lambda *x: matrix_form.forward_dynamics(model, *x)))(q, v, tau)
+    want = quick(jax.vmap(lambda *x: matrix_form.inverse_dynamics(model, *x)))(q, v, tau)
     for g, args in ((jax.vmap(f), (q, v, tau)), (jax.vmap(jax.jit(f)), (q, v, tau)), (jax.vmap(jax.vmap(f)), split)):
         assert kept(g, *args) > 10
         assert_close(quick(g)(*args).reshape(256, -1), want, 1e-10)
