@@ -154,7 +154,7 @@ def test_forward_dynamics_of_every_joint(dtype):
     q, v, tau = (jnp.asarray(x, dtype) for x in random_states(model, 6, seed=2)[:3])
     wanted = jax.vmap(lambda *args: matrix_form.forward_dynamics(model, *args))(q, v, tau)
     kernel = of_arrays(recursive.aba, model, q[0], v[0], tau[0])
-    size = 1e-10 if dtype == jnp.float64 else 2e-3  # M's condition number is 1e4: as exact as float32 can be
+    size = 1e-10 if dtype == jnp.float64 else 4e-4  # 5 eps times the condition number of M, at most 642
     for found in (
         jnp.stack([jax.jit(kernel)(*args) for args in zip(q, v, tau, strict=True)]),
         jax.jit(jax.vmap(kernel))(q, v, tau),
