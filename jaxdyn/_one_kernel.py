@@ -1,14 +1,13 @@
 """`kernel_of`: a function of some hundred numbers as one piece of machine code, in which every value is computed once.
 
-XLA:CPU makes a loop of every fusion and starts it anew in each call: a recursion over seven bodies has some hundred of them,
-10 to 30 us in all, of which the arithmetic is less than one. But inside the function that a `reduce` folds with it does not
-fuse: that function is one basic block for LLVM, which computes each value once and keeps it in a register. So the recursion
-is traced into single numbers (`scalar_program`) and put there, folding an axis that holds the arguments twice. A batch is
-a loop around the block.
+XLA:CPU makes a loop of every fusion and starts it anew in each call, which for one sample takes far longer than the arithmetic
+in it. But inside the function that a `reduce` folds with it does not fuse: that function is one basic block for LLVM, which
+computes each value once and keeps it in a register. So the recursion is traced into single numbers (`scalar_program`) and
+put there, folding an axis that holds the arguments twice. A batch is a loop around the block.
 
 The fold is legal in any order and grouping that XLA may choose. An entry is nothing (the initial value), a set of arguments
-or a result; folding makes a result of arguments, and keeps a result. An answer that has not become a result is NaN, never
-a wrong number. LLVM sees that the last fold alone counts and drops the others. An axis of length one would not do: XLA
+or a result; folding makes a result of arguments, and keeps a result. A floating-point answer that has not become a
+result is NaN. LLVM sees that the last fold alone counts and drops the others. An axis of length one would not do: XLA
 takes folding with the initial value for the identity.
 
 The primitive batches. It has no derivative: put it under one that is given. On other platforms than CPU it is the function
@@ -234,7 +233,8 @@ def _as_folds(*arrays, program: ClosedJaxpr, shapes, depth: int, otherwise: Call
     del otherwise
     lead = arrays[0].shape[:depth]
     jaxpr = program.jaxpr
-    numbers = [x.reshape(*lead, -1)[..., i] for x in arrays for i in range(math.prod(x.shape[depth:]))]
+    sizes = [math.prod(x.shape[depth:]) for x in arrays]  # reshape cannot find them where there are no samples
+    numbers = [x.reshape(*lead, size)[..., i] for x, size in zip(arrays, sizes, strict=True) for i in range(size)]
     values = dict(zip(jaxpr.invars, numbers, strict=True))
     sound = jnp.ones(lead, bool)
     for eqns, takes, gives in _blocks(program):

@@ -88,7 +88,7 @@ class Kernels(NamedTuple):
 
 
 def kernels(model: Model, loops, q: Array, v: Array) -> Kernels | None:
-    """Those of a mechanism; None if one of them cannot be had."""
+    """Those of a mechanism with q (nq,) and v (nv,) of these shapes and dtypes; None if one of them cannot be had."""
     rows = jax.ShapeDtypeStruct((sum(loop.kind.count for loop in loops),), q.dtype)
     tree = model, loops
     found = []
@@ -102,10 +102,7 @@ def kernels(model: Model, loops, q: Array, v: Array) -> Kernels | None:
 
 
 class ClosingInKernels:
-    """`Closing` with each of its methods in one kernel.
-
-    M and the rows are factored anew in every step, which costs less than to write some hundred factors and read them.
-    """
+    """`Closing` with each of its methods in one kernel: functions of arrays alone, so each step factors M and the rows anew."""
 
     def __init__(self, model: Model, loops, q: Array, kernels: Kernels):
         self.tree, self.q, self.kernels = (model, loops), q, kernels

@@ -73,6 +73,13 @@ def test_kernel_of_batches():
     assert_same(jax.jit(over(kernel))(many, n, which), over(functools.partial(mixed, FACTORS))(many, n, which))
 
 
+def test_kernel_of_no_samples():
+    args = mixed_args()
+    kernel = of_arrays(mixed, FACTORS, *args)
+    found = jax.jit(jax.vmap(kernel, (0, None, None)))(jnp.zeros((0, 3)), *args[1:])
+    assert found["corner"].shape == (0, 2, 2) and found["known"].shape == (0, 3)
+
+
 @pytest.mark.parametrize("most", [9, 10, 12])
 def test_long_functions_are_cut_into_blocks(monkeypatch, most):
     """Each block hands what is needed later to the next ones."""
