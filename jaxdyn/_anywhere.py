@@ -6,6 +6,7 @@ samples that need it again and leaves the others alone. `flattened` makes one ba
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -46,7 +47,7 @@ def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | 
 
     - `careful(*args)` -> what `found` is: a pair of pytrees, of which the first is differentiated. It depends on nothing traced
       but `args`.
-    - `same(found[0], *args)` -> found[0], to be differentiated by the args; None where nothing is.
+    - `same(found[0], *args)` -> found[0], to be differentiated by the args; None for the derivatives of `careful`.
     - `dense` (), for all samples alike: whether derivatives are those of `careful` anyway.
 
     Derivatives are those of `same` if the flag is set in no sample of the batch, else those of `careful` for all of them: in a
@@ -62,15 +63,14 @@ def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | 
         flag, dense, (smooth, _), args = primals
         _, _, (_, plain_step), args_step = tangents
 
-        def as_found(*args):
-            if same is None:
-                raise TypeError("what is mended here has no derivative")
-            return same(smooth, *args)
-
         def by(function):
             return lambda: jax.jvp(function, args, args_step)[1]
 
-        step = lax.cond(anywhere(flag) | dense, by(lambda *args: careful(*args)[0]), by(as_found))
+        by_careful = by(lambda *args: careful(*args)[0])
+        if same is None:
+            step = by_careful()
+        else:
+            step = lax.cond(anywhere(flag) | dense, by_careful, by(partial(same, smooth)))
         return run(*primals), (step, plain_step)
 
     return run(flag, jnp.asarray(dense), lax.stop_gradient(found), args)

@@ -36,6 +36,7 @@ from jaxdyn import closed_recursion, looped, matrix_form, recursive
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn._one_kernel import Kernel, kernel_of
+from jaxdyn._scalar_program import is_written_out
 from jaxdyn._tracing import is_one_sample, is_staged, still, traced_once
 from jaxdyn.model import Model
 
@@ -93,7 +94,7 @@ def _choose(model: Model, recursion: Callable, matrices: Callable, *args):
     """`recursion(model, *args)` for large batches of mechanisms of moderate size, else `matrices(model, *args)`."""
     if model.nb > MOST_BODIES or model.nb == 0:
         return matrices(model, *args)
-    large = True if _is_tiny(model) else is_large_batch(model, *args[:3])
+    large = True if _is_tiny(model) or is_written_out() else is_large_batch(model, *args[:3])
 
     def by_recursion():
         with at_least(LEAST_BATCH):

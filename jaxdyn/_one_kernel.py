@@ -2,13 +2,16 @@
 
 XLA:CPU makes a loop of every fusion and starts it anew in each call, which for one sample takes far longer than the arithmetic
 in it. But inside the function that a `reduce` folds with it does not fuse: that function is one basic block for LLVM, which
-computes each value once and keeps it in a register. So the recursion is traced into single numbers (`scalar_program`) and
+computes each value once and keeps it in a register. So the recursion is traced into single numbers (`_scalar_program`) and
 put there, folding an axis that holds the arguments twice. A batch is a loop around the block.
 
 The fold is legal in any order and grouping that XLA may choose. An entry is nothing (the initial value), a set of arguments
 or a result; folding makes a result of arguments, and keeps a result. A floating-point answer that has not become a
 result is NaN. LLVM sees that the last fold alone counts and drops the others. An axis of length one would not do: XLA
 takes folding with the initial value for the identity.
+
+For each operation of the fold the runtime sets up a buffer, which is never used, when a program is called: 0.1 us, however often
+the kernel then runs. In a loop that is nothing. Outside of one a kernel is what it stands for, unless the batch is large.
 
 The primitive batches. It has no derivative: put it under one that is given. On other platforms than CPU it is the function
 that the caller gives for them.
@@ -26,21 +29,22 @@ import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Literal, Primitive
+from jax.extend.mlir import ir
 from jax.interpreters import batching, mlir
 
+from jaxdyn._scalar_program import TooMuch, scalar_program
 from jaxdyn._tracing import Known, split
 
 MOST_AT_ONCE = 4400  # operations in one block; from about 4500 on XLA cuts it in pieces that compute values again
 MOST = 9000  # operations in all; longer ones compile for minutes
+AT_ONE_CALL = (
+    4096  # samples from which on a kernel that is not in a loop pays for what its operations cost at each call
+)
 
 _NOTHING, _ARGUMENTS, _RESULT = (np.int8(i) for i in range(3))
 
 _one_kernel_p = Primitive("one_kernel")
 _one_kernel_p.multiple_results = True
-
-
-class _TooMuch(Exception):
-    """An operation that is not one of single numbers, or too many of them."""
 
 
 class Kernel(NamedTuple):
@@ -56,8 +60,8 @@ class Kernel(NamedTuple):
         return jax.tree.unflatten(self.structure, found)
 
 
-def kernel_of(function: Callable, tree, *args) -> Kernel | None:
-    """function(tree, *args) for arrays of the shapes of `args`, one sample, as a kernel.
+def kernel_of(function: Callable, tree, *args, most: int | None = None) -> Kernel | None:
+    """function(tree, *args) for arrays of the shapes of `args`, one sample, as a kernel of at most `most` operations (`MOST`).
 
     None if the tree holds numbers that are traced, if the function computes with more than single numbers, such as a
     factorisation by LAPACK, or if it is too long. It is traced once for a tree and shapes.
@@ -65,140 +69,18 @@ def kernel_of(function: Callable, tree, *args) -> Kernel | None:
     traced, known = split(tree)
     if traced or len(jax.tree.leaves(args)) != len(args):
         return None
-    return _kernel(function, known, tuple((np.shape(x), np.dtype(x.dtype)) for x in args))
+    return _kernel(
+        function, known, tuple((np.shape(x), np.dtype(x.dtype)) for x in args), MOST if most is None else most
+    )
 
 
 @functools.lru_cache(maxsize=256)  # kernels hold their trees
-def _kernel(function: Callable, known: Known, shapes) -> Kernel | None:
+def _kernel(function: Callable, known: Known, shapes, most: int) -> Kernel | None:
     args = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
     try:
-        return Kernel(*scalar_program(lambda *args: function(known(()), *args), *args))
-    except _TooMuch:
+        return Kernel(*scalar_program(lambda *args: function(known(()), *args), *args, most=most))
+    except TooMuch:
         return None
-
-
-# --- from arrays to single numbers ---------------------------------------------------------------
-
-
-def scalar_program(function: Callable, *args):
-    """The program of `function` in single numbers: its jaxpr, (shape, dtype) of the outputs and their structure."""
-    jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*args)
-    leaves, structure = jax.tree.flatten(out)
-    if _length(jaxpr.jaxpr) > MOST:
-        raise _TooMuch
-
-    def run(*numbers):
-        given, at = [], 0
-        for arg in args:
-            size = math.prod(np.shape(arg))
-            given.append(_objects(numbers[at : at + size], np.shape(arg)))
-            at += size
-        found = _evaluate(jaxpr.jaxpr, [np.asarray(const) for const in map(_known, jaxpr.consts)], given)
-        return [
-            jnp.asarray(number, leaf.dtype)
-            for array, leaf in zip(found, leaves, strict=True)
-            for number in array.ravel().tolist()
-        ]
-
-    numbers = [ShapedArray((), arg.dtype) for arg in args for _ in range(math.prod(np.shape(arg)))]
-    program = jax.make_jaxpr(run)(*numbers)
-    if program.consts or len(program.eqns) > MOST:
-        raise _TooMuch
-    return program, tuple((leaf.shape, leaf.dtype) for leaf in leaves), structure
-
-
-def _length(jaxpr) -> int:
-    """Operations of a program and of those inside it; on arrays of several numbers each counts once, so there may be more."""
-    inner = (x.params[_INNER[x.primitive.name]] for x in jaxpr.eqns if x.primitive.name in _INNER)
-    return len(jaxpr.eqns) + sum(_length(getattr(x, "jaxpr", x)) for x in inner)
-
-
-def _known(const):
-    if isinstance(const, jax.core.Tracer):
-        raise _TooMuch
-    return const
-
-
-def _objects(entries, shape) -> np.ndarray:
-    array = np.empty(len(entries), object)
-    for i, entry in enumerate(entries):  # in one assignment numpy would look into them
-        array[i] = entry
-    return array.reshape(shape)
-
-
-_ELEMENTWISE = frozenset(
-    "add sub mul div neg sqrt rsqrt abs sign floor ceil round max min pow integer_pow square exp log sin cos tan tanh atan2 "
-    "rem clamp select_n eq ne lt le gt ge and or not xor is_finite convert_element_type copy stop_gradient".split()
-)
-_REDUCTIONS = {"reduce_sum": lax.add, "reduce_min": lax.min, "reduce_max": lax.max}
-_INNER = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "checkpoint": "jaxpr",
-}
-
-
-def _evaluate(jaxpr, consts, args) -> list[np.ndarray]:
-    values: dict = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args), strict=True))
-
-    def read(atom):
-        return np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
-
-    for eqn in jaxpr.eqns:
-        found = _one(eqn.primitive, eqn.params, [read(x) for x in eqn.invars], [x.aval for x in eqn.outvars])
-        values.update(zip(eqn.outvars, found, strict=True))
-    return [read(x) for x in jaxpr.outvars]
-
-
-def _one(primitive, params, args, outs):
-    name, shape = primitive.name, outs[0].shape
-    if name in _INNER:
-        inner = params[_INNER[name]]
-        consts, inner = (inner.consts, inner.jaxpr) if isinstance(inner, ClosedJaxpr) else ((), inner)
-        return _evaluate(inner, [np.asarray(_known(const)) for const in consts], args)
-    if name == "materialize":
-        return args
-    if name in _ELEMENTWISE:
-        size = math.prod(shape)
-        columns = [_entries(arg) * (size if arg.size == 1 else 1) for arg in args]
-        return [_objects([primitive.bind(*each, **params) for each in zip(*columns, strict=True)], shape)]
-    if name in _REDUCTIONS:
-        axes, fold = params["axes"], _REDUCTIONS[name]
-        rows = np.moveaxis(args[0], axes, range(len(axes))).reshape(-1, math.prod(shape))
-        return [_objects([functools.reduce(fold, _entries(column)) for column in rows.T], shape)]
-    if name in ("reshape", "squeeze"):
-        return [args[0].reshape(shape)]
-    if name == "broadcast_in_dim":
-        kept = [1] * len(shape)
-        for place, size in zip(params["broadcast_dimensions"], args[0].shape, strict=True):
-            kept[place] = size
-        return [np.broadcast_to(args[0].reshape(kept), shape)]
-    if name == "slice":
-        strides = params["strides"] or (1,) * args[0].ndim
-        places = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
-        return [args[0][tuple(slice(*place) for place in places)]]
-    if name == "unstack":
-        rows = np.moveaxis(args[0], params["axis"], 0)
-        return [rows[i, ...] for i in range(len(rows))]
-    if name == "rev":
-        return [np.flip(args[0], params["dimensions"])]
-    if name == "transpose":
-        return [args[0].transpose(params["permutation"])]
-    if name in ("concatenate", "stack"):
-        args = [_objects(_entries(arg), arg.shape) for arg in args]
-        if name == "stack":
-            return [np.stack(args, params["axis"])]
-        return [np.concatenate(args, params["dimension"])]
-    raise _TooMuch(name)
-
-
-def _entries(array) -> list:
-    """The numbers of an array in order: traced ones as they are, known ones of its dtype."""
-    if array.dtype.kind == "O":
-        return array.ravel().tolist()
-    return [array.dtype.type(x) for x in array.ravel().tolist()]
 
 
 # --- the fold --------------------------------------------------------------------------------------
@@ -302,6 +184,26 @@ def _elsewhere(*arrays, program, shapes, depth: int, otherwise: Callable):
     return jax.tree.leaves(otherwise(*arrays))
 
 
+def _on_cpu(ctx, *arrays, **params):
+    samples = math.prod(ctx.avals_in[0].shape[: params["depth"]])
+    way = _elsewhere if samples < AT_ONE_CALL and _is_done_once() else _as_folds
+    return mlir.lower_fun(way, multiple_results=True)(ctx, *arrays, **params)
+
+
+def _is_done_once() -> bool:
+    """Whether what is being lowered is known to be no part of a loop: in the program's main function, outside of all loops in it.
+
+    Functions of their own, as jax makes of a nested `jit` and of branches, may be called in one.
+    """
+    place: Any = ir.InsertionPoint.current  # pyright: ignore[reportAttributeAccessIssue]
+    place = place.block.owner.operation
+    while place.name != "func.func":
+        if place.name == "stablehlo.while":
+            return False
+        place = place.parent.operation
+    return ir.StringAttr(place.attributes["sym_name"]).value == "main"
+
+
 def _abstract(*avals, program, shapes, depth: int, otherwise):
     return [ShapedArray((*avals[0].shape[:depth], *shape), dtype) for shape, dtype in shapes]
 
@@ -324,5 +226,5 @@ def _program(**params):
 _one_kernel_p.def_impl(lambda *arrays, **params: _program(**params)(*arrays))
 _one_kernel_p.def_abstract_eval(_abstract)
 mlir.register_lowering(_one_kernel_p, mlir.lower_fun(_elsewhere, multiple_results=True))
-mlir.register_lowering(_one_kernel_p, mlir.lower_fun(_as_folds, multiple_results=True), platform="cpu")
+mlir.register_lowering(_one_kernel_p, _on_cpu, platform="cpu", cacheable=False)
 batching.primitive_batchers[_one_kernel_p] = _batch

@@ -9,14 +9,20 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn._materialize import materialize
+from jaxdyn._scalar_program import is_written_out
 
 MOST = 6  # operations grow with the third power, and XLA repeats part of them in every consumer
+MOST_WRITTEN = 24  # in a program of single numbers, where nothing is repeated
+
+
+def _most() -> int:
+    return MOST_WRITTEN if is_written_out() else MOST
 
 
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """matrix^-1 right by Cholesky's factorisation; NaN where the matrix is not positive definite."""
     n = matrix.shape[0]
-    if n > MOST:
+    if n > _most():
         return cho_solve((jnp.linalg.cholesky(matrix), True), right)
     lower, scale = _factored(matrix)
     return jnp.stack(_backward(lower, scale, _forward(lower, scale, list(right))))
@@ -25,7 +31,7 @@ def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower triangular L with L L^T = matrix; not `definite` where the matrix is not."""
     n = matrix.shape[0]
-    if not 0 < n <= MOST:
+    if not 0 < n <= _most():
         return jnp.linalg.cholesky(matrix)
     lower, scale = _factored(matrix)
     zero = jnp.zeros((), matrix.dtype)
@@ -48,7 +54,7 @@ def solve_lower(
 ) -> Float[Array, "n *k"]:
     """L^-1 right, or L^-T right."""
     n = factor.shape[0]
-    if not 0 < n <= MOST:
+    if not 0 < n <= _most():
         return solve_triangular(factor, right, lower=True, trans=int(transposed))
     sweep = _backward if transposed else _forward
     return materialize(jnp.stack(sweep(factor, [1 / factor[i, i] for i in range(n)], list(right))))[0]
@@ -56,7 +62,7 @@ def solve_lower(
 
 def solve_factored(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """(L L^T)^-1 right."""
-    if not 0 < factor.shape[0] <= MOST:
+    if not 0 < factor.shape[0] <= _most():
         return cho_solve((factor, True), right)
     return solve_lower(factor, solve_lower(factor, right), transposed=True)
 

@@ -12,6 +12,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxdyn._materialize import at_least, least_size
+from jaxdyn._scalar_program import is_written_out
 
 
 def is_concrete(*trees) -> bool:
@@ -120,11 +121,11 @@ def traced_once(function: Callable, tree, *args, static: tuple = ()):
     if not is_staged():
         return function(tree, *args, *static)
     traced, known = split(tree)
-    return _program(function, known, static, least_size(), is_one_sample())(traced, *args)
+    return _program(function, known, static, least_size(), is_one_sample(), is_written_out())(traced, *args)
 
 
 @functools.lru_cache(maxsize=256)  # programs hold their trees
-def _program(function, known: Known, static, least: int, _one_sample: bool):
+def _program(function, known: Known, static, least: int, _one_sample: bool, _written_out: bool):
     def run(traced, *args):
         with at_least(least):
             return function(known(traced), *args, *static)

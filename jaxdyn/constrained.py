@@ -20,11 +20,13 @@ from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
+from jaxdyn import closed_recursion
 from jaxdyn._anywhere import anywhere, flattened, mended
-from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, closed_kernel, is_large_batch, with_derivatives
+from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
+from jaxdyn._one_kernel import kernel_of
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
-from jaxdyn._tracing import is_staged, split, traced_once
+from jaxdyn._tracing import is_staged, split, still, traced_once
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.loops import Loop
@@ -113,28 +115,61 @@ def constrained_dynamics(
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}")
     rank_tol = checked_tolerance(rank_tol)
-    force = applied(scene, q, v, tau, t)
+    tau = jnp.zeros_like(v) if tau is None else checked_force(tau, q, scene.nv, "tau")
     places = layout(scene)
     if not places:
-        return _free(scene, q, v, force, t)
-
-    bare, state = Scene(scene.system, scene.constraints), (q, v, force, jnp.asarray(t, q.dtype))
+        return _free(scene, q, v, applied(scene, q, v, tau, t), t)
+    state = q, v, tau, jnp.asarray(t, q.dtype)
 
     def dense(*state):
-        return traced_once(_by_matrices, bare, *state, static=(method, rank_tol))
+        return traced_once(_by_matrices, scene, *state, static=(method, rank_tol))
 
-    def short(q, v, force, t):
-        return _by_recursion(bare, q, v, force, t, method, rank_tol)
+    def short(q, v, tau, t):
+        force = applied(scene, q, v, tau, t)
+        found = closed_dynamics(scene.system, scene.constraints, q, v, force)
+        if method == "rank_aware":
+            return _mended(scene, found, q, v, tau, t, rank_tol, _derivatives_of_recursion)
+        rank, result = _judged(scene, q, found[-1])
+        a, lam = with_derivatives(scene.system, scene.constraints, q, v, force, *found[:2])
+        return ConstrainedDynamics(a, lam, rank, result, places)
 
     if method == "range_space":
         return dense(*state)
-    in_kernel = is_staged() and method == "rank_aware" and has_short_recursion(bare)
-    in_kernel = in_kernel and closed_kernel((bare.system, bare.constraints), q, v, force) is not None
-    return by_the_batch(bare, short, dense, *state, on_cpu=in_kernel)
+    kernel = _kernel(scene, *state) if method == "rank_aware" else None
+    if kernel is None and method == "rank_aware" and scene.forces:
+        # Forces may be anything. The rest may do without branches.
+        bare = Scene(scene.system, scene.constraints)
+        return constrained_dynamics(bare, q, v, applied(scene, q, v, tau, t), t, rank_tol=rank_tol)
+    if kernel is None:
+        return by_the_batch(scene, short, dense, *state)
+    found = kernel(partial(_in_numbers, scene), *still(state))
+    same = _derivatives_of_recursion if has_short_recursion(scene) else None
+    return _mended(scene, found, *state, rank_tol, same)
 
 
-def _by_matrices(scene: Scene, q, v, force, t, method: str, rank_tol) -> ConstrainedDynamics:
-    return solve_rows(scene, q, v, force, t, rows(scene, q, v, t), method, rank_tol)
+def _kernel(scene: Scene, q, v, tau, t):
+    """Accelerations, multipliers and the quality of the rows in one kernel, if there is one and it is not for one call."""
+    if not is_staged() or layout(scene)[-1].end > scene.nv:
+        return None
+    return kernel_of(_in_numbers, scene, q, v, tau, t)
+
+
+def _in_numbers(scene: Scene, q, v, tau, t):
+    """(a, lam, least over largest pivot of A M^-1 A^T) without branches; NaN where M is not positive definite."""
+    force = applied(scene, q, v, tau, t)
+    if has_short_recursion(scene):
+        return closed_recursion.closed_dynamics(scene.system, scene.constraints, q, v, force)
+    row = rows(scene, q, v, t)
+    mass, factor, Y, free = _weighted(scene, q, v, force, t, row)
+    normal = cholesky(_product(Y.T, Y))
+    lam = _refined(normal, Y, row.gamma - _product(Y.T, free))
+    a = solve_lower(factor, free + _product(Y, lam), transposed=True)
+    pivots = jnp.diagonal(normal) ** 2
+    return a, lam, jnp.where(definite(mass, factor), jnp.min(pivots) / jnp.max(pivots), jnp.nan)
+
+
+def _by_matrices(scene: Scene, q, v, tau, t, method: str, rank_tol) -> ConstrainedDynamics:
+    return solve_rows(scene, q, v, applied(scene, q, v, tau, t), t, rows(scene, q, v, t), method, rank_tol)
 
 
 def has_short_recursion(scene: Scene) -> bool:
@@ -165,33 +200,36 @@ def in_one_batch(function: Callable, scene: Scene, *args):
     return flattened(lambda unknown, *args: function(known(unknown), *args))(unknown, *args)
 
 
-def _by_recursion(scene: Scene, q, v, force, t, method: str, rank_tol) -> ConstrainedDynamics:
-    """The Schur complement written out; the samples with which it cannot do well are left to the rank-aware solve."""
-    system, loops, places = scene.system, scene.constraints, layout(scene)
-    a, lam, quality = closed_dynamics(system, loops, q, v, force)
-    rank = jnp.asarray(places[-1].end, jnp.int32)
+def _judged(scene: Scene, q, quality):
+    """Rank and code of rows that were taken for independent, from the ratio of their pivots."""
+    rank = jnp.asarray(layout(scene)[-1].end, jnp.int32)
     result = RESULTS.where(quality > 10 * scene.nv * _eps(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
-    result = RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
-    if method == "schur":
-        a, lam = with_derivatives(system, loops, q, v, force, a, lam)
-        return ConstrainedDynamics(a, lam, rank, result, places)
+    return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
+
+
+def _mended(scene: Scene, found, q, v, tau, t, rank_tol, same: Callable | None) -> ConstrainedDynamics:
+    """`found` = (a, lam, quality of the rows), with the rank-aware solve for the samples whose rows it could not serve."""
+    a, lam, quality = found
     unknown, known = split(scene)
 
-    def same(found, unknown, state):
-        here = known(unknown)
-        return with_derivatives(here.system, here.constraints, *state[:3], *found)
-
     def careful(unknown, state):
-        found = traced_once(_by_matrices, known(unknown), *state, static=(method, rank_tol))
+        found = traced_once(_by_matrices, known(unknown), *state, static=("rank_aware", rank_tol))
         return (found.acceleration, found.multipliers), (found.rank, found.result)
 
     # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
     careful = jax.checkpoint(careful, prevent_cse=False)
-    found, doubtful = ((a, lam), (rank, result)), ~(quality > least_pivot(q, rank_tol))
+    rate = None if same is None else lambda found, unknown, state: same(known(unknown), found, *state)
+    doubtful = ~(quality > least_pivot(q, rank_tol))
     # The recursion's derivatives are for large batches.
-    dense = ~jnp.asarray(is_large_batch(scene, q, v, force, t))
-    (a, lam), (rank, result) = mended(doubtful, careful, found, (unknown, (q, v, force, t)), same, dense)
-    return ConstrainedDynamics(a, lam, rank, result, places)
+    dense = ~jnp.asarray(is_large_batch(scene, q, v, tau, t))
+    start, state = ((a, lam), _judged(scene, q, quality)), (q, v, tau, t)
+    (a, lam), (rank, result) = mended(doubtful, careful, start, (unknown, state), rate, dense)
+    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+
+
+def _derivatives_of_recursion(scene: Scene, found, q, v, tau, t):
+    force = applied(scene, q, v, tau, t)
+    return with_derivatives(scene.system, scene.constraints, q, v, force, *found)
 
 
 def least_pivot(like, rank_tol: float | None) -> float:
@@ -220,11 +258,7 @@ def solve_rows(
     """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
     if method == "range_space" and isinstance(scene.system, Model):
         return _by_range_space(scene, q, v, force, row)
-    mass = mass_matrix(scene.system, q, t)
-    factor = cholesky(mass)
-    columns = jnp.concatenate([row.A, (force - bias_force(scene.system, q, v, t))[None]]).T
-    solved = solve_lower(factor, columns)
-    Y, free = solved[:, :-1], solved[:, -1]
+    mass, factor, Y, free = _weighted(scene, q, v, force, t, row)
     wanted = row.gamma - _product(Y.T, free)
     if method != "rank_aware":
         lam, result = _by_delassus(_product(Y.T, Y), wanted, scene.nv)
@@ -240,6 +274,21 @@ def solve_rows(
     a = solve_lower(factor, free + pushed, transposed=True)
     result = RESULTS.where(definite(mass, factor), result, RESULTS.singular_mass_matrix)
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+
+
+def _weighted(scene: Scene, q, v, force, t, row: Rows):
+    """M = L L^T, L, Y = L^-1 A^T and L^-1 (force - h)."""
+    mass = mass_matrix(scene.system, q, t)
+    factor = cholesky(mass)
+    columns = jnp.concatenate([row.A, (force - bias_force(scene.system, q, v, t))[None]]).T
+    solved = solve_lower(factor, columns)
+    return mass, factor, solved[:, :-1], solved[:, -1]
+
+
+def _refined(factor, Y, right):
+    """(Y^T Y)^-1 right from the Cholesky factor: one correction takes the squared condition number out of the error."""
+    x = solve_factored(factor, right)
+    return x + solve_factored(factor, right - _product(Y.T, _product(Y, x)))
 
 
 def _shortest(Y, wanted, rank_tol):
@@ -259,12 +308,7 @@ def _shortest(Y, wanted, rank_tol):
         def normal(x):
             return _product(Y.T, _product(Y, x))
 
-        def solve(normal, right):
-            # One correction takes the squared condition number out of the error.
-            x = solve_factored(factor, right)
-            return x + solve_factored(factor, right - normal(x))
-
-        lam = lax.custom_linear_solve(normal, wanted, solve, symmetric=True)
+        lam = lax.custom_linear_solve(normal, wanted, lambda _, right: _refined(factor, Y, right), symmetric=True)
         return lam, _product(Y, lam), jnp.asarray(Y.shape[1], jnp.int32)
 
     careful = jax.checkpoint(by_rank, prevent_cse=False)

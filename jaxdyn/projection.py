@@ -12,7 +12,9 @@ from jaxdyn._anywhere import anywhere, mended
 from jaxdyn._dispatch import LEAST_BATCH
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
-from jaxdyn._small import cholesky, solve_factored, solve_lower
+from jaxdyn._one_kernel import MOST_AT_ONCE, Kernel, kernel_of
+from jaxdyn._scalar_program import is_written_out
+from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
 from jaxdyn._tracing import is_staged, split, traced_once
 from jaxdyn.closed_projection import Closing, ClosingInKernels, Kernels, kernels
 from jaxdyn.constrained import (
@@ -32,6 +34,7 @@ from jaxdyn.so3 import _product
 from jaxdyn.systems import displace, retract
 
 _MOST_STEPS = 4
+_STEPS_WRITTEN, _MOST_ROUNDS = 2, 3  # in a kernel
 
 
 def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
@@ -74,8 +77,13 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 
 def _by_the_batch(scene: Scene, q, v, t, errors, rank_tol):
     q = retract(scene.system, q)
-    staged = is_staged() and has_short_recursion(scene)
-    in_kernels = kernels(scene.system, scene.constraints, q, v) if staged else None
+    staged, in_kernels = is_staged() and layout(scene)[-1].end <= scene.nv, None
+    if staged:
+        whole = kernel_of(_in_numbers, scene, q, v, t, *errors, most=MOST_AT_ONCE)
+        if whole is not None:
+            return _by_kernel(scene, rank_tol, whole, q, v, t, errors)
+    if staged and has_short_recursion(scene):
+        in_kernels = kernels(scene.system, scene.constraints, q, v)
     short, long = partial(_by_recursion, scene, rank_tol, in_kernels), partial(_by_matrices, scene, rank_tol)
     return by_the_batch(scene, short, long, q, v, t, errors, on_cpu=in_kernels is not None)
 
@@ -87,7 +95,14 @@ class _Correction(NamedTuple):
     Z: Array
     C: Array
 
+    @property
+    def quality(self):
+        """Least over largest pivot of the rows."""
+        pivots = jnp.diagonal(self.C) ** 2
+        return jnp.min(pivots) / jnp.max(pivots)
+
     def step(self, residual):
+        """B r."""
         along_rows = _product(self.Z, solve_factored(self.C, residual))
         return solve_lower(self.L, along_rows, transposed=True)
 
@@ -112,8 +127,8 @@ def _by_matrices(scene: Scene, rank_tol, q, v, t, errors):
     some = every if held.size in (0, Y.shape[1]) else _correction(L, Y[:, held], rank_tol)
     apart = jnp.zeros((), q.dtype)
     if held.size:
-        q, apart = _closed(scene, q, some.step, lambda place: position_residual(scene, place, t))
-    v, slip = _descend(v, every.step, lambda v: velocity_residual(scene, q, v, t), lambda v, step: v - step)
+        q, apart, _ = _closed(scene, q, some.step, lambda place: position_residual(scene, place, t))
+    v, slip, _ = _descend(v, every.step, lambda v: velocity_residual(scene, q, v, t), lambda v, step: v - step)
     if errors:
         A = constraint_jacobian(scene, q, t)
         of_place = some.step if held.size else None
@@ -128,17 +143,71 @@ def _by_recursion(scene: Scene, rank_tol, in_kernels: Kernels | None, q, v, t, e
     tree = scene.system, scene.constraints
     with at_least(LEAST_BATCH):
         closing = Closing(*tree, q) if in_kernels is None else ClosingInKernels(*tree, q, in_kernels)
-        place, apart = _closed(scene, q, closing.step, closing.apart)
-        slip = partial(closing.slip, place)
-        speed, slipping = _descend(v, closing.step, slip, lambda v, step: v - step)
-        found = place, speed, _allowed(errors, (closing.step, slip, apart), (closing.step, slip, slipping))
+        *found, quality, _ = _loops_closed(scene, closing, q, v, errors)
+    return _mended(scene, rank_tol, tuple(found), quality, q, v, t, errors)
+
+
+def _by_kernel(scene: Scene, rank_tol, kernel: Kernel, q, v, t, errors):
+    """The same in one kernel: a round takes few steps, the next one factors the rows anew where these were not enough."""
+
+    def more(state):
+        return state[-1]
+
+    def again(state):
+        count, (place, speed, _), quality, _ = state
+        *found, pivots, more = kernel(partial(_in_numbers, scene), place, speed, t, *errors)
+        return count + 1, tuple(found), jnp.minimum(quality, pivots), more & (count + 1 < _MOST_ROUNDS)
+
+    best = jnp.asarray(jnp.inf, q.dtype)
+    _, found, quality, _ = lax.while_loop(more, again, (0, (q, v, errors), best, jnp.asarray(True)))
+    return _mended(scene, rank_tol, found, quality, q, v, t, errors)
+
+
+def _mended(scene: Scene, rank_tol, found, quality, q, v, t, errors):
     unknown, known = split(scene)
 
     def careful(unknown, q, v, t, errors):
         return _by_matrices(known(unknown), rank_tol, q, v, t, errors), ()
 
-    doubtful = ~(closing.quality > least_pivot(q, rank_tol))
+    doubtful = ~(quality > least_pivot(q, rank_tol))
     return mended(doubtful, careful, (found, ()), (unknown, q, v, t, errors))[0]
+
+
+def _in_numbers(scene: Scene, q, v, t, *errors):
+    """q, v and errors after a few steps without branches, the ratio of the rows' pivots, and whether a step more would help."""
+    if has_short_recursion(scene):
+        return _loops_closed(scene, Closing(scene.system, scene.constraints, q), q, v, errors)
+    held = holonomic_rows(layout(scene))
+    mass = mass_matrix(scene.system, q, t)
+    L, A = cholesky(mass), constraint_jacobian(scene, q, t)
+    Y = solve_lower(L, A.T)
+    every = _Correction(L, Y, cholesky(_product(Y.T, Y)))
+    some = every
+    if held.size not in (0, Y.shape[1]):
+        some = _Correction(L, Y[:, held], cholesky(_product(Y[:, held].T, Y[:, held])))
+    quality = jnp.minimum(every.quality, some.quality)
+    quality = jnp.where(definite(mass, L), quality, jnp.nan)
+    place, apart, open_ = q, jnp.zeros((), q.dtype), False
+    if held.size:
+        place, apart, open_ = _closed(scene, q, some.step, lambda place: position_residual(scene, place, t))
+    residual = partial(_slip, scene, place, t)
+    speed, slip, slips = _descend(v, every.step, residual, lambda v, step: v - step)
+    of_place = some.step if held.size else None
+    ways = (of_place, partial(_product, A[held]), apart), (every.step, partial(_product, A), slip)
+    return place, speed, _allowed(errors, *ways), quality, open_ | slips
+
+
+def _slip(scene: Scene, q, t, v):
+    return velocity_residual(scene, q, v, t)
+
+
+def _loops_closed(scene: Scene, closing: Closing | ClosingInKernels, q, v, errors):
+    """`_in_numbers` for loops of a tree, body by body."""
+    place, apart, open_ = _closed(scene, q, closing.step, closing.apart)
+    slip = partial(closing.slip, place)
+    speed, slipping, slips = _descend(v, closing.step, slip, lambda v, step: v - step)
+    errors = _allowed(errors, (closing.step, slip, apart), (closing.step, slip, slipping))
+    return place, speed, errors, closing.quality, open_ | slips
 
 
 def _allowed(errors: tuple, *ways) -> tuple:
@@ -159,7 +228,7 @@ def enlarged(error, by):
 
 
 def _closed(scene: Scene, q, step, residual):
-    """q on the holonomic constraints, and about how far it still is from them."""
+    """q on the holonomic constraints, about how far it still is from them, and whether another step would bring it closer."""
 
     def move(place, change):
         return retract(scene.system, displace(scene.system, place, -change))
@@ -170,7 +239,8 @@ def _closed(scene: Scene, q, step, residual):
 def _descend(x, step, residual, move):
     """x moved by x -> move(x, step(residual(x))) until that would change it by rounding alone, `_MOST_STEPS` times at most.
 
-    Also the largest entry of the next step, which is about how far x is still away.
+    Also the largest entry of the next step, which is about how far x is still away, and whether to take it. Written out, it is
+    `_STEPS_WRITTEN` steps.
     """
     rounding = float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.abs(x))
 
@@ -190,9 +260,14 @@ def _descend(x, step, residual, move):
         return lax.cond(anywhere(state[2]), improve, lambda state: state, state), None
 
     first = residual(x)
-    start = x, first, jnp.max(jnp.abs(first)) > 0, jnp.zeros((), x.dtype)
-    (x, _, _, away), _ = lax.scan(maybe, start, None, length=_MOST_STEPS)
-    return x, away
+    state = x, first, jnp.max(jnp.abs(first)) > 0, jnp.zeros((), x.dtype)
+    if is_written_out():
+        for _ in range(_STEPS_WRITTEN):
+            state = jax.tree.map(partial(jnp.where, state[2]), improve(state), state)
+    else:
+        state, _ = lax.scan(maybe, state, None, length=_MOST_STEPS)
+    x, _, more, away = state
+    return x, away, more
 
 
 def _in_fixed_steps(scene: Scene, q, v, t, errors, rank_tol):

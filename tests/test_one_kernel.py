@@ -12,10 +12,17 @@ from pinocchio_bridge import random_states, random_tree
 
 import jaxdyn as jd
 from jaxdyn import _one_kernel, matrix_form, projection, recursive, scenes
-from jaxdyn._one_kernel import kernel_of, scalar_program
+from jaxdyn._one_kernel import kernel_of
+from jaxdyn._scalar_program import scalar_program
 from jaxdyn.constrained import constrained_dynamics, solve_rows
 from jaxdyn.constraints.base import rows
 from jaxdyn.joints import KINDS
+
+
+@pytest.fixture(autouse=True)
+def everywhere(monkeypatch):
+    """Kernels in calls outside of loops too, so that these need no loop around them."""
+    monkeypatch.setattr(_one_kernel, "AT_ONE_CALL", 0)
 
 
 def mixed(factors, x, n, flag):
@@ -185,7 +192,7 @@ def test_forward_dynamics_compiles_to_one_kernel_on_cpu_and_to_matrices_elsewher
     other = forward.trace(*args).lower(lowering_platforms=("cuda",)).as_text()
     assert "stablehlo.dot_general" in other
     # One computation holds the recursion, whole: cut in pieces it would compute values again.
-    operations = len(scalar_program(lambda *args: recursive.aba(model, *args), *args)[0].eqns)
+    operations = len(scalar_program(lambda *args: recursive.aba(model, *args), *args, most=_one_kernel.MOST)[0].eqns)
     assert operations < _one_kernel.MOST_AT_ONCE
 
 
@@ -211,12 +218,12 @@ def test_loops_in_kernels(samples):
     lowered = jax.jit(jax.vmap(project)).lower(*state)
     assert "stablehlo.reduce" in lowered.as_text()
     place, speed, errors = lowered.compile()(*state)
-    for found, wanted in zip(
-        jax.tree.leaves((place, speed, errors)),
-        jax.tree.leaves(jax.vmap(partial(projection._by_matrices, scene, None))(*state)),
-        strict=True,
-    ):
-        np.testing.assert_allclose(found, wanted, atol=1e-10, rtol=0)
+    wanted = jax.vmap(partial(projection._by_matrices, scene, None))(*state)
+    for found, by_matrices in zip((place, speed), wanted, strict=False):
+        np.testing.assert_allclose(found, by_matrices, atol=1e-10, rtol=0)
+    for found, by_matrices in zip(errors, wanted[2], strict=True):
+        # The last round takes the rows where it starts: another one, by the size of the change, of an error of its size.
+        np.testing.assert_allclose(found, by_matrices, atol=20e-6, rtol=0)
 
     found = jax.jit(jax.vmap(lambda q, v: constrained_dynamics(scene, q, v)))(place, speed)
     wanted = jax.vmap(lambda q, v: solve_rows(scene, q, v, 0 * v, 0.0, rows(scene, q, v, 0.0)))(place, speed)
@@ -257,3 +264,139 @@ def test_singular_samples_of_a_small_batch_are_solved_by_matrices():
         wanted = solve_rows(scene, place, 0 * v, 0 * v, 0.0, rows(scene, place, 0 * v, 0.0))
         np.testing.assert_allclose(found.acceleration[i], wanted.acceleration, atol=1e-10, rtol=0)
         assert int(found.rank[i]) == int(wanted.rank)
+
+
+@pytest.mark.parametrize(
+    "place, once",
+    [
+        (lambda kernel, x: kernel(x), True),
+        (lambda kernel, x: lax.cond(x[0] > 0, lambda x: kernel(x)["same"], lambda x: x, x), False),
+        (lambda kernel, x: lax.scan(lambda y, _: (y + kernel(y)["same"], None), x, length=3)[0], False),
+        (lambda kernel, x: lax.fori_loop(0, 3, lambda _, y: y + kernel(y)["same"], x), False),
+        (lambda kernel, x: jax.jit(kernel)(x), False),
+        (lambda kernel, x: lax.while_loop(lambda y: y[0] < 0, lambda y: jnp.abs(kernel(y)["same"]), x), False),
+    ],
+    ids=["call", "branch", "scan", "for", "function", "while"],
+)
+def test_one_call_takes_the_other_way(monkeypatch, place, once):
+    """A kernel costs something at each call of the program, which pays in a loop alone, or in a large batch."""
+    monkeypatch.undo()
+    x, n, flag = mixed_args()
+    kernel = kernel_of(mixed, FACTORS, x, n, flag)
+    assert kernel is not None
+    taken = []
+
+    def otherwise(*args):
+        taken.append(args)
+        return mixed(FACTORS, *args)
+
+    here = partial(place, lambda x: kernel(otherwise, x, n, flag))
+    jax.jit(here).lower(x)
+    assert bool(taken) is once
+    if once:
+        taken.clear()
+        jax.jit(jax.vmap(here)).lower(jnp.zeros((_one_kernel.AT_ONE_CALL, 3)))
+        assert not taken
+
+
+PLACES = np.array([2, 0, 2])
+
+
+def many_operations(tree, x, y):
+    """What derivatives and indexing are made of."""
+    table = jnp.outer(x, y)
+    picked = table[PLACES] @ tree
+    moved = table.at[PLACES, 1].add(x).at[0].set(y)
+    slid = lax.dynamic_update_slice(jnp.pad(x, (1, 2), constant_values=0.5), y[:2], (3,))
+    parts = jnp.split(slid, 3)
+    batched = jnp.einsum("ij,ikj->ik", table, jnp.stack([table, table.T, moved]))
+    hessian = jax.hessian(lambda z: jnp.sum(jnp.sin(z) * z[::-1] ** 3) + z[0] / z[1])(x)
+    chosen = jnp.where(np.array([True, False, True]), x, y)
+    known = lax.cond(np.asarray(True), jnp.cos, jnp.sin, x)
+    return picked, moved, slid, parts[1], batched, hessian, chosen, known, jnp.all(table > 0), jnp.max(table, 1)
+
+
+def test_operations_in_single_numbers():
+    tree = np.array([[1.0, 0.0], [0.0, 0.0], [0.5, -1.0]])
+    args = jnp.array([0.3, -1.2, 2.5]), jnp.array([0.7, 0.1, -0.4])
+    kernel = of_arrays(many_operations, tree, *args)
+    assert_same(jax.jit(kernel)(*args), many_operations(tree, *args))
+
+
+def count(function, *args):
+    return len(scalar_program(function, *args, most=1000)[0].eqns)
+
+
+def test_zeros_ones_and_repetitions_are_not_written_down():
+    x = jnp.array([0.3, -1.2, 2.5])
+    eye = np.eye(3)
+    assert count(lambda x: eye @ x + 0.0, x) == 0
+    assert count(lambda x: jnp.stack([jnp.sin(x[0]), jnp.sin(x[0]) * jnp.sin(x[0])]), x) == 2
+    assert count(lambda x: (jnp.cos(x), x[0])[1], x) == 0
+    assert count(lambda x: jax.hessian(lambda z: z[0] * z[1])(x), x) == 0
+
+
+NAMES = ("andrews", "car_axis", "rolling_disk", "chaplygin_sleigh", "rolling_coin", "pendulum_in_plane", "suslov")
+
+
+def at_start(name):
+    made = getattr(scenes, name)
+    q, v = (jnp.asarray(x, float) for x in made.start())
+    return made(), q, v
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_systems_of_equations_in_kernels(name):
+    """Accelerations and multipliers in a program against the rank-aware solve without one, off the constraints too."""
+    scene, q, v = at_start(name)
+    tau, t = 0.3 * jnp.cos(jnp.arange(float(scene.nv))), jnp.asarray(0.2)
+    q = q + 1e-3 * jnp.sin(jnp.arange(float(scene.nq)) + 1)
+    q = jd.systems.retract(scene.system, q)
+
+    def dynamics(tau):
+        return constrained_dynamics(scene, q, v, tau, t)
+
+    lowered = jax.jit(dynamics).lower(tau)
+    assert "stablehlo.reduce" in lowered.as_text()
+    found, wanted = lowered.compile()(tau), solve_rows(scene, q, v, tau, t, rows(scene, q, v, t))
+    for x, y in ((found.acceleration, wanted.acceleration), (found.multipliers, wanted.multipliers)):
+        np.testing.assert_allclose(x, y, atol=1e-10 * (1 + float(jnp.abs(y).max())), rtol=0)
+    along = jnp.sin(jnp.arange(float(scene.nv)) + 0.5)
+    slope = jax.jit(lambda tau: jax.jvp(lambda tau: dynamics(tau).acceleration, (tau,), (along,))[1])(tau)
+    back = jax.jit(jax.jacrev(lambda tau: dynamics(tau).acceleration))(tau) @ along
+    change = [solve_rows(scene, q, v, tau + side * along, t, rows(scene, q, v, t)).acceleration for side in (1, -1)]
+    for x in (slope, back):
+        np.testing.assert_allclose(x, (change[0] - change[1]) / 2, atol=1e-10 * (1 + float(jnp.abs(x).max())), rtol=0)
+
+
+@pytest.mark.parametrize("name", NAMES[:5])
+@pytest.mark.parametrize("off", [1e-3, 1e-6, 0.0])
+def test_projection_in_one_kernel(name, off):
+    """On the constraints to rounding, and as close to the start of the projection as by matrices."""
+    scene, q, v = at_start(name)
+    t = jnp.asarray(0.0)
+    q, v = (x + off * jnp.cos(jnp.arange(float(x.size)) + k) for k, x in enumerate((q, v)))
+    error = off * jnp.sin(jnp.arange(float(scene.nv)))
+    state = q, v, t, (error, 2 * error)
+    lowered = jax.jit(partial(projection.project_step, scene)).lower(*state)
+    assert "stablehlo.reduce" in lowered.as_text()
+    place, speed, errors = lowered.compile()(*state)
+    wanted = projection._by_matrices(scene, None, jd.systems.retract(scene.system, q), v, t, (error, 2 * error))
+    assert float(jnp.max(jnp.abs(projection.velocity_residual(scene, place, speed, t)))) < 1e-11
+    if projection.holonomic_rows(projection.layout(scene)).size:
+        assert float(jnp.max(jnp.abs(projection.position_residual(scene, place, t)))) < 1e-14
+    # A round factors the rows anew where it starts, so the least change is one in another metric by the size of the change.
+    size = 20 * off**2 * float(1 + jnp.abs(v).max())
+    for x, y in zip(jax.tree.leaves((place, speed, errors)), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-13 * float(1 + jnp.abs(y).max()) + size, rtol=0)
+
+
+def test_dependent_rows_of_equations_are_left_to_the_careful_way():
+    """A row that is given twice: the kernel's pivots say so, and the multipliers are those of least norm."""
+    scene, q, v = at_start("rolling_disk")
+    twice = jd.Scene(scene.system, (*scene.constraints, *scene.constraints[:1]))
+    found = jax.jit(lambda q, v: constrained_dynamics(twice, q, v))(q, v)
+    wanted = solve_rows(twice, q, v, 0 * v, 0.0, rows(twice, q, v, 0.0))
+    assert int(found.rank) == 2
+    np.testing.assert_allclose(found.acceleration, wanted.acceleration, atol=1e-10)
+    np.testing.assert_allclose(found.multipliers, wanted.multipliers, atol=1e-10)
