@@ -22,7 +22,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn import closed_recursion
 from jaxdyn._anywhere import anywhere, flattened, mended
-from jaxdyn._dispatch import MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
+from jaxdyn._dispatch import LEAST_BATCH, MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
+from jaxdyn._materialize import at_least
 from jaxdyn._one_kernel import kernel_of
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
@@ -142,13 +143,13 @@ def constrained_dynamics(
         return constrained_dynamics(bare, q, v, applied(scene, q, v, tau, t), t, rank_tol=rank_tol)
     if kernel is None:
         return by_the_batch(scene, short, dense, *state)
-    found = kernel(partial(_in_numbers, scene), *still(state))
+    found = kernel(partial(_elsewhere, scene), *still(state))
     same = _derivatives_of_recursion if has_short_recursion(scene) else None
     return _mended(scene, found, *state, rank_tol, same)
 
 
 def _kernel(scene: Scene, q, v, tau, t):
-    """Accelerations, multipliers and the quality of the rows in one kernel, if there is one and it is not for one call."""
+    """Accelerations, multipliers and the quality of the rows in one kernel, if there is one."""
     if not is_staged() or layout(scene)[-1].end > scene.nv:
         return None
     return kernel_of(_in_numbers, scene, q, v, tau, t)
@@ -156,16 +157,35 @@ def _kernel(scene: Scene, q, v, tau, t):
 
 def _in_numbers(scene: Scene, q, v, tau, t):
     """(a, lam, least over largest pivot of A M^-1 A^T) without branches; NaN where M is not positive definite."""
+    if not has_short_recursion(scene):
+        return _by_pivots(scene, q, v, tau, t)
     force = applied(scene, q, v, tau, t)
-    if has_short_recursion(scene):
-        return closed_recursion.closed_dynamics(scene.system, scene.constraints, q, v, force)
+    return closed_recursion.closed_dynamics(scene.system, scene.constraints, q, v, force)
+
+
+def _elsewhere(scene: Scene, q, v, tau, t):
+    """The same where it is not written out in numbers: see `_dispatch`."""
+
+    def recursion(*state):
+        with at_least(LEAST_BATCH):
+            return traced_once(_in_numbers, scene, *state)
+
+    return by_the_batch(scene, recursion, partial(_by_pivots, scene), q, v, tau, t)
+
+
+def _by_pivots(scene: Scene, q, v, tau, t):
     row = rows(scene, q, v, t)
-    mass, factor, Y, free = _weighted(scene, q, v, force, t, row)
+    mass, factor, Y, free = _weighted(scene, q, v, applied(scene, q, v, tau, t), t, row)
     normal = cholesky(_product(Y.T, Y))
     lam = _refined(normal, Y, row.gamma - _product(Y.T, free))
     a = solve_lower(factor, free + _product(Y, lam), transposed=True)
-    pivots = jnp.diagonal(normal) ** 2
-    return a, lam, jnp.where(definite(mass, factor), jnp.min(pivots) / jnp.max(pivots), jnp.nan)
+    return a, lam, jnp.where(definite(mass, factor), quality_of(normal), jnp.nan)
+
+
+def quality_of(factor):
+    """Least over largest pivot, from a Cholesky factor."""
+    pivots = jnp.diagonal(factor) ** 2
+    return jnp.min(pivots) / jnp.max(pivots)
 
 
 def _by_matrices(scene: Scene, q, v, tau, t, method: str, rank_tol) -> ConstrainedDynamics:

@@ -149,6 +149,11 @@ class Projected(Multipliers):
             error = error | {"q": velocity_to_rate(scene.system, q, errors[0]), "v": errors[1]}
         return y | {"q": q, "v": v}, error
 
+    def corrected(self, scene, y, t):
+        """q and v on the constraints."""
+        q, v = project_state(scene, y["q"], y["v"], t, self.rank_tol)
+        return y | {"q": q, "v": v}
+
 
 class Baumgarte(Multipliers):
     """Accelerations that pull violated rows back, for comparison: the pull is an error where it is not zero.

@@ -25,6 +25,7 @@ from jaxdyn.constrained import (
     least_pivot,
     normal_factor,
     pseudo_inverse,
+    quality_of,
     tolerance,
 )
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
@@ -45,20 +46,20 @@ def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
     Those that are differentiated are a fixed number, so that derivatives converge as far. A projection that does not
     reduce the residual is not applied.
     """
-    return project_step(scene, q, v, t, (), rank_tol)[:2]
+    return project_step(scene, q, v, t, (), rank_tol, once=True)[:2]
 
 
-def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | None = None):
+def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | None = None, *, once: bool = False):
     """`project_state` for the end of a step with estimated errors of q, and of v, each (nv,): (q, v, errors).
 
     Errors come back without their parts normal to the constraints: as far as small ones go, those are what is removed from
     q and v. Near a singular position they are large, and shorter steps make them no smaller. What the projection leaves open
-    is added.
+    is added. What is done `once`, and not in every step, is not worth a kernel (see `_one_kernel`).
     """
 
     def project(scene, q, v, t, *errors):
         def whole(scene, *state):
-            return traced_once(_by_the_batch, scene, *state, static=(rank_tol,))
+            return traced_once(_by_the_batch, scene, *state, static=(rank_tol, once))
 
         return in_one_batch(whole, scene, q, v, t, errors)
 
@@ -75,9 +76,9 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
     return implicit(Scene(scene.system, scene.constraints), (q, v, t, *errors), project, tangent)
 
 
-def _by_the_batch(scene: Scene, q, v, t, errors, rank_tol):
+def _by_the_batch(scene: Scene, q, v, t, errors, rank_tol, once: bool):
     q = retract(scene.system, q)
-    staged, in_kernels = is_staged() and layout(scene)[-1].end <= scene.nv, None
+    staged, in_kernels = is_staged() and not once and layout(scene)[-1].end <= scene.nv, None
     if staged:
         whole = kernel_of(_in_numbers, scene, q, v, t, *errors, most=MOST_AT_ONCE)
         if whole is not None:
@@ -98,8 +99,7 @@ class _Correction(NamedTuple):
     @property
     def quality(self):
         """Least over largest pivot of the rows."""
-        pivots = jnp.diagonal(self.C) ** 2
-        return jnp.min(pivots) / jnp.max(pivots)
+        return quality_of(self.C)
 
     def step(self, residual):
         """B r."""
@@ -155,7 +155,7 @@ def _by_kernel(scene: Scene, rank_tol, kernel: Kernel, q, v, t, errors):
 
     def again(state):
         count, (place, speed, _), quality, _ = state
-        *found, pivots, more = kernel(partial(_in_numbers, scene), place, speed, t, *errors)
+        *found, pivots, more = kernel(partial(_elsewhere, scene), place, speed, t, *errors)
         return count + 1, tuple(found), jnp.minimum(quality, pivots), more & (count + 1 < _MOST_ROUNDS)
 
     best = jnp.asarray(jnp.inf, q.dtype)
@@ -177,6 +177,20 @@ def _in_numbers(scene: Scene, q, v, t, *errors):
     """q, v and errors after a few steps without branches, the ratio of the rows' pivots, and whether a step more would help."""
     if has_short_recursion(scene):
         return _loops_closed(scene, Closing(scene.system, scene.constraints, q), q, v, errors)
+    return _by_pivots(scene, q, v, t, *errors)
+
+
+def _elsewhere(scene: Scene, q, v, t, *errors):
+    """The same where it is not written out in numbers: see `_dispatch`."""
+
+    def recursion(*state):
+        with at_least(LEAST_BATCH):
+            return traced_once(_in_numbers, scene, *state)
+
+    return by_the_batch(scene, recursion, partial(_by_pivots, scene), q, v, t, *errors)
+
+
+def _by_pivots(scene: Scene, q, v, t, *errors):
     held = holonomic_rows(layout(scene))
     mass = mass_matrix(scene.system, q, t)
     L, A = cholesky(mass), constraint_jacobian(scene, q, t)
