@@ -10,8 +10,9 @@ or a result; folding makes a result of arguments, and keeps a result. A floating
 result is NaN. LLVM sees that the last fold alone counts and drops the others. An axis of length one would not do: XLA
 takes folding with the initial value for the identity.
 
-For each operation of the fold the runtime sets up a buffer, which is never used, when a program is called: 0.1 us, however often
-the kernel then runs. In a loop that is nothing. Outside of one a kernel is what it stands for, unless the batch is large.
+For each operation of the fold the runtime sets up a buffer, which nothing uses, whenever the program that holds it is called,
+however often the kernel then runs. In a loop that is soon made up for. One call of one sample takes longer for it than by other
+ways, so outside of a loop a kernel is what it stands for, unless the batch is large.
 
 The primitive batches. It has no derivative: put it under one that is given. On other platforms than CPU it is the function
 that the caller gives for them.
@@ -37,9 +38,7 @@ from jaxdyn._tracing import Known, split
 
 MOST_AT_ONCE = 4400  # operations in one block; from about 4500 on XLA cuts it in pieces that compute values again
 MOST = 9000  # operations in all; longer ones compile for minutes
-AT_ONE_CALL = (
-    4096  # samples from which on a kernel that is not in a loop pays for what its operations cost at each call
-)
+AT_ONE_CALL = 4096  # samples from which on a kernel pays that is not in a loop
 
 _NOTHING, _ARGUMENTS, _RESULT = (np.int8(i) for i in range(3))
 

@@ -17,7 +17,6 @@ import jax.core
 import jax.numpy as jnp
 import lineax as lx
 from jax import lax
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
 from jaxdyn import closed_recursion
@@ -25,6 +24,7 @@ from jaxdyn._anywhere import anywhere, flattened, mended
 from jaxdyn._dispatch import LEAST_BATCH, MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
 from jaxdyn._materialize import at_least
 from jaxdyn._one_kernel import kernel_of
+from jaxdyn._rank import checked_tolerance, eps_of, least_pivot, normal_factor, pseudo_inverse, quality_of, tolerance
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
 from jaxdyn._tracing import is_staged, split, still, traced_once
@@ -182,12 +182,6 @@ def _by_pivots(scene: Scene, q, v, tau, t):
     return a, lam, jnp.where(definite(mass, factor), quality_of(normal), jnp.nan)
 
 
-def quality_of(factor):
-    """Least over largest pivot, from a Cholesky factor."""
-    pivots = jnp.diagonal(factor) ** 2
-    return jnp.min(pivots) / jnp.max(pivots)
-
-
 def _by_matrices(scene: Scene, q, v, tau, t, method: str, rank_tol) -> ConstrainedDynamics:
     return solve_rows(scene, q, v, applied(scene, q, v, tau, t), t, rows(scene, q, v, t), method, rank_tol)
 
@@ -223,7 +217,7 @@ def in_one_batch(function: Callable, scene: Scene, *args):
 def _judged(scene: Scene, q, quality):
     """Rank and code of rows that were taken for independent, from the ratio of their pivots."""
     rank = jnp.asarray(layout(scene)[-1].end, jnp.int32)
-    result = RESULTS.where(quality > 10 * scene.nv * _eps(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
 
 
@@ -250,11 +244,6 @@ def _mended(scene: Scene, found, q, v, tau, t, rank_tol, same: Callable | None) 
 def _derivatives_of_recursion(scene: Scene, found, q, v, tau, t):
     force = applied(scene, q, v, tau, t)
     return with_derivatives(scene.system, scene.constraints, q, v, force, *found)
-
-
-def least_pivot(like, rank_tol: float | None) -> float:
-    """Ratio of the pivots of A M^-1 A^T above which the rows are independent whatever the rounding, and Cholesky serves."""
-    return max(_eps(like) ** 0.4, (100 * tolerance(rank_tol, like)) ** 2)
 
 
 def applied(scene: Scene, q, v, tau, t) -> Array:
@@ -289,7 +278,7 @@ def solve_rows(
         # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
         missed = jnp.abs(wanted - _product(Y.T, pushed))
         sizes = jnp.abs(row.gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
-        met = jnp.all(missed <= _eps(Y) ** 0.5 * (sizes + jnp.max(sizes)))
+        met = jnp.all(missed <= eps_of(Y) ** 0.5 * (sizes + jnp.max(sizes)))
         result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
     a = solve_lower(factor, free + pushed, transposed=True)
     result = RESULTS.where(definite(mass, factor), result, RESULTS.singular_mass_matrix)
@@ -335,13 +324,6 @@ def _shortest(Y, wanted, rank_tol):
     return lax.cond(anywhere(~independent), careful, by_normal_equations, Y, wanted)
 
 
-def normal_factor(Y, rank_tol):
-    """Cholesky factor of Y^T Y, and whether the columns of Y are so independent that it may stand for the pseudo-inverse."""
-    factor = cholesky(_product(Y.T, Y))
-    pivots = jnp.diagonal(factor) ** 2
-    return factor, jnp.min(pivots) > least_pivot(Y, rank_tol) * jnp.max(pivots)
-
-
 def _by_range_space(scene, q, v, force, row: Rows) -> ConstrainedDynamics:
     """The Schur complement from a0 and X = M^-1 A^T of one articulated-body factorisation: a = a0 + X lam."""
     free, X = aba_with_columns(scene.system, q, v, force, row.A.T)
@@ -356,7 +338,7 @@ def _by_delassus(delassus, wanted, nv: int):
     factor = cholesky(0.5 * (delassus + delassus.T))
     pivots = jnp.diagonal(factor)
     # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
-    fine = jnp.min(pivots) > (10 * nv * _eps(delassus)) ** 0.5 * jnp.max(pivots)
+    fine = jnp.min(pivots) > (10 * nv * eps_of(delassus)) ** 0.5 * jnp.max(pivots)
     return solve_factored(factor, wanted), RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
 
 
@@ -438,83 +420,3 @@ def _metric(scene, q, t, rank_tol):
     factor = cholesky(mass_matrix(scene.system, q, t))
     Y = solve_lower(factor, constraint_jacobian(scene, q, t).T)
     return factor, Y, pseudo_inverse(Y, tolerance(rank_tol, Y))
-
-
-def checked_tolerance(rank_tol: float | None) -> float | None:
-    """The rank tolerance as a float, or None for the default. **Raises:** ValueError outside (0, 1)."""
-    if rank_tol is None:
-        return None
-    if isinstance(rank_tol, jax.core.Tracer) or not 0 < float(rank_tol) < 1:
-        raise ValueError(f"rank_tol is {rank_tol}; give a number between 0 and 1 that is not traced, or None")
-    return float(rank_tol)
-
-
-def tolerance(rank_tol: float | None, like: Array) -> float:
-    """The rank tolerance as given, or the default for the dtype."""
-    return _eps(like) ** (4 / 7) if rank_tol is None else float(rank_tol)
-
-
-def _eps(like) -> float:
-    return float(jnp.finfo(like.dtype).eps)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
-def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = False) -> Float[Array, "m n"]:
-    """Moore-Penrose inverse of Y, singular values below `rank_tol` times the largest taken for zero.
-
-    Values: (Y^T Y)^-1 Y^T where that is as good; else on CPU a complete orthogonal decomposition (pivoted QR, then QR
-    of the triangle's transpose), elsewhere an SVD, of all samples if one in a batch needs it; at once where the columns are
-    known to be `dependent`. Derivative: the formula of Golub & Pereyra (1973), eq. 4.12, right wherever the rank is
-    constant; no factorisation is differentiated.
-    """
-    if dependent or Y.shape[1] > Y.shape[0]:
-        return _by_factors(Y, rank_tol)
-    factor, independent = normal_factor(Y, rank_tol)
-    return lax.cond(anywhere(~independent), lambda: _by_factors(Y, rank_tol), lambda: _by_normal_equations(Y, factor))
-
-
-def _by_normal_equations(Y, factor):
-    inverse = solve_factored(factor, Y.T)
-    # One step of Newton and Schulz takes the squared condition number out of the error.
-    return 2 * inverse - _product(_product(inverse, Y), inverse)
-
-
-def _by_factors(Y, rank_tol):
-    return lax.platform_dependent(
-        Y, cpu=partial(_by_orthogonal, rank_tol=rank_tol), default=partial(_by_svd, rank_tol=rank_tol)
-    )
-
-
-def _by_orthogonal(Y, rank_tol):
-    # The triangles are taken as products with Q and Z, and not from the factorisations, so that these run one after the
-    # other: two large LAPACK calls at once can wait for each other's share of XLA's thread pool for ever.
-    Q, _, order = lax.linalg.qr(Y, pivoting=True, full_matrices=False)
-    R = jnp.triu(_product(Q.T, Y[:, order]))
-    pivots = jnp.abs(jnp.diagonal(R))
-    keep = pivots > rank_tol * pivots[0]
-    # Y[:, order] = Q R with the rows of R below the rank dropped; R^T = Z T makes what is left square and triangular.
-    left = jnp.where(keep[:, None], R, jnp.zeros_like(R)).T
-    Z, _ = lax.linalg.qr(left, full_matrices=False)
-    T = jnp.triu(_product(Z.T, left))
-    T = T + jnp.diag(jnp.where(keep, jnp.zeros_like(pivots), jnp.ones_like(pivots)))
-    kept = jnp.where(keep[:, None], Q.T, jnp.zeros_like(Q.T))
-    inverse = _product(Z, solve_triangular(T, kept, trans=1))
-    return jnp.zeros_like(inverse).at[order].set(inverse)
-
-
-def _by_svd(Y, rank_tol):
-    U, s, Vt = jnp.linalg.svd(Y, full_matrices=False)
-    keep = s > rank_tol * s[0]
-    inverse = jnp.where(keep, 1.0 / jnp.where(keep, s, jnp.ones_like(s)), jnp.zeros_like(s))
-    return _product(Vt.T * inverse[None], U.T)
-
-
-@pseudo_inverse.defjvp
-def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
-    (Y,), (dY,) = primals, tangents
-    P = pseudo_inverse(Y, rank_tol, dependent)
-    across = dY.T - _product(_product(dY.T, Y), P)  # dY^T (1 - Y P)
-    along = dY.T - _product(P, _product(Y, dY.T))  # (1 - P Y) dY^T
-    dP = -_product(_product(P, dY), P)
-    dP = dP + _product(_product(P, P.T), across) + _product(along, _product(P.T, P))
-    return P, dP

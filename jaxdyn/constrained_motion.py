@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn import variational
+from jaxdyn._rank import checked_tolerance
 from jaxdyn._tracing import still, traced_once
 from jaxdyn.assembly import open_constraints, residuals, start_evidence
-from jaxdyn.constrained import checked_tolerance, constrained_dynamics, in_one_batch, solve_rows
+from jaxdyn.constrained import constrained_dynamics, in_one_batch, solve_rows
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
 from jaxdyn.dynamics import forward_dynamics
 from jaxdyn.projection import project_state, project_step

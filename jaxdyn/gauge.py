@@ -22,8 +22,9 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from jaxdyn._rank import pseudo_inverse, tolerance
 from jaxdyn._tracing import compiled
-from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
+from jaxdyn.constrained import RESULTS, applied
 from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.dynamics import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.reduced import freedoms, orthonormal, split_directions

@@ -13,6 +13,7 @@ from jaxdyn._dispatch import LEAST_BATCH
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn._one_kernel import MOST_AT_ONCE, Kernel, kernel_of
+from jaxdyn._rank import least_pivot, normal_factor, pseudo_inverse, quality_of, tolerance
 from jaxdyn._scalar_program import is_written_out
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
 from jaxdyn._tracing import is_staged, split, traced_once
@@ -22,11 +23,6 @@ from jaxdyn.constrained import (
     correction,
     has_short_recursion,
     in_one_batch,
-    least_pivot,
-    normal_factor,
-    pseudo_inverse,
-    quality_of,
-    tolerance,
 )
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics import mass_matrix

@@ -19,9 +19,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxdyn._rank import pseudo_inverse, tolerance
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
 from jaxdyn._tracing import compiled, is_concrete, is_known
-from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
+from jaxdyn.constrained import RESULTS, applied
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.dynamics import inverse_dynamics, mass_matrix
 from jaxdyn.scene import Scene, as_pytree

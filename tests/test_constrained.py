@@ -9,6 +9,7 @@ from jax.extend.core import jaxprs_in_params
 from pinocchio_bridge import assert_close, quick, random_tree, to_pinocchio
 
 from jaxdyn import scenes
+from jaxdyn._rank import pseudo_inverse
 from jaxdyn.assembly import assemble, residuals
 from jaxdyn.constrained import (
     RESULTS,
@@ -16,7 +17,6 @@ from jaxdyn.constrained import (
     constraint_forces,
     constraint_wrenches,
     projections,
-    pseudo_inverse,
     second_fundamental_form,
 )
 from jaxdyn.constraints import Holonomic, Pfaffian, lock_joint, loop, rolling_wheel

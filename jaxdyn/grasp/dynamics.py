@@ -16,8 +16,9 @@ import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
+from jaxdyn._rank import pseudo_inverse, tolerance
 from jaxdyn._tracing import compiled
-from jaxdyn.constrained import RESULTS, applied, pseudo_inverse, tolerance
+from jaxdyn.constrained import RESULTS, applied
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.dynamics import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.constrained import pseudo_inverse, tolerance
+from jaxdyn._rank import pseudo_inverse, tolerance
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.grasp.joining import joined
