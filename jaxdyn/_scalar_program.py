@@ -2,7 +2,7 @@
 
 Its jaxpr is evaluated on arrays of numbers, known or traced. Sums and products with known zeros and ones are not written
 down, and what has been written once is used again: derivatives of a Lagrangian repeat themselves, and most entries of their
-one-hot tangents are zero.
+one-hot tangents are zero. A known zero makes zero of what it is multiplied with, also of what is no number.
 
 While a function is traced for this, `is_written_out()` holds. Code that chooses between ways to compute then takes one without
 branches, loops and LAPACK, which are not single numbers.
@@ -161,6 +161,8 @@ class _Writer:
             return np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
 
         for eqn in jaxpr.eqns:
+            if eqn.effects:  # which are to happen when the program runs, as often as it does
+                raise TooMuch(eqn.primitive.name)
             found = self._one(eqn.primitive, eqn.params, [read(x) for x in eqn.invars], [x.aval for x in eqn.outvars])
             values.update(zip(eqn.outvars, found, strict=True))
         return [read(x) for x in jaxpr.outvars]

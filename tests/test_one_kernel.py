@@ -391,6 +391,29 @@ def test_projection_in_one_kernel(name, off):
         np.testing.assert_allclose(x, y, atol=1e-13 * float(1 + jnp.abs(y).max()) + size, rtol=0)
 
 
+def spoken(system, q, v, t):
+    jax.debug.callback(lambda v: heard.append(float(v[0])), v)
+    jax.debug.callback(lambda: heard.append("again"))
+    return 0.1 * v
+
+
+heard: list = []
+
+
+def test_forces_with_effects_have_them_in_every_call():
+    """A force that prints is no part of a kernel, and is not heard while it is traced."""
+    scene, q, v = at_start("rolling_disk")
+    loud = jd.Scene(scene.system, scene.constraints, (spoken,))
+    run = jax.jit(lambda q, v: constrained_dynamics(loud, q, v))
+    lowered = run.lower(q, v)
+    assert not heard and "stablehlo.reduce" in lowered.as_text()  # the rest runs in one
+    for speed in (1.0, 2.0):
+        found = run(q, v.at[0].set(speed))
+    jax.effects_barrier()
+    assert sorted(map(str, heard)) == ["1.0", "2.0", "again", "again"]
+    assert bool(jnp.isfinite(found.acceleration).all())
+
+
 def test_dependent_rows_of_equations_are_left_to_the_careful_way():
     """A row that is given twice: the kernel's pivots say so, and the multipliers are those of least norm."""
     scene, q, v = at_start("rolling_disk")
