@@ -15,7 +15,7 @@ from jaxdyn.solvers.wrapped import Wrapped
 _EXPECTED = 10  # times the normal part of the estimated error a projection may move a step
 
 
-class _Interpolation(diffrax.AbstractLocalInterpolation):
+class Bent(diffrax.AbstractLocalInterpolation):
     """Dense output of the wrapped method, bent so that the step ends where the projection put it.
 
     The bend is as small as the local error, so the order of the dense output is kept and it stays continuous from one
@@ -71,7 +71,7 @@ class ProjectedSolver(Wrapped):
     @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         """Dense output of the wrapped method, ending at the projected point."""
-        return functools.partial(_Interpolation, self.solver.interpolation_cls)
+        return functools.partial(Bent, self.solver.interpolation_cls)
 
     def ended(self, t, y, error, args):
         """A step's result y projected, what that adds to it (zero in entries that are `jumping`), its error, and a result."""
