@@ -77,7 +77,7 @@ def is_large_batch(*trees, on_cpu: bool = False):
     """Whether the batch over which the trees vary has at least `LEAST_BATCH` samples: a bool, or a traced one that is known
     when the program is compiled. With `on_cpu`, also whether that is for CPU."""
     traced = [x for x in jax.tree.leaves(trees) if isinstance(x, jax.core.Tracer)]
-    if not traced:
+    if not traced or is_written_out():
         return False
     large = _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1, on_cpu=on_cpu)
     if is_one_sample() and isinstance(large, jax.core.Tracer):

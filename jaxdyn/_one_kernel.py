@@ -59,27 +59,28 @@ class Kernel(NamedTuple):
         return jax.tree.unflatten(self.structure, found)
 
 
-def kernel_of(function: Callable, tree, *args, most: int | None = None) -> Kernel | None:
+def kernel_of(function: Callable, tree, *args, most: int | None = None, for_batches: bool = False) -> Kernel | None:
     """function(tree, *args) for arrays of the shapes of `args`, one sample, as a kernel of at most `most` operations (`MOST`).
 
     None if the tree holds numbers that are traced, if the function computes with more than single numbers, such as a
-    factorisation by LAPACK, or if it is too long. It is traced once for a tree and shapes.
+    factorisation by LAPACK, or if it is too long. It is traced once for a tree and shapes. With `for_batches` it is made for many
+    samples: see `scalar_program`.
     """
     traced, known = split(tree)
     if traced or len(jax.tree.leaves(args)) != len(args):
         return None
-    return _kernel(
-        function, known, tuple((np.shape(x), np.dtype(x.dtype)) for x in args), MOST if most is None else most
-    )
+    shapes = tuple((np.shape(x), np.dtype(x.dtype)) for x in args)
+    return _kernel(function, known, shapes, MOST if most is None else most, for_batches)
 
 
 @functools.lru_cache(maxsize=256)  # kernels hold their trees
-def _kernel(function: Callable, known: Known, shapes, most: int) -> Kernel | None:
+def _kernel(function: Callable, known: Known, shapes, most: int, for_batches: bool) -> Kernel | None:
     args = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
     try:
-        return Kernel(*scalar_program(lambda *args: function(known(()), *args), *args, most=most))
+        program = scalar_program(lambda *args: function(known(()), *args), *args, most=most, for_batches=for_batches)
     except TooMuch:
         return None
+    return Kernel(*program)
 
 
 # --- the fold --------------------------------------------------------------------------------------

@@ -22,6 +22,8 @@ from jax import lax
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
+from jaxdyn._trig import sin_cos
+
 _writing = contextvars.ContextVar("writing", default=False)
 
 
@@ -43,8 +45,10 @@ def _written_out():
         _writing.reset(token)
 
 
-def scalar_program(function: Callable, *args, most: int):
+def scalar_program(function: Callable, *args, most: int, for_batches: bool = False):
     """The program of `function` in single numbers: its jaxpr, (shape, dtype) of the outputs and their structure.
+
+    With `for_batches` sines and cosines are written as polynomials: more operations, but ones that become vector instructions.
 
     **Raises:** `TooMuch` for more than `most` operations, and for those that are none of single numbers.
     """
@@ -60,7 +64,7 @@ def scalar_program(function: Callable, *args, most: int):
             size = math.prod(np.shape(arg))
             given.append(_objects(numbers[at : at + size], np.shape(arg)))
             at += size
-        found = _Writer(4 * most).evaluate(
+        found = _Writer(4 * most, for_batches).evaluate(
             jaxpr.jaxpr, [np.asarray(const) for const in map(_known, jaxpr.consts)], given
         )
         return [
@@ -150,8 +154,9 @@ _MOVES = {
 class _Writer:
     """Evaluates jaxprs on arrays of numbers; operations that recur are written once."""
 
-    def __init__(self, most: int):
+    def __init__(self, most: int, for_batches: bool = False):
         self.left = most  # of which some are not needed in the end
+        self.for_batches = for_batches
         self.written: dict = {}
 
     def evaluate(self, jaxpr, consts, args) -> list[np.ndarray]:
@@ -218,6 +223,9 @@ class _Writer:
         if plain is not None:
             return plain
         names = (id(x) if k is None else (k.dtype, k.tobytes()) for x, k in zip(args, known, strict=True))
+        if self.for_batches and primitive.name in ("sin", "cos") and args[0].dtype in (np.float32, np.float64):
+            sine, cosine = self.evaluate(*_sines(np.dtype(args[0].dtype)), [_objects([args[0]], ())])
+            return (sine if primitive.name == "sin" else cosine).item()
         key = primitive, _frozen(params), tuple(names)
         if key not in self.written:
             self.left -= 1
@@ -264,6 +272,13 @@ class _Writer:
             for i in np.flatnonzero(where):
                 numbers[i] = self._pair(lax.add_p, numbers[i], update)
         return _objects(numbers, operand.shape)
+
+
+@functools.lru_cache
+def _sines(dtype):
+    """Program of the sine and cosine of a number, and its constants."""
+    program = jax.make_jaxpr(sin_cos)(jax.ShapeDtypeStruct((), dtype))
+    return program.jaxpr, [np.asarray(const) for const in program.consts]
 
 
 # What numpy does as well, and without compiling it first.

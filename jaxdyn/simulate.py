@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxdyn._scalar_program import is_written_out
 from jaxdyn._tracing import compiled, is_concrete, is_known, split
 from jaxdyn.assembly import residuals
 from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves, start_limit
@@ -196,11 +197,15 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     def power(force, v):
         return jnp.zeros((), v.dtype) if force is None else jnp.sum(v * force)
 
-    @jax.jit  # traced once for all the places where diffrax and differentiation call it
-    def derivative(t, y, args):
+    # Traced once for all the places where diffrax and differentiation call it, and once to be written out in numbers.
+    @functools.partial(jax.jit, static_argnums=0)
+    def traced(written_out, t, y, args):
         scene, _, method = given(args)
         rates, force, v = method.evaluated(scene, y, t, functools.partial(effort, args))
         return rates | {"work": power(force, v)} if "work" in y else rates
+
+    def derivative(t, y, args):
+        return traced(is_written_out(), t, y, args)
 
     @jax.jit
     def explicit_part(t, y, args):

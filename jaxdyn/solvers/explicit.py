@@ -11,6 +11,7 @@ small state are kept in pieces of that size.
 
 import functools
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import diffrax
@@ -21,6 +22,11 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn._anywhere import anywhere
+from jaxdyn._by_batch import by_batch
+from jaxdyn._dispatch import LEAST_BATCH
+from jaxdyn._implicit import along, implicit
+from jaxdyn._one_kernel import kernel_of
+from jaxdyn._tracing import split
 from jaxdyn.projection import enlarged
 from jaxdyn.solvers.projected import Bent, ProjectedSolver
 
@@ -44,7 +50,9 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
         self.y0 = y0
 
     def evaluate(self, t0, t1=None, left=True):
-        return ravel_pytree(self.y0)[1](jnp.concatenate(self.inner.evaluate(t0, t1, left)))
+        if t1 is not None:
+            return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
+        return ravel_pytree(self.y0)[1](jnp.concatenate(self.inner.evaluate(t0, left=left)))
 
 
 class ExplicitSteps(ProjectedSolver):
@@ -63,8 +71,8 @@ class ExplicitSteps(ProjectedSolver):
     @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         """Dense output of the wrapped method, ending at the projected point if there is one."""
-        interpolation = functools.partial(_Interpolation, self.solver.interpolation_cls)
-        return interpolation if self.project is None else functools.partial(Bent, interpolation)
+        interpolation = partial(_Interpolation, self.solver.interpolation_cls)
+        return interpolation if self.project is None else partial(Bent, interpolation)
 
     def init(self, terms, t0, t1, y0, args):
         """The last stage of the step before, and whether there is one."""
@@ -72,63 +80,146 @@ class ExplicitSteps(ProjectedSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step, projected where it ends."""
-        tableau: Any = self.solver.tableau  # of one term
-        count, start, structure = tableau.num_stages, *ravel_pytree(y0)
-        dt = jnp.asarray(t1 - t0, start.dtype)
-        # Rows: what is added for each stage, for the result, and for the error.
-        sums = np.zeros((count + 2, count))
-        for i, row in enumerate(tableau.a_lower):
-            sums[i + 1, : i + 1] = row
-        sums[count], sums[count + 1] = tableau.b_sol, tableau.b_error
-        known = tableau.b_error[-1] == 0
-        lasts = self.project is not None and passes_last_stage_on(tableau, self.jumping, self.branching)
-        times = jnp.asarray(np.concatenate([[0.0], tableau.c]), jnp.result_type(t0, t1))
-        # For the whole batch: a branch that differs between samples would be computed for all.
+        plan, start, structure = _Plan(self, y0, args), *ravel_pytree(y0)
         kept, ready = solver_state
-        ready = ~anywhere(~ready | made_jump) if tableau.fsal else jnp.asarray(False)
+        state = t0, t1, start, kept, ready & ~jnp.asarray(made_jump)
 
-        rows = jnp.arange(count), _pieces(jnp.asarray(sums.T, start.dtype), count), times
+        def values(terms, *state):
+            unknown, known = split(terms)
+            # The one number in a term is diffrax's direction of time, which is forward where there are no `args`.
+            terms = known([1 if jnp.issubdtype(x.dtype, jnp.integer) else x for x in unknown])
+            return by_batch(partial(in_turn, plan, terms), partial(at_once, plan, terms), LEAST_BATCH, *state)
 
-        def ended(y, error):
-            projected, shift, error, result = self.ended(t1, structure(y), structure(error), args)
-            return *(ravel_pytree(x)[0] for x in (projected, shift, error)), result
+        def tangent(terms, *rest):
+            *state, steps = rest
+            found, moved = along(partial(in_turn, plan), (terms, *state), steps)
+            return found, jax.tree.map(_still, found) if moved is None else moved
 
-        def rate(y, c):
-            t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
-            return dt * ravel_pytree(terms.vf(t, structure(y), args))[0]
-
-        def stage(carry, row):
-            total, *end = carry
-            i, weights, c = row
-            y = start + _row(total, i)
-            if lasts:
-                error = _row(total, count + 1) if known else none
-                end = lax.cond(i == count - 1, ended, lambda y, _: (y, *end[1:]), y, error)
-                y = end[0]
-            k = lax.cond(ready & (i == 0), lambda y: dt * kept, lambda y: rate(y, c), y)
-            k, weights = _pieces(k, count + 2), jnp.concatenate(weights)
-            total = tuple(part + weights[:, None] * k[None] for part, k in zip(total, k, strict=True))
-            return (total, *end), k
-
-        none = jnp.zeros_like(start)
-        blank = tuple(jnp.zeros((count + 2, part.size), start.dtype) for part in _pieces(start, count + 2))
-        first = blank, start, none, none, diffrax.RESULTS.successful
-        (total, *found), k = lax.scan(stage, first, rows)
-        end: Any = found
-        raw, error = start + _row(total, count), _row(total, count + 1)
-        if self.project is None:
-            end = raw, none, error, diffrax.RESULTS.successful
-        elif not lasts:
-            end = ended(raw, error)
-        projected, shift, left, result = end
-        error = enlarged(error, left) if lasts and not known else left
-        y1, error = structure(projected), structure(error)
+        # What is traced elsewhere than in the state is not known when it comes to the choice by the batch.
+        found = in_turn(plan, terms, *state) if args is not None else implicit(terms, state, values, tangent)
+        projected, shift, error, raw, k, result = found
         dense = {"y0": y0, "y1": structure(raw), "pieces": k}
         if self.project is not None:
             dense = {"dense_info": dense, "shift": structure(shift)}
-        reusable = jnp.asarray(tableau.fsal and (self.project is None or lasts))
+        dt = jnp.asarray(t1 - t0, start.dtype)
         last = _row(k, -1) / jnp.where(dt == 0, jnp.ones_like(dt), dt)
-        return y1, error, dense, (last, reusable), result
+        reusable = jnp.asarray(plan.tableau.fsal and (self.project is None or plan.lasts))
+        return structure(projected), structure(error), dense, (last, reusable), result
+
+
+class _Plan:
+    """How a step is made: `sums` has rows of what is added for each stage, for the result and for the error."""
+
+    def __init__(self, method: ExplicitSteps, y0, args):
+        self.method, self.args = method, args
+        self.structure = ravel_pytree(y0)[1]
+        tableau: Any = method.solver.tableau  # of one term
+        self.tableau, self.count = tableau, tableau.num_stages
+        self.sums = np.zeros((self.count + 2, self.count))
+        for i, row in enumerate(tableau.a_lower):
+            self.sums[i + 1, : i + 1] = row
+        self.sums[self.count], self.sums[self.count + 1] = tableau.b_sol, tableau.b_error
+        self.times = np.concatenate([[0.0], tableau.c])
+        # Whether the last stage comes after the projection, and whether the error is known before it.
+        self.lasts = method.project is not None and passes_last_stage_on(tableau, method.jumping, method.branching)
+        self.known = bool(tableau.b_error[-1] == 0)
+
+    def rate(self, terms, t0, t1, y, c):
+        """A stage: (t1 - t0) times the vector field."""
+        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+        return jnp.asarray(t1 - t0, y.dtype) * ravel_pytree(terms.vf(t, self.structure(y), self.args))[0]
+
+    def first(self, terms, t0, t1, start, kept, ready):
+        """The first stage, from the last one of the step before where that is `ready`."""
+        # For the whole batch: a branch that differs between samples would be computed for all.
+        ready = ~anywhere(~ready) if self.tableau.fsal else jnp.asarray(False)
+        dt = jnp.asarray(t1 - t0, start.dtype)
+        return lax.cond(ready, lambda y: dt * kept, lambda y: self.rate(terms, t0, t1, y, 0.0), start)
+
+    def ended(self, t1, y, error):
+        """y projected, what that adds, the error, and a result."""
+        given = self.method.ended(t1, self.structure(y), self.structure(error), self.args)
+        return *(ravel_pytree(x)[0] for x in given[:3]), given[3]
+
+
+def in_turn(plan: _Plan, terms, t0, t1, start, kept, ready):
+    """The result of a step, what a projection adds to it, its error, the result before, stages in pieces, and a code.
+
+    One loop over the stages.
+    """
+    count, none = plan.count, jnp.zeros_like(start)
+    ready = ~anywhere(~ready) if plan.tableau.fsal else jnp.asarray(False)
+    dt = jnp.asarray(t1 - t0, start.dtype)
+    times = jnp.asarray(plan.times, jnp.result_type(t0, t1))
+    rows = jnp.arange(count), _pieces(jnp.asarray(plan.sums.T, start.dtype), count), times
+
+    def stage(carry, row):
+        total, *end = carry
+        i, weights, c = row
+        y = start + _row(total, i)
+        if plan.lasts:
+            error = _row(total, count + 1) if plan.known else none
+            ended = partial(plan.ended, t1)
+            end = lax.cond(i == count - 1, ended, lambda y, _: (y, *end[1:]), y, error)
+            y = end[0]
+        k = lax.cond(ready & (i == 0), lambda y: dt * kept, lambda y: plan.rate(terms, t0, t1, y, c), y)
+        k, weights = _pieces(k, count + 2), jnp.concatenate(weights)
+        total = tuple(part + weights[:, None] * k[None] for part, k in zip(total, k, strict=True))
+        return (total, *end), k
+
+    blank = tuple(jnp.zeros((count + 2, part.size), start.dtype) for part in _pieces(start, count + 2))
+    first = blank, start, none, none, diffrax.RESULTS.successful
+    (total, *found), k = lax.scan(stage, first, rows)
+    return _finished(plan, t1, start + _row(total, count), _row(total, count + 1), found, k)
+
+
+def _finished(plan: _Plan, t1, raw, error, end: Any, k):
+    """What `in_turn` returns; `end` is where the projection left the step, if there is one before the last stage."""
+    if plan.method.project is None:
+        end = raw, jnp.zeros_like(raw), error, diffrax.RESULTS.successful
+    elif not plan.lasts:
+        end = plan.ended(t1, raw, error)
+    projected, shift, left, result = end
+    error = enlarged(error, left) if plan.lasts and not plan.known else left
+    return projected, shift, error, raw, k, result
+
+
+def at_once(plan: _Plan, terms, t0, t1, start, kept, ready):
+    """The same with the stages in one kernel, if there is one."""
+    count = plan.count - plan.lasts
+
+    def numbers(terms, t0, t1, start, first):
+        k = [first]
+        for i in range(1, count):
+            k.append(plan.rate(terms, t0, t1, start + _sum(plan.sums[i], k), float(plan.times[i])))
+        k = jnp.stack(k)
+        return k, start + _sum(plan.sums[plan.count], k), _sum(plan.sums[plan.count + 1], k), jnp.isfinite(jnp.sum(k))
+
+    args = t0, t1, start, plan.first(terms, t0, t1, start, kept, ready)
+    kernel = kernel_of(numbers, terms, *args, for_batches=True)
+    if kernel is None:
+        return in_turn(plan, terms, t0, t1, start, kept, ready)
+    k, raw, error, served = kernel(partial(numbers, terms), *args)
+    if plan.lasts:
+        end = plan.ended(t1, raw, error if plan.known else jnp.zeros_like(error))
+        last = plan.rate(terms, t0, t1, end[0], 1.0)
+        k, whole = jnp.concatenate([k, last[None]]), error + float(plan.sums[-1, -1]) * last
+    else:
+        end, whole = (), error
+    found = _finished(plan, t1, raw, whole, end, _pieces(k, plan.count + 2))
+    # Where numbers alone do not serve, as where rows are close to dependent, they are NaN.
+    return lax.cond(anywhere(~served), lambda: in_turn(plan, terms, t0, t1, start, kept, ready), lambda: found)
+
+
+def _still(x):
+    """No change of an array."""
+    return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(x.shape, jax.dtypes.float0)
+
+
+def _sum(weights, k):
+    """Stages times their weights, of which many are zero."""
+    terms = [float(weight) * stage for weight, stage in zip(weights, k, strict=False) if weight != 0]
+    return functools.reduce(jnp.add, terms) if terms else jnp.zeros_like(k[0])
 
 
 def _pieces(x, rows: int) -> tuple:
