@@ -96,7 +96,7 @@ class ExplicitSteps(ProjectedSolver):
             return found, jax.tree.map(_still, found) if moved is None else moved
 
         # What is traced elsewhere than in the state is not known when it comes to the choice by the batch.
-        found = in_turn(plan, terms, *state) if args is not None else implicit(terms, state, values, tangent)
+        found: Any = in_turn(plan, terms, *state) if args is not None else implicit(terms, state, values, tangent)
         projected, shift, error, raw, k, result = found
         dense = {"y0": y0, "y1": structure(raw), "pieces": k}
         if self.project is not None:
