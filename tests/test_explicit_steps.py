@@ -64,7 +64,7 @@ def largest(lines) -> int:
 
 
 def test_loops_of_one_motion_have_small_arrays():
-    """XLA runs the operations of such a loop one after the other, without its scheduler. That takes a fourth of the time."""
+    """XLA runs the operations of such a loop one after the other, without its scheduler."""
     scene, (q, v) = scenes.andrews(), scenes.andrews.start()
     ts = jnp.linspace(0.0, 0.01, 8)
 

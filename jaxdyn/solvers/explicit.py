@@ -5,7 +5,7 @@ For states as small as those of mechanisms that costs more than the dynamics. He
 added, as soon as it is known, to the sums of all that need it.
 
 XLA:CPU runs the operations of a loop one after the other if none of their arrays has more than `_SMALL` bytes. Otherwise it
-hands them to a scheduler, which takes longer for each than small operations do: 130 ns for 22. So sums, stages and tableau of a
+hands them to a scheduler, which takes longer for each than small operations do. So sums, stages and tableau of a
 small state are kept in pieces of that size.
 """
 
