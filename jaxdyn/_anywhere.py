@@ -20,6 +20,7 @@ from jax.interpreters import batching, mlir
 
 from jaxdyn._materialize import at_least
 from jaxdyn._scalar_program import is_written_out
+from jaxdyn._ways import is_straight
 
 AT_ONCE = 32  # samples that are computed again together
 
@@ -54,9 +55,10 @@ def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | 
     Derivatives are those of `same` if the flag is set in no sample of the batch, else those of `careful` for all of them: in a
     branch, as what a singular sample makes of the other way is no number, and would reach gradients even times zero.
 
-    While a function is traced to become one of single numbers, which have no branches, floats of samples with the flag are NaN.
+    While a function is traced to become one of single numbers, which have no branches, or one that goes `straight`, floats of samples
+    with the flag are NaN.
     """
-    if is_written_out():
+    if is_written_out() or is_straight():
         return jax.tree.map(
             lambda x: jnp.where(flag, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.floating) else x, found
         )

@@ -37,19 +37,27 @@ def by_batch(small: Callable, large: Callable, least: int, *args):
     return jax.tree.unflatten(jax.tree.structure(shape), found)
 
 
-def _run(*arrays, function, axes):
+def of_samples(function: Callable, axes) -> Callable:
+    """The function under one `vmap` for each entry of `axes`, the innermost first."""
     for each in axes:
         function = jax.vmap(function, each)
-    return function(*arrays)
+    return function
+
+
+def batched_axes(arrays, places) -> tuple[int, tuple]:
+    """Of a batching rule's arrays and places: how many samples there are, and `in_axes` for them."""
+    varies = [batching.not_mapped is not place for place in places]
+    size = next(x.shape[place] for x, place, moves in zip(arrays, places, varies, strict=True) if moves)
+    return size, tuple(place if moves else None for place, moves in zip(places, varies, strict=True))
 
 
 def _as_small(*arrays, small: ClosedJaxpr, axes, **_):
-    return _run(*arrays, function=jaxpr_as_fun(small), axes=axes)
+    return of_samples(jaxpr_as_fun(small), axes)(*arrays)
 
 
 def _on_cpu(ctx, *arrays, small, large, least, sizes, axes):
     function = jaxpr_as_fun(small) if math.prod(sizes) < least else large
-    return mlir.lower_fun(_run, multiple_results=True)(ctx, *arrays, function=function, axes=axes)
+    return mlir.lower_fun(of_samples(function, axes), multiple_results=True)(ctx, *arrays)
 
 
 def _abstract(*avals, small, large, least, sizes, axes):
@@ -57,9 +65,7 @@ def _abstract(*avals, small, large, least, sizes, axes):
 
 
 def _batch(arrays, places, *, sizes, axes, **params):
-    varies = [batching.not_mapped is not place for place in places]
-    size = next(x.shape[place] for x, place, moves in zip(arrays, places, varies, strict=True) if moves)
-    each = tuple(place if moves else None for place, moves in zip(places, varies, strict=True))
+    size, each = batched_axes(arrays, places)
     found = _by_batch_p.bind(*arrays, sizes=(size, *sizes), axes=(*axes, each), **params)
     return found, [0] * len(found)
 

@@ -60,6 +60,16 @@ def materialize(*values):
     return kept
 
 
+def never(direction: str = "EQ"):
+    """While lowering: a flag that is false in every program (true for the direction "NE"), which XLA does not know."""
+    return hlo.CompareOp(
+        hlo.PartitionIdOp().result,
+        mlir.ir_constant(np.uint32(0xFFFFFFFF)),
+        hlo.ComparisonDirectionAttr.get(direction),
+        compare_type=hlo.ComparisonTypeAttr.get("UNSIGNED"),
+    ).result
+
+
 def _identity_lowering(ctx, *values, least):
     return list(values)
 
@@ -67,13 +77,7 @@ def _identity_lowering(ctx, *values, least):
 def _cpu_lowering(ctx, *values, least):
     worth = [value for value, aval in zip(values, ctx.avals_in, strict=True) if aval.size >= least]
     if worth:
-        never = hlo.CompareOp(
-            hlo.PartitionIdOp().result,
-            mlir.ir_constant(np.uint32(0xFFFFFFFF)),
-            hlo.ComparisonDirectionAttr.get("EQ"),
-            compare_type=hlo.ComparisonTypeAttr.get("UNSIGNED"),
-        )
-        branches = hlo.IfOp([], never.result)
+        branches = hlo.IfOp([], never())
         with ir.InsertionPoint(branches.regions[0].blocks.append()):
             hlo.OutfeedOp(worth, hlo.CreateTokenOp().result, outfeed_config=ir.StringAttr.get(""))
             hlo.ReturnOp([])

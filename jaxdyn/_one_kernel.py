@@ -35,6 +35,7 @@ from jax.interpreters import batching, mlir
 
 from jaxdyn._scalar_program import TooMuch, scalar_program
 from jaxdyn._tracing import Known, split
+from jaxdyn._ways import way
 
 MOST_AT_ONCE = 4400  # operations in one block; from about 4500 on XLA cuts it in pieces that compute values again
 MOST = 9000  # operations in all; longer ones compile for minutes
@@ -62,12 +63,12 @@ class Kernel(NamedTuple):
 def kernel_of(function: Callable, tree, *args, most: int | None = None, for_batches: bool = False) -> Kernel | None:
     """function(tree, *args) for arrays of the shapes of `args`, one sample, as a kernel of at most `most` operations (`MOST`).
 
-    None if the tree holds numbers that are traced, if the function computes with more than single numbers, such as a
+    None where `without_kernels` is in force, if the tree holds numbers that are traced, if the function computes with more than single numbers, such as a
     factorisation by LAPACK, or if it is too long. It is traced once for a tree and shapes. With `for_batches` it is made for many
     samples: see `scalar_program`.
     """
     traced, known = split(tree)
-    if traced or len(jax.tree.leaves(args)) != len(args):
+    if way() == "without kernels" or traced or len(jax.tree.leaves(args)) != len(args):
         return None
     shapes = tuple((np.shape(x), np.dtype(x.dtype)) for x in args)
     return _kernel(function, known, shapes, MOST if most is None else most, for_batches)
@@ -111,8 +112,8 @@ def _cut(jaxpr, count: int):
     return blocks[::-1]
 
 
-def _as_folds(*arrays, program: ClosedJaxpr, shapes, depth: int, otherwise: Callable):
-    del otherwise
+def as_folds(*arrays, program: ClosedJaxpr, shapes, depth: int, **_) -> list:
+    """What a kernel's program gives for arrays with `depth` leading axes, as it is put down on CPU."""
     lead = arrays[0].shape[:depth]
     jaxpr = program.jaxpr
     sizes = [math.prod(x.shape[depth:]) for x in arrays]  # reshape cannot find them where there are no samples
@@ -186,7 +187,7 @@ def _elsewhere(*arrays, program, shapes, depth: int, otherwise: Callable):
 
 def _on_cpu(ctx, *arrays, **params):
     samples = math.prod(ctx.avals_in[0].shape[: params["depth"]])
-    way = _elsewhere if samples < AT_ONE_CALL and _is_done_once() else _as_folds
+    way = _elsewhere if samples < AT_ONE_CALL and _is_done_once() else as_folds
     return mlir.lower_fun(way, multiple_results=True)(ctx, *arrays, **params)
 
 

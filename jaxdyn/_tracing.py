@@ -13,6 +13,7 @@ from jax.core import Tracer
 
 from jaxdyn._materialize import at_least, least_size
 from jaxdyn._scalar_program import is_written_out
+from jaxdyn._ways import way
 
 
 def is_concrete(*trees) -> bool:
@@ -121,11 +122,12 @@ def traced_once(function: Callable, tree, *args, static: tuple = ()):
     if not is_staged():
         return function(tree, *args, *static)
     traced, known = split(tree)
-    return _program(function, known, static, least_size(), is_one_sample(), is_written_out())(traced, *args)
+    mode = is_one_sample(), is_written_out(), way()
+    return _program(function, known, static, least_size(), mode)(traced, *args)
 
 
 @functools.lru_cache(maxsize=256)  # programs hold their trees
-def _program(function, known: Known, static, least: int, _one_sample: bool, _written_out: bool):
+def _program(function, known: Known, static, least: int, _mode: tuple):
     def run(traced, *args):
         with at_least(least):
             return function(known(traced), *args, *static)

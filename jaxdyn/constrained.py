@@ -28,6 +28,7 @@ from jaxdyn._rank import checked_tolerance, eps_of, least_pivot, normal_factor, 
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
 from jaxdyn._tracing import is_staged, split, still, traced_once
+from jaxdyn._ways import is_careful
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.loops import Loop
@@ -308,7 +309,7 @@ def _shortest(Y, wanted, rank_tol):
         pushed = _product(inverse.T, wanted)
         return _product(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
 
-    if Y.shape[1] > Y.shape[0]:
+    if Y.shape[1] > Y.shape[0] or is_careful():
         return by_rank(Y, wanted)
     # The factor is not differentiated: where it is not used it may be NaN, which would reach derivatives even times zero.
     factor, independent = normal_factor(lax.stop_gradient(Y), rank_tol)

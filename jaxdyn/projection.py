@@ -17,6 +17,7 @@ from jaxdyn._rank import least_pivot, normal_factor, pseudo_inverse, quality_of,
 from jaxdyn._scalar_program import is_written_out
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
 from jaxdyn._tracing import is_staged, split, traced_once
+from jaxdyn._ways import is_careful, is_straight
 from jaxdyn.closed_projection import Closing, ClosingInKernels, Kernels, kernels
 from jaxdyn.constrained import (
     by_the_batch,
@@ -50,7 +51,8 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 
     Errors come back without their parts normal to the constraints: as far as small ones go, those are what is removed from
     q and v. Near a singular position they are large, and shorter steps make them no smaller. What the projection leaves open
-    is added. What is done `once`, and not in every step, is not worth a kernel (see `_one_kernel`).
+    is added. What is done `once`, and not in every step, is not worth a kernel (see `_one_kernel`), except where it has to be
+    `straight`.
     """
 
     def project(scene, q, v, t, *errors):
@@ -74,7 +76,7 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 
 def _by_the_batch(scene: Scene, q, v, t, errors, rank_tol, once: bool):
     q = retract(scene.system, q)
-    staged, in_kernels = is_staged() and not once and layout(scene)[-1].end <= scene.nv, None
+    staged, in_kernels = is_staged() and layout(scene)[-1].end <= scene.nv and (not once or is_straight()), None
     if staged:
         whole = kernel_of(_in_numbers, scene, q, v, t, *errors, most=MOST_AT_ONCE)
         if whole is not None:
@@ -105,7 +107,7 @@ class _Correction(NamedTuple):
 
 def _correction(L, Y, rank_tol) -> _Correction:
     """From Y = L^-1 A^T: by its normal equations, or by its pseudo-inverse where the rows are close to dependent."""
-    if Y.shape[1] > Y.shape[0]:
+    if Y.shape[1] > Y.shape[0] or is_careful():
         return _Correction(L, pseudo_inverse(Y, tolerance(rank_tol, Y), True).T, jnp.eye(Y.shape[1], dtype=Y.dtype))
     C, independent = normal_factor(Y, rank_tol)
 

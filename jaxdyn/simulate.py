@@ -14,8 +14,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxdyn._one_call import one_call
 from jaxdyn._scalar_program import is_written_out
 from jaxdyn._tracing import compiled, is_concrete, is_known, split
+from jaxdyn._ways import straight, without_kernels
 from jaxdyn.assembly import residuals
 from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves, start_limit
 from jaxdyn.constraints.base import state_dtype
@@ -37,14 +39,13 @@ from jaxdyn.solvers.choice import (
     progress_meter,
     stepping,
 )
-from jaxdyn.solvers.differentiable import run, run_adaptively
+from jaxdyn.solvers.differentiable import COUNTS, run, run_adaptively
 from jaxdyn.solvers.fixed_steps import Watched, too_coarse
 from jaxdyn.solvers.inputs import as_array, check_state, check_times, check_turns, most_turned, turning
 from jaxdyn.systems import System, displace, retract, velocity_to_rate
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
 _POSE = "pose:"
-_COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 
 
 def simulate(
@@ -174,6 +175,30 @@ def simulate(
 
 @compiled
 def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
+    unknown, known = split((scene, control, method, numbers))
+
+    def motion(*unknown):
+        return _motion(*known(unknown), options)
+
+    if not scene.constraints or split((scene, control, method))[0]:
+        return one_call(motion, *unknown)
+
+    # By kernels, and without them where these do not serve.
+    def quick(*unknown):
+        with straight():
+            found = motion(*unknown)
+        numbers = [x for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.inexact)]
+        refused = (found.result == RESULTS.nonfinite_start) | (found.result == RESULTS.unordered_times)
+        return found, refused | jnp.stack([jnp.isfinite(x).all() for x in numbers]).all()
+
+    def careful(*unknown):
+        with without_kernels():
+            return motion(*unknown)
+
+    return one_call(motion, *unknown, quick=quick, careful=careful)
+
+
+def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     q0, v0, ts, *steps = numbers
     system, outputs = scene.system, options["outputs"]
     # diffrax compiles its arguments, which hides their values. What is known stays in closures, the rest is `args`:
@@ -251,7 +276,9 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     if isinstance(options["solver"], Stepper):
         options = options | {"solver": Stepper(begin, advance, functools.partial(displace, system))}
     q0 = retract(system, q0)
-    good = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
+    in_order = jnp.isfinite(ts).all() & (ts[1:] > ts[:-1]).all()
+    given_times, ts = ts, jnp.where(in_order, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
+    good = jnp.isfinite(q0).all() & jnp.isfinite(v0).all() & in_order
     # A bad lane of a batch takes a harmless start, so that it does not make the others wait.
     harmless = neutral(system).astype(q0.dtype) if isinstance(system, Model) else jnp.zeros_like(q0)
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
@@ -305,6 +332,7 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
         coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
         result = RESULTS.where(coarse, RESULTS.coarse_start, result)
     result = RESULTS.where(good, result, RESULTS.nonfinite_start)
+    result = RESULTS.where(in_order, result, RESULTS.unordered_times)
 
     def report(q, v, t):
         values = {}
@@ -326,9 +354,9 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
         return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
 
     rows = {"q": q, "v": v} | jax.vmap(report)(q, v, ts) | ({} if work is None else {"work": work})
-    stats = {name: jnp.asarray(counts[name], jnp.int32) for name in _COUNTS}
+    stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
-    return Solution(ts=ts, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
+    return Solution(ts=given_times, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
 
 
 def _integrate(term, project, quality, method, y0, ts, args, steps, options):

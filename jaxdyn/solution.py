@@ -12,10 +12,11 @@ from jaxdyn.solvers.choice import for_stiff, known_stiffness, unwrapped
 
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a simulation ended: diffrax's codes and seven more."""
+    """How a simulation ended: diffrax's codes and eight more."""
 
     nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
     nonfinite_state = "The state became NaN or infinite."
+    unordered_times = "The save points are not finite and increasing."
     coarse_steps = (
         "The fixed steps are too long, or too many for the dtype: the motion may be wrong by a tenth of it or more."
     )
@@ -31,6 +32,7 @@ ADVICE = {
     "moves no inertia) or a force or control that is not finite there; or constraints whose rows lose rank on the way, "
     "which fixed steps pass (stepsize=0.01); or rtol and atol are below the rounding error",
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
+    "unordered_times": "give times ts that increase from each to the next",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
     "coarse_steps": "take a smaller stepsize, or None for steps that keep a tolerance; if stiff, solver=jd.Rodas5P(); beyond "
     "some 1e5 steps, float64",

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 ROOM = 4096  # steps that are written down where the user gives no limit: 32 kB a trajectory
 
 
@@ -46,10 +47,11 @@ def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress
         throw=False,
         progress_meter=progress,
     )
+    counts = {name: solved.stats[name] for name in COUNTS}
     if continuous:
         reached = jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
-        return solved.ys, (solved.result, solved.stats, reached), solved
-    return solved.ys[0], (solved.result, solved.stats, solved.ts[1][0]), solved
+        return solved.ys, (solved.result, counts, reached), solved
+    return solved.ys[0], (solved.result, counts, solved.ts[1][0]), solved
 
 
 def run_adaptively(moving, options, limit_is_given: bool):

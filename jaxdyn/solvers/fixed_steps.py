@@ -7,6 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxdyn.solvers.first_step import ended_where_not_straight
+
 ALLOWED = 0.1  # of how far positions, or velocities, come from where they started
 _PASSED_OVER = ("frame", "work")  # constants of a step, and what nothing depends on
 
@@ -47,7 +49,7 @@ class Watched(diffrax.ConstantStepSize):
                 error = error * (share if power == 1 else share**power)
             ways = jnp.maximum(ways, way)
             errors = errors + error + jnp.where(moved > 0, jnp.finfo(way.dtype).eps * ways, jnp.zeros_like(ways))
-        return *step, (inner, start, errors, ways), result
+        return *step, (inner, start, errors, ways), ended_where_not_straight(result, y1_candidate)
 
 
 def too_coarse(controller_state):
