@@ -55,8 +55,8 @@ def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | 
     Derivatives are those of `same` if the flag is set in no sample of the batch, else those of `careful` for all of them: in a
     branch, as what a singular sample makes of the other way is no number, and would reach gradients even times zero.
 
-    While a function is traced to become one of single numbers, which have no branches, or one that goes `straight`, floats of samples
-    with the flag are NaN.
+    While a function is traced to become one of single numbers, which have no branches, or one that goes `straight` (see `_ways`),
+    floats of samples with the flag are NaN.
     """
     if is_written_out() or is_straight():
         return jax.tree.map(

@@ -10,11 +10,13 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
@@ -23,9 +25,12 @@ from jaxdyn._by_batch import of_samples
 from jaxdyn._factor_loops import entry
 from jaxdyn._one_kernel import as_folds
 
+MOST_PRODUCTS = 10000  # of a product of matrices; libraries are better at larger ones
 MOST_TERMS = 4  # of a sum that is written out; longer ones are loops
 MOST_OPERATIONS = 9000  # of a program before it is written; the time that LLVM takes grows faster than the function
-MOST_NUMBERS = 2500  # operations of a kernel that are written as they are: XLA's passes take long over more, longer than over a fold
+MOST_NUMBERS = (
+    2500  # operations of a kernel that are written as they are; XLA's passes take longer over more than over a fold
+)
 MOST_WINDOWS = 4  # windows of a scatter that are written out
 
 # Tried in tests/test_one_call.py.
@@ -106,7 +111,7 @@ class _Writer:
         values: dict = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args), strict=True))
 
         def read(atom):
-            return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
+            return _known(atom) if isinstance(atom, Literal) else values[atom]
 
         for eqn in jaxpr.eqns:
             if eqn.effects:
@@ -167,7 +172,7 @@ class _Writer:
         values: dict = dict(zip(program.jaxpr.invars, numbers, strict=True))
 
         def read(atom):
-            return np.full(lead, atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
+            return np.broadcast_to(_known(atom), lead) if isinstance(atom, Literal) else values[atom]
 
         for eqn in program.jaxpr.eqns:
             values[eqn.outvars[0]] = eqn.primitive.bind(*map(read, eqn.invars), **eqn.params)
@@ -190,7 +195,7 @@ class _Writer:
 
     def _cond(self, args, outermost, *, branches, **_):
         index, *args = args
-        if not isinstance(index, jax.core.Tracer):
+        if not isinstance(index, Tracer):
             return self.closed(branches[int(np.clip(index, 0, len(branches) - 1))], args, outermost)
         if self.checking:
             quiet = [i for i, branch in enumerate(branches) if not _calls_back(branch.jaxpr)]
@@ -259,6 +264,8 @@ class _Writer:
         free = [x.shape[len(lead) : x.ndim - len(left_sum)] for x in (a, b)]
         a, b = (x.reshape(*lead, math.prod(some), length) for x, some in zip((a, b), free, strict=True))
 
+        if math.prod((*lead, a.shape[-2], b.shape[-2], length)) > MOST_PRODUCTS:
+            raise NotWritten("a large product")
         a, b = jnp.moveaxis(a, -1, 0)[..., :, None], jnp.moveaxis(b, -1, 0)[..., None, :]
 
         def term(i):
@@ -297,6 +304,10 @@ def _over_batch(function: Callable, args, name: str) -> list:
     program, shape = jax.make_jaxpr(function, return_shape=True)(*args)
     del shape
     return _Writer().closed(program, args)
+
+
+def _known(literal: Any) -> np.ndarray:
+    return np.asarray(literal.val, literal.aval.dtype)
 
 
 def _folded(fold: Callable, x, axes, primitive, params):

@@ -1,15 +1,17 @@
 """`one_call`: a program of many small operations as one piece of machine code.
 
-XLA:CPU runs a program by calling one compiled function for each of its operations, or groups of operations, and for small arrays
-these calls cost far more than the arithmetic. But for loops over very few numbers it has another way: the whole loop is compiled as one
-function, in which loops, branches and operations are plain code. It finds such loops by their size, moves them into a call
-and marks this call with an attribute. Here a call is marked the same way, whatever its size, so a whole simulation becomes one function.
+XLA:CPU runs a program by calling one compiled function for each of its operations, or groups of operations, and for small
+arrays these calls cost far more than the arithmetic. But for loops over very few numbers it has another way: the whole loop
+is compiled as one function, in which loops, branches and operations are plain code. It finds such loops by their size, moves
+them into a call and marks this call with an attribute. Here a call is marked the same way whatever its size, so that a whole
+simulation becomes one function.
 
-Such a function runs on one core and may contain only some operations. `_call_writer` writes programs in these; what cannot be written
-stays as it is. The body is the branch of an `if` that always runs: XLA divides operations on larger arrays between threads, which fails
-here, and does not look into branches for them.
+Such a function runs on one core and may contain only some operations. `_call_writer` writes programs in these; what cannot be
+written, or is so long that LLVM would take minutes, stays as it is. The body is the branch of an `if` that always runs: XLA
+divides operations on larger arrays between threads, which fails here, and does not look into branches for them.
 
-The attributes are no promise of XLA's. Where they mean nothing, the call is an ordinary one with the same results.
+The attributes are no promise of XLA's. Where they mean nothing, the call is an ordinary one with the same results; a test
+counts the marked calls of compiled simulations.
 
 The primitive batches, and is differentiated as what it stands for. On other platforms than CPU it is that.
 """
@@ -44,8 +46,8 @@ def one_call(function: Callable, *args, quick: Callable | None = None, careful: 
 
     With `quick` two other ways to the same are taken instead:
 
-    - quick(*args) -> (what the function gives, whether it may be believed), in one call; it goes by kernels (see `_one_kernel`), which
-      do not serve everywhere;
+    - quick(*args) -> (what the function gives, whether it may be believed), in one call; it goes by kernels (see `_one_kernel`),
+      which do not serve everywhere;
     - careful(*args), which serves everywhere and goes without kernels: an ordinary program, computed for all samples where one
       of them may not be believed.
 
@@ -90,9 +92,10 @@ def _as_it_is(*arrays, ways, axes, **_):
 
 def _on_cpu(ctx, *arrays, ways, sizes, axes, **_):
     function = partial(_as_it_is, ways=ways, axes=axes)
-    if math.prod(sizes) <= MOST_SAMPLES:
+    real = all(jnp.issubdtype(aval.dtype, np.number) or aval.dtype == bool for aval in ctx.avals_in)
+    if real and 0 < math.prod(sizes) <= MOST_SAMPLES:
         try:
-            function = _in_calls(*(way and of_samples(way, axes) for way in ways), ctx.avals_in)
+            function = _in_calls(*[way and of_samples(way, axes) for way in ways], avals=ctx.avals_in)
         except NotWritten:
             pass
     return mlir.lower_fun(function, multiple_results=True)(ctx, *arrays)
@@ -155,12 +158,12 @@ def _marked(ctx, *arrays, body: ClosedJaxpr):
     arrays = [arrays[0], *(x for x, here in zip(arrays[1:], given, strict=True) if here)]
     ctx = ctx.replace(avals_in=[ctx.avals_in[0], *(x for x, here in zip(ctx.avals_in[1:], given, strict=True) if here)])
     # A function of its own, of which one call is written here.
-    block = ir.InsertionPoint.current.block
+    block = ir.InsertionPoint.current.block  # pyright: ignore[reportAttributeAccessIssue]
     before = len(block.operations)
     found = mlir.lower_fun(jax.jit(branches), multiple_results=True)(ctx, *arrays)
     for operation in list(block.operations)[before:]:
         if operation.operation.name == "func.call":
-            marks = {name: ir.StringAttr.get(value) for name, value in _ATTRIBUTES.items()}
+            marks: dict[str, ir.Attribute] = {name: ir.StringAttr.get(value) for name, value in _ATTRIBUTES.items()}
             operation.operation.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(marks)
     return found
 

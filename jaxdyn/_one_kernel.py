@@ -63,9 +63,9 @@ class Kernel(NamedTuple):
 def kernel_of(function: Callable, tree, *args, most: int | None = None, for_batches: bool = False) -> Kernel | None:
     """function(tree, *args) for arrays of the shapes of `args`, one sample, as a kernel of at most `most` operations (`MOST`).
 
-    None where `without_kernels` is in force, if the tree holds numbers that are traced, if the function computes with more than single numbers, such as a
-    factorisation by LAPACK, or if it is too long. It is traced once for a tree and shapes. With `for_batches` it is made for many
-    samples: see `scalar_program`.
+    None where `without_kernels` is in force, if the tree holds numbers that are traced, if the function computes with more than
+    single numbers, such as a factorisation by LAPACK, or if it is too long. It is traced once for a tree and shapes. With
+    `for_batches` it is made for many samples: see `scalar_program`.
     """
     traced, known = split(tree)
     if way() == "without kernels" or traced or len(jax.tree.leaves(args)) != len(args):

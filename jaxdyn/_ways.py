@@ -21,7 +21,7 @@ def straight():
 
 
 def without_kernels():
-    """While tracing inside: there are no kernels, and rows are taken for dependent, which they may be where kernels do not serve."""
+    """While tracing inside: there are no kernels, and rows are taken for dependent, as they may be where kernels do not serve."""
     return _going("without kernels")
 
 

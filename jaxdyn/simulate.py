@@ -178,9 +178,13 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     unknown, known = split((scene, control, method, numbers))
 
     def motion(*unknown):
-        return _motion(*known(unknown), options)
+        scene, control, method, numbers = known(unknown)
+        return _motion(scene, control, method, numbers, options)
 
-    if not scene.constraints or split((scene, control, method))[0]:
+    # A call of a scene that is not known would take longer to compile than it saves.
+    if split((scene, control, method))[0]:
+        return motion(*unknown)
+    if not scene.constraints:
         return one_call(motion, *unknown)
 
     # By kernels, and without them where these do not serve.

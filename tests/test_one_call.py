@@ -164,7 +164,7 @@ def test_every_operation_that_is_allowed_was_tried():
     assert set(_call_writer._AS_THEY_ARE) - names <= {"add_any", "copy_p", "clamp", "expand_dims", "pow"} | {"split"}
 
 
-@pytest.mark.parametrize("n", [1, 2, 7, 40])
+@pytest.mark.parametrize("n", [1, 2, 7, 15])
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_factors_in_a_call_are_lapacks(n, dtype):
     tolerance = (1e-12 if dtype == jnp.float64 else 1e-4) * n
@@ -174,11 +174,6 @@ def test_factors_in_a_call_are_lapacks(n, dtype):
     def everything(A, b):
         P = A @ A.mT + jnp.eye(n, dtype=dtype)[None]
         solved = jnp.linalg.solve(A, b), jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(P), True), b)
-        turned = (
-            jax.vmap(lambda A, b: jax.scipy.linalg.lu_solve(jax.scipy.linalg.lu_factor(A), b, trans=1))
-            if n < 0
-            else None
-        )
         T = jnp.tril(A / n) + 3 * jnp.eye(n, dtype=dtype)[None]
         triangular = [
             lax.linalg.triangular_solve(
