@@ -93,8 +93,7 @@ def _reduced(x):
         jnp.cumprod(x, 1),
         lax.cummax(x),
         lax.cummin(x),
-        x.T @ x,
-        x[:2] @ x.T,
+        x[:, :4].T @ x[:, :3],
         x[:0].sum(0),
     )
 
@@ -230,12 +229,26 @@ def test_a_matrix_that_is_not_definite_has_no_factor():
         jnp.linalg.svd,
         lambda x: jax.random.normal(jax.random.key(x[0, 0].astype(int)), x.shape) + x,
         jnp.fft.fft,
+        lambda x: jnp.repeat(x, 40, 1).T @ jnp.repeat(x, 40, 1),
     ],
 )
 def test_what_cannot_be_written_stays_as_it_is(function):
     compiled = jax.jit(lambda x: one_call(function, x)).lower(FEW).compile()
     assert _marks(compiled) == 0
     _same(compiled(FEW), function(FEW))
+
+
+def test_arguments_of_any_kind():
+    # XLA ends the process where a call does not use one of its arguments.
+    def first(x, unused, empty, whole, flag):
+        return x + 1, whole, flag, empty
+
+    args = FEW, FEW[0], FEW[:0], jnp.arange(3), jnp.array([True, False])
+    _same(_in_call(first, *args), first(*args))
+    # As many samples as go in a call, and none.
+    lanes = jax.vmap(lambda x: one_call(lambda x: (x * 2, x.sum() > 1), x))
+    _same(jax.jit(lanes)(FEW), (2 * FEW, FEW.sum(1) > 1))
+    assert jax.jit(lanes)(FEW[:0])[0].shape == (0, 4)
 
 
 def test_callbacks_stay_callbacks():
