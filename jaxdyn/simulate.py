@@ -186,6 +186,8 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
         return motion(*unknown)
     if not scene.constraints:
         return one_call(motion, *unknown)
+    if isinstance(numbers[-1], diffrax.AbstractStepSizeController):
+        return motion(*unknown)  # it would go on with shorter steps where kernels do not serve
 
     # By kernels, and without them where these do not serve.
     def quick(*unknown):
