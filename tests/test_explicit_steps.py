@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn import scenes
+from jaxdyn import _one_call, scenes
 from jaxdyn._one_kernel import kernel_of
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.scene import Scene
@@ -63,7 +63,13 @@ def largest(lines) -> int:
     return max(SIZES[kind] * int(np.prod([int(x) for x in size.split(",")])) for kind, size in shapes if kind in SIZES)
 
 
-def test_loops_of_one_motion_have_small_arrays():
+@pytest.fixture
+def ordinary(monkeypatch):
+    """Programs of operations, as those of what is too long for one call, instead of one call for few samples."""
+    monkeypatch.setattr(_one_call, "MOST_SAMPLES", 0)
+
+
+def test_loops_of_one_motion_have_small_arrays(ordinary):
     """XLA runs the operations of such a loop one after the other, without its scheduler."""
     scene, (q, v) = scenes.andrews(), scenes.andrews.start()
     ts = jnp.linspace(0.0, 0.01, 8)
@@ -78,7 +84,7 @@ def test_loops_of_one_motion_have_small_arrays():
 
 
 @pytest.fixture
-def kernels(monkeypatch):
+def kernels(monkeypatch, ordinary):
     """Batches of any size take all stages in one kernel; the list says for each program whether there was one."""
     made = []
 
