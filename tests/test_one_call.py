@@ -238,6 +238,13 @@ def test_what_cannot_be_written_stays_as_it_is(function):
     _same(compiled(FEW), function(FEW))
 
 
+def test_what_is_too_long_stays_as_it_is(monkeypatch):
+    monkeypatch.setattr(_call_writer, "MOST_OPERATIONS", 10)
+    compiled = jax.jit(lambda x: one_call(_controlled, x)).lower(FEW).compile()
+    assert _marks(compiled) == 0
+    _same(compiled(FEW), jax.jit(_controlled)(FEW))
+
+
 def test_arguments_of_any_kind():
     # XLA ends the process where a call does not use one of its arguments.
     def first(x, unused, empty, whole, flag):
@@ -345,7 +352,6 @@ def _ordinary(monkeypatch, name, **options):
         pytest.param("four_bar", {}, marks=pytest.mark.slow),
         ("car_axis", {"stepsize": 0.003}),
         pytest.param("andrews", {}, marks=pytest.mark.slow),
-        pytest.param("bicycle", {"method": "reduced"}, marks=pytest.mark.slow),
         pytest.param("double_pendulum", {"solver": jd.Rodas5P()}, marks=pytest.mark.slow),
         pytest.param("double_pendulum", {"method": "variational", "stepsize": 0.01}, marks=pytest.mark.slow),
     ],
