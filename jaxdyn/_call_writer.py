@@ -24,6 +24,7 @@ from jaxdyn import _factor_loops
 from jaxdyn._by_batch import of_samples
 from jaxdyn._factor_loops import entry
 from jaxdyn._one_kernel import as_folds
+from jaxdyn._scalar_program import INNER
 
 MOST_PRODUCTS = 10000  # of a product of matrices; libraries are better at larger ones
 MOST_TERMS = 4  # of a sum that is written out; longer ones are loops
@@ -46,16 +47,8 @@ _OF_LIBRARIES = frozenset(
     "dot_general cholesky lu triangular_solve qr custom_linear_solve lu_pivots_to_permutation sort eigh svd".split()
 )
 _SAME = frozenset("anywhere materialize optimization_barrier stop_gradient".split())
-_INNER = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "custom_vmap_call": "call",
-    "checkpoint": "jaxpr",
-    "remat2": "jaxpr",
-}
+_INNER = {name: inner for name, inner in INNER.items() if name != "one_kernel"}
+_INNER |= {"custom_vmap_call": "call", "remat2": "jaxpr"}
 # Of equinox; functions of arrays that jax can trace.
 _TRACEABLE = frozenset(
     "unvmap_any unvmap_all unvmap_max nonbatchable nontraceable nondifferentiable nondifferentiable_backward select_if_vmap "
@@ -301,9 +294,7 @@ def _over_batch(function: Callable, args, name: str) -> list:
     for _ in range(args[0].ndim - (1 if name == "pivots" else 2)):
         function = jax.vmap(function)
     # The loops are written like anything else.
-    program, shape = jax.make_jaxpr(function, return_shape=True)(*args)
-    del shape
-    return _Writer().closed(program, args)
+    return _Writer().closed(jax.make_jaxpr(function)(*args), args)
 
 
 def _known(literal: Any) -> np.ndarray:

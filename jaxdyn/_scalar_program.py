@@ -82,7 +82,7 @@ def scalar_program(function: Callable, *args, most: int, for_batches: bool = Fal
 
 def _length(jaxpr) -> int:
     """Operations of a program and of those inside it; on arrays of several numbers each counts once, so there may be more."""
-    inner = (x.params[_INNER[x.primitive.name]] for x in jaxpr.eqns if x.primitive.name in _INNER)
+    inner = (x.params[INNER[x.primitive.name]] for x in jaxpr.eqns if x.primitive.name in INNER)
     return len(jaxpr.eqns) + sum(_length(getattr(x, "jaxpr", x)) for x in inner)
 
 
@@ -131,7 +131,7 @@ _REDUCTIONS = {
     "reduce_or": lax.or_p,
 }
 _SAME = frozenset({"materialize", "optimization_barrier"})
-_INNER = {
+INNER = {
     "jit": "jaxpr",
     "pjit": "jaxpr",
     "closed_call": "call_jaxpr",
@@ -176,8 +176,8 @@ class _Writer:
         name = primitive.name
         if name == "one_kernel":
             return self._kernel(params["program"], args, outs)
-        if name in _INNER:
-            inner = params[_INNER[name]]
+        if name in INNER:
+            inner = params[INNER[name]]
             consts, inner = (inner.consts, inner.jaxpr) if isinstance(inner, ClosedJaxpr) else ((), inner)
             return self.evaluate(inner, [np.asarray(_known(const)) for const in consts], args)
         if name in _SAME:

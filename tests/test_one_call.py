@@ -134,7 +134,7 @@ def _same(found, known, tolerance=1e-13):
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
 
 
-def _in_call(function, *args, quick=None):
+def _in_call(function, *args):
     """What the function is in one call; fails where it is not."""
     compiled = jax.jit(lambda *args: one_call(function, *args)).lower(*args).compile()
     assert _marks(compiled) == 1
@@ -361,7 +361,6 @@ def test_a_simulation_is_one_call(monkeypatch, name, options):
     found, known = run(*args), _ordinary(monkeypatch, name, **options)
     assert _marks(run) == 1
     assert bool(found.success) and bool(known.success)
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, found.stats, known.stats)) or found.stats["num_steps"] > 0
     # Rounding may decide about a step; two runs at a tolerance of 1e-9 differ by less than ten times that.
     _same((found.q, found.v), (known.q, known.v), 1e-8)
     # Outside of the call there is nothing that takes a microsecond a step: no loop, no library, no callback.
