@@ -275,15 +275,16 @@ def starts(dtypes, gradient):
 FLAT = (
     "Adaptive steps in float64 pass the position where the rows lose rank, by every method. On the spot rounding decides "
     "on which of two ways the mechanism leaves; a run whose steps end there, as float32 makes likely, ends with "
-    "`dt_min_reached` or `max_steps_reached`: take float64, or fixed steps. In float32 these are off by 3e-3 or refused, so "
-    "ask for outputs=('energy', 'work'). Gradients through the position itself are those of the steps taken."
+    "`dt_min_reached` or `max_steps_reached`: take float64, or fixed steps. In float32 these are off by up to 1e-2 "
+    "without a code, so ask for outputs=('energy', 'work'). Gradients through the position itself are those of the steps taken."
 )
 PLANES = (
     "Rows at an angle below `rank_tol` (1e-9 in float64, 1e-4 in float32) count as one row, because rows that "
     "really depend on each other differ by as much when a loop is open by rounding; the other direction is then "
     "free, with a residual of the angle times the way. `constrained_dynamics(...).rank` says how many rows "
-    "counted. If they are meant as two, give jd.Projected(rank_tol=1e-14), or write the two directions as rows of "
-    "their own."
+    "counted. If they are meant as two, write the two directions as rows of their own, or give "
+    "jd.Projected(rank_tol=1e-14): accelerations are then off by eps over the angle, so that below 1e-10 rad adaptive "
+    "steps become short, up to `max_steps_reached`."
 )
 BASES = "Take jd.Reduced() without indices, which continues its basis, or method='projected'."
 GRASPS = (

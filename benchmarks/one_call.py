@@ -1,6 +1,6 @@
-"""Simulations of a few samples in one call against the same as ordinary programs: time to run and to compile.
+"""Simulations in calls (see `jaxdyn._one_call`) against the same as ordinary programs: time to run and to compile.
 
-    python -m benchmarks.one_call [SCENE ...] [--batch 1 8 32] [--tolerance 1e-6] [--rounds 20]
+    python -m benchmarks.one_call [SCENE ...] [--batch 1 8 32 1024] [--tolerance 1e-6] [--rounds 20]
 
 Scenes of `jaxdyn report`, known to the compiled function, by Dopri8. Both programs take turns in one loop.
 """
@@ -21,8 +21,8 @@ from jaxdyn.report.cases import cases
 SCENES = ("free_body", "double_pendulum", "rolling_disk", "car_axis", "four_bar", "andrews")
 
 
-def program(name: str, batch: int, tolerance: float, most: int):
-    """A compiled simulation as a function of no arguments, with calls for up to `most` samples, and seconds to compile it."""
+def program(name: str, batch: int, tolerance: float, in_calls: bool):
+    """A compiled simulation as a function of no arguments, in calls or not, and seconds to compile it."""
     case = cases()[name]
     scene, (q, v) = case.build()
     ts = jnp.asarray(case.ts)
@@ -35,20 +35,20 @@ def program(name: str, batch: int, tolerance: float, most: int):
     args = jnp.asarray(q), jnp.asarray(v)
     if batch > 1:
         one, args = jax.vmap(one), tuple(jnp.stack([x] * batch) for x in args)
-    usual, _one_call.MOST_SAMPLES = _one_call.MOST_SAMPLES, most
+    usual, _one_call.IN_CALLS = _one_call.IN_CALLS, in_calls
     try:
         began = time.perf_counter()
         run = jax.jit(one).lower(*args).compile()
         return (lambda: jax.block_until_ready(run(*args))), time.perf_counter() - began
     finally:
-        _one_call.MOST_SAMPLES = usual
+        _one_call.IN_CALLS = usual
 
 
 def main(argv=None) -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", default=SCENES, metavar="SCENE")
-    parser.add_argument("--batch", nargs="+", type=int, default=(1, 8, 32))
+    parser.add_argument("--batch", nargs="+", type=int, default=(1, 8, 32, 1024))
     parser.add_argument("--tolerance", type=float, default=1e-6)
     parser.add_argument("--rounds", type=int, default=20)
     options = parser.parse_args(argv)
@@ -57,7 +57,7 @@ def main(argv=None) -> None:
     for name in options.scenes:
         for batch in options.batch:
             made = {
-                way: program(name, batch, options.tolerance, most) for way, most in (("call", 10**6), ("ordinary", 0))
+                way: program(name, batch, options.tolerance, way == "call") for way in ("call", "ordinary")
             }
             found = timing.interleaved({way: run for way, (run, _) in made.items()}, options.rounds)
             times = {way: 1e6 * found[way]["best"] for way in made}

@@ -26,7 +26,7 @@ from jaxdyn._factor_loops import entry
 from jaxdyn._one_kernel import as_folds
 from jaxdyn._scalar_program import INNER
 
-MOST_PRODUCTS = 10000  # of a product of matrices; libraries are better at larger ones
+MOST_PRODUCTS = 10000  # of a product of two matrices; libraries are better at larger ones
 MOST_TERMS = 4  # of a sum that is written out; longer ones are loops
 MOST_OPERATIONS = 9000  # of a program before it is written; the time that LLVM takes grows faster than the function
 MOST_NUMBERS = (
@@ -257,7 +257,7 @@ class _Writer:
         free = [x.shape[len(lead) : x.ndim - len(left_sum)] for x in (a, b)]
         a, b = (x.reshape(*lead, math.prod(some), length) for x, some in zip((a, b), free, strict=True))
 
-        if math.prod((*lead, a.shape[-2], b.shape[-2], length)) > MOST_PRODUCTS:
+        if a.shape[-2] * b.shape[-2] * length > MOST_PRODUCTS:
             raise NotWritten("a large product")
         a, b = jnp.moveaxis(a, -1, 0)[..., :, None], jnp.moveaxis(b, -1, 0)[..., None, :]
 

@@ -33,6 +33,7 @@ from jaxdyn._by_batch import batched_axes, of_samples
 from jaxdyn._call_writer import NotWritten, has_kernels, is_short, written
 from jaxdyn._materialize import never
 
+IN_CALLS = True  # False leaves ordinary programs, to compare with
 MOST_SAMPLES = 32  # more run as fast on two cores in other ways
 
 _ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
@@ -93,7 +94,7 @@ def _as_it_is(*arrays, ways, axes, **_):
 def _on_cpu(ctx, *arrays, ways, sizes, axes, **_):
     function = partial(_as_it_is, ways=ways, axes=axes)
     real = all(jnp.issubdtype(aval.dtype, np.number) or aval.dtype == bool for aval in ctx.avals_in)
-    if real and 0 < math.prod(sizes) <= MOST_SAMPLES:
+    if IN_CALLS and real and 0 < math.prod(sizes) <= MOST_SAMPLES:
         try:
             function = _in_calls(*[way and of_samples(way, axes) for way in ways], avals=ctx.avals_in)
         except NotWritten:

@@ -66,7 +66,7 @@ def largest(lines) -> int:
 @pytest.fixture
 def ordinary(monkeypatch):
     """Programs of operations, as those of what is too long for one call, instead of one call for few samples."""
-    monkeypatch.setattr(_one_call, "MOST_SAMPLES", 0)
+    monkeypatch.setattr(_one_call, "IN_CALLS", False)
 
 
 def test_loops_of_one_motion_have_small_arrays(ordinary):

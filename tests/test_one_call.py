@@ -337,7 +337,7 @@ def _motion(name, count=1, **options):
 
 def _ordinary(monkeypatch, name, **options):
     with monkeypatch.context() as patched:
-        patched.setattr(_one_call, "MOST_SAMPLES", 0)
+        patched.setattr(_one_call, "IN_CALLS", False)
         run, args = _motion(name, **options)
     assert _marks(run) == 0
     return run(*args)
@@ -380,7 +380,7 @@ def test_dependent_rows_take_the_careful_way(monkeypatch):
 
     found = jax.jit(run)(q, v)
     with monkeypatch.context() as patched:
-        patched.setattr(_one_call, "MOST_SAMPLES", 0)
+        patched.setattr(_one_call, "IN_CALLS", False)
         known = jax.jit(lambda q, v: run(q, v))(q, v)
     assert found.result == known.result
     _same((found.q, found.v), (known.q, known.v), 1e-6)
@@ -401,7 +401,7 @@ def test_derivatives_are_those_of_the_ordinary_program(monkeypatch):
         jax.jit(jax.jacfwd(end), static_argnums=1),
     )
     with monkeypatch.context() as patched:
-        patched.setattr(_one_call, "MOST_SAMPLES", 0)
+        patched.setattr(_one_call, "IN_CALLS", False)
         known = jax.jit(jax.grad(end), static_argnums=1)(v, "reverse")
     _same(reverse, known, 1e-10)
     _same(forward(v, "forward"), known, 1e-5)  # steps of their own at tolerances of 1e-6
