@@ -56,9 +56,7 @@ def main(argv=None) -> None:
     rows = []
     for name in options.scenes:
         for batch in options.batch:
-            made = {
-                way: program(name, batch, options.tolerance, way == "call") for way in ("call", "ordinary")
-            }
+            made = {way: program(name, batch, options.tolerance, way == "call") for way in ("call", "ordinary")}
             found = timing.interleaved({way: run for way, (run, _) in made.items()}, options.rounds)
             times = {way: 1e6 * found[way]["best"] for way in made}
             medians = {way: 1e6 * found[way]["median"] for way in made}

@@ -6,12 +6,13 @@ The rule, measured by benchmarks/dynamics.py on CPU:
   one run in one kernel on CPU, whatever the batch, if there is one (see `_one_kernel`); what follows is for all the rest;
 - batches of at least `LEAST_BATCH` samples of a mechanism with at most `MOST_BODIES` bodies run on the recursion, whose
   numbers become vectors over the batch;
-- single samples and small batches run on the world-frame matrix form, whose program is short;
+- single samples and small batches run on the world-frame matrix form, whose program is short, unless there are many bodies;
 - single bodies and mechanisms of at most `FEW_FREEDOMS` degrees of freedom run on the recursion in any batch: below `LEAST_BATCH`
   samples it is written into a few calls that compute some values again and again (see `_materialize`), which for them is
   little: 0.1 to 0.3 us a sample instead of 3 to 5;
-- forward dynamics of more than `MOST_BODIES` bodies, and inverse dynamics of more than `MOST_IN_MASK`, run as loops over the
-  bodies, whose program is as short and whose time grows with the number of bodies instead of its third power or its square.
+- forward dynamics of more than `MOST_BODIES` bodies, in small batches of more than `MOST_IN_MATRICES`, and inverse dynamics of
+  more than `MOST_IN_MASK`, run as loops over the bodies, whose program is as short and whose time grows with the number of
+  bodies instead of its third power or its square; for few samples such a loop is one piece of machine code (see `_one_call`).
 
 How large the batch is, is known only after every enclosing `jax.vmap` has been applied, which may be long after this code
 has been traced (a `vmap` around a `jit` or around a loop). A primitive therefore stands for the question "is the batch this
@@ -35,6 +36,7 @@ from jaxtyping import Array
 from jaxdyn import closed_recursion, looped, matrix_form, recursive
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
+from jaxdyn._one_call import one_call
 from jaxdyn._one_kernel import Kernel, kernel_of
 from jaxdyn._scalar_program import is_written_out
 from jaxdyn._tracing import is_one_sample, is_staged, still, traced_once
@@ -44,6 +46,7 @@ LEAST_BATCH = 256
 FEW_FREEDOMS = 3
 MOST_BODIES = 64
 MOST_IN_MASK = 128
+MOST_IN_MATRICES = 16
 
 _large_batch_p = Primitive("large_batch")
 _large_batch_p.def_impl(lambda *arrays, count, on_cpu: np.bool_(count >= LEAST_BATCH))
@@ -108,14 +111,14 @@ def _choose(model: Model, recursion: Callable, matrices: Callable, *args):
 def inverse_dynamics(model: Model, q: Array, v: Array, a: Array) -> Array:
     """tau = M a + C v + N, (nv,)."""
     if model.nb > MOST_IN_MASK:
-        return looped.inverse_dynamics(model, q, v, a)
+        return _by_loops(looped.inverse_dynamics, model, q, v, a)
     return _choose(model, recursive.rnea, matrix_form.inverse_dynamics, q, v, a)
 
 
 def bias_force(model: Model, q: Array, v: Array) -> Array:
     """h = C v + N, (nv,)."""
     if model.nb > MOST_IN_MASK:
-        return looped.inverse_dynamics(model, q, v, None)
+        return _by_loops(_bias_by_loops, model, q, v)
     return _choose(model, recursive.bias_force, _bias_by_matrices, q, v)
 
 
@@ -124,6 +127,15 @@ def gravity_force(model: Model, q: Array) -> Array:
     if model.gravity is None:
         return jnp.zeros((model.nv,), model.home.dtype)
     return _choose(model, recursive.gravity_force, matrix_form.gravity_force, q)
+
+
+def _by_loops(function: Callable, model: Model, *args):
+    """function(model, *args), a loop over the bodies, in one call (see `_one_call`): each turn is a few small operations."""
+    return one_call(partial(function, model), *args) if is_staged() else function(model, *args)
+
+
+def _bias_by_loops(model, q, v):
+    return looped.inverse_dynamics(model, q, v, None)
 
 
 def _bias_by_matrices(model, q, v):
@@ -139,9 +151,12 @@ def forward_dynamics(model: Model, q: Array, v: Array, tau: Array) -> Array:
     """a = M^-1 (tau - C v - N), (nv,), differentiated by the implicit function theorem and not through the algorithm."""
 
     def by_other_ways(model, *args):
+        by_loops = partial(_by_loops, looped.forward_dynamics)
         if model.nb > MOST_BODIES:
-            return looped.forward_dynamics(model, *args)
-        return _choose(model, recursive.aba, matrix_form.forward_dynamics, *args)
+            return by_loops(model, *args)
+        return _choose(
+            model, recursive.aba, by_loops if model.nb > MOST_IN_MATRICES else matrix_form.forward_dynamics, *args
+        )
 
     def solve(model, *args):
         if not 0 < model.nb <= MOST_BODIES or _is_tiny(model) or not is_staged():

@@ -39,6 +39,7 @@ from jaxdyn._ways import way
 
 MOST_AT_ONCE = 4400  # operations in one block; from about 4500 on XLA cuts it in pieces that compute values again
 MOST = 9000  # operations in all; longer ones compile for minutes
+MOST_TAKEN = 220  # numbers that a block takes from those before it; with more it compiles for minutes too
 AT_ONE_CALL = 4096  # samples from which on a kernel pays that is not in a loop
 
 _NOTHING, _ARGUMENTS, _RESULT = (np.int8(i) for i in range(3))
@@ -81,7 +82,8 @@ def _kernel(function: Callable, known: Known, shapes, most: int, for_batches: bo
         program = scalar_program(lambda *args: function(known(()), *args), *args, most=most, for_batches=for_batches)
     except TooMuch:
         return None
-    return Kernel(*program)
+    kernel = Kernel(*program)
+    return None if any(len(takes) > MOST_TAKEN for _, takes, _ in _blocks(kernel.program)[1:]) else kernel
 
 
 # --- the fold --------------------------------------------------------------------------------------

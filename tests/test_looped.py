@@ -8,6 +8,8 @@ import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree, to_pinocchio
 
 from jaxdyn import dynamics, looped, matrix_form
+from jaxdyn._one_call import MOST_SAMPLES
+from jaxdyn.robots import chain as planar_chain
 from jaxdyn.robots import random_tree as chain
 
 KINDS = ("free", "revolute", "spherical", "helical", "planar", "prismatic")
@@ -65,3 +67,14 @@ def test_five_hundred_links(branching):
     want = pin.aba(source, source.createData(), bridge.q_to_pinocchio(q), np.asarray(v), np.asarray(tau))
     # Both lose what the chain's mass matrix is badly conditioned.
     assert_close(a, want, 1e-8)
+
+
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_loops_are_one_call_of_few_samples(count):
+    """Of a mechanism with no kernel: what runs, against the matrix form, and how it was compiled."""
+    model = planar_chain(40)
+    q, v, tau = (jnp.asarray(x) for x in np.random.default_rng(0).normal(size=(3, count, 40)))
+    run = jax.jit(jax.vmap(lambda *state: dynamics.forward_dynamics(model, *state))).lower(q, v, tau).compile()
+    assert ("xla_cpu_small_call" in run.as_text()) == (count <= MOST_SAMPLES)
+    want = quick(jax.vmap(lambda *state: matrix_form.forward_dynamics(model, *state)))(q, v, tau)
+    assert_close(run(q, v, tau), want, 1e-10)

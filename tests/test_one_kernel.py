@@ -12,6 +12,7 @@ from pinocchio_bridge import random_states, random_tree
 
 import jaxdyn as jd
 from jaxdyn import _one_kernel, matrix_form, projection, recursive, scenes
+from jaxdyn._dispatch import MOST_BODIES
 from jaxdyn._one_kernel import kernel_of
 from jaxdyn._scalar_program import scalar_program
 from jaxdyn.constrained import constrained_dynamics, solve_rows
@@ -158,6 +159,14 @@ def test_no_kernel():
 
     jax.jit(traced)(jnp.asarray(FACTORS), x)
     assert seen == [None]
+
+
+def test_what_would_compile_for_minutes_is_no_kernel():
+    # Both are short enough; of the longer chain the second block would take too many numbers from the first.
+    assert jd.robots.chain(40).nb <= MOST_BODIES
+    for links, there in ((30, True), (40, False)):
+        none = jnp.zeros(links)
+        assert (kernel_of(recursive.aba, jd.robots.chain(links), none, none, none) is not None) == there
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
