@@ -150,6 +150,7 @@ def _marks(compiled) -> int:
 @pytest.mark.parametrize("x", [FEW, MANY, FEW.astype(jnp.float32)], ids=["few", "many", "float32"])
 def test_operations_in_a_call_are_those_outside(function, x):
     # Other orders of summation; powers and functions of more than one instruction may differ in the last digits.
+    # Float32: some hundred roundings of 1e-7, in another order.
     _same(_in_call(function, x), jax.jit(function)(x), 1e-12 if x.dtype == jnp.float64 else 2e-5)
 
 
@@ -166,6 +167,7 @@ def test_every_operation_that_is_allowed_was_tried():
 @pytest.mark.parametrize("n", [1, 2, 7, 15])
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_factors_in_a_call_are_lapacks(n, dtype):
+    # Entries are sums of n terms, and the matrices have condition numbers up to some hundred, eps being 2e-16 and 1e-7.
     tolerance = (1e-12 if dtype == jnp.float64 else 1e-4) * n
     A = jax.random.normal(jax.random.key(n), (2, n, n), dtype) + 3 * jnp.eye(n, dtype=dtype)[None]
     b = jnp.ones((2, n, 2), dtype)
