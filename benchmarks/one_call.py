@@ -1,6 +1,6 @@
-"""Simulations in calls (see `jaxdyn._one_call`) against the same as ordinary programs: time to run and to compile.
+"""Simulations of a few samples in one call against the same as ordinary programs: time to run and to compile.
 
-    python -m benchmarks.one_call [SCENE ...] [--batch 1 8 32 1024] [--tolerance 1e-6] [--rounds 20]
+    python -m benchmarks.one_call [SCENE ...] [--batch 1 8 32] [--tolerance 1e-6] [--rounds 20]
 
 Scenes of `jaxdyn report`, known to the compiled function, by Dopri8. Both programs take turns in one loop.
 """
@@ -48,7 +48,7 @@ def main(argv=None) -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", default=SCENES, metavar="SCENE")
-    parser.add_argument("--batch", nargs="+", type=int, default=(1, 8, 32, 1024))
+    parser.add_argument("--batch", nargs="+", type=int, default=(1, 8, 32))
     parser.add_argument("--tolerance", type=float, default=1e-6)
     parser.add_argument("--rounds", type=int, default=20)
     options = parser.parse_args(argv)
