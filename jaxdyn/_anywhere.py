@@ -42,6 +42,21 @@ def anywhere(flag):
     return _anywhere_p.bind(flag) if isinstance(flag, jax.core.Tracer) else flag
 
 
+def redone(flag, again: Callable, found):
+    """`found`, or again() where a flag () is set in any sample of the batch; without derivatives.
+
+    A loop of at most one turn: a branch that gives `found` would copy it. As vectors, because XLA would copy matrices into the
+    order of axes in which `again` finds them.
+    """
+
+    def flat(arrays):
+        return jax.tree.map(lambda x: x.reshape(-1), arrays)
+
+    start = anywhere(flag), flat(found)
+    flattened = lax.while_loop(lambda state: state[0], lambda _: (jnp.asarray(False), flat(again())), start)[1]
+    return jax.tree.map(lambda x, y: x.reshape(y.shape), flattened, found)
+
+
 def mended(flag, careful: Callable, found: tuple, args: tuple, same: Callable | None = None, dense: Any = False):
     """`found` where the flag () is not set, else `careful(*args)`; in a batch only the samples that need it, a few at a time.
 

@@ -48,7 +48,7 @@ def _written_out():
 def scalar_program(function: Callable, *args, most: int, for_batches: bool = False):
     """The program of `function` in single numbers: its jaxpr, (shape, dtype) of the outputs and their structure.
 
-    With `for_batches` sines and cosines are written as polynomials: more operations, but ones that become vector instructions.
+    With `for_batches` sines, cosines and square roots are written as more operations, but ones that become vector instructions.
 
     **Raises:** `TooMuch` for more than `most` operations, and for those that are none of single numbers.
     """
@@ -222,10 +222,18 @@ class _Writer:
         plain = _without(primitive.name, params, args, known)
         if plain is not None:
             return plain
-        names = (id(x) if k is None else (k.dtype, k.tobytes()) for x, k in zip(args, known, strict=True))
         if self.for_batches and primitive.name in ("sin", "cos") and args[0].dtype in (np.float32, np.float64):
             sine, cosine = self.evaluate(*_sines(np.dtype(args[0].dtype)), [_objects([args[0]], ())])
             return (sine if primitive.name == "sin" else cosine).item()
+        found = self._operation(primitive, params, args, known)
+        if self.for_batches and primitive is lax.sqrt_p:
+            # XLA makes 1/sqrt(x) an instruction of one processor, of which LLVM makes no vector instructions; this hides it.
+            return self._operation(lax.max_p, {}, (found, (zero := args[0].dtype.type(0))), (None, zero))
+        return found
+
+    def _operation(self, primitive, params, args, known):
+        """One that is written down, unless it has been before."""
+        names = (id(x) if k is None else (k.dtype, k.tobytes()) for x, k in zip(args, known, strict=True))
         key = primitive, _frozen(params), tuple(names)
         if key not in self.written:
             self.left -= 1

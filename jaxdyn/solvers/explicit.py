@@ -21,7 +21,7 @@ import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from jaxdyn._anywhere import anywhere
+from jaxdyn._anywhere import anywhere, redone
 from jaxdyn._by_batch import by_batch
 from jaxdyn._dispatch import LEAST_BATCH
 from jaxdyn._implicit import along, implicit
@@ -185,30 +185,53 @@ def _finished(plan: _Plan, t1, raw, error, end: Any, k):
 
 
 def at_once(plan: _Plan, terms, t0, t1, start, kept, ready):
-    """The same with the stages in one kernel, if there is one."""
-    count = plan.count - plan.lasts
-
-    def numbers(terms, t0, t1, start, first):
-        k = [first]
-        for i in range(1, count):
-            k.append(plan.rate(terms, t0, t1, start + _sum(plan.sums[i], k), float(plan.times[i])))
-        k = jnp.stack(k)
-        return k, start + _sum(plan.sums[plan.count], k), _sum(plan.sums[plan.count + 1], k), jnp.isfinite(jnp.sum(k))
-
+    """The same with the stages in one kernel, and what comes after them too if that is as simple, if there is such a kernel."""
     args = t0, t1, start, plan.first(terms, t0, t1, start, kept, ready)
-    kernel = kernel_of(numbers, terms, *args, for_batches=True)
-    if kernel is None:
+
+    def redo():
         return in_turn(plan, terms, t0, t1, start, kept, ready)
-    k, raw, error, served = kernel(partial(numbers, terms), *args)
-    if plan.lasts:
-        end = plan.ended(t1, raw, error if plan.known else jnp.zeros_like(error))
-        last = plan.rate(terms, t0, t1, end[0], 1.0)
-        k, whole = jnp.concatenate([k, last[None]]), error + float(plan.sums[-1, -1]) * last
+
+    whole, stages = partial(_whole, plan), partial(_stages, plan)
+    kernel = kernel_of(whole, terms, *args, for_batches=True)
+    if kernel is not None:
+        found, served = kernel(partial(whole, terms), *args)
     else:
-        end, whole = (), error
-    found = _finished(plan, t1, raw, whole, end, _pieces(k, plan.count + 2))
+        kernel = kernel_of(stages, terms, *args, for_batches=True)
+        if kernel is None:
+            return redo()
+        (k, raw, error), served = kernel(partial(stages, terms), *args)
+        found = _after(plan, terms, t0, t1, k, raw, error)
     # Where numbers alone do not serve, as where rows are close to dependent, they are NaN.
-    return lax.cond(anywhere(~served), lambda: in_turn(plan, terms, t0, t1, start, kept, ready), lambda: found)
+    return redone(~served, redo, found)
+
+
+def _stages(plan: _Plan, terms, t0, t1, start, first):
+    """All stages but one after the projection, in pieces with a row for that one, the result and the error without it; and
+    whether all of these are numbers."""
+    k = [first]
+    for i in range(1, plan.count - plan.lasts):
+        k.append(plan.rate(terms, t0, t1, start + _sum(plan.sums[i], k), float(plan.times[i])))
+    raw, error = start + _sum(plan.sums[plan.count], k), _sum(plan.sums[plan.count + 1], k)
+    served = jnp.isfinite(sum(map(jnp.sum, k)))
+    return (_pieces(jnp.stack([*k, *[jnp.zeros_like(start)] * plan.lasts]), plan.count + 2), raw, error), served
+
+
+def _after(plan: _Plan, terms, t0, t1, k, raw, error):
+    """The whole of a step from its `_stages`."""
+    if not plan.lasts:
+        return _finished(plan, t1, raw, error, (), k)
+    end = plan.ended(t1, raw, error if plan.known else jnp.zeros_like(error))
+    last = plan.rate(terms, t0, t1, end[0], 1.0)
+    rows = jnp.split(last, np.cumsum([part.shape[-1] for part in k])[:-1])
+    k = tuple(lax.dynamic_update_index_in_dim(part, row, plan.count - 1, 0) for part, row in zip(k, rows, strict=True))
+    return _finished(plan, t1, raw, error + float(plan.sums[-1, -1]) * last, end, k)
+
+
+def _whole(plan: _Plan, terms, t0, t1, start, first):
+    """All of it, and whether it is numbers."""
+    found, served = _stages(plan, terms, t0, t1, start, first)
+    found = _after(plan, terms, t0, t1, *found)
+    return found, served & jnp.isfinite(jnp.sum(found[0]))
 
 
 def _still(x):
