@@ -25,6 +25,7 @@ from jaxdyn._by_batch import of_samples
 from jaxdyn._factor_loops import entry
 from jaxdyn._one_kernel import as_folds
 from jaxdyn._scalar_program import INNER
+from jaxdyn._vector_program import VectorProgram
 
 MOST_PRODUCTS = 10000  # of a product of two matrices; libraries are better at larger ones
 MOST_TERMS = 4  # of a sum that is written out; longer ones are loops
@@ -116,6 +117,9 @@ class _Writer:
     def _one(self, primitive, params, args, outermost: bool) -> list:
         name = primitive.name
         if name in _AS_THEY_ARE or (self.by_libraries and name in _OF_LIBRARIES):
+            if args and not any(isinstance(x, Tracer) or np.ndim(x) for x in args):
+                with jax.ensure_compile_time_eval():  # a choice that is made is not written, nor is what it is not for
+                    return [np.asarray(x) for x in jax.tree.leaves(primitive.bind(*args, **params))]
             found = primitive.bind(*args, **params)
             return list(found) if primitive.multiple_results else [found]
         if name in _SAME:
@@ -157,6 +161,8 @@ class _Writer:
         return self._traced(of_samples(ways[0], axes), args, outermost)
 
     def _one_kernel(self, args, outermost, *, program, shapes, depth, **_):
+        if isinstance(program, VectorProgram):
+            raise NotWritten("vectors")  # of which LLVM makes loops, and takes minutes to take them apart
         if len(program.eqns) > MOST_NUMBERS:
             return as_folds(*args, program=program, shapes=shapes, depth=depth)
         lead = args[0].shape[:depth]
@@ -383,6 +389,8 @@ def _names(jaxpr):
     for eqn in jaxpr.eqns:
         yield eqn.primitive.name
         for value in eqn.params.values():
+            if isinstance(value, VectorProgram):
+                yield from itertools.repeat("vectors", MOST_OPERATIONS)
             for inner in value if isinstance(value, (tuple, list)) else (value,):
                 inner = getattr(inner, "jaxpr", inner)
                 if hasattr(inner, "eqns"):

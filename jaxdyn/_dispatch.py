@@ -40,6 +40,7 @@ from jaxdyn._one_call import one_call
 from jaxdyn._one_kernel import Kernel, kernel_of
 from jaxdyn._scalar_program import is_written_out
 from jaxdyn._tracing import is_one_sample, is_staged, still, traced_once
+from jaxdyn._ways import way
 from jaxdyn.model import Model
 
 LEAST_BATCH = 256
@@ -82,6 +83,8 @@ def is_large_batch(*trees, on_cpu: bool = False):
     traced = [x for x in jax.tree.leaves(trees) if isinstance(x, jax.core.Tracer)]
     if not traced or is_written_out():
         return False
+    if way() != "usual":  # those are for few samples on CPU
+        return on_cpu
     large = _large_batch_p.bind(*[lax.stop_gradient(x) for x in traced], count=1, on_cpu=on_cpu)
     if is_one_sample() and isinstance(large, jax.core.Tracer):
         # What no batch encloses is not made large any more.
@@ -213,7 +216,7 @@ def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tupl
 
 def closed_kernel(tree, q: Array, v: Array, tau: Array) -> Kernel | None:
     """`closed_dynamics` of a pair (model, loops), in one kernel."""
-    return kernel_of(_closed, tree, q, v, tau)
+    return kernel_of(_closed, tree, q, v, tau, in_vectors=True)
 
 
 def _closed(tree, q, v, tau):

@@ -27,33 +27,40 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Literal, Primitive
 from jax.extend.mlir import ir
 from jax.interpreters import batching, mlir
 
+from jaxdyn._fold import fold
+from jaxdyn._in_vectors import as_vectors
 from jaxdyn._scalar_program import TooMuch, scalar_program
 from jaxdyn._tracing import Known, split
+from jaxdyn._vector_program import VectorProgram, vector_program
 from jaxdyn._ways import way
 
 MOST_AT_ONCE = 4400  # operations in one block; from about 4500 on XLA cuts it in pieces that compute values again
 MOST = 9000  # operations in all; longer ones compile for minutes
 MOST_TAKEN = 220  # numbers that a block takes from those before it; with more it compiles for minutes too
+MOST_IN_VECTORS = 60000  # operations that may become those of vectors
+MOST_VECTORS = 2000  # and how many of these there may be
 AT_ONE_CALL = 4096  # samples from which on a kernel pays that is not in a loop
-
-_NOTHING, _ARGUMENTS, _RESULT = (np.int8(i) for i in range(3))
 
 _one_kernel_p = Primitive("one_kernel")
 _one_kernel_p.multiple_results = True
 
 
 class Kernel(NamedTuple):
-    """A function of arrays in single numbers; see `kernel_of`."""
+    """A function of arrays in single numbers, or in vectors of them; see `kernel_of`."""
 
-    program: ClosedJaxpr
+    program: ClosedJaxpr | VectorProgram
     shapes: tuple
     structure: Any
+
+    @property
+    def is_in_vectors(self) -> bool:
+        """Whether it is a program of vectors, of several kernels."""
+        return isinstance(self.program, VectorProgram)
 
     def __call__(self, otherwise: Callable, *args):
         """What the function is of `args`; on other platforms than CPU otherwise(*args)."""
@@ -61,29 +68,51 @@ class Kernel(NamedTuple):
         return jax.tree.unflatten(self.structure, found)
 
 
-def kernel_of(function: Callable, tree, *args, most: int | None = None, for_batches: bool = False) -> Kernel | None:
+def kernel_of(
+    function: Callable, tree, *args, most: int | None = None, for_batches: bool = False, in_vectors: bool = False
+) -> Kernel | None:
     """function(tree, *args) for arrays of the shapes of `args`, one sample, as a kernel of at most `most` operations (`MOST`).
 
     None where `without_kernels` is in force, if the tree holds numbers that are traced, if the function computes with more than
     single numbers, such as a factorisation by LAPACK, or if it is too long. It is traced once for a tree and shapes. With
-    `for_batches` it is made for many samples: see `scalar_program`.
+    `for_batches` it is made for many samples: see `scalar_program`. With `in_vectors` a function that is too long may become a
+    program of vectors (see `_vector_program`), if that is short: then it has several kernels.
     """
     traced, known = split(tree)
     if way() == "without kernels" or traced or len(jax.tree.leaves(args)) != len(args):
         return None
     shapes = tuple((np.shape(x), np.dtype(x.dtype)) for x in args)
-    return _kernel(function, known, shapes, MOST if most is None else most, for_batches)
+    return _kernel(function, known, shapes, MOST if most is None else most, for_batches, in_vectors)
 
 
 @functools.lru_cache(maxsize=256)  # kernels hold their trees
-def _kernel(function: Callable, known: Known, shapes, most: int, for_batches: bool) -> Kernel | None:
+def _kernel(function: Callable, known: Known, shapes, most: int, for_batches: bool, in_vectors: bool) -> Kernel | None:
     args = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
+
+    def whole(*args):
+        return function(known(()), *args)
+
+    kernel, length = None, most + 1
     try:
-        program = scalar_program(lambda *args: function(known(()), *args), *args, most=most, for_batches=for_batches)
+        program, shapes, structure = scalar_program(whole, *args, most=most, for_batches=for_batches)
+        length = len(program.eqns)
+        if not any(len(takes) > MOST_TAKEN for _, takes, _ in _blocks(program)[1:]):
+            kernel = Kernel(program, shapes, structure)
+    except TooMuch:
+        pass
+    return (_kernel_in_vectors(whole, args) if in_vectors and length > MOST_AT_ONCE else None) or kernel
+
+
+def _kernel_in_vectors(function: Callable, args) -> Kernel | None:
+    try:
+        # Another function than before, of which jax would keep the trace.
+        anew = functools.partial(function)
+        program, shapes, structure = scalar_program(anew, *args, most=MOST_IN_VECTORS, in_vectors=True)
     except TooMuch:
         return None
-    kernel = Kernel(*program)
-    return None if any(len(takes) > MOST_TAKEN for _, takes, _ in _blocks(kernel.program)[1:]) else kernel
+    sizes, results = [math.prod(x.shape) for x in args], [math.prod(shape) for shape, _ in shapes]
+    short = vector_program(program, sizes, results)
+    return None if short.operations > MOST_VECTORS else Kernel(short, shapes, structure)
 
 
 # --- the fold --------------------------------------------------------------------------------------
@@ -114,8 +143,10 @@ def _cut(jaxpr, count: int):
     return blocks[::-1]
 
 
-def as_folds(*arrays, program: ClosedJaxpr, shapes, depth: int, **_) -> list:
+def as_folds(*arrays, program: ClosedJaxpr | VectorProgram, shapes, depth: int, **_) -> list:
     """What a kernel's program gives for arrays with `depth` leading axes, as it is put down on CPU."""
+    if isinstance(program, VectorProgram):
+        return as_vectors(*arrays, program=program, shapes=shapes, depth=depth)
     lead = arrays[0].shape[:depth]
     jaxpr = program.jaxpr
     sizes = [math.prod(x.shape[depth:]) for x in arrays]  # reshape cannot find them where there are no samples
@@ -123,7 +154,7 @@ def as_folds(*arrays, program: ClosedJaxpr, shapes, depth: int, **_) -> list:
     values = dict(zip(jaxpr.invars, numbers, strict=True))
     sound = jnp.ones(lead, bool)
     for eqns, takes, gives in _blocks(program):
-        done, given = _fold(eqns, takes, gives, values, lead)
+        done, given = fold(eqns, takes, gives, values, lead)
         sound = sound & done
         values.update(given)
     found, at = [], 0
@@ -135,47 +166,6 @@ def as_folds(*arrays, program: ClosedJaxpr, shapes, depth: int, **_) -> list:
             array = jnp.where(sound[..., None], array, np.asarray(np.nan, dtype))
         found.append(array.reshape(*lead, *shape))
     return found
-
-
-def _fold(eqns, takes, gives, values, lead):
-    """Whether they are results (the batch's shape `lead`), and the values of `gives`, each of that shape."""
-    # A result takes the place of an argument of its dtype.
-    kinds = [*{x.aval.dtype: None for x in (*takes, *gives)}]
-    slots = []  # pairs of an argument and a result, either of which may be missing
-    for dtype in kinds:
-        ins, outs = ([x for x in side if x.aval.dtype == dtype] for side in (takes, gives))
-        slots += [
-            (ins[i] if i < len(ins) else None, outs[i] if i < len(outs) else None, dtype)
-            for i in range(max(len(ins), len(outs)))
-        ]
-
-    def fold(one, other):
-        (kind, *one), (other_kind, *other) = one, other
-        first, done = kind == _ARGUMENTS, kind == _RESULT
-        given = first | (other_kind == _ARGUMENTS)
-        inner = {x: lax.select(first, a, b) for (x, _, _), a, b in zip(slots, one, other, strict=True) if x is not None}
-
-        def read(x):
-            return x.val if isinstance(x, Literal) else inner[x]
-
-        for eqn in eqns:
-            found = eqn.primitive.bind(*map(read, eqn.invars), **eqn.params)
-            inner.update(zip(eqn.outvars, found if eqn.primitive.multiple_results else [found], strict=True))
-        results = [
-            lax.select(given, inner[y] if y is not None else np.zeros((), dtype), lax.select(done, a, b))
-            for (_, y, dtype), a, b in zip(slots, one, other, strict=True)
-        ]
-        return lax.select(given | done, _RESULT, other_kind), *results
-
-    def twice(x, dtype):
-        return jnp.zeros((*lead, 2), dtype) if x is None else jnp.broadcast_to(values[x][..., None], (*lead, 2))
-
-    operands = [jnp.full((*lead, 2), _ARGUMENTS), *(twice(x, dtype) for x, _, dtype in slots)]
-    start = [_NOTHING, *(np.zeros((), dtype) for _, _, dtype in slots)]
-    found = lax.reduce(operands, start, fold, (len(lead),))
-    # A canonicalisation of StableHLO explores every path through the fold for results that nothing uses. The barrier uses all.
-    kind, *found = lax.optimization_barrier(found)
-    return kind == _RESULT, {y: x for x, (_, y, _) in zip(found, slots, strict=True) if y is not None}
 
 
 # --- the primitive -----------------------------------------------------------------------------------

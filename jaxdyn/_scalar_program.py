@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray, Tracer
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jaxdyn._trig import sin_cos
 
-_writing = contextvars.ContextVar("writing", default=False)
+_writing = contextvars.ContextVar("writing", default="")
 
 
 class TooMuch(Exception):
@@ -33,26 +33,32 @@ class TooMuch(Exception):
 
 def is_written_out() -> bool:
     """Whether a function is being traced to become a program of single numbers."""
-    return _writing.get()
+    return bool(_writing.get())
+
+
+def is_written_in_vectors() -> bool:
+    """Whether it is to become one of vectors, in which sequences that repeat themselves are better not written out."""
+    return _writing.get() == "vectors"
 
 
 @contextlib.contextmanager
-def _written_out():
-    token = _writing.set(True)
+def _written_out(in_vectors: bool):
+    token = _writing.set("vectors" if in_vectors else "numbers")
     try:
         yield
     finally:
         _writing.reset(token)
 
 
-def scalar_program(function: Callable, *args, most: int, for_batches: bool = False):
+def scalar_program(function: Callable, *args, most: int, for_batches: bool = False, in_vectors: bool = False):
     """The program of `function` in single numbers: its jaxpr, (shape, dtype) of the outputs and their structure.
 
-    With `for_batches` sines, cosines and square roots are written as more operations, but ones that become vector instructions.
+    With `for_batches`, or `in_vectors` (see `_vector_program`), sines, cosines and square roots are written as more operations,
+    but ones that become vector instructions.
 
     **Raises:** `TooMuch` for more than `most` operations, and for those that are none of single numbers.
     """
-    with _written_out():
+    with _written_out(in_vectors):
         jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*args)
     leaves, structure = jax.tree.flatten(out)
     if _length(jaxpr.jaxpr) > 4 * most:  # not all of them are needed, and some only move numbers
@@ -64,7 +70,7 @@ def scalar_program(function: Callable, *args, most: int, for_batches: bool = Fal
             size = math.prod(np.shape(arg))
             given.append(_objects(numbers[at : at + size], np.shape(arg)))
             at += size
-        found = _Writer(4 * most, for_batches).evaluate(
+        found = _Writer(4 * most, for_batches or in_vectors, _in_pairs if in_vectors else functools.reduce).evaluate(
             jaxpr.jaxpr, [np.asarray(const) for const in map(_known, jaxpr.consts)], given
         )
         return [
@@ -83,7 +89,8 @@ def scalar_program(function: Callable, *args, most: int, for_batches: bool = Fal
 def _length(jaxpr) -> int:
     """Operations of a program and of those inside it; on arrays of several numbers each counts once, so there may be more."""
     inner = (x.params[INNER[x.primitive.name]] for x in jaxpr.eqns if x.primitive.name in INNER)
-    return len(jaxpr.eqns) + sum(_length(getattr(x, "jaxpr", x)) for x in inner)
+    inner = (getattr(x, "jaxpr", x) for x in inner)
+    return len(jaxpr.eqns) + sum(_length(x) for x in inner if isinstance(x, Jaxpr))
 
 
 def _needed(program: ClosedJaxpr) -> ClosedJaxpr:
@@ -111,6 +118,14 @@ def _objects(entries, shape) -> np.ndarray:
     return array.reshape(shape)
 
 
+def _in_pairs(fold: Callable, numbers: list):
+    """The numbers folded in pairs, and these again: few sequences of the same kind instead of one long one."""
+    while len(numbers) > 1:
+        half = len(numbers) // 2
+        numbers = [fold(*pair) for pair in zip(numbers[:half], numbers[half:], strict=False)] + numbers[2 * half :]
+    return numbers[0]
+
+
 def _entries(array) -> list:
     """The numbers of an array in order: traced ones as they are, known ones of its dtype."""
     if array.dtype.kind == "O":
@@ -131,6 +146,7 @@ _REDUCTIONS = {
     "reduce_or": lax.or_p,
 }
 _SAME = frozenset({"materialize", "optimization_barrier"})
+_OF_MANY = frozenset({"banded_factor", "banded_solution"})  # numbers
 INNER = {
     "jit": "jaxpr",
     "pjit": "jaxpr",
@@ -154,8 +170,9 @@ _MOVES = {
 class _Writer:
     """Evaluates jaxprs on arrays of numbers; operations that recur are written once."""
 
-    def __init__(self, most: int, for_batches: bool = False):
+    def __init__(self, most: int, for_batches: bool, reduced: Callable):
         self.left = most  # of which some are not needed in the end
+        self.reduced = reduced
         self.for_batches = for_batches
         self.written: dict = {}
 
@@ -175,6 +192,8 @@ class _Writer:
     def _one(self, primitive, params, args, outs):
         name = primitive.name
         if name == "one_kernel":
+            if not isinstance(params["program"], ClosedJaxpr):
+                raise TooMuch("vectors")
             return self._kernel(params["program"], args, outs)
         if name in INNER:
             inner = params[INNER[name]]
@@ -182,6 +201,9 @@ class _Writer:
             return self.evaluate(inner, [np.asarray(_known(const)) for const in consts], args)
         if name in _SAME:
             return args
+        if name in _OF_MANY:
+            found = primitive.bind(*(entry for arg in args for entry in _entries(arg)), **params)
+            return [_objects([x], ()) for x in found]
         if name == "cond" and args[0].dtype.kind != "O":
             branch = params["branches"][int(np.clip(args[0], 0, len(params["branches"]) - 1))]
             return self.evaluate(branch.jaxpr, [np.asarray(_known(const)) for const in branch.consts], args[1:])
@@ -194,7 +216,7 @@ class _Writer:
         if name in _REDUCTIONS:
             axes, fold = params["axes"], functools.partial(self._pair, _REDUCTIONS[name])
             rows = np.moveaxis(args[0], axes, range(len(axes))).reshape(-1, math.prod(shape))
-            return [_objects([functools.reduce(fold, _entries(column)) for column in rows.T], shape)]
+            return [_objects([self.reduced(fold, _entries(column)) for column in rows.T], shape)]
         if name == "dot_general":
             return [self._product(args[0], args[1], params["dimension_numbers"], outs[0])]
         if name == "scatter-add":

@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxdyn._materialize import at_least, least_size
-from jaxdyn._scalar_program import is_written_out
+from jaxdyn._scalar_program import is_written_in_vectors, is_written_out
 from jaxdyn._ways import way
 
 
@@ -122,7 +122,7 @@ def traced_once(function: Callable, tree, *args, static: tuple = ()):
     if not is_staged():
         return function(tree, *args, *static)
     traced, known = split(tree)
-    mode = is_one_sample(), is_written_out(), way()
+    mode = is_one_sample(), is_written_out(), is_written_in_vectors(), way()
     return _program(function, known, static, least_size(), mode)(traced, *args)
 
 

@@ -93,7 +93,7 @@ def kernels(model: Model, loops, q: Array, v: Array) -> Kernels | None:
     tree = model, loops
     found = []
     for function, *args in ((_step, q, rows), (_quality, q), (_apart, q), (_slip, q, v)):
-        kernel = kernel_of(function, tree, *args)
+        kernel = kernel_of(function, tree, *args, in_vectors=True)
         if kernel is None:
             return None
         found.append(kernel)

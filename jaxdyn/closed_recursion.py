@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxdyn._articulated import Factor, factorize, inward, outward
+from jaxdyn._banded import banded_factor, banded_solution
 from jaxdyn._links import (
     canonical_bodies,
     canonical_poses,
@@ -48,9 +49,13 @@ from jaxdyn._scalar import (
     vanishes,
     vsub,
 )
+from jaxdyn._scalar_program import is_written_in_vectors
 from jaxdyn._tracing import is_concrete
 from jaxdyn.model import Model, body_index, frame_index
 from jaxdyn.recursive import body_wrenches, joint_forces
+
+LEAST_ROWS = 8  # that a band is taken for in a program of vectors
+MOST_WIDTH = 9  # of it, with the diagonal
 
 
 class Side(NamedTuple):
@@ -79,6 +84,7 @@ class Factored(NamedTuple):
     parts: list  # per row, entries of D^(1/2) y by (body, joint coordinate)
     lower: list  # per column of L, its entries by row
     pivots: list  # of L D L^T
+    band: list | None = None  # rows of L and D, in a program of vectors; see `_banded`
 
 
 def close(model: Model, loops: Sequence) -> list[Closed]:
@@ -295,6 +301,9 @@ def factored(model: Model, moves, factor: Factor, pending) -> Factored:
     parts = _carry(model, moves, factor, pending)
     weighted = keep_all([{key: mul(u, factor.inverses[key[0]][key[1]]) for key, u in part.items()} for part in parts])
     columns = pattern([frozenset(part) for part in parts])
+    width = 1 + max((r - min(some) for r, some in enumerate(columns) if some), default=0)
+    if is_written_in_vectors() and len(parts) > LEAST_ROWS and width <= MOST_WIDTH:
+        return _factored_in_band(model, moves, factor, parts, weighted, width)
     scaled: list[dict] = []  # L D
     lower: list[dict] = []
     pivots: list = []
@@ -317,6 +326,19 @@ def factored(model: Model, moves, factor: Factor, pending) -> Factored:
     return Factored(moves, factor, parts, lower, pivots)
 
 
+def _factored_in_band(model: Model, moves, factor: Factor, parts, weighted, width: int) -> Factored:
+    """The same from the entries of the rows' matrix, all of which are no further than that from its diagonal."""
+    rows = []
+    for r in range(len(parts)):
+        shared = (sorted(parts[r].keys() & weighted[k].keys()) if k >= 0 else () for k in range(r - width + 1, r + 1))
+        near = range(r - width + 1, r + 1)
+        rows.append(
+            [add(*(mul(parts[r][key], weighted[k][key]) for key in keys)) for k, keys in zip(near, shared, strict=True)]
+        )
+    band = banded_factor([[jnp.asarray(x, model.home.dtype) for x in row] for row in rows])
+    return Factored(moves, factor, parts, [], [row[-1] for row in band], band)
+
+
 def solve(model: Model, f: Factored, tau, wrenches, wanted, like):
     """a and lam with M a = tau - (forces that the wrenches ask for) + A^T lam, A a = wanted."""
     residual = inward(model, f.moves, f.factor, split(tau, model.topology.v_slices), wrenches)
@@ -327,16 +349,22 @@ def solve(model: Model, f: Factored, tau, wrenches, wanted, like):
         sub(w, add(*(mul(u, free[i][j]) for (i, j), u in part.items())))
         for w, part in zip(wanted, f.parts, strict=True)
     ]
+    x = _multipliers(f, x) if f.band is None else banded_solution(f.band, [jnp.asarray(y, like.dtype) for y in x])
+    for part, multiplier in zip(f.parts, x, strict=True):
+        for (i, j), u in part.items():
+            residual[i][j] = add(residual[i][j], mul(u, multiplier))
+    return stack(outward(model, f.moves, f.factor, keep_all(residual)), like), stack([x], like)
+
+
+def _multipliers(f: Factored, x: list) -> list:
+    """The solution of L D L^T y = x."""
     for k in range(len(x)):
         x[k] = materialize(x[k])[0]
         for r, entry in f.lower[k].items():
             x[r] = sub(x[r], mul(entry, x[k]))
     for k in reversed(range(len(x))):
         x[k] = materialize(sub(x[k] / f.pivots[k], add(*(mul(entry, x[r]) for r, entry in f.lower[k].items()))))[0]
-    for part, multiplier in zip(f.parts, x, strict=True):
-        for (i, j), u in part.items():
-            residual[i][j] = add(residual[i][j], mul(u, multiplier))
-    return stack(outward(model, f.moves, f.factor, keep_all(residual)), like), stack([x], like)
+    return x
 
 
 def _prepared(model: Model, loops, q, v):

@@ -432,3 +432,15 @@ def test_dependent_rows_of_equations_are_left_to_the_careful_way():
     assert int(found.rank) == 2
     np.testing.assert_allclose(found.acceleration, wanted.acceleration, atol=1e-10)
     np.testing.assert_allclose(found.multipliers, wanted.multipliers, atol=1e-10)
+
+
+def test_square_roots_of_batches_stay_square_roots():
+    """XLA makes 1/sqrt an instruction of one processor, which LLVM does not make vector instructions of."""
+    x = jnp.linspace(0.5, 2.0, 512)
+    texts = []
+    for for_batches in (False, True):
+        kernel = kernel_of(lambda tree, x: (x + 1.0) / jnp.sqrt(x * x + 0.1), (), x[0], for_batches=for_batches)
+        program = jax.jit(jax.vmap(lambda x, kernel=kernel: kernel(lambda x: x, x))).lower(x).compile()
+        texts.append(program.as_text())
+        np.testing.assert_allclose(program(x), (x + 1.0) / np.sqrt(x * x + 0.1), rtol=1e-14)
+    assert "rsqrt(" in texts[0] and "rsqrt(" not in texts[1]

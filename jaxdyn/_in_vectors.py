@@ -1,0 +1,95 @@
+"""A kernel's program on vectors: see `_vector_program`. Vectors come first, so that a batch is the inner loop."""
+
+import itertools
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend.core import Literal
+
+from jaxdyn import _banded
+from jaxdyn._fold import fold
+from jaxdyn._vector_program import Group, Taken, VectorProgram
+
+_LEAST_FOLDED = 10  # operations of a group of one sample that become a kernel; a fold needs more besides than a few
+_MOST_RUNS = 4  # of consecutive entries, that are put together from slices
+
+
+def as_vectors(*arrays, program: VectorProgram, shapes, depth: int) -> list:
+    """What a kernel's program gives for arrays with `depth` leading axes."""
+    lead = arrays[0].shape[:depth]
+    values = {i: jnp.moveaxis(x.reshape(*lead, program.sizes[i]), -1, 0) for i, x in enumerate(arrays)}
+    sound = jnp.ones(lead, bool)
+    for step in program.steps:
+        if isinstance(step, Group):
+            given = {name: _taken(taken, values, lead) for name, taken in step.takes.items()}
+            if not lead and len(step.eqns) < _LEAST_FOLDED:
+                found = _one_by_one(step, given, lead)
+            else:
+                done, found = fold(step.eqns, list(step.takes), step.gives, given, (step.length, *lead))
+                sound = sound & jnp.all(done, 0)
+            values.update((name.number, x) for name, x in found.items())
+        else:
+            numbers = _taken(step.takes, values, lead)
+            values[step.gives.number] = _banded.in_vectors(step.primitive, numbers, **step.params)
+    found = []
+    for (shape, dtype), taken in zip(shapes, program.results, strict=True):
+        array = jnp.moveaxis(_taken(taken, values, lead), 0, -1).astype(dtype)
+        if jnp.issubdtype(dtype, jnp.floating):
+            array = jnp.where(sound[..., None], array, np.asarray(np.nan, dtype))
+        found.append(array.reshape(*lead, *shape))
+    return found
+
+
+def _one_by_one(group: Group, values: dict, lead) -> dict:
+    """What a group gives, as operations on arrays."""
+    values = dict(values)
+    for eqn in group.eqns:
+        args = [
+            jnp.broadcast_to(_known(x), (group.length, *lead)) if isinstance(x, Literal) else values[x]
+            for x in eqn.invars
+        ]
+        values[eqn.outvars[0]] = eqn.primitive.bind(*args, **eqn.params)
+    return {name: values[name] for name in group.gives}
+
+
+def _known(literal: Any) -> np.ndarray:
+    return np.asarray(literal.val, literal.aval.dtype)
+
+
+def _taken(taken: Taken, values: dict, lead):
+    """The entries as an array (n, *lead)."""
+    dtype = taken.aval.dtype
+    if not taken.entries:
+        return jnp.zeros((0, *lead), dtype)
+    vectors = sorted({v for v, _ in taken.entries if v is not None})
+    known = [x for v, x in taken.entries if v is None]
+    parts, first, at = [], {}, 0
+    for v in vectors:
+        parts.append(values[v])
+        first[v] = at
+        at += values[v].shape[0]
+    if known:
+        constants = {np.asarray(x, dtype).tobytes(): x for x in known}  # also those that are no number
+        where = {name: at + i for i, name in enumerate(constants)}
+        column = np.asarray(list(constants.values()), dtype).reshape(-1, *[1] * len(lead))
+        parts.append(jnp.broadcast_to(column, (len(constants), *lead)))
+    places = [where[np.asarray(x, dtype).tobytes()] if v is None else first[v] + x for v, x in taken.entries]
+    return _entries(jnp.concatenate(parts) if len(parts) > 1 else parts[0], np.asarray(places))
+
+
+def _entries(x, places: np.ndarray):
+    """x[places]."""
+    if len(places) == x.shape[0] and (np.diff(places) == 1).all():
+        return x
+    steps = np.unique(np.diff(places))
+    if len(places) > 1 and len(steps) == 1 and steps[0] != 0:
+        step, low = abs(int(steps[0])), int(places.min())
+        run = lax.slice_in_dim(x, low, int(places.max()) + 1, step)
+        return run if steps[0] > 0 else lax.rev(run, (0,))
+    starts = [0, *(np.flatnonzero(np.diff(places) != 1) + 1), len(places)]
+    if len(starts) - 1 <= _MOST_RUNS:
+        runs = [x[int(places[a]) : int(places[b - 1]) + 1] for a, b in itertools.pairwise(starts)]
+        return jnp.concatenate(runs) if len(runs) > 1 else runs[0]
+    return x.at[places].get(mode="promise_in_bounds")
