@@ -117,9 +117,6 @@ class _Writer:
     def _one(self, primitive, params, args, outermost: bool) -> list:
         name = primitive.name
         if name in _AS_THEY_ARE or (self.by_libraries and name in _OF_LIBRARIES):
-            if args and not any(isinstance(x, Tracer) or np.ndim(x) for x in args):
-                with jax.ensure_compile_time_eval():  # a choice that is made is not written, nor is what it is not for
-                    return [np.asarray(x) for x in jax.tree.leaves(primitive.bind(*args, **params))]
             found = primitive.bind(*args, **params)
             return list(found) if primitive.multiple_results else [found]
         if name in _SAME:
