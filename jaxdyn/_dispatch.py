@@ -216,7 +216,7 @@ def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tupl
 
 def closed_kernel(tree, q: Array, v: Array, tau: Array) -> Kernel | None:
     """`closed_dynamics` of a pair (model, loops), in one kernel."""
-    return kernel_of(_closed, tree, q, v, tau, in_vectors=True)
+    return kernel_of(_closed, tree, q, v, tau) or kernel_of(_closed, tree, q, v, tau, in_vectors=True)
 
 
 def _closed(tree, q, v, tau):

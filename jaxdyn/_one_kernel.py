@@ -44,6 +44,7 @@ MOST = 9000  # operations in all; longer ones compile for minutes
 MOST_TAKEN = 220  # numbers that a block takes from those before it; with more it compiles for minutes too
 MOST_IN_VECTORS = 60000  # operations that may become those of vectors
 MOST_VECTORS = 2000  # and how many of these there may be
+LEAST_EQUAL = 4  # of them in one operation, on average
 AT_ONE_CALL = 4096  # samples from which on a kernel pays that is not in a loop
 
 _one_kernel_p = Primitive("one_kernel")
@@ -75,8 +76,8 @@ def kernel_of(
 
     None where `without_kernels` is in force, if the tree holds numbers that are traced, if the function computes with more than
     single numbers, such as a factorisation by LAPACK, or if it is too long. It is traced once for a tree and shapes. With
-    `for_batches` it is made for many samples: see `scalar_program`. With `in_vectors` a function that is too long may become a
-    program of vectors (see `_vector_program`), if that is short: then it has several kernels.
+    `for_batches` it is made for many samples: see `scalar_program`. With `in_vectors` it is a program of vectors, of several
+    kernels (see `_vector_program`), if that is much shorter: for functions that have no kernel otherwise.
     """
     traced, known = split(tree)
     if way() == "without kernels" or traced or len(jax.tree.leaves(args)) != len(args):
@@ -92,27 +93,17 @@ def _kernel(function: Callable, known: Known, shapes, most: int, for_batches: bo
     def whole(*args):
         return function(known(()), *args)
 
-    kernel, length = None, most + 1
+    most = MOST_IN_VECTORS if in_vectors else most
     try:
-        program, shapes, structure = scalar_program(whole, *args, most=most, for_batches=for_batches)
-        length = len(program.eqns)
-        if not any(len(takes) > MOST_TAKEN for _, takes, _ in _blocks(program)[1:]):
-            kernel = Kernel(program, shapes, structure)
-    except TooMuch:
-        pass
-    return (_kernel_in_vectors(whole, args) if in_vectors and length > MOST_AT_ONCE else None) or kernel
-
-
-def _kernel_in_vectors(function: Callable, args) -> Kernel | None:
-    try:
-        # Another function than before, of which jax would keep the trace.
-        anew = functools.partial(function)
-        program, shapes, structure = scalar_program(anew, *args, most=MOST_IN_VECTORS, in_vectors=True)
+        # jax keeps traces of functions, and in vectors another one is wanted: the function is new each time.
+        program, *form = scalar_program(whole, *args, most=most, for_batches=for_batches, in_vectors=in_vectors)
     except TooMuch:
         return None
-    sizes, results = [math.prod(x.shape) for x in args], [math.prod(shape) for shape, _ in shapes]
-    short = vector_program(program, sizes, results)
-    return None if short.operations > MOST_VECTORS else Kernel(short, shapes, structure)
+    if in_vectors:
+        sizes, results = [math.prod(x.shape) for x in args], [math.prod(shape) for shape, _ in form[0]]
+        short = vector_program(program, sizes, results)
+        return Kernel(short, *form) if short.operations <= min(MOST_VECTORS, len(program.eqns) / LEAST_EQUAL) else None
+    return None if any(len(takes) > MOST_TAKEN for _, takes, _ in _blocks(program)[1:]) else Kernel(program, *form)
 
 
 # --- the fold --------------------------------------------------------------------------------------

@@ -91,14 +91,17 @@ def kernels(model: Model, loops, q: Array, v: Array) -> Kernels | None:
     """Those of a mechanism with q (nq,) and v (nv,) of these shapes and dtypes; None if one of them cannot be had."""
     rows = jax.ShapeDtypeStruct((sum(loop.kind.count for loop in loops),), q.dtype)
     tree = model, loops
-    found = []
-    for function, *args in ((_step, q, rows), (_quality, q), (_apart, q), (_slip, q, v)):
-        kernel = kernel_of(function, tree, *args, in_vectors=True)
-        if kernel is None:
-            return None
-        found.append(kernel)
-    step, quality, apart, slip = found
-    return Kernels(quality, step, apart, slip)
+    for in_vectors in (False, True):
+        found = []
+        for function, *args in ((_step, q, rows), (_quality, q), (_apart, q), (_slip, q, v)):
+            kernel = kernel_of(function, tree, *args, in_vectors=in_vectors)
+            if kernel is None:
+                break
+            found.append(kernel)
+        else:
+            step, quality, apart, slip = found
+            return Kernels(quality, step, apart, slip)
+    return None
 
 
 class ClosingInKernels:

@@ -153,7 +153,10 @@ def _kernel(scene: Scene, q, v, tau, t):
     """Accelerations, multipliers and the quality of the rows in one kernel, if there is one."""
     if not is_staged() or layout(scene)[-1].end > scene.nv:
         return None
-    return kernel_of(_in_numbers, scene, q, v, tau, t, in_vectors=has_short_recursion(scene))
+    kernel = kernel_of(_in_numbers, scene, q, v, tau, t)
+    if kernel is None and has_short_recursion(scene):
+        kernel = kernel_of(_in_numbers, scene, q, v, tau, t, in_vectors=True)
+    return kernel
 
 
 def _in_numbers(scene: Scene, q, v, tau, t):

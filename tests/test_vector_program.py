@@ -96,7 +96,7 @@ def windows(count):
 @pytest.fixture
 def in_vectors(monkeypatch):
     """Vectors for mechanisms that are short enough for numbers."""
-    monkeypatch.setattr(_one_kernel, "MOST_AT_ONCE", 500)
+    monkeypatch.setattr(_one_kernel, "MOST", 500)
     jax.clear_caches()
     _one_kernel._kernel.cache_clear()
     yield
@@ -157,6 +157,7 @@ def test_wide_bands_are_written_out(in_vectors, monkeypatch):
     """Where the rows' matrix has no narrow band its factor is written in numbers, with the same result."""
     scene, q, v, tau = windows(10)
     args = q, v, tau, jnp.zeros(())
+    monkeypatch.setattr(_one_kernel, "LEAST_EQUAL", 1)  # a long sequence is like no other
     put = []
     for width in (closed_recursion.MOST_WIDTH, 1):
         monkeypatch.setattr(closed_recursion, "MOST_WIDTH", width)
