@@ -68,9 +68,8 @@ def _factor_rows(before: list[list], new: list[list]) -> list[list]:
         *entries, pivot = row
         back, scaled, lower = len(entries), [], []
         for j, entry in enumerate(entries):
-            at = (
-                len(known) - back + j
-            )  # the row of this column; its entry m - j to the left of the diagonal is for column m
+            # The row of this column. Its entry for the column m of this row is j - m to the left of its diagonal.
+            at = len(known) - back + j
             for m in range(j):
                 entry = lax.sub(entry, lax.mul(known[at][back - j + m], scaled[m]))
             scaled.append(entry)

@@ -386,7 +386,7 @@ def _names(jaxpr):
     for eqn in jaxpr.eqns:
         yield eqn.primitive.name
         for value in eqn.params.values():
-            if isinstance(value, VectorProgram):
+            if isinstance(value, VectorProgram):  # which is too long for a call, whatever else there is
                 yield from itertools.repeat("vectors", MOST_OPERATIONS)
             for inner in value if isinstance(value, (tuple, list)) else (value,):
                 inner = getattr(inner, "jaxpr", inner)

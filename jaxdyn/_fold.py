@@ -9,7 +9,10 @@ _NOTHING, _ARGUMENTS, _RESULT = (np.int8(i) for i in range(3))
 
 
 def fold(eqns, takes, gives, values, lead):
-    """Whether they are results (the batch's shape `lead`), and the values of `gives`, each of that shape."""
+    """Operations, in the form of jax's equations, on numbers `takes` with given `values`, for each sample of a batch.
+
+    Whether they are results (the batch's shape `lead`), and the values of `gives`, each of that shape.
+    """
     # A result takes the place of an argument of its dtype.
     kinds = [*{x.aval.dtype: None for x in (*takes, *gives)}]
     slots = []  # pairs of an argument and a result, either of which may be missing

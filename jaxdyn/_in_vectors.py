@@ -23,11 +23,11 @@ def as_vectors(*arrays, program: VectorProgram, shapes, depth: int) -> list:
     sound = jnp.ones(lead, bool)
     for step in program.steps:
         if isinstance(step, Group):
-            given = {name: _taken(taken, values, lead) for name, taken in step.takes.items()}
+            given = {name: _taken(taken, values, lead) for taken, name in step.takes.items()}
             if not lead and len(step.eqns) < _LEAST_FOLDED:
                 found = _one_by_one(step, given, lead)
             else:
-                done, found = fold(step.eqns, list(step.takes), step.gives, given, (step.length, *lead))
+                done, found = fold(step.eqns, list(step.takes.values()), step.gives, given, (step.length, *lead))
                 sound = sound & jnp.all(done, 0)
             values.update((name.number, x) for name, x in found.items())
         else:
@@ -63,19 +63,17 @@ def _taken(taken: Taken, values: dict, lead):
     dtype = taken.aval.dtype
     if not taken.entries:
         return jnp.zeros((0, *lead), dtype)
-    vectors = sorted({v for v, _ in taken.entries if v is not None})
-    known = [x for v, x in taken.entries if v is None]
-    parts, first, at = [], {}, 0
-    for v in vectors:
+    parts, first, at = [], {}, 0  # where each vector begins, and each known number is
+    for v in sorted(taken.vectors()):
         parts.append(values[v])
         first[v] = at
-        at += values[v].shape[0]
+        at += len(values[v])
+    known = [*dict.fromkeys(number for v, number in taken.entries if v is None)]
     if known:
-        constants = {np.asarray(x, dtype).tobytes(): x for x in known}  # also those that are no number
-        where = {name: at + i for i, name in enumerate(constants)}
-        column = np.asarray(list(constants.values()), dtype).reshape(-1, *[1] * len(lead))
-        parts.append(jnp.broadcast_to(column, (len(constants), *lead)))
-    places = [where[np.asarray(x, dtype).tobytes()] if v is None else first[v] + x for v, x in taken.entries]
+        column = np.frombuffer(b"".join(known), dtype).reshape(-1, *[1] * len(lead))
+        parts.append(jnp.broadcast_to(column, (len(known), *lead)))
+    where = {number: at + i for i, number in enumerate(known)}
+    places = [where[x] if v is None else first[v] + x for v, x in taken.entries]
     return _entries(jnp.concatenate(parts) if len(parts) > 1 else parts[0], np.asarray(places))
 
 

@@ -58,11 +58,6 @@ class Kernel(NamedTuple):
     shapes: tuple
     structure: Any
 
-    @property
-    def is_in_vectors(self) -> bool:
-        """Whether it is a program of vectors, of several kernels."""
-        return isinstance(self.program, VectorProgram)
-
     def __call__(self, otherwise: Callable, *args):
         """What the function is of `args`; on other platforms than CPU otherwise(*args)."""
         found = _one_kernel_p.bind(*args, program=self.program, otherwise=otherwise, shapes=self.shapes, depth=0)

@@ -17,14 +17,14 @@ from jax.extend.core import ClosedJaxpr, Literal
 
 
 class Taken(NamedTuple):
-    """Entries of vectors as a new vector: pairs of a vector (None: a known number) and a place in it (or that number)."""
+    """Entries of vectors as a new vector: pairs of a vector (None: a known number) and a place in it (or that number's bytes)."""
 
     entries: tuple[tuple[Any, Any], ...]
     aval: Any
 
-    def is_all_of(self, vector: int, length: int) -> bool:
-        """Whether it is a vector of that length as it is."""
-        return self.entries == tuple((vector, place) for place in range(length))
+    def vectors(self) -> set[int]:
+        """Those that entries are of."""
+        return {vector for vector, _ in self.entries if vector is not None}
 
 
 class Name(NamedTuple):
@@ -48,7 +48,7 @@ class Group(NamedTuple):
 
     length: int
     eqns: list[Operation]
-    takes: dict[Name, Taken]
+    takes: dict[Taken, Name]
     gives: list[Name]
 
 
@@ -76,10 +76,10 @@ class VectorProgram:
 
 
 class _Class:
-    """Numbers that are made in the same way."""
+    """Numbers that are made in the same way: arguments, results of one operation on many numbers, or operations."""
 
-    def __init__(self, number: int, level: int = 0):
-        self.number, self.level, self.made = number, level, []
+    def __init__(self, number: int, made: list, whole: Any = None):
+        self.number, self.made, self.whole, self.level = number, made, whole, 0
 
 
 def vector_program(program: ClosedJaxpr, sizes: Sequence[int], results: Sequence[int]) -> VectorProgram:
@@ -88,95 +88,94 @@ def vector_program(program: ClosedJaxpr, sizes: Sequence[int], results: Sequence
     kinds: dict = {}  # by what they are made of
     of: dict = {}  # the class of each number
     numbers = iter(jaxpr.invars)
-    classes = [_Class(i) for i in range(len(sizes))]
-    for each, size in zip(classes, sizes, strict=True):
-        each.made = [next(numbers) for _ in range(size)]
-        of.update((x, each) for x in each.made)
-    wholes: list[tuple[_Class, Any]] = []
+    classes = [_Class(i, [next(numbers) for _ in range(size)]) for i, size in enumerate(sizes)]
+    of.update((x, each) for each in classes for x in each.made)
     for eqn in jaxpr.eqns:
         if eqn.primitive.multiple_results:
-            found = _Class(len(classes), 1 + max(of[x].level for x in eqn.invars if not isinstance(x, Literal)))
-            classes.append(found)
-            found.made = list(eqn.outvars)
-            wholes.append((found, eqn))
-            of.update((x, found) for x in eqn.outvars)
+            classes.append(_Class(len(classes), list(eqn.outvars), whole=eqn))
+            of.update((x, classes[-1]) for x in eqn.outvars)
             continue
         operands = tuple(("known", str(x.aval)) if isinstance(x, Literal) else of[x].number for x in eqn.invars)
         kind = eqn.primitive, str(eqn.params), operands
         if kind not in kinds:
-            kinds[kind] = _Class(len(classes))
+            kinds[kind] = _Class(len(classes), [])
             classes.append(kinds[kind])
-        found = kinds[kind]
-        found.made.append(eqn)
-        of[eqn.outvars[0]] = found
-    return _grouped(jaxpr, sizes, results, classes, of, {found.number: eqn for found, eqn in wholes})
+        kinds[kind].made.append(eqn)
+        of[eqn.outvars[0]] = kinds[kind]
+    return _grouped(jaxpr, sizes, results, classes, of)
 
 
-def _grouped(jaxpr, sizes, results, classes, of, wholes) -> VectorProgram:
+def _grouped(jaxpr, sizes, results, classes: list[_Class], of: dict) -> VectorProgram:
     place: dict = {}
 
-    def entry(x):
-        return (None, x.val) if isinstance(x, Literal) else (of[x].number, place[x])
+    def taken_of(numbers, aval) -> Taken:
+        return Taken(tuple(map(entry, numbers)), aval)
 
-    steps: dict = {}  # by level and length
+    def entry(x):
+        return (None, _bytes(x)) if isinstance(x, Literal) else (of[x].number, place[x])
+
+    steps: dict = {}  # by level, and length or number
     for each in classes:
-        if each.number < len(sizes) or each.number in wholes:
+        if each.number < len(sizes) or each.whole is not None:
             place.update((x, i) for i, x in enumerate(each.made))
-            if each.number in wholes:
-                eqn = wholes[each.number]
-                taken = Taken(tuple(map(entry, eqn.invars)), eqn.outvars[0].aval)
+            if each.whole is not None:
+                aval = each.made[0].aval
+                taken = taken_of(each.whole.invars, aval)
                 each.level = 1 + max(classes[v].level for v, _ in taken.entries if v is not None)
-                name = Name(each.number, eqn.outvars[0].aval)
-                steps[each.level, -each.number] = Whole(eqn.primitive, eqn.params, taken, name)
+                step = Whole(each.whole.primitive, each.whole.params, taken, Name(each.number, aval))
+                steps[each.level, -each.number] = step
             continue
         # In the order of what they take, so that it is taken in order.
-        each.made.sort(key=lambda eqn: [entry(x)[1] for x in eqn.invars if not isinstance(x, Literal)])
-        length = len(each.made)
+        each.made.sort(key=lambda eqn: [place[x] for x in eqn.invars if not isinstance(x, Literal)])
+        length, (first, *_) = len(each.made), each.made
         place.update((eqn.outvars[0], i) for i, eqn in enumerate(each.made))
-        takes = [
-            Taken(tuple(map(entry, column)), column[0].aval)
-            for column in zip(*(e.invars for e in each.made), strict=True)
-        ]
-        straight = [_as_it_is(taken, classes, length, len(sizes), wholes) for taken in takes]
-        each.level = 0
-        for taken, is_straight in zip(takes, straight, strict=True):
-            for v in {v for v, _ in taken.entries} - {None}:
-                each.level = max(each.level, classes[v].level + (not is_straight))
+        takes = [taken_of(column, column[0].aval) for column in zip(*(e.invars for e in each.made), strict=True)]
+        as_made = [_is_as_made(taken, classes, length, len(sizes)) for taken in takes]
+        each.level = max(
+            (
+                classes[v].level + (not same)
+                for taken, same in zip(takes, as_made, strict=True)
+                for v in taken.vectors()
+            ),
+            default=0,
+        )
         group = steps.setdefault((each.level, length), Group(length, [], {}, []))
         operands = []
-        for taken, is_straight in zip(takes, straight, strict=True):
-            vector, first = taken.entries[0]
-            if vector is None and len({np.asarray(x).tobytes() for _, x in taken.entries}) == 1:
-                operands.append(Literal(first, taken.aval))
-            elif vector is not None and is_straight and classes[vector].level == each.level:
+        for x, taken, same in zip(first.invars, takes, as_made, strict=True):
+            vector = taken.entries[0][0]
+            if isinstance(x, Literal) and len(set(taken.entries)) == 1:
+                operands.append(x)
+            elif same and classes[vector].level == each.level:
                 operands.append(Name(vector, taken.aval))
             else:
-                same = [name for name, there in group.takes.items() if there.entries == taken.entries]
-                operands.append(same[0] if same else Name(-1 - len(group.takes), taken.aval))
-                group.takes[operands[-1]] = taken
-        made = Name(each.number, each.made[0].outvars[0].aval)
-        group.eqns.append(Operation(each.made[0].primitive, each.made[0].params, operands, [made]))
+                operands.append(group.takes.setdefault(taken, Name(-1 - len(group.takes), taken.aval)))
+        made = Name(each.number, first.outvars[0].aval)
+        group.eqns.append(Operation(first.primitive, first.params, operands, [made]))
     outs, at = [], 0
     for size in results:
         some = jaxpr.outvars[at : at + size]
         at += size
-        outs.append(Taken(tuple(map(entry, some)), some[0].aval if some else ShapedArray((), np.dtype(float))))
+        outs.append(taken_of(some, some[0].aval if some else ShapedArray((), np.dtype(float))))
     ordered = [steps[key] for key in sorted(steps)]
-    needed = {v for step in ordered for taken in _takes(step) for v, _ in taken.entries}
-    needed |= {v for taken in outs for v, _ in taken.entries}
+    needed = {v for taken in (*outs, *(x for step in ordered for x in _takes(step))) for v in taken.vectors()}
     for step in ordered:
         if isinstance(step, Group):
             step.gives.extend(eqn.outvars[0] for eqn in step.eqns if eqn.outvars[0].number in needed)
     return VectorProgram(tuple(sizes), ordered, outs)
 
 
-def _as_it_is(taken: Taken, classes, length, arguments, wholes) -> bool:
-    """Whether a vector that operations have made is taken as it is."""
+def _is_as_made(taken: Taken, classes, length: int, arguments: int) -> bool:
+    """Whether it is a whole vector of that length, in order, that operations have made."""
     vector = taken.entries[0][0]
-    if vector is None or vector < arguments or vector in wholes:
+    if vector is None or vector < arguments or classes[vector].whole is not None:
         return False
-    return len(classes[vector].made) == length and taken.is_all_of(vector, length)
+    return len(classes[vector].made) == length and taken.entries == tuple((vector, place) for place in range(length))
 
 
-def _takes(step):
-    return step.takes.values() if isinstance(step, Group) else [step.takes]
+def _takes(step: Group | Whole):
+    return step.takes if isinstance(step, Group) else [step.takes]
+
+
+def _bytes(literal: Any) -> bytes:
+    """Of a known number: unlike numbers, those of zeros of two signs differ, and those that are no number are equal."""
+    return np.asarray(literal.val, literal.aval.dtype).tobytes()

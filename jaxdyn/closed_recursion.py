@@ -328,14 +328,12 @@ def factored(model: Model, moves, factor: Factor, pending) -> Factored:
 
 def _factored_in_band(model: Model, moves, factor: Factor, parts, weighted, width: int) -> Factored:
     """The same from the entries of the rows' matrix, all of which are no further than that from its diagonal."""
-    rows = []
-    for r in range(len(parts)):
-        shared = (sorted(parts[r].keys() & weighted[k].keys()) if k >= 0 else () for k in range(r - width + 1, r + 1))
-        near = range(r - width + 1, r + 1)
-        rows.append(
-            [add(*(mul(parts[r][key], weighted[k][key]) for key in keys)) for k, keys in zip(near, shared, strict=True)]
-        )
-    band = banded_factor([[jnp.asarray(x, model.home.dtype) for x in row] for row in rows])
+
+    def entry(r, k):
+        shared = sorted(parts[r].keys() & weighted[k].keys()) if k >= 0 else ()
+        return jnp.asarray(add(*(mul(parts[r][key], weighted[k][key]) for key in shared)), model.home.dtype)
+
+    band = banded_factor([[entry(r, k) for k in range(r - width + 1, r + 1)] for r in range(len(parts))])
     return Factored(moves, factor, parts, [], [row[-1] for row in band], band)
 
 

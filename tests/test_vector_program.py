@@ -87,6 +87,29 @@ def test_vectors_give_what_the_numbers_give(batch):
     )
 
 
+def test_known_numbers_that_compare_equal_are_kept_apart():
+    """Zeros of both signs, and numbers of several dtypes, that operations in one group take in the same places."""
+    one, other = np.array([1.0, 0.0, 2.0, 0.0]), np.array([1.0, -0.0, 2.0, 0.0])
+
+    def function(x):
+        return (
+            jnp.where(x > 0, one, other),
+            jnp.where(x > 1, one.astype(np.float32), np.float32(3)),
+            jnp.where(x > 2, one.astype(int), 5),
+        )
+
+    x = jnp.array([-1.0, -1.0, 3.0, 3.0])
+    program, shapes, structure = scalar_program(
+        function, jax.ShapeDtypeStruct((4,), x.dtype), most=100, in_vectors=True
+    )
+    short = vector_program(program, [4], [4, 4, 4])
+    found = jax.tree.unflatten(structure, jax.jit(lambda x: as_folds(x, program=short, shapes=shapes, depth=0))(x))
+    for a, b in zip(found, function(x), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(np.signbit(found[0]), [False, True, False, False])
+
+
 def windows(count):
     scene = scenes.windows(count=count)
     keys = jax.random.split(jax.random.key(5), 3)
@@ -111,7 +134,7 @@ def test_windows_in_vectors_move_as_by_dense_matrices(in_vectors, batch):
     for count in (10, 14):
         scene, q, v, tau = windows(count)
         kernel = kernel_of(_in_numbers, scene, q, v, tau, jnp.zeros(()), in_vectors=True)
-        assert kernel is not None and kernel.is_in_vectors
+        assert kernel is not None and isinstance(kernel.program, VectorProgram)
         counted.append(kernel.program.operations)
         assert any(not isinstance(step, Group) for step in kernel.program.steps)  # band matrices
         if count == 14:
@@ -144,7 +167,7 @@ def test_windows_in_vectors_are_closed_as_by_the_recursion(in_vectors):
 
 def _kernels(tree, q, v):
     found = closed_projection.kernels(*tree, q, v)
-    assert found is not None and all(kernel.is_in_vectors for kernel in found)
+    assert found is not None and all(isinstance(kernel.program, VectorProgram) for kernel in found)
     return found
 
 

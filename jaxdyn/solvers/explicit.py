@@ -185,14 +185,14 @@ def _finished(plan: _Plan, t1, raw, error, end: Any, k):
 
 
 def at_once(plan: _Plan, terms, t0, t1, start, kept, ready):
-    """The same with the stages in one kernel, and what comes after them too if that is as simple, if there is such a kernel."""
+    """The same with the stages in one kernel, if there is one; all of it, unless it ends on constraints, which takes loops."""
     args = t0, t1, start, plan.first(terms, t0, t1, start, kept, ready)
 
     def redo():
         return in_turn(plan, terms, t0, t1, start, kept, ready)
 
     whole, stages = partial(_whole, plan), partial(_stages, plan)
-    kernel = kernel_of(whole, terms, *args, for_batches=True)
+    kernel = None if plan.method.branching else kernel_of(whole, terms, *args, for_batches=True)
     if kernel is not None:
         found, served = kernel(partial(whole, terms), *args)
     else:
