@@ -18,6 +18,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 
 from jaxdyn._fold import fold
+from jaxdyn._marked_call import in_call
 
 _AT_A_TIME = 2  # rows of one sample: XLA's runtime sets up buffers for what is written (see `_one_kernel`)
 _IN_BATCHES = 8
@@ -48,7 +49,12 @@ banded_solution_p.def_abstract_eval(lambda *avals, width: _as_numbers(len(avals)
 
 
 def in_vectors(primitive: Primitive, numbers, width: int):
-    """What a primitive gives for its numbers (n, ...), as an array (n, ...)."""
+    """What a primitive gives for its numbers (n, ...), as an array (n, ...); for one sample in a call (see `_marked_call`)."""
+    function = functools.partial(_on_rows, primitive, width=width)
+    return function(numbers) if numbers.ndim > 1 else in_call(jax.make_jaxpr(function)(numbers))(numbers)[0]
+
+
+def _on_rows(primitive: Primitive, numbers, width: int):
     lead = numbers.shape[1:]
     if primitive is banded_factor_p:
         return _factor(numbers.reshape(-1, width, *lead)).reshape(numbers.shape)

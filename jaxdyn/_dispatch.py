@@ -37,7 +37,7 @@ from jaxdyn import closed_recursion, looped, matrix_form, recursive
 from jaxdyn._implicit import along, implicit
 from jaxdyn._materialize import at_least
 from jaxdyn._one_call import one_call
-from jaxdyn._one_kernel import Kernel, kernel_of
+from jaxdyn._one_kernel import Kernel, kernel_of, kernel_or_vectors
 from jaxdyn._scalar_program import is_written_out
 from jaxdyn._tracing import is_one_sample, is_staged, still, traced_once
 from jaxdyn._ways import way
@@ -216,7 +216,7 @@ def closed_dynamics(model: Model, loops, q: Array, v: Array, tau: Array) -> tupl
 
 def closed_kernel(tree, q: Array, v: Array, tau: Array) -> Kernel | None:
     """`closed_dynamics` of a pair (model, loops), in one kernel."""
-    return kernel_of(_closed, tree, q, v, tau) or kernel_of(_closed, tree, q, v, tau, in_vectors=True)
+    return kernel_or_vectors(_closed, tree, q, v, tau, long=tree[0].nb > MOST_BODIES)
 
 
 def _closed(tree, q, v, tau):

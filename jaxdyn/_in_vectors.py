@@ -1,6 +1,8 @@
 """A kernel's program on vectors: see `_vector_program`. Vectors come first, so that a batch is the inner loop."""
 
+import functools
 import itertools
+import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,33 +15,67 @@ from jaxdyn._fold import fold
 from jaxdyn._vector_program import Group, Taken, VectorProgram
 
 _LEAST_FOLDED = 10  # operations of a group of one sample that become a kernel; a fold needs more besides than a few
+_AT_ONCE = 128  # samples of a batch, whose vectors stay in a core's cache
 _MOST_RUNS = 4  # of consecutive entries, that are put together from slices
 
 
-def as_vectors(*arrays, program: VectorProgram, shapes, depth: int) -> list:
-    """What a kernel's program gives for arrays with `depth` leading axes."""
+def as_vectors(*arrays, program: VectorProgram, shapes, depth: int, often: bool = True) -> list:
+    """What a kernel's program gives for arrays with `depth` leading axes.
+
+    Of one sample folds are for what runs `often`: the runtime sets up a buffer for each of their operations, once a program.
+    """
     lead = arrays[0].shape[:depth]
+    if math.prod(lead) > _AT_ONCE:
+        return _in_portions(arrays, program, shapes, depth)
     values = {i: jnp.moveaxis(x.reshape(*lead, program.sizes[i]), -1, 0) for i, x in enumerate(arrays)}
-    sound = jnp.ones(lead, bool)
+    sound = []
     for step in program.steps:
         if isinstance(step, Group):
             given = {name: _taken(taken, values, lead) for taken, name in step.takes.items()}
-            if not lead and len(step.eqns) < _LEAST_FOLDED:
+            if not lead and (not often or len(step.eqns) < _LEAST_FOLDED):
                 found = _one_by_one(step, given, lead)
             else:
                 done, found = fold(step.eqns, list(step.takes.values()), step.gives, given, (step.length, *lead))
-                sound = sound & jnp.all(done, 0)
+                sound.append(done)
             values.update((name.number, x) for name, x in found.items())
         else:
             numbers = _taken(step.takes, values, lead)
             values[step.gives.number] = _banded.in_vectors(step.primitive, numbers, **step.params)
-    found = []
+    all_sound, found = _all(sound, lead), []
     for (shape, dtype), taken in zip(shapes, program.results, strict=True):
         array = jnp.moveaxis(_taken(taken, values, lead), 0, -1).astype(dtype)
         if jnp.issubdtype(dtype, jnp.floating):
-            array = jnp.where(sound[..., None], array, np.asarray(np.nan, dtype))
+            array = jnp.where(all_sound[..., None], array, np.asarray(np.nan, dtype))
         found.append(array.reshape(*lead, *shape))
     return found
+
+
+def _in_portions(arrays, program: VectorProgram, shapes, depth: int) -> list:
+    """The same for `_AT_ONCE` samples after another."""
+    lead = arrays[0].shape[:depth]
+    count = math.prod(lead)
+    portions = -(-count // _AT_ONCE)
+
+    def cut(x):
+        x = x.reshape(count, *x.shape[depth:])
+        x = jnp.pad(x, [(0, portions * _AT_ONCE - count), *[(0, 0)] * (x.ndim - 1)], mode="edge")
+        return x.reshape(portions, _AT_ONCE, *x.shape[1:])
+
+    def portion(arrays):
+        return as_vectors(*arrays, program=program, shapes=shapes, depth=1)
+
+    found = lax.map(portion, [cut(x) for x in arrays])
+    return [x.reshape(-1, *x.shape[2:])[:count].reshape(*lead, *x.shape[2:]) for x in found]
+
+
+def _all(flags: list, lead):
+    """Whether all flags (n, *lead) of all arrays are set."""
+    if lead:
+        return functools.reduce(jnp.logical_and, [jnp.all(x, 0) for x in flags], jnp.ones(lead, bool))
+    # First together, as to reduce each array takes three operations, which here take longer than what they do.
+    longest = max(map(len, flags), default=0)
+    padded = [jnp.pad(x, (0, longest - len(x)), constant_values=True) for x in flags]
+    return jnp.all(functools.reduce(jnp.logical_and, padded, jnp.ones(longest, bool)))
 
 
 def _one_by_one(group: Group, values: dict, lead) -> dict:

@@ -2,16 +2,11 @@
 
 XLA:CPU runs a program by calling one compiled function for each of its operations, or groups of operations, and for small
 arrays these calls cost far more than the arithmetic. But for loops over very few numbers it has another way: the whole loop
-is compiled as one function, in which loops, branches and operations are plain code. It finds such loops by their size, moves
-them into a call and marks this call with an attribute. Here a call is marked the same way whatever its size, so that a whole
-simulation becomes one function.
+is compiled as one function, in which loops, branches and operations are plain code. Here a whole simulation becomes one such
+function (see `_marked_call`).
 
-Such a function runs on one core and may contain only some operations. `_call_writer` writes programs in these; what cannot be
-written, or is so long that LLVM would take minutes, stays as it is. The body is the branch of an `if` that always runs: XLA
-divides operations on larger arrays between threads, which fails here, and does not look into branches for them.
-
-The attributes are no promise of XLA's. Where they mean nothing, the call is an ordinary one with the same results; a test
-counts the marked calls of compiled simulations.
+It may contain only some operations. `_call_writer` writes programs in these; what cannot be written, or is so long that LLVM
+would take minutes, stays as it is.
 
 The primitive batches, and is differentiated as what it stands for. On other platforms than CPU it is that.
 """
@@ -26,17 +21,14 @@ import numpy as np
 from jax import lax
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
-from jax.extend.mlir import ir
 from jax.interpreters import ad, batching, mlir
 
 from jaxdyn._by_batch import batched_axes, of_samples
 from jaxdyn._call_writer import NotWritten, has_kernels, is_short, written
-from jaxdyn._materialize import never
+from jaxdyn._marked_call import in_call
 
 IN_CALLS = True  # False leaves ordinary programs, to compare with
 MOST_SAMPLES = 32  # more run as fast on two cores in other ways
-
-_ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 
 _one_call_p = Primitive("one_call")
 _one_call_p.multiple_results = True
@@ -104,7 +96,7 @@ def _on_cpu(ctx, *arrays, ways, sizes, axes, **_):
 
 def _in_calls(function: Callable, quick: Callable | None, careful: Callable | None, avals) -> Callable:
     """The function by a marked call. **Raises:** NotWritten."""
-    shortly = _in_call(_written(quick or function, avals))
+    shortly = in_call(_written(quick or function, avals))
     if careful is None:
         return shortly
     surely = jaxpr_as_fun(_written(careful, avals, by_libraries=True))
@@ -114,10 +106,6 @@ def _in_calls(function: Callable, quick: Callable | None, careful: Callable | No
         return lax.cond(believed.all(), lambda *_: found, surely, *arrays)
 
     return either
-
-
-def _in_call(body: ClosedJaxpr) -> Callable:
-    return lambda *arrays: _call_p.bind(_always_p.bind(), *arrays, body=body)
 
 
 def _written(function: Callable, avals, by_libraries: bool = False) -> ClosedJaxpr:
@@ -130,50 +118,6 @@ def _written(function: Callable, avals, by_libraries: bool = False) -> ClosedJax
         return [jnp.where(failed, jnp.nan, x) if jnp.issubdtype(x.dtype, jnp.inexact) else x for x in found]
 
     return jax.make_jaxpr(body)(*avals)
-
-
-# --- the marked call -----------------------------------------------------------------------------
-
-_call_p = Primitive("marked_call")
-_call_p.multiple_results = True
-_call_p.def_abstract_eval(lambda runs, *avals, body: body.out_avals)
-
-
-def _marked(ctx, *arrays, body: ClosedJaxpr):
-    given = [aval.size > 0 for aval in body.in_avals]
-
-    def branches(runs, *some):
-        rest = iter(some)
-        arrays = [
-            next(rest) if here else jnp.zeros(x.shape, x.dtype) for x, here in zip(body.in_avals, given, strict=True)
-        ]
-
-        def never_taken(*arrays):
-            # XLA stops at calls that do not use all of their arguments, so here all are used.
-            entries = [x.reshape(-1)[0].astype(float) for x in arrays if x.size]
-            total = sum(entries, start=jnp.zeros(()))
-            return [jnp.full(aval.shape, total.astype(aval.dtype)) for aval in body.out_avals]
-
-        return lax.cond(runs, jaxpr_as_fun(body), never_taken, *arrays)
-
-    arrays = [arrays[0], *(x for x, here in zip(arrays[1:], given, strict=True) if here)]
-    ctx = ctx.replace(avals_in=[ctx.avals_in[0], *(x for x, here in zip(ctx.avals_in[1:], given, strict=True) if here)])
-    # A function of its own, of which one call is written here.
-    block = ir.InsertionPoint.current.block  # pyright: ignore[reportAttributeAccessIssue]
-    before = len(block.operations)
-    found = mlir.lower_fun(jax.jit(branches), multiple_results=True)(ctx, *arrays)
-    for operation in list(block.operations)[before:]:
-        if operation.operation.name == "func.call":
-            marks: dict[str, ir.Attribute] = {name: ir.StringAttr.get(value) for name, value in _ATTRIBUTES.items()}
-            operation.operation.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(marks)
-    return found
-
-
-mlir.register_lowering(_call_p, _marked, cacheable=False)
-
-_always_p = Primitive("always")
-_always_p.def_abstract_eval(lambda: ShapedArray((), np.dtype(bool)))
-mlir.register_lowering(_always_p, lambda ctx: [never("NE")])
 
 
 # --- the primitive ---------------------------------------------------------------------------------

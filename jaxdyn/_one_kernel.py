@@ -12,7 +12,7 @@ takes folding with the initial value for the identity.
 
 For each operation of the fold the runtime sets up a buffer, which nothing uses, whenever the program that holds it is called,
 however often the kernel then runs. In a loop that is soon made up for. One call of one sample takes longer for it than by other
-ways, so outside of a loop a kernel is what it stands for, unless the batch is large.
+ways, so outside of a loop a kernel of numbers is what it stands for, unless the batch is large.
 
 The primitive batches. It has no derivative: put it under one that is given. On other platforms than CPU it is the function
 that the caller gives for them.
@@ -52,16 +52,23 @@ _one_kernel_p.multiple_results = True
 
 
 class Kernel(NamedTuple):
-    """A function of arrays in single numbers, or in vectors of them; see `kernel_of`."""
+    """A function of arrays in single numbers, or in vectors of them; see `kernel_of`.
+
+    `often`: whether a program may run it so often that setting it up does not count; of no effect on numbers.
+    """
 
     program: ClosedJaxpr | VectorProgram
     shapes: tuple
     structure: Any
+    often: bool = True
 
     def __call__(self, otherwise: Callable, *args):
         """What the function is of `args`; on other platforms than CPU otherwise(*args)."""
-        found = _one_kernel_p.bind(*args, program=self.program, otherwise=otherwise, shapes=self.shapes, depth=0)
-        return jax.tree.unflatten(self.structure, found)
+        program, _, structure, often = self
+        found = _one_kernel_p.bind(
+            *args, program=program, otherwise=otherwise, shapes=self.shapes, depth=0, often=often
+        )
+        return jax.tree.unflatten(structure, found)
 
 
 def kernel_of(
@@ -81,6 +88,15 @@ def kernel_of(
     return _kernel(function, known, shapes, MOST if most is None else most, for_batches, in_vectors)
 
 
+def kernel_or_vectors(function: Callable, tree, *args, long: bool) -> Kernel | None:
+    """`kernel_of` in single numbers, or else in vectors; the other way round for what is likely to be too `long` for numbers."""
+    for in_vectors in (long, not long):
+        kernel = kernel_of(function, tree, *args, in_vectors=in_vectors)
+        if kernel is not None:
+            return kernel
+    return None
+
+
 @functools.lru_cache(maxsize=256)  # kernels hold their trees
 def _kernel(function: Callable, known: Known, shapes, most: int, for_batches: bool, in_vectors: bool) -> Kernel | None:
     args = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes]
@@ -91,14 +107,18 @@ def _kernel(function: Callable, known: Known, shapes, most: int, for_batches: bo
     most = MOST_IN_VECTORS if in_vectors else most
     try:
         # jax keeps traces of functions, and in vectors another one is wanted: the function is new each time.
-        program, *form = scalar_program(whole, *args, most=most, for_batches=for_batches, in_vectors=in_vectors)
+        program, shapes, structure = scalar_program(
+            whole, *args, most=most, for_batches=for_batches, in_vectors=in_vectors
+        )
     except TooMuch:
         return None
     if in_vectors:
-        sizes, results = [math.prod(x.shape) for x in args], [math.prod(shape) for shape, _ in form[0]]
+        sizes, results = [math.prod(x.shape) for x in args], [math.prod(shape) for shape, _ in shapes]
         short = vector_program(program, sizes, results)
-        return Kernel(short, *form) if short.operations <= min(MOST_VECTORS, len(program.eqns) / LEAST_EQUAL) else None
-    return None if any(len(takes) > MOST_TAKEN for _, takes, _ in _blocks(program)[1:]) else Kernel(program, *form)
+        longest = min(MOST_VECTORS, len(program.eqns) // LEAST_EQUAL)
+        return Kernel(short, shapes, structure) if short.operations <= longest else None
+    many = any(len(takes) > MOST_TAKEN for _, takes, _ in _blocks(program)[1:])
+    return None if many else Kernel(program, shapes, structure)
 
 
 # --- the fold --------------------------------------------------------------------------------------
@@ -129,10 +149,10 @@ def _cut(jaxpr, count: int):
     return blocks[::-1]
 
 
-def as_folds(*arrays, program: ClosedJaxpr | VectorProgram, shapes, depth: int, **_) -> list:
+def as_folds(*arrays, program: ClosedJaxpr | VectorProgram, shapes, depth: int, often: bool = True, **_) -> list:
     """What a kernel's program gives for arrays with `depth` leading axes, as it is put down on CPU."""
     if isinstance(program, VectorProgram):
-        return as_vectors(*arrays, program=program, shapes=shapes, depth=depth)
+        return as_vectors(*arrays, program=program, shapes=shapes, depth=depth, often=often)
     lead = arrays[0].shape[:depth]
     jaxpr = program.jaxpr
     sizes = [math.prod(x.shape[depth:]) for x in arrays]  # reshape cannot find them where there are no samples
@@ -157,7 +177,7 @@ def as_folds(*arrays, program: ClosedJaxpr | VectorProgram, shapes, depth: int, 
 # --- the primitive -----------------------------------------------------------------------------------
 
 
-def _elsewhere(*arrays, program, shapes, depth: int, otherwise: Callable):
+def _elsewhere(*arrays, depth: int, otherwise: Callable, **_):
     for _ in range(depth):
         otherwise = jax.vmap(otherwise)
     return jax.tree.leaves(otherwise(*arrays))
@@ -165,7 +185,9 @@ def _elsewhere(*arrays, program, shapes, depth: int, otherwise: Callable):
 
 def _on_cpu(ctx, *arrays, **params):
     samples = math.prod(ctx.avals_in[0].shape[: params["depth"]])
-    way = _elsewhere if samples < AT_ONE_CALL and _is_done_once() else as_folds
+    # What has a program of vectors is long, and would compile for longer in other ways than a kernel is set up.
+    numbers = isinstance(params["program"], ClosedJaxpr)
+    way = _elsewhere if numbers and samples < AT_ONE_CALL and _is_done_once() else as_folds
     return mlir.lower_fun(way, multiple_results=True)(ctx, *arrays, **params)
 
 
@@ -183,7 +205,7 @@ def _is_done_once() -> bool:
     return ir.StringAttr(place.attributes["sym_name"]).value == "main"
 
 
-def _abstract(*avals, program, shapes, depth: int, otherwise):
+def _abstract(*avals, shapes, depth: int, **_):
     return [ShapedArray((*avals[0].shape[:depth], *shape), dtype) for shape, dtype in shapes]
 
 

@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 from jaxdyn._dispatch import LEAST_BATCH
 from jaxdyn._materialize import at_least
-from jaxdyn._tracing import compiled, is_concrete
-from jaxdyn.closed_projection import Residuals
-from jaxdyn.constrained import RESULTS, _right_inverse, by_the_batch, correction
+from jaxdyn._tracing import compiled, is_concrete, is_staged
+from jaxdyn.closed_projection import Kernels, Residuals, ResidualsInKernels, kernels
+from jaxdyn.constrained import RESULTS, _right_inverse, by_the_batch, correction, has_long_recursion
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics import mass_matrix
 from jaxdyn.model import Model, difference
@@ -167,20 +167,32 @@ def _newton(scene, q, t, held, rank_tol):
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
     """Largest |phi| (m or rad) and |A v - b| (m/s or rad/s) of the state q (nq,), v (nv,) at t (s): (2,)."""
+    return _residuals(scene, q, v, t, None)
 
+
+def still_residuals(scene: Scene, q, v, t):
+    """The same without derivatives: of long mechanisms on CPU by kernels (see `_one_kernel`)."""
+    in_kernels = None
+    if is_staged() and has_long_recursion(scene):
+        in_kernels = kernels(scene.system, scene.constraints, q, v, long=True, often=False)
+    return _residuals(scene, q, v, t, in_kernels)
+
+
+def _residuals(scene: Scene, q, v, t, in_kernels: Kernels | None):
     def largest(*parts):
         zero = jnp.zeros((1,), q.dtype)
         return jnp.stack([jnp.max(jnp.abs(jnp.concatenate([zero, part]))) for part in parts]).astype(q.dtype)
 
     def short(q, v):
+        tree = scene.system, scene.constraints
         with at_least(LEAST_BATCH):
-            found = Residuals(scene.system, scene.constraints)
+            found = Residuals(*tree) if in_kernels is None else ResidualsInKernels(*tree, in_kernels)
             return largest(found.apart(q), found.slip(q, v))
 
     def long(q, v):
         return largest(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
 
-    return by_the_batch(scene, short, long, q, v)
+    return by_the_batch(scene, short, long, q, v, on_cpu=in_kernels is not None)
 
 
 def open_constraints(scene: Scene, q, v, t=0.0, limit: float = 0.0) -> str:

@@ -87,29 +87,31 @@ class Kernels(NamedTuple):
     slip: Kernel
 
 
-def kernels(model: Model, loops, q: Array, v: Array) -> Kernels | None:
-    """Those of a mechanism with q (nq,) and v (nv,) of these shapes and dtypes; None if one of them cannot be had."""
+def kernels(model: Model, loops, q: Array, v: Array, *, long: bool, often: bool = True) -> Kernels | None:
+    """Those of a mechanism with q (nq,) and v (nv,) of these shapes and dtypes; None if one of them cannot be had.
+
+    In single numbers or in vectors, all four alike; see `kernel_or_vectors` for `long`, and `Kernel` for `often`.
+    """
     rows = jax.ShapeDtypeStruct((sum(loop.kind.count for loop in loops),), q.dtype)
     tree = model, loops
-    for in_vectors in (False, True):
+    for in_vectors in (long, not long):
         found = []
         for function, *args in ((_step, q, rows), (_quality, q), (_apart, q), (_slip, q, v)):
             kernel = kernel_of(function, tree, *args, in_vectors=in_vectors)
             if kernel is None:
                 break
-            found.append(kernel)
+            found.append(kernel._replace(often=often))
         else:
             step, quality, apart, slip = found
             return Kernels(quality, step, apart, slip)
     return None
 
 
-class ClosingInKernels:
-    """`Closing` with each of its methods in one kernel: functions of arrays alone, so each step factors M and the rows anew."""
+class ResidualsInKernels:
+    """`Residuals` with each of its methods in one kernel."""
 
-    def __init__(self, model: Model, loops, q: Array, kernels: Kernels):
-        self.tree, self.q, self.kernels = (model, loops), q, kernels
-        self.quality = self._call(kernels.quality, _quality, q)
+    def __init__(self, model: Model, loops, kernels: Kernels):
+        self.tree, self.kernels = (model, loops), kernels
 
     def _call(self, kernel: Kernel, function, *args):
         return kernel(partial(function, self.tree), *args)
@@ -119,6 +121,14 @@ class ClosingInKernels:
 
     def slip(self, q: Array, v: Array) -> Array:
         return self._call(self.kernels.slip, _slip, q, v)
+
+
+class ClosingInKernels(ResidualsInKernels):
+    """`Closing` with each of its methods in one kernel: functions of arrays alone, so each step factors M and the rows anew."""
+
+    def __init__(self, model: Model, loops, q: Array, kernels: Kernels):
+        super().__init__(model, loops, kernels)
+        self.q, self.quality = q, self._call(kernels.quality, _quality, q)
 
     def step(self, residual: Array) -> Array:
         return self._call(self.kernels.step, _step, self.q, residual)

@@ -23,7 +23,7 @@ from jaxdyn import closed_recursion
 from jaxdyn._anywhere import anywhere, flattened, mended
 from jaxdyn._dispatch import LEAST_BATCH, MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
 from jaxdyn._materialize import at_least
-from jaxdyn._one_kernel import kernel_of
+from jaxdyn._one_kernel import kernel_of, kernel_or_vectors
 from jaxdyn._rank import checked_tolerance, eps_of, least_pivot, normal_factor, pseudo_inverse, quality_of, tolerance
 from jaxdyn._row_pattern import MOST_PRODUCTS, products
 from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
@@ -153,10 +153,9 @@ def _kernel(scene: Scene, q, v, tau, t):
     """Accelerations, multipliers and the quality of the rows in one kernel, if there is one."""
     if not is_staged() or layout(scene)[-1].end > scene.nv:
         return None
-    kernel = kernel_of(_in_numbers, scene, q, v, tau, t)
-    if kernel is None and has_short_recursion(scene):
-        kernel = kernel_of(_in_numbers, scene, q, v, tau, t, in_vectors=True)
-    return kernel
+    if has_short_recursion(scene):
+        return kernel_or_vectors(_in_numbers, scene, q, v, tau, t, long=has_long_recursion(scene))
+    return kernel_of(_in_numbers, scene, q, v, tau, t)
 
 
 def _in_numbers(scene: Scene, q, v, tau, t):
@@ -197,6 +196,11 @@ def has_short_recursion(scene: Scene) -> bool:
         return False
     ends = [(body_index(model, loop.body_a), body_index(model, loop.body_b)) for loop in loops]
     return products(model, ends, [loop.kind.count for loop in loops]) <= MOST_PRODUCTS
+
+
+def has_long_recursion(scene: Scene) -> bool:
+    """Whether the recursion is written out, but likely to be too long for a kernel of single numbers."""
+    return has_short_recursion(scene) and scene.system.nb > MOST_BODIES
 
 
 def by_the_batch(scene: Scene, short: Callable, long: Callable, *args, on_cpu: bool = False):

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxdyn import variational
 from jaxdyn._rank import checked_tolerance
 from jaxdyn._tracing import still, traced_once
-from jaxdyn.assembly import open_constraints, residuals, start_evidence
+from jaxdyn.assembly import open_constraints, start_evidence, still_residuals
 from jaxdyn.constrained import constrained_dynamics, in_one_batch, solve_rows
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
 from jaxdyn.dynamics import forward_dynamics
@@ -401,7 +401,9 @@ def start_limit(dtype) -> float:
 
 def consistent(scene: Scene, q, v, t):
     """Whether a state is on the constraints but for rounding."""
-    found = in_one_batch(partial(traced_once, residuals), *still((Scene(scene.system, scene.constraints), q, v, t)))
+    found = in_one_batch(
+        partial(traced_once, still_residuals), *still((Scene(scene.system, scene.constraints), q, v, t))
+    )
     return jnp.max(found) <= start_limit(q.dtype)
 
 

@@ -22,6 +22,7 @@ from jaxdyn.closed_projection import Closing, ClosingInKernels, Kernels, kernels
 from jaxdyn.constrained import (
     by_the_batch,
     correction,
+    has_long_recursion,
     has_short_recursion,
     in_one_batch,
 )
@@ -52,7 +53,7 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
     Errors come back without their parts normal to the constraints: as far as small ones go, those are what is removed from
     q and v. Near a singular position they are large, and shorter steps make them no smaller. What the projection leaves open
     is added. What is done `once`, and not in every step, is not worth a kernel (see `_one_kernel`), except where it has to be
-    `straight`.
+    `straight`, and of many bodies, whose other programs compile for longer.
     """
 
     def project(scene, q, v, t, *errors):
@@ -76,13 +77,14 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 
 def _by_the_batch(scene: Scene, q, v, t, errors, rank_tol, once: bool):
     q = retract(scene.system, q)
-    staged, in_kernels = is_staged() and layout(scene)[-1].end <= scene.nv and (not once or is_straight()), None
-    if staged:
+    is_long, in_kernels = has_long_recursion(scene), None
+    staged = is_staged() and layout(scene)[-1].end <= scene.nv and (not once or is_long or is_straight())
+    if staged and not is_long:
         whole = kernel_of(_in_numbers, scene, q, v, t, *errors, most=MOST_AT_ONCE)
         if whole is not None:
             return _by_kernel(scene, rank_tol, whole, q, v, t, errors)
     if staged and has_short_recursion(scene):
-        in_kernels = kernels(scene.system, scene.constraints, q, v)
+        in_kernels = kernels(scene.system, scene.constraints, q, v, long=is_long, often=not once)
     short, long = partial(_by_recursion, scene, rank_tol, in_kernels), partial(_by_matrices, scene, rank_tol)
     return by_the_batch(scene, short, long, q, v, t, errors, on_cpu=in_kernels is not None)
 

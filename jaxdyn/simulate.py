@@ -19,6 +19,7 @@ from jaxdyn._scalar_program import is_written_out
 from jaxdyn._tracing import compiled, is_concrete, is_known, split
 from jaxdyn._ways import straight, without_kernels
 from jaxdyn.assembly import residuals
+from jaxdyn.constrained import has_long_recursion
 from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves, start_limit
 from jaxdyn.constraints.base import state_dtype
 from jaxdyn.dynamics import kinetic_energy, potential_energy
@@ -320,7 +321,14 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     reached = good & jnp.stack(finite).all(0)
     y = jax.tree.map(lambda rows, start: jnp.where(_along(reached, rows), rows, start[None]), y, y0)
     work = y.pop("work", None)
-    q, v = jax.vmap(lambda y, t: method.place(scene, method.corrected(scene, y, t), t))(y, ts)
+
+    def place(row):
+        y, t = row
+        return method.place(scene, method.corrected(scene, y, t), t)
+
+    # One after the other where the projection is a long program, which for several at once would be another one.
+    long = method.projects and has_long_recursion(scene)
+    q, v = jax.lax.map(place, (y, ts)) if long else jax.vmap(place)((y, ts))
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
     ended = (result == RESULTS.successful) | (result == RESULTS.coarse_steps)
     result = RESULTS.where(ended & ~reached.all(), RESULTS.nonfinite_state, result)

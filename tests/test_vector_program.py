@@ -3,13 +3,14 @@
 import math
 from functools import partial
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn import _banded, _one_kernel, closed_projection, closed_recursion, scenes
+from jaxdyn import _banded, _in_vectors, _one_kernel, closed_projection, closed_recursion, constrained, scenes
 from jaxdyn._one_kernel import as_folds, kernel_of
 from jaxdyn._scalar_program import scalar_program
 from jaxdyn._vector_program import Group, VectorProgram, vector_program
@@ -153,20 +154,38 @@ def test_windows_in_vectors_move_as_by_dense_matrices(in_vectors, batch):
     assert counted[1] <= 1.1 * counted[0]
 
 
-def test_windows_in_vectors_are_closed_as_by_the_recursion(in_vectors):
-    """Residuals and steps of a projection against the recursion as it is."""
+@pytest.mark.parametrize("lead", [(5,), (2, 3)], ids=str)
+def test_large_batches_go_in_portions(in_vectors, monkeypatch, lead):
+    """Samples that differ, two of them after another, as all at once."""
+    scene, q, v, tau = windows(10)
+    kernel = kernel_of(_in_numbers, scene, q, v, tau, jnp.zeros(()), in_vectors=True)
+    assert kernel is not None
+    rng = np.random.default_rng(0)
+    q, v, tau = (jnp.asarray(np.asarray(x) + 0.01 * rng.normal(size=(*lead, *x.shape))) for x in (q, v, tau))
+    args, found = (q, v, tau, jnp.zeros(lead)), []
+    for at_once in (2, 100):
+        monkeypatch.setattr(_in_vectors, "_AT_ONCE", at_once)
+        found.append(as_folds(*args, program=kernel.program, shapes=kernel.shapes, depth=len(lead)))
+    for a, b in zip(*found, strict=True):
+        assert a.shape == b.shape and a.shape[: len(lead)] == lead
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11 * np.max(np.abs(b)))
+
+
+@pytest.mark.parametrize("often", [True, False])
+def test_windows_in_vectors_are_closed_as_by_the_recursion(in_vectors, often):
+    """Residuals and steps of a projection against the recursion as it is, with folds and without."""
     scene, q, v, _ = windows(10)
     tree = scene.system, scene.constraints
-    found = jax.jit(lambda q, v: _of_closing(closed_projection.ClosingInKernels(*tree, q, _kernels(tree, q, v)), q, v))(
-        q, v
-    )
+    found = jax.jit(
+        lambda q, v: _of_closing(closed_projection.ClosingInKernels(*tree, q, _kernels(tree, q, v, often)), q, v)
+    )(q, v)
     wanted = _of_closing(closed_projection.Closing(*tree, q), q, v)
     for a, b in zip(found, wanted, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
 
 
-def _kernels(tree, q, v):
-    found = closed_projection.kernels(*tree, q, v)
+def _kernels(tree, q, v, often):
+    found = closed_projection.kernels(*tree, q, v, long=True, often=often)
     assert found is not None and all(isinstance(kernel.program, VectorProgram) for kernel in found)
     return found
 
@@ -193,22 +212,52 @@ def test_wide_bands_are_written_out(in_vectors, monkeypatch):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
+def test_long_mechanisms_end_where_others_do(in_vectors, monkeypatch):
+    """Three windows for half a second taken for a long mechanism, and as they are; with residuals at the save points."""
+    scene = scenes.windows(count=3)
+    q0, v0 = scenes.windows.start(count=3)
+    ts = jnp.linspace(0.0, 0.5, 3)
+
+    def run(q0, v0):
+        outputs = ("constraint_residual",)
+        return jd.simulate(scene, q0, v0, ts, stepsize=0.125, solver=diffrax.Dopri8(), throw=False, outputs=outputs)
+
+    wanted = jax.jit(run)(q0, v0)
+    monkeypatch.setattr(constrained, "MOST_BODIES", 6)
+    monkeypatch.setattr(_one_kernel, "LEAST_EQUAL", 1)
+    jax.clear_caches()
+    _one_kernel._kernel.cache_clear()
+    assert constrained.has_long_recursion(scene)
+    found = jax.jit(run)(q0, v0)
+    assert bool(found.success)
+    np.testing.assert_allclose(found.q, wanted.q, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.v, wanted.v, rtol=0, atol=1e-12)
+    assert np.max(found.constraint_residual) < 1e-13
+
+
 @pytest.mark.slow
 def test_a_simulation_in_vectors_is_the_ordinary_one(in_vectors, monkeypatch):
-    """Ten windows for half a second, and without kernels at all."""
+    """Ten windows for half a second, and without kernels at all: by the same steps, and by those that are chosen.
+
+    The error of the first step that is chosen is estimated as some rounding errors, so that the second one differs by a third.
+    Dense output then differs by more than the ends of steps.
+    """
     scene = scenes.windows(count=10)
     q0, v0 = scenes.windows.start(count=10)
     ts = jnp.linspace(0.0, 0.5, 3)
 
     def run(q0, v0):
-        return jd.simulate(scene, q0, v0, ts, rtol=1e-11, atol=1e-11, throw=False)
+        chosen = jd.simulate(scene, q0, v0, ts, rtol=1e-11, atol=1e-11, throw=False)
+        return chosen, jd.simulate(scene, q0, v0, ts, stepsize=0.125, solver=diffrax.Dopri8(), throw=False)
 
-    found = jax.jit(run)(q0, v0)
+    found, found_fixed = jax.jit(run)(q0, v0)
     monkeypatch.setattr(_one_kernel, "MOST_IN_VECTORS", 0)
     jax.clear_caches()
     _one_kernel._kernel.cache_clear()
-    wanted = jax.jit(run)(q0, v0)
-    assert bool(found.success)
+    wanted, wanted_fixed = jax.jit(run)(q0, v0)
+    assert bool(found.success) and bool(found_fixed.success)
+    np.testing.assert_allclose(found_fixed.q, wanted_fixed.q, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found_fixed.v, wanted_fixed.v, rtol=0, atol=1e-12)
     # Both are as far from the motion as their tolerance allows.
-    np.testing.assert_allclose(found.q, wanted.q, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(found.v, wanted.v, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found.q[-1], wanted.q[-1], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found.v[-1], wanted.v[-1], rtol=0, atol=1e-10)

@@ -166,7 +166,7 @@ def _cases() -> tuple[Case, ...]:
             lambda start: references.windows(ten / 10, 40),
             ten / 10,
             10,
-            # The program for a batch compiles for six minutes.
+            # Programs for a batch compile for a minute and more each.
             largest=1,
         ),
         Case(
