@@ -56,10 +56,14 @@ def _marked(ctx, *arrays, body: ClosedJaxpr):
 
     arrays = [arrays[0], *(x for x, here in zip(arrays[1:], given, strict=True) if here)]
     ctx = ctx.replace(avals_in=[ctx.avals_in[0], *(x for x, here in zip(ctx.avals_in[1:], given, strict=True) if here)])
+    def hidden(*arrays):
+        # XLA writes known arguments into the function, which then does not use them: see above.
+        return jax.jit(branches)(*lax.optimization_barrier(arrays))
+
     # A function of its own, of which one call is written here.
     block = ir.InsertionPoint.current.block  # pyright: ignore[reportAttributeAccessIssue]
     before = len(block.operations)
-    found = mlir.lower_fun(jax.jit(branches), multiple_results=True)(ctx, *arrays)
+    found = mlir.lower_fun(hidden, multiple_results=True)(ctx, *arrays)
     for operation in list(block.operations)[before:]:
         if operation.operation.name == "func.call":
             marks: dict[str, ir.Attribute] = {name: ir.StringAttr.get(value) for name, value in _ATTRIBUTES.items()}

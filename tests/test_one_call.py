@@ -13,6 +13,7 @@ from jax import lax
 
 import jaxdyn as jd
 from jaxdyn import _call_writer, _factor_loops, _one_call
+from jaxdyn._marked_call import in_call
 from jaxdyn._one_call import one_call
 from jaxdyn.report.cases import cases
 
@@ -258,6 +259,36 @@ def test_arguments_of_any_kind():
     lanes = jax.vmap(lambda x: one_call(lambda x: (x * 2, x.sum() > 1), x))
     _same(jax.jit(lanes)(FEW), (2 * FEW, FEW.sum(1) > 1))
     assert jax.jit(lanes)(FEW[:0])[0].shape == (0, 4)
+
+
+def test_large_known_arguments_in_a_loop():
+    # XLA knows them there, would write them into the function and then stop at arguments that this does not use.
+    known = jnp.linspace(0.0, 1.0, 2000)  # more than 10 kB
+
+    def body(x, table):
+        return [x + jnp.sum(table[-3:])]
+
+    def repeated(x):
+        def step(_, state):
+            program = jax.make_jaxpr(body)(*state)
+            return in_call(program)(*state)[0], state[1]
+
+        return lax.fori_loop(0, 10, step, (x, known))[0]
+
+    _same(jax.jit(repeated)(jnp.ones(4)), 1 + 10 * np.sum(np.linspace(0, 1, 2000)[-3:]) * np.ones(4))
+
+
+def test_long_chains_that_are_built_in_a_program():
+    q = 0.3 * jnp.cos(jnp.arange(100))
+
+    def energies(speed):
+        chain = jd.robots.chain(100)
+        found = jd.simulate(chain, q, speed * jnp.sin(q), jnp.asarray([0.0, 0.02]), stepsize=0.001, outputs=("energy",))
+        return found.energy, found.q[-1]
+
+    energy, end = jax.jit(energies)(0.1)
+    np.testing.assert_allclose(energy[1], energy[0], rtol=1e-8)  # of RK4
+    np.testing.assert_allclose(end, energies(0.1)[1], rtol=0, atol=1e-12)
 
 
 def test_callbacks_stay_callbacks():
