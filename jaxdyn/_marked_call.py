@@ -56,6 +56,7 @@ def _marked(ctx, *arrays, body: ClosedJaxpr):
 
     arrays = [arrays[0], *(x for x, here in zip(arrays[1:], given, strict=True) if here)]
     ctx = ctx.replace(avals_in=[ctx.avals_in[0], *(x for x, here in zip(ctx.avals_in[1:], given, strict=True) if here)])
+
     def hidden(*arrays):
         # XLA writes known arguments into the function, which then does not use them: see above.
         return jax.jit(branches)(*lax.optimization_barrier(arrays))

@@ -76,7 +76,8 @@ def _identity_lowering(ctx, *values, least):
 
 def _cpu_lowering(ctx, *values, least):
     worth = [value for value, aval in zip(values, ctx.avals_in, strict=True) if aval.size >= least]
-    if worth:
+    # Where a program is divided between devices, XLA takes no side effects that do not say on which one they happen.
+    if worth and getattr(ctx.module_context.axis_context, "num_devices", 1) in (None, 1):
         branches = hlo.IfOp([], never())
         with ir.InsertionPoint(branches.regions[0].blocks.append()):
             hlo.OutfeedOp(worth, hlo.CreateTokenOp().result, outfeed_config=ir.StringAttr.get(""))
