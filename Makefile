@@ -34,7 +34,7 @@ lint: $(VENV)/.installed-dev  ## style and formatting
 types: $(VENV)/.installed-dev  ## static types
 	$(BIN)/pyright
 
-bench: $(VENV)/.installed-bench  ## the benchmarks, into out/
+bench: $(VENV)/.installed-bench  ## dynamics against peers, into out/; the other benchmarks: benchmarks/README.md
 	$(BIN)/python -m benchmarks
 
 notebooks: $(VENV)/.installed-notebook  ## run the notebooks, into out/notebooks

@@ -1,4 +1,4 @@
-"""All benchmarks, one after another."""
+"""`python -m benchmarks` measures dynamics; the other scripts run by their names."""
 
 from benchmarks import dynamics
 

@@ -90,7 +90,7 @@ def main(argv=None) -> None:
         + "|"
     )
     rows = []
-    for name in options.scenes:
+    for name in timing.chosen_names(options.scenes, SCENES):
         for row in measure(name, options.length):
             residual = "" if row["residual"] is None else f"{row['residual']:.1e}"
             print(

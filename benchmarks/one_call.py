@@ -54,7 +54,7 @@ def main(argv=None) -> None:
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     rows = []
-    for name in options.scenes:
+    for name in timing.chosen_names(options.scenes, SCENES):
         for batch in options.batch:
             made = {way: program(name, batch, options.tolerance, way == "call") for way in ("call", "ordinary")}
             found = timing.interleaved({way: run for way, (run, _) in made.items()}, options.rounds)

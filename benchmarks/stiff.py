@@ -1,8 +1,8 @@
 """Stiff scenes, each with a reference: what every solver makes of them, and what to do.
 
 Run as `python -m benchmarks.stiff [CASE ...]`. For every case, solver and stiffness: steps and the error of the positions against
-the reference, or how the run ended; and the largest error of the derivative by the logarithm of the stiffness. Errors are
-relative to the size of the motion. Tolerances are 1e-8, and 10 rounding errors in float32.
+the reference, or the code with which the run ended; and the largest error of the derivative by the logarithm of the
+stiffness. Errors are relative to the size of the motion. Tolerances are 1e-8, and 10 rounding errors in float32.
 """
 
 import functools
@@ -18,6 +18,8 @@ import mpmath
 import numpy as np
 
 import jaxdyn as jd
+from benchmarks.extremes import name_of
+from benchmarks.timing import chosen_names
 from jaxdyn.report.references import car_axis
 
 SOLVERS: dict[str, Any] = {
@@ -229,7 +231,7 @@ def program(case: Case, solver, dtype=float, **options) -> Callable:
         found = jd.simulate(
             scene, q0, v0, case.ts, control=control, solver=solver, adjoint="forward", **tolerances, **options
         )
-        return found.q, (found.stats["num_steps"], found.success)
+        return found.q, (found.stats["num_steps"], found.success, found.result._value)
 
     def both(stiffness, tolerance):
         log = jnp.log(stiffness.astype(dtype))
@@ -240,7 +242,7 @@ def program(case: Case, solver, dtype=float, **options) -> Callable:
 
 
 def runner(case: Case, solver, dtype=float) -> Callable:
-    """A function (tolerance) -> positions, derivatives, steps and success at all stiffnesses of a case, in numpy."""
+    """A function (tolerance) -> positions, derivatives, steps, success and code at all stiffnesses of a case, in numpy."""
     options = {"stepsize": FIXED_STEP} if isinstance(solver, jd.solvers.RK4) else {"max_steps": MOST_STEPS}
     run = jax.jit(jax.vmap(program(case, solver, dtype, **options), (0, None)))
     return lambda tolerance: tuple(
@@ -278,8 +280,11 @@ def table(case: Case) -> str:
     for name, run in runs.items():
         found = run(1e-8)
         error, off = (np.abs(a - b).max((1, 2)) / case.size for a, b in zip(found[:2], (q, slope), strict=True))
-        steps, success = found[2:]
-        cells = [f"{n}, {e:.0e}" if ok else f"refused ({n})" for n, e, ok in zip(steps, error, success, strict=True)]
+        steps, success, codes = found[2:]
+        cells = [
+            f"{n}, {e:.0e}" if ok else f"`{name_of(code)}` ({n})"
+            for n, e, ok, code in zip(steps, error, success, codes, strict=True)
+        ]
         worst = f"{off[success].max():.0e}" if success.any() else ""
         lines += [f"| {name} | " + " | ".join(cells) + f" | {worst} |"]
         print(lines[-1], file=sys.stderr, flush=True)
@@ -290,7 +295,7 @@ def main() -> None:
     """Print the tables of the cases named, or of all."""
     jax.config.update("jax_enable_x64", True)
     chosen = cases()
-    for name in sys.argv[1:] or chosen:
+    for name in chosen_names(sys.argv[1:], chosen):
         print(table(chosen[name]), end="\n\n", flush=True)
 
 

@@ -17,6 +17,14 @@ def once(call) -> float:
     return time.perf_counter() - start
 
 
+def chosen_names(given, known) -> list[str]:
+    """The names given, or all known ones. **Raises:** ValueError for one that is not known."""
+    for name in given:
+        if name not in known:
+            raise ValueError(f"there is no {name!r}; choose from {', '.join(known)}")
+    return list(given or known)
+
+
 def machine() -> dict:
     """Processor, cores and versions, for the head of a report."""
     return timing.machine(("pin", "frax", "mujoco", "mujoco-mjx"))

@@ -1,5 +1,7 @@
 """The table of extreme cases: what is right, what is refused and by which code; nothing wrong comes with success."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,12 +93,29 @@ SLOW = {
 }
 
 
+# Rounding decides whether these, whose rows are far closer to dependent than float64 tells apart, are right or refused.
+BY_ROUNDING = {("planes", f"1e-12 rad, {way}, rank_tol 1e-14", "float64") for way in ("along", "across")}
+
+
+def documented():
+    """Verdicts in docs/extremes.md by case, place and dtype."""
+    text = (Path(__file__).parent.parent / "docs" / "extremes.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
+    return {tuple(row[:3]): row[-1] for row in rows}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SLOW)
 def test_verdicts_of_long_runs(name):
     dtypes, gradient = SLOW[name]
     rows = CASES[name](dtypes, gradient)
     assert "SILENT" not in verdicts(rows).values()
+    # Without gradients fewer rows can be wrong, and a refusal may give way to an answer; nothing that was right is lost.
+    known = documented()
+    lost = {
+        (row.case, row.at, row.dtype) for row in rows if row.verdict != known[row.case, row.at, row.dtype] == "right"
+    }
+    assert lost <= BY_ROUNDING
     assert sum(row.verdict == "right" for row in rows) >= 2
 
 

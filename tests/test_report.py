@@ -1,6 +1,7 @@
 """The report of error against run time: references, counts, errors, the front, the page and the command."""
 
 import dataclasses
+import sys
 
 import diffrax
 import jax
@@ -17,7 +18,7 @@ from jaxdyn.report import Record, Report, beaten_by, cases, html_page, pareto_fr
 from jaxdyn.report import run as running
 from jaxdyn.report.front import cost_at
 from jaxdyn.report.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
-from jaxdyn.report.programs import FIXED, SOLVERS, prepare
+from jaxdyn.report.programs import FIXED, SOLVERS, Programs, prepare
 from jaxdyn.report.records import Known
 from jaxdyn.report.references import (
     car_axis,
@@ -358,7 +359,7 @@ def small(monkeypatch, body):
     return prepared
 
 
-def test_report_resumes_and_writes(small, rungs, tmp_path, capsys, monkeypatch):
+def test_report_resumes_and_writes(small, body, rungs, tmp_path, capsys, monkeypatch):
     lines = []
     found = jd.report("free_body", rounds=1, out=tmp_path, echo=lines.append)
     assert small == ["free_body"]
@@ -389,8 +390,25 @@ def test_report_resumes_and_writes(small, rungs, tmp_path, capsys, monkeypatch):
     path.write_text(path.read_text() + '{"key": "cut')
     assert jd.report("free_body", rounds=1, out=tmp_path).records == found.records
     assert len(path.read_text().splitlines()) == 2
+    # So are records of other versions, and what is no record; peers make a group another one.
+    command = ["report", "free_body", "--rounds", "1", "--out", str(tmp_path)]
+    written, (head, *groups) = path.read_text(), path.read_text().splitlines()
+    for first, word in (
+        (head.replace(jax.__version__, "0.1.2"), "0.1.2"),
+        ('{"commit": 1}', "remove"),
+        ("[", "remove"),
+    ):
+        path.write_text("\n".join([first, *groups]) + "\n")
+        assert main(command) == 2
+        assert word in capsys.readouterr().err
+    path.write_text(written)
+    peer = Contestant(
+        "peer", "by hand", "exact", 1.0, True, lambda: None, lambda _: Motion(body.reference.q, body.reference.v)
+    )
+    with_peers = jd.report("free_body", rounds=1, out=tmp_path, peers=lambda *_: [peer])
+    assert {r.source for r in with_peers.records} == {"jaxdyn", "peer"}
     monkeypatch.setattr(running, "commit", lambda: "another")
-    assert main(["report", "free_body", "--rounds", "1", "--out", str(tmp_path)]) == 2
+    assert main(command) == 2
     assert "another" in capsys.readouterr().err
 
 
@@ -409,9 +427,39 @@ def test_command(small, rungs, capsys):
         (["report", "free_body", "--rounds", "0"], "rounds"),
         (["report", "free_body", "--way", "Dopri8"], "ways"),
         (["report", "free_body", "--way", "free:Euler"], "Euler"),
+        (["report", "four_bar", "free_body", "--way", "projected:Dopri8"], "free_body cannot take"),
+        (["report", "free_body", "--way", "fre:Dopri8"], "ways"),
     ):
         assert main(wrong) == 2
         assert word in capsys.readouterr().err
+    assert small == ["free_body"]
+
+
+@pytest.mark.parametrize("name", ["scenes", "dtypes", "batches", "ways"])
+def test_empty_arguments_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name} is empty"):
+        jd.report(**({"scenes": "free_body"} | {name: []}))
+
+
+def test_nothing_to_measure_is_refused():
+    with pytest.raises(ValueError, match=r"batches \[256\] leave nothing to measure of windows_40"):
+        jd.report("windows_40", batches=[256])
+
+
+def test_a_page_without_matplotlib_is_refused_before_the_runs(small, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match="jaxdyn\\[plot\\]"):
+        jd.report("free_body", rounds=1, out=tmp_path)
+    assert small == []
+
+
+def test_a_batch_fails_with_any_of_its_trajectories(body):
+    q, v, ts = body.programs.lanes(2)
+    bad = np.stack([v[0], np.nan * v[1]])
+    rung = ladder(body, "free", "Tsit5", [1e-4], "float64", (q, bad, ts), flop_counter(body, "free", 2))[0]
+    assert rung.motion(rung.call()).result == "nonfinite_start"
+    with pytest.raises(RuntimeError, match="no starts for a batch"):
+        Programs(body.scene, (q[0], np.nan * v[0]), body.programs.ts).lanes(2)
 
 
 def test_report_needs_float64():

@@ -9,7 +9,8 @@ import pytest
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
-from benchmarks.stiff import cases, program
+from benchmarks.extremes import name_of
+from benchmarks.stiff import SOLVERS, cases, program, reference, runner
 from jaxdyn.model import _per_joint
 from jaxdyn.solvers.lie import _local_rate
 from jaxdyn.solvers.rosenbrock import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P
@@ -355,12 +356,38 @@ def test_transient_at_the_start_in_single_precision():
 # Verdicts
 
 
+# How RK4 with steps of a millisecond ends at each stiffness of the table.
+BY_RK4 = {
+    "spring": ["successful"] * 2 + ["nonfinite_state"] * 3,
+    "drive": ["successful"] * 2 + ["nonfinite_state"] * 2,
+    "flexible_joint": ["successful"] * 2 + ["nonfinite_state"] * 3,
+    "press": ["successful"] * 2 + ["coarse_steps"] * 2,
+    "car_axis": ["successful"],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BY_RK4)
+def test_what_succeeds_is_right(name):
+    """The table of docs/stiff.md: what is advised serves everywhere, and a run is right or ends with a code."""
+    case = cases()[name]
+    runs = {solver: runner(case, SOLVERS[solver]) for solver in ("Dopri8", "Kvaerno5", "Rodas5P", "RK4, 1 ms")}
+    q, _, _ = reference(case, runs["Rodas5P"], runs["Kvaerno5"])
+    codes = {}
+    for solver, run in runs.items():
+        found, _, _, success, code = run(1e-8)
+        codes[solver] = [name_of(x) for x in code]
+        assert np.abs(found - q).max((1, 2))[success].max() < 1e-6 * case.size
+    assert codes["Dopri8" if name == "car_axis" else "Rodas5P"] == ["successful"] * len(case.values)
+    assert codes["RK4, 1 ms"] == BY_RK4[name]
+
+
 def test_rodas_serves_at_every_stiffness():
     """Springs of 1e2 to 1e9 N/m in one program: positions and their derivatives against closed forms."""
     case = cases()["flexible_joint"]
     case = case._replace(values=case.values[[0, 1, 3, 4]])
     run = quick(jax.vmap(program(case, jd.Rodas5P(), max_steps=1024), (0, None)))
-    q, slope, steps, success = run(case.values, 1e-8)
+    q, slope, steps, success, _ = run(case.values, 1e-8)
     step = 1e-3
     ends = [np.stack([case.exact(k * np.exp(n * step)) for k in case.values]) for n in (0, 1, -1, 2, -2)]
     expected = (8 * (ends[1] - ends[2]) - (ends[3] - ends[4])) / (12 * step)

@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn import scenes
+from jaxdyn import robots, scenes
+from jaxdyn.forces import Drive
 from jaxdyn.report import references
 from jaxdyn.report.references import Reference
 from jaxdyn.scene import Scene
@@ -53,6 +55,11 @@ def named(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
         return scene(**taken), (np.asarray(q), np.asarray(v))
 
     return build
+
+
+def _held_elbow() -> tuple[Scene, tuple]:
+    drive = Drive(kp=jnp.asarray([0.0, 1e5]), kd=jnp.asarray([0.1, 1e4]), target=jnp.asarray([0.0, 0.5]))
+    return Scene(robots.chain(2), forces=(drive,)), (np.array([1.0, 0.8]), np.zeros(2))
 
 
 def _cases() -> tuple[Case, ...]:
@@ -181,6 +188,17 @@ def _cases() -> tuple[Case, ...]:
                 Published("PSIDE at 1e-14 (Cray C90, 1990s)", 56.74, error=3e-8),
                 Published(f"OpenSim 3.2 on 0.05 s, problem A03 ({i5})", 0.384),
             ),
+        ),
+        Case(
+            "held_elbow",
+            "Double pendulum whose elbow a stiff drive holds, 2 s: decays of 1e5 1/s",
+            "free, stiff",
+            _held_elbow,
+            None,
+            ten / 5,
+            1000,
+            conserves=False,
+            stiff=True,
         ),
         Case(
             "car_axis",

@@ -20,7 +20,8 @@ class _Entry(NamedTuple):
 class Journal:
     """Groups of records by key; with a directory, also in its file: a line for the head, then one for each group.
 
-    **Raises:** ValueError when the file's records are of another commit, machine or kind of report.
+    **Raises:** ValueError when the file's records are of another commit, machine, set of versions or kind of report, or
+    cannot be read.
     """
 
     def __init__(self, directory: Path | None, head: dict):
@@ -40,25 +41,27 @@ class Journal:
         first, *lines = path.read_text(encoding="utf-8").splitlines() or ["{}"]
         if not lines:
             return
-        before = json.loads(first)
-        for name, of in (
-            ("commit", lambda head: head["commit"]),
-            ("machine", lambda head: [head["machine"][key] for key in ("processor", "device", "cores")]),
-            ("full", lambda head: head["full"]),
-        ):
-            if of(before) != of(self.head):
-                raise ValueError(
-                    f"out has {path} with {name} {of(before)}, and this is {of(self.head)}; name another directory, or "
-                    "remove the file to start anew"
-                )
+        remedy = "name another directory, or remove the file to start anew"
+        try:
+            before = json.loads(first)
+            for name, of in (
+                ("commit", lambda head: head["commit"]),
+                ("machine", lambda head: [head["machine"][key] for key in ("processor", "device", "cores")]),
+                ("versions", lambda head: head["machine"]["versions"]),
+                ("full", lambda head: head["full"]),
+            ):
+                if of(before) != of(self.head):
+                    raise ValueError(f"out has {path} with {name} {of(before)}, and this is {of(self.head)}; {remedy}")
+            for line in lines:
+                try:
+                    entry = json.loads(line)
+                except json.JSONDecodeError:  # cut by an interruption
+                    continue
+                records = [Record(**x) for x in entry["records"]]
+                self._entries[entry["key"]] = _Entry(entry["scene"], Known.from_dict(entry["known"]), records)
+        except (KeyError, TypeError, json.JSONDecodeError) as error:
+            raise ValueError(f"out has {path}, which is no file of this version's ({error!r}); {remedy}") from error
         self.head = before
-        for line in lines:
-            try:
-                entry = json.loads(line)
-            except json.JSONDecodeError:  # cut by an interruption
-                continue
-            records = [Record(**x) for x in entry["records"]]
-            self._entries[entry["key"]] = _Entry(entry["scene"], Known.from_dict(entry["known"]), records)
 
     def __contains__(self, key: str) -> bool:
         return key in self._entries

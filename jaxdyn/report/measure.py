@@ -56,8 +56,12 @@ def ladder(
     chosen = chosen_method(prepared.scene, method)
 
     def motion(found) -> Motion:
-        q, v, result, stats = jax.tree.map(lambda x: np.asarray(x if batch == 1 else x[0]), found)
-        name = next(name for name in RESULTS._name_to_item if bool(result == getattr(RESULTS, name)))
+        q, v, result, stats = found
+        codes = np.atleast_1d(np.asarray(result._value))
+        # Of a batch the first trajectory is judged, if none of them failed: those that stop early cost less time.
+        code = next((code for code in codes if code != RESULTS.successful._value), codes[0])
+        name = next(name for name in RESULTS._name_to_item if code == getattr(RESULTS, name)._value)
+        q, v, stats = jax.tree.map(lambda x: np.asarray(x if batch == 1 else x[0]), (q, v, stats))
         steps = int(stats["num_steps"])
         count = evaluations(solver, steps, prepared.scene, chosen)
         return Motion(q, v, name, steps, int(stats["num_rejected_steps"]), count)
@@ -78,8 +82,8 @@ def evaluations(solver: str, steps: int, scene: Scene, method: Method) -> int | 
     """
     if solver in FIXED:
         return 4 * steps
-    tableau = SOLVERS[solver]().tableau  # pyright: ignore[reportAttributeAccessIssue]
-    if tableau.implicit:
+    tableau: Any = getattr(SOLVERS[solver](), "tableau", None)
+    if tableau is None or tableau.implicit:
         return None
     saves = passes_last_stage_on(tableau, method.jumping, method.projects) if method.corrects(scene) else tableau.fsal
     saved = steps - 1 if saves else 0

@@ -34,8 +34,13 @@ def write(report: Report, directory: str | Path) -> None:
     """Write report.json, report.txt and report.html."""
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    for kind, text in (("json", report.to_json()), ("txt", report.table() + "\n"), ("html", html_page(report))):
-        (directory / f"report.{kind}").write_text(text, encoding="utf-8")
+    # The page last: it needs matplotlib, the others nothing.
+    for kind, text in (
+        ("json", report.to_json),
+        ("txt", lambda: report.table() + "\n"),
+        ("html", lambda: html_page(report)),
+    ):
+        (directory / f"report.{kind}").write_text(text(), encoding="utf-8")
 
 
 def html_page(report: Report) -> str:

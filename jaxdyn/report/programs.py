@@ -19,7 +19,7 @@ from jaxdyn.report.references import Reference
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import simulate
 from jaxdyn.so3 import quat_to_matrix
-from jaxdyn.solvers import RK4
+from jaxdyn.solvers import RK4, Rodas5P
 
 # By name; those in FIXED run with fixed steps.
 SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
@@ -28,6 +28,7 @@ SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "Tsit5": diffrax.Tsit5,
     "Kvaerno3": diffrax.Kvaerno3,
     "Kvaerno5": diffrax.Kvaerno5,
+    "Rodas5P": Rodas5P,
     "RK4": RK4,
 }
 FIXED = frozenset({"RK4"})
@@ -83,6 +84,8 @@ class Programs:
         """Starts q (batch, nq), v (batch, nv) and times (batch, nt): states along the first tenth of the motion.
 
         All are on the constraints, and no two trajectories take quite the same steps; the first is the reference's.
+
+        **Raises:** RuntimeError when the motion along which they lie stops early.
         """
         ts, (q, v) = self.ts, self.start
         delays = SPREAD * (ts[-1] - ts[0]) * np.arange(batch) / batch
@@ -91,6 +94,8 @@ class Programs:
             first = len(states) - 1
             times = ts[0] + SPREAD * (ts[-1] - ts[0]) * np.arange(first, first + ahead + 1) / batch
             found = self.solve("auto", "Dopri8", 1e-12, states[-1], times)
+            if not all(np.isfinite(x).all() for x in found):
+                raise RuntimeError("no starts for a batch: a simulation at tolerances of 1e-12 stopped early")
             states += [*zip(*(x[1:] for x in found), strict=True)]
         q, v = (np.stack(x) for x in zip(*states[:batch], strict=True))
         return q, v, ts + delays[:, None]

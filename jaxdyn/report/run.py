@@ -8,6 +8,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.constrained_motion import chosen_method
+from jaxdyn.plotting import new_figure
 from jaxdyn.report.cases import Case, cases
 from jaxdyn.report.journal import Journal
 from jaxdyn.report.measure import Contestant, flop_counter, ladder, measure
@@ -22,7 +24,7 @@ Peers = Callable[[Prepared, str, tuple], Sequence[Contestant]]
 
 def combinations(case: Case, constrained: bool, *, full: bool, plain: bool = True) -> list[tuple[str, str]]:
     """Methods with solvers: the usual ones, or every sensible pair; `plain` is float64 and one trajectory."""
-    stiff = ["Kvaerno5", "Kvaerno3"] if full else ["Kvaerno5"]
+    stiff = ["Rodas5P", "Kvaerno5", "Kvaerno3"] if full else ["Rodas5P", "Kvaerno5"]
     implicit = stiff if case.stiff or (full and plain) else []
     explicit = ["Dopri8", "Tsit5", "RK4"]
     if not constrained:
@@ -74,8 +76,9 @@ def report(
 
     **Returns:** a `Report`; `print(report.table())`; `jaxdyn.report.write(report, directory)` makes its page.
 
-    **Raises:** ValueError for a name that is not known, a dtype, batch or way that cannot be, float64 that is not enabled,
-    and a directory that holds another commit's or another machine's records.
+    **Raises:** ValueError for a name that is not known, a dtype, batch or way that cannot be, nothing to measure, float64 that
+    is not enabled, and a directory that holds records of another commit, machine or set of versions; ImportError for `out`
+    without matplotlib.
 
     ```python
     quick = jd.report("pendulum_in_plane")
@@ -91,6 +94,13 @@ def report(
         groups += [(case, dtype, batch) for dtype in dtypes for batch in sizes]
         if len(sizes) < len(batches):
             say(f"{case.name}: batches above {case.largest} are left out: they take minutes, unless `ways` are chosen")
+    if not groups:
+        raise ValueError(
+            f"batches {list(batches)} leave nothing to measure of {', '.join(case.name for case in chosen)}; choose `ways`, "
+            "or smaller batches"
+        )
+    if out is not None:
+        new_figure(1.0, 1.0)  # without matplotlib there is no page, which is better known before hours of runs
     head = {
         "machine": machine(),
         "commit": commit(),
@@ -99,7 +109,7 @@ def report(
     }
     journal = Journal(None if out is None else Path(out), head)
     prepared, began = None, time.perf_counter()
-    only = "".join(f", {method} {solver}" for method, solver in ways or ())
+    only = "".join(f", {method} {solver}" for method, solver in ways or ()) + (", with peers" if peers else "")
     keys = [f"{case.name}, {dtype}, batch {batch}, {rounds} rounds{only}" for case, dtype, batch in groups]
     todo = [(key, *group) for key, group in zip(keys, groups, strict=True) if key not in journal]
     if len(todo) < len(groups):
@@ -147,6 +157,9 @@ def _checked(scenes, dtypes, batches, ways, rounds) -> list[Case]:
     """The cases, after a check of the arguments of `report`."""
     known = cases()
     names = list(known) if scenes is None else [scenes] if isinstance(scenes, str) else list(scenes)
+    for argument, given in (("scenes", names), ("dtypes", dtypes), ("batches", batches), ("ways", ways)):
+        if given is not None and len(given) == 0:
+            raise ValueError(f"{argument} is empty; leave it out for the usual ones")
     for name in names:
         if name not in known:
             raise ValueError(f"scenes has {name!r}; choose from {', '.join(known)}")
@@ -165,4 +178,12 @@ def _checked(scenes, dtypes, batches, ways, rounds) -> list[Case]:
         raise ValueError(f"rounds is {rounds!r}; give a positive integer")
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError('a report compares in float64; call jax.config.update("jax_enable_x64", True) first')
-    return [known[name] for name in dict.fromkeys(names)]
+    chosen = [known[name] for name in dict.fromkeys(names)]
+    for case in chosen if ways else ():
+        scene, _ = case.build()
+        for method in dict(ways or ()):
+            try:
+                chosen_method(scene, method)
+            except ValueError as error:
+                raise ValueError(f"ways has {method!r}, which {case.name} cannot take: {error}") from None
+    return chosen
