@@ -17,9 +17,9 @@ examples:
   jaxdyn report four_bar andrews --dtype float64 float32 --batch 1 256 --out out/report
   jaxdyn report --full --out out/report
 
-Without --full: the usual ways to integrate, four tolerances each, about a minute a scene, of which most is compilation. With it:
-every sensible way, in both dtypes, alone and in batches, hours for all scenes; started again with the same --out, it goes on
-where it stopped.
+Without --full: the usual ways to integrate, four tolerances each, a quarter of a minute to two minutes a scene, of which
+most is compilation. With it: every sensible way, in both dtypes, alone and in batches, hours for all scenes; started again
+with the same --out, it goes on where it stopped.
 
 output (--out DIR):
   report.html      one page: plots, tables, the machine; needs no network
