@@ -37,7 +37,9 @@ def test_a_batch_on_two_devices_is_that_on_one():
     env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", PROGRAM], env=env, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-2000:]
-    for found in map(json.loads, done.stdout.splitlines()):
+    checks = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(checks) == 2
+    for found in checks:
         assert found["devices"] == 2
         assert found["spread"] > 1e-3
         assert found["apart"] < 1e-12
