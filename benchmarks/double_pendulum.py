@@ -2,8 +2,8 @@
 
     python -m benchmarks.double_pendulum [--batch 4096] [--rounds 20]
 
-Operations are those that XLA counts in the compiled program, sines, roots and the like apart; the library's own sines, of joints,
-are polynomials and count as such. The time is the best and the median of interleaved rounds.
+Operations are those of the kernel of one sample; sines, roots and the like are among them, and are counted apart too. The time is
+the best and the median of interleaved rounds.
 "known" has the numbers of the mechanism closed over, "given" takes them as an argument.
 """
 
@@ -16,6 +16,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks import timing
+from benchmarks.operations import Operations, operations
 
 FORMULATIONS = ("lagrangian", "model", "immersion", "loop")
 
@@ -28,7 +29,7 @@ def acceleration(scene, q, v):
 
 
 def programs(batch: int) -> dict:
-    """Compiled programs and their arguments, by formulation and by how the numbers come."""
+    """Compiled programs, their arguments and their operations, by formulation and by how the numbers come."""
     angles, rates = (jnp.asarray(x) for x in np.random.default_rng(0).normal(size=(2, batch, 2)))
     found = {}
     for name in FORMULATIONS:
@@ -36,10 +37,13 @@ def programs(batch: int) -> dict:
         start = lambda a, r, name=name: jd.scenes.double_pendulum.start(formulation=name, angles=a, rates=r)  # noqa: E731
         state = jax.jit(jax.vmap(start))(angles, rates)
         numbers, rest = eqx.partition(scene, eqx.is_array)
-        given = lambda numbers, q, v, rest=rest: jax.vmap(acceleration, (None, 0, 0))(eqx.combine(numbers, rest), q, v)  # noqa: E731
-        known = lambda q, v, scene=scene: jax.vmap(acceleration, (None, 0, 0))(scene, q, v)  # noqa: E731
-        found[name, "known"] = jax.jit(known).lower(*state).compile(), state
-        found[name, "given"] = jax.jit(given).lower(numbers, *state).compile(), (numbers, *state)
+        given = lambda numbers, q, v, rest=rest: acceleration(eqx.combine(numbers, rest), q, v)  # noqa: E731
+        known = lambda q, v, scene=scene: acceleration(scene, q, v)  # noqa: E731
+        one = [x[0] for x in state]
+        batched = jax.jit(jax.vmap(known)).lower(*state).compile()
+        found[name, "known"] = batched, state, operations(known, *one)
+        batched = jax.jit(jax.vmap(given, (None, 0, 0))).lower(numbers, *state).compile()
+        found[name, "given"] = batched, (numbers, *state), operations(given, numbers, *one)
     return found
 
 
@@ -53,28 +57,29 @@ def main() -> None:
     compiled = programs(options.batch)
     contestants = {
         key: lambda program=program, arguments=arguments: jax.block_until_ready(program(*arguments))
-        for key, (program, arguments) in compiled.items()
+        for key, (program, arguments, _) in compiled.items()
     }
     times = timing.interleaved(contestants, options.rounds)
     print(f"float64, batch {options.batch}")
-    print(f"{'':24}{'flops':>10}{'sines, roots':>14}{'ns best':>10}{'ns median':>12}{'to model':>10}")
+    print(f"{'':24}{'operations':>12}{'sines, roots':>14}{'ns best':>10}{'ns median':>12}{'to model':>10}")
     rows = []
-    for (name, numbers), (program, _) in compiled.items():
-        cost = program.cost_analysis()
-        flops, sines = (cost.get(key, 0.0) / options.batch for key in ("flops", "transcendentals"))
+    for (name, numbers), (_, _, counted) in compiled.items():
+        counted = counted or Operations(0, 0, 0)  # no kernel
         best, median = (1e9 * times[name, numbers][key] / options.batch for key in ("best", "median"))
         ratio = times[name, numbers]["best"] / times["model", numbers]["best"]
         rows.append(
             {
                 "formulation": name,
                 "numbers": numbers,
-                "flops": flops,
-                "transcendentals": sines,
+                "operations": counted.all,
+                "functions": counted.functions,
                 "best": best,
                 "median": median,
             }
         )
-        print(f"{name + ', ' + numbers:24}{flops:10.0f}{sines:14.0f}{best:10.1f}{median:12.1f}{ratio:10.2f}")
+        print(
+            f"{name + ', ' + numbers:24}{counted.all:12}{counted.functions:14}{best:10.1f}{median:12.1f}{ratio:10.2f}"
+        )
     print(timing.write("double_pendulum", {"machine": timing.machine(), "batch": options.batch, "rows": rows}))
 
 

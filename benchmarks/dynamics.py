@@ -1,11 +1,15 @@
-"""Time of the dynamics against Pinocchio (one and two threads), and against frax and MJX where they are installed.
+"""Time of dynamics and kinematics against Pinocchio (one and two threads), and against frax and MJX where they are installed.
 
-    python -m benchmarks.dynamics [--robots panda g1] [--batches 1 256 4096] [--dtypes float64 float32] [--rounds 20] [--readme]
+    python -m benchmarks.dynamics [--robots panda g1] [--batches 1 256 4096] [--dtypes float64 float32] [--functions NAME ...]
+                                  [--loop-batches 1 300 5000] [--calls 10] [--rounds 20] [--readme]
 
 Per robot, function, batch and dtype: microseconds per evaluation, best and median of 20 interleaved rounds, and the ratio to
 Pinocchio with two threads measured in the same loop. jaxdyn runs through plain `jax.vmap` and `jax.jit`, default XLA flags, the
-model closed over ("known") or passed as an argument ("given"). Compile and trace times are printed apart. `--readme` writes the
-table into README.md.
+model closed over ("known") or passed as an argument ("given"). Compile and trace times are printed apart.
+
+A second table has forward dynamics of a given model, `jax.jit(jax.vmap(jd.forward_dynamics, (None, 0, 0, 0)))`, called
+alone and as the body of a `lax.scan` of 10 calls, each with the velocities that the one before leaves. `--readme` writes six
+rows into README.md and all into docs/benchmarks.md.
 """
 
 import argparse
@@ -58,11 +62,16 @@ def ours(model, weights):
     def gradient(model, q, v, tau):
         return jax.grad(lambda *x: jnp.vdot(weights, jd.forward_dynamics(model, *x)), (0, 1, 2))(q, v, tau)
 
+    tip = model.body_names[-1]
     return {
         "forward dynamics": jd.forward_dynamics,
         "inverse dynamics": jd.inverse_dynamics,
         "mass matrix": lambda model, q, v, tau: jd.mass_matrix(model, q),
         "gradient of forward dynamics": gradient,
+        "frame pose": lambda model, q, v, tau: jd.frame_pose(model, q, tip),
+        "body Jacobian": lambda model, q, v, tau: jd.body_jacobian(model, q, tip),
+        "centre of mass": lambda model, q, v, tau: jd.center_of_mass(model, q),
+        "potential energy": lambda model, q, v, tau: jd.potential_energy(model, q),
     }
 
 
@@ -85,9 +94,33 @@ def peers(source, q, v, tau):
     for n in sorted({1, min(THREADS, batch)}):  # waking a second thread for one sample takes milliseconds
         calls["forward dynamics"][f"pin {n}"] = lambda n=n: pin.abaInParallel(n, pool, q_, v_, tau_, out)
         calls["inverse dynamics"][f"pin {n}"] = lambda n=n: pin.rneaInParallel(n, pool, q_, v_, tau_, out)
+    last = source.njoints - 1
+
+    def poses():
+        for i in range(batch):
+            pin.forwardKinematics(source, data, q_[:, i])
+
+    def jacobians():
+        for i in range(batch):
+            pin.computeJointJacobian(source, data, q_[:, i], last)
+
+    def centres():
+        for i in range(batch):
+            pin.centerOfMass(source, data, q_[:, i])
+
+    def energies():
+        for i in range(batch):
+            pin.computePotentialEnergy(source, data, q_[:, i])
+
     calls["mass matrix"] = {"pin loop": mass}
     calls["gradient of forward dynamics"] = {"pin loop": derivatives}
-    return calls
+    kinematics = {
+        "frame pose": poses,
+        "body Jacobian": jacobians,
+        "centre of mass": centres,
+        "potential energy": energies,
+    }
+    return calls | {name: {"pin loop": call} for name, call in kinematics.items()}
 
 
 def compiled(function, *args):
@@ -171,6 +204,64 @@ HEAD = (
     "| robot | function | batch | dtype | jaxdyn us | ratio | model given us | ratio | Pinocchio us | as | frax us | MJX us | "
     "trace + compile s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
+KINEMATICS = ("frame pose", "body Jacobian", "centre of mass", "potential energy")
+
+
+def against_inverse_dynamics(rows):
+    """Lines of a table: kinematics relative to inverse dynamics of the same robot, batch and dtype."""
+    best = {(r["robot"], r["batch"], r["dtype"], r["function"]): r["times"]["known"]["best_us"] for r in rows}
+    lines = []
+    for robot, batch, dtype in dict.fromkeys(key[:3] for key in best):
+        base = best.get((robot, batch, dtype, "inverse dynamics"))
+        found = [best.get((robot, batch, dtype, name)) for name in KINEMATICS]
+        if base is not None and any(found):
+            cells = ["" if x is None else f"{x / base:.2f}" for x in found]
+            lines.append(f"| {robot} | {batch} | {dtype} | {' | '.join(cells)} |")
+    return lines
+
+
+INVERSE_HEAD = f"| robot | batch | dtype | {' | '.join(KINEMATICS)} |\n|---|---|---|---|---|---|---|"
+
+
+def in_loops(name, batch, calls, rounds):
+    """Forward dynamics of a given model, alone and in a scan of calls, next to Pinocchio; a row."""
+    model, source = load(name)
+    (q, v, tau), q_pin = states(model, batch, jnp.float64)
+    several = jax.vmap(jd.forward_dynamics, (None, 0, 0, 0))
+
+    def repeated(model, q, v, tau):
+        return jax.lax.scan(lambda v, _: (v + 1e-6 * several(model, q, v, tau), None), v, None, calls)[0]
+
+    pool, out = pin.ModelPool(source, THREADS), np.zeros((source.nv, batch), order="F")
+    threads = min(THREADS, batch)
+    q_, v_, tau_ = (np.asfortranarray(np.asarray(x, float).T) for x in (q_pin, v, tau))
+    alone, scanned = (jax.jit(f).lower(model, q, v, tau).compile() for f in (several, repeated))
+    found = timing.interleaved(
+        {
+            "alone": lambda: jax.block_until_ready(alone(model, q, v, tau)),
+            "in a scan": lambda: jax.block_until_ready(scanned(model, q, v, tau)),
+            "pin": lambda: pin.abaInParallel(threads, pool, q_, v_, tau_, out),
+        },
+        rounds,
+    )
+    per = {"alone": batch, "in a scan": batch * calls, "pin": batch}
+    times = {key: {kind: 1e6 * found[key][kind] / per[key] for kind in ("best", "median")} for key in per}
+    row = {"robot": name, "batch": batch, "calls": calls, "threads": threads, "us": times}
+    print(loop_line(row), flush=True)
+    return row
+
+
+def loop_line(row):
+    """One row of the table of loops."""
+    cells = [row["robot"], str(row["batch"])]
+    for key in ("alone", "in a scan"):
+        here, peer = row["us"][key], row["us"]["pin"]
+        cells += ["{best:.3g} ({median:.3g})".format(**here), f"{here['best'] / peer['best']:.2f}"]
+    cells += ["{best:.3g} ({median:.3g})".format(**row["us"]["pin"]), f"{row['threads']} threads"]
+    return "| " + " | ".join(cells) + " |"
+
+
+LOOP_HEAD = "| robot | batch | alone us | ratio | in a scan us | ratio | Pinocchio us | with |\n|---|---|---|---|---|---|---|---|"
 
 
 def rollout(name, batch, rounds, steps=100, dt=1e-3):
@@ -230,11 +321,13 @@ def main(argv=None):
     parser.add_argument("--batches", nargs="+", type=int, default=[1, 256, 4096])
     parser.add_argument("--dtypes", nargs="+", default=["float64", "float32"])
     parser.add_argument("--functions", nargs="+", default=None)
+    parser.add_argument("--loop-batches", nargs="*", type=int, default=[1, 300, 5000])
+    parser.add_argument("--calls", type=int, default=10, help="evaluations in a scan")
     parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--readme", action="store_true", help="write the table into README.md")
+    parser.add_argument("--readme", action="store_true", help="write into README.md and docs/benchmarks.md")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
-    report = {"machine": timing.machine(), "rows": [], "rollouts": [], "eager": []}
+    report = {"machine": timing.machine(), "rows": [], "loops": [], "rollouts": [], "eager": []}
     print(report["machine"])
     print(HEAD)
     for name in options.robots:
@@ -242,26 +335,65 @@ def main(argv=None):
             for batch in options.batches:
                 report["rows"] += measure(name, batch, jnp.dtype(dtype), options.rounds, options.functions)
                 timing.write("benchmark_dynamics", report)
+    inverse = against_inverse_dynamics(report["rows"])
+    print("\n".join(["kinematics / inverse dynamics", INVERSE_HEAD, *inverse]))
+    print(LOOP_HEAD)
+    for name in options.robots:
+        for batch in options.loop_batches:
+            report["loops"].append(in_loops(name, batch, options.calls, options.rounds))
     if not options.functions:
         report["rollouts"].append(rollout("panda", 1024, options.rounds))
         report["eager"].append(eager("panda", 1024))
     print("written to", timing.write("benchmark_dynamics", report))
     if options.readme:
-        readme = Path(__file__).resolve().parent.parent / "README.md"
-        table = "\n".join([HEAD, *(line(row) for row in report["rows"])])
-        about = report["machine"]
-        note = (
-            f"Microseconds per evaluation, best (median) of {options.rounds} interleaved rounds; ratios to Pinocchio in the same "
-            f"run; {about['processor']}, {about['cores']} cores, jax {about['versions']['jax']}, pin {about['versions']['pin']}. "
-            "Made by `python -m benchmarks.dynamics --readme`."
-        )
+        write(report, options, inverse)
+
+
+# Of the rows with float64, those that README.md has.
+SHOWN = (
+    ("panda", "forward dynamics", 4096), ("panda", "forward dynamics", 256), ("panda", "gradient of forward dynamics", 4096),
+    ("panda", "frame pose", 4096), ("g1", "forward dynamics", 4096), ("g1", "gradient of forward dynamics", 4096),
+)  # fmt: skip
+
+
+def write(report, options, inverse):
+    """Write six rows into README.md, and all of them into docs/benchmarks.md."""
+    about = report["machine"]
+    note = (
+        f"Microseconds per evaluation, best (median) of {options.rounds} interleaved rounds; ratios to Pinocchio in the same "
+        f"run; {about['processor']}, {about['cores']} cores, jax {about['versions']['jax']}, pin {about['versions']['pin']}. "
+        "Made by `python -m benchmarks.dynamics --readme`"
+    )
+    rows = {(row["robot"], row["function"], row["batch"]): row for row in report["rows"] if row["dtype"] == "float64"}
+    six = "\n".join([HEAD, *(line(rows[key]) for key in SHOWN if key in rows)])
+    full = "\n".join([HEAD, *(line(row) for row in report["rows"])])
+    relative = "\n".join(["Kinematics, time relative to inverse dynamics:", "", INVERSE_HEAD, *inverse])
+    loops = "\n".join(
+        [
+            f"Forward dynamics of a given model, called alone and in a scan of {options.calls} calls; ratios to Pinocchio:",
+            "",
+            LOOP_HEAD,
+            *(loop_line(row) for row in report["loops"]),
+        ]
+    )
+    rollouts = "\n".join(
+        f"An RK4 rollout of {row['batch']} {row['robot']} in a jitted scan made {row['steps_per_s']:.3g} steps per second, "
+        f"{row['us_per_evaluation']:.3g} us per evaluation."
+        for row in report["rollouts"]
+    )
+    root = Path(__file__).resolve().parent.parent
+    more = " (all rows: [docs/benchmarks.md](docs/benchmarks.md))."
+    for path, parts in (
+        (root / "README.md", (note + more, six)),
+        (root / "docs/benchmarks.md", (note + ".", full, relative, loops, rollouts)),
+    ):
         text = re.sub(
             r"(<!-- benchmark:begin -->\n).*(<!-- benchmark:end -->)",
-            lambda found: f"{found[1]}{note}\n\n{table}\n{found[2]}",
-            readme.read_text(),
+            lambda found, parts=parts: found[1] + "\n\n".join(x for x in parts if x) + "\n" + found[2],
+            path.read_text(),
             flags=re.DOTALL,
         )
-        readme.write_text(text)
+        path.write_text(text)
 
 
 if __name__ == "__main__":

@@ -8,9 +8,9 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.extremes import Outcome, Study, as_dtype, case, outcome, study, table
-from jaxdyn import constrained, looped, matrix_form, recursive
+from jaxdyn import constrained, looped, matrix_form, recursions
 
-FORMS = (matrix_form.forward_dynamics, recursive.aba, looped.forward_dynamics)
+FORMS = (matrix_form.forward_dynamics, recursions.aba, looped.forward_dynamics)
 
 
 def chain_acceleration(masses, q, v, length=1.0, gravity=9.81):

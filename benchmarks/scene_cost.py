@@ -3,10 +3,10 @@
     python -m benchmarks.scene_cost [--batch 1024] [--rounds 20] [--steps 50]
 
 The ladder takes one thing away at a time: outputs, friction, rows of the loop that depend on others in a plane, the loop,
-gravity, float64. Per rung: operations that XLA counts in one evaluation of the accelerations, and the time of it, of one
+gravity, float64. Per rung: operations of the kernels of one evaluation of the accelerations, and the time of it, of one
 projection onto the constraints and of a simulation with fixed steps, per trajectory, best and median of interleaved rounds.
-Below it, pairs of scenes that differ in one thing which one of them lacks. XLA counts neither calls of LAPACK nor repetitions of
-inner loops.
+Below it, pairs of scenes that differ in one thing which one of them lacks. What is done for samples alone whose rows depend on
+each other is in the times and not in the operations.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks import timing
+from benchmarks.operations import operations
 from jaxdyn.projection import project_state
 
 STEP = 0.005  # s
@@ -128,7 +129,7 @@ def _acceleration(scene, method):
 
 
 def programs(rung: Rung, batch: int, steps: int):
-    """Operations of one acceleration, alone and in a batch; calls of a batch of them, of projections and of simulations."""
+    """Operations of one acceleration; calls of a batch of accelerations, of projections and of simulations."""
     scene, dtype = _cast(rung.scene, rung.dtype), jnp.dtype(rung.dtype)
     q, v = (jnp.tile(jnp.asarray(x, dtype), (batch, 1)) for x in rung.start)
     v = v * jnp.linspace(0.8, 1.2, batch, dtype=dtype)[:, None]
@@ -137,9 +138,7 @@ def programs(rung: Rung, batch: int, steps: int):
         return jax.jit(jax.vmap(function)).lower(q, v).compile()
 
     accelerate = _acceleration(scene, rung.method)
-    one, many = jax.jit(accelerate).lower(q[0], v[0]).compile(), built(accelerate)
-    flops = [float((x.cost_analysis() or {}).get("flops", 0.0)) / n for x, n in ((one, 1), (many, batch))]
-    made = {"acceleration": many}
+    made = {"acceleration": built(accelerate)}
     if steps:
         ts = jnp.asarray([0.0, STEP * steps], dtype)
         options = {"stepsize": STEP, "outputs": rung.outputs, "throw": False, "max_steps": 2 * steps}
@@ -147,7 +146,7 @@ def programs(rung: Rung, batch: int, steps: int):
         if scene.constraints:
             made["projection"] = built(lambda q, v: project_state(scene, q, v, jnp.zeros((), dtype)))
     calls = {kind: lambda run=run: jax.block_until_ready(run(q, v)) for kind, run in made.items()}
-    return flops, calls
+    return operations(accelerate, q[0], v[0]), calls
 
 
 def measure(rungs: list[Rung], batch: int, steps: int, rounds: int) -> list[dict]:
@@ -156,8 +155,8 @@ def measure(rungs: list[Rung], batch: int, steps: int, rounds: int) -> list[dict
     calls = {(i, kind): call for i, (_, both) in enumerate(made) for kind, call in both.items()}
     times = timing.interleaved(calls, rounds, most=20.0)
     rows = []
-    for i, (rung, (flops, _)) in enumerate(zip(rungs, made, strict=True)):
-        row: dict[str, Any] = {"scene": rung.name, "flops": flops[0], "flops in a batch": flops[1]}
+    for i, (rung, (counted, _)) in enumerate(zip(rungs, made, strict=True)):
+        row: dict[str, Any] = {"scene": rung.name, "operations": None if counted is None else counted.all}
         for kind in ("acceleration", "projection", "simulation") if steps else ("acceleration",):
             found = times.get((i, kind))
             row[f"{kind} us"] = None if found is None else [1e6 * found[key] / batch for key in ("best", "median")]

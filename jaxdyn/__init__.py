@@ -1,5 +1,6 @@
 """Rigid-body dynamics in JAX: pure functions of one sample, to be batched, compiled and differentiated."""
 
+from jaxdyn import contact as contact
 from jaxdyn import geometry as geometry
 from jaxdyn import grasp as grasp
 from jaxdyn import identify as identify
@@ -13,6 +14,8 @@ from jaxdyn.assembly import assemble as assemble
 from jaxdyn.building import ModelBuilder as ModelBuilder
 from jaxdyn.building import inertia_report as inertia_report
 from jaxdyn.building import repair_inertias as repair_inertias
+from jaxdyn.compile import compilation as compilation
+from jaxdyn.constrained import RESULTS as RESULTS
 from jaxdyn.constrained import constrained_dynamics as constrained_dynamics
 from jaxdyn.constrained import projections as projections
 from jaxdyn.constrained import second_fundamental_form as second_fundamental_form
@@ -35,12 +38,14 @@ from jaxdyn.dissipation import RayleighDissipation as RayleighDissipation
 from jaxdyn.dissipation import SlidingFriction as SlidingFriction
 from jaxdyn.distributions import involutive as involutive
 from jaxdyn.distributions import spurious_terms as spurious_terms
+from jaxdyn.dynamics import aba as aba
 from jaxdyn.dynamics import bias_force as bias_force
 from jaxdyn.dynamics import center_of_mass as center_of_mass
 from jaxdyn.dynamics import centroidal_momentum as centroidal_momentum
 from jaxdyn.dynamics import centroidal_momentum_matrix as centroidal_momentum_matrix
 from jaxdyn.dynamics import christoffel_symbols as christoffel_symbols
 from jaxdyn.dynamics import coriolis_matrix as coriolis_matrix
+from jaxdyn.dynamics import crba as crba
 from jaxdyn.dynamics import forward_dynamics as forward_dynamics
 from jaxdyn.dynamics import generalized_force as generalized_force
 from jaxdyn.dynamics import gravity_force as gravity_force
@@ -48,7 +53,9 @@ from jaxdyn.dynamics import inverse_dynamics as inverse_dynamics
 from jaxdyn.dynamics import kinetic_energy as kinetic_energy
 from jaxdyn.dynamics import mass_matrix as mass_matrix
 from jaxdyn.dynamics import mass_matrix_derivative as mass_matrix_derivative
+from jaxdyn.dynamics import mass_matrix_sqrt as mass_matrix_sqrt
 from jaxdyn.dynamics import potential_energy as potential_energy
+from jaxdyn.dynamics import rnea as rnea
 from jaxdyn.dynamics import torque_regressor as torque_regressor
 from jaxdyn.forces import CoulombFriction as CoulombFriction
 from jaxdyn.forces import Drive as Drive
@@ -58,6 +65,13 @@ from jaxdyn.forces import JointSpring as JointSpring
 from jaxdyn.gauge import gauge_invariant as gauge_invariant
 from jaxdyn.immersion import constrain_by_immersion as constrain_by_immersion
 from jaxdyn.immersion import reaction_force as reaction_force
+from jaxdyn.io import Actuators as Actuators
+from jaxdyn.io import LoadedScene as LoadedScene
+from jaxdyn.io import NotTakenWarning as NotTakenWarning
+from jaxdyn.io import Start as Start
+from jaxdyn.io import UnitsWarning as UnitsWarning
+from jaxdyn.io import load_mjcf as load_mjcf
+from jaxdyn.io import load_sdf as load_sdf
 from jaxdyn.io import load_urdf as load_urdf
 from jaxdyn.io import save_urdf as save_urdf
 from jaxdyn.io import urdf_inertia_report as urdf_inertia_report
@@ -77,15 +91,10 @@ from jaxdyn.model import integrate as integrate
 from jaxdyn.model import neutral as neutral
 from jaxdyn.model import normalize as normalize
 from jaxdyn.model import random_configuration as random_configuration
-from jaxdyn.recursive import aba as aba
-from jaxdyn.recursive import crba as crba
-from jaxdyn.recursive import mass_matrix_sqrt as mass_matrix_sqrt
-from jaxdyn.recursive import rnea as rnea
 from jaxdyn.reduced import reduced_dynamics as reduced_dynamics
 from jaxdyn.reduced import tangent_basis as tangent_basis
 from jaxdyn.report import report as report
 from jaxdyn.scene import Scene as Scene
-from jaxdyn.simulate import RESULTS as RESULTS
 from jaxdyn.simulate import Solution as Solution
 from jaxdyn.simulate import simulate as simulate
 from jaxdyn.solvers import LieGroup as LieGroup

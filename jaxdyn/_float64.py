@@ -140,6 +140,20 @@ def joint_pose(kind: str, screw: np.ndarray, q: np.ndarray) -> np.ndarray:
     return pose
 
 
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of a rotation (3, 3), w >= 0: the largest of four equal forms, so that no digits cancel."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    squares = np.array([1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i])  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
+    products = np.array(
+        [[0, h - f, c - g, d - b], [h - f, 0, b + d, c + g], [c - g, b + d, 0, f + h], [d - b, c + g, f + h, 0]]
+    )
+    k = int(np.argmax(squares))
+    found = products[k].copy()
+    found[k] = squares[k]
+    found = found / np.linalg.norm(found)
+    return found if found[0] >= 0 else -found
+
+
 def motion_subspace(kind: str, screw: np.ndarray) -> np.ndarray:
     """`joints.motion_subspace` in float64, (6, nv of the joint)."""
     return screw[:, None] if kind in SCREW_KINDS else np.eye(6)[:, KINDS[kind].columns]

@@ -1,17 +1,21 @@
 """Whether rows are independent, and pseudo-inverses of those that may not be."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.core
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from jaxdyn._anywhere import anywhere
-from jaxdyn._small import cholesky, solve_factored
+from jaxdyn.compile import pseudo_inverse_by_rotations, run
+from jaxdyn.linear import cholesky, solve_factored
+from jaxdyn.repair import any_in_batch
 from jaxdyn.so3 import _product
+
+# Operations of the normal equations up to which they are written out: LLVM takes 50 to 100 microseconds for each of them.
+_MOST_STRAIGHT = 10_000
 
 
 def checked_tolerance(rank_tol: float | None) -> float | None:
@@ -23,7 +27,7 @@ def checked_tolerance(rank_tol: float | None) -> float | None:
     return float(rank_tol)
 
 
-def tolerance(rank_tol: float | None, like: Array) -> float:
+def tolerance(rank_tol: float | None, like) -> float:
     """The rank tolerance as given, or the default for the dtype."""
     return eps_of(like) ** (4 / 7) if rank_tol is None else float(rank_tol)
 
@@ -44,61 +48,30 @@ def quality_of(factor):
     return jnp.min(pivots) / jnp.max(pivots)
 
 
-def normal_factor(Y, rank_tol):
-    """Cholesky factor of Y^T Y, and whether the columns of Y are so independent that it may stand for the pseudo-inverse."""
-    factor = cholesky(_product(Y.T, Y))
-    return factor, quality_of(factor) > least_pivot(Y, rank_tol)
-
-
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
 def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = False) -> Float[Array, "m n"]:
     """Moore-Penrose inverse of Y, singular values below `rank_tol` times the largest taken for zero.
 
-    Values: (Y^T Y)^-1 Y^T where that is as good; else on CPU a complete orthogonal decomposition (pivoted QR, then QR
-    of the triangle's transpose), elsewhere an SVD, of all samples if one in a batch needs it; at once where the columns are
-    known to be `dependent`. Derivative: the formula of Golub & Pereyra (1973), eq. 4.12, right wherever the rank is
-    constant; no factorisation is differentiated.
+    Values: (Y^T Y)^-1 Y^T where that is as good; else by singular values, of all samples if one in a batch needs it; at
+    once where the columns are known to be `dependent`. Derivative: the formula of Golub & Pereyra (1973), eq. 4.12, right
+    wherever the rank is constant; no factorisation is differentiated.
     """
     if dependent or Y.shape[1] > Y.shape[0]:
-        return _by_factors(Y, rank_tol)
-    factor, independent = normal_factor(Y, rank_tol)
-    return lax.cond(anywhere(~independent), lambda: _by_factors(Y, rank_tol), lambda: _by_normal_equations(Y, factor))
+        return pseudo_inverse_by_rotations(Y, rank_tol)
+    found: Any = run(_by_normal_equations, None, Y, most=_MOST_STRAIGHT, otherwise=lambda *_: None)
+    if found is None:
+        return pseudo_inverse_by_rotations(Y, rank_tol)
+    inverse, quality = found
+    doubtful = any_in_batch(~(quality > least_pivot(Y, rank_tol)))
+    return lax.cond(doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
 
 
-def _by_normal_equations(Y, factor):
+def _by_normal_equations(_, Y):
+    """(Y^T Y)^-1 Y^T, and the least over the largest pivot of Y^T Y."""
+    factor = cholesky(_product(Y.T, Y))
     inverse = solve_factored(factor, Y.T)
     # One step of Newton and Schulz takes the squared condition number out of the error.
-    return 2 * inverse - _product(_product(inverse, Y), inverse)
-
-
-def _by_factors(Y, rank_tol):
-    return lax.platform_dependent(
-        Y, cpu=partial(_by_orthogonal, rank_tol=rank_tol), default=partial(_by_svd, rank_tol=rank_tol)
-    )
-
-
-def _by_orthogonal(Y, rank_tol):
-    # The triangles are taken as products with Q and Z, and not from the factorisations, so that these run one after the
-    # other: two large LAPACK calls at once can wait for each other's share of XLA's thread pool for ever.
-    Q, _, order = lax.linalg.qr(Y, pivoting=True, full_matrices=False)
-    R = jnp.triu(_product(Q.T, Y[:, order]))
-    pivots = jnp.abs(jnp.diagonal(R))
-    keep = pivots > rank_tol * pivots[0]
-    # Y[:, order] = Q R with the rows of R below the rank dropped; R^T = Z T makes what is left square and triangular.
-    left = jnp.where(keep[:, None], R, jnp.zeros_like(R)).T
-    Z, _ = lax.linalg.qr(left, full_matrices=False)
-    T = jnp.triu(_product(Z.T, left))
-    T = T + jnp.diag(jnp.where(keep, jnp.zeros_like(pivots), jnp.ones_like(pivots)))
-    kept = jnp.where(keep[:, None], Q.T, jnp.zeros_like(Q.T))
-    inverse = _product(Z, solve_triangular(T, kept, trans=1))
-    return jnp.zeros_like(inverse).at[order].set(inverse)
-
-
-def _by_svd(Y, rank_tol):
-    U, s, Vt = jnp.linalg.svd(Y, full_matrices=False)
-    keep = s > rank_tol * s[0]
-    inverse = jnp.where(keep, 1.0 / jnp.where(keep, s, jnp.ones_like(s)), jnp.zeros_like(s))
-    return _product(Vt.T * inverse[None], U.T)
+    return 2 * inverse - _product(_product(inverse, Y), inverse), quality_of(factor)
 
 
 @pseudo_inverse.defjvp

@@ -9,15 +9,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn._dispatch import LEAST_BATCH
-from jaxdyn._materialize import at_least
-from jaxdyn._tracing import compiled, is_concrete, is_staged
-from jaxdyn.closed_projection import Kernels, Residuals, ResidualsInKernels, kernels
-from jaxdyn.constrained import RESULTS, _right_inverse, by_the_batch, correction, has_long_recursion
+from jaxdyn._rank import tolerance
+from jaxdyn.arguments import check_state, or_zeros
+from jaxdyn.compile import along, compiled, compute, implicit, is_concrete, is_staged, run
+from jaxdyn.constrained import RESULTS, Outcome, correction, right_inverse, whitened_rows
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics import mass_matrix
+from jaxdyn.linear import mass_factor
 from jaxdyn.model import Model, difference
-from jaxdyn.scene import Scene
+from jaxdyn.scene import Scene, as_scene
 from jaxdyn.so3 import _product
 from jaxdyn.systems import displace, retract
 
@@ -26,7 +26,7 @@ _NEWTON_STEPS = 40
 _STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
 
 
-class Assembly(eqx.Module):
+class Assembly(Outcome):
     """State on the constraints: `q` (nq,), `v` (nv,), largest `residual` (2,) left in |phi| and |A v - b|, `result`."""
 
     q: Float[Array, " nq"]
@@ -57,9 +57,11 @@ def assemble(
 
     **Raises:** ValueError that names the constraints that stay open and by how much, if it fails and `throw`.
     """
+    scene = as_scene(scene)
+    v = or_zeros(v, scene.nv)
+    q, v, t = check_state(scene.system, q=q, v=v, t=t)
     concrete = is_concrete(scene, q, v, t)
-    v = jnp.zeros((scene.nv,), q.dtype) if v is None else v
-    found = _assemble(scene, q, v, jnp.asarray(t, q.dtype), rank_tol)
+    found = _assemble(scene, q, v, t, rank_tol)
     if concrete and (throw is None or throw) and not bool(found.result == RESULTS.successful):
         raise ValueError(f"not assembled: {open_constraints(scene, found.q, found.v, t)}; give a better guess")
     if throw and not concrete:
@@ -69,35 +71,57 @@ def assemble(
 
 @compiled
 def _assemble(scene, q, v, t, rank_tol):
-    held = holonomic_rows(layout(scene))
-    if held.size:
-        fixed, frozen, guess = (lax.stop_gradient(x) for x in (scene, t, q))
-        place = _nearest(fixed, guess, frozen, held, rank_tol)
-        place = lax.stop_gradient(_newton(fixed, place, frozen, held, rank_tol))
-        e = difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
-        moved = displace(scene.system, q, _stationary(scene, q, t, e, rank_tol))
-        # The way from guess to place and back again costs digits, which the place itself has not lost.
-        q = retract(scene.system, place + (moved - lax.stop_gradient(moved)))
+    if holonomic_rows(layout(scene)).size:
+        q = _closed(Scene(scene.system, scene.constraints), q, t, rank_tol)
     B = correction(scene, q, t, rank_tol, holonomic=False)
     for _ in range(2):
         v = v - _product(B, velocity_residual(scene, q, v, t))
-    residual = residuals(scene, q, v, t)
+    residual = _sizes(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
     good = jnp.all(residual <= float(jnp.finfo(q.dtype).eps) ** 0.7 * (1.0 + jnp.max(jnp.abs(v))))
     return Assembly(q, v, residual, RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled))  # pyright: ignore[reportArgumentType]
 
 
-def _nearest(scene, guess, t, held, rank_tol):
+def _closed(scene, q, t, rank_tol):
+    """The configuration on the constraints next to a guess, with the derivatives of a minimum."""
+
+    def solve(scene, q, t):
+        return _newton(scene, _nearest(scene, q, t, rank_tol), t, rank_tol)
+
+    def differentiable(scene, q, t):
+        fixed, guess, frozen = lax.stop_gradient((scene, q, t))
+        place = lax.stop_gradient(solve(fixed, guess, frozen))
+        e = difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
+        moved = displace(scene.system, q, _stationary(scene, q, t, e, rank_tol))
+        # The way from guess to place and back again costs digits, which the place itself has not lost.
+        return retract(scene.system, place + (moved - lax.stop_gradient(moved)))
+
+    def tangent(scene, q, t, steps):
+        place, change = along(differentiable, (scene, q, t), steps)
+        return place, jnp.zeros_like(place) if change is None else change
+
+    return implicit(scene, (q, t), solve, tangent)
+
+
+def _linearized(scene, guess, t, e):
+    """phi at a displacement e from the guess, and its derivative in e: rows times the velocity for a rate of e."""
+    place = displace(scene.system, guess, e)
+    A = constraint_jacobian(scene, place, t)[holonomic_rows(layout(scene))]
+    if isinstance(scene.system, Model):
+        A = _product(A, jax.jacfwd(lambda e: difference(scene.system, place, displace(scene.system, guess, e)))(e))
+    return position_residual(scene, place, t), A
+
+
+def _nearest(scene, guess, t, rank_tol):
     """Displacement e from the guess of least |e| in the metric M(guess) with phi = 0, by repeated linearisation."""
-    factor = jnp.linalg.cholesky(mass_matrix(scene.system, guess, t))
+    metric, _ = run(whitened_rows, scene, guess, t)
 
     def residual(e):
         return position_residual(scene, displace(scene.system, guess, e), t)
 
     def improve(state):
         e, _, count = state
-        differentiate = jax.jacrev if held.size < scene.nv else jax.jacfwd
-        A = differentiate(residual)(e)
-        new = _product(_right_inverse(factor, A, rank_tol), _product(A, e) - residual(e))
+        phi, A = run(_linearized, scene, guess, t, e)
+        new = _product(right_inverse(metric, A, rank_tol), _product(A, e) - phi)
         return new, jnp.max(jnp.abs(new - e)), count + 1
 
     def unfinished(state):
@@ -112,7 +136,8 @@ def _nearest(scene, guess, t, held, rank_tol):
 
 def _stationary(scene, guess, t, e, rank_tol):
     """The displacement e from the guess, known in value, as a differentiable solution of M(guess) e + A^T lam = 0, phi = 0."""
-    factor = jnp.linalg.cholesky(mass_matrix(scene.system, guess, t))
+    mass = mass_matrix(scene.system, guess, t)
+    metric = mass_factor(mass)
 
     def residual(e):
         return position_residual(scene, displace(scene.system, guess, e), t)
@@ -120,29 +145,29 @@ def _stationary(scene, guess, t, e, rank_tol):
     def conditions(z):
         e, lam = z[: scene.nv], z[scene.nv :]
         phi, back = jax.vjp(residual, e)
-        return jnp.concatenate([_product(factor, _product(factor.T, e)) + back(lam)[0], phi])
+        return jnp.concatenate([_product(mass, e) + back(lam)[0], phi])
 
     def solve(linear, right):
         """By the null space of A, on which the Hessian of the Lagrangian is definite; A may have dependent rows."""
         matrix = jax.jacfwd(linear)(jnp.zeros_like(right))
         H, A = matrix[: scene.nv, : scene.nv], matrix[scene.nv :, : scene.nv]
-        B = _right_inverse(factor, A, rank_tol)
+        B = right_inverse(metric, A, rank_tol)
         keep = jnp.eye(scene.nv, dtype=A.dtype) - _product(B, A)
         along = _product(B, right[scene.nv :])
         left = right[: scene.nv] - _product(H, along)
         # Across the null space M stands in for H, so that the matrix is regular.
-        away = _product(factor.T, jnp.eye(scene.nv, dtype=A.dtype) - keep)
-        whole = _product(keep.T, _product(H, keep)) + _product(away.T, away)
+        across = jnp.eye(scene.nv, dtype=A.dtype) - keep
+        whole = _product(keep.T, _product(H, keep)) + _product(across.T, _product(mass, across))
         step = along + _product(keep, jnp.linalg.solve(whole, _product(keep.T, left)))
         return jnp.concatenate([step, _product(B.T, right[: scene.nv] - _product(H, step))])
 
     A = jax.jacrev(residual)(e)
-    lam = -_product(_right_inverse(factor, A, rank_tol).T, _product(factor, _product(factor.T, e)))
+    lam = -_product(right_inverse(metric, A, rank_tol).T, _product(mass, e))
     known = lax.stop_gradient(jnp.concatenate([e, lam]))
     return lax.custom_root(conditions, known, lambda conditions, known: known, solve)[: scene.nv]
 
 
-def _newton(scene, q, t, held, rank_tol):
+def _newton(scene, q, t, rank_tol):
     """Gauss-Newton steps with a choice of lengths, until the residual is at rounding or no longer falls."""
     lengths = jnp.asarray(_STEP_LENGTHS, q.dtype)
 
@@ -153,7 +178,7 @@ def _newton(scene, q, t, held, rank_tol):
         q, error, _, count = state
         step = -_product(correction(scene, q, t, rank_tol, holonomic=True), position_residual(scene, q, t))
         tried = jax.vmap(lambda s: retract(scene.system, displace(scene.system, q, s * step)))(lengths)
-        errors = jax.vmap(size)(tried)
+        errors = lax.map(size, tried)  # by the kernel of one sample
         best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.full_like(errors, jnp.inf)))
         falls = errors[best] < error
         return jnp.where(falls, tried[best], q), jnp.where(falls, errors[best], error), falls, count + 1
@@ -167,32 +192,16 @@ def _newton(scene, q, t, held, rank_tol):
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
     """Largest |phi| (m or rad) and |A v - b| (m/s or rad/s) of the state q (nq,), v (nv,) at t (s): (2,)."""
-    return _residuals(scene, q, v, t, None)
+    return run(_largest_residuals, Scene(scene.system, scene.constraints), q, v, jnp.asarray(t, q.dtype))
 
 
-def still_residuals(scene: Scene, q, v, t):
-    """The same without derivatives: of long mechanisms on CPU by kernels (see `_one_kernel`)."""
-    in_kernels = None
-    if is_staged() and has_long_recursion(scene):
-        in_kernels = kernels(scene.system, scene.constraints, q, v, long=True, often=False)
-    return _residuals(scene, q, v, t, in_kernels)
+def _largest_residuals(scene: Scene, q, v, t):
+    return _sizes(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
 
 
-def _residuals(scene: Scene, q, v, t, in_kernels: Kernels | None):
-    def largest(*parts):
-        zero = jnp.zeros((1,), q.dtype)
-        return jnp.stack([jnp.max(jnp.abs(jnp.concatenate([zero, part]))) for part in parts]).astype(q.dtype)
-
-    def short(q, v):
-        tree = scene.system, scene.constraints
-        with at_least(LEAST_BATCH):
-            found = Residuals(*tree) if in_kernels is None else ResidualsInKernels(*tree, in_kernels)
-            return largest(found.apart(q), found.slip(q, v))
-
-    def long(q, v):
-        return largest(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
-
-    return by_the_batch(scene, short, long, q, v, on_cpu=in_kernels is not None)
+def _sizes(*parts):
+    """Largest entry of each array, zero of empty ones."""
+    return jnp.stack([jnp.max(jnp.abs(part), initial=0.0) for part in parts])
 
 
 def open_constraints(scene: Scene, q, v, t=0.0, limit: float = 0.0) -> str:
@@ -219,10 +228,10 @@ def _both_residuals(scene, q, v, t):
     return position_residual(scene, q, t), velocity_residual(scene, q, v, t)
 
 
-@eqx.filter_jit
-def start_evidence(scene: Scene, q, v, t):
-    """Largest residuals (2,) and the rank of the rows at a state."""
-    factor = jnp.linalg.cholesky(mass_matrix(scene.system, q, t))
-    A = constraint_jacobian(scene, q, t)
-    rank = jnp.round(jnp.trace(_product(A, _right_inverse(factor, A, None)))).astype(jnp.int32)
-    return residuals(scene, q, v, t), rank
+def start_evidence(scene: Scene, q, v, t) -> tuple[np.ndarray, int]:
+    """Largest residuals (2,) and the rank of the rows at a concrete state."""
+    bare, given = Scene(scene.system, scene.constraints), not is_staged()
+    _, Y = compute(whitened_rows, bare, q, t, given=given)
+    sizes = np.linalg.svd(Y, compute_uv=False)
+    rank = int(np.sum(sizes > tolerance(None, Y) * sizes[0])) if sizes.size else 0
+    return compute(_largest_residuals, bare, q, v, t, given=given), rank

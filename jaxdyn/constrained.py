@@ -7,42 +7,33 @@ least constraint. Its pseudo-inverse gives accelerations, multipliers and projec
     w = (Y^+)^T c,   lam = Y^+ w,   a = a0 + L^-T w,   P_T = L^-T (1 - Y Y^+) L^T,   c = gamma - A a0.
 """
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
-import lineax as lx
-from jax import lax
-from jaxtyping import Array, Float, Int
+import optimistix
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxdyn import closed_recursion
-from jaxdyn._anywhere import anywhere, flattened, mended
-from jaxdyn._dispatch import LEAST_BATCH, MOST_BODIES, closed_dynamics, is_large_batch, with_derivatives
-from jaxdyn._materialize import at_least
-from jaxdyn._one_kernel import kernel_of, kernel_or_vectors
-from jaxdyn._rank import checked_tolerance, eps_of, least_pivot, normal_factor, pseudo_inverse, quality_of, tolerance
-from jaxdyn._row_pattern import MOST_PRODUCTS, products
-from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
-from jaxdyn._tracing import is_staged, split, still, traced_once
-from jaxdyn._ways import is_careful
+from jaxdyn._rank import checked_tolerance, eps_of, least_pivot, pseudo_inverse, quality_of, tolerance
+from jaxdyn.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.compile import partition_traced, run
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.frames import Pair, relative_poses
-from jaxdyn.constraints.loops import Loop
 from jaxdyn.dynamics import bias_force, mass_matrix
-from jaxdyn.model import Model, body_index
-from jaxdyn.recursive import aba_with_columns
-from jaxdyn.scene import Scene, checked_force
+from jaxdyn.linear import MassFactor, cholesky, mass_factor, solve_factored
+from jaxdyn.model import Model
+from jaxdyn.recursions import aba_with_columns
+from jaxdyn.repair import is_rank_safe, repair_flagged
+from jaxdyn.scene import Scene, as_scene, checked_force
 from jaxdyn.so3 import _product
 
 METHODS = ("rank_aware", "schur", "range_space")
 
 
-class RESULTS(lx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a constrained computation ended."""
+class RESULTS(optimistix.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How a computation ended: one enumeration for constrained dynamics and for simulations."""
 
     singular_mass_matrix = (
         "The mass matrix is not positive definite to rounding: a joint moves no inertia, or next to none."
@@ -51,14 +42,43 @@ class RESULTS(lx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     contradictory_rows = "No acceleration satisfies the constraint rows: they contradict each other."
     singular_basis = "The minimal velocities do not determine the others here; choose another basis."
     not_assembled = "No configuration and velocity that satisfy the constraints were found."
+    # Of simulations: those of diffrax, by its names, and ours.
+    dt_min_reached = "The minimum step size was reached in the differential equation solver."
+    event_occurred = "An event ended the motion."
+    max_steps_rejected = "Too many steps were rejected."
+    internal_error = "diffrax met an error of its own."
+    nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
+    nonfinite_state = "The state became NaN or infinite."
+    unordered_times = "The save points are not finite and increasing."
+    bad_stepsize = "The step is not positive and finite."
+    bad_tolerance = "A tolerance is negative or not finite."
+    coarse_steps = (
+        "The fixed steps are too long, or too many for the dtype: the motion may be wrong by a tenth of it or more."
+    )
+    coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
+    inconsistent_start = "The initial state is not on the constraints."
+    open_constraints = "The constraints opened, and the projection could not close them."
 
 
-class ConstrainedDynamics(eqx.Module):
+# Of optimistix the message of this one is empty, which prints as nothing.
+RESULTS._index_to_message[RESULTS.successful._value.item()] = "successful"
+
+
+class Outcome(eqx.Module):
+    """What has a `result`, one of `RESULTS`."""
+
+    @property
+    def success(self) -> Bool[Array, "..."]:
+        """Whether `result` is `RESULTS.successful`."""
+        return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class ConstrainedDynamics(Outcome):
     """Accelerations and constraint forces of a scene.
 
     - `acceleration` (nv,); `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for
       rows in m and N m for rows in rad.
-    - `rank` (): number of independent rows. `result`: one of `RESULTS`.
+    - `rank` (): number of independent rows. `result`: one of `RESULTS`; `success`: whether it is `successful`.
     - `layout`: name and place of each constraint's rows.
     """
 
@@ -117,109 +137,50 @@ def constrained_dynamics(
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}")
     rank_tol = checked_tolerance(rank_tol)
-    tau = jnp.zeros_like(v) if tau is None else checked_force(tau, q, scene.nv, "tau")
+    scene = as_scene(scene)
+    tau = or_zeros(tau, scene.nv)
+    q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     places = layout(scene)
     if not places:
         return _free(scene, q, v, applied(scene, q, v, tau, t), t)
-    state = q, v, tau, jnp.asarray(t, q.dtype)
-
-    def dense(*state):
-        return traced_once(_by_matrices, scene, *state, static=(method, rank_tol))
-
-    def short(q, v, tau, t):
-        force = applied(scene, q, v, tau, t)
-        found = closed_dynamics(scene.system, scene.constraints, q, v, force)
-        if method == "rank_aware":
-            return _mended(scene, found, q, v, tau, t, rank_tol, _derivatives_of_recursion)
-        rank, result = _judged(scene, q, found[-1])
-        a, lam = with_derivatives(scene.system, scene.constraints, q, v, force, *found[:2])
-        return ConstrainedDynamics(a, lam, rank, result, places)
-
-    if method == "range_space":
-        return dense(*state)
-    kernel = _kernel(scene, *state) if method == "rank_aware" else None
-    if kernel is None and method == "rank_aware" and scene.forces:
-        # Forces may be anything. The rest may do without branches.
+    state = q, v, tau, t
+    if method != "rank_aware":
+        return _by_schur(scene, *state, method=method)
+    if places[-1].end > scene.nv or is_rank_safe():
+        return _by_rank(scene, *state, rank_tol)
+    found = run(_by_pivots, scene, *state, otherwise=_nothing)
+    if found is None and scene.forces:
+        # Forces may be anything. The rest may be a program of numbers without them.
         bare = Scene(scene.system, scene.constraints)
         return constrained_dynamics(bare, q, v, applied(scene, q, v, tau, t), t, rank_tol=rank_tol)
-    if kernel is None:
-        return by_the_batch(scene, short, dense, *state)
-    found = kernel(partial(_elsewhere, scene), *still(state))
-    same = _derivatives_of_recursion if has_short_recursion(scene) else None
-    return _mended(scene, found, *state, rank_tol, same)
+    return _by_rank(scene, *state, rank_tol) if found is None else _repaired(scene, found, state, rank_tol)
 
 
-def _kernel(scene: Scene, q, v, tau, t):
-    """Accelerations, multipliers and the quality of the rows in one kernel, if there is one."""
-    if not is_staged() or layout(scene)[-1].end > scene.nv:
-        return None
-    if has_short_recursion(scene):
-        return kernel_or_vectors(_in_numbers, scene, q, v, tau, t, long=has_long_recursion(scene))
-    return kernel_of(_in_numbers, scene, q, v, tau, t)
-
-
-def _in_numbers(scene: Scene, q, v, tau, t):
-    """(a, lam, least over largest pivot of A M^-1 A^T) without branches; NaN where M is not positive definite."""
-    if not has_short_recursion(scene):
-        return _by_pivots(scene, q, v, tau, t)
-    force = applied(scene, q, v, tau, t)
-    return closed_recursion.closed_dynamics(scene.system, scene.constraints, q, v, force)
-
-
-def _elsewhere(scene: Scene, q, v, tau, t):
-    """The same where it is not written out in numbers: see `_dispatch`."""
-
-    def recursion(*state):
-        with at_least(LEAST_BATCH):
-            return traced_once(_in_numbers, scene, *state)
-
-    return by_the_batch(scene, recursion, partial(_by_pivots, scene), q, v, tau, t)
+def _nothing(*_):
+    """Instead of a kernel that there is not."""
+    return None
 
 
 def _by_pivots(scene: Scene, q, v, tau, t):
-    row = rows(scene, q, v, t)
-    mass, factor, Y, free = _weighted(scene, q, v, applied(scene, q, v, tau, t), t, row)
+    """(a, lam, least over largest pivot of A M^-1 A^T) without branches; NaN where M is not positive definite."""
+    metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
     normal = cholesky(_product(Y.T, Y))
-    lam = _refined(normal, Y, row.gamma - _product(Y.T, free))
-    a = solve_lower(factor, free + _product(Y, lam), transposed=True)
-    return a, lam, jnp.where(definite(mass, factor), quality_of(normal), jnp.nan)
+    lam = _refined(normal, Y, wanted)
+    quality = jnp.where(metric.definite(), quality_of(normal), jnp.nan)
+    return metric.unwhiten(free + _product(Y, lam)), lam, quality
 
 
-def _by_matrices(scene: Scene, q, v, tau, t, method: str, rank_tol) -> ConstrainedDynamics:
-    return solve_rows(scene, q, v, applied(scene, q, v, tau, t), t, rows(scene, q, v, t), method, rank_tol)
+def _whitened(scene: Scene, q, v, tau, t):
+    """The mass matrix's factor, Y = U^-1 A^T, U^-1 (tau + forces - h), gamma - A M^-1 (tau + forces - h), and gamma."""
+    row = rows(scene, q, v, t)
+    metric, Y, free = _weighted(scene, q, v, applied(scene, q, v, tau, t), t, row.A)
+    return metric, Y, free, row.gamma - _product(Y.T, free), row.gamma
 
 
-def has_short_recursion(scene: Scene) -> bool:
-    """Whether all constraints are loops of a tree, and few enough to be written out in single numbers."""
-    model, loops = scene.system, scene.constraints
-    if not (isinstance(model, Model) and model.nb <= 2 * MOST_BODIES and all(isinstance(loop, Loop) for loop in loops)):
-        return False
-    ends = [(body_index(model, loop.body_a), body_index(model, loop.body_b)) for loop in loops]
-    return products(model, ends, [loop.kind.count for loop in loops]) <= MOST_PRODUCTS
-
-
-def has_long_recursion(scene: Scene) -> bool:
-    """Whether the recursion is written out, but likely to be too long for a kernel of single numbers."""
-    return has_short_recursion(scene) and scene.system.nb > MOST_BODIES
-
-
-def by_the_batch(scene: Scene, short: Callable, long: Callable, *args, on_cpu: bool = False):
-    """short(*args) in large batches of scenes that have a short recursion, or in all `on_cpu`, else long(*args)."""
-    large = has_short_recursion(scene) and is_large_batch(scene, *args, on_cpu=on_cpu)
-    if isinstance(large, jax.core.Tracer):
-        return lax.cond(large, short, long, *args)
-    return (short if large else long)(*args)
-
-
-def in_one_batch(function: Callable, scene: Scene, *args):
-    """function(scene, *args); where a large batch would run on the short recursion, the samples of nested `vmap`s together.
-
-    Other constraints may be functions that hold traced numbers, of which `flattened` would not know.
-    """
-    if not has_short_recursion(scene):
-        return function(scene, *args)
-    unknown, known = split(scene)
-    return flattened(lambda unknown, *args: function(known(unknown), *args))(unknown, *args)
+def _by_rank(scene: Scene, q, v, tau, t, rank_tol) -> ConstrainedDynamics:
+    """For rows that may depend on each other."""
+    metric, Y, free, wanted, gamma = run(_whitened, scene, q, v, tau, t)
+    return _shortest_push(scene, metric, Y, free, wanted, gamma, rank_tol)
 
 
 def _judged(scene: Scene, q, quality):
@@ -229,29 +190,25 @@ def _judged(scene: Scene, q, quality):
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
 
 
-def _mended(scene: Scene, found, q, v, tau, t, rank_tol, same: Callable | None) -> ConstrainedDynamics:
+def _repaired(scene: Scene, found, state, rank_tol) -> ConstrainedDynamics:
     """`found` = (a, lam, quality of the rows), with the rank-aware solve for the samples whose rows it could not serve."""
     a, lam, quality = found
-    unknown, known = split(scene)
+    traced, known = partition_traced(scene)
 
-    def careful(unknown, state):
-        found = traced_once(_by_matrices, known(unknown), *state, static=("rank_aware", rank_tol))
+    def careful(traced, state):
+        q, v, tau, t = state
+        found = _by_rank(known(traced), q, v, tau, t, rank_tol)
         return (found.acceleration, found.multipliers), (found.rank, found.result)
+
+    def fast(traced, state):
+        return run(_by_pivots, known(traced), *state)[:2]
 
     # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
     careful = jax.checkpoint(careful, prevent_cse=False)
-    rate = None if same is None else lambda found, unknown, state: same(known(unknown), found, *state)
-    doubtful = ~(quality > least_pivot(q, rank_tol))
-    # The recursion's derivatives are for large batches.
-    dense = ~jnp.asarray(is_large_batch(scene, q, v, tau, t))
-    start, state = ((a, lam), _judged(scene, q, quality)), (q, v, tau, t)
-    (a, lam), (rank, result) = mended(doubtful, careful, start, (unknown, state), rate, dense)
+    flag = ~(quality > least_pivot(state[0], rank_tol))
+    start = (a, lam), _judged(scene, state[0], quality)
+    (a, lam), (rank, result) = repair_flagged(flag, careful, fast, start, (traced, state))
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
-
-
-def _derivatives_of_recursion(scene: Scene, found, q, v, tau, t):
-    force = applied(scene, q, v, tau, t)
-    return with_derivatives(scene.system, scene.constraints, q, v, force, *found)
 
 
 def applied(scene: Scene, q, v, tau, t) -> Array:
@@ -262,44 +219,37 @@ def applied(scene: Scene, q, v, tau, t) -> Array:
 
 
 def _free(scene, q, v, force, t) -> ConstrainedDynamics:
-    mass = mass_matrix(scene.system, q, t)
-    factor = cholesky(mass)
-    a = solve_factored(factor, force - bias_force(scene.system, q, v, t))
-    result = RESULTS.where(definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    metric = mass_factor(mass_matrix(scene.system, q, t))
+    a = metric.solve(force - bias_force(scene.system, q, v, t))
+    result = RESULTS.where(metric.definite(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
 
 
-def solve_rows(
-    scene: Scene, q, v, force, t, row: Rows, method: str = "rank_aware", rank_tol: float | None = None
-) -> ConstrainedDynamics:
+def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None = None) -> ConstrainedDynamics:
     """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
-    if method == "range_space" and isinstance(scene.system, Model):
-        return _by_range_space(scene, q, v, force, row)
-    mass, factor, Y, free = _weighted(scene, q, v, force, t, row)
-    wanted = row.gamma - _product(Y.T, free)
-    if method != "rank_aware":
-        lam, result = _by_delassus(_product(Y.T, Y), wanted, scene.nv)
-        pushed = _product(Y, lam)
-        rank = jnp.asarray(Y.shape[1], jnp.int32)
-    else:
-        lam, pushed, rank = _shortest(Y, wanted, rank_tol)
-        # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
-        missed = jnp.abs(wanted - _product(Y.T, pushed))
-        sizes = jnp.abs(row.gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
-        met = jnp.all(missed <= eps_of(Y) ** 0.5 * (sizes + jnp.max(sizes)))
-        result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
-    a = solve_lower(factor, free + pushed, transposed=True)
-    result = RESULTS.where(definite(mass, factor), result, RESULTS.singular_mass_matrix)
-    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+    bare = Scene(scene.system)
+    metric, Y, free = run(_weighted, bare, q, v, force, t, row.A)
+    return _shortest_push(scene, metric, Y, free, row.gamma - _product(Y.T, free), row.gamma, rank_tol)
 
 
-def _weighted(scene: Scene, q, v, force, t, row: Rows):
-    """M = L L^T, L, Y = L^-1 A^T and L^-1 (force - h)."""
-    mass = mass_matrix(scene.system, q, t)
-    factor = cholesky(mass)
-    columns = jnp.concatenate([row.A, (force - bias_force(scene.system, q, v, t))[None]]).T
-    solved = solve_lower(factor, columns)
-    return mass, factor, solved[:, :-1], solved[:, -1]
+def _shortest_push(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, rank_tol) -> ConstrainedDynamics:
+    """By Gauss's principle: what is added to the free acceleration is as short as can be."""
+    lam, pushed, rank = _shortest(Y, wanted, rank_tol)
+    # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
+    missed = jnp.abs(wanted - _product(Y.T, pushed))
+    sizes = jnp.abs(gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
+    met = jnp.all(missed <= eps_of(Y) ** 0.5 * (sizes + jnp.max(sizes)))
+    result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(metric.definite(), result, RESULTS.singular_mass_matrix)
+    return ConstrainedDynamics(metric.unwhiten(free + pushed), lam, rank, result, layout(scene))
+
+
+def _weighted(scene: Scene, q, v, force, t, A):
+    """M = U U^T, Y = U^-1 A^T and U^-1 (force - h)."""
+    metric = mass_factor(mass_matrix(scene.system, q, t))
+    columns = jnp.concatenate([A, (force - bias_force(scene.system, q, v, t))[None]]).T
+    whitened = metric.whiten(columns)
+    return metric, whitened[:, :-1], whitened[:, -1]
 
 
 def _refined(factor, Y, right):
@@ -311,50 +261,51 @@ def _refined(factor, Y, right):
 def _shortest(Y, wanted, rank_tol):
     """lam and w = Y lam, the shortest w with Y^T w = wanted, and the rank of Y."""
 
-    def by_rank(Y, wanted):
-        inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), True)
-        pushed = _product(inverse.T, wanted)
-        return _product(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
-
-    if Y.shape[1] > Y.shape[0] or is_careful():
-        return by_rank(Y, wanted)
-    # The factor is not differentiated: where it is not used it may be NaN, which would reach derivatives even times zero.
-    factor, independent = normal_factor(lax.stop_gradient(Y), rank_tol)
-
-    def by_normal_equations(Y, wanted):
-        def normal(x):
-            return _product(Y.T, _product(Y, x))
-
-        lam = lax.custom_linear_solve(normal, wanted, lambda _, right: _refined(factor, Y, right), symmetric=True)
-        return lam, _product(Y, lam), jnp.asarray(Y.shape[1], jnp.int32)
-
-    careful = jax.checkpoint(by_rank, prevent_cse=False)
-    return lax.cond(anywhere(~independent), careful, by_normal_equations, Y, wanted)
+    inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
+    pushed = _product(inverse.T, wanted)
+    return _product(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
 
 
-def _by_range_space(scene, q, v, force, row: Rows) -> ConstrainedDynamics:
-    """The Schur complement from a0 and X = M^-1 A^T of one articulated-body factorisation: a = a0 + X lam."""
+def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:
+    """Rows that are taken for independent: the Cholesky factor of A M^-1 A^T."""
+    by_bodies = method == "range_space" and isinstance(scene.system, Model)
+    a, lam, fine, definite = run(_by_bodies if by_bodies else _by_delassus, scene, q, v, tau, t)
+    result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(definite, result, RESULTS.singular_mass_matrix)
+    rank = jnp.asarray(lam.shape[0], jnp.int32)
+    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+
+
+def _by_delassus(scene: Scene, q, v, tau, t):
+    metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
+    lam, fine = _solve_delassus(_product(Y.T, Y), wanted, scene.nv)
+    return metric.unwhiten(free + _product(Y, lam)), lam, fine, metric.definite()
+
+
+def _by_bodies(scene: Scene, q, v, tau, t):
+    """The same from a0 and X = M^-1 A^T of one articulated-body factorisation: a = a0 + X lam."""
+    row, force = rows(scene, q, v, t), applied(scene, q, v, tau, t)
     free, X = aba_with_columns(scene.system, q, v, force, row.A.T)
-    lam, result = _by_delassus(_product(row.A, X), row.gamma - _product(row.A, free), scene.nv)
-    a = free + _product(X, lam)
-    result = RESULTS.where(jnp.isfinite(free).all(), result, RESULTS.singular_mass_matrix)
-    return ConstrainedDynamics(a, lam, jnp.asarray(row.A.shape[0], jnp.int32), result, layout(scene))
+    lam, fine = _solve_delassus(_product(row.A, X), row.gamma - _product(row.A, free), scene.nv)
+    return free + _product(X, lam), lam, fine, jnp.isfinite(free).all()
 
 
-def _by_delassus(delassus, wanted, nv: int):
+def _solve_delassus(delassus, wanted, nv: int):
     """lam with A M^-1 A^T lam = wanted by Cholesky, and whether the rows were independent."""
     factor = cholesky(0.5 * (delassus + delassus.T))
     pivots = jnp.diagonal(factor)
     # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
     fine = jnp.min(pivots) > (10 * nv * eps_of(delassus)) ** 0.5 * jnp.max(pivots)
-    return solve_factored(factor, wanted), RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    return solve_factored(factor, wanted), fine
 
 
 def constraint_forces(
     scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t=0.0
 ) -> dict[str, Float[Array, " nv"]]:
     """Generalised force A_i^T lam_i (nv,) of each constraint on the system, by name; N m or N."""
+    scene = as_scene(scene)
     A = constraint_jacobian(scene, q, t)
+    multipliers = _checked_multipliers(multipliers, A.shape[0], A.dtype)
     return {p.name: _product(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
 
 
@@ -366,12 +317,23 @@ def constraint_wrenches(
     N and N m, by name. The wrench on body A is the negative of it. A loop has its frames A and B as given; for a rolling
     contact A is on the surface and B on the body that rolls, for a contact of a grasp A is on the object and B on the finger.
     """
-    found = {}
-    for constraint, place in zip(scene.constraints, layout(scene), strict=True):
+    scene, found = as_scene(scene), {}
+    (q,) = check_state(scene.system, q=q)
+    places = layout(scene)
+    multipliers = _checked_multipliers(multipliers, places[-1].end if places else 0, q.dtype)
+    for constraint, place in zip(scene.constraints, places, strict=True):
         if isinstance(constraint, Pair):
             rotation, position = relative_poses([constraint], scene.system, q)
             found[place.name] = constraint.wrench(rotation[0], position[0], multipliers[place.start : place.end])
     return found
+
+
+def _checked_multipliers(multipliers, count: int, dtype) -> Array:
+    multipliers = as_array(multipliers, "multipliers", dtype)
+    if multipliers.shape != (count,):
+        hint = batch_hint(multipliers, (1,))
+        raise ValueError(f"multipliers has shape {multipliers.shape}, expected {(count,)}, one per row{hint}")
+    return multipliers
 
 
 def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None) -> Projections:
@@ -385,14 +347,24 @@ def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float 
 
     Source: EQUATIONS section 7.
     """
-    factor, Y, inverse = _metric(scene, q, t, rank_tol)
-    keep = jnp.eye(Y.shape[0], dtype=Y.dtype) - _product(Y, inverse)
-    P_T = solve_lower(factor, _product(keep, factor.T), transposed=True)
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
+    metric, Y = run(whitened_rows, scene, q, t)
+    inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
+    kept = jnp.eye(Y.shape[0], dtype=Y.dtype) - _product(Y, inverse)
+    # U^-T (1 - Y Y^+) U^T, of which the columns of U^T are found from the unit velocities.
+    P_T = metric.unwhiten(_product(kept, metric.momentum(jnp.eye(scene.nv, dtype=Y.dtype))))
     return Projections(P_T, P_T.T)
 
 
+def whitened_rows(scene: Scene, q, t):
+    """M = U U^T and Y = U^-1 A^T."""
+    metric = mass_factor(mass_matrix(scene.system, q, t))
+    return metric, metric.whiten(constraint_jacobian(scene, q, t).T)
+
+
 def second_fundamental_form(
-    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0, *, rank_tol: float | None = None
+    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0, *, rank_tol: float | None = None
 ) -> Float[Array, " nv"]:
     """S(v, v) = (1 - P_T)(a + M^-1 C v): the covariant acceleration that the constraints prescribe.
 
@@ -403,10 +375,12 @@ def second_fundamental_form(
 
     Source: EQUATIONS section 7 and erratum E20.
     """
+    scene = as_scene(scene)
+    q, v, t = check_state(scene.system, q=q, v=v, t=t)
     coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
-    factor, Y, inverse = _metric(scene, q, t, rank_tol)
-    wanted = rows(scene, q, v, t).gamma + _product(Y.T, solve_lower(factor, coriolis))
-    return solve_lower(factor, _product(inverse.T, wanted), transposed=True)
+    metric, Y = run(whitened_rows, scene, q, t)
+    wanted = rows(scene, q, v, t).gamma + _product(Y.T, metric.whiten(coriolis))
+    return metric.unwhiten(_product(pseudo_inverse(Y, tolerance(rank_tol, Y)).T, wanted))
 
 
 def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
@@ -414,17 +388,14 @@ def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
 
     Rows: the holonomic ones, or all.
     """
-    factor = cholesky(mass_matrix(scene.system, q, t))
-    A = constraint_jacobian(scene, q, t)
-    return _right_inverse(factor, A[holonomic_rows(layout(scene))] if holonomic else A, rank_tol)
+    metric, Y = run(whitened_rows, scene, q, t)
+    return _unwhitened_inverse(metric, Y[:, holonomic_rows(layout(scene))] if holonomic else Y, rank_tol)
 
 
-def _right_inverse(factor, A, rank_tol):
-    Y = solve_lower(factor, A.T)
-    return solve_lower(factor, pseudo_inverse(Y, tolerance(rank_tol, Y)).T, transposed=True)
+def right_inverse(metric: MassFactor, A, rank_tol) -> Array:
+    """B (nv, n) with A B = 1 and columns as short as can be in the metric, for rows A (n, nv)."""
+    return _unwhitened_inverse(metric, metric.whiten(A.T), rank_tol)
 
 
-def _metric(scene, q, t, rank_tol):
-    factor = cholesky(mass_matrix(scene.system, q, t))
-    Y = solve_lower(factor, constraint_jacobian(scene, q, t).T)
-    return factor, Y, pseudo_inverse(Y, tolerance(rank_tol, Y))
+def _unwhitened_inverse(metric, Y, rank_tol):
+    return metric.unwhiten(pseudo_inverse(Y, tolerance(rank_tol, Y)).T)

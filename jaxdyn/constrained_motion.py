@@ -11,19 +11,19 @@ A method says what the state y of the equation is, how it changes, and what is d
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn import variational
 from jaxdyn._rank import checked_tolerance
-from jaxdyn._tracing import still, traced_once
-from jaxdyn.assembly import open_constraints, start_evidence, still_residuals
-from jaxdyn.constrained import constrained_dynamics, in_one_batch, solve_rows
+from jaxdyn.assembly import open_constraints, residuals, start_evidence
+from jaxdyn.constrained import constrained_dynamics, solve_rows
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
 from jaxdyn.dynamics import forward_dynamics
 from jaxdyn.projection import project_state, project_step
@@ -89,6 +89,10 @@ class Method(eqx.Module):
         """The state put back between steps, where it is saved."""
         return self.stepped(scene, y, t, None)[0]
 
+    def onto_constraints(self, scene: Scene, q, v, t) -> tuple[Array, Array]:
+        """q and v by the least change on the constraints, where the motion starts."""
+        return project_state(scene, q, v, t)
+
     def stepped(self, scene: Scene, y, t, error):
         """The state put back after a step, and its estimated error (a state, or None) less what constraints remove."""
         return y | {"q": retract(scene.system, y["q"])}, error
@@ -152,8 +156,13 @@ class Projected(Multipliers):
 
     def corrected(self, scene, y, t):
         """q and v on the constraints."""
-        q, v = project_state(scene, y["q"], y["v"], t, self.rank_tol)
+        q, v = self.onto_constraints(scene, y["q"], y["v"], t)
         return y | {"q": q, "v": v}
+
+    def onto_constraints(self, scene, q, v, t):
+        """By the programs that correct a step."""
+        none = jnp.zeros_like(v)
+        return project_step(scene, q, v, t, (none, none), self.rank_tol)[:2]
 
 
 class Baumgarte(Multipliers):
@@ -401,10 +410,7 @@ def start_limit(dtype) -> float:
 
 def consistent(scene: Scene, q, v, t):
     """Whether a state is on the constraints but for rounding."""
-    found = in_one_batch(
-        partial(traced_once, still_residuals), *still((Scene(scene.system, scene.constraints), q, v, t))
-    )
-    return jnp.max(found) <= start_limit(q.dtype)
+    return jnp.max(lax.stop_gradient(residuals(scene, q, v, t))) <= start_limit(q.dtype)
 
 
 def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
@@ -413,7 +419,7 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
     **Raises:** ValueError that names the constraints and by how much they are violated, and the fix; for a basis that
     does not serve at the start.
     """
-    found, rank = start_evidence(scene, q, v, jnp.asarray(t, q.dtype))
+    found, rank = start_evidence(scene, q, v, np.asarray(t, q.dtype))
     limit = start_limit(q.dtype)
     if float(np.max(found)) > limit:
         raise ValueError(
@@ -429,9 +435,12 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
         )
     if not isinstance(method, Reduced):
         return method
-    method = method.fitted(scene, scene.nv - int(rank))
-    if method.basis is not None and not bool(_serves_at(scene, method.basis, q, jnp.asarray(t, q.dtype))):
-        raise ValueError(f"the basis does not serve at q0: {method.basis.advice(scene, q, t)}")
+    # Inside a jit, jax would trace operations on known numbers too.
+    with jax.ensure_compile_time_eval():
+        q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
+        method = method.fitted(scene, scene.nv - int(rank))
+        if method.basis is not None and not bool(_serves_at(scene, method.basis, q, t)):
+            raise ValueError(f"the basis does not serve at q0: {method.basis.advice(scene, q, t)}")
     return method
 
 

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn._tracing import compiled, is_concrete, is_known
+from jaxdyn.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.compile import compiled, is_concrete, is_known
 from jaxdyn.constrained import tolerance
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, velocity_residual
 from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.lagrange import LagrangianSystem
 from jaxdyn.reduced import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, reduce, tangent_basis
-from jaxdyn.scene import Scene
+from jaxdyn.scene import Scene, as_scene
 from jaxdyn.so3 import _product
 from jaxdyn.systems import velocity_to_rate
 
@@ -56,13 +57,14 @@ def involutive(
 
     Source: Murray, Li & Sastry (1994), section 7.2; EQUATIONS section 6.
     """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints; every velocity is allowed")
     if not is_known(scene, q, t):
         raise ValueError(
             "involutive looks at ranks, which decide what it computes next; call it outside of jit and vmap"
         )
-    t = jnp.asarray(t, q.dtype)
     reference = tangent_basis(scene, q, t, dof=dof, rank_tol=rank_tol)
     count, limit = reference.shape[1], tolerance(rank_tol, q)
     # Brackets stay tangent to the holonomic constraints.
@@ -173,12 +175,17 @@ def spurious_terms(
 
     Source: Murray, Li & Sastry (1994), eq. 6.15; EQUATIONS section 6, errata E32 and E33.
     """
+    scene = as_scene(scene)
+    tau = or_zeros(tau, scene.nv)
+    q, tau, t = check_state(scene.system, q=q, tau=tau, t=t)
+    nu = as_array(nu, "nu", q.dtype)
+    if not layout(scene):
+        raise ValueError("the scene has no constraints, so there is nothing to substitute; add some")
     if scene.nq != scene.nv:
         raise ValueError(f"the system has nq = {scene.nq}, nv = {scene.nv}; substitution needs v = dq/dt")
     choice = as_basis(tuple(independent), scene)
     if not isinstance(choice, Independent) or nu.shape != (choice.size(scene),):
-        raise ValueError(f"nu has shape {nu.shape}, expected {(choice.size(scene),)} = (nr,)")
-    t = jnp.asarray(t, q.dtype)
+        raise ValueError(f"nu has shape {nu.shape}, expected {(choice.size(scene),)} = (nr,){batch_hint(nu, (1,))}")
     found, depends = _substituted(scene, choice, q, nu, tau, t)
     if is_concrete(depends) and float(depends) > 1e-9:
         raise ValueError(

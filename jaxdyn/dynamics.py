@@ -8,16 +8,23 @@ Every function raises a ValueError that names the argument when a shape does not
 (s) take any `System` in the model's place; a Model's dynamics do not depend on it.
 """
 
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn import _dispatch, matrix_form
+from jaxdyn import looped, matrix_form, recursions
+from jaxdyn.arguments import check_shapes, check_state
+from jaxdyn.compile import along, implicit, native, run
 from jaxdyn.kinematics import TreeFrame, body_twists, sum_to_coordinates, take, tree_frame
 from jaxdyn.matrix_form import momentum, tree_inertias
-from jaxdyn.model import Model, check_shapes
+from jaxdyn.model import Model
 from jaxdyn.so3 import _product, cross
-from jaxdyn.systems import System, checked_time, symbols
+from jaxdyn.systems import System, symbols
 
 
 def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv"]:
@@ -31,9 +38,9 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[A
     Source: Murray, Li & Sastry (1994), eq. 4.19; EQUATIONS sections 2 and 4.
     """
     if isinstance(model, System):
-        return model.mass_matrix(q, checked_time(model, t, q=q))
-    check_shapes(model, q=q)
-    return _dispatch.mass_matrix(model, q)
+        return _of_system(model, "mass_matrix", *check_state(model, q=q, t=t))
+    (q,) = check_shapes(model, q=q)
+    return _by_recursion(recursions.crba, matrix_form.mass_matrix, model, q)
 
 
 def coriolis_matrix(
@@ -51,9 +58,9 @@ def coriolis_matrix(
     Source: EQUATIONS section 4, Cs and erratum E11.
     """
     if isinstance(model, System):
-        return model.coriolis_matrix(q, v, checked_time(model, t, q=q, v=v))
-    check_shapes(model, q=q, v=v)
-    return matrix_form.coriolis_matrix(model, q, v)
+        return _of_system(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
+    q, v = check_shapes(model, q=q, v=v)
+    return _by_recursion(matrix_form.coriolis_matrix, matrix_form.coriolis_matrix, model, q, v)
 
 
 def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nv"]:
@@ -64,9 +71,11 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float
     **Returns:** (nv,), N m or N: the torques that hold the mechanism at rest. Zero when `model.gravity` is None.
     """
     if isinstance(model, System):
-        return model.gravity_force(q, checked_time(model, t, q=q))
-    check_shapes(model, q=q)
-    return _dispatch.gravity_force(model, q)
+        return _of_system(model, "gravity_force", *check_state(model, q=q, t=t))
+    (q,) = check_shapes(model, q=q)
+    if model.gravity is None:
+        return jnp.zeros((model.nv,), model.home.dtype)
+    return _by_recursion(recursions.gravity_force, matrix_form.gravity_force, model, q)
 
 
 def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"]:
@@ -77,9 +86,9 @@ def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " 
     **Returns:** (nv,), N m or N.
     """
     if isinstance(model, System):
-        return model.bias_force(q, v, checked_time(model, t, q=q, v=v))
-    check_shapes(model, q=q, v=v)
-    return _dispatch.bias_force(model, q, v)
+        return _of_system(model, "bias_force", *check_state(model, q=q, v=v, t=t))
+    q, v = check_shapes(model, q=q, v=v)
+    return _by_recursion(recursions.bias_force, _bias_force, model, q, v)
 
 
 def inverse_dynamics(
@@ -101,11 +110,11 @@ def inverse_dynamics(
     Source: EQUATIONS section 4.
     """
     if isinstance(model, System):
-        t = checked_time(model, t, external, q=q, v=v, a=a)
-        return model.inverse_dynamics(q, v, a, t)
-    check_shapes(model, q=q, v=v, a=a, external=external)
-    tau = _dispatch.inverse_dynamics(model, q, v, a)
-    return tau if external is None else tau - matrix_form.generalized_force(model, q, external)
+        q, v, a, t, _ = check_state(model, q=q, v=v, a=a, t=t, external=external)
+        return _of_system(model, "inverse_dynamics", q, v, a, t)
+    q, v, a, external = check_shapes(model, q=q, v=v, a=a, external=external)
+    tau = _by_recursion(recursions.rnea, _inverse_dynamics, model, q, v, a)
+    return tau if external is None else tau - generalized_force(model, q, external)
 
 
 def forward_dynamics(
@@ -129,13 +138,81 @@ def forward_dynamics(
     Lagrangian that is not finite, an immersion of too low a rank.
     """
     if isinstance(model, System):
-        t = checked_time(model, t, external, q=q, v=v, tau=tau)
+        q, v, tau, t, _ = check_state(model, q=q, v=v, tau=tau, t=t, external=external)
         model.check_start(q, v, t)
-        return model.forward_dynamics(q, v, tau, t)
-    check_shapes(model, q=q, v=v, tau=tau, external=external)
+        return _of_system(model, "forward_dynamics", q, v, tau, t)
+    q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
     if external is not None:
-        tau = tau + matrix_form.generalized_force(model, q, external)
-    return _dispatch.forward_dynamics(model, q, v, tau)
+        tau = tau + generalized_force(model, q, external)
+    if model.nb > MAX_BODIES or model.nb == 0:
+        return _solve_for_acceleration(model, q, v, tau)
+    return run(recursions.aba, model, q, v, tau, otherwise=_solve_for_acceleration, tangent=_acceleration_change)
+
+
+def _public(recursion: Callable) -> Callable:
+    """recursion(model, *args) as a kernel of arguments that were checked."""
+    by_kernel, signature = native(recursion), inspect.signature(recursion)
+
+    @functools.wraps(recursion)
+    def call(*args, **named):
+        (_, model), *rest = signature.bind(*args, **named).arguments.items()
+        return by_kernel(model, *check_shapes(model, **dict(rest)))
+
+    return call
+
+
+rnea, crba, aba, mass_matrix_sqrt = map(
+    _public, (recursions.rnea, recursions.crba, recursions.aba, recursions.mass_matrix_sqrt)
+)
+
+# Beyond, programs of single numbers compile for longer than a few seconds, and recursions run as loops over the bodies.
+MAX_BODIES = 128
+# In small batches the mask form of the matrices is as fast as the loops.
+_MAX_BODIES_IN_MATRICES = 16
+
+
+def _by_recursion(recursion, matrices, model: Model, *args):
+    """recursion(model, *args) as a kernel, else by products of matrices."""
+    if model.nb > MAX_BODIES or model.nb == 0:
+        return matrices(model, *args)
+    return run(recursion, model, *args, otherwise=matrices)
+
+
+def _inverse_dynamics(model: Model, q, v, a):
+    return (looped if model.nb > MAX_BODIES else matrix_form).inverse_dynamics(model, q, v, a)
+
+
+def _bias_force(model: Model, q, v):
+    return _inverse_dynamics(model, q, v, None)
+
+
+def _solve_for_acceleration(model: Model, q, v, tau):
+    """Forward dynamics where there is no kernel, differentiated by the implicit function theorem."""
+    form = looped if model.nb > _MAX_BODIES_IN_MATRICES else matrix_form
+
+    def tangent(model, q, v, tau, steps):
+        return form.forward_dynamics_tangent(
+            model, q, v, tau, _force_change(_inverse_dynamics, model, q, v, tau, steps)
+        )
+
+    return implicit(model, (q, v, tau), form.forward_dynamics, tangent)
+
+
+def _acceleration_change(model: Model, q, v, tau, steps):
+    """M^-1 (dtau - dID at fixed a) for changes in the leaves of (model, q, v, tau)."""
+    return recursions.aba_tangent(model, q, v, tau, _force_change(recursions.rnea, model, q, v, tau, steps))[1]
+
+
+def _force_change(inverse, model, q, v, tau, steps):
+    """a -> dtau - dID(q, v, a) at fixed a."""
+    *steps, tau_step = steps
+
+    def change(a):
+        total = jnp.zeros_like(tau) if tau_step is None else tau_step
+        _, moved = along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
+        return total if moved is None else total - moved
+
+    return change
 
 
 def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:
@@ -146,8 +223,8 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
 
     **Returns:** (nv,), N m or N; it stands on the right, with tau.
     """
-    check_shapes(model, q=q, external=external)
-    return matrix_form.generalized_force(model, q, external)
+    q, external = check_shapes(model, q=q, external=external)
+    return _by_recursion(matrix_form.generalized_force, matrix_form.generalized_force, model, q, external)
 
 
 def kinetic_energy(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, ""]:
@@ -158,8 +235,12 @@ def kinetic_energy(model: Model | System, q: Float[Array, " nq"], v: Float[Array
     **Returns:** (), J.
     """
     if isinstance(model, System):
-        return model.kinetic_energy(q, v, checked_time(model, t, q=q, v=v))
-    check_shapes(model, q=q, v=v)
+        return _of_system(model, "kinetic_energy", *check_state(model, q=q, v=v, t=t))
+    q, v = check_shapes(model, q=q, v=v)
+    return _by_recursion(_kinetic_energy, _kinetic_energy, model, q, v)
+
+
+def _kinetic_energy(model: Model, q, v):
     frame = tree_frame(model, q)
     twists = body_twists(model, frame, v)
     energy = 0.5 * jnp.sum(twists * jax.vmap(momentum)(tree_inertias(model, frame), twists))
@@ -177,12 +258,17 @@ def potential_energy(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Fl
     **Returns:** (), J. Zero when `model.gravity` is None.
     """
     if isinstance(model, System):
-        return model.potential_energy(q, checked_time(model, t, q=q))
-    check_shapes(model, q=q)
+        return _of_system(model, "potential_energy", *check_state(model, q=q, t=t))
+    (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         return jnp.zeros((), model.home.dtype)
+    return _by_recursion(_potential_energy, _potential_energy, model, q)
+
+
+def _potential_energy(model: Model, q):
     mass, first, origin, shift = _first_moments(model, tree_frame(model, q))
-    return -jnp.sum(model.gravity * (jnp.sum(mass) * origin + jnp.sum(first + mass[:, None] * shift, axis=0)))
+    gravity: Any = model.gravity
+    return -jnp.sum(gravity * (jnp.sum(mass) * origin + jnp.sum(first + mass[:, None] * shift, axis=0)))
 
 
 def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
@@ -192,7 +278,11 @@ def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
 
     **Returns:** (3,), world position, m. NaN when no body has mass.
     """
-    check_shapes(model, q=q)
+    (q,) = check_shapes(model, q=q)
+    return _by_recursion(_center_of_mass, _center_of_mass, model, q)
+
+
+def _center_of_mass(model: Model, q):
     mass, first, origin, shift = _first_moments(model, tree_frame(model, q))
     return origin + jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
 
@@ -210,7 +300,11 @@ def centroidal_momentum(model: Model, q: Float[Array, " nq"], v: Float[Array, " 
 
     Source: Orin, Goswami & Lee (2013), eq. 21.
     """
-    check_shapes(model, q=q, v=v)
+    q, v = check_shapes(model, q=q, v=v)
+    return _by_recursion(_centroidal_momentum, _centroidal_momentum, model, q, v)
+
+
+def _centroidal_momentum(model: Model, q, v):
     frame = tree_frame(model, q)
     momenta = jax.vmap(momentum)(tree_inertias(model, frame), body_twists(model, frame, v))
     return jnp.sum(_about_center(model, frame, momenta), axis=0)
@@ -225,7 +319,11 @@ def centroidal_momentum_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Ar
 
     Source: Orin, Goswami & Lee (2013), eq. 22.
     """
-    check_shapes(model, q=q)
+    (q,) = check_shapes(model, q=q)
+    return _by_recursion(_centroidal_momentum_matrix, _centroidal_momentum_matrix, model, q)
+
+
+def _centroidal_momentum_matrix(model: Model, q):
     frame = tree_frame(model, q)
     composite = sum_to_coordinates(model, tree_inertias(model, frame))
     momenta = jax.vmap(momentum)(composite, frame.subspace)
@@ -246,8 +344,8 @@ def torque_regressor(
 
     Source: Atkeson, An & Hollerbach (1986).
     """
-    check_shapes(model, q=q, v=v, a=a)
-    return matrix_form.torque_regressor(model, q, v, a)
+    q, v, a = check_shapes(model, q=q, v=v, a=a)
+    return _by_recursion(matrix_form.torque_regressor, matrix_form.torque_regressor, model, q, v, a)
 
 
 def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
@@ -261,9 +359,9 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
 
     Source: Li & Wu, Property 2, corrected (EQUATIONS section 2, E8).
     """
+    (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "mass_matrix_derivative")
-    check_shapes(model, q=q)
-    return matrix_form.mass_matrix_derivative(model, q)
+    return _by_recursion(matrix_form.mass_matrix_derivative, matrix_form.mass_matrix_derivative, model, q)
 
 
 def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv nv"]:
@@ -280,10 +378,19 @@ def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t=0.0) ->
     Source: Murray, Li & Sastry (1994), eq. 4.23; EQUATIONS section 0.
     """
     if isinstance(model, System):
-        return model.christoffel_symbols(q, checked_time(model, t, q=q))
+        return _of_system(model, "christoffel_symbols", *check_state(model, q=q, t=t))
+    (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "christoffel_symbols")
-    check_shapes(model, q=q)
-    return symbols(matrix_form.mass_matrix_derivative(model, q))
+    return symbols(mass_matrix_derivative(model, q))
+
+
+def _of_system(system: System, name: str, *args):
+    """A quantity of a system that is no tree of bodies."""
+    return run(_method, system, *args, static=(name,))
+
+
+def _method(name: str, system: System, *args):
+    return getattr(system, name)(*args)
 
 
 def _check_coordinates(model: Model, name: str) -> None:
@@ -314,4 +421,5 @@ def _about_center(model: Model, frame: TreeFrame, momenta: Array, bodies=None) -
     center = jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
     lever = shift - center[None]
     lever = lever if bodies is None else take(lever, bodies)
-    return momenta.at[:, 3:].add(jax.vmap(cross)(lever, momenta[:, :3]))
+    angular = momenta[:, 3:] + jax.vmap(cross)(lever, momenta[:, :3])
+    return jnp.concatenate([momenta[:, :3], angular], axis=1)

@@ -13,6 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxdyn.arguments import batch_hint
 from jaxdyn.kinematics import body_jacobian, frame_pose, take
 from jaxdyn.model import Model, difference, frame_index, neutral
 
@@ -44,7 +45,9 @@ def _places(system, joints: tuple[str, ...] | None, force: str) -> _Places:
 def _sized(value, like: Array, size: int, name: str) -> Array:
     """A leaf as (size,) in the dtype of the state; a scalar is repeated."""
     if jnp.shape(value) not in ((), (size,)):
-        raise ValueError(f"{name} has shape {jnp.shape(value)}, expected a scalar or {(size,)}, one per coordinate")
+        raise ValueError(
+            f"{name} has shape {jnp.shape(value)}, expected a scalar or {(size,)}, one per coordinate{batch_hint(value, (1,))}"
+        )
     return jnp.broadcast_to(jnp.asarray(value, like.dtype), (size,))
 
 

@@ -16,24 +16,24 @@ V1^T V2dot = -Lam_r^+ Lamdot V2. Source: EQUATIONS section 9, with errata E23 to
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from jaxdyn._rank import pseudo_inverse, tolerance
-from jaxdyn._tracing import compiled
-from jaxdyn.constrained import RESULTS, applied
+from jaxdyn.arguments import batch_hint, check_state, or_zeros
+from jaxdyn.compile import compiled
+from jaxdyn.constrained import RESULTS, Outcome, applied
 from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.dynamics import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.reduced import freedoms, orthonormal, split_directions
-from jaxdyn.scene import Scene
+from jaxdyn.scene import Scene, as_scene
 from jaxdyn.so3 import _product
 from jaxdyn.systems import velocity_to_rate
 
 
-class GaugeInvariant(eqx.Module):
+class GaugeInvariant(Outcome):
     """Quasi velocities, the equations in them, and the motion they give.
 
     - `W` (nv, nv), M = W W^T. `velocity` (nv,), w = W^T v. `Gamma` (nv, nv), skew. `Lambda` (nc, nv) = A W^-T. `force`
@@ -95,13 +95,17 @@ def gauge_invariant(
 
     Source: EQUATIONS section 9.
     """
+    scene = as_scene(scene)
+    tau = or_zeros(tau, scene.nv)
+    q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so there is nothing to decouple; use jd.forward_dynamics")
-    t = jnp.asarray(t, q.dtype)
     dof = freedoms(scene, q, t, dof, rank_tol)
     for name, value, size in (("rotation", rotation, scene.nv), ("motion_rotation", motion_rotation, dof)):
         if value is not None and value.shape != (size, size):
-            raise ValueError(f"{name} has shape {value.shape}, expected {(size, size)}; give an orthogonal matrix")
+            raise ValueError(
+                f"{name} has shape {value.shape}, expected {(size, size)}; give an orthogonal matrix{batch_hint(value, (1, 1))}"
+            )
     return _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol)
 
 

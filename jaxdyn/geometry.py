@@ -14,14 +14,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn._small import solve_positive
+from jaxdyn.arguments import as_array, batch_hint, check_state, check_system, state_dtype
 from jaxdyn.dynamics import mass_matrix
 from jaxdyn.immersion import constrain_by_immersion as constrain_by_immersion
 from jaxdyn.immersion import pull_back as pull_back
 from jaxdyn.immersion import reaction_force as reaction_force
+from jaxdyn.linear import solve_positive
 from jaxdyn.model import Model
+from jaxdyn.scene import Scene
 from jaxdyn.so3 import _product
 from jaxdyn.systems import System, symbols
 
@@ -33,6 +36,7 @@ def flat(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Arr
 
     **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
     """
+    q, v = _vectors(metric, q=q, v=v)
     return _product(_at(metric)(q), v)
 
 
@@ -41,6 +45,7 @@ def sharp(metric: Any, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Ar
 
     **Arguments:** `metric` as above; `q`, `p` (n,). **Returns:** (n,); NaN where g is not positive definite.
     """
+    q, p = _vectors(metric, q=q, p=p)
     return solve_positive(_at(metric)(q), p)
 
 
@@ -55,6 +60,7 @@ def christoffel_symbols(metric: Any, q: Float[Array, " n"], kind: str = "second"
     """
     if kind not in KINDS:
         raise ValueError(f"kind is {kind!r}; choose from {', '.join(KINDS)}")
+    (q,) = _vectors(metric, q=q)
     g = _at(metric)
     first = symbols(jax.jacfwd(g)(q))
     return first if kind == "first" else solve_positive(g(q), first.reshape(q.shape[0], -1)).reshape(first.shape)
@@ -65,6 +71,7 @@ def connection(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"], w: Flo
 
     **Arguments:** `metric` as above; `q`, `v`, `w` (n,). **Returns:** (n,).
     """
+    q, v, w = _vectors(metric, q=q, v=v, w=w)
     g = _at(metric)
     _, along_v = jax.jvp(lambda q: _product(g(q), w), (q,), (v,))
     _, along_w = jax.jvp(lambda q: _product(g(q), v), (q,), (w,))
@@ -81,6 +88,7 @@ def covariant_rate(
 
     **Arguments:** `metric` as above; `q`, its rate `v`, `w` and its `rate` dw/dt, each (n,). **Returns:** (n,).
     """
+    q, v, w, rate = _vectors(metric, q=q, v=v, w=w, rate=rate)
     return rate + connection(metric, q, v, w)
 
 
@@ -91,6 +99,7 @@ def covariant_derivative(
 
     **Arguments:** `metric` as above; `field`, X; `q`, `v` (n,). **Returns:** (n,).
     """
+    q, v = _vectors(metric, q=q, v=v)
     w, rate = jax.jvp(field, (q,), (v,))
     return covariant_rate(metric, q, v, w, rate)
 
@@ -113,6 +122,7 @@ def riemann_tensor(metric: Any, q: Float[Array, " n"]) -> Float[Array, "n n n n"
 
     Source: do Carmo (1992), chapter 4, with the opposite sign of R.
     """
+    (q,) = _vectors(metric, q=q)
     gamma = christoffel_symbols(metric, q)
     slope = jax.jacfwd(lambda q: christoffel_symbols(metric, q))(q)
     half = slope.transpose(0, 2, 3, 1) + jnp.einsum("ikm,mlj->ijkl", gamma, gamma)
@@ -126,10 +136,26 @@ def sectional_curvature(
 
     **Arguments:** `metric` as above; `q`, `u`, `w` (n,), u and w independent. **Returns:** ().
     """
+    q, u, w = _vectors(metric, q=q, u=u, w=w)
     g = _at(metric)(q)
     turned = jnp.einsum("ijkl,j,k,l->i", riemann_tensor(metric, q), w, u, w)
     dot = lambda a, b: jnp.sum(a * _product(g, b))  # noqa: E731
     return dot(turned, u) / (dot(u, u) * dot(w, w) - dot(u, w) ** 2)
+
+
+def _vectors(metric, **arguments) -> tuple[Array, ...]:
+    """The arguments as vectors (n,) of the metric's dtype, which for a function is that of q or else jax's default.
+
+    **Raises:** ValueError that names the argument.
+    """
+    if isinstance(metric, (Model, System)):
+        return check_state(metric, **arguments)
+    q = as_array(arguments["q"], "q")
+    dtype = state_dtype(None, q)
+    for name, value in arguments.items():
+        if np.ndim(value) != 1 or np.shape(value) != q.shape:
+            raise ValueError(f"{name} has shape {np.shape(value)}, expected (n,) as q has{batch_hint(value, (1,))}")
+    return tuple(as_array(value, name, dtype) for name, value in arguments.items())
 
 
 def _at(metric) -> Callable:
@@ -148,6 +174,8 @@ def _at(metric) -> Callable:
         )
     if isinstance(metric, (Model, System)):
         return lambda q: mass_matrix(metric, q)
+    if isinstance(metric, Scene):
+        check_system(metric, "metric")
     if not callable(metric):
         raise ValueError(f"metric is {metric!r}; pass a function g(q) -> (n, n) or a system")
 
@@ -156,7 +184,9 @@ def _at(metric) -> Callable:
     def checked(q):
         g = given(q)
         if jnp.shape(g) != (q.shape[0], q.shape[0]):
-            raise ValueError(f"metric returned shape {jnp.shape(g)}, expected {(q.shape[0], q.shape[0])} for this q")
+            raise ValueError(
+                f"metric returned shape {jnp.shape(g)}, expected {(q.shape[0], q.shape[0])} for this q{batch_hint(g, (1, 1))}"
+            )
         return jnp.asarray(g, q.dtype)
 
     return checked

@@ -22,8 +22,9 @@ from jaxtyping import Array, Float
 
 from jaxdyn import dynamics
 from jaxdyn._start import place_of
-from jaxdyn._tracing import is_known
-from jaxdyn.scene import Scene, as_pytree, checked_force
+from jaxdyn.arguments import check_state
+from jaxdyn.compile import is_known
+from jaxdyn.scene import Scene, as_pytree, as_scene, checked_force
 from jaxdyn.so3 import _product
 from jaxdyn.systems import System, checked_size, rate_to_velocity
 
@@ -231,7 +232,7 @@ def constrain_by_immersion(system: Any, xi: Callable, nq: int, *, moving: bool =
     given = tuple(system) if joined else (system,)
     if not given:
         raise ValueError("system is an empty tuple; give at least one system")
-    scenes = [unit if isinstance(unit, Scene) else Scene(unit) for unit in given]
+    scenes = [as_scene(unit) for unit in given]
     for scene in scenes:
         if scene.constraints:
             raise ValueError(
@@ -263,7 +264,7 @@ def reaction_force(system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], 
 
     **Raises:** ValueError for what is not immersed, forces that were not pulled back, and shapes that do not fit.
     """
-    scene = system if isinstance(system, Scene) else Scene(system)
+    scene = as_scene(system)
     immersed = scene.system
     if not isinstance(immersed, ImmersedSystem):
         raise ValueError(f"system is a {type(immersed).__name__}; pass what constrain_by_immersion returned")
@@ -272,7 +273,7 @@ def reaction_force(system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], 
             "the scene has forces or constraints in s, whose share in q is not known; list forces on the systems that go "
             "into constrain_by_immersion"
         )
-    t = jnp.asarray(t, q.dtype)
+    q, v, t = check_state(immersed, q=q, v=v, t=t)
     motions = immersed.motions(q, v, t)
     places, speeds = [m.q for m in motions], [m.v for m in motions]
     applied = [jnp.zeros_like(w) for w in speeds]

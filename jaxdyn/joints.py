@@ -73,7 +73,7 @@ def joint_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, " nqj"]
     Quaternions are divided by their norm, so that a slightly drifted one still gives a rotation.
     """
     if kind in SCREW_KINDS:
-        return se3.exp(screw * q[0])
+        return screw_transform(kind, screw, q[0])
     zero = jnp.zeros_like(q[0])
     if kind == "planar":
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
@@ -84,6 +84,25 @@ def joint_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, " nqj"]
     if kind == "spherical":
         return se3.from_parts(so3.quat_to_matrix(q), jnp.stack([zero, zero, zero]))
     return se3.from_parts(so3.quat_to_matrix(q[3:]), q[:3])
+
+
+def screw_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, ""]) -> Float[Array, "4 4"]:
+    """exp(hat(screw) q) of a joint of one degree of freedom, whose kind says whether it turns: no case is told apart by numbers.
+
+    With the axis u = omega/|omega|: R = u u^T + cos (1 - u u^T) + sin hat(u), and p = (1 - R)(u x v)/|omega| + u (u . v) q.
+    """
+    v, omega = screw[:3], screw[3:]
+    if kind == "prismatic":
+        return se3.from_parts(jnp.eye(3, dtype=screw.dtype), v * q)
+    rate = jnp.sqrt(jnp.sum(omega * omega))
+    axis = omega / rate
+    along = axis[:, None] * axis[None]
+    across = jnp.eye(3, dtype=screw.dtype) - along
+    rotation = along + jnp.cos(rate * q) * across + jnp.sin(rate * q) * so3.hat(axis)
+    if kind != "helical":
+        return se3.from_parts(rotation, jnp.zeros_like(v))
+    lever = so3.cross(axis, v) / rate
+    return se3.from_parts(rotation, lever - so3._product(rotation, lever) + axis * (jnp.sum(axis * v) * q))
 
 
 def joint_neutral(kind: str) -> np.ndarray:

@@ -10,6 +10,7 @@ the tree's root body. Positions in it are built without ever adding the root's o
 world's origin is computed exactly as one at home.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,8 +20,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn import se3
-from jaxdyn.joints import KINDS, SCREW_KINDS, joint_transform
-from jaxdyn.model import Model, Topology, check_shapes, frame_index, geometry
+from jaxdyn.arguments import check_shapes
+from jaxdyn.compile import is_expanding, run
+from jaxdyn.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
+from jaxdyn.model import Model, Topology, frame_index, geometry
 from jaxdyn.so3 import _product
 
 
@@ -41,13 +44,13 @@ class TreeFrame(NamedTuple):
 def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
     """Pose of each body frame in its parent body frame (the world's for roots), home @ exp(hat(S) q)."""
     topology = model.topology
-    home, screws = geometry(model)
+    home, screws = map(jnp.asarray, geometry(model))
     order, transforms = [], []
     for kind, bodies in _groups(topology):
         if kind in SCREW_KINDS:
             coordinates = np.array([topology.q_slices[i].start for i in bodies])
-            twists = take(screws, bodies) * take(q, coordinates)[:, None]
-            transforms.append(jax.vmap(se3.exp)(twists))
+            place = jax.vmap(functools.partial(screw_transform, kind))
+            transforms.append(place(take(screws, bodies), take(q, coordinates)))
         else:
             coordinates = np.array([np.arange(topology.nq)[topology.q_slices[i]] for i in bodies])
             # The screw is not read by these kinds.
@@ -72,7 +75,7 @@ def body_subspace(model: Model) -> Float[Array, "nv 6"]:
     constant = jnp.asarray(fixed, model.screws.dtype)
     if not is_screw.any():
         return constant
-    screws = take(geometry(model)[1], topology.dof_body)
+    screws = take(jnp.asarray(geometry(model)[1]), topology.dof_body)
     return screws if is_screw.all() else jnp.where(is_screw[:, None], screws, constant)
 
 
@@ -86,11 +89,25 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     keep = np.ones((topology.nb, 4, 4), bool)
     keep[is_root, :3, 3] = False
     pose = jnp.where(keep, local, jnp.zeros_like(local))
+    pose = _along_tree(topology, pose)
+    subspace = jax.vmap(se3.Ad_apply)(take(pose, topology.dof_body), body_subspace(model))
+    return TreeFrame(pose, origin, subspace)
+
+
+def _along_tree(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
+    """Products of the poses of all bodies above each body, root first.
+
+    As operations on arrays by pointer jumping, in log2(depth) products of all bodies; as single numbers one product a body.
+    """
+    if is_expanding():
+        found: list = []
+        for i, parent in enumerate(topology.parents):
+            found.append(pose[i] if parent < 0 else _product(found[parent], pose[i]))
+        return jnp.stack(found) if found else pose
     world = jnp.eye(4, dtype=pose.dtype)[None]
     for table in topology.jumps:
         pose = _product(jnp.concatenate([pose, world])[table], pose)
-    subspace = jax.vmap(se3.Ad_apply)(take(pose, topology.dof_body), body_subspace(model))
-    return TreeFrame(pose, origin, subspace)
+    return pose
 
 
 class Carried(NamedTuple):
@@ -207,9 +224,19 @@ def forward_kinematics(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb
 
     Source: Murray, Li & Sastry (1994), eq. 3.3; EQUATIONS section 2.
     """
-    check_shapes(model, q=q)
+    (q,) = check_shapes(model, q=q)
+    return run(_world_poses, model, q)
+
+
+def _world_poses(model: Model, q):
     frame = tree_frame(model, q)
-    return frame.pose.at[:, :3, 3].add(frame.origin)
+    return _moved(frame.pose, frame.origin)
+
+
+def _moved(pose: Float[Array, "*n 4 4"], shift: Float[Array, "*n 3"]) -> Float[Array, "*n 4 4"]:
+    """Poses with their positions moved by a shift in the axes that they are given in."""
+    step = jnp.concatenate([shift[..., None], jnp.zeros_like(shift[..., :1, None])], -2)
+    return jnp.concatenate([pose[..., :3], pose[..., 3:] + step], -1)
 
 
 def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[Array, "4 4"]:
@@ -221,12 +248,15 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
 
     **Raises:** ValueError for an unknown name (near names are listed) or a q that does not fit.
     """
-    check_shapes(model, q=q)
+    (q,) = check_shapes(model, q=q)
     body, offset = _named_frame(model, name)
-    if body < 0:
-        return offset
+    return offset if body < 0 else run(_pose_in_body, (_kinematic(model), offset), q, static=(body,))
+
+
+def _pose_in_body(body: int, tree, q):
+    model, offset = tree
     found = carried(model, q, [body])
-    return _product(found.pose[0], offset).at[:3, 3].add(found.origin[0])
+    return _moved(_product(found.pose[0], offset), found.origin[0])
 
 
 def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -241,10 +271,17 @@ def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Fl
 
     Source: Murray, Li & Sastry (1994), eq. 3.55; EQUATIONS section 2.
     """
-    check_shapes(model, q=q)
+    (q,) = check_shapes(model, q=q)
     body, offset = _named_frame(model, frame)
-    tree = tree_frame(model, q)
-    return _body_twist_columns(model, tree, body, offset, tree.subspace).T
+    if body < 0:
+        return jnp.zeros((6, model.nv), model.home.dtype)
+    return run(_body_jacobian, (_kinematic(model), offset), q, static=(body,))
+
+
+def _body_jacobian(body: int, tree, q):
+    model, offset = tree
+    frame = tree_frame(model, q)
+    return _body_twist_columns(model, frame, body, offset, frame.subspace).T
 
 
 def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -259,13 +296,17 @@ def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) ->
 
     Source: Murray, Li & Sastry (1994), eq. 3.54.
     """
-    check_shapes(model, q=q)
+    (q,) = check_shapes(model, q=q)
     body, _ = _named_frame(model, frame)
-    tree = tree_frame(model, q)
     if body < 0:
         return jnp.zeros((6, model.nv), model.home.dtype)
-    shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), tree.origin[body])
-    return jax.vmap(se3.Ad_apply, (None, 0), 1)(shift, _moving(model, body, tree.subspace))
+    return run(_spatial_jacobian, _kinematic(model), q, static=(body,))
+
+
+def _spatial_jacobian(body: int, model: Model, q):
+    frame = tree_frame(model, q)
+    shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frame.origin[body])
+    return jax.vmap(se3.Ad_apply, (None, 0), 1)(shift, _moving(model, body, frame.subspace))
 
 
 def jacobian_dot_v(
@@ -283,11 +324,25 @@ def jacobian_dot_v(
 
     **Raises:** ValueError for an unknown name or shapes that do not fit.
     """
-    check_shapes(model, q=q, v=v)
+    q, v = check_shapes(model, q=q, v=v)
     body, offset = _named_frame(model, frame)
-    tree = tree_frame(model, q)
-    rate = subspace_rate(model, tree, body_twists(model, tree, v)) * v[:, None]
-    return jnp.sum(_body_twist_columns(model, tree, body, offset, rate), axis=0)
+    if body < 0:
+        return jnp.zeros((6,), model.home.dtype)
+    return run(_jacobian_dot_v, (_kinematic(model), offset), q, v, static=(body,))
+
+
+def _jacobian_dot_v(body: int, tree, q, v):
+    model, offset = tree
+    frame = tree_frame(model, q)
+    rate = subspace_rate(model, frame, body_twists(model, frame, v)) * v[:, None]
+    return jnp.sum(_body_twist_columns(model, frame, body, offset, rate), axis=0)
+
+
+def _kinematic(model: Model) -> Model:
+    """The model as kinematics read it, so that programs do not depend on its other numbers."""
+    if all(x is None for x in (model.gravity, model.armature)):
+        return model
+    return model.replace(gravity=None, armature=None)
 
 
 def take(rows: Array, index: np.ndarray) -> Array:
@@ -299,8 +354,7 @@ def take(rows: Array, index: np.ndarray) -> Array:
 
 
 def _groups(topology: Topology) -> list[tuple[str, np.ndarray]]:
-    # All screw kinds share one exponential, every other kind has its own transform.
-    labels = np.array(["revolute" if kind in SCREW_KINDS else kind for kind in topology.kinds], str)
+    labels = np.array(["revolute" if kind == "continuous" else kind for kind in topology.kinds], str)
     return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn._start import check_mass_matrix, place_of
-from jaxdyn._tracing import is_known
+from jaxdyn.compile import is_known
 from jaxdyn.scene import as_pytree
 from jaxdyn.systems import System, as_parameter, called, checked_size
 

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn import se3
+from jaxdyn.arguments import check_shapes
 from jaxdyn.inertia import spatial_inertia
 from jaxdyn.kinematics import body_subspace, relative_poses
-from jaxdyn.model import Model, check_shapes, frame_index
+from jaxdyn.model import Model, frame_index
 from jaxdyn.so3 import _product
 
 
@@ -110,7 +111,7 @@ def newton_euler_matrices(
 
     Source: EQUATIONS section 4; Park, Bobrow & Ploen (1995), Murray, Li & Sastry (1994) section 4.3.
     """
-    check_shapes(model, q=q, v=v)
+    q, v = check_shapes(model, q=q, v=v)
     topology, n = model.topology, model.nb
     tip_selector = None if tip is None else _tip_selector(model, tip)
     to_child = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))(relative_poses(model, q))

@@ -14,9 +14,9 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxdyn import se3
-from jaxdyn._small import solve_positive
 from jaxdyn.inertia import spatial_inertia
 from jaxdyn.kinematics import body_subspace, relative_poses
+from jaxdyn.linear import solve_positive
 from jaxdyn.model import Model
 from jaxdyn.so3 import _product
 

@@ -11,6 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn._tree import tree_of
+from jaxdyn.arguments import as_array, check_shapes
+from jaxdyn.compile import is_concrete, is_expanding
 from jaxdyn.joints import KINDS, joint_difference, joint_integrate, joint_neutral, joint_random, joint_rate, screw_mask
 
 
@@ -152,6 +155,9 @@ class Model(eqx.Module):
     topology: Topology = eqx.field(static=True)
     coupling_values: Float[Array, "nc 2"] | None = None
 
+    def __str__(self) -> str:
+        return tree_of(self)
+
     @property
     def name(self) -> str:
         """Name of the mechanism."""
@@ -214,21 +220,35 @@ def _replace(model: Model, leaves: dict) -> Model:
     return Model(**{name: leaves.get(name, getattr(model, name)) for name in names}, topology=model.topology)
 
 
-def geometry(model: Model) -> tuple[Array, Array]:
+def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """Home poses (nb, 4, 4) and screws (nb, 6) as every algorithm reads them.
 
     Values are those of the leaves, except that screw entries which the joint's kind does not have are zero. Derivatives
     are made unique: a change of a home pose that leaves SE(3) has no meaning, and algorithms would answer it differently,
     so it is projected onto SE(3), by R (3 - R^T R)/2, which is R for a rotation and has the projection as its derivative.
     """
-    screws = model.screws * jnp.asarray(model.topology.screw_mask, model.screws.dtype)
-    if not isinstance(model.home, jax.core.Tracer):
+    mask = model.topology.screw_mask
+    if is_expanding() and is_concrete(model.home, model.screws):
+        return jnp.asarray(_snapped(model.home)), jnp.asarray(_snapped(model.screws) * mask.astype(model.screws.dtype))
+    screws = model.screws * jnp.asarray(mask, model.screws.dtype)
+    if is_concrete(model.home):
         return model.home, screws
     rotation = model.home[:, :3, :3]
     gram = jnp.einsum("nji,njk->nik", rotation, rotation)
     rotation = jnp.einsum("nij,njk->nik", rotation, 1.5 * jnp.eye(3, dtype=rotation.dtype)[None] - 0.5 * gram)
     last = jnp.broadcast_to(jnp.asarray(np.eye(4)[3:], rotation.dtype), (model.nb, 1, 4))
     return jnp.concatenate([jnp.concatenate([rotation, model.home[:, :3, 3:]], 2), last], 1), screws
+
+
+def _snapped(leaf) -> np.ndarray:
+    """Known numbers with those within rounding of 0, 1 and -1 replaced by these, which programs of numbers leave out.
+
+    A rotation by a right angle that was computed has cosines of 1e-16.
+    """
+    values = np.asarray(leaf)
+    near = np.round(values)
+    close = (np.abs(near) <= 1) & (np.abs(values - near) <= 4 * np.finfo(values.dtype).eps)
+    return np.where(close, near, values)
 
 
 def _per_joint(topology: Topology, function, q, *rest) -> Array:
@@ -251,6 +271,7 @@ def _per_joint(topology: Topology, function, q, *rest) -> Array:
 
 def neutral(model: Model) -> Float[Array, " nq"]:
     """Configuration at which every body is at its home pose, (nq,)."""
+    check_shapes(model)
     parts = [joint_neutral(kind) for kind in model.topology.kinds]
     return jnp.asarray(np.concatenate(parts) if parts else np.zeros(0), model.home.dtype)
 
@@ -262,7 +283,8 @@ def integrate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], dt=1
 
     **Returns:** (nq,), with unit quaternions.
     """
-    check_shapes(model, q=q, v=v)
+    q, v = check_shapes(model, q=q, v=v)
+    dt = as_array(dt, "dt", q.dtype)
     return _per_joint(model.topology, joint_integrate, q, (v * dt, False))
 
 
@@ -271,19 +293,19 @@ def difference(model: Model, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -
 
     Rotations are compared by the shorter way round; at exactly half a turn one of the two ways is chosen.
     """
-    check_shapes(model, q0=q0, q1=q1)
+    q0, q1 = check_shapes(model, q0=q0, q1=q1)
     return _per_joint(model.topology, joint_difference, q0, (q1, True))
 
 
 def configuration_rate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nq"]:
     """dq/dt (nq,) for the body velocity v (nv,): the kinematic map qdot = H(q) v."""
-    check_shapes(model, q=q, v=v)
+    q, v = check_shapes(model, q=q, v=v)
     return _per_joint(model.topology, joint_rate, q, (v, False))
 
 
 def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
     """Put q back on the manifold: unit quaternions, other coordinates unchanged."""
-    check_shapes(model, q=q)
+    (q,) = check_shapes(model, q=q)
 
     def unit(kind, qj):
         if kind not in ("spherical", "free"):
@@ -296,6 +318,7 @@ def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
 
 def random_configuration(model: Model, key: Array) -> Float[Array, " nq"]:
     """Random configuration (nq,): uniform within finite position limits (else within +-pi or +-1 m), uniform rotations."""
+    check_shapes(model)
     topology = model.topology
     keys = jax.random.split(key, topology.nb)
     parts = []
@@ -309,24 +332,6 @@ def random_configuration(model: Model, key: Array) -> Float[Array, " nq"]:
         high = jnp.where(jnp.isfinite(high), high, jnp.asarray(reach, high.dtype))
         parts.append(joint_random(kind, keys[i], low, high, model.home.dtype))
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), model.home.dtype)
-
-
-def check_shapes(model: Model, **arguments) -> None:
-    """Raise a ValueError that names the argument whose shape does not fit the model.
-
-    Names starting with q must have shape (nq,), `external` (nb, 6), all others (nv,).
-    """
-    for name, value in arguments.items():
-        if value is None:
-            continue
-        if name == "external":
-            want, label = (model.nb, 6), "(nb, 6)"
-        else:
-            want, label = ((model.nq,), "(nq,)") if name.startswith("q") else ((model.nv,), "(nv,)")
-        got = jnp.shape(value)
-        if got != want:
-            hint = "; functions take one sample, use jax.vmap for a batch" if len(got) == len(want) + 1 else ""
-            raise ValueError(f"{name} has shape {got}, expected {want} = {label} of model {model.name!r}{hint}")
 
 
 def body_index(model: Model, name: str | None) -> int:

@@ -20,12 +20,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn._rank import pseudo_inverse, tolerance
-from jaxdyn._small import cholesky, definite, solve_factored, solve_lower
-from jaxdyn._tracing import compiled, is_concrete, is_known
-from jaxdyn.constrained import RESULTS, applied
+from jaxdyn.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.compile import compiled, is_concrete, is_known
+from jaxdyn.constrained import RESULTS, Outcome, applied
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.dynamics import inverse_dynamics, mass_matrix
-from jaxdyn.scene import Scene, as_pytree
+from jaxdyn.linear import cholesky, definite, solve_factored, solve_lower
+from jaxdyn.scene import Scene, as_pytree, as_scene
 from jaxdyn.so3 import _product
 from jaxdyn.systems import velocity_to_rate
 
@@ -186,13 +187,13 @@ def as_basis(basis: Any, scene: Scene) -> Basis:
     return Orthonormal(jnp.asarray(basis))
 
 
-class ReducedDynamics(eqx.Module):
+class ReducedDynamics(Outcome):
     """Equations of motion in minimal velocities, M_r nudot + h_r = tau_r, and their solution.
 
     - `nu_rate` (nr,): nudot. `velocity`, `acceleration` (nv,): v = N nu + v0 and its rate a.
     - `mass_matrix` (nr, nr) = N^T M N; `bias_force` (nr,) = N^T (M s + h) with s = Ndot nu + v0dot; `force` (nr,) =
       N^T (tau + forces). Units: those of N^T times N or N m.
-    - `basis` (nv, nr): N. `result`: one of `jaxdyn.constrained.RESULTS`.
+    - `basis` (nv, nr): N. `result`: one of `jd.RESULTS`.
     """
 
     nu_rate: Float[Array, " nr"]
@@ -233,13 +234,17 @@ def reduced_dynamics(
 
     Source: EQUATIONS section 6; Kane & Levinson (1985), section 6.1.
     """
+    scene = as_scene(scene)
+    tau = or_zeros(tau, scene.nv)
+    q, tau, t = check_state(scene.system, q=q, tau=tau, t=t)
+    nu = as_array(nu, "nu", q.dtype)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so there is nothing to reduce; use jd.forward_dynamics")
     choice = as_basis(basis, scene)
     size = choice.size(scene)
     if size is not None and nu.shape != (size,):
-        raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns")
-    found = _reduce_compiled(scene, choice, q, nu, tau, jnp.asarray(t, q.dtype))
+        raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns{batch_hint(nu, (1,))}")
+    found = _reduce_compiled(scene, choice, q, nu, tau, t)
     singular = found.result == RESULTS.singular_basis
     if is_concrete(singular) and bool(singular):
         raise ValueError(f"basis does not serve at this q: {choice.advice(scene, q, t)}")
@@ -266,7 +271,9 @@ def moving(scene: Scene, choice: Basis, q, nu, t) -> Moving:
     def velocity(q, t):
         place = choice.at(scene, q, t)
         if nu.shape != place.N.shape[1:]:
-            raise ValueError(f"nu has shape {nu.shape}, expected {place.N.shape[1:]} as the basis has columns")
+            raise ValueError(
+                f"nu has shape {nu.shape}, expected {place.N.shape[1:]} as the basis has columns{batch_hint(nu, (1,))}"
+            )
         return _product(place.N, nu) + place.v0, place
 
     v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
@@ -302,7 +309,10 @@ def tangent_basis(
 
     **Raises:** ValueError when no freedom is left, or when `dof` has to be given.
     """
-    t = jnp.asarray(t, q.dtype)
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
+    if not layout(scene):
+        raise ValueError("the scene has no constraints, so every velocity is tangent; add some")
     dof = freedoms(scene, q, t, dof, rank_tol)
     keep, _ = _tangent_projection(scene, q, t, rank_tol)
     return split_directions(keep)[:, scene.nv - dof :]

@@ -1,5 +1,6 @@
 """A scene: one system, the constraints on it and the forces in it. What it lists is all that is compiled."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -7,6 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxdyn._tree import scene_lines
+from jaxdyn.arguments import as_array, batch_hint, check_system
 
 
 class _Static(eqx.Module):
@@ -52,13 +56,13 @@ class Scene(eqx.Module):
     forces: tuple = ()
 
     def __init__(self, system, constraints=(), forces=()):
-        if not (hasattr(system, "nq") and hasattr(system, "nv")):
-            raise ValueError(
-                f"system is a {type(system).__name__}, which has no nq and nv; pass a Model or another system"
-            )
+        check_system(system, "system")
         self.system = system
         self.constraints = _sequence(constraints, "constraints")
         self.forces = tuple(as_pytree(f, f"forces[{i}]") for i, f in enumerate(_sequence(forces, "forces")))
+
+    def __str__(self) -> str:
+        return scene_lines(self)
 
     @property
     def nq(self) -> int:
@@ -82,11 +86,41 @@ class Scene(eqx.Module):
         return total
 
 
+def as_scene(scene: Any) -> Scene:
+    """A scene as it is, and a system as the scene without constraints and forces."""
+    return scene if isinstance(scene, Scene) else Scene(scene)
+
+
 def checked_force(value, q: Float[Array, " nq"], nv: int, argument: str) -> Float[Array, " nv"]:
     """What a force or control callback returned, checked to be (nv,), in the dtype of q."""
     if jnp.shape(value) != (nv,):
-        raise ValueError(f"{argument} returned shape {jnp.shape(value)}, expected {(nv,)} = (nv,)")
-    return jnp.asarray(value, q.dtype)
+        hint = batch_hint(value, (nv,))
+        raise ValueError(f"{argument} returned shape {jnp.shape(value)}, expected {(nv,)} = (nv,){hint}")
+    return as_array(value, argument, q.dtype)
+
+
+def check_callback(function: Callable, name: str, signature: str, *args) -> None:
+    """Call a function of the user with traced numbers, as the integration will.
+
+    **Raises:** ValueError for a function of other arguments, and for one that needs the values of its arguments.
+    """
+    try:
+        taken = inspect.signature(function.function if isinstance(function, _Static) else function)
+    except (TypeError, ValueError):  # of what is not written in Python
+        taken = None
+    try:
+        if taken is not None:
+            taken.bind(*args)
+    except TypeError as error:
+        raise ValueError(f"{name} takes {taken}, but is called as {signature}; {error}") from None
+    try:
+        eqx.filter_eval_shape(function, *args)
+    except (jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"{name} needs the values of its arguments, which are traced; take jax.numpy in place of numpy and math, and "
+            f"jnp.where or jax.lax.cond in place of if. {reason}"
+        ) from error
 
 
 def _sequence(items, argument: str) -> tuple:

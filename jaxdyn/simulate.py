@@ -13,22 +13,21 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
 
-from jaxdyn._one_call import one_call
-from jaxdyn._scalar_program import is_written_out
-from jaxdyn._tracing import compiled, is_concrete, is_known, split
-from jaxdyn._ways import straight, without_kernels
+from jaxdyn.arguments import as_array, state_dtype
 from jaxdyn.assembly import residuals
-from jaxdyn.constrained import has_long_recursion
+from jaxdyn.compile import compiled, is_concrete, is_expanding, is_known, partition_traced
 from jaxdyn.constrained_motion import Method, Reduced, checked_start, chosen_method, consistent, serves, start_limit
-from jaxdyn.constraints.base import state_dtype
 from jaxdyn.dynamics import kinetic_energy, potential_energy
 from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import Model, frame_index, neutral
-from jaxdyn.projection import project_state
-from jaxdyn.scene import Scene, as_pytree, checked_force
-from jaxdyn.solution import RESULTS, Solution, raise_failure
-from jaxdyn.solvers import ExplicitSteps, LieGroup, ProjectedSolver, Stepper
+from jaxdyn.repair import is_rank_safe
+from jaxdyn.scene import Scene, as_pytree, as_scene, check_callback, checked_force
+from jaxdyn.solution import RESULTS, Solution, from_diffrax, raise_failure
+from jaxdyn.solvers import ExplicitSteps, LieGroup, ProjectedSolver, Stepper, driver
 from jaxdyn.solvers.choice import (
     checked_adjoint,
     checked_method,
@@ -40,9 +39,18 @@ from jaxdyn.solvers.choice import (
     progress_meter,
     stepping,
 )
-from jaxdyn.solvers.differentiable import COUNTS, run, run_adaptively
+from jaxdyn.solvers.differentiable import COUNTS, ROOM, run, run_adaptively, run_driven
+from jaxdyn.solvers.first_step import Adaptive
 from jaxdyn.solvers.fixed_steps import Watched, too_coarse
-from jaxdyn.solvers.inputs import as_array, check_state, check_times, check_turns, most_turned, turning
+from jaxdyn.solvers.inputs import (
+    check_start,
+    check_times,
+    check_tolerance,
+    check_turns,
+    most_turned,
+    turning,
+    usable_steps,
+)
 from jaxdyn.systems import System, displace, retract, velocity_to_rate
 
 _OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
@@ -122,16 +130,18 @@ def simulate(
     solution = jd.simulate(model, q0, v0, jnp.linspace(0.0, 1.0, 101), outputs=("energy",))
     ```
     """
-    scene = scene if isinstance(scene, Scene) else Scene(scene)
-    q0, v0, ts = (as_array(x) for x in (q0, v0, ts))
-    check_state(scene, q0, v0)
+    scene = as_scene(scene)
+    q0, v0, ts = as_array(q0, "q0"), as_array(v0, "v0"), as_array(ts, "ts")
+    check_start(scene, q0, v0)
     check_times(ts)
+    rtol, atol = as_array(rtol, "rtol"), as_array(atol, "atol")
+    check_tolerance("rtol", rtol)
+    check_tolerance("atol", atol)
+    stepsize = as_array(stepsize, "stepsize") if is_fixed(stepsize) else stepsize
     method = chosen_method(scene, method)
     if scene.constraints and is_concrete((scene, method, q0, v0, ts)):
-        # Inside a jit, jax would trace operations on known numbers too.
-        with jax.ensure_compile_time_eval():
-            state = [jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])]
-            method = checked_start(scene, method, *state)
+        state = [np.asarray(x, state_dtype(scene.system)) for x in (q0, v0, np.asarray(ts)[0])]
+        method = checked_start(scene, method, *state)
     if isinstance(scene.system, System) and is_concrete((scene, q0, v0, ts)):
         with jax.ensure_compile_time_eval():
             scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
@@ -176,33 +186,7 @@ def simulate(
 
 @compiled
 def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
-    unknown, known = split((scene, control, method, numbers))
-
-    def motion(*unknown):
-        scene, control, method, numbers = known(unknown)
-        return _motion(scene, control, method, numbers, options)
-
-    # A call of a scene that is not known would take longer to compile than it saves.
-    if split((scene, control, method))[0]:
-        return motion(*unknown)
-    if not scene.constraints:
-        return one_call(motion, *unknown)
-    if isinstance(numbers[-1], diffrax.AbstractStepSizeController):
-        return motion(*unknown)  # it would go on with shorter steps where kernels do not serve
-
-    # By kernels, and without them where these do not serve.
-    def quick(*unknown):
-        with straight():
-            found = motion(*unknown)
-        numbers = [x for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.inexact)]
-        refused = (found.result == RESULTS.nonfinite_start) | (found.result == RESULTS.unordered_times)
-        return found, refused | jnp.stack([jnp.isfinite(x).all() for x in numbers]).all()
-
-    def careful(*unknown):
-        with without_kernels():
-            return motion(*unknown)
-
-    return one_call(motion, *unknown, quick=quick, careful=careful)
+    return _motion(scene, control, method, numbers, options)
 
 
 def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
@@ -210,7 +194,7 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     system, outputs = scene.system, options["outputs"]
     # diffrax compiles its arguments, which hides their values. What is known stays in closures, the rest is `args`:
     # flat, because its continuous adjoint takes no empty tuples.
-    unknown, known = split((scene, control, method))
+    unknown, known = partition_traced((scene, control, method))
     args = tuple(unknown) or None
 
     def given(args):
@@ -229,15 +213,15 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     def power(force, v):
         return jnp.zeros((), v.dtype) if force is None else jnp.sum(v * force)
 
-    # Traced once for all the places where diffrax and differentiation call it, and once to be written out in numbers.
+    # Traced once for all the places where diffrax and differentiation call it, and once for each way in which it is traced.
     @functools.partial(jax.jit, static_argnums=0)
-    def traced(written_out, t, y, args):
+    def traced(way, t, y, args):
         scene, _, method = given(args)
         rates, force, v = method.evaluated(scene, y, t, functools.partial(effort, args))
         return rates | {"work": power(force, v)} if "work" in y else rates
 
     def derivative(t, y, args):
-        return traced(is_written_out(), t, y, args)
+        return traced((is_expanding(), is_rank_safe()), t, y, args)
 
     @jax.jit
     def explicit_part(t, y, args):
@@ -285,7 +269,9 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     q0 = retract(system, q0)
     in_order = jnp.isfinite(ts).all() & (ts[1:] > ts[:-1]).all()
     given_times, ts = ts, jnp.where(in_order, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
-    good = jnp.isfinite(q0).all() & jnp.isfinite(v0).all() & in_order
+    finite_start = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
+    steps, fine_steps, fine_tolerances = usable_steps(steps, ts)
+    good = finite_start & in_order & fine_steps & fine_tolerances
     # A bad lane of a batch takes a harmless start, so that it does not make the others wait.
     harmless = neutral(system).astype(q0.dtype) if isinstance(system, Model) else jnp.zeros_like(q0)
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
@@ -294,13 +280,18 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
         held = consistent(scene, q0, v0, ts[0])
         if method.projects:
             given_start = q0, v0
-            q0, v0 = project_state(scene, q0, v0, ts[0])
+            q0, v0 = method.onto_constraints(scene, q0, v0, ts[0])
             # Residuals of a small mechanism are small numbers of metres: how far it moves onto the constraints tells more.
             ways = [
                 jnp.max(jnp.abs(x - y)) / (1 + jnp.max(jnp.abs(x))) for x, y in zip(given_start, (q0, v0), strict=True)
             ]
             held = held & (jnp.maximum(*ways) <= 10 * start_limit(q0.dtype))
-    eqx.filter_eval_shape(effort, args, q0, v0, ts[0])  # refuses callbacks of a wrong shape before diffrax meets them
+    # Refuses callbacks that do not fit before diffrax meets them.
+    for i, force in enumerate(scene.forces):
+        check_callback(force, f"forces[{i}]", "force(system, q, v, t)", system, q0, v0, ts[0])
+    if control is not None:
+        check_callback(control, "control", "control(q, v, t)", q0, v0, ts[0])
+    eqx.filter_eval_shape(effort, args, q0, v0, ts[0])
     y0 = method.start(scene, q0, v0, ts[0])
     first = method.quality(scene, y0, ts[0])
     y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
@@ -326,9 +317,8 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
         y, t = row
         return method.place(scene, method.corrected(scene, y, t), t)
 
-    # One after the other where the projection is a long program, which for several at once would be another one.
-    long = method.projects and has_long_recursion(scene)
-    q, v = jax.lax.map(place, (y, ts)) if long else jax.vmap(place)((y, ts))
+    # One after the other, by the kernels that have put the start on the constraints.
+    q, v = lax.map(place, (y, ts))
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
     ended = (result == RESULTS.successful) | (result == RESULTS.coarse_steps)
     result = RESULTS.where(ended & ~reached.all(), RESULTS.nonfinite_state, result)
@@ -336,7 +326,7 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     kept = jnp.max(jnp.where(reached, ts, ts[0]))
     time_reached = jnp.where(result == RESULTS.nonfinite_state, kept, time_reached)
     if method.projects and scene.constraints:
-        closed = jax.vmap(consistent, (None, 0, 0, 0))(scene, q, v, ts)
+        closed = lax.map(lambda row: consistent(scene, *row), (q, v, ts))
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
     if first is not None:
         result = RESULTS.where(serves(first), result, RESULTS.singular_basis)
@@ -345,8 +335,13 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     if angles.size and not is_fixed(steps[-1]):
         coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
         result = RESULTS.where(coarse, RESULTS.coarse_start, result)
-    result = RESULTS.where(good, result, RESULTS.nonfinite_start)
-    result = RESULTS.where(in_order, result, RESULTS.unordered_times)
+    for fine, code in (
+        (finite_start, RESULTS.nonfinite_start),
+        (fine_tolerances, RESULTS.bad_tolerance),
+        (fine_steps, RESULTS.bad_stepsize),
+        (in_order, RESULTS.unordered_times),
+    ):
+        result = RESULTS.where(fine, result, code)
 
     def report(q, v, t):
         values = {}
@@ -368,6 +363,8 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
         return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
 
     rows = {"q": q, "v": v} | jax.vmap(report)(q, v, ts) | ({} if work is None else {"work": work})
+    whole = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
+    result = RESULTS.where((result == RESULTS.successful) & ~whole, RESULTS.nonfinite_state, result)
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     return Solution(ts=given_times, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
@@ -376,13 +373,15 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
 def _integrate(term, project, quality, method, y0, ts, args, steps, options):
     """Rows of the state at ts[1:], how it ended, counts, and the time it came to."""
     adjoint = options["adjoint"]
+    solver: Any
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
+    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which integrates another vector field
     # Of a method that wraps an explicit one, diffrax says that it is one.
-    if isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver):
-        solver = ExplicitSteps(solver, project, method.jumping, method.projects)
+    explicit = isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
+    if explicit and not continuous:
+        solver = ExplicitSteps(solver, project, method.jumping, method.projects, field=term.vector_field)
     elif project:
         solver = ProjectedSolver(solver, project, method.jumping, method.projects)
-    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)
     if continuous and isinstance(controller, Watched):
         controller = diffrax.ConstantStepSize()  # backwards the state is another one
     event = None
@@ -397,21 +396,52 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
         "adjoint": adjoint,
         "max_steps": options["max_steps"],
         "progress": progress_meter(options["progress"]),
+        "dt0": dt0,
     }
-    if is_fixed(steps[-1]):
-        rows, facts, solved = run((y0, args, ts), dt0=dt0, **how)
+    sums = None
+    if explicit and not continuous and event is None and _is_driven(controller, adjoint, options):
+        stepper: Any = solver
+        drive = _driver(stepper, controller, y0, steps, options)
+        room = options["max_steps"] if options["limit_is_given"] else min(options["max_steps"], ROOM)
+        rows, facts, sums = run_driven((y0, args, ts), drive, how, room)
+    elif is_fixed(steps[-1]):
+        rows, facts, solved = run((y0, args, ts), **how)
+        sums = solved.controller_state[2:] if isinstance(controller, Watched) else None
     else:
         rows, facts = run_adaptively((y0, args, ts), how, options["limit_is_given"])
     result, stats, reached = facts
-    result = RESULTS.promote(result)
+    result = from_diffrax(result)
     if is_fixed(steps[-1]):
-        if isinstance(controller, Watched):
-            coarse = (result == RESULTS.successful) & too_coarse(solved.controller_state)
+        if sums is not None:
+            coarse = (result == RESULTS.successful) & too_coarse(sums)
             result = RESULTS.where(coarse, RESULTS.coarse_steps, result)
         # diffrax is at the end of the step that could not be solved; what is known ends where it began.
         began = ts[0] + (stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
         reached = jnp.where(result == RESULTS.nonlinear_divergence, began, reached)
     return rows, result, stats, reached
+
+
+def _is_driven(controller, adjoint, options) -> bool:
+    """Whether steps are made by a loop of our own: explicit ones, of a control that we know, with nothing shown on the way."""
+    known = type(controller) in (Adaptive, Watched)
+    return known and isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) and not options["progress"]
+
+
+def _driver(solver: ExplicitSteps, controller, y0, steps, options):
+    """drive(y0, args, ts) -> (rows, facts, sums about fixed steps) for `run_driven`."""
+    plan, structure = solver.plan(y0), ravel_pytree(y0)[1]
+    order = solver.error_order(None)
+    if isinstance(controller, Adaptive):
+        how, stepsize = driver.Adaptive(order, controller.norm), None
+        rtol, atol = controller.rtol, controller.atol
+    else:
+        how, stepsize, rtol, atol = driver.Fixed(solver.order(None), order), steps[-1], None, None
+
+    def drive(y0, args, ts):
+        found = driver.drive(plan, how, ravel_pytree(y0)[0], args, ts, rtol, atol, stepsize, options["max_steps"])
+        return jax.vmap(structure)(found.rows), (found.result, found.counts, found.reached), found.sums
+
+    return drive
 
 
 def _signed(quality):

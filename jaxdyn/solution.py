@@ -5,25 +5,21 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from jaxdyn._tree import solution_lines
+from jaxdyn.constrained import RESULTS as RESULTS
+from jaxdyn.constrained import Outcome
 from jaxdyn.scene import Scene
 from jaxdyn.solvers.choice import for_stiff, known_stiffness, unwrapped
 
 
-class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a simulation ended: diffrax's codes and eight more."""
-
-    nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
-    nonfinite_state = "The state became NaN or infinite."
-    unordered_times = "The save points are not finite and increasing."
-    coarse_steps = (
-        "The fixed steps are too long, or too many for the dtype: the motion may be wrong by a tenth of it or more."
-    )
-    coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
-    inconsistent_start = "The initial state is not on the constraints."
-    open_constraints = "The constraints opened, and the projection could not close them."
-    singular_basis = "The minimal velocities no longer determine the others."
+def from_diffrax(result) -> Any:
+    """A code of diffrax as one of `RESULTS`, by its name."""
+    found: Any = RESULTS.successful
+    for name, code in diffrax.RESULTS._name_to_item.items():
+        found = RESULTS.where(result == code, getattr(RESULTS, name), found)
+    return found
 
 
 ADVICE = {
@@ -33,6 +29,8 @@ ADVICE = {
     "which fixed steps pass (stepsize=0.01); or rtol and atol are below the rounding error",
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
     "unordered_times": "give times ts that increase from each to the next",
+    "bad_stepsize": "give a positive stepsize (s)",
+    "bad_tolerance": "give finite rtol and atol that are not negative",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
     "coarse_steps": "take a smaller stepsize, or None for steps that keep a tolerance; if stiff, solver=jd.Rodas5P(); beyond "
     "some 1e5 steps, float64",
@@ -46,11 +44,12 @@ ADVICE = {
 }
 
 
-class Solution(eqx.Module):
+class Solution(Outcome):
     """A simulated motion; every row belongs to one save point. Rows not reached are NaN.
 
     - `ts` (nt,) in s, as given; `q` (nt, nq); `v` (nt, nv), body-fixed.
-    - `result`, a `RESULTS` code; `success` tells whether all went well; `solver`, the name of the method that was used.
+    - `result`, a `RESULTS` code; `success` tells whether the motion was computed to its end, by steps short enough; `solver`,
+      the name of the method that was used.
     - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
     - What `outputs` asked for, else None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
       scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
@@ -72,10 +71,8 @@ class Solution(eqx.Module):
     poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
     solver: str = eqx.field(static=True, default="")
 
-    @property
-    def success(self) -> Bool[Array, "..."]:
-        """Whether the motion was computed to its end, by steps short enough."""
-        return self.result == RESULTS.successful
+    def __str__(self) -> str:
+        return solution_lines(self)
 
 
 def raise_failure(solution: Solution, scene: Scene, control, options) -> None:

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn._small import solve_positive
-from jaxdyn._tracing import compiled, is_known
+from jaxdyn.arguments import check_state
+from jaxdyn.compile import compiled, is_known
 from jaxdyn.constrained import constrained_dynamics
-from jaxdyn.constraints.base import state_dtype
 from jaxdyn.dynamics import gravity_force, mass_matrix
+from jaxdyn.linear import solve_positive
 from jaxdyn.model import Model
-from jaxdyn.scene import Scene, as_pytree, checked_force
+from jaxdyn.scene import Scene, as_pytree, as_scene, checked_force
 from jaxdyn.so3 import _product
 from jaxdyn.systems import displace
 
@@ -61,12 +61,9 @@ def stiffness(scene: Any, q: Any, v: Any, t: Any = 0.0, control: Any = None) -> 
     rates = jd.stiffness(jd.Scene(model, forces=(jd.JointDamping(1e3),)), q, v)
     ```
     """
-    scene = scene if isinstance(scene, Scene) else Scene(scene)
+    scene = as_scene(scene)
     control = None if control is None else as_pytree(control, "control")
-    q, v, t = (jnp.asarray(x, state_dtype(scene.system)) for x in (q, v, t))
-    for name, value, size in (("q", q, scene.nq), ("v", v, scene.nv)):
-        if value.shape != (size,):
-            raise ValueError(f"{name} has shape {value.shape}, expected {(size,)} of the scene's system")
+    q, v, t = check_state(scene.system, q=q, v=v, t=t)
     matrix = _linearised(scene, q, v, t, control)
     if is_known(matrix):
         # LAPACK by numpy, which compiles nothing.

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn._small import solve_positive
 from jaxdyn._start import check_mass_matrix
-from jaxdyn._tracing import is_known
+from jaxdyn.arguments import batch_hint
+from jaxdyn.compile import is_known, run
+from jaxdyn.linear import solve_positive
 from jaxdyn.model import Model, configuration_rate, difference, integrate, normalize
 from jaxdyn.scene import as_pytree
 from jaxdyn.so3 import _product
@@ -70,7 +71,7 @@ class System(eqx.Module):
 
     def forward_dynamics(self, q, v, tau, t):
         """M^-1 (tau - h), (nv,)."""
-        return solve_positive(self.mass_matrix(q, t), tau - self.bias_force(q, v, t))
+        return run(_acceleration, self, q, v, tau, t, otherwise=_acceleration)
 
     def check_start(self, q, v, t) -> None:
         """Refuse a state from which no motion can be computed. Nothing is done where a number is traced.
@@ -79,6 +80,10 @@ class System(eqx.Module):
         """
         if is_known(self, q, v, t):
             check_mass_matrix(_mass_matrix_compiled(self, q, t), type(self).__name__, q, t)
+
+
+def _acceleration(system: System, q, v, tau, t):
+    return solve_positive(system.mass_matrix(q, t), tau - system.bias_force(q, v, t))
 
 
 class MetricSystem(System):
@@ -192,20 +197,6 @@ class ExplicitSystem(System):
         return called(self._potential, (), "potential", (q,), t, self.parameters)
 
 
-def checked_time(system: System, t, external=None, **arguments) -> Array:
-    """The time in the dtype of the state, after a check of the shapes of `arguments`, each (nq,) = (nv,).
-
-    **Raises:** ValueError that names the argument; also for `external`, as there are no bodies.
-    """
-    if external is not None:
-        raise ValueError(f"external holds wrenches on bodies, and a {type(system).__name__} has none; add them to tau")
-    for name, value in arguments.items():
-        if jnp.shape(value) != (system.nq,):
-            hint = "; functions take one sample, use jax.vmap for a batch" if jnp.ndim(value) == 2 else ""
-            raise ValueError(f"{name} has shape {jnp.shape(value)}, expected {(system.nq,)} of the system{hint}")
-    return jnp.asarray(t, arguments["q"].dtype)
-
-
 def velocity_to_rate(system, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nq"]:
     """dq/dt (nq,) for the velocity v of any system: H(q) v for a `Model`, else v."""
     return configuration_rate(system, q, v) if isinstance(system, Model) else v
@@ -257,7 +248,9 @@ def called(function, shape, name, state, t, parameters):
     if jnp.shape(value) != shape:
         size = state[0].shape[0]
         wanted = "return one number, ()" if shape == () else f"expected {shape} for nq = {size}"
-        raise ValueError(f"{name} returned shape {jnp.shape(value)}{';' if shape == () else ','} {wanted}")
+        raise ValueError(
+            f"{name} returned shape {jnp.shape(value)}{';' if shape == () else ','} {wanted}{batch_hint(value, shape)}"
+        )
     return jnp.asarray(value, state[0].dtype)
 
 

@@ -28,7 +28,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn import se2, se3, so3
-from jaxdyn._small import solve_positive
 from jaxdyn.constrained import correction
 from jaxdyn.constraints.base import (
     constraint_jacobian,
@@ -42,6 +41,7 @@ from jaxdyn.dynamics import bias_force, mass_matrix
 from jaxdyn.joints import SCREW_KINDS
 from jaxdyn.kinematics import body_twists, sum_to_coordinates, take, tree_frame
 from jaxdyn.lagrange import LagrangianSystem
+from jaxdyn.linear import solve_positive
 from jaxdyn.matrix_form import momentum, tree_inertias
 from jaxdyn.model import Model
 from jaxdyn.scene import Scene

@@ -1,9 +1,15 @@
 """Settings and fixtures of every test.
 
+Machine code of kernels is kept in a folder of the session, which workers and processes that tests start share.
+
 There is no persistent compilation cache. It was tried: programs with host callbacks (`eqx.error_if`, hence diffrax) are
 never stored, what is stored logs machine-feature errors when loaded, and its files are not written atomically.
 """
 
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
@@ -26,6 +32,36 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("jaxdyn")
     group.addoption("--data", type=Path, default=ROOT.parent / "shared" / "data", help="directory of recorded data")
     group.addoption("--all-robots", action="store_true", help="run the robot tests on every robot, not on a few")
+    group.addoption("--compilation", choices=("auto", "plain"), help="run all tests in this mode of jaxdyn.compilation")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    mode = config.getoption("--compilation")
+    if mode is not None:
+        os.environ["JAXDYN_COMPILATION"] = mode
+    if not hasattr(config, "workerinput"):  # workers of pytest-xdist inherit the environment
+        # Matplotlib looks for its list of fonts, which takes seconds to make, in the same place.
+        usual = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        os.environ.setdefault("MPLCONFIGDIR", os.path.join(usual, "matplotlib"))
+        config.stash[_CACHE] = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="jaxdyn-tests-")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    folder = config.stash.get(_CACHE, None)
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+_CACHE = pytest.StashKey[str]()
+
+
+@pytest.fixture(params=["auto", "plain"])
+def mode(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Both modes of `jaxdyn.compilation`, in force where the test traces; functions that are compiled once keep theirs."""
+    import jaxdyn
+
+    with jaxdyn.compilation(request.param):
+        yield request.param
 
 
 @pytest.fixture(scope="session")

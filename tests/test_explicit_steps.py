@@ -1,6 +1,4 @@
-"""Steps of explicit methods on one flat state: against diffrax's own steps, and how they compile."""
-
-import re
+"""Steps of explicit methods on one flat state: against diffrax's own steps, in kernels and in turn."""
 
 import diffrax
 import jax
@@ -9,14 +7,12 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn import _one_call, scenes
-from jaxdyn._one_kernel import kernel_of
+from jaxdyn import scenes
 from jaxdyn.constraints.base import velocity_residual
+from jaxdyn.report.cases import cases
 from jaxdyn.scene import Scene
-from jaxdyn.solvers import explicit
-from jaxdyn.solvers.explicit import _SMALL, ExplicitSteps
-
-SIZES = {"f64": 8, "s64": 8, "u64": 8, "f32": 4, "s32": 4, "u32": 4, "s8": 1, "u8": 1, "pred": 1}
+from jaxdyn.solvers import driver
+from jaxdyn.solvers.explicit import ExplicitSteps
 
 
 def field(t, y, args):
@@ -43,58 +39,11 @@ def test_steps_are_those_of_diffrax(solver, shape):
             found.append((y, error, output.evaluate(t0 + 0.3 * (t1 - t0)), output.evaluate(t1)))
         return found
 
-    ours, theirs = jax.jit(lambda: two_steps(ExplicitSteps(solver)))(), jax.jit(lambda: two_steps(solver))()
+    ours, theirs = (
+        jax.jit(lambda: two_steps(ExplicitSteps(solver, field=field)))(),
+        jax.jit(lambda: two_steps(solver))(),
+    )
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-13), ours, theirs)
-
-
-def loops(text: str):
-    """Lines of the bodies of all loops in a compiled program."""
-    bodies, parts, name = set(re.findall(r"body=%([\w.\-]+)", text)), {}, None
-    for line in text.splitlines():
-        start = re.match(r"(?:ENTRY )?%([\w.\-]+) \(.*\{$", line)
-        name = start.group(1) if start else name
-        parts.setdefault(name, []).append(line)
-    return [parts[name] for name in bodies]
-
-
-def largest(lines) -> int:
-    """Bytes of the largest array that an operation makes or takes from outside."""
-    shapes = [shape for line in lines[1:] for shape in re.findall(r"\b(\w+)\[([\d,]+)\]", line.split(", metadata")[0])]
-    return max(SIZES[kind] * int(np.prod([int(x) for x in size.split(",")])) for kind, size in shapes if kind in SIZES)
-
-
-@pytest.fixture
-def ordinary(monkeypatch):
-    """Programs of operations, as those of what is too long for one call, instead of one call for few samples."""
-    monkeypatch.setattr(_one_call, "IN_CALLS", False)
-
-
-def test_loops_of_one_motion_have_small_arrays(ordinary):
-    """XLA runs the operations of such a loop one after the other, without its scheduler."""
-    scene, (q, v) = scenes.andrews(), scenes.andrews.start()
-    ts = jnp.linspace(0.0, 0.01, 8)
-
-    def run(q, v):
-        return jd.simulate(scene, q, v, ts, solver=diffrax.Dopri8(), throw=False).q
-
-    text = jax.jit(run).lower(q, v).compile().as_text() or ""
-    steps = [lines for lines in loops(text) if any("diffeqsolve" in line for line in lines)]
-    assert len(steps) > 3  # over the steps, the stages and the save points among them
-    assert max(map(largest, steps)) <= _SMALL
-
-
-@pytest.fixture
-def kernels(monkeypatch, ordinary):
-    """Batches of any size take all stages in one kernel; the list says for each program whether there was one."""
-    made = []
-
-    def noted(*args, **options):
-        made.append(kernel_of(*args, **options))
-        return made[-1]
-
-    monkeypatch.setattr(explicit, "LEAST_BATCH", 1)
-    monkeypatch.setattr(explicit, "kernel_of", noted)
-    return made
 
 
 def batch(scene, start, size=3):
@@ -130,25 +79,151 @@ def twice(scene):
 @pytest.mark.parametrize(
     "case", [pytest.param(name, marks=[pytest.mark.slow] * (name not in ("free body", "disk"))) for name in CASES]
 )
-def test_stages_at_once_are_those_in_turn(case, kernels):
+def test_stages_at_once_are_those_in_turn(case, monkeypatch):
+    """A whole step in one kernel, its stages in turn, and without kernels; a batch and one sample."""
     one, vs = batch(*CASES[case]())
-    found = jax.jit(jax.vmap(one))(vs)
-    assert any(kernel is not None for kernel in kernels)
-    explicit.LEAST_BATCH = 1 << 30
-    wanted = jax.jit(jax.vmap(one))(vs)
-    assert bool(found.success.all()) and bool(wanted.success.all())
-    np.testing.assert_allclose(found.q, wanted.q, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found.v, wanted.v, rtol=0, atol=1e-12)
+    taken, run = [], driver.run
+
+    def noted(function, *args, **options):
+        found = run(function, *args, **options)
+        if function is driver._advance:
+            taken.append(found[0] is not None)
+        return found
+
+    monkeypatch.setattr(driver, "run", noted)
+    found, alone = jax.jit(jax.vmap(one))(vs), jax.jit(one)(vs[1])
+    assert all(taken) and taken
+    monkeypatch.setattr(
+        driver,
+        "run",
+        lambda f, *args, **options: (None, True) if f is driver._advance else run(f, *args, **options),
+    )
+    in_turn = jax.jit(jax.vmap(one))(vs)
+    with jd.compilation("plain"):
+        plain = jax.jit(jax.vmap(one))(vs)
+    for wanted in (in_turn, plain):
+        assert bool(found.success.all()) and bool(wanted.success.all())
+        np.testing.assert_allclose(found.q, wanted.q, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.v, wanted.v, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(alone.q, found.q[1], rtol=0, atol=1e-12)
 
 
-def test_derivatives_are_those_of_stages_in_turn(kernels):
+def test_derivatives_are_those_without_kernels():
     one, vs = batch(*CASES["free body"]())
 
     def end(v):
         return jnp.sum(one(v).q[-1, :2] ** 2)
 
     found = jax.jit(jax.vmap(jax.grad(end)))(vs)
-    explicit.LEAST_BATCH = 1 << 30
-    wanted = jax.jit(jax.vmap(jax.grad(end)))(vs)
+    with jd.compilation("plain"):
+        wanted = jax.jit(jax.vmap(jax.grad(end)))(vs)
     np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
     assert np.abs(wanted).max() > 0.01
+
+
+# --- whole motions in both modes ---
+
+
+def motion(name, **options):
+    """A simulation of a scene of the report, for given start and tolerance."""
+    case = cases()[name]
+    scene, (q, v) = case.build()
+    ts = jnp.asarray(case.ts[:4])
+
+    def run(q, v, tolerance):
+        steps = {"rtol": tolerance, "atol": tolerance} if "stepsize" not in options else {}
+        return jd.simulate(scene, q, v, ts, throw=False, **steps, **options)
+
+    return run, (jnp.asarray(q), jnp.asarray(v), jnp.asarray(1e-9))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("free_body", {}),
+        ("double_pendulum", {"outputs": ("energy", "acceleration")}),
+        ("rolling_disk", {"outputs": ("multipliers", "constraint_residual")}),
+        pytest.param("four_bar", {}, marks=pytest.mark.slow),
+        ("car_axis", {"stepsize": 0.003}),
+        pytest.param("andrews", {}, marks=pytest.mark.slow),
+        pytest.param("double_pendulum", {"solver": jd.Rodas5P()}, marks=pytest.mark.slow),
+        pytest.param("double_pendulum", {"method": "variational", "stepsize": 0.01}, marks=pytest.mark.slow),
+    ],
+)
+def test_motions_are_those_without_kernels(name, options):
+    run, args = motion(name, **options)
+    found = jax.jit(run)(*args)
+    with jd.compilation("plain"):
+        run, args = motion(name, **options)
+        wanted = jax.jit(run)(*args)
+    assert bool(found.success) and bool(wanted.success)
+    for x, y in ((found.q, wanted.q), (found.v, wanted.v)):
+        # Rounding may decide about a step; two runs at a tolerance of 1e-9 differ by less than ten times that.
+        np.testing.assert_allclose(x, y, rtol=1e-8, atol=1e-8)
+    for key in options.get("outputs", ()):
+        np.testing.assert_allclose(getattr(found, key), getattr(wanted, key), rtol=1e-6, atol=1e-6)
+
+
+def test_dependent_rows_take_the_careful_way():
+    """Two rows that say the same, which kernels do not serve anywhere."""
+    once = scenes.pendulum_in_plane()
+    scene = Scene(once.system, (*once.constraints, *once.constraints))
+    q, v = (jnp.asarray(x) for x in scenes.pendulum_in_plane.start())
+
+    def run(scene):
+        ts = jnp.linspace(0.0, 0.2, 3)
+        return jax.jit(lambda q, v: jd.simulate(scene, q, v, ts, throw=False, rtol=1e-8, atol=1e-8))(q, v)
+
+    found = run(scene)
+    with jd.compilation("plain"):
+        plain = run(scene)
+    assert found.result == plain.result
+    for wanted in (plain, run(once)):
+        np.testing.assert_allclose(found.q, wanted.q, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(found.v, wanted.v, rtol=1e-6, atol=1e-6)
+
+
+def test_derivatives_of_a_constrained_motion():
+    scene, (q, v) = cases()["rolling_disk"].build()
+    v, ts = jnp.asarray(v), jnp.linspace(0.0, 0.5, 3)
+
+    def end(v, adjoint):
+        found = jd.simulate(scene, q, v, ts, throw=False, rtol=1e-6, atol=1e-6, adjoint=adjoint)
+        return jnp.sum(found.q[-1] ** 2)
+
+    def reverse():
+        return jax.jit(jax.grad(lambda v: end(v, "reverse")))(v)
+
+    found, forward = reverse(), jax.jit(jax.jacfwd(lambda v: end(v, "forward")))(v)
+    with jd.compilation("plain"):
+        wanted = reverse()
+    np.testing.assert_allclose(found, wanted, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(forward, wanted, rtol=1e-5, atol=1e-5)  # steps of their own at tolerances of 1e-6
+
+
+def test_long_chains_that_are_built_in_a_program():
+    q = 0.3 * jnp.cos(jnp.arange(100))
+
+    def energies(speed):
+        chain = jd.robots.chain(100)
+        ts = jnp.asarray([0.0, 0.02])
+        found = jd.simulate(chain, q, speed * jnp.sin(q), ts, stepsize=0.001, outputs=("energy",))
+        return found.energy, found.q[-1]
+
+    energy, end = jax.jit(energies)(0.1)
+    np.testing.assert_allclose(energy[1], energy[0], rtol=1e-8)  # of RK4
+    np.testing.assert_allclose(end, energies(0.1)[1], rtol=0, atol=1e-12)
+
+
+def test_times_that_do_not_increase_have_a_code():
+    scene, (q, v) = cases()["free_body"].build()
+
+    @jax.jit
+    def run(ts):
+        return jd.simulate(scene, q, v, ts)
+
+    assert bool(run(jnp.array([0.0, 0.5, 1.0])).success)
+    for times in ([0.0, 0.5, 0.5], [0.0, 1.0, 0.5], [0.0, jnp.nan, 1.0]):
+        found = run(jnp.array(times))
+        assert found.result == jd.RESULTS.unordered_times
+        assert jnp.isnan(found.q).all()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree
 
-from jaxdyn import inertia, looped, matrix_form, recursive, scenes
+from jaxdyn import inertia, looped, matrix_form, recursions, scenes
 from jaxdyn.building import ModelBuilder
 from jaxdyn.constrained import RESULTS, constrained_dynamics
 from jaxdyn.constraints import Holonomic
@@ -16,7 +16,7 @@ from jaxdyn.scene import Scene
 from jaxdyn.simulate import simulate
 from jaxdyn.systems import ExplicitSystem
 
-FORMS = {"matrices": matrix_form.forward_dynamics, "recursion": recursive.aba, "loops": looped.forward_dynamics}
+FORMS = {"matrices": matrix_form.forward_dynamics, "recursion": recursions.aba, "loops": looped.forward_dynamics}
 
 
 _programs = quick(lambda model, *states: [form(model, *states) for form in FORMS.values()])

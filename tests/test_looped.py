@@ -8,7 +8,6 @@ import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree, to_pinocchio
 
 from jaxdyn import dynamics, looped, matrix_form
-from jaxdyn._one_call import MOST_SAMPLES
 from jaxdyn.robots import chain as planar_chain
 from jaxdyn.robots import random_tree as chain
 
@@ -69,12 +68,13 @@ def test_five_hundred_links(branching):
     assert_close(a, want, 1e-8)
 
 
-@pytest.mark.parametrize("count", [1, 3, 40])
-def test_loops_are_one_call_of_few_samples(count):
-    """Of a mechanism with no kernel: what runs, against the matrix form, and how it was compiled."""
-    model = planar_chain(40)
-    q, v, tau = (jnp.asarray(x) for x in np.random.default_rng(0).normal(size=(3, count, 40)))
-    run = jax.jit(jax.vmap(lambda *state: dynamics.forward_dynamics(model, *state))).lower(q, v, tau).compile()
-    assert ("xla_cpu_small_call" in run.as_text()) == (count <= MOST_SAMPLES)
+@pytest.mark.parametrize("links", [40, dynamics.MAX_BODIES + 1])
+@pytest.mark.parametrize("count", [1, 40])
+def test_long_chains(count, links):
+    """With the most bodies of a kernel and more, against the matrix form; which way was taken."""
+    model = planar_chain(links)
+    q, v, tau = (jnp.asarray(x) for x in np.random.default_rng(0).normal(size=(3, count, links)))
+    run = jax.jit(jax.vmap(lambda *state: dynamics.forward_dynamics(model, *state)))
+    assert ("jaxdyn_kernel" in run.lower(q, v, tau).as_text()) == (links <= dynamics.MAX_BODIES)
     want = quick(jax.vmap(lambda *state: matrix_form.forward_dynamics(model, *state)))(q, v, tau)
     assert_close(run(q, v, tau), want, 1e-10)

@@ -21,12 +21,13 @@ PACKAGE = Path(jaxdyn.__file__).parent
 # From the bottom up, subpackages by their name. A module may use its own layer and those below it. Modules named
 # nowhere (helpers) have no layer of their own and count as what they import.
 LAYERS = (
+    "compile",
     "_series so3 se2 se3",
     "inertia",
     "joints",
     "model",
     "kinematics",
-    "link_form matrix_form recursive",
+    "link_form matrix_form looped recursions",
     "dynamics",
     "immersion geometry",
     "constraints constrained reduced gauge distributions",
@@ -46,17 +47,25 @@ ABOVE_CONTROL = {name for name, rank in RANK.items() if rank > RANK["control"]}
 FILES_AND_PLOTS = {"io", "report", "plotting"} | PROGRAMS
 
 # Two implementations that check each other share nothing above the kinematics.
-INDEPENDENT = [("matrix_form", "recursive"), ("link_form", "matrix_form"), ("link_form", "recursive")]
+INDEPENDENT = [
+    ("matrix_form", "recursions"),
+    ("link_form", "matrix_form"),
+    ("link_form", "recursions"),
+    ("looped", "recursions"),
+]
 
 # Who may import what from outside. Packages not named here and not needed by all (LIGHT) are for nobody.
 USERS = {
+    "llvmlite": {"compile"},
     "diffrax": ABOVE_CONTROL,
     "optax": {"identify"} | PROGRAMS,
     "optimistix": {"constraints", "constrained", "reduced", "solvers", "identify"} | PROGRAMS,
     "lineax": ABOVE_DYNAMICS,
     "matplotlib": FILES_AND_PLOTS,
-    "scipy": {"identify"} | FILES_AND_PLOTS,  # a dependency of jax, so always there; not when jaxdyn is imported
+    "scipy": {"contact", "identify"}
+    | FILES_AND_PLOTS,  # a dependency of jax, so always there; not when jaxdyn is imported
     "yourdfpy": FILES_AND_PLOTS,
+    "mujoco": FILES_AND_PLOTS,
 }
 LIGHT = {"equinox", "jax", "jaxtyping", "numpy"}
 
@@ -196,7 +205,7 @@ def test_import_is_light_and_leaves_jax_unconfigured():
     program = """
 import sys
 import jaxdyn
-heavy = {"matplotlib", "scipy", "yourdfpy"} & sys.modules.keys()
+heavy = {"matplotlib", "mujoco", "scipy", "yourdfpy"} & sys.modules.keys()
 assert not heavy, f"importing jaxdyn imports {heavy}"
 import jax
 try:

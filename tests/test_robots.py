@@ -10,7 +10,7 @@ import pytest
 from pinocchio_bridge import ROBOTS, Bridge, assert_close, quick, random_states
 
 import jaxdyn as jd
-from jaxdyn import _dispatch, recursive
+from jaxdyn import recursions
 
 FEW = {
     "panda.urdf": False,
@@ -106,8 +106,7 @@ def theirs(source, frames, q, v, a, tau):
 
 
 @pytest.mark.parametrize("file,floating", CASES)
-def test_agrees_with_pinocchio(file, floating, monkeypatch):
-    monkeypatch.setattr(_dispatch, "MOST_BODIES", 0)  # the matrix form only; the recursion has its own test below
+def test_agrees_with_pinocchio(file, floating):
     model, source, bridge = both(file, floating)
     if model.nv == 0:
         pytest.skip("no joints: nothing moves")
@@ -136,7 +135,7 @@ def test_recursion_agrees_with_pinocchio(file, floating):
     if model.nv == 0:
         pytest.skip("no joints: nothing moves")
     q, v, a, tau, _ = random_states(model, 5, 2)
-    got = quick(jax.vmap(lambda q, v, a, tau: (recursive.rnea(model, q, v, a), recursive.aba(model, q, v, tau))))(
+    got = quick(jax.vmap(lambda q, v, a, tau: (recursions.rnea(model, q, v, a), recursions.aba(model, q, v, tau))))(
         q, v, a, tau
     )
     data = source.createData()

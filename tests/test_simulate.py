@@ -22,7 +22,7 @@ from jaxdyn.kinematics import frame_pose
 from jaxdyn.model import integrate, neutral
 from jaxdyn.scene import Scene
 from jaxdyn.simulate import RESULTS, simulate
-from jaxdyn.solvers import RK4, LieGroup, ProjectedSolver
+from jaxdyn.solvers import RK4, ExplicitSteps, LieGroup, ProjectedSolver
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
 SYMMETRIC = np.array([0.4, 0.4, 0.2])
@@ -106,7 +106,12 @@ def test_only_models_with_quaternions_are_retracted(pendulum, leg, monkeypatch):
     """Nothing to retract, nothing compiled."""
     wrapped = []
     module = sys.modules["jaxdyn.simulate"]  # as an attribute of the package it is the function
-    monkeypatch.setattr(module, "ProjectedSolver", lambda *x: wrapped.append(x) or ProjectedSolver(*x))
+
+    def made(solver, project, *more, **fields):
+        wrapped.extend([] if project is None else [project])
+        return ExplicitSteps(solver, project, *more, **fields)
+
+    monkeypatch.setattr(module, "ExplicitSteps", made)
     for model, size in ((pendulum, 0), (leg, 1)):
         q0, v0 = neutral(model), jnp.zeros(model.nv)
         jax.make_jaxpr(lambda q, v, model=model: simulate(model, q, v, [0.0, 1.0], stepsize=0.1).q)(q0, v0)

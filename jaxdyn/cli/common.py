@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxdyn._table import short as short
 from jaxdyn._table import table as table
+from jaxdyn.arguments import as_path
 from jaxdyn.io import load_urdf
 from jaxdyn.joints import KINDS
 from jaxdyn.model import Model
@@ -107,7 +108,7 @@ def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathl
     """A file to write, checked before any work is done: its type is known and its directory exists."""
     if text is None:
         return None
-    path = pathlib.Path(text)
+    path = as_path(text, option)
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{option} {text}: write to a file that ends in {' or '.join(suffixes)}")
     if not path.parent.is_dir():

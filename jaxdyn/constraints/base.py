@@ -16,7 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.scene import Scene, as_pytree
+from jaxdyn.arguments import batch_hint, check_state, state_dtype
+from jaxdyn.compile import run
+from jaxdyn.scene import Scene, as_pytree, as_scene
 from jaxdyn.so3 import _product
 from jaxdyn.systems import velocity_to_rate
 
@@ -87,7 +89,9 @@ class Holonomic(Constraint):
         """phi(q, t), (n,)."""
         value = self.phi(system, q, t) if self.with_system else self.phi(q, t)
         if jnp.ndim(value) > 1:
-            raise ValueError(f"constraint {self.name!r}: phi returned shape {jnp.shape(value)}; return a vector (n,)")
+            raise ValueError(
+                f"constraint {self.name!r}: phi returned shape {jnp.shape(value)}; return a vector (n,){batch_hint(value, (1,))}"
+            )
         return jnp.atleast_1d(jnp.asarray(value, q.dtype))
 
 
@@ -195,7 +199,10 @@ def slip_rows(places: Sequence[Layout]) -> np.ndarray:
 
 def position_residual(scene: Scene, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nh"]:
     """phi(q, t) of all holonomic parts, stacked in the scene's order; (0,) when there are none."""
-    t = jnp.asarray(t, q.dtype)
+    return run(_position_residual, scene, q, jnp.asarray(t, q.dtype))
+
+
+def _position_residual(scene: Scene, q, t):
     parts = [part for part in _positions(scene, q, t) if part is not None]
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), q.dtype)
 
@@ -204,9 +211,13 @@ def velocity_residual(
     scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0
 ) -> Float[Array, " nc"]:
     """psi(q, v, t) = A v - b of all constraints, (nc,)."""
-    found, rest, others = _split(scene, q, v, jnp.asarray(t, q.dtype))
+    return run(_velocity_residual, scene, q, v, jnp.asarray(t, q.dtype))
+
+
+def _velocity_residual(scene: Scene, q, v, t):
+    found, rest, others = _split(scene, q, v, t)
     if rest:
-        velocity = _by_functions(others, q, v, jnp.asarray(t, q.dtype))
+        velocity = _by_functions(others, q, v, t)
         for i, place in zip(rest, layout(others), strict=True):
             found[i] = (velocity[place.start : place.end],)
     return jnp.concatenate([parts[-1] for parts in found])
@@ -224,7 +235,10 @@ def _by_functions(scene: Scene, q, v, t):
 
 def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Rows:
     """A, gamma and A v - b of all constraints of the scene (see `Rows`)."""
-    t = jnp.asarray(t, q.dtype)
+    return run(_rows, scene, q, v, jnp.asarray(t, q.dtype))
+
+
+def _rows(scene: Scene, q, v, t) -> Rows:
     found, rest, others = _split(scene, q, v, t)
     if rest:
         motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
@@ -248,9 +262,14 @@ def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> F
 
     Source: EQUATIONS section 7.
     """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints; add some to have rows")
-    t = jnp.asarray(t, q.dtype)
+    return run(_jacobian, scene, q, t)
+
+
+def _jacobian(scene: Scene, q, t):
     found, rest, others = _split(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
     if rest:
         A = _by_differentiation(others, q, t)
@@ -275,15 +294,6 @@ def _by_differentiation(scene: Scene, q, t):
     # psi is affine in v, so one mode costs a pass per row and the other one per column.
     differentiate = jax.jacrev if layout(scene)[-1].end < scene.nv else jax.jacfwd
     return differentiate(lambda v: _by_functions(scene, q, v, t))(jnp.zeros((scene.nv,), q.dtype))
-
-
-def state_dtype(system):
-    """Floating-point type of a system's states: that of a Model's leaves, else of its numbers, else jax's default."""
-    home = getattr(system, "home", None)
-    if home is not None:
-        return home.dtype
-    kinds = [leaf.dtype for leaf in jax.tree.leaves(system) if eqx.is_inexact_array(leaf)]
-    return jnp.result_type(*kinds) if kinds else jnp.zeros(()).dtype
 
 
 def _positions(scene: Scene, q, t) -> list:

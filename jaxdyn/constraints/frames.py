@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn import se3, so3
+from jaxdyn.compile import is_expanding
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.kinematics import Carried, carried, take
 from jaxdyn.model import Model, frame_index
@@ -102,17 +103,15 @@ class Pair(Constraint):
     @classmethod
     def grouped_position(cls, members: Sequence["Pair"], system, q, t):
         """Residuals (nh,) of each constraint, None without one."""
-        return _positions(tuple(members), system, q)
+        return (_positions_of if is_expanding() else _positions)(tuple(members), system, q)
 
     @classmethod
     def grouped_motion(cls, members: Sequence["Pair"], system, q, v, t):
         """A (r, nv), gamma (r,) and velocity (r,) of each constraint."""
-        return _motions(tuple(members), system, q, v)
+        return (_motions_of if is_expanding() else _motions)(tuple(members), system, q, v)
 
 
-# A program that asks many times, as steps with projections do, traces each of these once.
-@eqx.filter_jit
-def _positions(members: tuple[Pair, ...], system, q) -> list:
+def _positions_of(members: tuple[Pair, ...], system, q) -> list:
     rotation, position = relative_poses(members, system, q)
     found: list = [None] * len(members)
     for index, build, leaves in _batches(members):
@@ -125,8 +124,7 @@ def _positions(members: tuple[Pair, ...], system, q) -> list:
     return found
 
 
-@eqx.filter_jit
-def _motions(members: tuple[Pair, ...], system, q, v) -> list:
+def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
     frames, n = _both_frames(members, system, q, v), len(members)
     rotation, position, across = _seen_from_a(frames)
     inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
@@ -156,6 +154,11 @@ def _motions(members: tuple[Pair, ...], system, q, v) -> list:
         for k, i in enumerate(index):
             found[i] = columns[k], gamma[k], velocity[k]
     return found
+
+
+# A program that asks many times, as steps with projections do, traces each of these once. A nested `jit` would hide what is
+# known.
+_positions, _motions = eqx.filter_jit(_positions_of), eqx.filter_jit(_motions_of)
 
 
 def relative_poses(members, system, q):

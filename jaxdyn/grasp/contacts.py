@@ -17,42 +17,7 @@ from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies, pose_leaf
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
-
-# Components (fx, fy, fz, tx, ty, tz) of a wrench that each contact transmits.
-_SPATIAL = {
-    "frictionless": (2,),
-    "hard-finger": (0, 1, 2),
-    "soft-finger": (0, 1, 2, 5),
-    "rigid": (0, 1, 2, 3, 4, 5),
-}
-_IN_PLANE = {"frictionless": (2,), "hard-finger": (0, 2), "rigid": (0, 2, 4)}
-
-
-def wrench_basis(kind: str, *, in_plane: bool = False) -> Float[np.ndarray, "6 m"]:
-    """Wrench basis B (6, m) of a contact: its columns are the wrenches (f, tau) that it transmits.
-
-    | kind         | m | B in the contact frame                   | m and rows in a plane |
-    |--------------|---|------------------------------------------|-----------------------|
-    | frictionless | 1 | force along z                            | 1: fz                 |
-    | hard-finger  | 3 | all forces: a point with friction        | 2: fx, fz             |
-    | soft-finger  | 4 | all forces, torque about z               |                       |
-    | rigid        | 6 | all                                      | 3: fx, fz, ty         |
-
-    The contact frame's z is the normal into the object, and its x-z plane is the plane of a planar mechanism.
-
-    **Raises:** ValueError for an unknown kind.
-
-    Source: Murray, Li & Sastry (1994), table 5.2; EQUATIONS section 10.
-    """
-    return np.eye(6)[:, list(_components(kind, in_plane, "contact"))]
-
-
-def _components(kind: str, in_plane: bool, what: str) -> tuple[int, ...]:
-    kinds = _IN_PLANE if in_plane else _SPATIAL
-    if kind not in kinds:
-        hint = "; in a plane a soft finger is a hard one" if kind in _SPATIAL else ""
-        raise ValueError(f"{what}: kind {kind!r} is unknown; choose from {', '.join(kinds)}{hint}")
-    return kinds[kind]
+from jaxdyn.contact.kinds import components
 
 
 class Contact(Pair):
@@ -73,7 +38,7 @@ class Contact(Pair):
     @property
     def components(self) -> tuple[int, ...]:
         """Components of the relative twist, in the contact frame, that are zero."""
-        return _components(self.kind, self.in_plane, self.name)
+        return components(self.kind, self.in_plane, self.name)
 
     @property
     def _spins(self) -> bool:
@@ -132,7 +97,7 @@ def contact(
     Source: Murray, Li & Sastry (1994), eq. 5.14; EQUATIONS section 10.
     """
     name = finger if name is None else name
-    _components(kind, in_plane, f"contact {name!r}")
+    components(kind, in_plane, f"contact {name!r}")
     return Contact(
         name=name,
         kind=kind,

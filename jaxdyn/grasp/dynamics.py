@@ -17,24 +17,25 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
 from jaxdyn._rank import pseudo_inverse, tolerance
-from jaxdyn._tracing import compiled
-from jaxdyn.constrained import RESULTS, applied
+from jaxdyn.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.compile import compiled
+from jaxdyn.constrained import RESULTS, Outcome, applied
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.dynamics import coriolis_matrix, gravity_force, mass_matrix
-from jaxdyn.grasp.hand import Grasp
+from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.reduced import least_quality
 from jaxdyn.so3 import _product
 from jaxdyn.systems import velocity_to_rate
 
 
-class ObjectDynamics(eqx.Module):
+class ObjectDynamics(Outcome):
     """M~ Vdot + C~ V + N~ = F of a grasped object, its solution and the contact forces.
 
     - `mass_matrix`, `coriolis_matrix` (no, no); `gravity_force`, `force` (no,): M~, C~, N~, F, wrenches in the object's
       frame for a free body. M~ is symmetric, dM~/dt - 2 C~ skew.
     - `rate` (no,): Vdot. `velocity`, `acceleration` (nv,): of all joints, thetadot = X V among them.
     - `contact_forces` (nc,): on the object, along the contacts' components, N and N m.
-    - `result`: one of `jaxdyn.constrained.RESULTS`; `singular_basis` where the hand Jacobian is singular.
+    - `result`: one of `jd.RESULTS`; `singular_basis` where the hand Jacobian is singular.
     - `layout`: name and place of each contact's rows.
     """
 
@@ -71,6 +72,10 @@ def object_dynamics(
 
     Source: Murray, Li & Sastry (1994), eqs 6.21-6.25; EQUATIONS section 10 and errata E35-E37.
     """
+    check_grasp(grasp)
+    tau = or_zeros(tau, grasp.nv)
+    q, tau, t = check_state(grasp.system, q=q, tau=tau, t=t)
+    V = as_array(V, "V", q.dtype)
     count, joints = layout(grasp)[-1].end, len(grasp.hand_velocities)
     if count != joints:
         raise ValueError(
@@ -80,8 +85,9 @@ def object_dynamics(
     if V.shape != (len(grasp.object_velocities),):
         raise ValueError(
             f"V has shape {V.shape}, expected {(len(grasp.object_velocities),)}, the velocity of {grasp.object!r}"
+            f"{batch_hint(V, (1,))}"
         )
-    return _solve(grasp, q, V, tau, jnp.asarray(t, q.dtype))
+    return _solve(grasp, q, V, tau, t)
 
 
 @compiled

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn._rank import pseudo_inverse, tolerance
+from jaxdyn.arguments import as_array, batch_hint
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.grasp.joining import joined
@@ -80,6 +81,7 @@ def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[A
 
     Source: Murray, Li & Sastry (1994), eq. 5.28; EQUATIONS section 10.
     """
+    check_grasp(grasp)
     return -constraint_jacobian(grasp, q, t)[:, np.array(grasp.hand_velocities, int)]
 
 
@@ -91,6 +93,7 @@ def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array
 
     Source: Murray, Li & Sastry (1994), eq. 5.11; EQUATIONS section 10.
     """
+    check_grasp(grasp)
     return constraint_jacobian(grasp, q, t)[:, np.array(grasp.object_velocities, int)].T
 
 
@@ -106,7 +109,18 @@ def internal_forces(
     Source: Murray, Li & Sastry (1994), sections 5.3 and 6.3; EQUATIONS section 10.
     """
     G = grasp_map(grasp, q, t)
+    lam = as_array(lam, "lam", G.dtype)
+    if lam.shape != G.shape[1:]:
+        raise ValueError(
+            f"lam has shape {lam.shape}, expected {G.shape[1:]}, one per row of the grasp{batch_hint(lam, (1,))}"
+        )
     return lam - _product(pseudo_inverse(G, tolerance(None, G)), _product(G, lam))
+
+
+def check_grasp(grasp) -> None:
+    """Refuse what is no `Grasp`."""
+    if not isinstance(grasp, Grasp):
+        raise ValueError(f"grasp is a {type(grasp).__name__}; pass a jd.grasp.Grasp")
 
 
 def _check_object(model: Model, name: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.model import Model
-from jaxdyn.scene import Scene
+from jaxdyn.scene import Scene, as_scene
 
 
 class Chosen(eqx.Module):
@@ -46,7 +46,7 @@ class Chosen(eqx.Module):
     def scene(self, y: Float[Array, " p"]) -> Scene:
         """The scene with the numbers of y."""
         found = self.system(y)
-        return found if isinstance(found, Scene) else Scene(found)
+        return as_scene(found)
 
 
 class _Leaf:

@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.base import state_dtype
+from jaxdyn.arguments import state_dtype
 from jaxdyn.identify.chosen import Chosen, choose
 from jaxdyn.identify.gauss_newton import Unknowns, gauss_newton, linear, standard_deviation
 from jaxdyn.identify.logs import Log, check_log

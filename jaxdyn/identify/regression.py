@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import dynamics
+from jaxdyn.arguments import as_array, check_shapes
 from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.joints import KINDS
@@ -65,7 +66,8 @@ def regressor(model: Model, q, v, a, *, v_s=0.01) -> np.ndarray:
 
     Computed in the model's dtype in blocks of equal size (one compilation for logs of any length), returned in float64.
     """
-    q, v, a = (np.asarray(x, model.home.dtype) for x in (q, v, a))
+    check_shapes(model)
+    q, v, a = (np.asarray(as_array(x, name), model.home.dtype) for name, x in (("q", q), ("v", v), ("a", a)))
     n = len(q)
     parts = []
     for start in range(0, n, _BLOCK):

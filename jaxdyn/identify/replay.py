@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.base import state_dtype
+from jaxdyn.arguments import state_dtype
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.model import Model
-from jaxdyn.scene import Scene
+from jaxdyn.scene import Scene, as_scene
 from jaxdyn.simulate import simulate
 from jaxdyn.systems import displace, displacement
 
@@ -100,7 +100,7 @@ def trajectory_error(
 
 def replayed(system: Any, log: Log, horizon: int | None, friction: Any = None) -> tuple[Scene, Segments]:
     """The scene of a `Model`, another system or a `Scene`, with one more force; and the log's segments for it."""
-    scene = system if isinstance(system, Scene) else Scene(system)
+    scene = as_scene(system)
     check_log(log, scene.system, needs=("v",))
     if friction is not None:
         scene = Scene(scene.system, scene.constraints, (*scene.forces, friction))

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import dynamics
-from jaxdyn.constraints.base import state_dtype
+from jaxdyn.arguments import state_dtype
 from jaxdyn.identify.friction import Friction
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
 from jaxdyn.model import Model
-from jaxdyn.scene import Scene
+from jaxdyn.scene import Scene, as_scene
 
 
 class AbstractFit(eqx.Module):
@@ -133,7 +133,7 @@ class ParameterFit(AbstractFit):
     @property
     def scene(self) -> Scene:
         """The fitted scene; of a system, the scene of it alone."""
-        return self.system if isinstance(self.system, Scene) else Scene(self.system)
+        return as_scene(self.system)
 
     @property
     def parameters(self) -> list[tuple[str, float, float, float]]:

@@ -1,10 +1,10 @@
 """Logs as files: CSV or NPZ with named columns t, q1.., v1.., a1.., tau1.. (or q_<joint name> ...)."""
 
 import csv
-import pathlib
 
 import numpy as np
 
+from jaxdyn.arguments import as_path
 from jaxdyn.identify.logs import Log
 
 _SIGNALS = ("q", "v", "a", "tau")
@@ -26,7 +26,7 @@ def read_log(path, *, joint_names=None) -> Log:
     **Raises:** FileNotFoundError; ValueError, with the path, for another file type, a cell that is no number (line and
     column), missing or repeated columns, and all that `Log` refuses (NaN, unequal lengths, time running backwards).
     """
-    path = pathlib.Path(path)
+    path = as_path(path)
     readers = {".csv": _read_csv, ".npz": _read_npz}
     if path.suffix.lower() not in readers:
         raise ValueError(f"{path}: log files are .csv or .npz, not {path.suffix!r}")
@@ -46,7 +46,7 @@ def write_log(path, log: Log) -> None:
 
     **Raises:** ValueError for another file type.
     """
-    path = pathlib.Path(path)
+    path = as_path(path)
     columns: dict[str, np.ndarray] = {"t": np.asarray(log.t)}
     named = log.joint_names if log.q.shape[1] == log.nv else None
     for signal in _SIGNALS:

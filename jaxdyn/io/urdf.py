@@ -7,14 +7,16 @@ not asked first). Meshes and all that is only seen are never looked at.
 
 import io
 import os
+import warnings
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxdyn import _float64 as f64
+from jaxdyn.arguments import as_path
 from jaxdyn.building import GRAVITY, ModelBuilder, inertia_problems, unknown
+from jaxdyn.io.urdf_check import JOINTS, NUMBERS, REQUIRED, check_elements
 from jaxdyn.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model import Model
 
@@ -22,19 +24,6 @@ from jaxdyn.model import Model
 NO_LIMIT = float(np.finfo(np.float64).max)
 ROOT_JOINT = "root_joint"
 _Z = np.array([0.0, 0.0, 1.0])
-_KINDS = {"floating": "free", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar", "fixed")}}
-# Attributes that must hold so many finite numbers where they are given. The model needs no others.
-_NUMBERS = {
-    "origin": {"xyz": 3, "rpy": 3},
-    "axis": {"xyz": 3},
-    "mass": {"value": 1},
-    "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 1),
-    "limit": dict.fromkeys(("lower", "upper", "velocity", "effort"), 1),
-    "dynamics": dict.fromkeys(("damping", "friction", "armature"), 1),
-    "mimic": {"multiplier": 1, "offset": 1},
-}
-_REQUIRED = {"mass": ("value",), "inertia": tuple(_NUMBERS["inertia"]), "parent": ("link",), "child": ("link",)}
-_REQUIRED["mimic"] = ("joint",)
 
 
 class _Description(NamedTuple):
@@ -76,16 +65,20 @@ def load_urdf(
     - `gravity`, `dtype`: as for `ModelBuilder`.
 
     **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, links that are not a tree,
-    an unknown joint type, a bad number, a negative mass, a zero axis; for names in `lock` that are not movable joints;
+    an unknown joint type, a bad number, a part that is given twice, a declared entity, a negative mass, a negative limit of
+    velocity or effort, a zero axis; for names in `lock` that are not movable joints;
     for a joint that moves no inertia. ImportError without yourdfpy.
+
+    **Warns:** UserWarning naming the links with a negative moment of inertia.
     """
     if mimic not in ("ignore", "couple", "error"):
         raise ValueError(f"mimic is {mimic!r}; give 'ignore', 'couple' or 'error'")
     urdf = _read(path)
+    _warn_of_inertias(urdf)
     root_joint = ROOT_JOINT
     while root_joint in urdf.joints:
         root_joint = f"_{root_joint}"
-    kinds = {name: _KINDS[joint.type] for name, joint in urdf.joints.items()}
+    kinds = {name: JOINTS[joint.type] for name, joint in urdf.joints.items()}
     held = _held({root_joint: "free", **kinds} if floating_base else kinds, lock, path)
     couplings = {name: joint.mimic for name, joint in urdf.joints.items() if joint.mimic and kinds[name] != "fixed"}
     if mimic == "error" and couplings:
@@ -135,8 +128,21 @@ def urdf_inertia_report(path: str | os.PathLike) -> list[tuple[str, str]]:
     return report
 
 
+def _warn_of_inertias(urdf: _Description) -> None:
+    for name, link in urdf.links.items():
+        if link.inertial is None or link.inertial.inertia is None:
+            continue
+        moments = np.linalg.eigvalsh(link.inertial.inertia)
+        if moments[0] < -1e-9 * np.abs(moments).max():
+            warnings.warn(
+                f"{urdf.places[f'link {name}']}: link {name!r}: a principal moment of inertia is negative "
+                f"({moments[0]:.6g} kg m^2); mend <inertia>, or take jd.repair_inertias(model)",
+                stacklevel=3,
+            )
+
+
 def _add_joint(builder: ModelBuilder, joint, inertia, urdf: _Description, held: dict[str, np.ndarray]) -> None:
-    kind, name = _KINDS[joint.type], joint.child
+    kind, name = JOINTS[joint.type], joint.child
     pose = np.eye(4) if joint.origin is None else joint.origin
     parent, axis, turn = joint.parent, _Z, np.eye(4)
     if kind in SCREW_KINDS or kind == "planar":
@@ -254,7 +260,7 @@ def _settle(couplings: dict, kinds: dict[str, str], held: dict[str, np.ndarray],
 def _read(path) -> _Description:
     etree, yourdfpy = _libraries()
     try:
-        data = Path(path).read_bytes()
+        data = as_path(path).read_bytes()
     except OSError as error:
         raise ValueError(f"URDF file {str(path)!r} cannot be read ({error.strerror}); check the path") from error
     # Undeclared namespace prefixes are common and harmless; all other faults that the parser can mend are errors.
@@ -270,11 +276,17 @@ def _read(path) -> _Description:
             raise ValueError(f"{path}:{entry.line}: malformed XML: {entry.message}")
     if root is None:
         raise ValueError(f"{path}:1: malformed XML: there is no element in the file")
-    elements, places = _check(root, path)
+    for declared in () if (dtd := root.getroottree().docinfo.internalDTD) is None else dtd.iterentities():
+        line = data[: max(data.find(b"<!ENTITY"), 0)].count(b"\n") + 1
+        raise ValueError(
+            f"{path}:{line}: the file declares the entity {declared.name!r}, which is refused, as entities can expand without "
+            "bound; write its text where it is used"
+        )
+    elements, places = check_elements(root, path)
     kept = etree.Element("robot", name=root.get("name"))
     for element in elements:
         copy = etree.SubElement(kept, element.tag, dict(element.attrib))
-        copy.extend(part for part in element if part.tag in (*_NUMBERS, *_REQUIRED, "inertial"))
+        copy.extend(part for part in element if part.tag in (*NUMBERS, *REQUIRED, "inertial"))
     robot = yourdfpy.URDF.load(io.BytesIO(etree.tostring(kept)), build_scene_graph=False, load_meshes=False).robot
     armature = {
         joint.get("name"): float(dynamics.get("armature"))
@@ -296,64 +308,6 @@ def _libraries():
     except ImportError as error:
         raise ImportError("reading URDF files needs yourdfpy: pip install jaxdyn[urdf]") from error
     return etree, yourdfpy
-
-
-def _check(root, path) -> tuple[list, dict[str, str]]:
-    """The link and joint elements, once names, references and numbers are found in order; file:line of each."""
-
-    def fault(element, text) -> ValueError:
-        return ValueError(f"{path}:{element.sourceline}: {text}")
-
-    if root.tag != "robot":
-        raise fault(root, f"the root element is <{root.tag}>, expected <robot>; this is not a URDF file")
-    elements = [element for element in root if element.tag in ("link", "joint")]
-    if not elements or not root.get("name"):
-        missing = "name" if elements else "<link>"
-        hint = "; expand this xacro file first: xacro IN > OUT" if "xacro" in root.nsmap else ""
-        raise fault(root, f"the robot has no {missing}{hint}")
-    places: dict[str, str] = {}
-    for element in elements:
-        tag, name = element.tag, element.get("name")
-        if not name:
-            raise fault(element, f"a <{tag}> has no name")
-        if f"{tag} {name}" in places:
-            raise fault(element, f"the {tag} name {name!r} is taken at {places[f'{tag} {name}']}; rename one")
-        places[f"{tag} {name}"] = f"{path}:{element.sourceline}"
-        for part in element.iter(*_NUMBERS, *_REQUIRED):
-            if part.getparent().tag in ("visual", "collision"):
-                continue
-            for key in _REQUIRED.get(part.tag, ()):
-                if part.get(key) is None:
-                    raise fault(part, f"<{part.tag}> of {tag} {name!r} has no {key}")
-            if part.get("quat_xyzw") is not None:
-                raise fault(part, f"<{part.tag}> of {tag} {name!r} has quat_xyzw, which is not read; write it as rpy")
-            for key, count in _NUMBERS.get(part.tag, {}).items():
-                if (text := part.get(key)) is not None and not _are_numbers(text, count):
-                    what = "a finite number" if count == 1 else f"{count} finite numbers"
-                    raise fault(part, f"{key} of <{part.tag}> of {tag} {name!r} is {text!r}, expected {what}")
-    for element in elements:
-        if element.tag == "link":
-            continue
-        name = element.get("name")
-        if element.get("type") not in _KINDS:
-            kinds = ", ".join(_KINDS)
-            raise fault(
-                element, f"joint {name!r} has type {element.get('type')!r}, which is unknown; types are {kinds}"
-            )
-        for end in ("parent", "child"):
-            if (part := element.find(end)) is None:
-                raise fault(element, f"joint {name!r} has no <{end}>")
-            if f"link {part.get('link')}" not in places:
-                raise fault(part, f"joint {name!r}: the {end} link {part.get('link')!r} is not in the file")
-    return elements, places
-
-
-def _are_numbers(text: str, count: int) -> bool:
-    try:
-        values = [float(part) for part in text.split()]
-    except ValueError:
-        return False
-    return len(values) == count and bool(np.all(np.isfinite(values)))
 
 
 def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str], path) -> str:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdyn import _float64 as f64
+from jaxdyn.arguments import as_path, check_shapes
 from jaxdyn.io.urdf import NO_LIMIT, ROOT_JOINT
 from jaxdyn.model import Model
 
@@ -37,6 +38,8 @@ def save_urdf(model: Model, path: str | os.PathLike) -> None:
     of planar and free joints, friction or armature that differs between the directions of one joint, first moments
     without mass. OSError when the file cannot be written.
     """
+    check_shapes(model)
+    path = as_path(path)
     root, edges = _edges(model)
     inertias = dict(zip(model.body_names, np.asarray(model.inertias, np.float64), strict=True))
     robot = ET.Element("robot", name=model.name)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 
-from jaxdyn._tracing import is_concrete, is_known
+from jaxdyn.arguments import batch_hint
+from jaxdyn.compile import is_concrete, is_known
 from jaxdyn.scene import Scene
 from jaxdyn.solvers.first_step import Adaptive
 from jaxdyn.solvers.fixed_steps import Watched
@@ -41,7 +42,7 @@ def checked_method(solver, stepsize):
         raise ValueError(f"solver is {solver!r}; pass an instance of a diffrax solver, e.g. diffrax.Tsit5()")
     if is_fixed(stepsize):
         if np.shape(stepsize) != ():
-            raise ValueError(f"stepsize has shape {np.shape(stepsize)}; pass one number (s)")
+            raise ValueError(f"stepsize has shape {np.shape(stepsize)}; pass one number (s){batch_hint(stepsize, ())}")
         if is_concrete(stepsize) and not (np.isfinite(stepsize) and stepsize > 0):
             raise ValueError(f"stepsize is {stepsize}; pass a positive number (s), or None for adaptive steps")
         solver = RK4() if solver is None else solver
@@ -50,7 +51,8 @@ def checked_method(solver, stepsize):
             raise ValueError("stepsize is a ConstantStepSize, which holds no length; pass the step as a number (s)")
         solver = diffrax.Dopri8() if solver is None else solver
         adaptive = stepsize is None or isinstance(stepsize, diffrax.AbstractAdaptiveStepSizeController)
-        if adaptive and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        # The estimate of RK4 tells steps that are too long, and is too coarse to choose them by.
+        if adaptive and (isinstance(solver, RK4) or not isinstance(solver, diffrax.AbstractAdaptiveSolver)):
             name = type(solver).__name__
             raise ValueError(f"solver {name} has no error estimate for adaptive steps; pass stepsize=, a number (s)")
     structure = solver.term_structure

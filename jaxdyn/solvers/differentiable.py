@@ -83,9 +83,42 @@ def _(perturbed, moving, options, room):
 
 @_run.def_bwd
 def _(taken, gradients, perturbed, moving, options, room):
+    return _pulled(perturbed, moving, _again(options, taken), gradients[0])
+
+
+def run_driven(moving, drive, options, room):
+    """As `run`, by steps that are not diffrax's: drive(y0, args, ts) -> (rows, facts, sums about fixed steps).
+
+    Reverse mode takes the steps by diffrax, with the `options` of `run`.
+    """
+    numbers, rest = eqx.partition(options, eqx.is_array)
+    return _driven(moving, drive, eqx.combine(jax.lax.stop_gradient(numbers), rest), room)
+
+
+@eqx.filter_custom_vjp
+def _driven(moving, drive, options, room):
+    return drive(*moving)
+
+
+@_driven.def_fwd
+def _(perturbed, moving, drive, options, room):
+    if options["dt0"] is not None:
+        return drive(*moving), None
+    rows, facts, taken = _recorded(moving, options, room)
+    return (rows, facts, None), taken
+
+
+@_driven.def_bwd
+def _(taken, gradients, perturbed, moving, drive, options, room):
+    again = options if taken is None else _again(options, taken)
+    return _pulled(perturbed, moving, again, gradients[0])
+
+
+def _pulled(perturbed, moving, options, gradients):
+    """Cotangents of what moves, by diffrax's adjoint."""
     free, fixed = eqx.partition(moving, perturbed)
-    rows, pull = eqx.filter_vjp(lambda free: run(eqx.combine(free, fixed), **_again(options, taken))[0], free)
-    weights = jax.tree.map(lambda y, g: jnp.zeros_like(y) if g is None else g, rows, gradients[0])
+    rows, pull = eqx.filter_vjp(lambda free: run(eqx.combine(free, fixed), **options)[0], free)
+    weights = jax.tree.map(lambda y, g: jnp.zeros_like(y) if g is None else g, rows, gradients)
     return pull(weights)[0]
 
 

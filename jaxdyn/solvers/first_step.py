@@ -1,13 +1,9 @@
 """Length of the first adaptive step, and the step-size control that begins with it."""
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-
-from jaxdyn._ways import is_straight
 
 
 class Adaptive(diffrax.PIDController):
@@ -35,19 +31,9 @@ class Adaptive(diffrax.PIDController):
         eps, at_end = jnp.finfo(jnp.result_type(t1)).eps, jnp.asarray(self.dtmin)
         least = jnp.clip(16 * eps * jnp.abs(t0), eps * at_end, at_end)
         local = eqx.tree_at(lambda c: c.dtmin, self, least)
-        *step, result = diffrax.PIDController.adapt_step_size(
+        return diffrax.PIDController.adapt_step_size(
             local, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
         )
-        return *step, ended_where_not_straight(result, y_error)
-
-
-def ended_where_not_straight(result, numbers):
-    """The result of a step, or one that ends the run where it had to go `straight` and could not: its `numbers` are NaN."""
-    if not is_straight():
-        return result
-    finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(numbers)]).all()
-    codes: Any = diffrax.RESULTS
-    return codes.where(finite, result, codes.internal_error)
 
 
 def first_step(terms, t0, t1, y0, args, order, rtol, atol, norm):

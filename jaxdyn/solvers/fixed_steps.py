@@ -7,8 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.solvers.first_step import ended_where_not_straight
-
 ALLOWED = 0.1  # of how far positions, or velocities, come from where they started
 _PASSED_OVER = ("frame", "work")  # constants of a step, and what nothing depends on
 
@@ -29,32 +27,43 @@ class Watched(diffrax.ConstantStepSize):
     def init(self, terms, t0, t1, y0: Any, dt0, args, func, error_order):
         """End of the first step; besides diffrax's state the start, sums of errors, and how far the motion came."""
         end, inner = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
-        start = jax.lax.stop_gradient(_rows(y0))
-        none = jnp.zeros(start.shape[0], start.dtype)
-        return end, (inner, start, none, none)
+        start = jax.lax.stop_gradient(y0)
+        return end, (inner, start, *no_sums(y0))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order: Any, controller_state: Any):
         """The next step, and its error added to the sum."""
         inner, start, errors, ways = controller_state
         *step, inner, result = super().adapt_step_size(t0, t1, y0, y1_candidate, args, y_error, error_order, inner)
         if y_error is not None:
-            before, after, error = (jax.lax.stop_gradient(_rows(y)) for y in (y0, y1_candidate, y_error))
-            # One reduction: for a pendulum it is as dear as its dynamics.
-            sizes = jnp.max(jnp.abs(jnp.stack([error, after - before, after - start])), -1)
-            error, moved, way = sizes[0], sizes[1], sizes[2]
             order: Any = self.order
-            if error_order < order:
-                share = jnp.minimum(error / jnp.maximum(moved, jnp.finfo(moved.dtype).tiny), 1.0)
-                power = (order + 1 - error_order) / (error_order - 1)
-                error = error * (share if power == 1 else share**power)
-            ways = jnp.maximum(ways, way)
-            errors = errors + error + jnp.where(moved > 0, jnp.finfo(way.dtype).eps * ways, jnp.zeros_like(ways))
-        return *step, (inner, start, errors, ways), ended_where_not_straight(result, y1_candidate)
+            errors, ways = watched(order, error_order, start, y0, y1_candidate, y_error, errors, ways)
+        return *step, (inner, start, errors, ways), result
 
 
-def too_coarse(controller_state):
-    """Whether a motion by `Watched` steps may be wrong by more than a tenth, ()."""
-    _, _, errors, ways = controller_state
+def no_sums(y):
+    """The sums of `watched` before the first step."""
+    rows = _rows(y)
+    none = jnp.zeros(rows.shape[0], rows.dtype)
+    return none, none
+
+
+def watched(order, error_order, start, y0, y1, error, errors, ways):
+    """The sums of what steps may be wrong by and of the longest way from the start, after one step more (see `Watched`)."""
+    start, before, after, error = (jax.lax.stop_gradient(_rows(y)) for y in (start, y0, y1, error))
+    # One reduction: for a pendulum it is as dear as its dynamics.
+    sizes = jnp.max(jnp.abs(jnp.stack([error, after - before, after - start])), -1)
+    error, moved, way = sizes[0], sizes[1], sizes[2]
+    if error_order < order:
+        share = jnp.minimum(error / jnp.maximum(moved, jnp.finfo(moved.dtype).tiny), 1.0)
+        power = (order + 1 - error_order) / (error_order - 1)
+        error = error * (share if power == 1 else share**power)
+    ways = jnp.maximum(ways, way)
+    return errors + error + jnp.where(moved > 0, jnp.finfo(way.dtype).eps * ways, jnp.zeros_like(ways)), ways
+
+
+def too_coarse(sums):
+    """Whether a motion by `Watched` steps may be wrong by more than a tenth, (); `sums` as of `watched`."""
+    errors, ways = sums
     # Below the root of eps, of what rests, all is rounding.
     return (errors > ALLOWED * jnp.maximum(ways, jnp.sqrt(jnp.finfo(ways.dtype).eps))).any()
 

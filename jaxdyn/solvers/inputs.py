@@ -1,30 +1,20 @@
 """Checks of the numbers that are given to `simulate`."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn._tracing import is_concrete
+from jaxdyn.arguments import batch_hint, check_shape
+from jaxdyn.compile import is_concrete
 from jaxdyn.model import Model
 from jaxdyn.scene import Scene
+from jaxdyn.solvers.choice import is_fixed
 from jaxdyn.systems import has_quaternions
 
 
-def as_array(value):
-    """Lists and numbers as numpy arrays, which stay known inside a trace; arrays and what holds tracers by jax."""
-    if isinstance(value, (np.ndarray, jax.Array)):
-        return value
-    return np.asarray(value) if is_concrete(value) else jnp.asarray(value)
-
-
-def check_state(scene: Scene, q0, v0) -> None:
+def check_start(scene: Scene, q0, v0) -> None:
     """Refuse states of a wrong shape, NaN, and quaternions that are far from unit length."""
-    for name, value, size, label in (("q0", q0, scene.nq, "(nq,)"), ("v0", v0, scene.nv, "(nv,)")):
-        if value.shape != (size,):
-            hint = "; simulate takes one sample, use jax.vmap for a batch" if value.ndim == 2 else ""
-            raise ValueError(
-                f"{name} has shape {value.shape}, expected {(size,)} = {label} of the scene's system{hint}"
-            )
+    for name, value in (("q0", q0), ("v0", v0)):
+        check_shape(scene.system, name, value)
         if is_concrete(value):
             _check_finite(name, value)
     if not (has_quaternions(scene.system) and is_concrete(q0)):
@@ -69,6 +59,28 @@ def check_turns(scene: Scene, q0, dtype) -> None:
             f"q0 is {value:.6g} rad at index {index}, which {jnp.dtype(dtype).name} holds only to {eps * abs(value):.1g} rad; "
             f"subtract the {round(value / (2 * np.pi))} whole turns, use float64, or fixed steps (stepsize=0.01)"
         )
+
+
+def check_tolerance(name: str, value) -> None:
+    """Refuse tolerances that are no single number, negative, infinite or NaN."""
+    if value.shape != ():
+        raise ValueError(f"{name} has shape {value.shape}; pass one number{batch_hint(value, ())}")
+    if is_concrete(value) and not (np.isfinite(value) and value >= 0):
+        raise ValueError(f"{name} is {value}; pass a finite number that is not negative, such as 1e-8")
+
+
+def usable_steps(steps, ts):
+    """(rtol, atol, stepsize or controller) with what cannot be used replaced, so that a bad lane of a batch ends soon.
+
+    **Returns:** the three, whether the step was positive and finite, and whether the tolerances were fine.
+    """
+    rtol, atol, stepsize = steps
+    fine_tolerances = jnp.isfinite(rtol) & (rtol >= 0) & jnp.isfinite(atol) & (atol >= 0)
+    rtol, atol = (jnp.where(fine_tolerances, x, jnp.full_like(x, 1e-3)) for x in (rtol, atol))
+    if not is_fixed(stepsize):
+        return (rtol, atol, stepsize), jnp.asarray(True), fine_tolerances
+    fine_steps = jnp.isfinite(stepsize) & (stepsize > 0)
+    return (rtol, atol, jnp.where(fine_steps, stepsize, ts[-1] - ts[0])), fine_steps, fine_tolerances
 
 
 def check_times(ts) -> None:

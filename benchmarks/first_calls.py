@@ -1,0 +1,208 @@
+"""What a user waits for: seconds of the import, of a first call and of a second one, each case in a fresh process.
+
+    python -m benchmarks.first_calls [CASE ...] [--rounds 3]
+
+Every case runs in two processes, one after the other. The first one has an empty folder of object files, the second one finds
+those of the first; JAX's own cache of programs is off in both. "build" is the time to read or build the mechanism, and to bring
+it to a start. A call is timed to its end. Numbers are the best of the rounds.
+"""
+
+import argparse
+import importlib.util
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent.parent
+STEPS = ("import", "build", "first call", "second call")
+PANDA = "panda_description/urdf/panda.urdf", False, ("panda_finger_joint1", "panda_finger_joint2")
+G1 = "g1_description/urdf/g1_29dof_rev_1_0.urdf", True, ()
+
+
+def robot(file: str, floating: bool, lock: tuple[str, ...]):
+    """A robot of the package example-robot-data, and a state q, v, tau."""
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    found = importlib.util.find_spec("pinocchio")  # beside which the files lie; it is not imported
+    if found is None or found.origin is None:
+        raise SystemExit("pinocchio and example-robot-data are not installed")
+    path = Path(found.origin).parents[4] / "share/example-robot-data/robots" / file
+    model = jd.load_urdf(path, floating_base=floating, lock=lock)
+    return model, jd.neutral(model), jnp.full(model.nv, 0.1), jnp.zeros(model.nv)
+
+
+def accelerate(which) -> Callable:
+    """Forward dynamics of a known robot."""
+    import jax
+
+    import jaxdyn as jd
+
+    model, *state = robot(*which)
+    run = jax.jit(lambda q, v, tau: jd.forward_dynamics(model, q, v, tau))
+    return lambda: run(*state)
+
+
+def simulate_panda() -> Callable:
+    """One second of the arm as it falls, adaptive steps."""
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    model, q, v, _ = robot(*PANDA)
+    return lambda: jd.simulate(model, q, v, jnp.linspace(0.0, 1.0, 11)).q
+
+
+def gradient_of_panda() -> Callable:
+    """Derivative of where the arm is after 100 steps of RK4 by where it started."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    model, q, v, _ = robot(*PANDA)
+    ts = jnp.asarray([0.0, 0.1])
+    run = jax.jit(jax.grad(lambda q: jnp.sum(jd.simulate(model, q, v, ts, stepsize=1e-3).q[-1])))
+    return lambda: run(q)
+
+
+def simulate_four_bar() -> Callable:
+    """One second of a loop of four bars."""
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    scene, (q, v) = jd.scenes.four_bar(), jd.scenes.four_bar.start()
+    return lambda: jd.simulate(scene, q, v, jnp.linspace(0.0, 1.0, 11)).q
+
+
+def stewart():
+    """A Stewart platform and a guess of a position: a plate on six legs with universal, prismatic and ball joints."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxdyn as jd
+
+    def on_circle(radius, degrees):
+        return (radius * math.cos(math.radians(degrees)), radius * math.sin(math.radians(degrees)), 0.0)
+
+    builder, loops, legs = jd.ModelBuilder("stewart platform"), [], range(6)
+    builder.add_body("plate", None, "free", (20.0, (0.0, 0.0, 0.0), (2.0, 2.0, 4.0)))
+    for i in legs:
+        middle, side = 120 * (i // 2), 2 * (i % 2) - 1
+        anchor = on_circle(1.0, middle + 10 * side)
+        builder.add_body(f"yoke{i}", None, "revolute", (0.1, (0.0, 0.0, 0.0), (1e-3,) * 3), axis=(1, 0, 0), pose=anchor)
+        builder.add_body(f"sleeve{i}", f"yoke{i}", "revolute", (3.0, (0.0, 0.0, 0.3), (0.1, 0.1, 0.01)), axis=(0, 1, 0))
+        builder.add_body(
+            f"rod{i}", f"sleeve{i}", "prismatic", (1.0, (0.0, 0.0, -0.3), (0.05, 0.05, 0.005)), axis=(0, 0, 1)
+        )
+        corner = on_circle(0.6, middle + 50 * side)
+        loops.append(jd.loop(f"rod{i}", None, "plate", corner, "spherical", name=f"ball{i}"))
+    model = builder.build()
+    q = np.array(jd.neutral(model))
+    place = dict(zip(model.body_names, model.topology.q_slices, strict=True))
+    q[place["plate"]][2] = 1.2
+    for i in legs:
+        q[place[f"rod{i}"]] = 1.3
+    return jd.Scene(model, tuple(loops)), jnp.asarray(q)
+
+
+def assemble_stewart() -> Callable:
+    """From a guess onto six loops."""
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    scene, q = stewart()
+    return lambda: jd.assemble(scene, q, jnp.zeros(scene.nv)).q
+
+
+def simulate_stewart() -> Callable:
+    """A tenth of a second of the platform as it falls; it is assembled before."""
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    scene, q = stewart()
+    start = jd.assemble(scene, q, jnp.zeros(scene.nv))
+    return lambda: jd.simulate(scene, start.q, start.v, jnp.linspace(0.0, 0.1, 3)).q
+
+
+CASES: dict[str, tuple[str, Callable[[], Callable]]] = {
+    "panda": ("forward dynamics of a Panda, under jit", lambda: accelerate(PANDA)),
+    "g1": ("forward dynamics of a G1, under jit", lambda: accelerate(G1)),
+    "panda_motion": ("simulate a Panda", simulate_panda),
+    "panda_gradient": ("gradient through 100 fixed steps of a Panda", gradient_of_panda),
+    "four_bar": ("simulate a four-bar", simulate_four_bar),
+    "stewart_assembly": ("assemble a Stewart platform", assemble_stewart),
+    "stewart_motion": ("simulate a Stewart platform", simulate_stewart),
+}
+
+
+def here(case: str) -> dict[str, float]:
+    """Seconds of each step, in this process."""
+    clock = [time.perf_counter()]
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    import jaxdyn  # noqa: F401
+
+    clock.append(time.perf_counter())
+    call = CASES[case][1]()
+    clock.append(time.perf_counter())
+    for _ in range(2):
+        jax.block_until_ready(call())
+        clock.append(time.perf_counter())
+    return {step: after - before for step, before, after in zip(STEPS, clock, clock[1:], strict=False)}
+
+
+def elsewhere(case: str, cache: str) -> dict[str, float]:
+    """The same in a fresh process."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("JAX_COMPILATION_CACHE")}
+    call = [sys.executable, "-m", "benchmarks.first_calls", "--here", case]
+    done = subprocess.run(
+        call, env=kept | {"XDG_CACHE_HOME": cache}, cwd=HERE, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(f"{case} failed:\n{done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def main(argv=None) -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES))
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--here", choices=list(CASES), help=argparse.SUPPRESS)
+    options = parser.parse_args(argv)
+    if options.here:
+        print(json.dumps(here(options.here)))
+        return
+    from benchmarks import timing
+
+    rows = []
+    print(
+        "| seconds | import | build | first call | second call | second process: first call |\n|---|---|---|---|---|---|"
+    )
+    for case in timing.chosen_names(options.cases, CASES):
+        cold, warm = [], []
+        for _ in range(options.rounds):
+            with tempfile.TemporaryDirectory() as cache:
+                cold.append(elsewhere(case, cache))
+                warm.append(elsewhere(case, cache))
+        first, again = ({step: min(x[step] for x in found) for step in STEPS} for found in (cold, warm))
+        rows.append({"case": case, "first process": first, "second process": again})
+        cells = [f"{first[step]:.3g}" for step in STEPS] + [f"{again['first call']:.3g}"]
+        print(f"| {CASES[case][0]} | {' | '.join(cells)} |", flush=True)
+    print("written to", timing.write("first_calls", {"machine": timing.machine(), "rows": rows}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""What users pass to functions of a system: numbers become arrays of its dtype, and what does not fit is refused."""
+
+import os
+import pathlib
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxdyn.compile import is_concrete
+
+_OPTIONAL = ("a", "external")
+
+
+def as_array(value: Any, name: str, dtype=None) -> Any:
+    """Real numbers as an array of `dtype`, by JAX.
+
+    Without a dtype arrays stay as they are, and lists and numbers become arrays of numpy, which stay known inside a trace,
+    unless they hold tracers.
+
+    **Raises:** ValueError that names the argument, for complex numbers and for what is no array of numbers.
+    """
+    if not isinstance(value, (np.ndarray, jax.Array)):
+        try:
+            value = np.asarray(value) if is_concrete(value) else jnp.asarray(value)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name} is {value!r}; pass an array of numbers, or a list of equal rows") from None
+    if jnp.issubdtype(value.dtype, jnp.complexfloating):
+        raise ValueError(f"{name} is complex ({value.dtype}); pass real numbers, such as {name}.real")
+    if not (jnp.issubdtype(value.dtype, jnp.number) or value.dtype == bool):
+        raise ValueError(f"{name} is {value!r}; pass an array of numbers")
+    if dtype is None or (isinstance(value, jax.Array) and value.dtype == dtype):
+        return value
+    return jnp.asarray(value, dtype)
+
+
+def or_zeros(value: Any, size: int) -> Any:
+    """A vector that was left out as one of zeros (size,)."""
+    return np.zeros(size) if value is None else value
+
+
+def as_path(path: Any, name: str = "path") -> pathlib.Path:
+    """A path that a user gave, `~` expanded.
+
+    **Raises:** ValueError for what is no path.
+    """
+    if not isinstance(path, (str, os.PathLike)) or isinstance(path, bytes):
+        raise ValueError(f"{name} is {path!r}; pass the path of a file, a string or a pathlib.Path")
+    return pathlib.Path(path).expanduser()
+
+
+def state_dtype(system, q=None):
+    """Floating-point type of a system's states: that of a Model's leaves, else of its numbers, else of q or jax's default."""
+    home = getattr(system, "home", None)
+    if home is not None:
+        return home.dtype
+    numbers = [leaf for leaf in jax.tree.leaves(system) if eqx.is_inexact_array(leaf)] or [q]
+    kinds = [leaf.dtype for leaf in numbers if eqx.is_inexact_array(leaf) and not jnp.iscomplexobj(leaf)]
+    return jnp.result_type(*kinds) if kinds else jnp.zeros(()).dtype
+
+
+def check_state(system, **arguments) -> tuple[Any, ...]:
+    """The arguments of a function of any system, in their order, as arrays of its dtype.
+
+    Names starting with q are to have shape (nq,), `t` (), `external` (nb, 6), all others (nv,). `a` and `external` may be
+    None.
+
+    **Raises:** ValueError that names the argument: a shape that does not fit, complex numbers, wrenches on the bodies of a
+    system that has none; for a Scene in the place of its system, and for what is no system.
+    """
+    check_system(system)
+    dtype, found = state_dtype(system, arguments.get("q")), []
+    for name, value in arguments.items():
+        if value is None and name in _OPTIONAL:
+            found.append(None)
+            continue
+        if name == "external" and not hasattr(system, "topology"):
+            raise ValueError(
+                f"external holds wrenches on bodies, and a {type(system).__name__} has none; add them to tau"
+            )
+        value = as_array(value, name, dtype)
+        check_shape(system, name, value)
+        found.append(value)
+    return tuple(found)
+
+
+def check_shape(system, name: str, value: Array | np.ndarray) -> None:
+    """Refuse an array whose shape does not fit the system, by the rules of `check_state`."""
+    if name == "t":
+        want, label = (), "()"
+    elif name == "external":
+        want, label = (system.nb, 6), "(nb, 6)"
+    elif name.startswith("q"):
+        want, label = (system.nq,), "(nq,)"
+    else:
+        want, label = (system.nv,), "(nv,)"
+    if value.shape != want:
+        whose = f"model {system.name!r}" if hasattr(system, "topology") else f"the {type(system).__name__}"
+        raise ValueError(
+            f"{name} has shape {value.shape}, expected {want} = {label} of {whose}{batch_hint(value, want)}"
+        )
+
+
+def batch_hint(value, want: tuple) -> str:
+    """What to do about a value that has one axis more than the shape that is wanted, else an empty string."""
+    return "; functions take one sample, use jax.vmap for a batch" if np.ndim(value) == len(want) + 1 else ""
+
+
+def check_system(system: Any, name: str = "model") -> None:
+    """Refuse what is no system, and a Scene, of which the system is to be passed.
+
+    **Raises:** ValueError that says what to pass.
+    """
+    if hasattr(system, "system") and hasattr(system, "constraints"):
+        raise ValueError(
+            f"{name} is a {type(system).__name__}; pass scene.system, as no constraints and forces are taken here"
+        )
+    if not (hasattr(system, "nq") and hasattr(system, "nv")):
+        raise ValueError(f"{name} is a {type(system).__name__}, which has no nq and nv; pass a Model or another system")
+
+
+def check_shapes(model, **arguments) -> tuple[Any, ...]:
+    """`check_state` for a function of a tree of bodies.
+
+    **Raises:** ValueError as there, and for a system that is no `Model`.
+    """
+    check_system(model)
+    if not hasattr(model, "topology"):
+        raise ValueError(f"model is a {type(model).__name__}, which has no bodies; pass a Model")
+    return check_state(model, **arguments)

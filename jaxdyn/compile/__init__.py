@@ -1,0 +1,25 @@
+"""How functions of one sample become machine code; the only place that knows.
+
+Mechanics are written with arrays, as a textbook writes them. `run(function, model, *args)` traces a function once, expands
+it to single numbers (`expand`, `graph`, `program`), writes these as LLVM IR over the lanes of a batch (`llvm`), and calls the
+machine code through XLA's foreign function interface (`target`, `objects`); `kernel` is the primitive of JAX that stands
+for it, with its batches, derivatives (`derive`) and the way without machine code. `compilation` (`mode`) turns all of it
+off.
+
+Imports nothing of jaxdyn. Others import the names below, and no module of this package.
+"""
+
+from jaxdyn.compile.calls import compiled as compiled
+from jaxdyn.compile.flags import unless as unless
+from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
+from jaxdyn.compile.kernel import compute as compute
+from jaxdyn.compile.kernel import native as native
+from jaxdyn.compile.kernel import run as run
+from jaxdyn.compile.known import is_concrete as is_concrete
+from jaxdyn.compile.known import is_known as is_known
+from jaxdyn.compile.known import is_staged as is_staged
+from jaxdyn.compile.known import partition_traced as partition_traced
+from jaxdyn.compile.mode import compilation as compilation
+from jaxdyn.compile.mode import is_expanding as is_expanding
+from jaxdyn.compile.rules import along as along
+from jaxdyn.compile.rules import implicit as implicit

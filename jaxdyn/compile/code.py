@@ -1,0 +1,227 @@
+"""The text of kernels: from a program of numbers to LLVM's intermediate representation.
+
+A kernel is `void kernel(ptr data, i64 n, i64 begin, i64 end)`: `data` points to the arguments and then to the results, each a row
+of numbers per sample (one row for all samples where an argument is uniform); samples begin .. end - 1 of n are computed, W at a
+time. Where fewer are left than W, the last sample stands in the other lanes.
+
+A subprogram is a function of the same name wherever its text is the same, so that it is compiled once for all kernels that call
+it: `void called(ptr ..., ptr ...)` with the arrays of its inputs, then of its outputs, each entry with its W lanes. A row of one
+sample is such an array: it is passed on without a copy.
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+
+from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program, kind_of
+
+LEAST_SHARED = 2000  # operations of a program of one sample, beside which those of a call do not count
+_ALIGNED = 64  # bytes
+_ATTRIBUTES = (
+    "attributes #0 = { nounwind }",
+    "attributes #1 = { nounwind willreturn memory(none) }",
+)
+
+
+class _Body:
+    """The operations of a program, as lines of an emitter.
+
+    **Arguments:** `load(place, entry, kind)` reads an entry of an input; `array(place)` is the pointer to an input that has the
+    layout of a subprogram's, or None.
+    """
+
+    def __init__(self, e: Emitter, program: Program, load: Callable, array: Callable):
+        self.e, self.program, self.load, self.array = e, program, load, array
+        self.names: list = [None] * len(program.operations)  # of inputs, those that have been read
+        self.parts: dict[int, list[int]] = {}  # of each call, the entries of its outputs that are needed
+        self.regions: dict[Program, int] = {}  # where in %in and %out the arrays of a subprogram begin
+        self.bytes = 0
+        self.passed: dict[int, str] = {}  # what stands in %in, which subprograms do not change
+        for op, _, args in program.operations:
+            if op == "part":
+                self.parts.setdefault(args[0], []).append(args[1].value)
+
+    def name(self, i: int) -> str:
+        """Of operation i."""
+        if self.names[i] is None:
+            _, kind, args = self.program.operations[i]
+            self.names[i] = self.load(*args, kind)
+        return self.names[i]
+
+    def text(self, x, kind: str) -> str:
+        """An entry: a name or a constant."""
+        return self.e.constant(x.value, kind) if type(x) is Constant else self.name(x)
+
+    def results(self) -> list[list[str]]:
+        """Names of the program's results."""
+        operations = self.program.operations
+        for i, (op, kind, args) in enumerate(operations):
+            if op == "input":
+                continue
+            if op == "call":
+                self.names[i] = self._call(i, args)
+            elif op == "part":
+                self.names[i] = self.names[args[0]][args[1].value]
+            else:
+                kinds = [operations[x].kind for x in args if type(x) is not Constant]
+                given = kinds[-1] if kinds else kind
+                known = given if op in COMPARISONS else kind
+                self.names[i] = self.e.operation(op, kind, [self.text(x, known) for x in args], given)
+        rows = zip(self.program.results, self.program.outputs, strict=True)
+        return [[self.text(x, kind_of(array.dtype)) for x in row] for row, array in rows]
+
+    def _call(self, i: int, args) -> dict[int, str]:
+        """Call a subprogram; names of the entries of its outputs that are needed."""
+        which, *given = args
+        called = self.program.subprograms[which.value]
+        if called not in self.regions:
+            self.regions[called] = self.bytes
+            self.bytes += sum(_bytes(x, self.e.width) for x in (*called.inputs, *called.outputs))
+        at, first, pointers = self.regions[called], 0, []
+        for array in called.inputs:
+            entries = given[first : first + array.size]
+            pointers.append(self._passed_on(entries, array) or self._copied(entries, array, at))
+            at, first = at + _bytes(array, self.e.width), first + array.size
+        outputs = []
+        for array in called.outputs:
+            outputs.append((self._place(at), kind_of(array.dtype), array.size))
+            at += _bytes(array, self.e.width)
+        _write_call(self.e, called, [*pointers, *(pointer for pointer, _, _ in outputs)])
+        needed, found, first = set(self.parts.get(i, ())), {}, 0
+        for pointer, kind, size in outputs:
+            found |= {first + k: self.e.load_at(pointer, k, kind) for k in range(size) if first + k in needed}
+            first += size
+        return found
+
+    def _passed_on(self, entries, array: Array) -> str | None:
+        """The pointer to an input of this program that these entries are."""
+        operations = self.program.operations
+        if any(type(x) is Constant or operations[x].op != "input" for x in entries) or not entries:
+            return None
+        place = operations[entries[0]].args[0]
+        whole = [(place, k) for k in range(self.program.inputs[place].size)]
+        same = whole == [operations[x].args for x in entries] and self.program.inputs[place].dtype == array.dtype
+        return self.array(place) if same else None
+
+    def _copied(self, entries, array: Array, at: int) -> str:
+        """A pointer to memory with these entries."""
+        kind, pointer = kind_of(array.dtype), self._place(at)
+        for k, x in enumerate(entries):
+            value, place = self.text(x, kind), at + k * array.dtype.itemsize * self.e.width
+            if self.passed.get(place) != value:
+                self.e.store_at(pointer, k, kind, value)
+                self.passed[place] = value
+        return pointer
+
+    def _place(self, at: int) -> str:
+        return self.e.put(f"getelementptr i8, ptr %passed, i64 {at}")
+
+    def allocated(self) -> list[str]:
+        """Memory for what is passed."""
+        return [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
+
+
+def _bytes(array: Array, width: int) -> int:
+    return -(-array.size * array.dtype.itemsize * width // _ALIGNED) * _ALIGNED
+
+
+def _write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
+    name = symbol_of(called, e.width)
+    e.declared[name] = f"declare void @{name}({', '.join(['ptr'] * len(pointers))})"
+    e.lines.append(f"  call void @{name}({', '.join(f'ptr {x}' for x in pointers)})")
+
+
+def symbol_of(called: Program, width: int) -> str:
+    """The name by which kernels call a subprogram: equal names have equal code."""
+    return f"jaxdyn_{hashlib.sha256(subprogram_ir(called, width).encode()).hexdigest()[:32]}"
+
+
+def subprogram_ir(called: Program, width: int) -> str:
+    """The text of a subprogram, the function `called`."""
+    key = ("text", width)
+    if key not in called.derived:
+        called.derived[key] = _subprogram_ir(called, width)
+    return called.derived[key]
+
+
+def _subprogram_ir(called: Program, width: int) -> str:
+    if called.subprograms:
+        raise AssertionError("a subprogram that calls others, which `expand` does not make")
+    e = Emitter(width)
+    body = _Body(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: None)
+    for i, (row, array) in enumerate(zip(body.results(), called.outputs, strict=True)):
+        for k, name in enumerate(row):
+            e.store_at(f"%r{i}", k, kind_of(array.dtype), name)
+    names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
+    head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
+    return "\n".join([head, *e.lines, "  ret void", "}", *e.declared.values(), *_ATTRIBUTES])
+
+
+def calls_itself(program: Program, width: int) -> bool:
+    """Whether a kernel is a call of its program as a subprogram, whose code other kernels have too."""
+    return width == 1 and program.cost >= LEAST_SHARED and not program.subprograms
+
+
+def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
+    """The text of a kernel; `uniform` says which arguments are the same for all samples."""
+    e = Emitter(width)
+    count = len(program.inputs)
+    arrays = [*program.inputs, *program.outputs]
+    entries = {x.args for x in program.operations if x.op == "input"}
+    read = {place for place, _ in entries}
+    places = [i for i in range(len(arrays)) if i >= count or (i in read and not uniform[i])]
+    rows = e.rows(places, [arrays[i].size * arrays[i].dtype.itemsize for i in places])
+    tiles: dict[tuple[int, int], list[str]] = {}
+
+    def load(place, entry, kind):
+        if uniform[place]:
+            return e.load_for_all(place, entry, kind)
+        first = entry - entry % width
+        wanted = [(place, k) in entries for k in range(first, first + width)]
+        if width == 1 or kind not in FLOATS or first + width > arrays[place].size or 2 * sum(wanted) < width:
+            return e.load(rows[place], entry, kind)
+        if (place, first) not in tiles:
+            tiles[place, first] = e.load_tile(rows[place], first, kind)
+        return tiles[place, first][entry - first]
+
+    def array(place):
+        """The row of one sample."""
+        return None if width > 1 else rows[place][0] if place in rows else f"%a{place}"
+
+    body = _Body(e, program, load, array)
+    if calls_itself(program, width):
+        _write_call(e, program, [str(array(i)) for i in range(len(arrays))])
+    else:
+        for i, (row, output) in enumerate(zip(body.results(), program.outputs, strict=True)):
+            e.store_array(rows[count + i], kind_of(output.dtype), row)
+    pointers = []
+    for i in range(len(arrays)):
+        pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {i}", f"  %a{i} = load ptr, ptr %p{i}"]
+    # Arguments that are not read are not in the code, but the handler checks their sizes: they are part of what is hashed.
+    sizes = " ".join(
+        f"{'same' if i < count and uniform[i] else 'each'}:{x.size}x{x.dtype}" for i, x in enumerate(arrays)
+    )
+    return "\n".join(
+        [
+            f"; {count} {sizes}",
+            "define void @kernel(ptr %data, i64 %n, i64 %begin, i64 %end) #0 {",
+            "entry:",
+            *body.allocated(),
+            *pointers,
+            *e.entry,
+            "  %last = sub i64 %n, 1",
+            "  %some = icmp ult i64 %begin, %end",
+            "  br i1 %some, label %block, label %done",
+            "block:",
+            "  %base = phi i64 [ %begin, %entry ], [ %next, %block ]",
+            *e.lines,
+            f"  %next = add i64 %base, {width}",
+            "  %more = icmp ult i64 %next, %end",
+            "  br i1 %more, label %block, label %done",
+            "done:",
+            "  ret void",
+            "}",
+            *e.declared.values(),
+            *_ATTRIBUTES,
+        ]
+    )

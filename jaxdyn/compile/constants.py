@@ -1,0 +1,55 @@
+"""Operations on arrays whose numbers are all known, while a program of numbers is written."""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from jaxdyn.compile import program as numbers
+from jaxdyn.compile.program import NotNumbers
+
+_NUMPY: dict[str, Callable] = {
+    "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "square": np.square,
+    "and": np.bitwise_and, "or": np.bitwise_or, "not": np.invert, "is_finite": np.isfinite,
+    "rsqrt": lambda x: 1 / np.sqrt(x),
+} | {name: f for name, f in numbers.COMPARISONS.items()} | numbers.FUNCTIONS | numbers.FUNCTIONS_OF_TWO  # fmt: skip
+_NUMPY_REDUCTIONS: dict[str, Callable] = {
+    "reduce_sum": np.sum, "reduce_prod": np.prod, "reduce_max": np.max, "reduce_min": np.min, "reduce_and": np.all,
+    "reduce_or": np.any,
+}  # fmt: skip
+
+
+def of_nothing(name: str, dtype):
+    """A reduction of no entries."""
+    if name in ("reduce_max", "reduce_min"):
+        ends = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+        return ends[name == "reduce_min"]
+    return name in ("reduce_prod", "reduce_and")
+
+
+def computed(eqn, args) -> np.ndarray:
+    """An operation on known arrays; by numpy where that does the same, as JAX would compile it first."""
+    name, out = eqn.primitive.name, eqn.outvars[0].aval
+    with np.errstate(all="ignore"):
+        if name in _NUMPY:
+            return np.asarray(_NUMPY[name](*args)).astype(out.dtype, copy=False)
+        if name == "div" and out.dtype.kind == "f":
+            return np.asarray(args[0] / args[1], out.dtype)
+        if name in _NUMPY_REDUCTIONS and not args[0].size:
+            return np.full(out.shape, of_nothing(name, out.dtype), out.dtype)
+        if name in _NUMPY_REDUCTIONS:
+            return np.asarray(_NUMPY_REDUCTIONS[name](args[0], axis=tuple(eqn.params["axes"]))).astype(out.dtype)
+        if name == "iota":
+            return np.indices(out.shape)[eqn.params["dimension"]].astype(out.dtype)
+    return bound(eqn, args)
+
+
+def bound(eqn, args) -> np.ndarray:
+    """The same by JAX itself."""
+    with jax.ensure_compile_time_eval():
+        found = eqn.primitive.bind(*args, **eqn.params)
+    if eqn.primitive.multiple_results:
+        raise NotNumbers(eqn.primitive.name)
+    if jax.numpy.issubdtype(found.dtype, jax.dtypes.extended):
+        raise NotNumbers(f"an array of {found.dtype}")
+    return np.asarray(found)

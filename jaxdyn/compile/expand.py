@@ -1,0 +1,427 @@
+"""From a function of arrays to a program of single numbers: one rule for each primitive of JAX's jaxprs.
+
+Arrays whose entries are all known stay numpy arrays of their dtype; others are arrays of objects (see `graph`). What has
+no rule here, or happens elsewhere (callbacks), or chooses its way by numbers that are not known (`cond`, `while_loop`), is
+not a program of numbers: `NotNumbers` says why.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, Literal
+
+from jaxdyn.compile import program as numbers
+from jaxdyn.compile.constants import bound, computed, of_nothing
+from jaxdyn.compile.graph import Graph, Number, as_objects, objects
+from jaxdyn.compile.moves import AT_PLACES, MOVES, written
+from jaxdyn.compile.program import Array, NotNumbers, Program, kind_of
+
+# A function of fewer operations is written where it is called.
+LEAST_CALLED = 300
+
+
+def expand(
+    closed: ClosedJaxpr, most: int, name: str = "", calls: bool = False, served: bool = False
+) -> tuple[Program, bool]:
+    """The program of a jaxpr, and whether it has functions whose derivatives are given by rules of their own.
+
+    With `calls`, functions under `jax.jit` of at least `LEAST_CALLED` operations become subprograms. With `served`, there is
+    one more output: whether no number is flagged (see `flags`).
+
+    **Raises:** `NotNumbers`, `TooLong`.
+    """
+    graph = Graph(most)
+    inputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in closed.jaxpr.invars]
+    outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in closed.jaxpr.outvars]
+    for array in (*inputs, *outputs):
+        if array.dtype.name not in ("float64", "float32", "bool", "int32", "int64"):
+            raise NotNumbers(f"an array of {array.dtype}")
+    expansion = _Expansion(graph, calls)
+    entries = [graph.inputs(place, array) for place, array in enumerate(inputs)]
+    found = expansion.evaluate(closed.jaxpr, closed.consts, entries)
+    if served:
+        outputs.append(_FLAG)
+        found.append(objects([graph.invert(expansion.flagged)], ()))
+    return graph.finish(inputs, outputs, [as_objects(x) for x in found], name=name), expansion.has_rules
+
+
+_FLAG = Array((), np.dtype(bool))
+
+
+class _Expansion:
+    def __init__(self, graph: Graph, calls: bool):
+        self.graph = graph
+        self.has_rules = False
+        self.flagged: Any = False  # whether any number is
+        self.calls = calls
+        self.called: dict = {}
+        binary = {"add": graph.add, "add_any": graph.add, "sub": graph.sub, "mul": graph.mul}
+        binary |= {"and": graph.both, "or": graph.either}
+        binary |= {name: functools.partial(graph.compare, name) for name in numbers.COMPARISONS}
+        binary |= {name: functools.partial(graph.function_of_two, name) for name in numbers.FUNCTIONS_OF_TWO}
+        unary = {"neg": graph.neg, "not": graph.invert, "is_finite": graph.is_finite}
+        unary |= {name: functools.partial(graph.function, name) for name in numbers.FUNCTIONS}
+        unary |= {"square": lambda x: graph.mul(x, x), "rsqrt": lambda x: graph.div(1.0, graph.function("sqrt", x))}
+        self.elementwise = {name: np.frompyfunc(f, 2, 1) for name, f in binary.items()}
+        self.elementwise |= {name: np.frompyfunc(f, 1, 1) for name, f in unary.items()}
+        self.divide = np.frompyfunc(graph.div, 2, 1)
+        self.reductions = {
+            "reduce_sum": graph.add,
+            "reduce_prod": graph.mul,
+            "reduce_max": functools.partial(graph.function_of_two, "max"),
+            "reduce_min": functools.partial(graph.function_of_two, "min"),
+            "reduce_and": graph.both,
+            "reduce_or": graph.either,
+        }
+
+    def evaluate(self, jaxpr, consts, args) -> list:
+        values = dict(zip(jaxpr.constvars, (_constant(x) for x in consts), strict=True))
+        values.update(zip(jaxpr.invars, args, strict=True))
+
+        def read(atom):
+            return np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
+
+        for eqn in jaxpr.eqns:
+            if eqn.effects:
+                raise NotNumbers(f"{eqn.primitive.name} has side effects")
+            found = self.one(eqn, [read(x) for x in eqn.invars])
+            values.update(zip(eqn.outvars, found, strict=True))
+        return [read(x) for x in jaxpr.outvars]
+
+    def closed(self, closed: ClosedJaxpr, args) -> list:
+        return self.evaluate(closed.jaxpr, closed.consts, args)
+
+    def one(self, eqn, args) -> list:
+        name, params = eqn.primitive.name, eqn.params
+        if name.startswith("custom_vjp") and any(x.dtype.kind == "O" for x in args):
+            raise NotNumbers(f"{name}, whose derivative is known in reverse alone")
+        if name in _INNER:
+            inner = params[_INNER[name]]
+            self.has_rules |= name.startswith("custom_")
+            if self.calls and name in ("jit", "pjit"):
+                return self._called(inner, args)
+            return self.closed(inner, args) if isinstance(inner, ClosedJaxpr) else self.evaluate(inner, (), args)
+        rule = _OTHER.get(name)
+        if rule is not None:
+            return rule(self, params, args, eqn)
+        if name in AT_PLACES:
+            return AT_PLACES[name](params, args, eqn)
+        out = eqn.outvars[0].aval
+        known = all(x.dtype.kind != "O" for x in args)
+        if name == "round" and params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+            return [bound(eqn, args) if known else self._rounded(args[0], out.dtype)]
+        if name in MOVES:
+            found = MOVES[name](params, args if known else [as_objects(x) for x in args], out)
+            return [x if known else as_objects(x) for x in found] if eqn.primitive.multiple_results else [found]
+        if known:
+            return [computed(eqn, args)]
+        if name in self.elementwise:
+            if name in _OF_FLOATS and any(x.aval.dtype.kind != "f" for x in eqn.invars):
+                raise NotNumbers(f"{name} of integers")
+            return [as_objects(self.elementwise[name](*args))]
+        if name == "div":
+            if out.dtype.kind != "f":
+                raise NotNumbers("division of integers")
+            return [as_objects(self.divide(*args))]
+        if name in self.reductions:
+            return [self._reduced(name, args[0], params["axes"], out)]
+        raise NotNumbers(name)
+
+    def _called(self, inner: ClosedJaxpr, args) -> list:
+        """A function as a subprogram, if it is long; arguments that are known are compiled in."""
+        known = tuple(None if x.dtype.kind == "O" else (x.shape, x.dtype.str, x.tobytes()) for x in args)
+        key = inner, known
+        if key not in self.called:
+            graph = Graph(self.graph.most)
+            inputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]
+            inputs = [array for array, x in zip(inputs, known, strict=True) if x is None]
+            entries = iter([graph.inputs(place, array) for place, array in enumerate(inputs)])
+            expansion = _Expansion(graph, False)
+            found = expansion.closed(
+                inner, [next(entries) if x is None else y for x, y in zip(known, args, strict=True)]
+            )
+            outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]
+            found = [as_objects(x) for x in found]
+            if expansion.flagged is not False:
+                outputs.append(_FLAG)
+                found.append(objects([expansion.flagged], ()))
+            self.called[key] = graph.finish(inputs, outputs, found)
+            self.has_rules |= expansion.has_rules
+        program = self.called[key]
+        given = [x for x, y in zip(args, known, strict=True) if y is None]
+        is_short = program.cost < LEAST_CALLED
+        found = self.graph.replay(program, given)[1] if is_short else self.graph.call(program, given)
+        count = len(inner.jaxpr.outvars)
+        for flagged in found[count:]:
+            self.flagged = self.graph.either(self.flagged, flagged.item())
+        return found[:count]
+
+    def _reduced(self, name, array, axes, out):
+        fold, count = self.reductions[name], math.prod(array.shape[i] for i in axes)
+        if not count:
+            return as_objects(np.full(out.shape, of_nothing(name, out.dtype), out.dtype))
+        rows = np.moveaxis(as_objects(array), axes, range(len(axes))).reshape(count, math.prod(out.shape))
+        return objects([functools.reduce(fold, column) for column in rows.T.tolist()], out.shape)
+
+    # --- rules that need more than the entries ---
+
+    def _rounded(self, array, dtype):
+        """To the nearest whole number, halves away from zero."""
+        g = self.graph
+
+        def rounded(x):
+            size = g.function("abs", x)
+            whole = g.function("floor", size)
+            up = g.compare("ge", g.sub(size, whole), 0.5)  # not floor(|x| + 1/2), whose sum is rounded
+            return g.mul(g.function("sign", x), g.select(up, whole, g.add(whole, 1.0), _kind(dtype)))
+
+        return objects([rounded(x) for x in array.ravel().tolist()], array.shape)
+
+    def _same(self, params, args, eqn):
+        return args
+
+    def _unless(self, params, args, eqn):
+        flags, entries = (as_objects(x).ravel().tolist() for x in args)
+        kind = _kind(eqn.outvars[0].aval.dtype)
+        for flag in flags:
+            self.flagged = self.graph.either(self.flagged, flag)
+        found = [self.graph.select(flag, x, math.nan, kind) for flag, x in zip(flags, entries, strict=True)]
+        return [objects(found, args[1].shape)]
+
+    def _convert(self, params, args, eqn):
+        if args[0].dtype.kind != "O":
+            return [args[0].astype(params["new_dtype"])]
+        kind = _kind(params["new_dtype"])
+        return [objects([self.graph.convert(x, kind) for x in args[0].ravel().tolist()], args[0].shape)]
+
+    def _integer_pow(self, params, args, eqn):
+        if args[0].dtype.kind != "O":
+            return [
+                np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)
+            ]
+        return [objects([self.graph.power(x, params["y"]) for x in args[0].ravel().tolist()], args[0].shape)]
+
+    def _select(self, params, args, eqn):
+        which, *cases = args
+        out = eqn.outvars[0].aval
+        if which.dtype.kind != "O":
+            which = np.broadcast_to(which.astype(np.int32), out.shape)
+            if all(x.dtype.kind != "O" for x in cases):
+                return [np.choose(which, cases)]
+            cases = [as_objects(x) for x in cases]
+            found = np.where(which == 0, cases[0], cases[1])
+            for i in range(2, len(cases)):
+                found = np.where(which == i, cases[i], found)
+            return [as_objects(found)]
+        if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
+            raise NotNumbers("a choice between more than two")
+        kind = _kind(out.dtype)
+        columns = (np.broadcast_to(as_objects(x), out.shape).ravel().tolist() for x in args)
+        return [objects([self.graph.select(a, b, c, kind) for a, b, c in zip(*columns, strict=True)], out.shape)]
+
+    def _clamp(self, params, args, eqn):
+        low, x, high = (np.broadcast_to(as_objects(x), eqn.outvars[0].aval.shape).ravel().tolist() for x in args)
+        pick = self.graph.function_of_two
+        found = [pick("min", pick("max", b, a), c) for a, b, c in zip(low, x, high, strict=True)]
+        return [objects(found, eqn.outvars[0].aval.shape)]
+
+    def _dot_general(self, params, args, eqn):
+        a, b = args
+        (sum_a, sum_b), (batch_a, batch_b) = params["dimension_numbers"]
+        out = eqn.outvars[0].aval
+        length, count = math.prod(a.shape[i] for i in sum_a), math.prod(a.shape[i] for i in batch_a)
+        rows = math.prod(n for i, n in enumerate(a.shape) if i not in (*batch_a, *sum_a))
+        columns = math.prod(n for i, n in enumerate(b.shape) if i not in (*batch_b, *sum_b))
+        a = np.moveaxis(a, (*batch_a, *sum_a), (*range(len(batch_a)), *range(-len(sum_a), 0))).reshape(
+            count, rows, length
+        )
+        b = np.moveaxis(b, (*batch_b, *sum_b), (*range(len(batch_b)), *range(-len(sum_b), 0))).reshape(
+            count, columns, length
+        )
+        if a.dtype.kind != "O" and b.dtype.kind != "O":
+            return [np.asarray(a @ b.transpose(0, 2, 1), out.dtype).reshape(out.shape)]
+        entries, add, mul = [], self.graph.add, self.graph.mul
+        zero = 0.0 if out.dtype.kind == "f" else 0
+        for rows, columns in zip(a.tolist(), b.tolist(), strict=True):
+            # Known zeros are most of it: they are looked for once.
+            kept = [[(k, y) for k, y in enumerate(column) if type(y) is Number or y != 0] for column in columns]
+            for row in rows:
+                for column in kept:
+                    total = zero
+                    for k, y in column:
+                        x = row[k]
+                        if type(x) is Number or x != 0:
+                            total = add(total, mul(x, y))
+                    entries.append(total)
+        return [objects(entries, out.shape)]
+
+    def _scatter(self, params, args, eqn):
+        operand, indices, updates = args
+        entries, adds = as_objects(operand).ravel().tolist(), eqn.primitive.name != "scatter"
+        places = written(eqn, operand, indices, updates)
+        for value, i in zip(as_objects(updates).ravel().tolist(), places, strict=True):
+            if i is not None:
+                entries[i] = self.graph.add(entries[i], value) if adds else value
+        return [objects(entries, operand.shape)]
+
+    def _cumsum(self, params, args, eqn):
+        x = np.moveaxis(as_objects(args[0]), params["axis"], 0)
+        order = range(x.shape[0])
+        order = reversed(order) if params["reverse"] else order
+        found, total = np.empty(x.shape, object), None
+        for i in order:
+            total = x[i] if total is None else self.elementwise["add"](total, x[i])
+            found[i] = total
+        return [np.moveaxis(found, 0, params["axis"])]
+
+    def _scan(self, params, args, eqn):
+        consts, carry = args[: params["num_consts"]], args[params["num_consts"] :][: params["num_carry"]]
+        rows = args[params["num_consts"] + params["num_carry"] :]
+        saved: list[list] = []
+        length = params["length"]
+        for i in reversed(range(length)) if params["reverse"] else range(length):
+            found = self.closed(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
+            carry = found[: params["num_carry"]]
+            saved.append(found[params["num_carry"] :])
+        if params["reverse"]:
+            saved.reverse()
+        outs = [x.aval for x in eqn.outvars[params["num_carry"] :]]
+        if not length:
+            return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
+        return [*carry, *(_stacked(column) for column in zip(*saved, strict=True))]
+
+    def _while(self, params, args, eqn):
+        count, more = params["cond_nconsts"], params["body_nconsts"]
+        of_cond, of_body, carry = args[:count], args[count : count + more], args[count + more :]
+        while True:
+            (going,) = self.closed(params["cond_jaxpr"], [*of_cond, *carry])
+            going = as_objects(going).item()
+            if type(going) is Number:
+                raise NotNumbers("a while_loop whose end is not known")
+            if not going:
+                return carry
+            carry = self.closed(params["body_jaxpr"], [*of_body, *carry])
+
+    def _cond(self, params, args, eqn):
+        which = as_objects(args[0]).item()
+        if type(which) is Number:
+            raise NotNumbers("a cond whose branch is not known")
+        branches = params["branches"]
+        return self.closed(branches[min(max(int(which), 0), len(branches) - 1)], args[1:])
+
+    def _linear_solve(self, params, args, eqn):
+        counts, jaxprs = params["const_lengths"], params["jaxprs"]
+        before = counts.matvec + counts.vecmat
+        solve_consts = args[before : before + counts.solve]
+        right = args[before + counts.solve + counts.transpose_solve :]
+        self.has_rules = True
+        return self.closed(jaxprs.solve, [*solve_consts, *right])
+
+    def _kernel(self, params, args, eqn):
+        inner = params["program"]
+        if not isinstance(inner, Program):
+            raise NotNumbers(inner.name)
+        shaped = [as_objects(x).reshape(array.shape) for x, array in zip(args, inner.inputs, strict=True)]
+        self.has_rules |= inner.derivative is not None
+        return [x.ravel() for x in self.graph.replay(inner, shaped)[1]]
+
+    def _cholesky(self, params, args, eqn):
+        matrices = as_objects(args[0]).reshape(-1, *args[0].shape[-2:])
+        return [np.stack([self._factor(x) for x in matrices]).reshape(args[0].shape)]
+
+    def _factor(self, matrix):
+        g, n = self.graph, matrix.shape[0]
+        lower = np.full((n, n), 0.0, object)
+        inverse = []
+        for j in range(n):
+            for i in range(j, n):
+                entry = matrix[i, j]
+                for k in range(j):
+                    entry = g.sub(entry, g.mul(lower[i, k], lower[j, k]))
+                if i == j:
+                    lower[j, j] = g.function("sqrt", entry)
+                    inverse.append(g.div(1.0, lower[j, j]))
+                else:
+                    lower[i, j] = g.mul(entry, inverse[j])
+        return lower
+
+    def _triangular_solve(self, params, args, eqn):
+        a, b = (as_objects(x) for x in args)
+        if params["transpose_a"]:
+            a = np.swapaxes(a, -1, -2)
+        lower = params["lower"] != params["transpose_a"]
+        if not params["left_side"]:  # x a = b is a^T x^T = b^T
+            a, b, lower = np.swapaxes(a, -1, -2), np.swapaxes(b, -1, -2), not lower
+        pairs = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
+        found = np.stack([self._solved(x, y, lower, params["unit_diagonal"]) for x, y in pairs]).reshape(b.shape)
+        return [found if params["left_side"] else np.swapaxes(found, -1, -2)]
+
+    def _solved(self, a, b, lower: bool, unit: bool):
+        g, n = self.graph, a.shape[0]
+        rows: list = [None] * n
+        for i in range(n) if lower else reversed(range(n)):
+            row = b[i].tolist()
+            for k in range(i) if lower else range(i + 1, n):
+                if type(a[i, k]) is Number or a[i, k] != 0:
+                    row = [g.sub(x, g.mul(a[i, k], y)) for x, y in zip(row, rows[k], strict=True)]
+            inverse = 1.0 if unit else g.div(1.0, a[i, i])
+            rows[i] = [g.mul(x, inverse) for x in row]
+        return objects([x for row in rows for x in row], b.shape)
+
+
+_INNER = {
+    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr",
+    "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
+    "custom_vjp_call_jaxpr": "fun_jaxpr",
+}  # fmt: skip
+_OTHER: dict[str, Callable] = {
+    "copy": _Expansion._same,
+    "copy_p": _Expansion._same,
+    "stop_gradient": _Expansion._same,
+    "optimization_barrier": _Expansion._same,
+    "pvary": _Expansion._same,
+    "convert_element_type": _Expansion._convert,
+    "integer_pow": _Expansion._integer_pow,
+    "select_n": _Expansion._select,
+    "clamp": _Expansion._clamp,
+    "dot_general": _Expansion._dot_general,
+    "scatter-add": _Expansion._scatter,
+    "scatter_add": _Expansion._scatter,
+    "scatter": _Expansion._scatter,
+    "cumsum": _Expansion._cumsum,
+    "scan": _Expansion._scan,
+    "while": _Expansion._while,
+    "cond": _Expansion._cond,
+    "custom_linear_solve": _Expansion._linear_solve,
+    "cholesky": _Expansion._cholesky,
+    "triangular_solve": _Expansion._triangular_solve,
+    "jaxdyn_kernel": _Expansion._kernel,
+    "jaxdyn_unless": _Expansion._unless,
+}
+
+# Maxima and minima are of integers too.
+_OF_FLOATS = {*numbers.FUNCTIONS, *numbers.FUNCTIONS_OF_TWO} - {"max", "min"}
+
+
+def _constant(x) -> np.ndarray:
+    if isinstance(x, Tracer):
+        raise NotNumbers("a number of an enclosing function")
+    return np.asarray(x)
+
+
+def _kind(dtype) -> str:
+    try:
+        return kind_of(dtype)
+    except KeyError:
+        raise NotNumbers(f"numbers of {dtype}") from None
+
+
+def _stacked(rows: Sequence) -> np.ndarray:
+    if any(x.dtype.kind == "O" for x in rows):
+        return np.stack([as_objects(x) for x in rows])
+    return np.stack(rows)

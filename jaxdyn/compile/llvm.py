@@ -1,0 +1,351 @@
+"""Operations on numbers as lines of LLVM's intermediate representation: every number is a vector over W samples of a batch."""
+
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxdyn.compile.program import COMPARISONS, FLOATS
+
+_TYPES = {"f8": "double", "f4": "float", "b1": "i1", "i1": "i8", "i4": "i32", "i8": "i64"}  # i1: a bool in memory
+_BYTES = {"f8": 8, "f4": 4, "b1": 1, "i1": 1, "i4": 4, "i8": 8}
+_FLOAT = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
+_INTEGER = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or"}
+_COMPARED = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
+_INTRINSICS = {
+    "sqrt": "sqrt", "abs": "fabs", "floor": "floor", "ceil": "ceil", "round": "roundeven", "max": "maximum", "min": "minimum",
+}  # fmt: skip
+# Functions of the C library, called for one lane after the other.
+_LIBRARY = {
+    "tan": "tan", "asin": "asin", "acos": "acos", "atan": "atan", "sinh": "sinh", "cosh": "cosh", "tanh": "tanh", "exp": "exp",
+    "exp2": "exp2", "expm1": "expm1", "log": "log", "log1p": "log1p", "cbrt": "cbrt", "pow": "pow", "atan2": "atan2",
+    "rem": "fmod",
+}  # fmt: skip
+
+# pi/2 in three parts: k times each of the first two is exact for the integers k up to 2^23 (2^13 in float32), so that the
+# reduced argument is right to rounding for |x| up to 1.3e7 (1.2e4). Beyond, the error stays within one unit in the last
+# place of x itself (Cody & Waite 1980, ch. 8).
+_HALF_PI = {
+    "f8": (1.570796325802803, 9.920935791635221e-10, 5.170182981794105e-19),
+    "f4": (1.5703125, 4.837512969970703e-04, 7.549789954891882e-08),
+}
+# (sin x - x)/x^3 and (cos x - 1 + x^2/2)/x^4 as polynomials in x^2 on |x| <= pi/4: Chebyshev fits made with 200 bits (mpmath
+# chebyfit), off by 2e-17 and 1e-18 in float64, 2e-8 and 2e-9 in float32.
+_SINE = {
+    "f8": (
+        -0.16666666666666666,
+        0.008333333333330936,
+        -0.00019841269836740527,
+        2.7557316093196066e-06,
+        -2.5051129895962807e-08,
+        1.5917988944318716e-10,
+    ),
+    "f4": (-0.16666664656310706, 0.008332747104372895, -0.000195876390357926),
+}
+_COSINE = {
+    "f8": (
+        0.041666666666666664,
+        -0.0013888888888887389,
+        2.48015872987544e-05,
+        -2.7557317265876615e-07,
+        2.087614504910828e-09,
+        -1.1382544623404291e-11,
+    ),
+    "f4": (0.04166666465348729, -0.0013888301867270142, 2.4547689709382208e-05),
+}
+
+
+STORES_BETWEEN_FENCES = 32
+
+
+class Emitter:
+    """Lines of LLVM IR for operations on W lanes."""
+
+    def __init__(self, width: int):
+        self.width = width
+        self.lines: list[str] = []
+        self.entry: list[str] = []  # what is done once, before the first sample
+        self.declared: dict[str, str] = {}
+        self.count = self.stores = 0
+        self.sines: dict[str, tuple[str, str]] = {}
+
+    def put(self, text: str) -> str:
+        """The name of the result of an instruction."""
+        self.count += 1
+        name = f"%x{self.count}"
+        self.lines.append(f"  {name} = {text}")
+        return name
+
+    def type(self, kind: str) -> str:
+        """Type of a number of all lanes."""
+        return _TYPES[kind] if self.width == 1 else f"<{self.width} x {_TYPES[kind]}>"
+
+    def constant(self, value, kind: str) -> str:
+        """A known number in all lanes."""
+        if kind in FLOATS:
+            rounded = float(np.float32(value)) if kind == "f4" else float(value)
+            text = "0x" + struct.pack(">d", rounded).hex().upper()
+        elif kind == "b1":
+            text = "true" if value else "false"
+        else:
+            text = str(int(value))
+        return text if self.width == 1 else f"splat ({_TYPES[kind]} {text})"
+
+    def call(self, name: str, kind: str, *args: str) -> str:
+        """An intrinsic of LLVM for all lanes at once."""
+        short = {"f8": "f64", "f4": "f32"}[kind]
+        full = f"llvm.{name}.{short if self.width == 1 else f'v{self.width}{short}'}"
+        of = self.type(kind)
+        self.declared[full] = f"declare {of} @{full}({', '.join([of] * len(args))})"
+        return self.put(f"call {of} @{full}({', '.join(f'{of} {a}' for a in args)})")
+
+    def library(self, name: str, kind: str, *args: str) -> str:
+        """A function of the C library, lane by lane."""
+        name, scalar = (name if kind == "f8" else f"{name}f"), _TYPES[kind]
+        self.declared[name] = f"declare {scalar} @{name}({', '.join([scalar] * len(args))}) #1"
+        if self.width == 1:
+            return self.put(f"call {scalar} @{name}({', '.join(f'{scalar} {a}' for a in args)})")
+        result, of = "poison", self.type(kind)
+        for lane in range(self.width):
+            each = [self.put(f"extractelement {of} {a}, i32 {lane}") for a in args]
+            value = self.put(f"call {scalar} @{name}({', '.join(f'{scalar} {a}' for a in each)})")
+            result = self.put(f"insertelement {of} {result}, {scalar} {value}, i32 {lane}")
+        return result
+
+    # --- operations ---
+
+    def operation(self, op: str, kind: str, args: Sequence[str], given: str) -> str:
+        """An operation; `kind` is that of its result, `given` that of its last operand."""
+        of = self.type(kind)
+        if op in _FLOAT and kind in FLOATS:
+            return self.put(f"{_FLOAT[op]} contract {of} {args[0]}, {args[1]}")
+        if op in _INTEGER:
+            return self.put(f"{_INTEGER[op]} {of} {args[0]}, {args[1]}")
+        if op == "neg":
+            return self.put(
+                f"fneg {of} {args[0]}" if kind in FLOATS else f"sub {of} {self.constant(0, kind)}, {args[0]}"
+            )
+        if op in COMPARISONS:
+            sign = "" if op in ("eq", "ne") else ("u" if given == "b1" else "s")
+            word = f"fcmp {_COMPARED[op]}" if given in FLOATS else f"icmp {sign}{op}"
+            return self.put(f"{word} {self.type(given)} {args[0]}, {args[1]}")
+        if op == "not":
+            return self.put(f"xor {of} {args[0]}, {self.constant(1 if kind == 'b1' else -1, kind)}")
+        if op == "select":
+            return self.put(f"select {self.type('b1')} {args[0]}, {of} {args[2]}, {of} {args[1]}")
+        if op == "convert":
+            return self.convert(args[0], given, kind)
+        if op == "is_finite":
+            size = self.call("fabs", given, args[0])
+            return self.put(f"fcmp olt {self.type(given)} {size}, {self.constant(np.inf, given)}")
+        if op in ("sin", "cos"):
+            return self.sine_and_cosine(args[0], kind)[op == "cos"]
+        if op == "sign" and kind in FLOATS:
+            return self.sign(args[0], kind)
+        if op in ("max", "min") and kind == "b1":
+            return self.put(f"{'or' if op == 'max' else 'and'} {of} {args[0]}, {args[1]}")
+        if op in ("max", "min") and kind not in FLOATS:
+            flag = self.put(f"icmp s{'gt' if op == 'max' else 'lt'} {of} {args[0]}, {args[1]}")
+            return self.put(f"select {self.type('b1')} {flag}, {of} {args[0]}, {of} {args[1]}")
+        if kind not in FLOATS:
+            raise AssertionError(f"{op} of integers, which `expand` refuses")
+        if op in _INTRINSICS:
+            return self.call(_INTRINSICS[op], kind, *args)
+        return self.library(_LIBRARY[op], kind, *args)
+
+    def convert(self, x: str, source: str, target: str) -> str:
+        """A number as another kind."""
+        if target == "b1":
+            zero = self.constant(0, source)
+            word = "fcmp une" if source in FLOATS else "icmp ne"
+            return self.put(f"{word} {self.type(source)} {x}, {zero}")
+        if source in FLOATS and target in ("i4", "i8"):  # saturated, and 0 for what is not a number, as XLA does
+            to = self.type(target)
+            kinds = (f"i{8 * _BYTES[target]}", f"f{8 * _BYTES[source]}")
+            full = "llvm.fptosi.sat." + ".".join(kinds if self.width == 1 else (f"v{self.width}{k}" for k in kinds))
+            self.declared[full] = f"declare {to} @{full}({self.type(source)})"
+            return self.put(f"call {to} @{full}({self.type(source)} {x})")
+        wider = _BYTES[target] > _BYTES[source]
+        words = {
+            "ff": "fpext" if wider else "fptrunc",
+            "bf": "uitofp",
+            "if": "sitofp",
+            "bi": "zext",
+            "ii": "sext" if wider else "trunc",
+        }
+        return self.put(f"{words[source[0] + target[0]]} {self.type(source)} {x} to {self.type(target)}")
+
+    def sign(self, x: str, kind: str) -> str:
+        """-1, 0, 1, or not a number."""
+        of, flag, zero = self.type(kind), self.type("b1"), self.constant(0, kind)
+        up, down = (self.put(f"fcmp {word} {of} {x}, {zero}") for word in ("ogt", "olt"))
+        low = self.put(f"select {flag} {down}, {of} {self.constant(-1, kind)}, {of} {x}")
+        return self.put(f"select {flag} {up}, {of} {self.constant(1, kind)}, {of} {low}")
+
+    def sine_and_cosine(self, x: str, kind: str) -> tuple[str, str]:
+        """(sin x, cos x) to about one unit in the last place, without branches: both share the reduction of x."""
+        if x in self.sines:
+            return self.sines[x]
+
+        def constant(value):
+            return self.constant(value, kind)
+
+        def add(a, b):
+            return self.operation("add", kind, (a, b), kind)
+
+        def mul(a, b):
+            return self.operation("mul", kind, (a, b), kind)
+
+        def polynomial(coefficients, z):
+            value = constant(coefficients[-1])
+            for coefficient in coefficients[-2::-1]:
+                value = add(mul(z, value), constant(coefficient))
+            return value
+
+        turns = self.call("roundeven", kind, mul(x, constant(2 / np.pi)))
+        r = x
+        for part in _HALF_PI[kind]:
+            r = add(r, mul(turns, constant(-part)))
+        z = mul(r, r)
+        sine = add(mul(mul(r, z), polynomial(_SINE[kind], z)), r)
+        cosine = add(mul(mul(z, z), polynomial(_COSINE[kind], z)), add(mul(z, constant(-0.5)), constant(1)))
+        # The quadrant is turns modulo 4, as bits of an integer: turns + 1.5 2^52 has them at its end.
+        whole, magic = ("i8", 1.5 * 2**52) if kind == "f8" else ("i4", 1.5 * 2**23)
+        bits = self.put(f"bitcast {self.type(kind)} {add(turns, constant(magic))} to {self.type(whole)}")
+        of, flag = self.type(kind), self.type("b1")
+
+        def bit(value, mask):
+            kept = self.put(f"and {self.type(whole)} {value}, {self.constant(mask, whole)}")
+            return self.put(f"icmp ne {self.type(whole)} {kept}, {self.constant(0, whole)}")
+
+        odd, high = bit(bits, 1), bit(bits, 2)
+        next_bits = self.put(f"add {self.type(whole)} {bits}, {self.constant(1, whole)}")
+        next_high = bit(next_bits, 2)
+        found = []
+        for first, second, negative in ((sine, cosine, high), (cosine, sine, next_high)):
+            value = self.put(f"select {flag} {odd}, {of} {second}, {of} {first}")
+            minus = self.put(f"fneg {of} {value}")
+            found.append(self.put(f"select {flag} {negative}, {of} {minus}, {of} {value}"))
+        self.sines[x] = found[0], found[1]
+        return self.sines[x]
+
+    # --- memory ---
+
+    def rows(self, places: Sequence[int], sizes: Sequence[int]) -> dict[int, list[str]]:
+        """Pointers to the rows of arrays for the W samples from `%base` on."""
+        index = []
+        for lane in range(self.width):
+            at = self.put(f"add i64 %base, {lane}")
+            inside = self.put(f"icmp ult i64 {at}, %last")
+            index.append(self.put(f"select i1 {inside}, i64 {at}, i64 %last"))
+        found = {}
+        for place, size in zip(places, sizes, strict=True):
+            offsets = [self.put(f"mul i64 {i}, {size}") for i in index]
+            found[place] = [self.put(f"getelementptr i8, ptr %a{place}, i64 {o}") for o in offsets]
+        return found
+
+    def load(self, rows: Sequence[str], entry: int, kind: str) -> str:
+        """An entry of the rows of all lanes."""
+        of, value = self.type(kind), "poison"
+        for lane, row in enumerate(rows):
+            x = self._load_one(row, entry, kind)
+            if self.width == 1:
+                return x
+            value = self.put(f"insertelement {of} {value}, {_TYPES[kind]} {x}, i32 {lane}")
+        return value
+
+    def load_for_all(self, place: int, entry: int, kind: str) -> str:
+        """An entry of an argument that is the same for all samples, read once."""
+        lines, self.lines = self.lines, self.entry
+        value = self._load_one(f"%a{place}", entry, kind)
+        if self.width > 1:
+            of = self.type(kind)
+            first = self.put(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
+            value = self.put(f"shufflevector {of} {first}, {of} poison, <{self.width} x i32> zeroinitializer")
+        self.lines = lines
+        return value
+
+    def load_at(self, array: str, k: int, kind: str) -> str:
+        """Entry k, in all lanes, of an array in memory whose entries stand one after the other, each with its lanes."""
+        at = self.put(f"getelementptr i8, ptr {array}, i64 {k * _BYTES[kind] * self.width}")
+        if kind != "b1":
+            return self.put(f"load {self.type(kind)}, ptr {at}")
+        wide = self.put(f"load {self.type('i1')}, ptr {at}")
+        return self.put(f"trunc {self.type('i1')} {wide} to {self.type('b1')}")
+
+    def store_at(self, array: str, k: int, kind: str, value: str) -> None:
+        """Write such an entry."""
+        at = self.put(f"getelementptr i8, ptr {array}, i64 {k * _BYTES[kind] * self.width}")
+        if kind == "b1":
+            kind, value = "i1", self.put(f"zext {self.type('b1')} {value} to {self.type('i1')}")
+        self.stored(f"  store {self.type(kind)} {value}, ptr {at}")
+
+    def _load_one(self, row: str, entry: int, kind: str) -> str:
+        at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
+        if kind != "b1":
+            return self.put(f"load {_TYPES[kind]}, ptr {at}, align {_BYTES[kind]}")
+        return self.put(f"trunc i8 {self.put(f'load i8, ptr {at}')} to i1")
+
+    def transposed(self, square: Sequence[str], kind: str) -> list[str]:
+        """W vectors of W lanes as the rows of a matrix, and its columns: blocks of 1, 2, 4 ... entries change places."""
+        square, of, distance = list(square), self.type(kind), 1
+        while distance < self.width:
+            for i in range(self.width):
+                if i & distance:
+                    continue
+                first, second = square[i], square[i + distance]
+                for place, step in ((i, 0), (i + distance, distance)):
+                    mask = [
+                        t + step if not t & distance else self.width + t - distance + step for t in range(self.width)
+                    ]
+                    indices = ", ".join(f"i32 {t}" for t in mask)
+                    square[place] = self.put(
+                        f"shufflevector {of} {first}, {of} {second}, <{self.width} x i32> <{indices}>"
+                    )
+            distance *= 2
+        return square
+
+    def load_tile(self, rows: Sequence[str], entry: int, kind: str) -> list[str]:
+        """W entries of the rows of all lanes, from one load of each row."""
+        of, found = self.type(kind), []
+        for row in rows:
+            at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
+            found.append(self.put(f"load {of}, ptr {at}, align {_BYTES[kind]}"))
+        return self.transposed(found, kind)
+
+    def store_tile(self, rows: Sequence[str], entry: int, kind: str, values: Sequence[str]) -> None:
+        """Write W entries of the rows of all lanes, each row by one store."""
+        of = self.type(kind)
+        if any(value.startswith("%") for value in values):
+            lines = self.transposed(values, kind)
+        else:  # known numbers, "splat (double 0x...)": the same line for all
+            known = ", ".join(value.removeprefix("splat (").removesuffix(")") for value in values)
+            lines = [f"<{known}>"] * self.width
+        for row, value in zip(rows, lines, strict=True):
+            at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
+            self.stored(f"  store {of} {value}, ptr {at}, align {_BYTES[kind]}")
+
+    def stored(self, line: str) -> None:
+        """Write a store. LLVM's schedulers compare every two of them between two fences, which cost no instruction."""
+        self.lines.append(line)
+        self.stores += 1
+        if self.stores % STORES_BETWEEN_FENCES == 0:
+            self.lines.append('  fence syncscope("singlethread") release')
+
+    def store_array(self, rows: Sequence[str], kind: str, values: Sequence[str]) -> None:
+        """Write all entries of the rows of all lanes."""
+        tiled = len(values) // self.width * self.width if self.width > 1 and kind in FLOATS else 0
+        for entry in range(0, tiled, self.width):
+            self.store_tile(rows, entry, kind, values[entry : entry + self.width])
+        for entry in range(tiled, len(values)):
+            self.store(rows, entry, kind, values[entry])
+
+    def store(self, rows: Sequence[str], entry: int, kind: str, value: str) -> None:
+        """Write an entry of the rows of all lanes."""
+        for lane, row in enumerate(rows):
+            at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
+            x = value if self.width == 1 else self.put(f"extractelement {self.type(kind)} {value}, i32 {lane}")
+            if kind == "b1":
+                self.stored(f"  store i8 {self.put(f'zext i1 {x} to i8')}, ptr {at}")
+            else:
+                self.stored(f"  store {_TYPES[kind]} {x}, ptr {at}, align {_BYTES[kind]}")

@@ -1,0 +1,72 @@
+"""How functions are compiled: `compilation("auto")` by native kernels where they serve, `compilation("plain")` by JAX alone."""
+
+import contextlib
+import contextvars
+import logging
+import os
+
+logger = logging.getLogger("jaxdyn")
+MODES = ("auto", "plain")
+# LLVM takes some 50 microseconds an operation: three seconds.
+MAX_OPERATIONS = 60_000
+
+_mode: contextvars.ContextVar[str | None] = contextvars.ContextVar("jaxdyn_compilation", default=None)
+_expanding: contextvars.ContextVar[bool] = contextvars.ContextVar("jaxdyn_expanding", default=False)
+_said: set[str] = set()
+
+
+def current() -> str:
+    """The mode in force. **Raises:** ValueError where the environment asks for one that does not exist."""
+    return _mode.get() or _checked(os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION")
+
+
+def _checked(mode, what: str) -> str:
+    if mode not in MODES:
+        raise ValueError(f"{what} is {mode!r}; choose from {', '.join(map(repr, MODES))}")
+    return mode
+
+
+@contextlib.contextmanager
+def compilation(mode: str):
+    """While functions are traced inside: how they become machine code.
+
+    **Arguments:** `mode`: "auto", native kernels on a CPU where a function is a program of single numbers, operations of JAX
+    elsewhere; "plain", operations of JAX everywhere, which compile and run slower and serve as a witness.
+
+    The mode counts when a function is traced: what `jax.jit` has compiled stays as it is. Without this context the environment
+    variable JAXDYN_COMPILATION decides, and without that, "auto".
+
+    **Raises:** ValueError for another mode.
+
+    ```python
+    with jd.compilation("plain"):
+        a = jd.forward_dynamics(model, q, v, tau)
+    ```
+    """
+    token = _mode.set(_checked(mode, "compilation: mode"))
+    try:
+        yield
+    finally:
+        _mode.reset(token)
+
+
+def is_expanding() -> bool:
+    """Whether a function is traced to become a program of numbers: what it calls is traced with it."""
+    return _expanding.get()
+
+
+@contextlib.contextmanager
+def expanding():
+    """While a function is traced to become a program of numbers."""
+    token = _expanding.set(True)
+    try:
+        yield
+    finally:
+        _expanding.reset(token)
+
+
+def say_once(message: str) -> None:
+    """Log a warning that has not been logged before in this process."""
+    if message not in _said:
+        _said.add(message)
+        logger.warning("jaxdyn: %s", message)

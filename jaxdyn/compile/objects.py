@@ -1,0 +1,163 @@
+"""Machine code from LLVM IR, kept on disk: a second start of a script compiles no kernel again.
+
+An object file is found by the hash of the IR, of LLVM's version and of the processor's name and features. Files are written
+beside their final name and moved there, so that two processes that build one at once do not disturb each other; each ends
+with a checksum, and one that is damaged is built anew. Where the folder cannot be written, code is kept in memory alone,
+and that is said once.
+"""
+
+import contextlib
+import functools
+import hashlib
+import logging
+import os
+import tempfile
+from pathlib import Path
+
+import llvmlite
+import llvmlite.binding as llvm
+
+logger = logging.getLogger("jaxdyn")
+MAX_CACHE_BYTES = 512 * 2**20
+_CHECKSUM_BYTES = 32
+
+
+@functools.cache
+def initialize() -> None:
+    """Make LLVM ready for this processor."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+
+
+@functools.cache
+def features() -> str:
+    """Of the processor, as LLVM writes them."""
+    return llvm.get_host_cpu_features().flatten()
+
+
+def target_machine():
+    """LLVM's description of this processor; not shared, as each engine takes its own."""
+    initialize()
+    target = llvm.Target.from_triple(llvm.get_process_triple())
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features(), opt=2, jit=True, reloc="pic")
+
+
+def key_of(text: str) -> bytes:
+    """Hash of a kernel's IR and of everything else that its machine code depends on."""
+    version = ".".join(map(str, llvm.llvm_version_info))
+    parts = (text, version, llvmlite.__version__, llvm.get_host_cpu_name(), features(), llvm.get_process_triple())
+    return hashlib.sha256("\0".join(parts).encode()).digest()
+
+
+class Code:
+    """Machine code in memory, as long as it is held."""
+
+    def __init__(self, text: str, stored: bool = True):
+        initialize()
+        self.key = key_of(text)
+        found = _read(self.key) if stored else None
+        machine = target_machine()
+        module = llvm.parse_assembly("" if found else text)
+        module.triple = llvm.get_process_triple()
+        module.data_layout = str(machine.target_data)
+        if not found:
+            _optimize(module, machine)
+        self.engine = llvm.create_mcjit_compiler(module, machine)
+        if found:
+            self.engine.add_object_file(llvm.ObjectFileRef.from_data(found))
+        elif stored:
+            self.engine.set_object_cache(lambda _, code: _write(self.key, bytes(code)))
+        self.engine.finalize_object()
+
+    def address(self, name: str) -> int:
+        """Of a function."""
+        return self.engine.get_function_address(name)
+
+    def publish(self, name: str, symbol: str) -> None:
+        """Let code that is made from now on call a function by this name."""
+        llvm.add_symbol(symbol, self.address(name))
+
+
+def _optimize(module, machine) -> None:
+    options = llvm.create_pipeline_tuning_options(speed_level=1)
+    options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+
+
+# --- files ---
+
+_folder: Path | None = None
+_is_off = False
+
+
+def cache_folder() -> Path:
+    """Where object files are kept: `jaxdyn` in the user's folder for caches."""
+    if _folder is not None:
+        return _folder
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
+    return Path(base) / "jaxdyn" / "kernels"
+
+
+def set_cache_folder(folder) -> None:
+    """Keep object files elsewhere; None for the default place."""
+    global _folder, _is_off
+    _folder, _is_off = None if folder is None else Path(folder), False
+
+
+def _path(key: bytes) -> Path:
+    return cache_folder() / f"{key.hex()}.o"
+
+
+def _read(key: bytes) -> bytes | None:
+    try:
+        path = _path(key)
+        found = path.read_bytes()
+    except (OSError, RuntimeError):  # a home that cannot be determined is a RuntimeError
+        return None
+    code, checksum = found[:-_CHECKSUM_BYTES], found[-_CHECKSUM_BYTES:]
+    if hashlib.sha256(code).digest() != checksum:
+        logger.warning("jaxdyn: %s is damaged and is built again", path)
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)
+    return code
+
+
+def _write(key: bytes, code: bytes) -> None:
+    global _is_off
+    if _is_off:
+        return
+    try:
+        folder = cache_folder()
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=folder, suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(code + hashlib.sha256(code).digest())
+            os.replace(name, _path(key))
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.unlink(name)
+            raise
+        _prune(folder)
+    except (OSError, RuntimeError) as error:
+        _is_off = True
+        logger.warning("jaxdyn: kernels are not kept on disk, and are compiled again at the next start: %s", error)
+
+
+@functools.cache  # once in a process
+def _prune(folder: Path) -> None:
+    """Remove the files that were used longest ago where all of them are more than `MAX_CACHE_BYTES`."""
+    files = []
+    for path in folder.glob("*"):
+        with contextlib.suppress(OSError):
+            status = path.stat()
+            files.append((status.st_mtime, status.st_size, path))
+    excess = sum(size for _, size, _ in files) - MAX_CACHE_BYTES
+    for _, size, path in sorted(files):
+        if excess <= 0:
+            return
+        with contextlib.suppress(OSError):
+            path.unlink()
+        excess -= size

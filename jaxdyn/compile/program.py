@@ -1,0 +1,123 @@
+"""Programs of single numbers: operations in an order in which they can be computed, from arrays to arrays."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+FLOATS = ("f8", "f4")
+
+
+class TooLong(Exception):
+    """A program would have more operations than it may have."""
+
+
+class NotNumbers(Exception):
+    """A function that cannot be written as a program of single numbers, and why."""
+
+
+class Operation(NamedTuple):
+    """An operation of a finished program; `args` are indices of operations, and `Constant`s."""
+
+    op: str
+    kind: str
+    args: tuple
+
+
+class Constant(NamedTuple):
+    """A known operand."""
+
+    value: Any
+
+
+class Array(NamedTuple):
+    """An argument or a result of a program."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return math.prod(self.shape)
+
+
+class Program:
+    """Operations on single numbers, from arrays to arrays.
+
+    - `inputs`, `outputs`: their `Array`s. `results`: per output a tuple of entries, indices of operations or `Constant`s.
+    - `operations`: "input" has the arguments (array, entry); "call" the number of a subprogram and the entries of its
+      inputs, one after the other; "part" a call and the number of an entry of its outputs.
+    - `subprograms`: what is called, written once however often it is.
+    - `derivative`: None, or a function (which inputs move) -> the `Program` of the change of all outputs, of the inputs and the
+      changes of those that move.
+    """
+
+    def __init__(
+        self, inputs, outputs, operations, results, subprograms=(), derivative: Callable | None = None, name: str = ""
+    ):
+        self.inputs: tuple[Array, ...] = tuple(inputs)
+        self.outputs: tuple[Array, ...] = tuple(outputs)
+        self.operations: list[Operation] = operations
+        self.results: tuple[tuple, ...] = tuple(results)
+        self.subprograms: tuple[Program, ...] = tuple(subprograms)
+        self.derivative = derivative
+        self.name = name
+        self.derived: dict = {}
+
+    def __repr__(self):
+        return f"Program({self.name or 'unnamed'}, {self.cost} operations)"
+
+    @functools.cached_property
+    def cost(self) -> int:
+        """Number of operations that are carried out, without inputs and changes of sign."""
+        own = sum(x.op not in ("input", "neg", "call", "part") for x in self.operations)
+        return own + sum(self.subprograms[x.args[0].value].cost for x in self.operations if x.op == "call")
+
+    def counts(self) -> dict[str, int]:
+        """Number of operations of each kind."""
+        found: dict[str, int] = {}
+        for x in self.operations:
+            found[x.op] = found.get(x.op, 0) + 1
+        return found
+
+
+COMPARISONS: dict[str, Callable] = {
+    "eq": lambda a, b: a == b,
+    "ne": lambda a, b: a != b,
+    "lt": lambda a, b: a < b,
+    "le": lambda a, b: a <= b,
+    "gt": lambda a, b: a > b,
+    "ge": lambda a, b: a >= b,
+}
+FUNCTIONS: dict[str, Callable] = {  # of one number
+    name: getattr(np, numpy_name)
+    for name, numpy_name in {
+        "sqrt": "sqrt", "sin": "sin", "cos": "cos", "tan": "tan", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
+        "sinh": "sinh", "cosh": "cosh", "tanh": "tanh", "exp": "exp", "exp2": "exp2", "expm1": "expm1", "log": "log",
+        "log1p": "log1p", "abs": "abs", "floor": "floor", "ceil": "ceil", "round": "rint", "sign": "sign", "cbrt": "cbrt",
+    }.items()
+}  # fmt: skip
+FUNCTIONS_OF_TWO: dict[str, Callable] = {
+    "pow": np.power,
+    "atan2": np.arctan2,
+    "rem": np.fmod,
+    "max": np.maximum,
+    "min": np.minimum,
+}
+
+
+_KINDS = {"float64": "f8", "float32": "f4", "bool": "b1", "int32": "i4", "int64": "i8"}
+_DTYPES = {kind: np.dtype(name) for name, kind in _KINDS.items()}
+
+
+def kind_of(dtype) -> str:
+    """Two letters for a dtype. **Raises:** KeyError for those that programs do not have."""
+    return _KINDS[np.dtype(dtype).name]
+
+
+def dtype_of(kind: str) -> np.dtype:
+    """The dtype of a kind."""
+    return _DTYPES[kind]

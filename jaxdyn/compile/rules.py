@@ -1,0 +1,47 @@
+"""Functions whose derivatives are given by another computation than their values."""
+
+from collections.abc import Callable
+
+import jax
+
+from jaxdyn.compile.known import partition_traced
+
+
+def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
+    """solve(tree, *args), whose derivative is given by tangent(tree, *args, steps) -> (value, its change).
+
+    `steps` are those of the tree's leaves and of the args, None where nothing moves. Leaves with known values stay outside of
+    the differentiated function: inside it they would be traced, and a recursion could not see their zeros any more.
+    """
+    unknown, known = partition_traced(tree)
+
+    @jax.custom_jvp
+    def run(traced, *args):
+        return solve(known(traced), *args)
+
+    def rule(primals, tangents):
+        traced, *args = primals
+        zero = jax.custom_derivatives.SymbolicZero
+        steps: list = [None] * known.structure.num_leaves
+        for place, step in zip(known.places, tangents[0], strict=True):
+            steps[place] = step
+        return tangent(known(traced), *args, [None if isinstance(x, zero) else x for x in (*steps, *tangents[1:])])
+
+    run.defjvp(rule, symbolic_zeros=True)
+    return run(unknown, *args)
+
+
+def along(function: Callable, args: tuple, steps):
+    """function(*args), and its change for `steps` in the leaves of args, None where one does not move; None if none does."""
+    base, structure = jax.tree.flatten(args)
+    moving = [i for i, step in enumerate(steps) if step is not None]
+    if not moving:
+        return function(*args), None
+
+    def moved(*values):
+        here = list(base)
+        for i, value in zip(moving, values, strict=True):
+            here[i] = value
+        return function(*jax.tree.unflatten(structure, here))
+
+    return jax.jvp(moved, [base[i] for i in moving], [steps[i] for i in moving])

@@ -1,0 +1,186 @@
+"""The one FFI target of the process: a table of kernels, and the handler through which XLA calls them (`handler.ll`)."""
+
+import contextlib
+import ctypes
+import functools
+import logging
+import re
+import threading
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of
+from jaxdyn.compile.objects import Code, features
+from jaxdyn.compile.program import FLOATS, Program, kind_of
+
+TARGET = "jaxdyn_kernel"
+SLOTS = 1 << 16
+# A chunk of a batch takes some 20 microseconds: 40 000 vector operations at 2 a nanosecond, long beside the claim of a chunk
+# (0.1 us) and short beside the wait for the last one.
+OPERATIONS_PER_CHUNK = 40_000
+ANNOUNCED_AFTER = 5.0  # seconds of compilation
+_VERSION = (0, 3)  # of XLA's FFI, whose structures `handler.ll` describes
+_MISSING = "jaxdyn: this program was compiled by another process, which had its kernel; trace it again here"
+_MISFIT = "jaxdyn: a buffer of a kernel has another size than the kernel was written for"
+# What a waiting thread tells each kind of processor: pause, and yield.
+_RELAX = {"x86_64": "void @llvm.x86.sse2.pause()", "aarch64": "void @llvm.aarch64.hint(i32 1)"}
+
+
+logger = logging.getLogger("jaxdyn")
+
+
+class Unsupported(Exception):
+    """Why kernels cannot be called here."""
+
+
+class _Entry(ctypes.Structure):
+    _fields_ = (
+        ("hash", ctypes.c_uint64),
+        ("kernel", ctypes.c_uint64),
+        ("chunk", ctypes.c_int64),
+        ("least", ctypes.c_int64),
+        ("buffers", ctypes.c_int64),
+        ("sizes", ctypes.c_uint64),
+    )
+
+
+_table = (_Entry * SLOTS)()
+_threads = ctypes.c_int64(1 << 30)
+_lock = threading.Lock()
+_called: dict[str, Code] = {}  # subprograms, which other kernels call too
+_held: dict[int, tuple] = {}  # code and sizes by hash, for as long as the process may call them
+
+
+def set_threads(count: int | None) -> None:
+    """Use at most `count` threads in a kernel; None for as many as XLA has."""
+    _threads.value = 1 << 30 if count is None else count
+
+
+def interface_version() -> tuple[int, int]:
+    """Version of the FFI of the jaxlib that is installed."""
+    text = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
+    found = [re.search(rf"define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
+    major, minor = (-1 if x is None else int(x.group(1)) for x in found)
+    return major, minor
+
+
+@functools.cache
+def register() -> None:
+    """Compile the handler and tell XLA of it, once in a process. **Raises:** `Unsupported`."""
+    version = interface_version()
+    if version != _VERSION:
+        raise Unsupported(f"jaxlib has version {version} of XLA's FFI, and kernels are written for {_VERSION}")
+    architecture = _architecture()
+    if architecture not in _RELAX:
+        raise Unsupported(f"the processor is {architecture}, and kernels are written for {', '.join(_RELAX)}")
+    text = resources.files("jaxdyn.compile").joinpath("handler.ll").read_text()
+    fields = {
+        "TABLE": ctypes.addressof(_table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads),
+        "MAJOR": version[0], "MINOR": version[1], "RELAX": _RELAX[architecture],
+        "RELAX_TYPE": _RELAX[architecture].replace("i32 1", "i32"),
+        "MISSING": _MISSING, "MISSING_BYTES": len(_MISSING) + 1, "MISFIT": _MISFIT, "MISFIT_BYTES": len(_MISFIT) + 1,
+    }  # fmt: skip
+    for name, value in fields.items():
+        text = text.replace("{" + name + "}", str(value))
+    # Its addresses are those of this process: it is not kept on disk.
+    code = Code(text, stored=False)
+    new = ctypes.pythonapi.PyCapsule_New
+    new.restype, new.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
+    jax.ffi.register_ffi_target(TARGET, new(code.address("handler"), None, None), platform="cpu", api_version=1)
+    _held[0] = (code,)
+
+
+def _architecture() -> str:
+    import llvmlite.binding as llvm
+
+    return llvm.get_process_triple().split("-")[0].replace("arm64", "aarch64")
+
+
+@functools.cache
+def vector_bytes() -> int:
+    """Of the processor's vectors of floats."""
+    has = features()
+    return 64 if "+avx512f" in has else 32 if "+avx," in has + "," else 16
+
+
+def width_of(program, samples: int | None) -> int:
+    """Lanes of a kernel: one for a single sample, else those of the processor's vectors."""
+    if not isinstance(program, Program):
+        return program.lanes(samples)
+    kinds = {kind_of(array.dtype) for array in (*program.inputs, *program.outputs)} & set(FLOATS)
+    return 1 if samples == 1 else vector_bytes() // (4 if kinds == {"f4"} else 8)
+
+
+def kernel(program, width: int, uniform: Sequence[bool]) -> int:
+    """The hash by which the handler finds the kernel of a program, which is compiled where it is not there yet."""
+    uniform = tuple(uniform)
+    key = ("kernel", width, uniform)
+    with _lock:
+        register()
+        if key not in program.derived:
+            text = kernel_ir(program, width, uniform) if isinstance(program, Program) else program.ir(width, uniform)
+            with _announced(program):
+                is_shared = isinstance(program, Program) and calls_itself(program, width)
+                for called in (program,) if is_shared else program.subprograms:
+                    _publish(called, width)
+                code = Code(text)
+            number = int.from_bytes(code.key[:8], "little") >> 1 | 1
+            if number not in _held:
+                _enter(number, code, program, width, uniform)
+            program.derived[key] = number
+        return program.derived[key]
+
+
+def _publish(called: Program, width: int) -> None:
+    """Compile a subprogram where that has not been done."""
+    symbol = symbol_of(called, width)
+    if symbol not in _called:
+        _called[symbol] = Code(subprogram_ir(called, width))
+        _called[symbol].publish("called", symbol)
+
+
+@contextlib.contextmanager
+def _announced(program):
+    """Say what is being compiled where that takes long."""
+    message = "jaxdyn: compiling %s, %d operations; the next start of this script reads it from the cache"
+    timer = threading.Timer(ANNOUNCED_AFTER, logger.warning, (message, program.name or "a function", program.cost))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _enter(number: int, code: Code, program, width: int, uniform: tuple[bool, ...]) -> None:
+    if len(_held) > SLOTS // 2:
+        raise Unsupported(f"more than {SLOTS // 2} kernels in one process")
+    sizes = [-1 - array.size if same else array.size for array, same in zip(program.inputs, uniform, strict=True)]
+    sizes += [array.size for array in program.outputs]
+    row = (ctypes.c_int64 * len(sizes))(*sizes)
+    slot = number % SLOTS
+    while _table[slot].hash:
+        slot = (slot + 1) % SLOTS
+    entry = _table[slot]
+    chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.cost)))
+    entry.kernel, entry.chunk, entry.least = code.address("kernel"), chunk, 2 * chunk
+    entry.buffers, entry.sizes = len(sizes), ctypes.addressof(row)
+    entry.hash = number  # last: from here on it is found
+    _held[number] = code, row
+
+
+def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The results of a program for one sample, by its kernel and without XLA; `arrays` as its inputs."""
+    number = kernel(program, 1, [False] * len(program.inputs))
+    given = [np.ascontiguousarray(x, array.dtype) for x, array in zip(arrays, program.inputs, strict=True)]
+    results = [np.empty(array.shape, array.dtype) for array in program.outputs]
+    data = (ctypes.c_void_p * (len(given) + len(results)))(*(x.ctypes.data for x in (*given, *results)))
+    _KERNEL(_held[number][0].address("kernel"))(data, 1, 0, 1)
+    return results
+
+
+_KERNEL = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)

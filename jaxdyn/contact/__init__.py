@@ -1,0 +1,28 @@
+"""Contacts: friction cones and wrench cones, optimal forces within them, force closure, and kinematics of rolling.
+
+Source: Murray, Li & Sastry (1994), chapter 5; EQUATIONS sections 8, 10 and 11.
+"""
+
+from jaxdyn.contact.closure import ForceClosure as ForceClosure
+from jaxdyn.contact.closure import force_closure as force_closure
+from jaxdyn.contact.cones import FrictionCone as FrictionCone
+from jaxdyn.contact.cones import friction_cone as friction_cone
+from jaxdyn.contact.cones import surface_cone as surface_cone
+from jaxdyn.contact.kinds import wrench_basis as wrench_basis
+from jaxdyn.contact.montana import ContactKinematics as ContactKinematics
+from jaxdyn.contact.montana import montana as montana
+from jaxdyn.contact.montana import relative_pose as relative_pose
+from jaxdyn.contact.optimal import optimal_forces as optimal_forces
+from jaxdyn.contact.qp import RESULTS as RESULTS
+from jaxdyn.contact.qp import QPSolution as QPSolution
+from jaxdyn.contact.qp import solve_qp as solve_qp
+from jaxdyn.contact.surfaces import Cylinder as Cylinder
+from jaxdyn.contact.surfaces import Ellipsoid as Ellipsoid
+from jaxdyn.contact.surfaces import Parametrised as Parametrised
+from jaxdyn.contact.surfaces import Plane as Plane
+from jaxdyn.contact.surfaces import Sphere as Sphere
+from jaxdyn.contact.surfaces import Surface as Surface
+from jaxdyn.contact.surfaces import SurfaceGeometry as SurfaceGeometry
+from jaxdyn.contact.surfaces import surface_geometry as surface_geometry
+from jaxdyn.contact.wrench_cones import wrench_cone as wrench_cone
+from jaxdyn.contact.wrench_cones import wrench_cone_of_polygon as wrench_cone_of_polygon

@@ -1,0 +1,46 @@
+"""Arguments as arrays, refused with their name, their value and the fix."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+
+def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[Array, "..."]:
+    """`value` as an array of floating-point numbers; of the dtype of `like` if that is given.
+
+    **Raises:** ValueError for another shape, None in it meaning any size, and for known numbers that are not finite.
+    """
+    # Known numbers are looked at before they become part of a program that may be traced.
+    known = None if isinstance(value, Tracer) else np.asarray(value)
+    if known is not None and known.dtype == object:
+        raise ValueError(f"{what} is {value!r}; give numbers")
+    array = value if known is None or isinstance(value, jax.Array) else known
+    if like is not None:
+        array = jnp.asarray(array, like)
+    elif not jnp.issubdtype(array.dtype, jnp.floating):
+        array = jnp.asarray(array, float)
+    array = jnp.asarray(array)
+    if shape is not None and (
+        array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
+    ):
+        shown = ", ".join("any" if n is None else str(n) for n in shape)
+        raise ValueError(f"{what} has shape {array.shape}, expected ({shown}); batch with jax.vmap")
+    if known is not None and np.isnan(known).any():
+        raise ValueError(f"{what} is {known}, with entries that are not a number; give numbers")
+    return array
+
+
+def as_number(value, what: str, unit: str, *, zero: bool, like=None) -> Float[Array, ""]:
+    """`value` as one positive number, or zero where that is allowed.
+
+    **Raises:** ValueError for known numbers below that or not finite.
+    """
+    array = as_float(value, what, (), like)
+    if not isinstance(value, Tracer):
+        number = float(np.asarray(value))
+        if not (number >= 0 if zero else number > 0) or number == float("inf"):
+            sign = "zero or a positive number" if zero else "a positive number"
+            raise ValueError(f"{what} is {number}; give {sign}{unit and f' ({unit})'}")
+    return array

@@ -1,0 +1,328 @@
+"""Interior point for a quadratic program with second-order cones, and the derivative of its solution.
+
+    minimise x^T Q x / 2 + q^T x    with    h_i - G_i x in K_i
+
+for groups i of cones of one dimension: G_i (k, d, n), h_i (k, d). Numbers are of order one (`jaxdyn.contact.qp` scales them).
+
+Predictor and corrector of Mehrotra with the scaling of Nesterov and Todd; then a Newton step on the equations of the
+projection, x, v: Q x + q + G^T z = 0, G x + s = h, s = P(v), z = s - v, which has no small numbers to divide by.
+A step of either is one kernel (`jaxdyn.compile`), and so are the start and the derivative; the loops are JAX's.
+Source: Vandenberghe, The CVXOPT linear and quadratic cone program solvers (2010).
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Int
+
+from jaxdyn.compile import run
+from jaxdyn.contact import _jordan as jordan
+from jaxdyn.linear import cholesky, solve_factored
+from jaxdyn.so3 import _product
+
+REFINEMENTS = 4  # steps of Newton's method
+Pattern = tuple[bytes | None, ...]  # of each group, which entries of G may differ from zero; None where all may
+
+
+class Program(NamedTuple):
+    """Q (n, n), q (n,), and of each group of cones G (k, d, n) and h (k, d)."""
+
+    Q: Array
+    q: Array
+    G: tuple
+    h: tuple
+
+
+def _sparse(program: Program, pattern: Pattern) -> Program:
+    """The program whose known zeros a kernel sees."""
+    known = [None if y is None else np.frombuffer(y, bool) for y in pattern]
+    G = [g if y is None else jnp.where(y.reshape(g.shape), g, 0) for g, y in zip(program.G, known, strict=True)]
+    return program._replace(G=tuple(G))
+
+
+class Point(NamedTuple):
+    """x (n,), slacks s and multipliers z, each (k, d) of each group."""
+
+    x: Array
+    s: tuple
+    z: tuple
+
+
+class End(NamedTuple):
+    """The last point, how many steps led to it, whether it is a solution, and whether there is none."""
+
+    point: Point
+    steps: Int[Array, ""]
+    solved: Bool[Array, ""]
+    infeasible: Bool[Array, ""]
+
+
+def _times(G, x):
+    """G x of each group, (k, d)."""
+    return tuple(_product(g.reshape(-1, x.shape[0]), x).reshape(g.shape[:2]) for g in G)
+
+
+def _gathered(G, z, like):
+    """Sum of G^T z over the groups, (n,)."""
+    parts = [_product(g.reshape(-1, g.shape[-1]).T, y.reshape(-1)) for g, y in zip(G, z, strict=True)]
+    return sum(parts, jnp.zeros_like(like))
+
+
+def _zip(function, *groups):
+    return tuple(function(*each) for each in zip(*groups, strict=True))
+
+
+def _largest(*groups):
+    parts = [jnp.max(jnp.abs(x), initial=0) for group in groups for x in group]
+    return jnp.max(jnp.stack(parts))
+
+
+def _dot(a, b, like):
+    return sum((jnp.sum(x * y) for x, y in zip(a, b, strict=True)), jnp.zeros_like(like))
+
+
+def _residuals(program: Program, point: Point):
+    """Q x + q + G^T z, and G x + s - h."""
+    x, s, z = point
+    stationary = _product(program.Q, x) + program.q + _gathered(program.G, z, x)
+    return stationary, _zip(lambda a, b, c: a + b - c, _times(program.G, x), s, program.h)
+
+
+def _measured(program: Program, point: Point):
+    """The residuals; and the largest of them, or the mean product of slacks and multipliers where that is larger."""
+    rx, rz = _residuals(program, point)
+    return (rx, rz), jnp.maximum(_largest((rx,), rz), _gap(point))
+
+
+def _gap(point: Point):
+    return _dot(point.s, point.z, point.x[0]) / sum(y.shape[0] for y in point.s)
+
+
+def _contradicts(program: Program, point: Point, tol: float):
+    """Whether h.z < 0 with G^T z = 0 and z in the cones, which contradicts any x; within rounding, any x below 1 / tol."""
+    level = -_dot(program.h, point.z, point.x[0])
+    return (level > 0) & (jnp.max(jnp.abs(_gathered(program.G, point.z, point.x))) < tol * level)
+
+
+def _where(condition, new, old):
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def _start(pattern: Pattern, _, program: Program):
+    """Least squares of the slacks, moved inside the cones (CVXOPT's start); its residuals and their measure."""
+    program = _sparse(program, pattern)
+    Q, q, G, h = program
+    rows = jnp.concatenate([g.reshape(-1, q.shape[0]) for g in G])
+    level = jnp.concatenate([y.reshape(-1) for y in h])
+    factor = cholesky(Q + _product(rows.T, rows))
+    x = solve_factored(factor, _product(rows.T, level) - q)
+    slack = _zip(lambda a, b: b - a, _times(G, x), h)
+
+    def inside(groups):
+        least = jnp.min(jnp.stack([jnp.min(jordan.depth(v), initial=jnp.inf) for v in groups]))
+        size = jnp.maximum(_largest(groups), 1)
+        # Far enough from the boundary that the first steps are not cut short.
+        lift = jnp.where(least > 0.1 * size, 0, jnp.maximum(-least, 0) + size)
+        return _zip(lambda v: v + lift * jordan.identity(v), groups)
+
+    point = Point(x, inside(slack), inside(_zip(lambda v: -v, slack)))
+    return point, *_measured(program, point)
+
+
+def _newton(program: Program, s, z):
+    """The scaled points, and the solution (dx, ds, dz) of the linear equations for right-hand sides."""
+    Q, _, G, _ = program
+    W = _zip(jordan.scaling, s, z)
+    n = Q.shape[0]
+    scaled = _zip(lambda w, g: jax.vmap(w.inverse_times, 2, 2)(g), W, G)
+    rows = jnp.concatenate([g.reshape(-1, n) for g in scaled])
+    factor = cholesky(Q + _product(rows.T, rows))
+
+    def solve(rx, rz, u, is_refined: bool = True):
+        """Q dx + G^T dz = -rx, G dx + ds = -rz, W dz + W^-1 ds = u; also W dz and W^-1 ds."""
+        right = _zip(lambda w, r, y: w.inverse_times(r) + y, W, rz, u)
+        dx = solve_factored(factor, -rx - _gathered(scaled, right, rx))
+        wdz = _zip(lambda a, b: a + b, _times(scaled, dx), right)
+        if is_refined:  # the matrix squares the condition; what that costs, one step of refinement returns
+            more = solve_factored(factor, -rx - _product(Q, dx) - _gathered(scaled, wdz, rx))
+            dx, wdz = dx + more, _zip(lambda a, b: a + b, wdz, _times(scaled, more))
+        wds = _zip(lambda a, b: a - b, u, wdz)
+        dz, ds = (_zip(lambda w, y: w.inverse_times(y), W, wdz), _zip(lambda w, y: w.times(y), W, wds))
+        return dx, ds, dz, wds, wdz
+
+    return _zip(lambda w, y: w.times(y), W, z), solve
+
+
+def _step(program: Program, point: Point, residuals) -> Point:
+    """One step of predictor and corrector."""
+    x, s, z = point
+    rx, rz = residuals
+    mu = _gap(point)
+    lam, solve = _newton(program, s, z)
+
+    def reach(ds, dz):
+        return jnp.min(jnp.stack([jordan.longest_step(v, dv) for v, dv in zip((*s, *z), (*ds, *dz), strict=True)]))
+
+    _, ds, dz, wds, wdz = solve(rx, rz, _zip(lambda v: -v, lam), is_refined=False)
+    centring = (1 - jnp.minimum(reach(ds, dz), 1)) ** 3
+    u = _zip(
+        lambda v, a, b: jordan.quotient(
+            v, centring * mu * jordan.identity(v) - jordan.product(v, v) - jordan.product(a, b)
+        ),
+        lam,
+        wds,
+        wdz,
+    )
+    dx, ds, dz, *_ = solve(rx, rz, u)
+    length = jnp.minimum(0.99 * reach(ds, dz), 1)
+    move = lambda v, dv: v + length * dv  # noqa: E731
+    return Point(move(x, dx), _zip(move, s, ds), _zip(move, z, dz))
+
+
+def _iteration(pattern: Pattern, tol: float, _, program: Program, point: Point, residuals, error):
+    """The next point, its residuals and their measure, whether it is a certificate, and whether it was taken."""
+    program = _sparse(program, pattern)
+    new = _step(program, point, residuals)
+    inside = jnp.stack([jnp.all(jordan.depth(v) > 0) for v in (*new.s, *new.z)]).all()
+    left, measure = _measured(program, new)
+    valid = inside & jnp.isfinite(measure)
+    # Below the tolerance only what is better is taken.
+    taken = valid & ((error > tol) | (measure < error))
+    kept = _where(taken, (new, left, measure), (point, residuals, error))
+    return *kept, valid & _contradicts(program, new, tol), taken
+
+
+def _refinement(pattern: Pattern, _, program: Program, point: Point, error):
+    """A Newton step on the equations of the projection, its residual, and whether it was taken, where that is less."""
+    program = _sparse(program, pattern)
+    x, s, z = point
+    v = _zip(lambda a, b: a - b, s, z)
+
+    def at(x, v):
+        s = _zip(jordan.projection, v)
+        point = Point(x, s, _zip(lambda a, b: a - b, s, v))
+        rx, rz = _residuals(program, point)
+        return point, rx, rz, _largest((rx,), rz)
+
+    # Points of the interior point are not complementary; the projection makes them so, at the price of a residual.
+    here, rx, rz, residual = at(x, v)
+    dx, dv = _solve_projected(program, v, float(jnp.finfo(x.dtype).eps), -rx, _zip(lambda r: -r, rz), 1)
+    there, *_, less = at(x + dx, _zip(lambda a, b: a + b, v, dv))
+    # Not less is also what a residual that is not a number is.
+    better = less < residual
+    new, residual = _where(better, there, here), jnp.where(better, less, residual)
+    better = residual < error
+    return _where(better, new, point), jnp.where(better, residual, error), better
+
+
+def _solve_projected(program: Program, v, width, right_x, right_s, corrections: int):
+    """(dx, dv) with Q dx + G^T (D - 1) dv = right_x and G dx + D dv = right_s, D the projection's derivative at v.
+
+    With dv eliminated, which takes D + delta (1 - D) for D; what that changes, and rounding, corrections return. Rows that
+    are active and dependent leave their multipliers open: they are then those that the corrections find, and dx does not
+    see them.
+    """
+    Q, _, G, _ = program
+    n = Q.shape[0]
+    eps = float(jnp.finfo(Q.dtype).eps)
+    delta = eps**0.5
+    D = tuple(jordan.projection_slope(y, width) for y in v)
+    rest = tuple(d.map(lambda x: 1 - x) for d in D)
+    inverse = tuple(d.map(lambda x: 1 / (x + delta * (1 - x))) for d in D)
+
+    def times(slopes, y):
+        return _zip(lambda d, x: d.times(x), slopes, y)
+
+    weighted = _zip(lambda r, i, g: jax.vmap(lambda x: r.times(i.times(x)), 2, 2)(g), rest, inverse, G)
+    rows, weighted = (jnp.concatenate([g.reshape(-1, n) for g in groups]) for groups in (G, weighted))
+    normal = Q + _product(rows.T, weighted)
+    # Rounding must not cost the matrix its definiteness.
+    factor = cholesky(normal + jnp.diag(n * eps * jnp.diagonal(normal)))
+    dx, dv = jnp.zeros_like(right_x), _zip(jnp.zeros_like, right_s)
+    for _ in range(1 + corrections):
+        rx = right_x - _product(Q, dx) + _gathered(G, times(rest, dv), dx)
+        rs = _zip(lambda r, a, b: r - a - b, right_s, _times(G, dx), times(D, dv))
+        more = solve_factored(factor, rx + _gathered(G, times(rest, times(inverse, rs)), dx))
+        dv = _zip(lambda a, b: a + b, dv, times(inverse, _zip(lambda r, a: r - a, rs, _times(G, more))))
+        dx = dx + more
+    return dx, dv
+
+
+def width_of(dtype):
+    """Distance from a kink of the projection, in scaled numbers, over which its derivative is rounded off."""
+    return float(jnp.finfo(dtype).eps) ** 0.5
+
+
+def _end(pattern: Pattern, tol: float, _, program: Program, last: Point, error, refined: Point, less, infeasible):
+    """The better point, whether it is a solution, and whether there is none."""
+    better = (less <= jnp.maximum(error, tol)) & ~infeasible
+    point = _where(better, refined, last)
+    solved = (jnp.where(better, less, error) <= tol) & ~infeasible
+    # Multipliers that grow without bound may stop before they are a certificate to the last digit.
+    return point, solved, infeasible | (~solved & _contradicts(_sparse(program, pattern), point, tol**0.5))
+
+
+def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End:
+    """Steps until residuals and gap are below `tol`, and the solution refined."""
+    eps = float(jnp.finfo(program.q.dtype).eps)
+    # A step costs less than what it gains in accuracy, so steps go on below `tol` while they help.
+    target = max(1e-3 * tol, 8 * eps)
+
+    def going(carry):
+        *_, error, infeasible, alive, steps = carry
+        return (steps < max_steps) & (error > target) & ~infeasible & alive
+
+    def advance(carry):
+        *state, _, _, steps = carry
+        return *run(_iteration, None, program, *state, static=(pattern, tol)), steps + 1
+
+    start = run(_start, None, program, static=(pattern,))
+    carry = (*start, jnp.zeros((), bool), jnp.ones((), bool), jnp.zeros((), jnp.int32))
+    last, _, error, infeasible, _, steps = lax.while_loop(going, advance, carry)
+
+    # Newton's method ends within rounding in two or three steps, where the interior point would lose its digits.
+    def improving(carry):
+        _, tries, error, alive = carry
+        return (tries < REFINEMENTS) & alive & (error > 4 * eps)
+
+    def refine(carry):
+        point, tries, error, _ = carry
+        point, error, alive = run(_refinement, None, program, point, error, static=(pattern,))
+        return point, tries + 1, error, alive
+
+    carry = (last, jnp.zeros((), jnp.int32), 10 * jnp.maximum(error, tol), ~infeasible)
+    refined, _, less, _ = lax.while_loop(improving, refine, carry)
+    rest = (program, last, error, refined, less, infeasible)
+    point, solved, infeasible = run(_end, None, *rest, static=(pattern, tol))
+    return End(point, steps, solved, infeasible)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def attached(pattern: Pattern, program: Program, point: Point) -> Point:
+    """The solution `point` of the program, with the derivative that the program gives it."""
+    return point
+
+
+@attached.defjvp
+def _attached_jvp(pattern: Pattern, primals, tangents):
+    program, point = primals
+    # Derivatives of higher order see that the point moves too.
+    point = attached(pattern, program, point)
+    return point, run(_change, None, program, point, tangents[0], static=(pattern,))
+
+
+def _change(pattern: Pattern, _, program: Program, point: Point, change: Program) -> Point:
+    """How the solution changes with the program."""
+    program, change = _sparse(program, pattern), _sparse(change, pattern)
+    x, s, z = point
+    right_x = -_product(change.Q, x) - change.q - _gathered(change.G, z, x)
+    right_s = _zip(lambda a, b: b - a, _times(change.G, x), change.h)
+    v = _zip(lambda a, b: a - b, s, z)
+    width = width_of(x.dtype)
+    dx, dv = _solve_projected(program, v, width, right_x, right_s, 2)
+    ds = _zip(lambda y, dy: jordan.projection_slope(y, width).times(dy), v, dv)
+    return Point(dx, ds, _zip(lambda a, b: a - b, ds, dv))

@@ -1,0 +1,159 @@
+"""Second-order cones {v : v0 >= |v1|} of R^d, many at once: arrays (k, d). Half-lines are those of d = 1.
+
+Products, the scaling of Nesterov and Todd, steps to the boundary, and the projection on the cone with its derivative.
+
+Source: Vandenberghe, The CVXOPT linear and quadratic cone program solvers (2010), sections 3-5; for the projection
+Fukushima, Luo & Tseng, SIAM J. Optim. 12 (2002), 436-460.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+
+def identity(like):
+    """e = (1, 0, ...) of each cone, (k, d)."""
+    return jnp.zeros_like(like).at[..., 0].set(1)
+
+
+def _norm(rest):
+    """|rest| along the last axis, with zero derivative where it vanishes."""
+    if rest.shape[-1] == 0:
+        return jnp.zeros(rest.shape[:-1], rest.dtype)
+    square = jnp.sum(rest * rest, -1)
+    safe = square > 0
+    return jnp.where(safe, jnp.sqrt(jnp.where(safe, square, jnp.ones_like(square))), jnp.zeros_like(square))
+
+
+def depth(v):
+    """v0 - |v1|, (k,): the smaller eigenvalue, positive inside the cone."""
+    return v[..., 0] - _norm(v[..., 1:])
+
+
+def determinant(v):
+    """v0^2 - |v1|^2, (k,), without cancellation near the boundary."""
+    norm = _norm(v[..., 1:])
+    return (v[..., 0] - norm) * (v[..., 0] + norm)
+
+
+def product(a, b):
+    """Jordan product (a.b, a0 b1 + b0 a1)."""
+    first = jnp.sum(a * b, -1, keepdims=True)
+    return jnp.concatenate([first, a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:]], -1)
+
+
+def quotient(a, b):
+    """x with product(a, x) = b."""
+    if a.shape[-1] == 1:
+        return b / a
+    along = jnp.sum(a[..., 1:] * b[..., 1:], -1, keepdims=True)
+    x0 = (a[..., :1] * b[..., :1] - along) / determinant(a)[..., None]
+    return jnp.concatenate([x0, (b[..., 1:] - x0 * a[..., 1:]) / a[..., :1]], -1)
+
+
+class Scaling(NamedTuple):
+    """W of Nesterov and Todd, W z = W^-1 s: W = beta (2 v v^T - J), J = diag(1, -1, ...), of each cone; `inverse` is 1 / beta.
+
+    On a half-line v = 1.
+    """
+
+    v: jnp.ndarray
+    beta: jnp.ndarray
+    inverse: jnp.ndarray
+
+    def times(self, x):
+        """W x."""
+        return self.beta * _mirrored(self.v, x)
+
+    def inverse_times(self, x):
+        """W^-1 x."""
+        return self.inverse * _mirrored(_reflected(self.v), x)
+
+
+def _mirrored(v, x):
+    """(2 v v^T - J) x."""
+    return x if x.shape[-1] == 1 else 2 * v * jnp.sum(v * x, -1, keepdims=True) - _reflected(x)
+
+
+def _reflected(x):
+    return jnp.concatenate([x[..., :1], -x[..., 1:]], -1)
+
+
+def scaling(s, z) -> Scaling:
+    """The scaling of points s and z inside the cones."""
+    if s.shape[-1] == 1:
+        return Scaling(jnp.ones_like(s), jnp.sqrt(s / z), jnp.sqrt(z / s))
+    norm_s, norm_z = jnp.sqrt(determinant(s))[..., None], jnp.sqrt(determinant(z))[..., None]
+    beta = jnp.sqrt(norm_s / norm_z)
+    s, z = s * (1 / norm_s), z * (1 / norm_z)
+    gamma = jnp.sqrt((1 + jnp.sum(s * z, -1, keepdims=True)) / 2)
+    w = (s + _reflected(z)) / (2 * gamma)
+    return Scaling((w + identity(w)) * (1 / jnp.sqrt(2 * (w[..., :1] + 1))), beta, 1 / beta)
+
+
+def longest_step(v, dv):
+    """Largest t, of all cones, with v + t dv in them; infinite where dv never leaves."""
+    falls = dv[..., 0] < 0
+    second = jnp.where(falls, -v[..., 0] / jnp.where(falls, dv[..., 0], 1), jnp.inf)
+    if v.shape[-1] == 1:
+        return jnp.min(second, initial=jnp.inf)
+    a = dv[..., 0] ** 2 - jnp.sum(dv[..., 1:] ** 2, -1)
+    b = v[..., 0] * dv[..., 0] - jnp.sum(v[..., 1:] * dv[..., 1:], -1)
+    c = determinant(v)
+    # The least positive root of a t^2 + 2 b t + c, in the form that does not cancel, and the root of v0 + t dv0.
+    slope = jnp.sqrt(jnp.maximum(b * b - a * c, 0)) - b
+    first = jnp.where(slope > 0, c / jnp.where(slope > 0, slope, 1), jnp.inf)
+    return jnp.min(jnp.minimum(first, second), initial=jnp.inf)
+
+
+def projection(v):
+    """Nearest point of the cone, (k, d)."""
+    norm = _norm(v[..., 1:])
+    high, low = jnp.maximum(v[..., 0] + norm, 0), jnp.maximum(v[..., 0] - norm, 0)
+    if v.shape[-1] == 1:
+        return high[..., None]
+    mean, half = (high + low) / 2, (high - low) / 2
+    safe = norm > 0
+    rest = jnp.where(safe, half / jnp.where(safe, norm, 1), 0)[..., None] * v[..., 1:]
+    return jnp.concatenate([mean[..., None], rest], -1)
+
+
+class Slope(NamedTuple):
+    """Derivatives D (k, d, d) of the projection, by their eigenvalues (k,), all between 0 and 1.
+
+    `high` is that of (1, u), `low` that of (1, -u), `across` that of (0, x) with x at right angles to u (k, d - 1), which is a
+    unit vector, or zero where the three eigenvalues are equal.
+    """
+
+    high: jnp.ndarray
+    low: jnp.ndarray
+    across: jnp.ndarray
+    u: jnp.ndarray
+
+    def map(self, function):
+        """The matrices with the same eigenvectors and a function of the eigenvalues."""
+        return Slope(function(self.high), function(self.low), function(self.across), self.u)
+
+    def times(self, x):
+        """D x, of x (k, d)."""
+        if x.shape[-1] == 1:
+            return self.high[..., None] * x
+        along = jnp.sum(self.u * x[..., 1:], -1)
+        up, down = self.high * ((x[..., 0] + along) / 2), self.low * ((x[..., 0] - along) / 2)
+        rest = (up - down - self.across * along)[..., None] * self.u + self.across[..., None] * x[..., 1:]
+        return jnp.concatenate([(up + down)[..., None], rest], -1)
+
+
+def projection_slope(v, width) -> Slope:
+    """Derivative of the projection, rounded off over `width` about its kinks, where it is a mean.
+
+    With the eigenvalues v0 -+ |v1| and p(x) = (x + sqrt(x^2 + 4 width^2)) / 2 instead of max(x, 0): p' along (1, -+u), and
+    the divided difference of p across.
+    """
+    norm = _norm(v[..., 1:])
+    high, low = v[..., 0] + norm, v[..., 0] - norm
+    root_high, root_low = (jnp.sqrt(x * x + 4 * width * width) for x in (high, low))
+    # (p(high) - p(low)) / (high - low), without the difference.
+    across = (1 + (high + low) / (root_high + root_low)) / 2
+    u = v[..., 1:] / jnp.where(norm > 0, norm, 1)[..., None]
+    return Slope((1 + high / root_high) / 2, (1 + low / root_low) / 2, across, u)

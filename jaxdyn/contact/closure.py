@@ -1,0 +1,209 @@
+"""Force closure: whether contact forces within their cones can balance every wrench on the object.
+
+A grasp with map G and cones FC has force closure, G(FC) = R^p, if and only if G has full rank and there are internal forces
+strictly inside the cones, G f = 0 with f in int(FC). So that is what is looked for, by the largest least margin of them.
+
+Source: Murray, Li & Sastry (1994), definition 5.2 and proposition 5.3; EQUATIONS section 10.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxdyn.compile import is_concrete
+from jaxdyn.contact._checks import as_float
+from jaxdyn.contact.cones import SIDES, FrictionCone, surface_cone
+
+_FIRST_FACES = 8
+_ROUNDS = 60
+_TIGHT = 1e-9  # distance of the bounds at which cutting ends
+_LEAST = 1e-8  # margins and singular values below this, of the largest, are zero
+
+
+class ForceClosure(eqx.Module):
+    """Whether a grasp has force closure, how far from losing it, and the reason where it has none.
+
+    - `closed`: bool. `margin`: the largest t such that internal forces f, G f = 0, with total normal force 1 N have every
+      margin of every cone at least t (for a friction cone mu f_n - |f_t|, so t is dimensionless: newtons of margin per
+      newton of grip). Zero where the grasp is open, infinite where no contact has a bound.
+    - `forces` (m,): those internal forces; zeros where there are none.
+    - `direction` (p,): where open, a unit wrench on the object that contact forces cannot balance, in the units and
+      axes of G's rows; zeros where closed. direction . (G f) >= 0 (to 1e-8) for all forces f in the cones, and to balance
+      it takes G f = -direction.
+    - `rank`: of G, in its columns along which there are forces.
+    """
+
+    closed: bool = eqx.field(static=True)
+    margin: float = eqx.field(static=True)
+    forces: Float[np.ndarray, " m"]
+    direction: Float[np.ndarray, " p"]
+    rank: int = eqx.field(static=True)
+
+
+class _Rows(NamedTuple):
+    """All cones side by side: linear rows (k, m), second-order rows (j, 3, m), and the total normal force (m,).
+
+    `kept` (m,): columns of G that they act on; directions in which a friction coefficient of zero leaves no force are not.
+    """
+
+    linear: np.ndarray
+    second: np.ndarray
+    normal: np.ndarray
+    kept: np.ndarray
+
+
+def force_closure(G, cones, *, faces: int | None = None, side="inscribed") -> ForceClosure:
+    """Whether the grasp with map G has force closure, with a margin, or with a wrench that it cannot resist.
+
+    Round cones are taken as they are: a linear program (HiGHS) with faces around them is solved, and faces are added where
+    its forces leave the cones, until the margin is found to 1e-9. With `faces` the cones are pyramids instead, one program.
+
+    **Arguments:**
+
+    - `G` (p, m): grasp map, G f is the wrench of contact forces f on the object; `jd.grasp.grasp_map`. Known numbers.
+    - `cones`: one per contact in the order of G's columns: `friction_cone(...)`, `surface_cone(...)`, or rows U (k, m_i) with
+      U f <= 0, for which the total normal force is the mean of -U f.
+    - `faces`, `side`: of `FrictionCone.pyramid`; None: the round cones.
+
+    **Returns:** `ForceClosure`.
+
+    **Raises:** ValueError for traced arguments, and for cones that do not fit the columns of G.
+
+    ```python
+    jd.contact.force_closure(jd.grasp.grasp_map(hand, q), [jd.contact.friction_cone("hard-finger", 0.5)] * 3).closed
+    ```
+
+    Source: Murray, Li & Sastry (1994), proposition 5.3; for the certificate, the theorem of separating hyperplanes.
+    """
+    if not is_concrete(G, cones):
+        raise ValueError(
+            "G or cones are traced; a linear program needs known numbers, call force_closure outside of jit"
+        )
+    G = np.asarray(as_float(G, "G", (None, None)), float)
+    every = _as_cones([cones] if isinstance(cones, FrictionCone) else cones, G.shape[1])
+    if side not in SIDES:
+        raise ValueError(f"side is {side!r}; choose from {', '.join(SIDES)}")
+    rows = _stacked(every, faces, side)
+    # Rows of G in N and in N m are made comparable before any of them is called zero.
+    sizes = np.linalg.norm(G[:, rows.kept], axis=1)
+    # What is left of a sum that cancels is no row.
+    sizes = np.where(sizes > 1e-13 * sizes.max(initial=0), sizes, 0.0)
+    unit = np.where(sizes[:, None] > 0, G[:, rows.kept], 0.0) / np.where(sizes > 0, sizes, 1)[:, None]
+    left, singular, _ = np.linalg.svd(unit)
+    rank = int(np.sum(singular > _LEAST * singular[0])) if singular.size and singular[0] > 0 else 0
+    nothing, none = np.zeros(G.shape[1]), np.zeros(G.shape[0])
+    if rank < G.shape[0]:
+        return ForceClosure(False, 0.0, nothing, _wrench(left[:, -1], sizes), rank)
+    if not len(rows.linear) and not len(rows.second):
+        return ForceClosure(True, float("inf"), nothing, none, rank)
+    margin, forces, twist = _widest(unit, rows)
+    if margin <= _LEAST:
+        return ForceClosure(False, 0.0, nothing, _wrench(twist, sizes), rank)
+    nothing[rows.kept] = forces
+    return ForceClosure(True, margin, nothing, none, rank)
+
+
+def _as_cones(cones, count: int) -> list[FrictionCone]:
+    """The cones, rows as those of a surface. **Raises:** ValueError where they do not fit `count` columns."""
+    if not isinstance(cones, (tuple, list)):
+        raise ValueError(f"cones is a {type(cones).__name__}; pass a list with one cone per contact")
+    every = []
+    for i, cone in enumerate(cones):
+        if not isinstance(cone, FrictionCone):
+            rows = as_float(cone, f"cones[{i}]", (None, None))
+            cone = surface_cone(rows) if rows.shape[1] == 6 else FrictionCone("surface", False, None, None, rows)
+        every.append(cone)
+    sizes = [_width(cone) for cone in every]
+    if sum(sizes) != count:
+        raise ValueError(
+            f"cones have {sizes} components, {sum(sizes)} in all, and G has {count} columns; they have to agree"
+        )
+    return every
+
+
+def _width(cone: FrictionCone) -> int:
+    return cone.size if cone.rows is None else cone.rows.shape[1]
+
+
+def _stacked(cones: list[FrictionCone], faces: int | None, side: str) -> _Rows:
+    total = sum(_width(cone) for cone in cones)
+    linear, second, normal, kept, place = [np.zeros((0, total))], [np.zeros((0, 3, total))], np.zeros(total), [], 0
+    for cone in cones:
+        columns = slice(place, place + _width(cone))
+        place = columns.stop
+        used = np.ones(_width(cone), bool)
+        if cone.mu is not None and float(cone.mu) == 0:
+            used[: 1 if cone.in_plane else 2] = False
+        if cone.gamma is not None and float(cone.gamma) == 0:
+            used[3] = False
+        kept.append(used)
+        rows = np.asarray(cone.linear_rows() if faces is None else cone.pyramid(faces, side), float)
+        cones_of = np.asarray(cone.second_order_rows(), float)
+        if not used.all():  # what is left of the cone is that it presses, and perhaps its friction
+            rows = np.concatenate(
+                [rows[np.abs(rows[:, used]).sum(1) > 0], -np.eye(len(used))[-1 if cone.in_plane else 2][None]]
+            )
+            rows = rows[[np.abs(row[~used]).sum() == 0 for row in rows]]
+            cones_of = cones_of if float(cone.mu) > 0 else cones_of[:0]  # pyright: ignore[reportArgumentType]
+        linear.append(np.zeros((len(rows), total)))
+        linear[-1][:, columns] = rows
+        if faces is None and len(cones_of):
+            second.append(np.zeros((len(cones_of), 3, total)))
+            second[-1][:, :, columns] = cones_of
+        if cone.rows is not None:
+            normal[columns] = -rows.mean(0)
+        elif cone.kind != "rigid":
+            normal[columns.start + (len(used) - 1 if cone.in_plane else min(2, len(used) - 1))] = 1.0
+    mask = np.concatenate([*kept, np.zeros(0, bool)])
+    return _Rows(
+        np.concatenate(linear)[:, mask], np.concatenate(second)[:, :, mask], normal[mask], np.flatnonzero(mask)
+    )
+
+
+def _widest(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
+    """Largest least margin t of forces f with G f = 0 and normal force 1; f; and y with y.(G f) >= -t for all f in the cones."""
+    # scipy's optimisers take long to import, so only who calls this pays for it.
+    from scipy.optimize import linprog
+
+    angles = 2 * np.pi / _FIRST_FACES * np.arange(_FIRST_FACES)
+    faces = [
+        c * s[1] + d * s[2] - s[0] for s in rows.second for c, d in zip(np.cos(angles), np.sin(angles), strict=True)
+    ]
+    above = np.concatenate([rows.linear, np.reshape(faces, (len(faces), G.shape[1]))])
+    equal = np.concatenate([np.concatenate([G, rows.normal[None]]), np.zeros((len(G) + 1, 1))], 1)
+    right = np.append(np.zeros(len(G)), 1.0)
+    cost = np.append(np.zeros(G.shape[1]), -1.0)
+    options = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    found = None
+    for _ in range(_ROUNDS):
+        limits = np.concatenate([above, np.ones((len(above), 1))], 1)
+        found = linprog(cost, limits, np.zeros(len(limits)), equal, right, bounds=(None, None), options=options)
+        if found.status == 2:
+            # No internal forces press at all: the normal force is a combination of the rows of G, n = G^T y.
+            return -np.inf, np.zeros(G.shape[1]), np.linalg.lstsq(G.T, rows.normal, rcond=None)[0]
+        if found.status != 0:
+            raise RuntimeError(f"the linear program of force closure was not solved: {found.message}")
+        forces, upper = found.x[:-1], found.x[-1]
+        seen = rows.second @ forces
+        slopes = np.linalg.norm(seen[:, 1:], axis=1)
+        margins = np.concatenate([-rows.linear @ forces, seen[:, 0] - slopes])
+        # The faces lie around the cones, so t is an upper bound; what its forces have is a lower one.
+        if upper <= _LEAST or margins.min() >= upper - _TIGHT:
+            break
+        touching = [(s, y / n) for s, y, n in zip(rows.second, seen[:, 1:], slopes, strict=True) if n > 0]
+        above = np.concatenate([above, *[(y[0] * s[1] + y[1] * s[2] - s[0])[None] for s, y in touching]])
+    else:
+        raise RuntimeError(f"force closure: the margin was not found to {_TIGHT} with {_ROUNDS} rounds of faces")
+    return (
+        float(min(margins.min(), upper)) if upper > _LEAST else float(upper),
+        forces,
+        -found.eqlin.marginals[: len(G)],
+    )
+
+
+def _wrench(twist, sizes) -> np.ndarray:
+    """Unit wrench in G's own units, of the vector that multiplies its scaled rows."""
+    direction = twist / np.where(sizes > 0, sizes, 1)
+    return direction / np.linalg.norm(direction)

@@ -1,0 +1,198 @@
+"""Friction cones: which forces a contact can transmit without pulling, slipping or spinning.
+
+Contact forces f (m,) are along the columns of the contact's wrench basis (`wrench_basis`), with z the normal into the
+object, so that f_n >= 0 presses. With friction coefficient mu and, for soft fingers, gamma (m):
+
+    frictionless    f_n >= 0
+    hard-finger     |(fx, fy)| <= mu f_n
+    soft-finger     |(fx, fy)| <= mu f_n   and   |tz| <= gamma f_n
+    rigid           all wrenches
+    surface         U w <= 0, see `wrench_cone`
+
+Source: Murray, Li & Sastry (1994), section 5.2; EQUATIONS sections 10 and 11.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.nn import logsumexp
+from jaxtyping import Array, Float
+
+from jaxdyn.contact._checks import as_float, as_number
+from jaxdyn.contact.kinds import components
+from jaxdyn.so3 import _product
+
+SIDES = ("inscribed", "circumscribed")
+
+
+class FrictionCone(eqx.Module):
+    """The forces that one contact can transmit; made by `friction_cone` and `surface_cone`.
+
+    - `kind`, `in_plane`: of the contact. `mu` (): friction coefficient. `gamma` (): m, radius of a soft finger's torque.
+    - `rows` (k, 6): U of a surface, U w <= 0.
+
+    It has `linear_rows` and `second_order_rows`, which together are the cone exactly, `pyramid`, which is a linear one
+    inside or around it, and `margins` and `margin`, how far within it a force is.
+    """
+
+    kind: str = eqx.field(static=True)
+    in_plane: bool = eqx.field(static=True)
+    mu: Float[Array, ""] | None
+    gamma: Float[Array, ""] | None
+    rows: Float[Array, "k 6"] | None
+
+    @property
+    def size(self) -> int:
+        """Number m of components of the contact's force."""
+        return 6 if self.kind == "surface" else len(components(self.kind, self.in_plane, "cone"))
+
+    def linear_rows(self) -> Float[Array, "k m"]:
+        """L (k, m) of the inequalities L f <= 0 that are linear; (0, m) if there are none."""
+        if self.rows is not None:
+            return self.rows
+        if self.kind == "frictionless":
+            return -jnp.ones((1, 1))
+        if self.mu is None:
+            return jnp.zeros((0, self.size))
+        one, zero = jnp.ones_like(self.mu), jnp.zeros_like(self.mu)
+        if self.in_plane:
+            return jnp.stack([jnp.stack([one, -self.mu]), jnp.stack([-one, -self.mu])])
+        if self.gamma is None:
+            return jnp.zeros((0, 3), self.mu.dtype)
+        return jnp.stack([jnp.stack([zero, zero, -self.gamma, sign * one]) for sign in (1.0, -1.0)])
+
+    def second_order_rows(self) -> Float[Array, "j 3 m"]:
+        """S (j, 3, m) of the inequalities |(S f)_1, (S f)_2| <= (S f)_0, j = 0 or 1.
+
+        It is (mu f_n, fx, fy) for a spatial contact with friction.
+        """
+        if self.mu is None or self.in_plane:
+            dtype = jnp.zeros(()).dtype if self.mu is None else self.mu.dtype
+            return jnp.zeros((0, 3, self.size), dtype)
+        unit = jnp.eye(self.size, dtype=self.mu.dtype)
+        return jnp.stack([self.mu * unit[2], unit[0], unit[1]])[None]
+
+    def pyramid(self, faces: int = 8, side: str = "inscribed") -> Float[Array, "k m"]:
+        """Rows P (k, m) of a pyramid P f <= 0 that stands for the cone.
+
+        The faces' normals are at the angles 2 pi i / faces from x. An "inscribed" pyramid lies within the cone: each
+        of its forces is one without slip, and mu is lost by a factor of at least cos(pi / faces), 1/sqrt(2) for four.
+        A "circumscribed" one contains the cone; with four faces it is |fx|, |fy| <= mu f_n. Cones that are linear are
+        returned as they are.
+
+        **Arguments:** `faces`: at least 3. `side`: "inscribed" or "circumscribed".
+
+        **Raises:** ValueError for fewer faces and for an unknown side.
+
+        Source: Caron, Pham & Nakamura (2015), section II; EQUATIONS section 11.
+        """
+        if isinstance(faces, bool) or not isinstance(faces, (int, np.integer)) or faces < 3:
+            raise ValueError(f"faces is {faces!r}; a pyramid has at least 3, give an integer")
+        if side not in SIDES:
+            raise ValueError(f"side is {side!r}; choose from {', '.join(SIDES)}")
+        linear = self.linear_rows()
+        if self.mu is None or self.in_plane or self.rows is not None:
+            return linear
+        angles = 2 * np.pi / faces * np.arange(faces)
+        shrink = float(np.cos(np.pi / faces)) if side == "inscribed" else 1.0
+        normals = np.zeros((faces, self.size))
+        normals[:, 0], normals[:, 1] = np.cos(angles), np.sin(angles)
+        along = jnp.zeros((faces, self.size), self.mu.dtype).at[:, 2].set(-shrink * self.mu)
+        return jnp.concatenate([jnp.asarray(normals, self.mu.dtype) + along, linear])
+
+    def margins(self, force, smoothing=0.0) -> Float[Array, " k"]:
+        """How far the force is from violating each inequality, (j + k,): mu f_n - |(fx, fy)|, then -L f.
+
+        Inside the cone all are positive, on its boundary the least is zero. Units are those of the rows: N for forces,
+        N m for a soft finger's gamma f_n -+ tz, and those of its rows for a surface.
+
+        **Arguments:** `force` (m,), N and N m. `smoothing` (), N: |(fx, fy)| is taken as sqrt(fx^2 + fy^2 + smoothing^2)
+        - that is smooth at a force along the normal too, and the margin is then too small by at most `smoothing`, on the
+        safe side. With zero the margin has a kink there, at which its derivative is that along the normal.
+
+        **Raises:** ValueError for a force of another size.
+        """
+        force = as_float(force, "force", (self.size,))
+        found = []
+        second = self.second_order_rows()
+        if second.shape[0]:
+            first, *rest = jnp.unstack(_product(second[0].astype(force.dtype), force))
+            found.append((first - _length(rest, smoothing))[None])
+        return jnp.concatenate([*found, -_product(self.linear_rows().astype(force.dtype), force)])
+
+    def margin(self, force, smoothing=0.0) -> Float[Array, ""]:
+        """Least of `margins`, () : positive inside the cone, zero on its boundary, infinite for a rigid contact.
+
+        With `smoothing` > 0 it is -s log(sum exp(-margins / s)), smooth and at most the least margin, by no more than
+        s (1 + log(number of margins)); it may be traced if it is positive.
+        """
+        every = self.margins(force, smoothing)
+        if every.shape[0] == 0:
+            return jnp.full((), jnp.inf, every.dtype)
+        if every.shape[0] == 1 or _is_zero(smoothing):
+            return jnp.min(every)
+        scale = jnp.asarray(smoothing, every.dtype)
+        return -scale * logsumexp(-every / scale)
+
+    def normal_force(self, force) -> Float[Array, ""]:
+        """f_n (), N: force along the contact's normal; positive where it presses."""
+        force = as_float(force, "force", (self.size,))
+        z = 2 if self.kind == "surface" else components(self.kind, self.in_plane, "cone").index(2)
+        return force[z]
+
+
+def _is_zero(smoothing) -> bool:
+    return isinstance(smoothing, (int, float)) and smoothing == 0
+
+
+def _length(parts, smoothing):
+    """sqrt(sum of squares + smoothing^2), with zero derivative where it vanishes."""
+    square = jnp.sum(jnp.stack(parts) ** 2)
+    if not _is_zero(smoothing):
+        square = square + jnp.asarray(smoothing, square.dtype) ** 2
+    safe = square > 0
+    return jnp.where(safe, jnp.sqrt(jnp.where(safe, square, jnp.ones_like(square))), jnp.zeros_like(square))
+
+
+def friction_cone(kind: str, mu=None, gamma=None, *, in_plane: bool = False) -> FrictionCone:
+    """The cone of forces that a contact of this kind can transmit (see `FrictionCone`).
+
+    **Arguments:**
+
+    - `kind`: "frictionless", "hard-finger" (a point with friction), "soft-finger" or "rigid".
+    - `mu`: friction coefficient, zero or positive; for fingers, and for them alone.
+    - `gamma`: m, ratio of the largest torque about the normal to the normal force; for a soft finger alone.
+    - `in_plane`: of a contact with `in_plane=True`, whose force is (fx, fz).
+
+    **Raises:** ValueError for an unknown kind, coefficients that are negative, missing, or given where there are none.
+
+    ```python
+    cone = jd.contact.friction_cone("hard-finger", mu=0.5)
+    cone.margin(jnp.array([0.3, 0.0, 1.0]))  # 0.2 N
+    ```
+
+    Source: Murray, Li & Sastry (1994), table 5.2; EQUATIONS section 10.
+    """
+    components(kind, in_plane, "cone")
+    for name, value, kinds in (("mu", mu, ("hard-finger", "soft-finger")), ("gamma", gamma, ("soft-finger",))):
+        if kind in kinds and value is None:
+            raise ValueError(f"{name} is None for a {kind}; give its friction coefficient, zero or positive")
+        if kind not in kinds and value is not None:
+            raise ValueError(f"{name} is {value} for a {kind} contact, which has none; leave it out")
+    mu = None if mu is None else as_number(mu, "mu", "", zero=True)
+    gamma = None if gamma is None or mu is None else as_number(gamma, "gamma", "m", zero=True, like=mu.dtype)
+    return FrictionCone(kind, bool(in_plane), mu, gamma, None)
+
+
+def surface_cone(rows) -> FrictionCone:
+    """The cone of wrenches U w <= 0 that a surface in contact can transmit.
+
+    **Arguments:** `rows` U (k, 6), from `wrench_cone` or `wrench_cone_of_polygon`. Rows that bound a torque (their
+    coefficients of torques are not zero) should be divided by a length to have margins in N throughout.
+
+    **Raises:** ValueError for another shape.
+    """
+    rows = as_float(rows, "rows", (None, 6))
+    if rows.shape[0] == 0:
+        raise ValueError("rows has shape (0, 6); give at least one row, or take friction_cone('rigid')")
+    return FrictionCone("surface", False, None, None, rows)

@@ -1,0 +1,187 @@
+"""Montana's equations of contact: how the place of a contact moves on two surfaces that stay in touch.
+
+Contact coordinates eta = (u_o, v_o, u_f, v_f, psi): where the contact is on the object's and on the finger's surface, and the
+angle from one Gauss frame to the other. Frames C_o, C_f are the Gauss frames there, with normals opposite to each other:
+
+    R_{co,cf} = [R_psi 0; 0 -1],   R_psi = [cos psi, -sin psi; -sin psi, -cos psi],
+    g_of = g_oCo(alpha_o) g_psi g_fCf(alpha_f)^-1.
+
+L_o and L_f are fixed in the bodies and coincide with C_o and C_f now. V_c = (vx, vy, vz, wx, wy, wz) is the body twist of L_f
+against L_o; touching is vz = 0, and then, with R_o = [0 -1; 1 0],
+
+    V_c = J_c eta_dot,   J_c = [ R_psi M_o,       -M_f,         0;
+                                 0,                0,           0;
+                                 R_psi R_o K_o M_o, -R_o K_f M_f, 0;
+                                 -T_o M_o,        -T_f M_f,     1 ].
+
+Source: Montana (1988); Murray, Li & Sastry (1994), eqs 5.28-5.32; EQUATIONS section 8.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxdyn import se3
+from jaxdyn.compile import compiled, is_concrete
+from jaxdyn.contact._checks import as_float
+from jaxdyn.contact.surfaces import (
+    Surface,
+    SurfaceGeometry,
+    check_regular,
+    check_surface,
+    geometry_at,
+    surface_geometry,
+)
+from jaxdyn.so3 import _product
+
+
+class ContactKinematics(eqx.Module):
+    """Kinematics of one contact at eta (see `montana`).
+
+    - `J_c` (6, 5): V_c = J_c eta_dot, twists of the finger against the object in the axes of C_f, at the contact.
+    - `forward` (5, 6): eta_dot = forward V_c where vz = 0; its column of vz is zero, forward J_c = 1.
+    - `J_F` (6, 5): V_of = J_F eta_dot, body twist of the finger's frame against the object's, in the finger's axes.
+    - `relative_curvature` (2, 2): K_f + R_psi K_o R_psi, 1/m. `strict` (): whether it is invertible and the surfaces lie
+      outside each other (both eigenvalues positive); where not, `forward` is finite without meaning.
+    - `g_of` (4, 4): pose of the finger's frame in the object's. `object`, `finger`: `SurfaceGeometry` of the surfaces.
+    """
+
+    J_c: Float[Array, "6 5"]
+    forward: Float[Array, "5 6"]
+    J_F: Float[Array, "6 5"]
+    relative_curvature: Float[Array, "2 2"]
+    strict: Bool[Array, ""]
+    g_of: Float[Array, "4 4"]
+    object: SurfaceGeometry
+    finger: SurfaceGeometry
+
+    @property
+    def rolling(self) -> Float[Array, "5 2"]:
+        """eta_dot = rolling (wx, wy): rates of contact coordinates when the surfaces neither slip nor spin."""
+        return self.forward[:, 3:5]
+
+
+def _turn(psi):
+    c, s = jnp.cos(psi), jnp.sin(psi)
+    return jnp.stack([jnp.stack([c, -s]), jnp.stack([-s, -c])])
+
+
+def _checked(eta) -> Float[Array, "5"]:
+    return as_float(eta, "eta", (5,))
+
+
+def relative_pose(surface_o: Surface, surface_f: Surface, eta) -> Float[Array, "4 4"]:
+    """g_of (4, 4): pose of the finger's body frame in the object's when the surfaces touch at eta.
+
+    **Arguments:** as of `montana`. **Raises:** as `montana`. Source: EQUATIONS section 8.
+    """
+    eta = _checked(eta)
+    geometry_o, geometry_f = surface_geometry(surface_o, eta[:2]), surface_geometry(surface_f, eta[2:4])
+    return _pose(geometry_o, geometry_f, eta[4])
+
+
+def _pose(geometry_o, geometry_f, psi):
+    turn = jnp.zeros((4, 4), psi.dtype).at[:2, :2].set(_turn(psi)).at[2, 2].set(-1).at[3, 3].set(1)
+    return _product(_product(geometry_o.pose, turn), se3.inverse(geometry_f.pose))
+
+
+def montana(surface_o: Surface, surface_f: Surface, eta) -> ContactKinematics:
+    """Montana's equations of contact at eta: J_c, its inverse on vz = 0, and what they are made of.
+
+    The forward form is, with Kt = R_psi K_o R_psi,
+
+        alpha_f_dot = M_f^-1 (K_f + Kt)^-1 ((-wy, wx) - Kt (vx, vy)),
+        alpha_o_dot = M_o^-1 R_psi (K_f + Kt)^-1 ((-wy, wx) + K_f (vx, vy)),
+        psi_dot = wz + T_f M_f alpha_f_dot + T_o M_o alpha_o_dot.
+
+    **Arguments:**
+
+    - `surface_o`, `surface_f`: of the object and of the finger, each in its body's frame, with outward normals.
+    - `eta` (5,): (u_o, v_o, u_f, v_f, psi), in the units of the charts, and rad.
+
+    **Returns:** `ContactKinematics`, differentiable in eta and in the surfaces.
+
+    **Raises:** ValueError for what is no surface, eta of another shape, coordinates at which a chart ends, and surfaces that
+    cut into each other or whose relative curvature is singular (two planes), when this is known.
+
+    ```python
+    ball, tip = jd.contact.Sphere(0.1), jd.contact.Sphere(0.02)
+    jd.contact.montana(ball, tip, jnp.array([0.1, 0.2, 0.3, 0.4, 0.5])).J_c
+    ```
+
+    Source: Montana (1988); Murray, Li & Sastry (1994), eqs 5.28-5.32; EQUATIONS section 8.
+    """
+    eta = _checked(eta)
+    for surface in (surface_o, surface_f):
+        check_surface(surface)
+    found = _montana(surface_o, surface_f, eta)
+    check_regular(surface_o, eta[:2], found.object)
+    check_regular(surface_f, eta[2:4], found.finger)
+    if is_concrete(found.strict) and not bool(found.strict):
+        raise ValueError(
+            f"eta is {np.asarray(eta).tolist()}, where the relative curvature {np.asarray(found.relative_curvature).tolist()} "
+            "is not positive definite; the surfaces do not touch in one point from outside, choose more convex ones or another "
+            "place"
+        )
+    return found
+
+
+@compiled
+def _montana(surface_o, surface_f, eta) -> ContactKinematics:
+    o, f = geometry_at(surface_o, eta[:2]), geometry_at(surface_f, eta[2:4])
+    turn = _turn(eta[4])
+    quarter = jnp.asarray(np.array([[0.0, -1.0], [1.0, 0.0]]), eta.dtype)
+    none = jnp.zeros((2, 1), eta.dtype)
+    moved_o, moved_f = o.metric, f.metric
+    top = jnp.concatenate([_product(turn, moved_o), -moved_f, none], 1)
+    turning_o = _product(turn, _product(quarter, _product(o.curvature, moved_o)))
+    turning_f = _product(quarter, _product(f.curvature, moved_f))
+    spin = jnp.concatenate([-_product(o.torsion, moved_o), -_product(f.torsion, moved_f), jnp.ones((1,), eta.dtype)])
+    middle = jnp.concatenate([turning_o, -turning_f, none], 1)
+    J_c = jnp.concatenate([top, jnp.zeros((1, 5), eta.dtype), middle, spin[None]])
+
+    seen = _product(turn, _product(o.curvature, turn))
+    relative = f.curvature + seen
+    strict = _is_positive(relative)
+    flexibility = _inverse(relative, strict)
+    # Columns (vx, vy, vz, wx, wy, wz) of (-wy, wx) and of (vx, vy).
+    rolled = jnp.asarray(np.array([[0, 0, 0, 0, -1, 0], [0, 0, 0, 1, 0, 0]]), eta.dtype)
+    slid = jnp.asarray(np.array([[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]), eta.dtype)
+    along_f = _product(flexibility, rolled - _product(seen, slid))
+    along_o = _product(turn, _product(flexibility, rolled + _product(f.curvature, slid)))
+    spun = (
+        jnp.asarray(np.array([0, 0, 0, 0, 0, 1]), eta.dtype)
+        + _product(f.torsion, along_f)
+        + _product(o.torsion, along_o)
+    )
+    forward = jnp.concatenate(
+        [_product(_inverse(o.metric, o.regular), along_o), _product(_inverse(f.metric, f.regular), along_f), spun[None]]
+    )
+    return ContactKinematics(
+        J_c=J_c,
+        forward=forward,
+        J_F=_product(se3.Ad(f.pose), J_c),
+        relative_curvature=relative,
+        strict=strict & o.regular & f.regular,
+        g_of=_pose(o, f, eta[4]),
+        object=o,
+        finger=f,
+    )
+
+
+def _is_positive(matrix) -> Any:
+    """Whether a symmetric (2, 2) matrix is positive definite beyond rounding."""
+    trace, size = matrix[0, 0] + matrix[1, 1], jnp.sum(matrix * matrix)
+    determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+    return (trace > 0) & (determinant > 1e2 * float(jnp.finfo(matrix.dtype).eps) * size)
+
+
+def _inverse(matrix, fine):
+    """Inverse (2, 2) in closed form, finite where it is not `fine`."""
+    a, b, c, d = matrix[0, 0], matrix[0, 1], matrix[1, 0], matrix[1, 1]
+    determinant = a * d - b * c
+    determinant = jnp.where(fine & (determinant != 0), determinant, jnp.ones_like(determinant))
+    return jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / determinant

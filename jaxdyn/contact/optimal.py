@@ -1,0 +1,62 @@
+"""Contact forces of least size that add up to a wrench and keep a margin from the boundary of every cone."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.contact._checks import as_float
+from jaxdyn.contact.cones import FrictionCone
+from jaxdyn.contact.qp import QPSolution, solve_qp
+
+
+def optimal_forces(G, wrench, cones, *, preload=0.0, target=None, weights=None, tol: float | None = None) -> QPSolution:
+    """Contact forces f nearest to `target` with G f = wrench, and every margin of every cone at least `preload`.
+
+        minimise (f - f0)^T diag(weights) (f - f0) / 2   with   G f = wrench,  margins(f) >= preload
+
+    A second-order cone program, by `solve_qp`: batched, and differentiable in G, the wrench, the coefficients of friction and
+    all others. Rows of G may be dependent, as those of a grasp that cannot resist every wrench are.
+
+    **Arguments:**
+
+    - `G` (p, m): grasp map. `wrench` (p,): that the contact forces have to exert on the object; to hold it against gravity,
+      minus its weight; N and N m.
+    - `cones`: one per contact, in the order of G's columns.
+    - `preload` (): N, least margin of each contact (`FrictionCone.margins`).
+    - `target` f0 (m,), N and N m: zero by default. `weights` (m,): positive, one by default.
+    - `tol`: of `solve_qp`.
+
+    **Returns:** `QPSolution`, with the forces in `x`; `result` is infeasible where no forces in the cones balance the wrench.
+
+    **Raises:** ValueError for shapes that do not fit together.
+
+    Source: Murray, Li & Sastry (1994), section 5.3; Boyd & Wegbreit, IEEE Trans. Robotics 23 (2007), 1117-1132.
+    """
+    G = as_float(G, "G", (None, None))
+    wrench = as_float(wrench, "wrench", (G.shape[0],), G.dtype)
+    if not isinstance(cones, (tuple, list)) or not all(isinstance(cone, FrictionCone) for cone in cones):
+        raise ValueError(f"cones is {cones!r}; pass a list with one FrictionCone per contact, from friction_cone(...)")
+    sizes = [cone.size for cone in cones]
+    m = sum(sizes)
+    if m != G.shape[1]:
+        raise ValueError(
+            f"cones have {sizes} components, {m} in all, and G has {G.shape[1]} columns; they have to agree"
+        )
+    preload = as_float(preload, "preload", (), G.dtype)
+    target = jnp.zeros((m,), G.dtype) if target is None else as_float(target, "target", (m,), G.dtype)
+    weights = jnp.ones((m,), G.dtype) if weights is None else as_float(weights, "weights", (m,), G.dtype)
+    linear, second, place = [], [], 0
+    for cone, size in zip(cones, sizes, strict=True):
+        sides = (place, m - place - size)
+        linear.append(_widened(cone.linear_rows().astype(G.dtype), sides))
+        second.append(_widened(cone.second_order_rows().astype(G.dtype), sides))
+        place += size
+    rows, round_rows = jnp.concatenate(linear), jnp.concatenate(second)
+    lifted = jnp.zeros(round_rows.shape[:2], G.dtype).at[:, 0].set(-preload)
+    bounds: dict = {"G": rows, "h": jnp.full((rows.shape[0],), -1, G.dtype) * preload} if rows.shape[0] else {}
+    bounds |= {"cones": [(-round_rows, lifted)]} if round_rows.shape[0] else {}
+    return solve_qp(jnp.diag(weights), -weights * target, A=G, b=wrench, tol=tol, **bounds)
+
+
+def _widened(rows: Float[Array, "..."], sides) -> Float[Array, "..."]:
+    """Rows of one contact's force as rows of all forces."""
+    return jnp.pad(rows, [(0, 0)] * (rows.ndim - 1) + [sides])

@@ -1,0 +1,223 @@
+"""Quadratic programs with linear rows and second-order cones, as contact forces ask for: many small ones, differentiated.
+
+See `solve_qp`. Before the interior point (`jaxdyn.contact._interior_point`) come a change of variables that gives Q a unit
+diagonal, rows of unit length, one scale for lengths of x, and the removal of equality rows: with A^+ the pseudo-inverse of
+their matrix and P = 1 - A^+ A, x = A^+ b + P y satisfies them however many of them are dependent, and the objective is
+the same in y, with y^T (1 - P) y / 2 added, which y = P y makes zero.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxdyn._rank import pseudo_inverse, tolerance
+from jaxdyn.compile import compiled, is_concrete, is_staged
+from jaxdyn.contact._checks import as_float
+from jaxdyn.contact._interior_point import Point, Program, attached, solve
+from jaxdyn.linear import cholesky, definite, solve_factored
+from jaxdyn.so3 import _product
+
+
+class RESULTS(lx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How a quadratic program ended."""
+
+    infeasible = "No x satisfies the rows and cones of the quadratic program."
+    stalled = "The quadratic program was not solved to the tolerance in the steps that it was given."
+    indefinite = "The matrix Q of the quadratic program is not positive definite."
+
+
+class QPSolution(eqx.Module):
+    """Solution of a quadratic program; its equations are Q x + q + G^T z + A^T y - sum S^T w = 0.
+
+    - `x` (n,): the minimiser. `result`: one of `jaxdyn.contact.RESULTS`; where it is not `successful`, all else is the
+      last iterate.
+    - `multipliers` z (m,): of the rows G x <= h, zero or positive. `slack` (m,): h - G x.
+    - `equality_multipliers` y (p,): of A x = b; of least norm where rows are dependent.
+    - `cone_multipliers` w, `cone_slack`, for each group of cones (k, d): both in their cones, the slack is c - S x.
+    - `steps` (): of the interior point.
+    """
+
+    x: Float[Array, " n"]
+    multipliers: Float[Array, " m"]
+    slack: Float[Array, " m"]
+    equality_multipliers: Float[Array, " p"]
+    cone_multipliers: tuple[Float[Array, "k d"], ...]
+    cone_slack: tuple[Float[Array, "k d"], ...]
+    steps: Int[Array, ""]
+    result: Any
+
+
+def solve_qp(Q, q, G=None, h=None, A=None, b=None, *, cones=(), tol: float | None = None, max_steps: int = 50):
+    """Minimise x^T Q x / 2 + q^T x with G x <= h, A x = b, and c - S x in second-order cones.
+
+    An interior point, each step of it a kernel (see `compilation`): it compiles, batches (`jax.vmap`) and is
+    differentiated in all arrays, forward and reverse, by the equations of the solution, also where forces are on the
+    boundary of their cone or at its apex. Where a row is active with a multiplier of zero, the solution has one-sided
+    derivatives alone, and their mean is returned. Zeros of G and S that are known while a program is traced cost nothing,
+    if there are no equality rows.
+
+    **Arguments:**
+
+    - `Q` (n, n): positive definite; only its symmetric part counts. `q` (n,).
+    - `G` (m, n), `h` (m,): inequality rows. An infinite h is no bound.
+    - `A` (p, n), `b` (p,): equality rows; they may be dependent.
+    - `cones`: a pair (S, c) or a list of pairs, S (k, d, n) and c (k, d): y = c - S x, of each of the k cones, satisfies
+      |(y1, ..., yd-1)| <= y0. Rows of zeros fill up a smaller cone.
+    - `tol`: residuals and gap, with Q's diagonal, the rows and the largest of q scaled to one; by default 1e-9 in float64 and
+      1e-4 in float32.
+    - `max_steps`: of the interior point; about 10 are usual.
+
+    **Returns:** `QPSolution`.
+
+    **Raises:** ValueError for shapes that do not fit, G without h, A without b, a known Q that is not positive definite, and
+    a tolerance or number of steps that is not positive.
+
+    Source: Vandenberghe, The CVXOPT linear and quadratic cone program solvers (2010); the derivative is that of the
+    projection on the cones, as in Agrawal et al., Differentiating through a cone program (2019).
+
+    ```python
+    jd.contact.solve_qp(jnp.eye(2), jnp.array([-2.0, 0.0]), jnp.array([[1.0, 0.0]]), jnp.array([1.0])).x  # (1, 0)
+    ```
+    """
+    Q = as_float(Q, "Q", (None, None))
+    n = Q.shape[0]
+    if Q.shape != (n, n) or n == 0:
+        raise ValueError(f"Q has shape {Q.shape}, expected (n, n) with n > 0")
+    q = as_float(q, "q", (n,), Q.dtype)
+    _check_definite(Q)
+    G, h = _pair(G, h, "G", "h", n, Q.dtype)
+    A, b = _pair(A, b, "A", "b", n, Q.dtype)
+    pairs = [cones] if len(cones) == 2 and hasattr(cones[0], "ndim") else list(cones)
+    checked = []
+    for i, pair in enumerate(pairs):
+        if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+            raise ValueError(f"cones[{i}] is {pair!r}; give a pair (S, c) of arrays (k, d, n) and (k, d)")
+        S = as_float(pair[0], f"cones[{i}]: S", (None, None, n), Q.dtype)
+        checked.append((S, as_float(pair[1], f"cones[{i}]: c", S.shape[:2], Q.dtype)))
+        if S.shape[1] == 0:
+            raise ValueError(f"cones[{i}]: S has shape {S.shape}; a cone has at least one row")
+    groups = [G, *(pair[0] for pair in pairs)]
+    pattern = tuple(_pattern(g, A) for g in groups)
+    if tol is None:
+        tol = max(1e-9, float(jnp.finfo(Q.dtype).eps) ** 0.575)
+    if not 0 < float(tol) < 1:
+        raise ValueError(f"tol is {tol}; give a number between 0 and 1")
+    if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
+        raise ValueError(f"max_steps is {max_steps!r}; give a positive integer")
+    return _solved(Q, q, G, h, A, b, tuple(checked), pattern, float(tol), int(max_steps))
+
+
+def _pair(matrix, level, name: str, right: str, n: int, dtype):
+    if (matrix is None) != (level is None):
+        missing, there = (right, name) if level is None else (name, right)
+        raise ValueError(f"{missing} is None, but {there} is given; give both or none")
+    if matrix is None:
+        return jnp.zeros((0, n), dtype), jnp.zeros((0,), dtype)
+    matrix = as_float(matrix, name, (None, n), dtype)
+    return matrix, as_float(level, right, (matrix.shape[0],), dtype)
+
+
+def _pattern(rows, A) -> bytes | None:
+    """Which entries of a group's rows may differ from zero; None where all may."""
+    # Calls with known numbers share one program, whatever their zeros are; equality rows mix columns.
+    known = is_staged() and is_concrete(rows) and not A.shape[0]
+    return (np.asarray(rows) != 0).tobytes() if known else None
+
+
+def _check_definite(Q):
+    if is_concrete(Q):
+        known = np.asarray(Q, float)
+        least = np.linalg.eigvalsh((known + known.T) / 2)[0]
+        if not least > 0:
+            raise ValueError(
+                f"Q is not positive definite, its smallest eigenvalue is {least}; add a small multiple of the identity"
+            )
+
+
+def _unit(sizes):
+    return jnp.where(sizes > 0, 1 / jnp.where(sizes > 0, sizes, 1), 1)
+
+
+@compiled
+def _solved(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: float, max_steps: int) -> QPSolution:
+    Q = (Q + Q.T) / 2
+    bounded = jnp.isfinite(h)
+    # A row without a bound becomes 0 <= 1; one that nothing satisfies, 0 <= -1.
+    G_used, h_used = jnp.where(bounded[:, None], G, 0), jnp.where(bounded, h, jnp.where(h > 0, 1, -1).astype(h.dtype))
+    blocks, levels = [G_used[:, None, :]], [h_used[:, None]]
+    blocks, levels = [*blocks, *(S for S, _ in cones)], [*levels, *(c for _, c in cones)]
+    kept = [i for i, block in enumerate(blocks) if block.shape[0]]
+
+    # Scales are no functions of the data: the solution does not depend on them.
+    diagonal = jax.lax.stop_gradient(jnp.diagonal(Q))
+    across = _unit(jnp.sqrt(jnp.maximum(diagonal, 0)))
+    blocks = [block * across[None, None] for block in blocks]
+    row_scales = [_unit(jnp.sqrt(jnp.sum(jax.lax.stop_gradient(x) ** 2, (1, 2)))) for x in blocks]
+    blocks = [x * r[:, None, None] for x, r in zip(blocks, row_scales, strict=True)]
+    levels = [x * r[:, None] for x, r in zip(levels, row_scales, strict=True)]
+    A = A * across[None]
+    equality_scale = _unit(jnp.sqrt(jnp.sum(jax.lax.stop_gradient(A) ** 2, 1)))
+    A, b = A * equality_scale[:, None], b * equality_scale
+    Q, q = Q * across[:, None] * across[None], q * across
+    inverse, x0 = None, jnp.zeros_like(q)
+    if A.shape[0]:
+        inverse = pseudo_inverse(A.T, tolerance(None, A)).T
+        x0 = _product(inverse, b)
+    shortest = [jnp.max(jnp.abs(x0)), jnp.max(jnp.abs(q))]
+    shortest += [jnp.max(jnp.sqrt(jnp.sum(x[:, 1:] ** 2, 1)) - x[:, 0], initial=0) for x in levels]
+    size = 1 / _unit(jax.lax.stop_gradient(jnp.max(jnp.stack(shortest))))
+    q, b, x0, levels = q / size, b / size, x0 / size, [x / size for x in levels]
+
+    result = RESULTS.successful
+    program = Program(Q, q, tuple(blocks[i] for i in kept), tuple(levels[i] for i in kept))
+    if inverse is not None:
+        unit = jnp.eye(q.shape[0], dtype=q.dtype)
+        P = unit - _product(inverse, A)
+        program = Program(
+            _product(P, _product(Q, P)) + unit - P,
+            _product(P, q + _product(Q, x0)),
+            tuple(_product(block, P) for block in program.G),
+            tuple(y - _product(block, x0) for block, y in zip(program.G, program.h, strict=True)),
+        )
+        met = jnp.max(jnp.abs(_product(A, x0) - b)) <= 10 * tol
+        result = RESULTS.where(met, result, RESULTS.infeasible)  # pyright: ignore[reportArgumentType]
+    steps = jnp.zeros((), jnp.int32)
+    if kept:
+        pattern = tuple(pattern[i] for i in kept)
+        end = solve(jax.lax.stop_gradient(program), pattern, tol, max_steps)
+        point = attached(pattern, program, jax.lax.stop_gradient(end.point))
+        steps = end.steps
+        result = RESULTS.where(end.solved, result, RESULTS.stalled)  # pyright: ignore[reportArgumentType]
+        result = RESULTS.where(end.infeasible, RESULTS.infeasible, result)  # pyright: ignore[reportArgumentType]
+    else:
+        point = Point(-solve_factored(cholesky(program.Q), program.q), (), ())
+    result = RESULTS.where(definite(Q, cholesky(Q)), result, RESULTS.indefinite)  # pyright: ignore[reportArgumentType]
+
+    x = point.x if inverse is None else x0 + point.x - _product(inverse, _product(A, point.x))
+    z = [jnp.zeros_like(y) for y in levels]
+    s = [jnp.ones_like(y) for y in levels]
+    for i, slack, multiplier in zip(kept, point.s, point.z, strict=True):
+        s[i], z[i] = slack, multiplier
+    y = jnp.zeros_like(b)
+    if inverse is not None:
+        gradient = _product(Q, x) + q
+        for block, multiplier in zip(blocks, z, strict=True):
+            gradient = gradient + jnp.einsum("kdn,kd->n", block, multiplier)
+        y = -_product(inverse.T, gradient) * equality_scale * size
+    z = [x * r[:, None] * size for x, r in zip(z, row_scales, strict=True)]
+    s = [x / r[:, None] * size for x, r in zip(s, row_scales, strict=True)]
+    return QPSolution(
+        x=x * across * size,
+        multipliers=jnp.where(bounded, z[0][:, 0], 0),
+        slack=jnp.where(bounded, s[0][:, 0], h),
+        equality_multipliers=y,
+        cone_multipliers=tuple(z[1:]),
+        cone_slack=tuple(s[1:]),
+        steps=steps,
+        result=result,
+    )

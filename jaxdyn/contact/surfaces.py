@@ -1,0 +1,248 @@
+"""Smooth surfaces by their parametrisation, with metric, curvature and torsion at a point.
+
+A surface is f(u, v) (3,), in the axes of the body that carries it. With alpha = (u, v) and the Gauss frame
+x = f_u / |f_u|, z the outward normal, y = z x x,
+
+    metric      M = [x y]^T f_alpha,               (x, y) velocity of the point = M alphadot,
+    curvature   K = [x y]^T z_alpha M^-1,          K > 0 where the body is convex,
+    torsion     T = y^T x_alpha M^-1.
+
+For an orthogonal chart (f_u . f_v = 0) M is diagonal and these are Montana's; for any other, M is upper triangular and the
+equations of contact hold as they are, because M enters by M alphadot alone.
+
+Source: Montana, Int. J. Robotics Research 7 (1988), 17-32; Murray, Li & Sastry (1994), section 5.6.1.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import compiled, is_concrete
+from jaxdyn.contact._checks import as_float, as_number
+from jaxdyn.scene import as_pytree
+from jaxdyn.so3 import _product, cross
+
+
+class Surface(eqx.Module):
+    """Base of all surfaces: `point` is the parametrisation, chosen so that f_u x f_v points out of the body."""
+
+    def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
+        """f(u, v) (3,), m, in the body's axes."""
+        raise NotImplementedError
+
+    def chart_margin(self, alpha: Float[Array, "2"]) -> Float[Array, ""]:
+        """How far alpha is from where the chart ends, in its own units; infinite for a chart without end."""
+        return jnp.full((), jnp.inf, alpha.dtype)
+
+
+class Plane(Surface):
+    """The plane z = 0 of the body, f = (u, v, 0); outward is +z."""
+
+    def point(self, alpha):
+        """(u, v, 0), m."""
+        return jnp.concatenate([alpha, jnp.zeros_like(alpha[:1])])
+
+
+# Rows of the rotation that turns the axes of a chart into those of the body: its poles are then on z, x, or y.
+_POLES = {"z": (0, 1, 2), "x": (1, 2, 0), "y": (2, 0, 1)}
+
+
+def _checked_poles(poles: str) -> str:
+    if poles not in _POLES:
+        raise ValueError(f"poles is {poles!r}; choose from {', '.join(_POLES)}, the axis on which the chart ends")
+    return poles
+
+
+class Ellipsoid(Surface):
+    """An ellipsoid about the body's origin, f = (a cos u cos v, -b cos u sin v, c sin u), |u| < pi / 2.
+
+    **Arguments:** `semi_axes` (a, b, c): along the body's x, y, z, m. `poles`: "z", "x" or "y", the axis on which the chart
+    ends; for another one than z, the axes of the formula are permuted in a cycle.
+
+    **Raises:** ValueError for semi-axes that are not positive, and an unknown axis.
+    """
+
+    semi_axes: Float[Array, "3"]
+    poles: str = eqx.field(static=True)
+
+    def __init__(self, semi_axes, poles: str = "z"):
+        self.semi_axes = as_float(semi_axes, "semi_axes", (3,))
+        if is_concrete(self.semi_axes) and not bool(jnp.all((self.semi_axes > 0) & jnp.isfinite(self.semi_axes))):
+            raise ValueError(f"semi_axes is {np.asarray(self.semi_axes).tolist()}; give three positive lengths (m)")
+        self.poles = _checked_poles(poles)
+
+    def point(self, alpha):
+        """f(u, v), m."""
+        u, v = jnp.unstack(alpha)
+        unit = jnp.stack([jnp.cos(u) * jnp.cos(v), -jnp.cos(u) * jnp.sin(v), jnp.sin(u)])
+        return self.semi_axes * unit[np.argsort(_POLES[self.poles])]
+
+    def chart_margin(self, alpha):
+        """Angle between u and the end of the chart, rad."""
+        return jnp.pi / 2 - jnp.abs(alpha[0])
+
+    def coordinates(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
+        """alpha (2,) of a point of the surface (of any point: of that on its ray in the stretched space)."""
+        x, y, z = jnp.unstack((point / self.semi_axes)[np.array(_POLES[self.poles])])
+        return jnp.stack([jnp.arctan2(z, jnp.sqrt(x * x + y * y)), jnp.arctan2(-y, x)])
+
+
+class Sphere(Ellipsoid):
+    """A sphere about the body's origin, f = R (cos u cos v, -cos u sin v, sin u), |u| < pi / 2.
+
+    M = diag(R, R cos u), K = 1 / R, T = (0, -tan(u) / R).
+
+    **Arguments:** `radius`: m. `poles`: as of `Ellipsoid`.
+
+    **Raises:** ValueError for a radius that is not positive, and an unknown axis.
+    """
+
+    def __init__(self, radius, poles: str = "z"):
+        radius = as_number(radius, "radius", "m", zero=False)
+        self.semi_axes = jnp.stack([radius] * 3)
+        self.poles = _checked_poles(poles)
+
+    @property
+    def radius(self) -> Float[Array, ""]:
+        """Radius (), m."""
+        return self.semi_axes[0]
+
+
+class Cylinder(Surface):
+    """A cylinder about the body's z axis, f = (R cos u, R sin u, v). K = diag(1 / R, 0), T = 0.
+
+    **Arguments:** `radius`: m. **Raises:** ValueError for a radius that is not positive.
+    """
+
+    radius: Float[Array, ""]
+
+    def __init__(self, radius):
+        self.radius = as_number(radius, "radius", "m", zero=False)
+
+    def point(self, alpha):
+        """(R cos u, R sin u, v), m."""
+        u, v = jnp.unstack(alpha)
+        return jnp.stack([self.radius * jnp.cos(u), self.radius * jnp.sin(u), v])
+
+
+class Parametrised(Surface):
+    """Any smooth surface, by its parametrisation.
+
+    **Arguments:**
+
+    - `f`: f(alpha) -> (3,), m, with alpha (2,); three times differentiable for the rates of contact coordinates. A plain
+      function is static: define it once; a Module or `jax.tree_util.Partial` carries numbers as leaves.
+    - `flip`: whether f_u x f_v points into the body, so that the outward normal is its negative.
+
+    **Raises:** ValueError when f cannot be called; when used, for another shape than (3,).
+
+    ```python
+    bowl = jd.contact.Parametrised(lambda a: jnp.array([a[0], a[1], 0.5 * a[0] ** 2 + a[1] ** 2]))
+    ```
+    """
+
+    f: Callable
+    flip: bool = eqx.field(static=True)
+
+    def __init__(self, f, flip: bool = False):
+        self.f = as_pytree(f, "surface: f")
+        self.flip = bool(flip)
+
+    def point(self, alpha):
+        """f(alpha), m; with u and v exchanged if f was to be flipped."""
+        # Exchanging the coordinates turns f_u x f_v around.
+        value = jnp.asarray(self.f(alpha[::-1] if self.flip else alpha), alpha.dtype)
+        if value.shape != (3,):
+            raise ValueError(f"surface: f returned shape {value.shape}, expected (3,), a point")
+        return value
+
+
+class SurfaceGeometry(eqx.Module):
+    """A surface at one point of its chart.
+
+    - `point` (3,), m; `frame` (3, 3): columns x, y and the outward normal z.
+    - `metric` M (2, 2), m per unit of the chart; `curvature` K (2, 2), 1/m; `torsion` T (2,), 1/m.
+    - `regular` (): whether f_u and f_v are independent here; where not, the chart ends.
+    """
+
+    point: Float[Array, "3"]
+    frame: Float[Array, "3 3"]
+    metric: Float[Array, "2 2"]
+    curvature: Float[Array, "2 2"]
+    torsion: Float[Array, "2"]
+    regular: Array
+
+    @property
+    def pose(self) -> Float[Array, "4 4"]:
+        """Pose (4, 4) of the contact frame in the body."""
+        top = jnp.concatenate([self.frame, self.point[:, None]], 1)
+        return jnp.concatenate([top, jnp.eye(4, dtype=top.dtype)[3:]])
+
+
+def surface_geometry(surface, alpha) -> SurfaceGeometry:
+    """Gauss frame, metric, curvature and torsion of a surface at alpha, by differentiating its parametrisation.
+
+    **Arguments:** `alpha` (2,): (u, v).
+
+    **Returns:** `SurfaceGeometry`; where the chart ends, numbers are finite without meaning and `regular` is False.
+
+    **Raises:** ValueError for a surface that is none, alpha of another shape, and a known alpha where the chart ends.
+
+    Source: Murray, Li & Sastry (1994), eqs 5.23-5.26; EQUATIONS section 8.
+    """
+    check_surface(surface)
+    geometry = _geometry(surface, as_float(alpha, "alpha", (2,)))
+    check_regular(surface, alpha, geometry)
+    return geometry
+
+
+def check_surface(surface) -> None:
+    """**Raises:** ValueError for what is no surface."""
+    if not isinstance(surface, Surface):
+        raise ValueError(
+            f"surface is a {type(surface).__name__}; take Plane, Sphere, Cylinder, Ellipsoid or Parametrised"
+        )
+
+
+def check_regular(surface: Surface, alpha, geometry: SurfaceGeometry) -> None:
+    """**Raises:** ValueError for known numbers where the chart ends."""
+    if is_concrete(geometry.regular) and not bool(geometry.regular):
+        raise ValueError(
+            f"alpha is {np.asarray(alpha).tolist()}, where the chart of the {type(surface).__name__} ends and has no frame; "
+            "choose another chart of the same surface (poles=) there"
+        )
+
+
+def geometry_at(surface: Surface, alpha: Float[Array, "2"]) -> SurfaceGeometry:
+    """`surface_geometry` without its checks."""
+    tangents = jax.jacfwd(surface.point)(alpha)
+    # rates (3, 3, 2): of the columns of the frame along u and v.
+    frame, fine = _frame_of(surface, alpha)
+    rates = jax.jacfwd(lambda a: _frame_of(surface, a)[0])(alpha)
+    y = frame[:, 1]
+    metric = _product(frame[:, :2].T, tangents)
+    # M is upper triangular: its inverse in closed form, of numbers that are not zero.
+    a, b, d = metric[0, 0], metric[0, 1], metric[1, 1]
+    a, d = (jnp.where(fine, value, jnp.ones_like(value)) for value in (a, d))
+    inverse = jnp.stack([jnp.stack([1 / a, -b / (a * d)]), jnp.stack([jnp.zeros_like(a), 1 / d])])
+    curvature = _product(_product(frame[:, :2].T, rates[:, 2]), inverse)
+    torsion = _product(_product(y, rates[:, 0]), inverse)
+    return SurfaceGeometry(surface.point(alpha), frame, metric, curvature, torsion, fine)
+
+
+_geometry = compiled(geometry_at)
+
+
+def _frame_of(surface, alpha):
+    """Columns x, y, z of the Gauss frame, and whether there is one."""
+    fu, fv = jax.jacfwd(surface.point)(alpha).T
+    normal = cross(fu, fv)
+    uu, nn, vv = jnp.sum(fu * fu), jnp.sum(normal * normal), jnp.sum(fv * fv)
+    fine = nn > 1e3 * float(jnp.finfo(alpha.dtype).eps) ** 2 * jnp.maximum(uu, vv) ** 2
+    x = fu / jnp.sqrt(jnp.where(fine, uu, jnp.ones_like(uu)))
+    z = normal / jnp.sqrt(jnp.where(fine, nn, jnp.ones_like(nn)))
+    return jnp.stack([x, cross(z, x), z], 1), fine

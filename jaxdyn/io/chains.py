@@ -1,0 +1,99 @@
+"""A body carried by one or several joints whose axes may pass beside its origin, as a chain of bodies of a `Model`.
+
+A joint of a `Model` turns its body about an axis through the body's origin. Formats let the axis pass anywhere, and put
+several joints between two bodies. Each joint k moves what follows it by D_k(x) = Trans(a_k) J_k(x) Trans(-a_k), with the
+anchor a_k and the axis in the axes of the body, so that the body stands at
+
+    pose D_1(q_1 - r_1) D_2(q_2 - r_2) ...
+
+with the joints' reference positions r_k: where the body is at `pose`, q = r. D_k(x - r) = D_k(-r) D_k(x) puts the
+reference into the home poses.
+"""
+
+import re
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdyn import _float64 as f64
+from jaxdyn.building import ModelBuilder
+from jaxdyn.joints import SCREW_KINDS
+from jaxdyn.model import Model
+
+
+class Link(NamedTuple):
+    """One joint of a chain: axis (3,) and anchor (3,) in the body's axes and frame, reference in rad or m."""
+
+    name: str
+    kind: str
+    axis: np.ndarray
+    anchor: np.ndarray
+    reference: float
+    leaves: dict[str, Any]
+    pitch: float = 0.0
+
+
+class Names:
+    """Names that are in use. Formats keep joints, bodies and sites in spaces of their own; a model has one of frames."""
+
+    def __init__(self):
+        self._used: set[str] = set()
+
+    def new(self, wanted: str) -> str:
+        """The name wanted, with underscores behind it while it is taken."""
+        while wanted in self._used:
+            wanted += "_"
+        self._used.add(wanted)
+        return wanted
+
+
+def built(builder: ModelBuilder, path) -> Model:
+    """The model of a file. **Raises:** ValueError of `ModelBuilder.build`, with the file and without advice for URDF."""
+    try:
+        return builder.build()
+    except ValueError as error:
+        raise ValueError(f"{path}: {re.sub(r' .load_urdf: lock=.*', '', str(error))}") from error
+
+
+def add_chain(
+    builder: ModelBuilder,
+    frames: Names,
+    joint_names: Names,
+    body: str,
+    parent: str | None,
+    pose,
+    joints: list[Link],
+    inertia,
+) -> None:
+    """Add a body with its joints. The frame `body` is the body's own; names in between are BODY_JOINT.
+
+    `pose` (4, 4) is that of the body's frame in the parent's where all joints are at their references; without joints
+    the body is fixed. Names that are made here are taken from `frames` and `joint_names`, which hold those of the file.
+    """
+    here, carrier = np.asarray(pose, float), parent
+    for k, joint in enumerate(joints):
+        turns = joint.kind not in ("prismatic", "free")
+        anchor = np.eye(4)
+        if turns:
+            # Along its own axis an anchor has no effect; leaving that part out leaves more bodies as they are.
+            along = joint.axis * (joint.axis @ joint.anchor) if joint.kind in SCREW_KINDS else np.zeros(3)
+            shift = joint.anchor - along
+            anchor[:3, 3] = np.where(np.abs(shift) > 1e-15 * np.abs(joint.anchor).max(initial=0.0), shift, 0.0)
+        leaves: dict[str, Any] = dict(joint.leaves)
+        home = here @ anchor
+        if joint.kind in SCREW_KINDS:
+            leaves |= {"axis": joint.axis, "pitch": joint.pitch}
+            slide = np.zeros(3) if joint.kind != "prismatic" else joint.axis
+            screw = np.concatenate([slide, joint.axis if turns else np.zeros(3)])
+            if joint.reference:
+                home = home @ f64.joint_pose(joint.kind, screw, np.array([-joint.reference]))
+        last = k == len(joints) - 1 and not anchor[:3, 3].any()
+        between = joint.name if joint.name.startswith(body) else f"{body}_{joint.name}"
+        name = body if last else frames.new(between)
+        builder.add_body(
+            name, carrier, joint.kind, inertia if last else None, joint_name=joint.name, pose=home, **leaves
+        )
+        if last:
+            return
+        here, carrier = f64.inverse(anchor), name
+    builder.add_body(body, carrier, "fixed", inertia, joint_name=joint_names.new(f"{body}_fixed"), pose=here)

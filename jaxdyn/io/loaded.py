@@ -1,0 +1,151 @@
+"""What a file gives beyond the mechanism: starts, named actuators, and a list of what was not taken."""
+
+import warnings
+from collections.abc import Iterable, Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn import _float64 as f64
+from jaxdyn.kinematics import body_jacobian
+from jaxdyn.model import Model
+from jaxdyn.scene import Scene
+
+
+class NotTakenWarning(UserWarning):
+    """A file holds things that the model does not have; the message names them."""
+
+
+class UnitsWarning(UserWarning):
+    """Numbers of a file look as if they were in other units than m, kg and rad; the message names them."""
+
+
+class Start(eqx.Module):
+    """A state that a file names: `q` (nq,), `v` (nv,) in the model's coordinates, `control` (nu,) of its actuators.
+
+    `control` is None where the file gives none. Units as for the model: m, rad, m/s, rad/s.
+    """
+
+    q: Float[Array, " nq"]
+    v: Float[Array, " nv"]
+    control: Float[Array, " nu"] | None = None
+
+
+class Actuators(eqx.Module):
+    """Named actuators: generalised forces from controls.
+
+    An actuator pulls along a length l(q) with the force f = gain u + bias, where gain and bias are affine in l and its
+    rate: gain = g0 + g1 l + g2 ldot, bias = b0 + b1 l + b2 ldot. That covers motors (f = g0 u), position and velocity
+    servos, dampers and general actuators without a state of their own. The force is held within `force_range`, the sum
+    of all at each coordinate within `effort_range`, the control within `control_range`.
+
+    Lengths are linear in q, l = moment q, with the coordinates that have v = dq/dt; actuators at a site have no
+    length (l = 0) and act with a wrench fixed in the site's frame.
+
+    **Fields:** `names` of the actuators, in the order of the controls; `moment` (nu, nv); `gain`, `bias` (nu, 3);
+    `control_range`, `force_range` (nu, 2), infinite where there are none; `effort_range` (nv, 2); `sites`, for each
+    actuator the name of its frame or None; `wrenches` (nu, 6), (f, tau) in the frame's axes for a unit force; `places`,
+    for each velocity coordinate its place in q, or -1 where it has none.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    sites: tuple[str | None, ...] = eqx.field(static=True)
+    places: tuple[int, ...] = eqx.field(static=True)
+    moment: Float[Array, "nu nv"]
+    wrenches: Float[Array, "nu 6"]
+    gain: Float[Array, "nu 3"]
+    bias: Float[Array, "nu 3"]
+    control_range: Float[Array, "nu 2"]
+    force_range: Float[Array, "nu 2"]
+    effort_range: Float[Array, "nv 2"]
+
+    def __call__(self, system, q: Float[Array, " nq"], v: Float[Array, " nv"], control) -> Float[Array, " nv"]:
+        """Generalised force (nv,) in N m or N of the controls (nu,), in the order of `names`.
+
+        **Raises:** ValueError for controls of another shape.
+        """
+        if jnp.shape(control) != (len(self.names),):
+            raise ValueError(
+                f"control has shape {jnp.shape(control)}, expected {(len(self.names),)}: one number for each of "
+                f"{', '.join(self.names)}"
+            )
+        chosen = [place for place in self.places if place >= 0]
+        columns = [i for i, place in enumerate(self.places) if place >= 0]
+        moment = self.moment.astype(q.dtype)
+        length = moment[:, jnp.asarray(columns, int)] @ q[jnp.asarray(chosen, int)]
+        rows = moment
+        for i, site in enumerate(self.sites):
+            if site is not None:
+                rows = rows.at[i].set(self.wrenches[i].astype(q.dtype) @ body_jacobian(system, q, site))
+        state = jnp.stack([jnp.ones_like(length), length, rows @ v], axis=1)
+        gain, bias, held, limits, effort = (
+            x.astype(q.dtype) for x in (self.gain, self.bias, self.control_range, self.force_range, self.effort_range)
+        )
+        control = jnp.clip(jnp.asarray(control, q.dtype), held[:, 0], held[:, 1])
+        force = jnp.sum(gain * state, 1) * control + jnp.sum(bias * state, 1)
+        force = jnp.clip(force, limits[:, 0], limits[:, 1])
+        return jnp.clip(force @ rows, effort[:, 0], effort[:, 1])
+
+
+class LoadedScene(Scene):
+    """The scene of a file: a `Scene` in every respect, and what else the file holds.
+
+    - `system`, `constraints`, `forces`: as in `Scene`. The system is a `Model`.
+    - `starts`: states by name. "reference" is the placement that the file describes; the others are its keyframes. They
+      are as in the file: put them on the constraints with `jd.assemble(scene, scene.starts[name].q)`.
+    - `actuators`: `Actuators`, called as `scene.actuators(scene.system, q, v, control)` to give tau (nv,); None when
+      there are none.
+    - `not_taken`: in words, what the file holds and the scene does not. `NotTakenWarning` says the same at load.
+    """
+
+    # Defaults as `Scene` has them; `__init__` sets all three.
+    starts: dict[str, Start] = eqx.field(default_factory=dict)
+    actuators: Actuators | None = None
+    not_taken: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __init__(self, system, constraints=(), forces=(), *, starts: Mapping, actuators=None, not_taken=()):
+        super().__init__(system, constraints, forces)
+        self.starts = dict(starts)
+        self.actuators = actuators
+        self.not_taken = tuple(not_taken)
+
+
+def listed(what: str, names: Iterable[str], most: int = 8) -> list[str]:
+    """One entry for `not_taken`: what it is and the names, the first few of many; empty when there are none."""
+    names = list(names)
+    if not names:
+        return []
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return [f"{what}: {', '.join(names[:most])}{more}"]
+
+
+def warn_not_taken(path, not_taken: Iterable[str], stacklevel: int = 3) -> None:
+    """Warn once, naming all that was not taken from a file; the caller of the loader is who is shown."""
+    if not_taken:
+        warnings.warn(f"{path}: not taken from the file: {'; '.join(not_taken)}", NotTakenWarning, stacklevel)
+
+
+# A robot arm turns by two or three turns at most, and its links are shorter than this; ships and cranes are named too.
+_MOST_TURNS, _LONGEST = 4.0, 100.0
+
+
+def warn_of_units(path, model: Model, stacklevel: int = 3) -> None:
+    """Warn where limits look like degrees, or places and inertias like millimetres; nothing is changed."""
+    top, doubts = model.topology, []
+    lower, upper = np.asarray(model.lower), np.asarray(model.upper)
+    for name, kind, place in zip(top.joint_names, top.kinds, top.q_slices, strict=True):
+        ends = np.abs(np.concatenate([lower[place], upper[place]]))
+        if kind == "revolute" and (ends[np.isfinite(ends)] > 2 * np.pi * _MOST_TURNS).any():
+            doubts.append(f"limits {lower[place][0]:g} to {upper[place][0]:g} rad of joint {name!r} (degrees?)")
+    for name, home, parameters in zip(top.body_names, np.asarray(model.home), np.asarray(model.inertias), strict=True):
+        if (far := np.linalg.norm(home[:3, 3])) > _LONGEST:
+            doubts.append(f"body {name!r} {far:g} m from the one that carries it (millimetres?)")
+        mass, _, moment = f64.about_com(parameters)
+        if mass > 0 and (radius := np.sqrt(np.abs(moment).max() / mass)) > _LONGEST:
+            doubts.append(f"radius of gyration {radius:g} m of body {name!r} (inertia in kg mm^2 or g mm^2?)")
+    if doubts:
+        more = f"; and {len(doubts) - 5} more" if len(doubts) > 5 else ""
+        text = f"{path}: numbers that look like other units than m, kg, rad: {'; '.join(doubts[:5])}{more}"
+        warnings.warn(text, UnitsWarning, stacklevel)

@@ -1,0 +1,217 @@
+"""Reading MJCF files: mujoco's own compiler reads the file, and what it compiled becomes a scene.
+
+Defaults, includes, inertias from geometry, angles in degrees and the twenty other rules of the format are mujoco's to
+apply. Compiled numbers are in SI units; quaternions are (w, x, y, z) of unit length. Two conventions differ: a free
+joint's velocity is linear in world axes there, and here a twist in the body's; a joint of one degree of freedom has a
+reference `qpos0` there, at which the body stands where the file puts it, and here the same number in its home pose.
+"""
+
+import os
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn import _float64 as f64
+from jaxdyn.arguments import as_path
+from jaxdyn.building import ModelBuilder
+from jaxdyn.forces import CoulombFriction, JointDamping, JointSpring
+from jaxdyn.io.chains import Link, Names, add_chain, built
+from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of_units
+from jaxdyn.io.mjcf_file import BALL, FREE, HINGE, SIZES, SLIDE, Compiled, compiled, library, named, pose_of
+from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
+from jaxdyn.joints import joint_neutral
+from jaxdyn.model import Model
+
+
+def load_mjcf(path: str | os.PathLike, *, dtype=None) -> LoadedScene:
+    """The scene of an MJCF file (MuJoCo's XML), compiled by the mujoco package.
+
+    Taken are bodies with their inertias, joints (hinge, slide, ball, free; several on one body become a chain of
+    massless bodies BODY_JOINT), armature, limits (as the model's `lower`, `upper`), damping, springs and dry friction
+    of joints, gravity; `equality` of kind connect, weld, joint and tendon as exact constraints, where MuJoCo softens
+    them; tendons that are linear in the joints' coordinates; actuators without a state of their own; sites as frames;
+    keyframes as starts. Every body keeps a frame of its name, which is its frame in the file. Names that the file leaves
+    out are "bodyN" and BODY_joint (BODY_jointK of several), names in use get an underscore behind them, and a site with
+    the name of a body is SITE_site.
+
+    `load_urdf` returns a `Model`, since a URDF holds a tree and nothing else; `load_mjcf` and `load_sdf` return a
+    `LoadedScene`, a `Scene` with that model as `.system`.
+
+    Coordinates: hinge and slide have MuJoCo's numbers; ball and free joints have MuJoCo's configuration (a free body's q
+    is its pose in the world), and velocities in body axes. Joints stand depth-first, siblings by name, as everywhere.
+
+    **Arguments:** `path`, the file; `dtype`, as for `ModelBuilder`.
+
+    **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
+    0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is MuJoCo's qpos0), `.actuators`, `.not_taken`.
+
+    **Warns:** `NotTakenWarning` naming what the scene does not have: contact geometry, muscles and other actuators with
+    a state, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and the like.
+
+    `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
+
+    **Raises:** ValueError with the file (and the line, where mujoco says it) for a file that cannot be read or
+    compiled; for a joint that moves no inertia. ImportError without mujoco.
+    """
+    mujoco = library()
+    given = str(as_path(path))
+    m, missing = compiled(mujoco, given)
+    file = named(mujoco, m, given)
+    model = _model(file, dtype)
+    rows, left = constraints(file, model)
+    tendons, also = tendon_forces(file, model)
+    drives, idle = actuators(file, model)
+    not_taken = (*missing, *left, *also, *idle, *_unused(file))
+    warn_not_taken(path, not_taken)
+    warn_of_units(path, model)
+    forces = (*_joint_forces(file, model), *tendons)
+    return LoadedScene(model, rows, forces, starts=_starts(file, model, drives), actuators=drives, not_taken=not_taken)
+
+
+def _model(file: Compiled, dtype) -> Model:
+    m = file.m
+    gravity = None if file.off("GRAVITY") or not m.opt.gravity.any() else m.opt.gravity
+    name = m.names.split(b"\0", 1)[0].decode() or "mechanism"
+    builder = ModelBuilder(name, gravity=gravity, dtype=dtype)
+    frames, joint_names = Names(), Names()
+    for taken in (*file.bodies[1:], *file.sites):
+        frames.new(str(taken))
+    for taken in file.joints:
+        joint_names.new(taken)
+    armature, damping = _rotors(file)
+    for b in range(1, m.nbody):
+        joints = range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]) if m.body_jntnum[b] else ()
+        links = [_link(file, j, armature, damping) for j in joints]
+        inertia = (m.body_mass[b], *_central_inertia(m, b))
+        free = bool(links) and links[0].kind == "free"
+        pose = np.eye(4) if free else pose_of(m.body_pos[b], m.body_quat[b])
+        parent = file.bodies[m.body_parentid[b]]
+        add_chain(builder, frames, joint_names, str(file.bodies[b]), parent, pose, links, inertia)
+    for s, site in enumerate(file.sites):
+        builder.add_frame(site, file.bodies[m.site_bodyid[s]], pose_of(m.site_pos[s], m.site_quat[s]))
+    return built(builder, file.path)
+
+
+def _central_inertia(m, b: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centre of mass (3,) and inertia (3, 3) about it in the body's frame.
+
+    Where the compiler finds the inertial frame within some nanometres of the body's, MuJoCo takes them as one.
+    """
+    same_frame, same_turn = m.body_sameframe[b] == 1, m.body_sameframe[b] in (1, 3)  # mjtSameFrame: BODY, BODYROT
+    turn = np.eye(3) if same_turn else pose_of(np.zeros(3), m.body_iquat[b])[:3, :3]
+    return np.zeros(3) if same_frame else m.body_ipos[b].copy(), turn @ np.diag(m.body_inertia[b]) @ turn.T
+
+
+def _rotors(file: Compiled) -> tuple[np.ndarray, np.ndarray]:
+    """Armature and damping (nv,) of the joints, with what actuators on joints add to them."""
+    m = file.m
+    armature, damping = m.dof_armature.copy(), m.dof_damping.copy()
+    for i in range(m.nactuator):
+        if m.actuator_trntype[i] in (0, 1) and m.jnt_type[j := m.actuator_trnid[i, 0]] in (SLIDE, HINGE):
+            armature[m.jnt_dofadr[j]] += m.actuator_gear[i, 0] ** 2 * m.actuator_armature[i]
+            damping[m.jnt_dofadr[j]] += m.actuator_gear[i, 0] ** 2 * m.actuator_damping[i]
+    return armature, damping * (not file.off("DAMPER"))
+
+
+def _link(file: Compiled, j: int, armature: np.ndarray, damping: np.ndarray) -> Link:
+    m = file.m
+    kind = m.jnt_type[j]
+    dofs = slice(m.jnt_dofadr[j], m.jnt_dofadr[j] + SIZES[kind][1])
+    leaves: dict[str, Any] = {
+        key: values[dofs] if values[dofs].any() else None
+        for key, values in (("armature", armature), ("damping", damping), ("friction", m.dof_frictionloss))
+    }
+    limited = bool(m.jnt_limited[j]) and kind in (SLIDE, HINGE)
+    if limited:
+        leaves |= {"lower": m.jnt_range[j, 0], "upper": m.jnt_range[j, 1]}
+    if m.jnt_actfrclimited[j] and kind in (SLIDE, HINGE):
+        leaves["effort_limit"] = np.abs(m.jnt_actfrcrange[j]).max()
+    word = ("free", "spherical", "prismatic", "revolute" if limited else "continuous")[kind]
+    reference = m.qpos0[m.jnt_qposadr[j]] if kind in (SLIDE, HINGE) else 0.0
+    return Link(file.joints[j], word, m.jnt_axis[j].copy(), m.jnt_pos[j].copy(), float(reference), leaves)
+
+
+def _joint_forces(file: Compiled, model: Model) -> list:
+    m, forces = file.m, []
+    scalars = [j for j in range(m.njnt) if m.jnt_type[j] in (SLIDE, HINGE, BALL) and m.jnt_stiffness[j]]
+    if scalars and not file.off("SPRING"):
+        rest = [m.qpos_spring[m.jnt_qposadr[j] :][: SIZES[m.jnt_type[j]][0]] for j in scalars]
+        stiffness = np.repeat(m.jnt_stiffness[scalars], [SIZES[m.jnt_type[j]][1] for j in scalars])
+        forces.append(JointSpring(stiffness, np.concatenate(rest), [file.joints[j] for j in scalars]))
+    if model.damping is not None:
+        forces.append(JointDamping())
+    if model.friction is not None and not file.off("FRICTIONLOSS"):
+        forces.append(CoulombFriction())
+    return forces
+
+
+def _starts(file: Compiled, model: Model, drives) -> dict[str, Start]:
+    m, dtype = file.m, model.home.dtype
+
+    def start(qpos, qvel, control=None) -> Start:
+        q, v = _state(file, model, qpos, qvel)
+        taken = None
+        if drives is not None and control is not None:
+            taken = jnp.asarray(control[[m.actuator_ctrladr[file.actuators.index(a)] for a in drives.names]], dtype)
+        return Start(jnp.asarray(q, dtype), jnp.asarray(v, dtype), taken)
+
+    starts = {"reference": start(m.qpos0, np.zeros(m.nv))}
+    for k in range(m.nkey):
+        name = file.mujoco.mj_id2name(m, file.mujoco.mjtObj.mjOBJ_KEY, k) or f"key{k}"
+        starts[name] = start(m.key_qpos[k], m.key_qvel[k], m.key_ctrl[k])
+    return starts
+
+
+def _state(file: Compiled, model: Model, qpos, qvel) -> tuple[np.ndarray, np.ndarray]:
+    """MuJoCo's state in our coordinates."""
+    m = file.m
+    q = np.concatenate([np.zeros(0), *(joint_neutral(kind) for kind in model.topology.kinds)])
+    v = np.zeros(model.nv)
+    for j, name in enumerate(file.joints):
+        i = model.joint_names.index(name)
+        nq, nv = SIZES[m.jnt_type[j]]
+        here, rate = qpos[m.jnt_qposadr[j] :][:nq].copy(), qvel[m.jnt_dofadr[j] :][:nv].copy()
+        if nq > 1:
+            here[-4:] /= np.linalg.norm(here[-4:])
+        if nq == 7:
+            rate[:3] = f64.joint_pose("free", np.zeros(6), here)[:3, :3].T @ rate[:3]
+        q[model.topology.q_slices[i]], v[model.topology.v_slices[i]] = here, rate
+    return q, v
+
+
+def _unused(file: Compiled) -> list[str]:
+    """What the file holds and the scene does not, apart from constraints, tendons and actuators."""
+    m, mujoco = file.m, file.mujoco
+    free = [file.joints[j] for j in range(m.njnt) if m.jnt_type[j] == FREE]
+
+    def joints(condition) -> list[str]:
+        return [file.joints[j] for j in range(m.njnt) if condition(j)]
+
+    def dofs(values) -> list[str]:
+        return list(dict.fromkeys(file.joints[m.dof_jntid[i]] for i in np.flatnonzero(values)))
+
+    touching = {m.geom_bodyid[g] for g in range(m.ngeom) if m.geom_contype[g] or m.geom_conaffinity[g]}
+    touching |= {m.geom_bodyid[g] for pair in (m.pair_geom1, m.pair_geom2) for g in pair}
+    names = [file.bodies[b] or "world" for b in sorted(touching)] if not file.off("CONTACT") else []
+    fluid = [key for key in ("density", "viscosity") if getattr(m.opt, key)]
+    sensors = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_SENSOR, i) or f"sensor{i}" for i in range(m.nsensor)]
+    flexes = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_FLEX, i) or f"flex{i}" for i in range(m.nflex)]
+    return [
+        *listed("contact geometry of bodies", names),
+        *listed("limit of ball joints", joints(lambda j: m.jnt_type[j] == BALL and m.jnt_limited[j])),
+        *listed("spring of free joints", joints(lambda j: m.jnt_type[j] == FREE and m.jnt_stiffness[j])),
+        *listed("nonlinear spring of joints", joints(lambda j: m.jnt_stiffnesspoly[j].any())),
+        *listed("plastic spring of joints", joints(lambda j: m.jnt_plasticadr[j] >= 0)),
+        *listed("nonlinear damping of joints", dofs(m.dof_dampingpoly.any(1))),
+        *listed(
+            "gyroscopic part of the armature of free joints (MuJoCo adds it in world axes)",
+            [name for name in dofs(m.dof_armature) if name in free],
+        ),
+        *listed("gravity compensation of bodies", (str(file.bodies[b]) for b in np.flatnonzero(m.body_gravcomp) if b)),
+        *listed("mocap bodies, fixed here", (str(file.bodies[b]) for b in range(m.nbody) if m.body_mocapid[b] >= 0)),
+        *listed("fluid forces", fluid),
+        *listed("flexible bodies", flexes),
+        *(["plugins"] if m.nplugin else []),
+        *listed("sensors", sensors),
+    ]

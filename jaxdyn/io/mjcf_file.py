@@ -1,0 +1,144 @@
+"""MJCF files compiled by the mujoco package, with a name for everything that a model names."""
+
+import re
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdyn import _float64 as f64
+from jaxdyn.io.chains import Names
+from jaxdyn.io.xml_lines import XmlFile
+
+FREE, BALL, SLIDE, HINGE = range(4)  # mjtJoint
+SIZES = ((7, 6), (4, 3), (1, 1), (1, 1))  # numbers in q and v of each
+
+
+class Compiled(NamedTuple):
+    """A compiled file, with a name for each thing, whether the file has one or not.
+
+    `m` is mujoco's MjModel; `bodies` (None: the world), `joints`, `sites`, `tendons` and `actuators` are named by their
+    numbers in it.
+    """
+
+    path: str
+    mujoco: Any
+    m: Any
+    bodies: list[str | None]
+    joints: list[str]
+    sites: list[str]
+    tendons: list[str]
+    actuators: list[str]
+
+    def off(self, flag: str) -> bool:
+        """Whether the file's <flag> switches something off, e.g. "GRAVITY"."""
+        return bool(self.m.opt.disableflags & int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{flag}")))
+
+
+def library():
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ImportError("reading MJCF files needs mujoco: pip install jaxdyn[mjcf]") from error
+    return mujoco
+
+
+def compiled(mujoco, path: str):
+    """The compiled file, and what was left out of it because a file that it names is missing."""
+    # mujoco also reads URDF, and loads what it can of files that are none; its parser knows no line of a broken one.
+    file = XmlFile(path, "MJCF")
+    if file.root.tag != "mujoco":
+        raise file.fault(
+            file.root,
+            f"the root element is <{file.root.tag}>, expected <mujoco>; load_urdf and load_sdf read those formats",
+        )
+    try:
+        spec = mujoco.MjSpec.from_file(path)
+    except ValueError as error:
+        raise ValueError(_located(path, error)) from error
+    missing: list[str] = []
+    while True:
+        try:
+            return spec.compile(), missing
+        except ValueError as error:
+            name = re.search(r"[Ee]rror opening file '(.*?)'", str(error))
+            if name is None or not (gone := _without_file(mujoco, spec, name[1])):
+                hint = f" (already left out: {'; '.join(missing)})" if missing else ""
+                raise ValueError(_located(path, error) + hint) from error
+            missing.append(gone)
+
+
+def _located(path: str, error: Exception) -> str:
+    text = " ".join(str(error).split())
+    lines = re.findall(r"[Ll]ine(?: number=| )(\d+)", text)
+    where = f"{path}:{lines[-1]}" if lines and int(lines[-1]) else path
+    return f"{where}: {text}"
+
+
+def _without_file(mujoco, spec, name: str) -> str:
+    """Leave a mesh, height field, skin or texture out. Returns in words what was left out, or "" for no such file.
+
+    Geoms that show it become points without mass and keep their names, which sensors and contact pairs may name.
+    """
+
+    def is_it(file: str) -> bool:
+        # The compiler names the file as it looked for it, below the folder of its kind.
+        return bool(file) and (name == file or name.replace("\\", "/").endswith("/" + file))
+
+    for asset in [*spec.meshes, *spec.hfields]:
+        if not is_it(asset.file):
+            continue
+        heavy = set()
+        for geom in spec.geoms:
+            if asset.name not in (geom.meshname, geom.hfieldname):
+                continue
+            # An explicit <inertial> stands on its own; else the mass of this geom is gone with its shape.
+            if geom.mass != 0 and not geom.parent.explicitinertial and geom.parent.name != "world":
+                heavy.add(geom.parent.name or "(unnamed)")
+            geom.meshname = geom.hfieldname = ""
+            geom.type, geom.size, geom.mass = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0.0, 0.0], 0.0
+        spec.delete(asset)
+        names = ", ".join(sorted(heavy))
+        return f"missing file {name!r}" + (
+            f", and with it mass of bodies {names}, which state no inertia" if heavy else ""
+        )
+    for texture in spec.textures:
+        if any(is_it(file) for file in (texture.file, *texture.cubefiles)):
+            for material in spec.materials:
+                material.textures = ["" if used == texture.name else used for used in material.textures]
+            spec.delete(texture)
+            return f"missing file {name!r}"
+    for skin in spec.skins:
+        if is_it(skin.file):
+            spec.delete(skin)
+            return f"missing file {name!r}"
+    return ""
+
+
+def named(mujoco, m, path: str) -> Compiled:
+    def all_of(kind: str, count: int) -> list[str]:
+        code = getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
+        return [mujoco.mj_id2name(m, code, i) or "" for i in range(count)]
+
+    def filled(found: list[str], default, taken: Names) -> list[str]:
+        given = [taken.new(name) if name else "" for name in found]  # the file's names first: none of them changes
+        return [name or taken.new(default(i)) for i, name in enumerate(given)]
+
+    def joint_default(j: int) -> str:
+        body = m.jnt_bodyid[j]
+        several = m.body_jntnum[body] > 1
+        return f"{bodies[body]}_joint{j - m.body_jntadr[body] if several else ''}"
+
+    frames = Names()
+    bodies: list[str | None] = [None, *filled(all_of("BODY", m.nbody)[1:], lambda i: f"body{i + 1}", frames)]
+    known = set(bodies)
+    sites = [f"{site}_site" if site in known else site for site in all_of("SITE", m.nsite)]
+    sites = filled(sites, lambda i: f"site{i}", frames)
+    joints = filled(all_of("JOINT", m.njnt), joint_default, Names())
+    tendons = filled(all_of("TENDON", m.ntendon), lambda i: f"tendon{i}", Names())
+    names = filled(all_of("ACTUATOR", m.nactuator), lambda i: f"actuator{i}", Names())
+    return Compiled(path, mujoco, m, bodies, joints, sites, tendons, names)
+
+
+def pose_of(position, quaternion) -> np.ndarray:
+    """(4, 4) from a position and a quaternion (w, x, y, z) of any length."""
+    return f64.joint_pose("free", np.zeros(6), np.concatenate([position, quaternion]))

@@ -1,0 +1,224 @@
+"""Constraints, tendons and actuators of a compiled MJCF file, each with a list of those that were not taken."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.constraints.base import Constraint, Holonomic
+from jaxdyn.constraints.loops import gear, lock_joint, loop
+from jaxdyn.io.loaded import Actuators, listed
+from jaxdyn.io.mjcf_file import HINGE, SLIDE, Compiled, pose_of
+from jaxdyn.io.tendons import PolynomialCoupling, TendonForce
+from jaxdyn.model import Model, body_index
+
+_CONNECT, _WELD, _JOINT, _TENDON = range(4)  # mjtEq
+_ON_JOINT, _IN_PARENT, _ON_TENDON, _AT_SITE = 0, 1, 3, 4  # mjtTrn
+_NO_TURN = (1.0, 0.0, 0.0, 0.0)
+
+
+def constraints(file: Compiled, model: Model) -> tuple[list[Constraint], list[str]]:
+    """The `equality` elements as exact constraints, and in words those that were not taken."""
+    m, taken, left = file.m, [], {}
+    for i in range(m.neq):
+        name = file.mujoco.mj_id2name(m, file.mujoco.mjtObj.mjOBJ_EQUALITY, i) or f"equality{i}"
+        if not m.eq_active0[i] or file.off("EQUALITY") or file.off("CONSTRAINT"):
+            left.setdefault("equalities that the file switches off", []).append(name)
+            continue
+        kind = m.eq_type[i]
+        if kind in (_CONNECT, _WELD):
+            made, reason = _loop(file, model, i, name)
+        elif kind in (_JOINT, _TENDON):
+            made, reason = _coupling(file, model, i, name)
+        else:
+            made, reason = None, "equalities of flexible bodies"
+        taken += [] if made is None else [made]
+        left.setdefault(reason, []).extend([name] if made is None else [])
+    return taken, [line for reason, names in left.items() for line in listed(reason, names)]
+
+
+def _loop(file: Compiled, model: Model, i: int, name: str) -> tuple[Constraint | None, str]:
+    m = file.m
+    first, second, data = int(m.eq_obj1id[i]), int(m.eq_obj2id[i]), m.eq_data[i]
+    if m.eq_objtype[i] == int(file.mujoco.mjtObj.mjOBJ_SITE):
+        ends = [(file.sites[first], np.eye(4)), (file.sites[second], np.eye(4))]
+    elif m.eq_type[i] == _CONNECT:
+        ends = [(file.bodies[first], pose_of(data[:3], _NO_TURN)), (file.bodies[second], pose_of(data[3:6], _NO_TURN))]
+    else:
+        # The compiler fills in the pose of the second body in the first, at the anchor given in the second.
+        ends = [
+            (file.bodies[first], pose_of(data[3:6], data[6:10])),
+            (file.bodies[second], pose_of(data[:3], _NO_TURN)),
+        ]
+    if len({body_index(model, body) for body, _ in ends}) == 1:
+        return None, "equalities between two parts of one body"
+    points = m.eq_type[i] == _CONNECT or data[10] == 0  # without torque scale a weld holds the point alone
+    (body_a, pose_a), (body_b, pose_b) = ends
+    return loop(body_a, pose_a, body_b, pose_b, "spherical" if points else "weld", name=name), ""
+
+
+def _coupling(file: Compiled, model: Model, i: int, name: str) -> tuple[Constraint | None, str]:
+    m = file.m
+    first, second, c = int(m.eq_obj1id[i]), int(m.eq_obj2id[i]), m.eq_data[i, :5]
+    if m.eq_type[i] == _JOINT:
+        r = [m.qpos0[m.jnt_qposadr[j]] if j >= 0 else 0.0 for j in (first, second)]
+        if second < 0:
+            return lock_joint(file.joints[first], r[0] + c[0], name=name), ""
+        if not c[2:].any():
+            return gear(file.joints[first], file.joints[second], c[1], r[0] + c[0] - c[1] * r[1], name=name), ""
+        rows = [{first: 1.0}, {second: 1.0}]
+    else:
+        found = _row(file, first), _row(file, second) if second >= 0 else {}
+        if None in found:
+            return None, "equalities of spatial tendons"
+        rows = [row for row in found if row is not None]
+        r = [m.tendon_length0[t] if t >= 0 else 0.0 for t in (first, second)]
+    joints = list(dict.fromkeys(j for row in rows for j in row))
+    values = [jnp.asarray([row.get(j, 0.0) for j in joints], float) for row in rows]
+    index = tuple(_places(file, model, j)[0] for j in joints)
+    residual = PolynomialCoupling(index, values[0], values[1], jnp.asarray(r, float), jnp.asarray(c, float))
+    return Holonomic(residual, name=name), ""
+
+
+def _places(file: Compiled, model: Model, joint: int) -> tuple[int, int]:
+    """Where a joint's coordinate stands in our q and v."""
+    i = model.joint_names.index(file.joints[joint])
+    return model.topology.q_slices[i].start, model.topology.v_slices[i].start
+
+
+def _row(file: Compiled, tendon: int) -> dict[int, float] | None:
+    """Coefficients by joint of a tendon that is linear in the joints' coordinates, None for any other."""
+    m, row = file.m, {}
+    for w in range(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon]):
+        if m.wrap_type[w] != int(file.mujoco.mjtWrap.mjWRAP_JOINT):
+            return None
+        joint = int(m.wrap_objid[w])
+        row[joint] = row.get(joint, 0.0) + float(m.wrap_prm[w])
+    return row
+
+
+def tendon_forces(file: Compiled, model: Model) -> tuple[list[TendonForce], list[str]]:
+    """Springs and dampers of linear tendons, and in words what tendons do that was not taken."""
+    m = file.m
+    springs = m.tendon_stiffness * (not file.off("SPRING"))
+    dampers = m.tendon_damping * (not file.off("DAMPER"))
+    rows = [_row(file, t) for t in range(m.ntendon)]
+    taken = [t for t, row in enumerate(rows) if row is not None and (springs[t] or dampers[t])]
+
+    def those(condition) -> list[str]:
+        return [name for t, name in enumerate(file.tendons) if condition(t)]
+
+    left = [
+        *listed("forces of spatial tendons", those(lambda t: rows[t] is None and (springs[t] or dampers[t]))),
+        *listed("limits of tendons", those(lambda t: m.tendon_limited[t])),
+        *listed("dry friction of tendons", those(lambda t: m.tendon_frictionloss[t])),
+        *listed("armature of tendons", those(lambda t: m.tendon_armature[t])),
+        *listed("plastic springs of tendons", those(lambda t: m.tendon_plasticadr[t] >= 0)),
+        *listed(
+            "nonlinear springs or damping of tendons",
+            those(lambda t: m.tendon_stiffnesspoly[t].any() or m.tendon_dampingpoly[t].any()),
+        ),
+    ]
+    if not taken:
+        return [], left
+    joints = sorted({j for t in taken for j in rows[t] or ()})
+    places = [_places(file, model, j) for j in joints]
+    force = TendonForce(
+        tuple(q for q, _ in places),
+        tuple(v for _, v in places),
+        jnp.asarray([[(rows[t] or {}).get(j, 0.0) for j in joints] for t in taken], float),
+        jnp.asarray(springs[taken], float),
+        jnp.asarray(dampers[taken], float),
+        jnp.asarray(m.tendon_lengthspring[taken], float),
+    )
+    return [force], left
+
+
+def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]]:
+    """The actuators without a state of their own, None without any, and in words those that were not taken."""
+    m, left = file.m, {}
+    taken = []
+    for i, name in enumerate(file.actuators):
+        if reason := _fault(file, i):
+            left.setdefault(reason, []).append(name)
+        else:
+            taken.append(i)
+    lines = [line for reason, names in left.items() for line in listed(f"actuators {reason}", names)]
+    lines += listed(
+        "armature or damping of actuators on tendons and sites",
+        (
+            file.actuators[i]
+            for i in range(m.nactuator)
+            if (m.actuator_armature[i] or m.actuator_damping[i] or m.actuator_dampingpoly[i].any())
+            and (m.actuator_trntype[i] not in (_ON_JOINT, _IN_PARENT) or m.actuator_dampingpoly[i].any())
+        ),
+    )
+    if not taken:
+        return None, lines
+    n = len(taken)
+    moment, wrenches = np.zeros((n, model.nv)), np.zeros((n, 6))
+    places, effort = np.full(model.nv, -1), np.tile([-np.inf, np.inf], (model.nv, 1))
+    for j in range(m.njnt):
+        if m.jnt_type[j] in (SLIDE, HINGE):
+            q, v = _places(file, model, j)
+            places[v] = q
+            if m.jnt_actfrclimited[j]:
+                effort[v] = m.jnt_actfrcrange[j]
+    sites: list[str | None] = [None] * n
+    for k, i in enumerate(taken):
+        kind, target, pull = m.actuator_trntype[i], int(m.actuator_trnid[i, 0]), m.actuator_gear[i]
+        if kind == _AT_SITE:
+            sites[k], wrenches[k] = file.sites[target], pull
+            continue
+        row = {target: 1.0} if kind != _ON_TENDON else _row(file, target) or {}
+        for joint, coefficient in row.items():
+            moment[k, _places(file, model, joint)[1]] += pull[0] * coefficient
+
+    def held(limited, ranges, off: bool) -> np.ndarray:
+        return np.where((limited[taken] != 0)[:, None] & (not off), ranges[taken], [-np.inf, np.inf])
+
+    no_gain = m.actuator_gaintype[taken] == int(file.mujoco.mjtGain.mjGAIN_FIXED)
+    no_bias = m.actuator_biastype[taken] == int(file.mujoco.mjtBias.mjBIAS_NONE)
+    gain, bias = m.actuator_gainprm[taken, :3].copy(), m.actuator_biasprm[taken, :3].copy()
+    gain[no_gain, 1:] = 0.0
+    bias[no_bias] = 0.0
+    numbers = (
+        moment,
+        wrenches,
+        gain,
+        bias,
+        held(m.actuator_ctrllimited, m.actuator_ctrlrange, file.off("CLAMPCTRL")),
+        held(m.actuator_forcelimited, m.actuator_forcerange, False),
+        effort,
+    )
+    names = tuple(file.actuators[i] for i in taken)
+    leaves = (jnp.asarray(x, model.home.dtype) for x in numbers)
+    return Actuators(names, tuple(sites), tuple(int(x) for x in places), *leaves), lines
+
+
+def _fault(file: Compiled, i: int) -> str:
+    """Why an actuator is not taken, in words that follow "actuators"; empty when it is."""
+    m, mujoco = file.m, file.mujoco
+    dynamics, gain, bias = m.actuator_dyntype[i], m.actuator_gaintype[i], m.actuator_biastype[i]
+    kind, target = m.actuator_trntype[i], [int(x) for x in m.actuator_trnid[i]]
+    if file.off("ACTUATION") or (m.actuator_group[i] >= 0 and m.opt.disableactuator >> m.actuator_group[i] & 1):
+        return "that the file switches off"
+    if m.actuator_plugin[i] >= 0:
+        return "of plugins"
+    if gain == int(mujoco.mjtGain.mjGAIN_MUSCLE) or bias == int(mujoco.mjtBias.mjBIAS_MUSCLE):
+        return "that are muscles"
+    if dynamics != int(mujoco.mjtDyn.mjDYN_NONE) or m.actuator_delay[i]:
+        return "with a state of their own or a delay"
+    affine = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
+    if gain not in affine or bias not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
+        return "whose force is not affine in length and velocity"
+    if m.actuator_ctrlnum[i] != 1 or m.actuator_outnum[i] != 1:
+        return "of several controls or forces"
+    if kind in (_ON_JOINT, _IN_PARENT):
+        return "on ball and free joints" if m.jnt_type[target[0]] not in (SLIDE, HINGE) else ""
+    if kind == _ON_TENDON:
+        limited = m.tendon_actfrclimited[target[0]]
+        if _row(file, target[0]) is None:
+            return "on spatial tendons"
+        return "on tendons that limit their force" if limited else ""
+    if kind == _AT_SITE:
+        return "at a site against another" if target[1] >= 0 else ""
+    return "on slider-cranks or bodies"

@@ -1,0 +1,304 @@
+"""Reading SDF files (the format of Gazebo), versions 1.4 to 1.12: trees, loops, gearboxes, nested models, worlds."""
+
+import os
+from collections.abc import Iterable
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn import _float64 as f64
+from jaxdyn.building import GRAVITY, ModelBuilder
+from jaxdyn.constraints.base import Constraint
+from jaxdyn.constraints.loops import gear, loop
+from jaxdyn.forces import CoulombFriction, JointDamping, JointSpring
+from jaxdyn.io.chains import Link, Names, add_chain, built
+from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of_units
+from jaxdyn.io.sdf_frames import SdfFile
+from jaxdyn.io.sdf_joints import Axis, Edge, Joint, read_joints, spanning_tree
+from jaxdyn.io.urdf import ROOT_JOINT, _turn_from_z
+from jaxdyn.joints import joint_neutral
+from jaxdyn.model import Model, body_index
+
+_KINDS = dict(revolute="revolute", continuous="revolute", revolute2="revolute", universal="revolute")
+_KINDS |= dict(prismatic="prismatic", screw="helical", ball="spherical")
+_LOOPS = dict(revolute="revolute", continuous="revolute", prismatic="prismatic", universal="universal")
+_LOOPS |= dict(revolute2="universal", ball="spherical", fixed="weld")
+_SECOND = "_axis2"  # behind the name of a joint of two axes: its second one
+_PARALLEL = 1e-4  # files give right angles with four or five digits
+_MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
+_SKIPPED = ("collision", "sensor", "plugin", "battery", "particle_emitter", "projector", "audio_source")
+
+
+def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype=None) -> LoadedScene:
+    """The scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.
+
+    Taken are links with their inertias, all joints (of two axes as two joints, JOINT and JOINT_axis2), limits (as the
+    model's `lower`, `upper`), damping, dry friction and springs of joints, gearboxes and mimicked axes as couplings,
+    frames, nested models (their names start with MODEL::), static models, and the world's gravity. A joint that closes a
+    loop becomes a constraint; which ones do is chosen so that springs, damping and limits keep a coordinate, and balls
+    are cut first (`jaxdyn.io.sdf_joints.spanning_tree`). Where the format sets a default it is taken: a link without
+    <inertial> has 1 kg and 1 kg m^2 about each axis.
+
+    `load_urdf` returns a `Model`, since a URDF holds a tree and nothing else; `load_mjcf` and `load_sdf` return a
+    `LoadedScene`, a `Scene` with that model as `.system`.
+
+    Coordinates: zero is the placement of the file; a positive angle turns the child against the parent about the axis,
+    also where the tree runs from child to parent. The coordinates of a free root (joint "root_joint", or LINK_root_joint
+    of several) are its link's pose in the world. Every link keeps a frame of its name.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `floating_base`: whether what no joint ties to the world moves freely, as the format has it; False fixes the root
+      links where the file puts them. The root of a part is its model's canonical link.
+    - `dtype`: as for `ModelBuilder`.
+
+    **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
+    0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is the placement of the file, on which all loops close),
+    `.actuators` (None), `.not_taken`. Gravity is that of the file's world (its default is 9.8 m/s^2), 9.81 m/s^2
+    downwards where the file holds a model alone.
+
+    **Warns:** `NotTakenWarning` naming what the scene does not have: collisions, sensors, plugins, includes, screws that
+    close loops, springs and damping of joints that close loops, and the like.
+
+    `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
+
+    **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, entity declarations,
+    another version, unknown names or types, poses in a circle, bad numbers, inertias that are to be computed from
+    shapes; for a joint that moves no inertia.
+    """
+    file = SdfFile(path)
+    joints = read_joints(file)
+    moving = [joint for joint in joints if joint.kind != "gearbox"]
+    static = [name for name, (_, scope) in file.links.items() if scope.static]
+    first = [link for model in file.models.values() if (link := file.canonical_link(model)) is not None]
+    edges, cut = spanning_tree(file.links, static, moving, first)
+    model, roots = _model(file, edges, set(static), floating_base, dtype)
+    tree = {edge.joint.name: edge.joint for edge in edges if edge.joint is not None}
+    loops, left = _loops(file, model, cut)
+    couplings, also = _couplings(file, joints, tree)
+    not_taken = (*left, *also, *_unused(file))
+    warn_not_taken(path, not_taken)
+    warn_of_units(path, model)
+    starts = {"reference": _start(file, model, roots)}
+    return LoadedScene(model, [*loops, *couplings], _forces(model, tree), starts=starts, not_taken=not_taken)
+
+
+def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, dtype) -> tuple[Model, dict[str, str]]:
+    """The model, and the joints of its free roots with the link of each."""
+    name = next(iter(file.models)) if len(file.models) == 1 or file.world is None else ""
+    name = name or (file.world.get("name") if file.world is not None else "") or "mechanism"
+    gravity: np.ndarray | tuple | None = GRAVITY
+    if file.world is not None:
+        found = file.world.find("gravity")
+        gravity = np.array([0.0, 0.0, -9.8]) if found is None else file.numbers(found, 3, "the world")
+        gravity = gravity if gravity.any() else None
+    builder = ModelBuilder(name, gravity=gravity, dtype=dtype)
+    frames, names = Names(), Names()
+    for link in file.links:
+        frames.new(link)
+    for joint in file.joints:
+        names.new(joint)
+    free = [edge.body for edge in edges if edge.joint is None and edge.body not in static and floating]
+    roots: dict[str, str] = {}
+    for edge in edges:
+        inertia = _inertia(file, edge.body)
+        place = file.pose(edge.body)
+        links: list[Link] = []
+        if edge.joint is not None:
+            links = _links(edge, place)
+            place = f64.inverse(file.pose(edge.carrier)) @ place if edge.carrier is not None else place
+        elif edge.body in free:
+            root = names.new(ROOT_JOINT if len(free) == 1 else f"{edge.body}_{ROOT_JOINT}")
+            roots[root] = edge.body
+            links, place = [Link(root, "free", np.zeros(3), np.zeros(3), 0.0, {})], np.eye(4)
+        element = file.links[edge.body][0] if edge.joint is None else edge.joint.element
+        try:
+            add_chain(builder, frames, names, edge.body, edge.carrier, place, links, inertia)
+        except ValueError as error:
+            raise file.fault(element, str(error)) from error
+    for frame, (_, _) in file.frames.items():
+        carrier = file.link_of(frame)
+        pose = file.pose(frame) if carrier is None else f64.inverse(file.pose(carrier)) @ file.pose(frame)
+        builder.add_frame(frames.new(frame), carrier, pose)
+    return built(builder, file.path), roots
+
+
+def _axis_names(joint: Joint) -> list[str]:
+    return [joint.name, joint.name + _SECOND][: max(1, len(joint.axes))]
+
+
+def _links(edge: Edge, place: np.ndarray) -> list[Link]:
+    """The chain that carries a body: axes and anchor in its frame, the other way round for a joint taken backwards."""
+    joint = edge.joint
+    if joint is None or joint.kind == "fixed":
+        return []
+    anchor = (f64.inverse(place) @ joint.pose)[:3, 3]
+    kind, sign = _KINDS[joint.kind], -1.0 if edge.backwards else 1.0
+    if kind == "spherical":
+        return [Link(joint.name, kind, np.zeros(3), anchor, 0.0, {})]
+    links = []
+    for name, axis in zip(_axis_names(joint), joint.axes, strict=True):
+        word = "continuous" if kind == "revolute" and not axis.limited else kind
+        direction = sign * place[:3, :3].T @ axis.direction
+        links.append(Link(name, word, direction, anchor, 0.0, axis.leaves, joint.pitch))
+    return links[::-1] if edge.backwards else links
+
+
+def _inertia(file: SdfFile, link: str) -> np.ndarray:
+    element, what = file.links[link][0], f"link {link!r}"
+    inertial = element.find("inertial")
+    if inertial is None:
+        return f64.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what)
+    if (inertial.get("auto") or "").strip().lower() in ("1", "true"):
+        raise file.fault(
+            inertial,
+            f"the inertia of {what} is to be computed from its shapes, which is not done here; write <mass> "
+            "and <inertia> (`gz sdf --inertial-stats FILE` prints them)",
+        )
+    get = lambda tag, default: file.number(inertial, f"inertia/{tag}", default, what)  # noqa: E731
+    xx, yy, zz = get("ixx", 1.0), get("iyy", 1.0), get("izz", 1.0)
+    xy, xz, yz = get("ixy", 0.0), get("ixz", 0.0), get("iyz", 0.0)
+    mass = file.number(inertial, "mass", 1.0, what)
+    try:
+        about_com = (mass, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        return f64.move_inertia(file.raw_pose(inertial, what), f64.inertia_numbers(about_com, what))
+    except ValueError as error:
+        raise error if str(error).startswith(file.path) else file.fault(inertial, str(error)) from error
+
+
+def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constraint], list[str]]:
+    """Constraints that close the loops, and in words what of them was not taken."""
+    taken, left = [], {}
+    for joint in cut:
+        ends = (joint.parent, joint.child)
+        if len(bodies := {body_index(model, end) for end in ends}) == 1:
+            # Two links that are fixed to each other, or to the world, are often joined twice.
+            if joint.kind != "fixed" and bodies != {-1}:
+                left.setdefault("joints between two parts of one body", []).append(joint.name)
+            continue
+        skew = len(joint.axes) == 2 and abs(joint.axes[0].direction @ joint.axes[1].direction) > _PARALLEL
+        if joint.kind == "screw" or skew:
+            reason = "screws that close loops" if joint.kind == "screw" else "skew joints of two axes that close loops"
+            left.setdefault(reason, []).append(joint.name)
+            continue
+        if any(axis.stiffness or axis.leaves for axis in joint.axes):
+            left.setdefault("springs, damping, friction and limits of joints that close loops", []).append(joint.name)
+        poses = []
+        for k, end in enumerate(ends):
+            axis = joint.axes[min(k, len(joint.axes) - 1)].direction if joint.axes else joint.pose[:3, 2]
+            # The loop closes as the file places the links: both frames are there, z along the end's own axis.
+            place = _turn_from_z(axis)
+            place[:3, 3] = joint.pose[:3, 3]
+            poses.append(place if end is None else f64.inverse(file.pose(end)) @ place)
+        taken.append(loop(ends[0], poses[0], ends[1], poses[1], _LOOPS[joint.kind], name=joint.name))
+    return taken, [line for reason, names in left.items() for line in listed(reason, names)]
+
+
+def _couplings(file: SdfFile, joints: list[Joint], tree: dict[str, Joint]) -> tuple[list[Constraint], list[str]]:
+    """Gearboxes and mimicked axes, and in words those whose joints have no coordinate."""
+    taken: list[Constraint] = []
+    left: list[str] = []
+    for joint in joints:
+        if joint.kind == "gearbox":
+            made = _gearbox(file, joint, tree.values())
+            (left if made is None else taken).append(joint.name if made is None else made)  # pyright: ignore[reportArgumentType]
+            continue
+        for name, axis in zip(_axis_names(joint), joint.axes, strict=False):
+            if axis.mimic is not None:
+                made = _mimic(file, joint, name, axis, tree)
+                (left if made is None else taken).append(name if made is None else made)  # pyright: ignore[reportArgumentType]
+    return taken, listed("couplings of joints that have no coordinate or axes that are not parallel", left)
+
+
+def _gearbox(file: SdfFile, joint: Joint, tree: Iterable[Joint]) -> Constraint | None:
+    """theta_2 = -ratio theta_1, the angles of the gearbox's child and parent against its reference body."""
+    element, scope = file.joints[joint.name]
+    tag = element.find("gearbox_reference_body")
+    if tag is None or not (tag.text or "").strip():
+        raise file.fault(element, f"gearbox {joint.name!r} has no <gearbox_reference_body>")
+    reference = file.link_of(file.find(tag.text.strip(), scope, tag))
+    ends = []
+    for link, axis in zip((joint.parent, joint.child), joint.axes, strict=True):
+        for other in tree:
+            if other.kind not in ("revolute", "continuous") or {other.parent, other.child} != {reference, link}:
+                continue
+            along = float(other.axes[0].direction @ axis.direction)
+            if abs(abs(along) - 1.0) < _PARALLEL:
+                ends.append((other.name, np.sign(along) * (1.0 if other.child == link else -1.0)))
+                break
+    if len(ends) < 2:
+        return None
+    (first, sign_1), (second, sign_2) = ends
+    ratio = -file.number(element, "gearbox_ratio", 1.0, f"joint {joint.name!r}") * sign_1 * sign_2
+    return gear(second, first, ratio, name=joint.name)
+
+
+def _mimic(file: SdfFile, joint: Joint, name: str, axis: Axis, tree: dict[str, Joint]) -> Constraint | None:
+    """follower = multiplier (leader - reference) + offset."""
+    element, scope = axis.mimic, file.joints[joint.name][1]
+    leader = scope.prefix + (element.get("joint") or "").strip()
+    if leader not in file.joints:
+        raise file.fault(element, f"joint {name!r} mimics {leader!r}, which is not a joint of the file; mend <mimic>")
+    which = element.get("axis") or "axis"
+    if joint.name not in tree or leader not in tree or len(tree[leader].axes) < (2 if which == "axis2" else 1):
+        return None
+    numbers = (file.number(element, tag, default, f"joint {name!r}") for tag, default in _MIMIC)
+    multiplier, offset, reference = numbers
+    source = leader + (_SECOND if which == "axis2" else "")
+    if source == name:
+        raise file.fault(element, f"joint {name!r} mimics itself; name another joint")
+    return gear(name, source, multiplier, offset - multiplier * reference, name=f"mimic {name}-{source}")
+
+
+def _forces(model: Model, tree: dict[str, Joint]) -> list:
+    named = [
+        (name, axis) for joint in tree.values() for name, axis in zip(_axis_names(joint), joint.axes, strict=False)
+    ]
+    sprung = [(name, axis) for name, axis in named if axis.stiffness]
+    forces: list = []
+    if sprung:
+        stiffness, rest = np.array([axis.stiffness for _, axis in sprung]), np.array([axis.rest for _, axis in sprung])
+        forces.append(JointSpring(stiffness, rest, [name for name, _ in sprung]))
+    if model.damping is not None:
+        forces.append(JointDamping())
+    if model.friction is not None:
+        forces.append(CoulombFriction())
+    return forces
+
+
+def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
+    """The placement of the file."""
+    q = np.concatenate([np.zeros(0), *(joint_neutral(kind) for kind in model.topology.kinds)])
+    for joint, link in roots.items():
+        pose = file.pose(link)
+        q[model.topology.q_slices[model.joint_names.index(joint)]] = np.concatenate(
+            [pose[:3, 3], f64.quaternion(pose[:3, :3])]
+        )
+    return Start(jnp.asarray(q, model.home.dtype), jnp.zeros(model.nv, model.home.dtype))
+
+
+def _unused(file: SdfFile) -> list[str]:
+    """What the file holds and the scene does not, apart from joints."""
+    found: dict[str, list[str]] = {}
+    for link, (element, _) in file.links.items():
+        for tag in _SKIPPED:
+            if element.find(tag) is not None:
+                found.setdefault(f"<{tag}> of links", []).append(link)
+        if element.find("gravity") is not None and not file.flag(element, "gravity", f"link {link!r}"):
+            found.setdefault("links without gravity (it acts on them here)", []).append(link)
+        if file.flag(element, "kinematic", f"link {link!r}"):
+            found.setdefault("kinematic links", []).append(link)
+        if element.find("inertial/fluid_added_mass") is not None:
+            found.setdefault("fluid added mass of links", []).append(link)
+    for joint, (element, _) in file.joints.items():
+        if element.find("sensor") is not None:
+            found.setdefault("<sensor> of joints", []).append(joint)
+        if any(file.number(element, f"{tag}/initial_position", 0.0, f"joint {joint!r}") for tag in ("axis", "axis2")):
+            found.setdefault("initial position of joints", []).append(joint)
+    for model, scope in file.models.items():
+        for tag in ("plugin", "gripper"):
+            if scope.element.find(tag) is not None:
+                found.setdefault(f"<{tag}> of models", []).append(model)
+    lines = [line for reason, names in found.items() for line in listed(reason, names)]
+    return [*lines, *listed("includes", file.includes)]

@@ -1,0 +1,205 @@
+"""Links, joints and frames of an SDF file, and where they are: the pose graph of the format, from version 1.4 on.
+
+Every pose is given in a frame: by default the model's for links, the child link's for joints, that of `attached_to` for
+frames; from 1.7 on `relative_to` names another. Names reach into nested models by "::". Everything is resolved to poses
+in the world, as the file describes the mechanism.
+
+Source: sdformat.org, "Pose frame semantics", and the descriptions of each version of the format.
+"""
+
+import dataclasses
+import os
+from typing import Any
+
+import numpy as np
+
+from jaxdyn import _float64 as f64
+from jaxdyn.building import unknown
+from jaxdyn.io.xml_lines import XmlFile
+
+WORLD = "world"
+_VERSIONS = tuple(f"1.{minor}" for minor in range(4, 13))
+
+
+@dataclasses.dataclass(frozen=True)
+class Scope:
+    """A world or a model: what is named in it starts with `prefix`; `frame` is its own frame's name."""
+
+    element: Any
+    prefix: str
+    frame: str
+    parent: "Scope | None"
+    static: bool
+
+
+class SdfFile(XmlFile):
+    """An SDF file with its links, joints and frames by their full names (MODEL::NAME in nested models).
+
+    **Raises:** ValueError with file and line for malformed XML, versions other than 1.4 to 1.12, names that are missing,
+    taken or unknown, poses in a circle, and numbers that are none.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        super().__init__(path, "SDF")
+        root = self.root
+        if root.tag != "sdf":
+            raise self.fault(root, f"the root element is <{root.tag}>, expected <sdf>; this is not an SDF file")
+        version = root.get("version") or ""
+        if version not in _VERSIONS:
+            raise self.fault(root, f"the version is {version!r}; {_VERSIONS[0]} to {_VERSIONS[-1]} are read")
+        self.minor = int(version.partition(".")[2])
+        self.links: dict[str, tuple[Any, Scope]] = {}
+        self.joints: dict[str, tuple[Any, Scope]] = {}
+        self.frames: dict[str, tuple[Any, Scope]] = {}
+        self.models: dict[str, Scope] = {}
+        self.includes: list[str] = []
+        worlds = root.findall("world")
+        if len(worlds) > 1:
+            raise self.fault(worlds[1], "the file holds several worlds; keep one")
+        self.world = worlds[0] if worlds else None
+        top = Scope(root if self.world is None else self.world, "", WORLD, None, False)
+        self._collect(top)
+        if not self.links:
+            raise self.fault(
+                root, "the file holds no <link>; its includes are not read" if self.includes else "no <link>"
+            )
+
+    def _collect(self, scope: Scope) -> None:
+        for element in scope.element:
+            if element.tag == "include":
+                self.includes.append(self.word(element, "uri", "(no uri)"))
+            if element.tag not in ("link", "joint", "frame", "model"):
+                continue
+            name = scope.prefix + self.name(element, scope.frame)
+            known = {"link": self.links, "joint": self.joints, "frame": self.frames, "model": self.models}[element.tag]
+            if name in known:
+                raise self.fault(element, f"the {element.tag} name {name!r} is taken; rename one")
+            if element.tag != "model":
+                known[name] = (element, scope)
+                continue
+            static = scope.static or self.flag(element, "static", f"model {name!r}")
+            # The one model of a file gives no prefix to its names; several do, so that they stay apart.
+            alone = scope.parent is None and len(scope.element.findall("model")) == 1
+            inner = Scope(element, "" if alone else f"{name}::", name, scope, static)
+            self.models[name] = inner
+            self._collect(inner)
+
+    def find(self, name: str, scope: Scope, element) -> str:
+        """Full name of a frame that is named within a scope. **Raises:** ValueError for an unknown one."""
+        if name == "__model__":
+            return scope.frame
+        if name in (WORLD, "__root__"):
+            return WORLD
+        for known in (self.links, self.frames, self.models, self.joints):
+            if scope.prefix + name in known:
+                return scope.prefix + name
+        known = (k.removeprefix(scope.prefix) for all in (self.links, self.frames, self.joints) for k in all)
+        raise self.fault(element, f"{unknown('frame', name, known)}; name a link, joint, frame or model of its scope")
+
+    def raw_pose(self, element, what: str) -> np.ndarray:
+        """The numbers of an element's <pose> as (4, 4), the identity where there is none."""
+        pose = element.find("pose")
+        if pose is None or not (pose.text or "").strip():
+            return np.eye(4)
+        if (pose.get("frame") or "").strip() and self.minor < 7:
+            raise self.fault(
+                pose,
+                f"<pose> of {what} is in the frame {pose.get('frame')!r}, which has no settled meaning before "
+                "version 1.7; write version 1.7 and relative_to",
+            )
+        if pose.get("rotation_format") == "quat_xyzw":
+            values = self.numbers(pose, 7, what)
+            if not values[3:].any():
+                raise self.fault(pose, f"<pose> of {what} has the quaternion zero; give x y z qx qy qz qw")
+            return f64.joint_pose("free", np.zeros(6), np.concatenate([values[:3], values[6:], values[3:6]]))
+        values = self.numbers(pose, 6, what)
+        turn = np.deg2rad(values[3:]) if (pose.get("degrees") or "").lower() in ("1", "true") else values[3:]
+        return f64.pose_matrix((values[:3], turn), what)
+
+    def pose(self, name: str, stop: str = WORLD, trail: tuple[str, ...] = ()) -> np.ndarray:
+        """Pose (4, 4) of a frame in the world (or in the frame `stop` that it hangs on)."""
+        if name == stop:
+            return np.eye(4)
+        element, scope = self._entry(name)
+        if name in trail:
+            raise self.fault(
+                element, f"the poses of {', '.join(trail[trail.index(name) :])} hang on each other in a circle"
+            )
+        if name == WORLD:
+            raise self.fault(scope.element, f"the frame {trail[0]!r} does not hang on the model {stop!r}")
+        raw = self.raw_pose(element, f"{element.tag} {name!r}")
+        tag = element.find("pose")
+        base = (tag.get("relative_to") or "").strip() if tag is not None else ""
+        if base:
+            base = self.find(base, scope, tag)
+        elif name in self.joints and name not in self.links:
+            base = self.end(name, "child")
+        elif name in self.frames and (element.get("attached_to") or "").strip():
+            base = self.find(element.get("attached_to").strip(), scope, element)
+        else:
+            base = scope.frame
+        found = self.pose(base, stop, (*trail, name)) @ raw
+        placement = (element.get("placement_frame") or "").strip() if name in self.models else ""
+        if placement:
+            inner = self.models[name]
+            found = found @ f64.inverse(self.pose(self.find(placement, inner, element), name))
+        return found
+
+    def _entry(self, name: str) -> tuple[Any, Scope]:
+        for known in (self.links, self.frames):
+            if name in known:
+                return known[name]
+        if name in self.models:
+            model = self.models[name]
+            return model.element, model.parent or model
+        if name in self.joints:
+            return self.joints[name]
+        return self.root, Scope(self.root, "", WORLD, None, False)
+
+    def joint_pose(self, name: str) -> np.ndarray:
+        """Pose (4, 4) of a joint's frame in the world; a link may have the same name before version 1.7."""
+        if name not in self.links and name not in self.frames and name not in self.models:
+            return self.pose(name)
+        element, scope = self.joints[name]
+        tag = element.find("pose")
+        base = (tag.get("relative_to") or "").strip() if tag is not None else ""
+        base = self.find(base, scope, tag) if base else self.end(name, "child")
+        return self.pose(base) @ self.raw_pose(element, f"joint {name!r}")
+
+    def end(self, joint: str, which: str) -> str:
+        """Full name of the frame that is a joint's "parent" or "child"."""
+        element, scope = self.joints[joint]
+        found = element.find(which)
+        if found is None or not (found.text or "").strip():
+            raise self.fault(element, f"joint {joint!r} has no <{which}>")
+        return self.find(found.text.strip(), scope, found)
+
+    def link_of(self, name: str, trail: tuple[str, ...] = ()) -> str | None:
+        """The link that carries a frame, or None: the world, or a model that is static."""
+        if name in trail:
+            element, _ = self._entry(name)
+            raise self.fault(element, f"the frames {', '.join(trail)} are attached to each other in a circle")
+        if name == WORLD:
+            return None
+        if name in self.links:
+            return name
+        trail = (*trail, name)
+        if name in self.frames:
+            element, scope = self.frames[name]
+            base = (element.get("attached_to") or "").strip()
+            return self.link_of(self.find(base, scope, element) if base else scope.frame, trail)
+        if name in self.joints:
+            return self.link_of(self.end(name, "child"), trail)
+        return self.canonical_link(self.models[name])
+
+    def canonical_link(self, model: Scope) -> str | None:
+        """The link that carries a model's frame, None for the world when the model is static or empty."""
+        if model.static:
+            return None
+        if named := (model.element.get("canonical_link") or "").strip():
+            return self.find(named, model, model.element)
+        for tag in ("link", "model"):
+            for element in model.element.findall(tag):
+                name = model.prefix + self.name(element, model.frame)
+                return name if tag == "link" else self.canonical_link(self.models[name])
+        return None

@@ -1,0 +1,190 @@
+"""Joints of an SDF file as data in world axes, and the choice of those that make the tree."""
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdyn import _float64 as f64
+from jaxdyn.building import unknown
+from jaxdyn.io.sdf_frames import SdfFile
+
+# Axes of each kind. A gearbox is a coupling of two other joints, not a joint.
+AXES = dict(revolute=1, continuous=1, prismatic=1, screw=1, revolute2=2, universal=2, ball=0, fixed=0, gearbox=2)
+_FAR = 1e15  # limits beyond this are none; +-1e16 was the default up to version 1.6
+
+
+class Axis(NamedTuple):
+    """An axis: direction (3,) in world axes, spring and what `ModelBuilder.add_body` takes of the joint."""
+
+    direction: np.ndarray
+    stiffness: float
+    rest: float
+    leaves: dict[str, Any]
+    limited: bool
+    mimic: Any
+
+
+class Joint(NamedTuple):
+    """A joint between two links (None: the world), its point (3,) in the world, its axes and its pitch (m/rad)."""
+
+    name: str
+    kind: str
+    parent: str | None
+    child: str | None
+    pose: np.ndarray
+    axes: tuple[Axis, ...]
+    pitch: float
+    cut: bool  # the file asks for a loop to be cut here
+    element: Any
+
+
+class Edge(NamedTuple):
+    """A joint of the tree: it carries `body` on `carrier`; reversed where `body` is the joint's parent in the file."""
+
+    joint: Joint | None  # None: the body stands on the world without a joint of the file
+    carrier: str | None
+    body: str
+    backwards: bool
+
+
+def read_joints(file: SdfFile) -> list[Joint]:
+    """All joints of a file, in its order.
+
+    **Raises:** ValueError with file and line for an unknown kind, a bad axis, a screw without a pitch, a joint that
+    carries a link on itself.
+    """
+    joints = []
+    for name, (element, scope) in file.joints.items():
+        kind = element.get("type") or ""
+        if kind not in AXES:
+            raise file.fault(element, f"joint {name!r}: {unknown('type', kind, AXES)}; types are {', '.join(AXES)}")
+        pose = file.joint_pose(name)
+        parent, child = (file.link_of(file.end(name, which)) for which in ("parent", "child"))
+        if parent == child and parent is not None:
+            raise file.fault(element, f"joint {name!r} joins {parent!r} to itself; name two links")
+        tags = ("axis", "axis2")[: AXES[kind]]
+        axes = tuple(_axis(file, name, element, scope, tag, kind, pose) for tag in tags)
+        cut = file.flag(element, "physics/simbody/must_be_loop_joint", f"joint {name!r}")
+        pitch = _pitch(file, name, element) if kind == "screw" else 0.0
+        joints.append(Joint(name, kind, parent, child, pose, axes, pitch, cut, element))
+    return joints
+
+
+def _axis(file: SdfFile, name: str, joint, scope, tag: str, kind: str, pose: np.ndarray) -> Axis:
+    what = f"joint {name!r}"
+    element = joint.find(tag)
+    xyz = None if element is None else element.find("xyz")
+    if xyz is None and (tag == "axis2" or file.minor < 7):
+        raise file.fault(joint if element is None else element, f"{what} is {kind} and has no <{tag}> with <xyz>")
+    values = np.array([0.0, 0.0, 1.0]) if xyz is None else file.numbers(xyz, 3, f"<{tag}> of {what}")
+    if not values.any():
+        raise file.fault(xyz, f"<xyz> of <{tag}> of {what} is zero; give a direction")
+    turn = pose[:3, :3]
+    inside = (xyz.get("expressed_in") or "").strip() if xyz is not None else ""
+    # Up to 1.4 axes are in the model's frame; in 1.5 and 1.6 where the file says so.
+    if file.minor < 7 and (file.minor == 4 or file.flag(element, "use_parent_model_frame", what)):
+        turn = file.pose(scope.frame)[:3, :3]
+    elif inside:
+        turn = file.pose(file.find(inside, scope, xyz))[:3, :3]
+    get = lambda tag, default, **how: file.number(element, tag, default, what, **how)  # noqa: E731
+    lower, upper = get("limit/lower", -np.inf, finite=False), get("limit/upper", np.inf, finite=False)
+    limited = kind != "continuous" and (lower > -_FAR or upper < _FAR)
+    leaves: dict[str, Any] = {}
+    if limited:
+        leaves = {"lower": lower if lower > -_FAR else -np.inf, "upper": upper if upper < _FAR else np.inf}
+    for key, path in (("effort_limit", "limit/effort"), ("velocity_limit", "limit/velocity")):
+        value = get(path, -1.0, finite=False)  # negative: no limit
+        if 0 <= value < _FAR:
+            leaves[key] = value
+    for key in ("damping", "friction"):
+        if value := get(f"dynamics/{key}", 0.0):
+            leaves[key] = value
+    stiffness, rest = get("dynamics/spring_stiffness", 0.0), get("dynamics/spring_reference", 0.0)
+    mimic = None if element is None else element.find("mimic")
+    return Axis(turn @ f64.unit(values, what), stiffness, rest, leaves, limited, mimic)
+
+
+def _pitch(file: SdfFile, name: str, joint) -> float:
+    """Metres per radian, positive for a right-handed thread."""
+    what = f"joint {name!r}"
+    if joint.find("screw_thread_pitch") is not None:
+        return file.number(joint, "screw_thread_pitch", 1.0, what) / (2 * math.pi)
+    if joint.find("thread_pitch") is None:
+        raise file.fault(joint, f"{what} is a screw without a pitch; give <screw_thread_pitch> (m per turn)")
+    turns = file.number(joint, "thread_pitch", 1.0, what)  # radians per metre, positive for a left-handed thread
+    if turns == 0:
+        raise file.fault(joint, f"{what}: <thread_pitch> is 0 rad/m; use a fixed joint, or <screw_thread_pitch>")
+    return -1.0 / turns
+
+
+def spanning_tree(
+    links: Iterable[str], fixed: Iterable[str], joints: list[Joint], first: Iterable[str]
+) -> tuple[list[Edge], list[Joint]]:
+    """The joints of the tree, carriers before what they carry, and those left over, which close loops.
+
+    A joint that closes a loop has no coordinate, so its spring, damping and limits have no place. The tree prefers
+    joints with a spring, then with damping or friction, then with limits; ball joints, and joints that the file says
+    are to be cut, come last; among equals those nearest to the root by breadth first, then the file's order.
+
+    **Arguments:** `links`; `fixed`, links that do not move; `joints` without gearboxes; `first`, links that are to be
+    roots where their part of the mechanism does not hang on the world, in order of preference.
+    """
+    links, fixed, first = list(links), set(fixed), list(first)
+    nodes: list[str | None] = [None, *links]
+    near: dict[str | None, list[str | None]] = {node: [] for node in nodes}
+    for joint in joints:
+        near[joint.parent].append(joint.child)
+        near[joint.child].append(joint.parent)
+    for link in fixed:
+        near[None].append(link)
+    depth: dict[str | None, int] = {}
+    roots: list[str | None] = []
+    for start in (None, *first, *links):
+        if start in depth:
+            continue
+        roots.append(start)
+        depth[start], queue = 0, [start]
+        for node in queue:
+            for other in near[node]:
+                if other not in depth:
+                    depth[other] = depth[node] + 1
+                    queue.append(other)
+
+    def cost(joint: Joint):
+        leaves = [axis.leaves for axis in joint.axes]
+        moving = any("damping" in leaf or "friction" in leaf for leaf in leaves)
+        springs, limits = any(axis.stiffness for axis in joint.axes), any(axis.limited for axis in joint.axes)
+        deep = min(depth[joint.parent], depth[joint.child])
+        return joint.cut, joint.kind == "ball", not springs, not moving, not limits, deep
+
+    # Kruskal's algorithm: the cheapest joints that join two parts, which makes the tree of least cost.
+    part: dict[str | None, str | None] = {node: node for node in nodes} | dict.fromkeys(fixed, None)
+
+    def group(node: str | None) -> str | None:
+        while part[node] != node:
+            node = part[node]
+        return node
+
+    chosen: list[Joint] = []
+    left: set[str] = set()
+    for joint in sorted(joints, key=cost):
+        a, b = group(joint.parent), group(joint.child)
+        if a == b:
+            left.add(joint.name)
+            continue
+        chosen.append(joint)
+        part[b if a is None else a] = a if a is None else b
+    edges: list[Edge] = [Edge(None, None, link, False) for link in links if link in fixed]
+    edges += [Edge(None, None, root, False) for root in roots if root is not None]
+    seen: set[str | None] = {None, *(edge.body for edge in edges)}
+    queue = [None, *(edge.body for edge in edges)]
+    for node in queue:
+        for joint in chosen:
+            for here, there, backwards in ((joint.parent, joint.child, False), (joint.child, joint.parent, True)):
+                if here == node and there is not None and there not in seen:
+                    seen.add(there)
+                    queue.append(there)
+                    edges.append(Edge(joint, node, there, backwards))
+    return edges, [joint for joint in joints if joint.name in left]

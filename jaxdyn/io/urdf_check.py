@@ -1,0 +1,86 @@
+"""What a URDF file must hold to be read: names, references and numbers, each fault with its line."""
+
+import numpy as np
+
+JOINTS = {"floating": "free", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar", "fixed")}}
+# Attributes that must hold so many finite numbers where they are given. The model needs no others.
+NUMBERS = {
+    "origin": {"xyz": 3, "rpy": 3},
+    "axis": {"xyz": 3},
+    "mass": {"value": 1},
+    "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 1),
+    "limit": dict.fromkeys(("lower", "upper", "velocity", "effort"), 1),
+    "dynamics": dict.fromkeys(("damping", "friction", "armature"), 1),
+    "mimic": {"multiplier": 1, "offset": 1},
+}
+REQUIRED = {"mass": ("value",), "inertia": tuple(NUMBERS["inertia"]), "parent": ("link",), "child": ("link",)}
+REQUIRED["mimic"] = ("joint",)
+_PARENTS = ("link", "joint", "inertial")  # what holds each of the parts above at most once
+
+
+def check_elements(root, path) -> tuple[list, dict[str, str]]:
+    """The link and joint elements, once names, references and numbers are found in order; file:line of each."""
+
+    def fault(element, text) -> ValueError:
+        return ValueError(f"{path}:{element.sourceline}: {text}")
+
+    if root.tag != "robot":
+        raise fault(root, f"the root element is <{root.tag}>, expected <robot>; this is not a URDF file")
+    elements = [element for element in root if element.tag in ("link", "joint")]
+    if not elements or not root.get("name"):
+        missing = "name" if elements else "<link>"
+        hint = "; expand this xacro file first: xacro IN > OUT" if "xacro" in root.nsmap else ""
+        raise fault(root, f"the robot has no {missing}{hint}")
+    places: dict[str, str] = {}
+    for element in elements:
+        tag, name = element.tag, element.get("name")
+        if not name:
+            raise fault(element, f"a <{tag}> has no name")
+        if f"{tag} {name}" in places:
+            raise fault(element, f"the {tag} name {name!r} is taken at {places[f'{tag} {name}']}; rename one")
+        places[f"{tag} {name}"] = f"{path}:{element.sourceline}"
+        for part in element.iter(*NUMBERS, *REQUIRED, "inertial"):
+            if part.getparent().tag in ("visual", "collision"):
+                continue
+            _check_once(part, f"{tag} {name!r}", fault)
+            for key in REQUIRED.get(part.tag, ()):
+                if part.get(key) is None:
+                    raise fault(part, f"<{part.tag}> of {tag} {name!r} has no {key}")
+            if part.get("quat_xyzw") is not None:
+                raise fault(part, f"<{part.tag}> of {tag} {name!r} has quat_xyzw, which is not read; write it as rpy")
+            for key, count in NUMBERS.get(part.tag, {}).items():
+                if (text := part.get(key)) is not None and not _are_numbers(text, count):
+                    what = "a finite number" if count == 1 else f"{count} finite numbers"
+                    raise fault(part, f"{key} of <{part.tag}> of {tag} {name!r} is {text!r}, expected {what}")
+            for key in ("velocity", "effort") if part.tag == "limit" else ():
+                if float(part.get(key, 0)) < 0:
+                    raise fault(part, f"{key} of <limit> of {tag} {name!r} is {part.get(key)}; give its magnitude")
+    for element in elements:
+        if element.tag == "link":
+            continue
+        name = element.get("name")
+        if element.get("type") not in JOINTS:
+            kinds = ", ".join(JOINTS)
+            raise fault(
+                element, f"joint {name!r} has type {element.get('type')!r}, which is unknown; types are {kinds}"
+            )
+        for end in ("parent", "child"):
+            if (part := element.find(end)) is None:
+                raise fault(element, f"joint {name!r} has no <{end}>")
+            if f"link {part.get('link')}" not in places:
+                raise fault(part, f"joint {name!r}: the {end} link {part.get('link')!r} is not in the file")
+    return elements, places
+
+
+def _check_once(part, what: str, fault) -> None:
+    first = part.getparent().find(part.tag)
+    if part.getparent().tag in _PARENTS and first is not part:
+        raise fault(part, f"a second <{part.tag}> of {what}, the first is on line {first.sourceline}; keep one")
+
+
+def _are_numbers(text: str, count: int) -> bool:
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        return False
+    return len(values) == count and bool(np.all(np.isfinite(values)))

@@ -1,0 +1,116 @@
+"""Products and choices that stay in numpy while their operands are known, and are one operation of a traced program if not."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+
+
+def is_known(*arrays) -> bool:
+    """Whether the values of all arrays can be read while tracing."""
+    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
+
+
+def known_as_numpy(array):
+    """A leaf of the model: as a numpy array if its values are known, as it is if it is traced."""
+    return np.asarray(array) if array is not None and is_known(array) else array
+
+
+def contract(a, b, axes_a: tuple[int, ...], axes_b: tuple[int, ...]):
+    """Sum of products over some axes of each; the other axes of `a` come first."""
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.tensordot(a, b, (axes_a, axes_b))
+    return lax.dot_general(a, b, ((axes_a, axes_b), ((), ())), precision=lax.Precision.HIGHEST)
+
+
+def dot(a, b):
+    """a b for a tensor, matrix or vector `a` and a matrix or vector `b`: over the last axis of `a`, the first of `b`."""
+    return contract(a, b, (a.ndim - 1,), (0,))
+
+
+def transposed_dot(a, b):
+    """a^T b for a matrix `a` and a matrix or vector `b`."""
+    return contract(a, b, (0,), (0,))
+
+
+def outer(a, b):
+    """a b^T for vectors."""
+    return contract(a, b, (), ())
+
+
+def select(mask: np.ndarray, a, b):
+    """Entries of `a` where the known mask is true, of `b` elsewhere; all of one shape."""
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.where(mask, a, b)
+    return lax.select(mask, a, b)
+
+
+def transpose(a):
+    """a^T for a matrix."""
+    return a.T if isinstance(a, np.ndarray) else lax.transpose(a, (1, 0))
+
+
+def symmetric(a):
+    """The symmetric matrix whose upper triangle is that of `a`; the lower triangle need not be computed."""
+    return select(UPPER[a.shape[0]], a, transpose(a))
+
+
+def join(parts, axis: int):
+    """Concatenation."""
+    if all(isinstance(x, np.ndarray) for x in parts):
+        return np.concatenate(parts, axis)
+    return lax.concatenate(parts, axis)
+
+
+def part(a, start: int, stop: int, axis: int = 0):
+    """Entries start to stop along an axis."""
+    if isinstance(a, np.ndarray):
+        return a[(slice(None),) * axis + (slice(start, stop),)]
+    return lax.slice_in_dim(a, start, stop, axis=axis)
+
+
+def entry(a, i: int, axis: int = 0):
+    """Entry i along an axis, which is left out."""
+    if isinstance(a, np.ndarray):
+        return np.take(a, i, axis)
+    return lax.squeeze(lax.slice_in_dim(a, i, i + 1, axis=axis), (axis,))
+
+
+UPPER = {n: np.triu(np.ones((n, n), bool)) for n in range(1, 7)}
+
+
+def _hat_tensor() -> np.ndarray:
+    hat = np.zeros((3, 3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        hat[k, j, i], hat[j, k, i] = 1.0, -1.0
+    return hat
+
+
+class Constants(NamedTuple):
+    """Constant tensors of mechanics, in one data type."""
+
+    hat: np.ndarray  # (3, 3, 3): hat(w) = hat . w, hat(w) x = w x x
+    shift: np.ndarray  # (6, 6, 3): twist at a point r from that at the origin: (1 + shift . r) V
+    moment: (
+        np.ndarray
+    )  # (6, 3, 4): wrench (f, n) from the flux Y = [K a] J of a body, n = vee(Y - Y^T), f = its last column
+    eye3: np.ndarray
+    eye6: np.ndarray
+
+
+_cache: dict = {}
+
+
+def constants(dtype) -> Constants:
+    """The constant tensors in a data type."""
+    dtype = np.dtype(dtype)
+    if dtype not in _cache:
+        hat = _hat_tensor()
+        shift, moment = np.zeros((6, 6, 3)), np.zeros((6, 3, 4))
+        shift[:3, 3:] = -hat
+        moment[:3, :, 3] = np.eye(3)
+        moment[3:, :, :3] = hat.transpose(2, 0, 1)
+        _cache[dtype] = Constants(*(x.astype(dtype) for x in (hat, shift, moment, np.eye(3), np.eye(6))))
+    return _cache[dtype]

@@ -1,0 +1,284 @@
+"""Constrained dynamics in kernels: against the rank-aware solve, plain mode and the equations themselves; singular samples."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close, quick, random_states, random_tree
+
+import jaxdyn as jd
+from jaxdyn import scenes, se3
+from jaxdyn.assembly import residuals
+from jaxdyn.constrained import constrained_dynamics, solve_rows
+from jaxdyn.constrained_motion import consistent
+from jaxdyn.constraints import loop
+from jaxdyn.constraints.base import rows
+from jaxdyn.dynamics import bias_force, mass_matrix
+from jaxdyn.model import integrate
+from jaxdyn.projection import project_state
+from jaxdyn.scene import Scene
+
+POSE = ((0.1, -0.2, 0.3), (0.5, 0.2, -0.4))
+OTHER = ((-0.3, 0.1, 0.2), (-0.2, 0.7, 0.3))
+# A floating base carries three branches: the loops have bodies in common, one reaches the world, one its own ancestor.
+KINDS = ("free", "revolute", "spherical", "helical", "planar", "revolute", "prismatic", "free")
+PARENTS = (-1, 0, 1, 0, 0, 4, 3, 0)
+JOINTS = {
+    "few": (("b2", "b5", "revolute"), (None, "b6", "point")),
+    "turning": (("b5", "b7", "prismatic"), ("b1", "b7", "universal"), ("b0", "b2", "planar")),
+    "in plane": (("b3", "b7", "weld"),),
+}
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("turning", "in plane")]
+
+
+def mechanism(name):
+    """A scene with loops that are open where the states are: the equations hold there as well."""
+    model = random_tree(5, KINDS, parents=PARENTS)
+    loops = [loop(a, POSE, b, OTHER, joint, in_plane=name == "in plane") for a, b, joint in JOINTS[name]]
+    return Scene(model, loops)
+
+
+def dense(scene, q, v, tau, t=0.0):
+    """The rank-aware solve."""
+    return solve_rows(scene, q, v, tau, t, rows(scene, q, v, t))
+
+
+def has_kernel(function, *args):
+    return "jaxdyn_kernel" in jax.jit(function).lower(*args).as_text()
+
+
+@pytest.fixture(scope="module", params=["few", *SLOW])
+def solved(request):
+    """Solutions at three states, and what they have to satisfy."""
+    scene = mechanism(request.param)
+    q, v, tau = random_states(scene.system, 3, 1)[:3]
+
+    def found(q, v, tau):
+        return constrained_dynamics(scene, q, v, tau), constrained_dynamics(scene, q, v, tau, method="range_space")
+
+    def wanted(q, v, tau):
+        row = rows(scene, q, v)
+        return dense(scene, q, v, tau), mass_matrix(scene.system, q), bias_force(scene.system, q, v), row.A, row.gamma
+
+    assert has_kernel(jax.vmap(found), q, v, tau)
+    numbers = quick(jax.vmap(found))(q, v, tau)
+    with jd.compilation("plain"):
+        assert not has_kernel(jax.vmap(found), q, v, tau)
+        return scene, tau, numbers, quick(jax.vmap(wanted))(q, v, tau)
+
+
+def test_accelerations_and_multipliers_are_those_of_the_dense_solve(solved):
+    _, _, numbers, (want, *_) = solved
+    for found in numbers:
+        # The rows' matrix squares the condition number of the rows, 1e3 at worst here.
+        assert_close(found.acceleration, want.acceleration, 1e-9)
+        assert_close(found.multipliers, want.multipliers, 1e-9)
+        assert found.rank.tolist() == want.rank.tolist() == [want.multipliers.shape[1]] * 3
+
+
+def test_equations_of_motion_and_rows_hold(solved):
+    _, tau, (found, _), (_, *equations) = solved
+    M, h, A, gamma = (np.asarray(x) for x in equations)
+    a, lam = np.asarray(found.acceleration), np.asarray(found.multipliers)
+    pushed = np.einsum("nij,ni->nj", A, lam)
+    assert_close(np.einsum("nij,nj->ni", M, a) + h, np.asarray(tau) + pushed, 1e-9)
+    assert_close(np.einsum("nij,nj->ni", A, a), gamma, 1e-9)
+
+
+@pytest.mark.parametrize("method", ["rank_aware", pytest.param("range_space", marks=pytest.mark.slow)])
+def test_derivatives_are_those_of_the_dense_solve(method):
+    """In masses, poses of a loop, states and forces; the dense solve in plain mode."""
+    model = random_tree(5, ("revolute", "spherical", "helical"), parents=(-1, 0, 0))
+    scene = Scene(model, (loop("b1", POSE, "b2", OTHER, "universal"),))
+    q0, v, tau = (x[0] for x in random_states(scene.system, 3, 0)[:3])
+    rng = np.random.default_rng(3)
+    weights = jnp.asarray(rng.normal(size=scene.nv)), jnp.asarray(rng.normal(size=4))
+
+    def value(inertias, twist, dq, v, tau, solve):
+        # Poses and quaternions move on their manifolds: off them the two are different functions.
+        first, *others = scene.constraints
+        pose, q = first.pose_a @ se3.exp(twist), integrate(scene.system, q0, dq)
+        first = type(first)(first.name, first.joint, first.body_a, first.body_b, first.in_plane, pose, first.pose_b)
+        found = solve(Scene(scene.system.replace(inertias=inertias), (first, *others)), q, v, tau)
+        return jnp.vdot(weights[0], found.acceleration) + jnp.vdot(weights[1], found.multipliers)
+
+    at = scene.system.inertias, jnp.zeros(6), jnp.zeros(scene.nv), v, tau
+    steps = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in at)
+
+    def derivatives(solve):
+        return quick(
+            lambda *at: (
+                jax.grad(value, (0, 1, 2, 3, 4))(*at, solve),
+                jax.jvp(lambda *x: value(*x, solve), at, steps),
+            )
+        )(*at)
+
+    found = jax.tree.leaves(derivatives(lambda *x: constrained_dynamics(*x, method=method)))
+    with jd.compilation("plain"):
+        want = jax.tree.leaves(derivatives(dense))
+    for x, y in zip(found, want, strict=True):
+        assert_close(x, y, 1e-8)  # derivatives of the dense solve lose the square of the rows' condition number
+
+
+# --- singular samples ---
+
+# Uprights and couplers in one line: the rows of the windows lose rank.
+FLAT = jnp.asarray([-np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, -np.pi / 2])
+
+
+def two_windows():
+    scene = scenes.windows(count=2)
+    q0, v0 = scenes.windows.start(count=2)
+    return scene, jnp.stack([q0, q0.at[0].add(0.1), q0 - 0.3, q0 + 0.2]), jnp.asarray(v0)
+
+
+def test_a_singular_sample_is_solved_with_its_rank():
+    scene, q, v0 = two_windows()
+
+    def run(q):
+        found = constrained_dynamics(scene, q, v0, jnp.zeros(5))
+        return found.acceleration, found.multipliers, found.rank
+
+    def wanted(q):
+        found = dense(scene, q, v0, jnp.zeros(5))
+        return found.acceleration, found.multipliers, found.rank
+
+    program = jax.jit(jax.vmap(run))
+    schur = jax.jit(jax.vmap(lambda q: constrained_dynamics(scene, q, v0, jnp.zeros(5), method="schur").acceleration))
+    assert "lapack" not in schur.lower(q).as_text()  # no factorisation is called
+    with_singular = q.at[1].set(FLAT)
+    with jd.compilation("plain"):
+        reference = jax.jit(jax.vmap(wanted))
+        for states in (q, with_singular):
+            for x, y in zip(program(states), reference(states), strict=True):
+                assert_close(x, y, 1e-10)
+    assert program(q)[2].tolist() == [4, 4, 4, 4]
+    assert program(with_singular)[2].tolist()[1] < 4
+    for k in range(4):  # and alone
+        for x, y in zip(jax.jit(run)(with_singular[k]), wanted(with_singular[k]), strict=True):
+            assert_close(x, y, 1e-10)
+
+
+def test_a_sample_is_not_changed_by_a_singular_one_beside_it():
+    scene, q, v0 = two_windows()
+
+    @jax.jit
+    @jax.vmap
+    def run(q):
+        found = constrained_dynamics(scene, q, v0, jnp.zeros(5))
+        return found.acceleration, found.multipliers, project_state(scene, q, v0, jnp.asarray(0.0))
+
+    others = np.array([0, 2, 3])
+    for x, y in zip(jax.tree.leaves(run(q)), jax.tree.leaves(run(q.at[1].set(FLAT))), strict=True):
+        assert np.array_equal(x[others], y[others])
+
+
+def test_gradients_beside_a_singular_sample():
+    scene, q, v0 = two_windows()
+    q, turn, others = q.at[1].set(FLAT), jnp.cos(jnp.arange(5.0)), np.array([0, 2, 3])
+
+    def pulled(solve):
+        one = jax.grad(lambda q, tau: jnp.sum(turn * solve(scene, q, v0, tau).acceleration), (0, 1))
+        return jax.jit(lambda: jax.vmap(one, (0, None))(q, jnp.zeros(5)))()
+
+    found = pulled(constrained_dynamics)
+    with jd.compilation("plain"):
+        want = pulled(dense)
+    for x, y in zip(found, want, strict=True):
+        assert_close(x[others], y[others], 1e-9)  # through normal equations the condition number is lost twice
+        assert np.isfinite(np.asarray(x)).all()
+
+
+@pytest.mark.parametrize("name", ["few", "windows", pytest.param("turning", marks=pytest.mark.slow)])
+def test_residuals_of_open_loops(name):
+    """Under nested `vmap`s, their derivatives, and the check of a motion's states, in both modes."""
+    scene = scenes.windows() if name == "windows" else mechanism(name)
+    states = [random_states(scene.system, 2, k) for k in range(3)]
+    q, v = (jnp.stack([jnp.asarray(state[i]) for state in states]) for i in range(2))
+
+    def found():
+        def one(q, v):
+            return residuals(scene, q, v), jax.jacfwd(lambda v: residuals(scene, q, v))(v), consistent(scene, q, v, 0.0)
+
+        return jax.jit(jax.vmap(jax.vmap(one)))(q, v)
+
+    by_kernels = found()
+    with jd.compilation("plain"):
+        plain = found()
+    for x, y in zip(by_kernels, plain, strict=True):
+        assert_close(x, y, 1e-12)
+    assert not np.any(plain[2])
+
+
+# --- systems of equations, and forces ---
+
+NAMES = ("andrews", "car_axis", "rolling_disk", "chaplygin_sleigh", "rolling_coin", "pendulum_in_plane", "suslov")
+
+
+def at_start(name):
+    made = getattr(scenes, name)
+    q, v = (jnp.asarray(x, float) for x in made.start())
+    return made(), q, v
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_systems_of_equations(name):
+    """Accelerations, multipliers and derivatives, also off the constraints."""
+    scene, q, v = at_start(name)
+    tau, t = 0.3 * jnp.cos(jnp.arange(float(scene.nv))), jnp.asarray(0.2)
+    q = jd.systems.retract(scene.system, q + 1e-3 * jnp.sin(jnp.arange(float(scene.nq)) + 1))
+    along = jnp.sin(jnp.arange(float(scene.nv)) + 0.5)
+
+    def dynamics(tau):
+        return constrained_dynamics(scene, q, v, tau, t)
+
+    def everything(tau):
+        slope = jax.jvp(lambda tau: dynamics(tau).acceleration, (tau,), (along,))[1]
+        return dynamics(tau), slope, jax.jacrev(lambda tau: dynamics(tau).acceleration)(tau) @ along
+
+    assert has_kernel(dynamics, tau)
+    found, *slopes = jax.jit(everything)(tau)
+    with jd.compilation("plain"):
+        three = jnp.stack([tau, tau + along, tau - along])
+        wanted = quick(jax.vmap(lambda tau: dense(scene, q, v, tau, t)))(three)
+    for x, y in ((found.acceleration, wanted.acceleration[0]), (found.multipliers, wanted.multipliers[0])):
+        np.testing.assert_allclose(x, y, atol=1e-10 * (1 + float(jnp.abs(y).max())), rtol=0)
+    change = (wanted.acceleration[1] - wanted.acceleration[2]) / 2  # linear in tau
+    for x in slopes:
+        np.testing.assert_allclose(x, change, atol=1e-10 * (1 + float(jnp.abs(x).max())), rtol=0)
+
+
+def test_dependent_rows_are_left_to_the_careful_way():
+    """A row that is given twice: the kernel's pivots say so, and the multipliers are those of least norm."""
+    scene, q, v = at_start("rolling_disk")
+    twice = jd.Scene(scene.system, (*scene.constraints, *scene.constraints[:1]))
+    found = jax.jit(lambda q, v: constrained_dynamics(twice, q, v))(q, v)
+    once = jax.jit(lambda q, v: constrained_dynamics(scene, q, v))(q, v)
+    wanted = dense(twice, q, v, 0 * v)
+    assert int(found.rank) == 2
+    np.testing.assert_allclose(found.acceleration, wanted.acceleration, atol=1e-10)
+    np.testing.assert_allclose(found.multipliers, wanted.multipliers, atol=1e-10)
+    np.testing.assert_allclose(found.acceleration, once.acceleration, atol=1e-10)
+
+
+heard: list = []
+
+
+def spoken(system, q, v, t):
+    jax.debug.callback(lambda v: heard.append(float(v[0])), v)
+    jax.debug.callback(lambda: heard.append("again"))
+    return 0.1 * v
+
+
+def test_forces_with_effects_have_them_in_every_call():
+    """A force that prints is no part of a kernel, and is not heard while it is traced."""
+    heard.clear()
+    scene, q, v = at_start("rolling_disk")
+    loud = jd.Scene(scene.system, scene.constraints, (spoken,))
+    run = jax.jit(lambda q, v: constrained_dynamics(loud, q, v))
+    assert not heard and "jaxdyn_kernel" in run.lower(q, v).as_text()  # the rest runs in one
+    for speed in (1.0, 2.0):
+        found = run(q, v.at[0].set(speed))
+    jax.effects_barrier()
+    assert sorted(map(str, heard)) == ["1.0", "2.0", "again", "again"]
+    assert bool(jnp.isfinite(found.acceleration).all())

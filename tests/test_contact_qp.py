@@ -1,0 +1,285 @@
+"""Quadratic programs against quadprog, Clarabel, linear programs and their own optimality conditions; their derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import quick
+from scipy.optimize import linprog
+
+from jaxdyn.contact import RESULTS, solve_qp
+
+N, ROWS, CONES = 6, 9, 2
+MU = 0.6
+
+
+def problems(count, seed, *, cones=True, feasible=True):
+    """Q, q, G, h, A, b, S, c in batches: dependent equality rows, rows of very different lengths, active constraints."""
+    random = np.random.default_rng(seed)
+    root = random.normal(size=(count, N, N))
+    Q = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(N)
+    q = 3 * random.normal(size=(count, N))
+    inside = random.normal(size=(count, N))
+    lengths = 10 ** random.uniform(-1, 1, size=(count, ROWS, 1))
+    G = random.normal(size=(count, ROWS, N)) * lengths
+    h = np.einsum("bmn,bn->bm", G, inside)
+    slack = 0.3 * random.exponential(size=h.shape) * lengths[..., 0]
+    h = h + slack if feasible else random.normal(size=h.shape) * lengths[..., 0]
+    A = random.normal(size=(count, 2, N))
+    A = np.concatenate([A, A.sum(1, keepdims=True)], 1)
+    b = np.einsum("bpn,bn->bp", A, inside)
+    S = random.normal(size=(count, CONES, 3, N)) * (1.0 if cones else 0.0)
+    y = random.normal(size=(count, CONES, 3))
+    y[..., 0] = np.linalg.norm(y[..., 1:], axis=-1) + 0.3 * random.exponential(size=y.shape[:2])
+    return tuple(map(jnp.asarray, (Q, q, G, h, A, b, S, np.einsum("bkdn,bn->bkd", S, inside) + y)))
+
+
+def one(Q, q, G, h, A, b, S, c):
+    return solve_qp(Q, q, G, h, A, b, cones=[(S, c)])
+
+
+many = quick(jax.vmap(one))
+
+
+def largest_residual(data, found):
+    """Largest violation of the conditions of optimality, of numbers of order one to ten."""
+    Q, q, G, h, A, b, S, c = (np.asarray(x) for x in data)
+    x, z, y, w = (
+        np.asarray(v) for v in (found.x, found.multipliers, found.equality_multipliers, found.cone_multipliers[0])
+    )
+    scale = 1 + abs(q).max(1)
+    slack, cone = h - np.einsum("bmn,bn->bm", G, x), c - np.einsum("bkdn,bn->bkd", S, x)
+    depth = lambda v: v[..., 0] - np.linalg.norm(v[..., 1:], axis=-1)  # noqa: E731
+    gradient = np.einsum("bij,bj->bi", Q, x) + q + np.einsum("bmn,bm->bn", G, z) + np.einsum("bpn,bp->bn", A, y)
+    gradient += np.einsum("bkdn,bkd->bn", S, w)
+    wrong = [abs(gradient), abs(np.einsum("bpn,bn->bp", A, x) - b), -slack, -z, -depth(cone), -depth(w)]
+    wrong += [
+        abs(slack * z),
+        abs((cone * w).sum(-1)),
+        abs(slack - found.slack),
+        abs(cone - found.cone_slack[0]).max(-1),
+    ]
+    return max((part.max(1) / scale).max() for part in wrong)
+
+
+def test_conditions_of_optimality_hold():
+    data = problems(200, 1)
+    found = many(*data)
+    assert (found.result == RESULTS.successful).all()
+    # The last Newton steps leave rounding, times lengths of rows of ten and multipliers of a hundred.
+    assert largest_residual(data, found) < 1e-10
+    # All kinds of ends occur: cones left alone, on their boundary, at their apex; rows active or not.
+    size, slack = (np.asarray(x)[..., 0] for x in (found.cone_multipliers[0], found.cone_slack[0]))
+    for case in (size < 1e-9, (size > 1e-3) & (slack > 1e-3)):
+        assert case.sum() > 20
+    assert (np.asarray(found.multipliers) > 1e-3).sum() > 100
+
+
+def test_agrees_with_clarabel():
+    clarabel, sparse = pytest.importorskip("clarabel"), pytest.importorskip("scipy.sparse")
+    data = problems(200, 1)
+    found = np.asarray(many(*data).x)
+    settings = clarabel.DefaultSettings()
+    settings.verbose, settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = False, 1e-12, 1e-12, 1e-12
+    kinds = [clarabel.ZeroConeT(2), clarabel.NonnegativeConeT(ROWS), *[clarabel.SecondOrderConeT(3)] * CONES]
+    for i in range(100):
+        Q, q, G, h, A, b, S, c = (np.asarray(x[i]) for x in data)
+        rows = sparse.csc_matrix(np.concatenate([A[:2], G, S.reshape(-1, N)]))
+        level = np.concatenate([b[:2], h, c.ravel()])
+        other = clarabel.DefaultSolver(sparse.csc_matrix(np.triu(Q)), q, rows, level, kinds, settings).solve()
+        # Clarabel's own conditions of optimality are met to about 1e-8, and x is as sensitive as Q is ill-conditioned.
+        np.testing.assert_allclose(found[i], other.x, atol=2e-5)
+        assert abs(found[i] @ Q @ found[i] / 2 + q @ found[i] - other.obj_val) < 1e-7 * (1 + abs(other.obj_val))
+
+
+def test_agrees_with_quadprog():
+    quadprog = pytest.importorskip("quadprog")
+    data = problems(200, 2, cones=False)
+    found = many(*data)
+    assert (found.result == RESULTS.successful).all()
+    for i in range(200):
+        Q, q, G, h, A, b, _, _ = (np.array(x[i]) for x in data)
+        rows = np.concatenate([A[:2], -G]).T.copy()
+        other = quadprog.solve_qp(Q, -q, rows, np.concatenate([b[:2], -h]), 2)
+        np.testing.assert_allclose(found.x[i], other[0], rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(found.multipliers[i], other[4][2:], rtol=1e-7, atol=1e-8)
+
+
+def test_infeasible_lanes_are_told_and_leave_the_others_alone():
+    data = problems(200, 3, cones=False, feasible=False)
+    found = many(*data)
+    is_feasible = []
+    for i in range(200):
+        _, _, G, h, A, b, _, _ = (np.asarray(x[i]) for x in data)
+        is_feasible.append(linprog(np.zeros(N), G, h, A[:2], b[:2], bounds=(None, None)).status == 0)
+    is_feasible = np.array(is_feasible)
+    assert 10 < is_feasible.sum() < 190
+    np.testing.assert_array_equal(found.result == RESULTS.successful, is_feasible)
+    np.testing.assert_array_equal(found.result == RESULTS.infeasible, ~is_feasible)
+    assert np.isfinite(found.x).all()
+    # Contradicting equality rows, and a matrix that is not positive definite, in single lanes of a batch.
+    Q, q, G, h, A, b, S, c = problems(3, 4)
+    found = many(Q.at[1].multiply(-1), q, G, h, A, b.at[2, 2].add(1.0), S, c)
+    assert [str(found.result == code) for code in (RESULTS.successful, RESULTS.indefinite, RESULTS.infeasible)] == [
+        str(np.arange(3) == i) for i in range(3)
+    ]
+
+
+def test_derivatives_are_those_of_differences():
+    data = problems(200, 1)
+    random = np.random.default_rng(5)
+    change = [jnp.asarray(0.3 * random.normal(size=x.shape)) for x in data]
+    # Equality rows stay consistent, or there is no solution to differentiate.
+    change[4] = change[4].at[:, 2].set(change[4][:, 0] + change[4][:, 1])
+    change[5] = change[5].at[:, 2].set(change[5][:, 0] + change[5][:, 1])
+    change, weights = tuple(change), jnp.asarray(random.normal(size=(200, N)))
+
+    @quick
+    @jax.vmap
+    def slopes(data, change, weights):
+        value = lambda *data: weights @ one(*data).x  # noqa: E731
+        return jax.jvp(value, data, change)[1], jax.grad(lambda data: value(*data))(data)
+
+    forward, gradients = slopes(data, change, weights)
+    reverse = sum(np.sum((g * d).reshape(200, -1), 1) for g, d in zip(gradients, change, strict=True))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9)
+
+    def at(step):
+        found = many(*(x + step * d for x, d in zip(data, change, strict=True)))
+        return np.sum(weights * found.x, 1)
+
+    def difference(step):
+        return (8 * (at(step) - at(-step)) - at(2 * step) + at(-2 * step)) / (12 * step)
+
+    coarse, fine = difference(2e-5), difference(1e-5)
+    # Where a constraint comes or goes within the steps, differences with two steps differ.
+    smooth = abs(coarse - fine) < 1e-7 * (1 + abs(fine))
+    assert smooth.sum() > 150
+    np.testing.assert_allclose(forward[smooth], fine[smooth], rtol=1e-6, atol=1e-6)
+
+
+def test_the_second_derivative_is_that_of_differences():
+    S, c = jnp.eye(3)[None] * jnp.array([-1.0, -1.0, -1.0])[None, None], jnp.zeros((1, 3))
+
+    def norm(q):
+        return jnp.sum(solve_qp(jnp.diag(jnp.array([1.0, 2.0, 3.0])), q, cones=[(S, c)]).x ** 2)
+
+    hessian = quick(jax.hessian(norm))
+    gradient = quick(jax.grad(norm))
+    for q in ([0.1, 1.0, -2.0], [-3.0, 0.1, 0.2], [3.0, 0.1, 0.2]):  # on the boundary, inside, at the apex
+        q, step = jnp.array(q), 1e-5
+        differences = np.stack([(gradient(q + step * e) - gradient(q - step * e)) / (2 * step) for e in np.eye(3)])
+        np.testing.assert_allclose(hessian(q), differences, atol=1e-6)
+
+
+def test_projections_in_closed_form():
+    # On a box, on the half-space of a sum, and without any constraint.
+    target = jnp.array([2.0, -0.5, 0.3])
+    unit = jnp.eye(3)
+    bounded = quick(solve_qp)
+    box = bounded(unit, -target, jnp.concatenate([unit, -unit]), jnp.ones(6))
+    np.testing.assert_allclose(box.x, [1, -0.5, 0.3], atol=1e-14)
+    np.testing.assert_allclose(box.multipliers, [1, 0, 0, 0, 0, 0], atol=1e-14)
+    # Rows twice leave the multipliers open but not x; infinite bounds are none.
+    twice = bounded(unit, -target, jnp.stack([unit[0]] * 6), jnp.array([1.0, 1.0, 1.0, jnp.inf, 5.0, jnp.inf]))
+    np.testing.assert_allclose(twice.x, [1, -0.5, 0.3], atol=1e-12)
+    np.testing.assert_allclose(twice.multipliers.sum(), 1, atol=1e-12)
+    free = quick(lambda A, b: solve_qp(unit, -target, A=A, b=b))(jnp.ones((2, 3)), jnp.ones(2))
+    np.testing.assert_allclose(free.x, target - (target.sum() - 1) / 3, atol=1e-14)
+    np.testing.assert_allclose(free.equality_multipliers, [0.8 / 6] * 2, atol=1e-14)
+
+
+def test_float32():
+    target = jnp.array([2.0, -0.5, 0.3], jnp.float32)
+    unit = jnp.eye(3, dtype=jnp.float32)
+    found = quick(solve_qp)(unit, -target, jnp.concatenate([unit, -unit]), jnp.ones(6, jnp.float32))
+    assert found.x.dtype == jnp.float32 and bool(found.result == RESULTS.successful)
+    np.testing.assert_allclose(found.x, [1, -0.5, 0.3], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_too_few_steps_are_told():
+    Q, q, G, h, *_ = (x[0] for x in problems(1, 9))
+    assert solve_qp(Q, q, G, h, max_steps=1).result == RESULTS.stalled
+
+
+def quadruped(count, seed):
+    """Twelve forces of four feet that track a wrench: Q, q, pyramids G, h, and cones S, c."""
+    random = np.random.default_rng(seed)
+    feet = np.array([[0.2, 0.13, -0.3], [0.2, -0.13, -0.3], [-0.2, 0.13, -0.3], [-0.2, -0.13, -0.3]])
+    G, S = np.zeros((count, 20, 12)), np.zeros((count, 4, 3, 12))
+    Q, q = np.zeros((count, 12, 12)), np.zeros((count, 12))
+    weight = np.diag([1, 1, 1, 10, 10, 10.0])
+    for i in range(count):
+        A = np.zeros((6, 12))
+        for k in range(4):
+            p = feet[k] + 0.03 * random.normal(size=3)
+            n = np.array([0, 0, 1]) + 0.2 * random.normal(size=3)
+            x = np.cross([0, 1.0, 0], n)
+            x, n = x / np.linalg.norm(x), n / np.linalg.norm(n)
+            R = np.stack([x, np.cross(n, x), n], 1)
+            A[:3, 3 * k : 3 * k + 3], A[3:, 3 * k : 3 * k + 3] = R, np.cross(p, R.T).T
+            for j, (a, s) in enumerate([(0, 1), (0, -1), (1, 1), (1, -1)]):
+                G[i, 5 * k + j, 3 * k + a], G[i, 5 * k + j, 3 * k + 2] = s, -MU
+            G[i, 5 * k + 4, 3 * k + 2] = -1
+            S[i, k, 0, 3 * k + 2], S[i, k, 1, 3 * k], S[i, k, 2, 3 * k + 1] = -MU, -1, -1
+        w = [*60 * random.normal(size=2), 120 + 20 * random.normal(), *15 * random.normal(size=3)]
+        Q[i], q[i] = A.T @ weight @ A + 1e-2 * np.eye(12), -A.T @ weight @ w
+    return tuple(map(jnp.asarray, (Q, q, G, np.zeros((count, 20)), S, np.zeros((count, 4, 3)))))
+
+
+@pytest.mark.slow
+def test_no_lane_of_ten_thousand_stalls():
+    quadprog = pytest.importorskip("quadprog")
+    Q, q, G, h, S, c = quadruped(10_000, 6)
+    flat = jax.jit(jax.vmap(lambda *data: solve_qp(*data, tol=1e-9)))(Q, q, G, h)
+    round_ = jax.jit(jax.vmap(lambda Q, q, S, c: solve_qp(Q, q, cones=[(S, c)], tol=1e-9)))(Q, q, S, c)
+    for found in (flat, round_):
+        assert (found.result == RESULTS.successful).all()
+    for i in range(200):
+        other = quadprog.solve_qp(np.array(Q[i]), -np.array(q[i]), -np.array(G[i]).T.copy(), -np.array(h[i]), 0)[0]
+        np.testing.assert_allclose(flat.x[i], other, atol=1e-8)
+    gradient = jnp.einsum("bij,bj->bi", Q, round_.x) + q + jnp.einsum("bkdn,bkd->bn", S, round_.cone_multipliers[0])
+    assert float(jnp.abs(gradient).max() / jnp.abs(q).max()) < 1e-10
+
+
+@pytest.mark.slow
+def test_derivatives_of_contact_forces_on_and_off_the_boundary():
+    count = 256
+    Q, q, _, _, S, c = quadruped(count, 7)
+    random = np.random.default_rng(8)
+    change = tuple(jnp.asarray(s * random.normal(size=x.shape)) for x, s in ((Q, 0.01), (q, 1.0), (S, 0.03), (c, 1.0)))
+    solve = lambda Q, q, S, c: solve_qp(Q, q, cones=[(S, c)]).x  # noqa: E731
+    forward = jax.jit(jax.vmap(lambda x, d: jax.jvp(solve, x, d)[1]))((Q, q, S, c), change)
+    many = jax.jit(jax.vmap(solve))
+    at = lambda s: many(*(x + s * d for x, d in zip((Q, q, S, c), change, strict=True)))  # noqa: E731
+    differences = [(8 * (at(s) - at(-s)) - at(2 * s) + at(-2 * s)) / (12 * s) for s in (1e-5, 2e-5)]
+    error = jnp.abs(forward - differences[0]).max(1) / (1 + jnp.abs(differences[0]).max(1))
+    smooth = jnp.abs(differences[1] - differences[0]).max(1) < 1e-5 * (1 + jnp.abs(differences[0]).max(1))
+    assert smooth.sum() > 0.9 * count
+    assert error[smooth].max() < 1e-6
+
+
+BAD = [
+    (dict(Q=jnp.diag(jnp.array([1.0, -1.0]))), "Q is not positive definite"),
+    (dict(Q=jnp.zeros((2, 2))), "Q is not positive definite"),
+    (dict(Q=jnp.ones((2, 3))), "Q has shape"),
+    (dict(q=jnp.ones(3)), "q has shape"),
+    (dict(q=jnp.array([1.0, jnp.nan])), "not a number"),
+    (dict(h=None), "h is None"),
+    (dict(h=jnp.ones(2)), "h has shape"),
+    (dict(G=jnp.ones((1, 3))), "G has shape"),
+    (dict(A=jnp.ones((1, 2))), "b is None"),
+    (dict(cones=[jnp.ones((1, 3, 2))]), r"cones\[0\]"),
+    (dict(cones=[(jnp.ones((1, 3, 2)), jnp.ones((1, 2)))]), r"cones\[0\]: c has shape"),
+    (dict(cones=[(jnp.ones((1, 0, 2)), jnp.ones((1, 0)))]), "at least one row"),
+    (dict(tol=0.0), "tol is 0.0"),
+    (dict(max_steps=0), "max_steps is 0"),
+]
+
+
+@pytest.mark.parametrize("change, match", BAD)
+def test_bad_input_is_refused(change, match):
+    good = dict(Q=jnp.eye(2), q=jnp.ones(2), G=jnp.ones((1, 2)), h=jnp.ones(1))
+    with pytest.raises(ValueError, match=match):
+        solve_qp(**{**good, **change})

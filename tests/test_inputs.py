@@ -1,0 +1,312 @@
+"""What public functions do with numbers, systems and scenes that users pass: lists, integers, complex numbers, batches."""
+
+# pyright: reportArgumentType=false
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+from jaxdyn.cli.common import output_path
+from jaxdyn.constrained import constraint_forces
+from jaxdyn.solution import from_diffrax
+
+ARM = jd.robots.chain(2)
+BODY = ARM.body_names[-1]
+CHAIN = jd.Scene(ARM, (jd.gear(ARM.joint_names[1], ARM.joint_names[0], 2.0),))
+PLANE = jd.MetricSystem(lambda q: jnp.diag(1.0 + q * q), 2)
+Q, V, A = [1, 2], [3, -1], [2, 5]
+NU, WRENCH = [3], [[1, 2, 3, 4, 5, 6], [6, 5, 4, 3, 2, 1]]
+
+OF_BODIES = {
+    "aba": (jd.aba, Q, V, A),
+    "body_jacobian": (lambda m, q: jd.body_jacobian(m, q, BODY), Q),
+    "center_of_mass": (jd.center_of_mass, Q),
+    "centroidal_momentum": (jd.centroidal_momentum, Q, V),
+    "centroidal_momentum_matrix": (jd.centroidal_momentum_matrix, Q),
+    "configuration_rate": (jd.configuration_rate, Q, V),
+    "crba": (jd.crba, Q),
+    "difference": (jd.difference, Q, A),
+    "forward_kinematics": (jd.forward_kinematics, Q),
+    "frame_pose": (lambda m, q: jd.frame_pose(m, q, BODY), Q),
+    "generalized_force": (jd.generalized_force, Q, WRENCH),
+    "integrate": (jd.integrate, Q, V),
+    "jacobian_dot_v": (lambda m, q, v: jd.jacobian_dot_v(m, q, v, BODY), Q, V),
+    "mass_matrix_derivative": (jd.mass_matrix_derivative, Q),
+    "mass_matrix_sqrt": (jd.mass_matrix_sqrt, Q),
+    "newton_euler_matrices": (lambda m, q, v: jd.newton_euler_matrices(m, q, v).V, Q, V),
+    "normalize": (jd.normalize, Q),
+    "regressor": (lambda m, q, v, a: jd.identify.regressor(m, [q], [v], [a]), Q, V, A),
+    "rnea": (jd.rnea, Q, V, A),
+    "spatial_jacobian": (lambda m, q: jd.spatial_jacobian(m, q, BODY), Q),
+    "torque_regressor": (jd.torque_regressor, Q, V, A),
+}
+OF_SYSTEMS = {
+    "bias_force": (jd.bias_force, Q, V),
+    "christoffel_symbols": (jd.christoffel_symbols, Q),
+    "coriolis_matrix": (jd.coriolis_matrix, Q, V),
+    "forward_dynamics": (jd.forward_dynamics, Q, V, A),
+    "geometry.christoffel_symbols": (jd.geometry.christoffel_symbols, Q),
+    "geometry.connection": (jd.geometry.connection, Q, V, A),
+    "geometry.covariant_rate": (jd.geometry.covariant_rate, Q, V, A, A),
+    "geometry.flat": (jd.geometry.flat, Q, V),
+    "geometry.geodesic_acceleration": (jd.geometry.geodesic_acceleration, Q, V),
+    "geometry.sectional_curvature": (jd.geometry.sectional_curvature, Q, V, A),
+    "geometry.sharp": (jd.geometry.sharp, Q, V),
+    "gravity_force": (jd.gravity_force, Q),
+    "inverse_dynamics": (jd.inverse_dynamics, Q, V, A),
+    "kinetic_energy": (jd.kinetic_energy, Q, V),
+    "mass_matrix": (jd.mass_matrix, Q),
+    "potential_energy": (jd.potential_energy, Q),
+}
+OF_SCENES = {
+    "assemble": (lambda s, q, v: jd.assemble(s, q, v).q, Q, V),
+    "constrained_dynamics": (lambda s, q, v, tau: jd.constrained_dynamics(s, q, v, tau).acceleration, Q, V, A),
+    "constraint_forces": (lambda s, q, lam: list(constraint_forces(s, q, lam).values()), Q, NU),
+    "constraint_jacobian": (jd.constraint_jacobian, Q),
+    "gauge_invariant": (lambda s, q, v, tau: jd.gauge_invariant(s, q, v, tau).acceleration, Q, V, A),
+    "involutive": (lambda s, q: jd.involutive(s, q).singular_values, Q),
+    "projections": (jd.projections, Q),
+    "reduced_dynamics": (lambda s, q, nu, tau: jd.reduced_dynamics(s, q, nu, tau, basis=(0,)).acceleration, Q, NU, A),
+    "second_fundamental_form": (jd.second_fundamental_form, Q, V),
+    "simulate": (lambda s, q, v: jd.simulate(s, q, v, [0, 1], stepsize=0.5, throw=False).v, [0, 0], [0, 0]),
+    "stiffness": (jd.stiffness, Q, V),
+    "tangent_basis": (jd.tangent_basis, Q),
+}
+TAKES = [
+    *((name, ARM, *call) for name, call in (OF_BODIES | OF_SYSTEMS).items()),
+    *((f"{name} of a metric", PLANE, *call) for name, call in OF_SYSTEMS.items()),
+    *((name, CHAIN, *call) for name, call in OF_SCENES.items()),
+]
+EVERY = pytest.mark.parametrize(
+    ("system", "function", "args"), [(x[1], x[2], x[3:]) for x in TAKES], ids=[x[0] for x in TAKES]
+)
+
+
+@pytest.fixture(autouse=True)
+def as_users_have_it():
+    """Without the checks of annotations that the tests put before all functions."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def same(found, wanted):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        assert np.asarray(a).dtype == np.asarray(b).dtype
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
+
+
+@EVERY
+def test_numbers_of_any_kind_give_those_of_the_model(system, function, args):
+    """Lists and integers are taken as floats of the model's dtype."""
+    wanted = function(system, *(jnp.asarray(x, float) for x in args))
+    same(function(system, *args), wanted)
+    same(function(system, *(jnp.asarray(x) for x in args)), wanted)
+    assert all(np.asarray(x).dtype == float for x in jax.tree.leaves(wanted))
+
+
+@EVERY
+def test_what_does_not_fit_is_refused_with_its_name(system, function, args):
+    for i in range(len(args)):
+        for wrong in (jnp.asarray(args[i], complex), "abc"):
+            with pytest.raises(ValueError, match=r"is complex|pass an array of numbers|pass one"):
+                function(system, *args[:i], wrong, *args[i + 1 :])
+    if function is not OF_BODIES["regressor"][0]:
+        with pytest.raises(ValueError, match=r"has shape \(2, .*vmap"):
+            function(system, jnp.ones((2, 2)), *args[1:])
+
+
+@pytest.mark.parametrize(("name", "call"), (OF_BODIES | OF_SYSTEMS).items())
+def test_functions_of_a_system_say_what_to_pass_for_a_scene(name, call):
+    with pytest.raises(ValueError, match=r"is a Scene; pass scene\.system"):
+        call[0](CHAIN, *call[1:])
+
+
+@pytest.mark.parametrize(("name", "call"), OF_BODIES.items())
+def test_functions_of_bodies_refuse_other_systems(name, call):
+    with pytest.raises(ValueError, match="MetricSystem, which has no bodies"):
+        call[0](PLANE, *call[1:])
+
+
+@pytest.mark.parametrize(("name", "call"), OF_SCENES.items())
+def test_functions_of_a_scene_take_a_system_as_one(name, call):
+    """With the same results, or the same refusal, as for `Scene(system)`."""
+    if name in ("constrained_dynamics", "simulate", "stiffness"):
+        same(call[0](ARM, *call[1:]), call[0](jd.Scene(ARM), *call[1:]))
+    else:
+        with pytest.raises(ValueError, match=r"the scene has no constraints"):
+            call[0](ARM, *call[1:])
+
+
+def test_a_scene_is_no_system_of_another():
+    with pytest.raises(ValueError, match=r"system is a Scene; pass scene\.system"):
+        jd.Scene(CHAIN)
+    with pytest.raises(ValueError, match="system is a str"):
+        jd.Scene("arm")
+
+
+def test_a_batch_without_vmap_is_told_so():
+    with pytest.raises(ValueError, match=r"control returned shape \(4, 2\), expected \(2,\).*jax\.vmap"):
+        jd.simulate(ARM, [0, 0], [0, 0], [0, 1], control=lambda q, v, t: jnp.ones((4, 2)))
+    with pytest.raises(ValueError, match=r"nu has shape \(4, 1\).*jax\.vmap"):
+        jd.reduced_dynamics(CHAIN, Q, jnp.ones((4, 1)), basis=(0,))
+    with pytest.raises(ValueError, match=r"multipliers has shape \(4, 1\).*jax\.vmap"):
+        constraint_forces(CHAIN, Q, jnp.ones((4, 1)))
+    with pytest.raises(ValueError, match=r"stepsize has shape \(2,\).*jax\.vmap"):
+        jd.simulate(ARM, [0, 0], [0, 0], [0, 1], stepsize=[0.1, 0.2])
+
+
+def stiffer(q, v, t):
+    return -q if t < 0.5 else q
+
+
+OPTIONS = [
+    ({"rtol": np.inf}, "rtol is inf; pass a finite number"),
+    ({"rtol": -1}, "rtol is -1; pass a finite number that is not negative"),
+    ({"atol": np.nan}, "atol is nan"),
+    ({"rtol": "1e-8"}, "rtol is .*; pass an array of numbers"),
+    ({"rtol": [1e-8, 1e-6]}, r"rtol has shape \(2,\); pass one number.*vmap"),
+    ({"stepsize": "0.1"}, "stepsize is .*; pass an array of numbers"),
+    ({"stepsize": -0.1}, "stepsize is -0.1; pass a positive number"),
+    ({"control": lambda q, v, t: np.sin(q)}, "control needs the values .* jax.numpy"),
+    ({"control": stiffer}, r"control needs the values .* jax\.lax\.cond in place of if"),
+    ({"control": lambda q, v: q}, r"control takes \(q, v\), but is called as control\(q, v, t\)"),
+]
+
+
+@pytest.mark.parametrize(("options", "said"), OPTIONS)
+def test_options_of_simulate_are_refused_before_the_motion(options, said):
+    with pytest.raises(ValueError, match=said):
+        jd.simulate(ARM, [0, 0], [0, 0], [0, 1], **options)
+
+
+def test_forces_that_do_not_fit_are_named():
+    with pytest.raises(ValueError, match=r"forces\[0\] takes \(q, v, t\), but is called as force\(system, q, v, t\)"):
+        jd.simulate(jd.Scene(ARM, forces=(stiffer,)), [0, 0], [0, 0], [0, 1], stepsize=0.1)
+
+
+def test_paths(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for load in (jd.load_urdf, jd.load_sdf):
+        with pytest.raises(ValueError, match="path is None; pass the path of a file"):
+            load(None)
+    jd.save_urdf(ARM, "~/arm.urdf")
+    assert (tmp_path / "arm.urdf").exists()
+    assert jd.load_urdf("~/arm.urdf").joint_names == ARM.joint_names
+    with pytest.raises(ValueError, match=r"--out nowhere/a\.csv: there is no directory nowhere"):
+        output_path("nowhere/a.csv", (".csv",), "--out")
+
+
+PENDULUM = jd.robots.chain(1)
+LANES = {
+    "q0": (jnp.asarray([[0.1], [jnp.nan]]), "nonfinite_start"),
+    "v0": (jnp.asarray([[0.1], [jnp.inf]]), "nonfinite_start"),
+    "ts": (jnp.asarray([[0.0, 0.1, 0.2], [0.0, 0.2, 0.1]]), "unordered_times"),
+    "stepsize": (jnp.asarray([0.01, -0.01]), "bad_stepsize"),
+    "rtol": (jnp.asarray([1e-8, jnp.nan]), "bad_tolerance"),
+}
+
+
+@pytest.mark.parametrize(("name", "method"), [*((name, "free") for name in LANES), ("stepsize", "variational")])
+def test_a_bad_lane_leaves_the_good_one_alone(name, method):
+    """Both lanes of the batch, against one with two good lanes."""
+    options = {} if name == "rtol" else {"stepsize": 0.01}
+    given = {"q0": [0.1], "v0": [0.3], "ts": [0.0, 0.1, 0.2]} | options
+
+    @jax.jit
+    @jax.vmap
+    def run(value):
+        return jd.simulate(PENDULUM, **(given | {name: value}), method=method, outputs=("energy",), throw=False)
+
+    values, code = LANES[name]
+    both, good = run(values), run(values[:1].repeat(2, 0))
+    assert both.success.tolist() == [True, False]
+    assert (both.result == getattr(jd.RESULTS, code)).tolist() == [False, True]
+    np.testing.assert_allclose(both.q[0], good.q[0], rtol=1e-10)
+    np.testing.assert_allclose(both.energy[0], good.energy[0], rtol=1e-10)
+    assert np.isnan(both.q[1]).all()
+
+
+def test_no_success_with_rows_that_are_not_finite():
+    """A force that is infinite where the motion ends enters no step; what is reported of it counts."""
+    late = lambda system, q, v, t: jnp.where(t >= 0.2, jnp.inf, 0.0) * jnp.ones(2)  # noqa: E731
+    scene = jd.Scene(ARM, forces=(late,))
+    found = jd.simulate(scene, [0.1, 0.2], [0, 0], [0, 0.2], stepsize=0.01, outputs=("acceleration",), throw=False)
+    assert not found.success
+
+
+def test_one_enumeration_of_results():
+    found = [
+        jd.assemble(CHAIN, Q),
+        jd.constrained_dynamics(CHAIN, Q, V),
+        jd.reduced_dynamics(CHAIN, Q, NU, basis=(0,)),
+        jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 0.1], stepsize=0.1),
+    ]
+    assert all(one.result == jd.RESULTS.successful and one.success for one in found)
+    assert "successful" in str(found[0].result) and "<>" not in str(found[3].result)
+    stopped = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 9.0], max_steps=1, throw=False)
+    assert stopped.result == jd.RESULTS.max_steps_reached != found[1].result and not stopped.success
+
+
+def test_every_code_of_diffrax_has_its_name():
+    for name, code in diffrax.RESULTS._name_to_item.items():
+        assert from_diffrax(code) == getattr(jd.RESULTS, name)
+
+
+def test_models_scenes_and_solutions_print_as_short_text():
+    text = str(ARM)
+    assert text.splitlines()[0] == "Model 'chain 2': 2 bodies, nq = 2, nv = 2, float64"
+    assert all(name in text for name in (*ARM.body_names, *ARM.joint_names, "revolute", "0 1 0"))
+    assert "(Gear): 1 holonomic row" in str(CHAIN) and str(jd.Scene(PLANE)) == "Scene of MetricSystem: nq = 2, nv = 2"
+    found = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 0.1], stepsize=0.05, outputs=("energy",))
+    assert str(found) == (
+        "Solution: successful, t = 0 to 0.1 s of 0.1 s\n  RK4: 2 steps, 0 rejected\n  2 rows of q (1), v (1), energy"
+    )
+    seen = []
+    jax.jit(lambda scene: seen.append(str(scene)))(CHAIN)
+    jax.vmap(lambda q: seen.append(str(jd.simulate(PENDULUM, q, q, [0.0, 0.1], stepsize=0.1))))(jnp.ones((2, 1)))
+    assert "?" in seen[0] and "Solution: traced" in seen[1]
+
+
+ROBOT = """<robot name="r"><link name="a"/><link name="b">
+<inertial>
+<origin xyz="0 0 1"/><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>
+</inertial></link>
+<joint name="j" type="revolute"><parent link="a"/><child link="b"/>
+<origin xyz="0 0 1"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="2" effort="3"/>
+</joint></robot>"""
+TWICE = ("<mass ", "<inertia ", "<axis ", "<limit ", "<parent ")
+
+
+def loaded(path, text):
+    path.write_text(text)
+    return jd.load_urdf(path)
+
+
+@pytest.mark.parametrize("tag", TWICE)
+def test_a_second_part_of_a_urdf_is_refused(tag, tmp_path):
+    whole = tag + ROBOT.partition(tag)[2].partition("/>")[0] + "/>"
+    with pytest.raises(
+        ValueError, match=rf"a.urdf:\d: a second {tag.strip()}> of (link 'b'|joint 'j'), the first is on"
+    ):
+        loaded(tmp_path / "a.urdf", ROBOT.replace(whole, whole + whole))
+
+
+def test_other_faults_of_a_urdf(tmp_path):
+    path = tmp_path / "a.urdf"
+    inertial = "<inertial>" + ROBOT.partition("<inertial>")[2].partition("</inertial>")[0] + "</inertial>"
+    with pytest.raises(
+        ValueError, match=r"a.urdf:4: a second <inertial> of link 'b', the first is on line 2; keep one"
+    ):
+        loaded(path, ROBOT.replace(inertial, inertial + inertial))
+    for key in ("velocity", "effort"):
+        with pytest.raises(ValueError, match=rf"a.urdf:6: {key} of <limit> of joint 'j' is -\d; give its magnitude"):
+            loaded(path, ROBOT.replace(f'{key}="', f'{key}="-'))
+    with pytest.raises(ValueError, match=r"a.urdf:2: the file declares the entity 'x', which is refused"):
+        loaded(path, '<!DOCTYPE robot [\n<!ENTITY x "b">]>' + ROBOT.replace('link="b"', 'link="&x;"'))
+    with pytest.warns(UserWarning, match=r"a.urdf:1: link 'b': a principal moment of inertia is negative \(-0.1 kg"):
+        loaded(path, ROBOT.replace('ixx="1"', 'ixx="-0.1"'))

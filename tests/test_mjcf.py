@@ -1,0 +1,365 @@
+"""MJCF files against MuJoCo itself: frames, masses, dynamics, springs, actuators and constraints."""
+
+import importlib.util
+import sys
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco_bridge import Oracle
+from pinocchio_bridge import quick
+
+import jaxdyn as jd
+from jaxdyn.constraints.base import position_residual
+from jaxdyn.io import NotTakenWarning, load_mjcf
+
+
+def error(ours, theirs) -> float:
+    """Largest difference, relative to the largest number, so that a fly counts as much as a dog."""
+    theirs = np.asarray(theirs)
+    return float(np.abs(np.asarray(ours) - theirs).max(initial=0.0) / (np.abs(theirs).max(initial=0.0) or 1.0))
+
+
+def silent(path) -> jd.LoadedScene:
+    """The scene of a file, whatever is not taken."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the compiler's own too, of attributes that are to go
+        return load_mjcf(path)
+
+
+def row_space(rows) -> np.ndarray:
+    """The projector on the space of the rows."""
+    _, sizes, right = np.linalg.svd(np.asarray(rows), full_matrices=False)
+    right = right[sizes > 1e-9 * max(1.0, sizes.max(initial=0.0))]
+    return right.T @ right
+
+
+def agreement(path, scene: jd.LoadedScene) -> dict[str, float]:
+    """Errors against MuJoCo at a random state: frames, M, bias, forward dynamics, springs and dampers, actuators; and at
+    the reference, where loops close, those of the space that the constraints' rows span."""
+    model, oracle, rng = scene.system, Oracle(path, scene.system), np.random.default_rng(1)
+    start = scene.starts["reference"].q
+    v, tau, step = (jnp.asarray(rng.normal(size=model.nv)) for _ in range(3))
+    drives = scene.actuators
+    control = rng.normal(size=0 if drives is None else len(drives.names))
+
+    @quick
+    def ours(scene, start, step, v, tau, control):
+        model = scene.system
+        q = jd.integrate(model, start, 0.7 * step)
+        forces = [force for force in scene.forces if not isinstance(force, jd.CoulombFriction)]
+        found = {
+            "M": jd.mass_matrix(model, q),
+            "bias": jd.bias_force(model, q, v),
+            "acceleration": jd.forward_dynamics(model, q, v, tau),
+            "passive": sum((force(model, q, v, 0.0) for force in forces), jnp.zeros(model.nv)),
+        }
+        if scene.actuators is not None:
+            found["actuation"] = scene.actuators(model, q, v, control)
+        rows = jd.constraint_jacobian(scene, start) if scene.constraints else None
+        return q, jd.forward_kinematics(model, q), found, rows
+
+    q, poses, found, rows = ours(scene, start, step, v, tau, jnp.asarray(control))
+    theirs = dict(zip(("M", "bias", "acceleration"), oracle.dynamics(q, v, tau), strict=True))
+    frames = [model.frame_names.index(name) for name in oracle.bodies[1:]]
+    carriers = np.concatenate([np.asarray(poses), np.eye(4)[None]])[np.array(model.topology.frame_bodies)[frames]]
+    errors = {"frames": error(carriers @ np.asarray(model.frame_poses)[frames], oracle.body_poses())}
+    theirs["passive"] = oracle.passive_force(q, v)
+    if drives is not None:
+        theirs["actuation"] = oracle.actuation(q, v, dict(zip(drives.names, control, strict=True)))
+    errors |= {name: error(value, theirs[name]) for name, value in found.items()}
+    if rows is not None:
+        errors["rows"] = error(row_space(rows), row_space(oracle.equality_rows(start)[0]))
+    return errors
+
+
+MIXED = """
+<mujoco model="mixed">
+  <compiler angle="radian"/>
+  <option gravity="0.3 -0.2 -9.7"/>
+  <default><joint armature="0.01" damping="0.2"/></default>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body name="base" pos="0.1 0.2 1" euler="0.1 0.2 0.3">
+      <freejoint name="root"/>
+      <inertial pos="0.01 0.02 0.03" mass="3" fullinertia="0.03 0.04 0.05 0.001 0.002 0.003"/>
+      <site name="imu" pos="0.1 0 0.2" euler="0.3 0 0.2"/>
+      <body name="arm" pos="0.3 0.1 0" quat="0.9 0.1 0.2 0.3">
+        <joint name="z" axis="0.2 0.3 1" pos="0.05 -0.1 0.02" ref="0.4" stiffness="3" springref="0.2"/>
+        <joint name="a" type="slide" axis="1 1 0" ref="-0.1" frictionloss="0.3"/>
+        <joint name="m" axis="1 0 0" pos="0 0.2 0" range="-1 2" limited="true" actuatorfrcrange="-2 1"/>
+        <geom type="capsule" fromto="0 0 0 0.2 0.1 0.3" size="0.04"/>
+        <body pos="0.2 0 0.1">
+          <joint type="ball" pos="0.02 0.03 -0.04" damping="0.1" stiffness="2"/>
+          <geom type="box" size="0.1 0.05 0.07" pos="0.1 0 0"/>
+        </body>
+        <body name="imu" pos="0 0.3 0"><geom size="0.05"/></body>
+      </body>
+    </body>
+    <body name="rod" pos="1 0 0">
+      <joint name="r" axis="0 1 0" ref="0.3"/><geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="t" stiffness="4" damping="0.3" springlength="0.1 0.3">
+      <joint joint="z" coef="0.7"/><joint joint="r" coef="-1.2"/>
+    </fixed>
+    <fixed name="u"><joint joint="a" coef="1"/></fixed>
+    <spatial name="cord" stiffness="3"><site site="imu"/><site site="imu2"/></spatial>
+  </tendon>
+  <equality>
+    <connect name="c" body1="imu" anchor="0.1 0 -0.4" body2="rod"/>
+    <weld name="w" body1="imu" body2="rod"/>
+    <joint name="j" joint1="m" joint2="r" polycoef="0.1 0.5"/>
+    <joint name="cubic" joint1="m" joint2="r" polycoef="0.1 0.5 0.3 -0.2"/>
+    <joint name="held" joint1="z" polycoef="0.1"/>
+    <tendon name="tt" tendon1="t" tendon2="u" polycoef="0.1 0.5 0.3"/>
+    <joint name="off" joint1="z" active="false"/>
+  </equality>
+  <actuator>
+    <motor name="m1" joint="z" gear="3" ctrlrange="-1 1" ctrllimited="true" armature="0.02"/>
+    <position name="p1" joint="m" kp="20" kv="1" forcerange="-3 3" forcelimited="true"/>
+    <motor name="tm" tendon="t" gear="2"/>
+    <motor name="thrust" site="imu" gear="0 0 1 0.1 0 0.2"/>
+    <damper name="d" joint="a" kv="2" ctrlrange="0 1"/>
+    <intvelocity name="stateful" joint="a" kp="2" actrange="-1 1"/>
+  </actuator>
+  <keyframe>
+    <key name="home" qpos="0 0 1 0.7 0.7 0 0.1 .1 .2 .3 1 0.1 0 0 .6" qvel="1 2 3 4 5 6 .1 .2 .3 .4 .5 .6 .8"
+         ctrl="1 2 3 4 5 6" act="0"/>
+  </keyframe>
+</mujoco>
+""".replace("</worldbody>", '<site name="imu2" pos="0 0 2"/></worldbody>')
+BODY = '<body name="b"><joint name="h" axis="0 1 0"/><geom name="g" size="0.1" pos="0 0 -1"/></body>'
+
+
+TWINS = BODY.replace("<geom", '<joint name="twin" axis="0 1 0"/><geom')
+
+
+def write(tmp_path, text: str) -> Path:
+    path = tmp_path / "robot.xml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def of_body(tmp_path, body: str = BODY, rest: str = "", name: str = "small") -> Path:
+    return write(tmp_path, f'<mujoco model="{name}"><worldbody>{body}</worldbody>{rest}</mujoco>')
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    path = write(tmp_path_factory.mktemp("mjcf"), MIXED)
+    return path, silent(path)
+
+
+def test_every_kind_of_joint_and_part_agrees_with_mujoco(mixed):
+    """Free, ball, three joints on one body, references, anchors, inertial frames, tendons, drives, equalities."""
+    errors = agreement(*mixed)
+    assert {"M", "bias", "acceleration", "frames", "passive", "actuation", "rows"} == errors.keys()
+    assert max(errors.values()) < 1e-12, errors
+
+
+def test_names_of_bodies_joints_and_frames(mixed):
+    _, scene = mixed
+    model = scene.system
+    assert model.name == "mixed"
+    assert model.joint_names == ("r", "root", "z", "a", "m", "body3_joint")
+    assert model.body_names == ("rod", "base", "arm_z", "arm_a", "arm_m", "body3_joint")
+    assert {"arm", "imu", "imu_site", "imu2", "body3"} <= set(model.frame_names)
+    assert [constraint.name for constraint in scene.constraints] == ["c", "w", "j", "cubic", "held", "tt"]
+    np.testing.assert_allclose(model.gravity, [0.3, -0.2, -9.7])
+    np.testing.assert_allclose(model.armature[model.topology.v_slices[2]], 0.01 + 9 * 0.02)
+    np.testing.assert_allclose(model.lower[model.topology.q_slices[4]], -1)
+    assert np.isinf(np.asarray(model.lower[model.topology.q_slices[2]]))
+
+
+def test_keyframes_are_starts_in_our_coordinates(mixed):
+    path, scene = mixed
+    oracle, start = Oracle(path, scene.system), scene.starts["home"]
+    key = oracle.m.key("home")
+    T, _ = oracle.rotation(key.qpos, np.asarray(start.v))
+    np.testing.assert_allclose(np.asarray(start.q)[oracle.to_q], key.qpos, atol=1e-15)
+    np.testing.assert_allclose(T @ np.asarray(start.v)[oracle.to_v], key.qvel, atol=1e-14)
+    assert scene.actuators.names == ("m1", "p1", "tm", "thrust", "d")
+    np.testing.assert_array_equal(start.control, [1, 2, 3, 4, 5])
+    np.testing.assert_allclose(np.asarray(scene.starts["reference"].q)[oracle.to_q], oracle.m.qpos0, atol=1e-15)
+
+
+def test_what_is_not_taken_is_named_by_a_warning(mixed):
+    path, scene = mixed
+    with pytest.warns(NotTakenWarning) as caught:
+        load_mjcf(path)
+    assert len(caught) == 1
+    text = str(caught[0].message)
+    for part in ("robot.xml", "stateful", "contact geometry of bodies: world, arm", "spatial tendons: cord", "off"):
+        assert part in text
+    assert all(line in text for line in scene.not_taken)
+
+
+def test_friction_is_smoothed_and_springs_are_forces(mixed):
+    kinds = [type(force).__name__ for force in mixed[1].forces]
+    assert kinds == ["JointSpring", "JointDamping", "CoulombFriction", "TendonForce"]
+
+
+def test_a_file_without_anything_else_warns_of_nothing(tmp_path):
+    body = BODY.replace("<geom ", '<geom contype="0" conaffinity="0" ')
+    scene = load_mjcf(of_body(tmp_path, body, '<option><flag gravity="disable"/></option>'))
+    assert scene.system.gravity is None
+    assert scene.constraints == scene.forces == scene.not_taken == ()
+    assert scene.actuators is None
+    assert scene.system.body_names == ("b",)  # an axis through the body's origin needs no body in between
+
+
+def test_an_anchor_along_the_axis_needs_no_body_in_between(tmp_path):
+    body = BODY.replace("axis", 'pos="0 0.3 0" axis')
+    assert silent(of_body(tmp_path, body)).system.body_names == ("b",)
+
+
+def test_equalities_with_the_world_with_sites_and_within_a_body(tmp_path):
+    body = f"""
+    <body name="mocap" mocap="true" pos="0 0 1"/><site name="s" pos="0.3 0 0" euler="30 0 0"/>
+    {BODY.replace("</body>", '<site name="t" pos="0.1 0.2 0"/><body name="tip"><geom size="0.1"/></body></body>')}
+    """
+    rest = """<equality>
+    <weld name="to mocap" body1="mocap" body2="b"/><weld name="to site" site1="s" site2="t"/>
+    <connect name="to world" body1="b" anchor="0 0 0.1"/><weld name="inside" body1="b" body2="tip"/>
+    <weld name="point" body1="b" torquescale="0"/>
+    </equality>"""
+    path = of_body(tmp_path, body, rest)
+    scene = silent(path)
+    assert [(c.name, c.joint) for c in scene.constraints] == [
+        ("to mocap", "weld"),
+        ("to site", "weld"),
+        ("to world", "spherical"),
+        ("point", "spherical"),
+    ]
+    assert any("inside" in line for line in scene.not_taken)
+    assert any("mocap bodies" in line for line in scene.not_taken)
+    q = scene.starts["reference"].q
+    residuals = np.abs(position_residual(scene, q, jnp.asarray(0.0)))
+    assert np.delete(residuals, np.s_[6:12]).max() < 1e-15
+    assert residuals[6:12].max() > 0.1  # nothing says that a file's sites meet
+
+
+def test_missing_meshes_and_textures_are_left_out(tmp_path):
+    assets = """<asset><mesh name="seen" file="seen.stl"/><mesh name="heavy" file="heavy.stl"/>
+    <texture name="wood" type="2d" file="wood.png"/><material name="m" texture="wood"/></asset>"""
+    geoms = (
+        '<geom type="mesh" mesh="seen" mass="0"/><geom type="mesh" mesh="heavy"/><geom size="0.1" material="m"/></body>'
+    )
+    scene = silent(of_body(tmp_path, BODY.replace("</body>", geoms), assets))
+    text = "; ".join(scene.not_taken)
+    for part in ("missing file 'seen.stl';", "'heavy.stl', and with it mass of bodies b", "missing file 'wood.png'"):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("<mujoco><worldbody><body></worldbody></mujoco>", ("robot.xml:1", "malformed XML")),
+        ('<mujoco>\n<worldbody><body foo="3"/></worldbody></mujoco>', ("robot.xml:2", "foo")),
+        ("<robot/>", ("robot.xml:1", "<robot>", "load_urdf")),
+        ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", ("robot.xml:1", "mass")),
+        (
+            f"<mujoco><worldbody>{TWINS}</worldbody></mujoco>",
+            ("robot.xml", "singular", "'h'"),
+        ),
+        ('<!DOCTYPE x [<!ENTITY a "b">]><mujoco model="&a;"/>', ("robot.xml:1", "entity 'a'", "refused")),
+    ],
+)
+def test_bad_files_are_refused_with_file_and_line(tmp_path, text, parts):
+    with pytest.raises(ValueError) as caught, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # mujoco's own, of the singular matrix
+        load_mjcf(write(tmp_path, text))
+    assert all(part in str(caught.value) for part in parts), str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_named():
+    with pytest.raises(ValueError, match=r"nowhere\.xml.*check the path"):
+        load_mjcf("nowhere.xml")
+
+
+def test_without_mujoco_the_error_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ImportError, match=r"pip install jaxdyn\[mjcf\]"):
+        load_mjcf(of_body(tmp_path))
+
+
+def test_controls_of_another_number_are_refused(mixed):
+    _, scene = mixed
+    q = scene.starts["reference"].q
+    with pytest.raises(ValueError, match=r"control has shape \(2,\), expected \(5,\).*m1, p1"):
+        scene.actuators(scene.system, q, jnp.zeros(scene.nv), jnp.zeros(2))
+
+
+# Packages whose wheels hold MJCF files; none is a dependency. What is installed is tested.
+COLLECTION = ("mujoco", "brax", "dm_control", "gymnasium", "gymnasium_robotics", "mujoco_playground", "robosuite")
+# What makes M or the bias another than MuJoCo's, as the warning says.
+APART = ("armature of tendons", "gyroscopic part of the armature")
+LARGEST = 100  # degrees of freedom; what is larger there repeats the same humanoid
+
+
+def files_of(package: str) -> list[Path]:
+    spec = importlib.util.find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        pytest.skip(f"the package {package} is not installed")
+    paths = sorted(Path(spec.submodule_search_locations[0]).rglob("*.xml"))
+    return [path for path in paths if b"<mujoco" in path.read_bytes()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("package", COLLECTION)
+def test_every_mjcf_file_of_installed_packages_agrees(package):
+    """Where MuJoCo itself loads a file, so do we, and all numbers agree, or what makes them differ is named."""
+    faults, count = [], 0
+    for path in files_of(package):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                m = mujoco.MjModel.from_xml_path(str(path))
+        except ValueError:
+            continue  # fragments that others include, and files whose meshes other packages hold
+        if not 0 < m.nv <= LARGEST:
+            continue
+        try:
+            scene = silent(path)
+        except ValueError as error:
+            if "mass matrix is singular" not in str(error) or np.linalg.matrix_rank(_mass_matrix(m)) == m.nv:
+                faults.append(f"{path}: {error}")
+            continue
+        errors = agreement(path, scene)
+        if any(line.startswith(APART) for line in scene.not_taken):
+            errors = {name: errors[name] for name in ("frames", "passive")}
+        faults += [f"{path}: {name} differs by {e:.1e}" for name, e in errors.items() if not e < 1e-9]
+        count += 1
+        jax.clear_caches()
+    assert count
+    assert not faults, "\n".join(faults)
+
+
+def _mass_matrix(m) -> np.ndarray:
+    data, M = mujoco.MjData(m), np.zeros((m.nv, m.nv))
+    data.qpos[:] = np.random.default_rng(0).normal(size=m.nq)
+    mujoco.mj_forward(m, data)
+    mujoco.mj_fullM(m, data, M)
+    return M
+
+
+@pytest.mark.slow
+def test_a_loop_of_a_file_assembles_from_a_rough_guess(tmp_path):
+    bars = """
+    <body name="crank"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02"/>
+      <body name="rod" pos="0 0 0.3"><joint name="b" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0.8 0 0" size="0.02"/></body></body>
+    <body name="rocker" pos="0.8 0 0"><joint name="c" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02"/></body>"""
+    rest = '<equality><connect body1="rod" body2="rocker" anchor="0.8 0 0"/></equality>'
+    scene = silent(of_body(tmp_path, bars, rest))
+    q = scene.starts["reference"].q + jnp.array([0.3, -0.2, 0.1])
+    found = jd.assemble(scene, q)
+    assert found.residual.max() < 1e-12
+    assert np.abs(found.q - scene.starts["reference"].q).max() > 0.1

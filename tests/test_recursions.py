@@ -1,0 +1,352 @@
+"""The recursions written with arrays: against the matrix form, Pinocchio and their own identities, on every joint kind."""
+
+import ast
+import functools
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import pytest
+from jax.extend.core import Literal
+from pinocchio_bridge import as_dtype, assert_close, quick, random_states, random_tree, to_pinocchio
+
+import jaxdyn
+from jaxdyn import matrix_form, neutral, recursions
+from jaxdyn.joints import KINDS
+from jaxdyn.recursions import frames, inertias, links, transforms
+
+# Every kind, as a root, inside the tree and at its end; with and without armature.
+TREES = {
+    "every kind": lambda: random_tree(1, list(KINDS)),
+    "floating, no armature": lambda: random_tree(
+        3, ["free", "revolute", "prismatic", "helical", "spherical", "revolute"], armature=False
+    ),
+    "planar, no armature": lambda: random_tree(5, ["planar", "prismatic", "revolute"], armature=False),
+    "screws of other norms": lambda: random_tree(6, ["helical", "revolute", "prismatic"]).replace(
+        screws=1.7 * random_tree(6, ["helical", "revolute", "prismatic"]).screws
+    ),
+}
+
+RULES = {
+    "add": np.add,
+    "add_any": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "sin": np.sin,
+    "cos": np.cos,
+    "sqrt": np.sqrt,
+    "square": np.square,
+    "lt": np.less,
+    "eq": np.equal,
+    "iota": lambda *, dtype, shape, dimension, **_: np.moveaxis(
+        np.broadcast_to(
+            np.arange(shape[dimension], dtype=dtype), (*shape[:dimension], *shape[dimension + 1 :], shape[dimension])
+        ),
+        -1,
+        dimension,
+    ),
+    "integer_pow": lambda x, *, y: x**y,
+    "select_n": lambda which, *cases: np.choose(which.astype(int), cases),
+    "concatenate": lambda *x, dimension: np.concatenate(x, dimension),
+    "reshape": lambda x, *, new_sizes, **_: x.reshape(new_sizes),
+    "transpose": lambda x, *, permutation: x.transpose(permutation),
+    "squeeze": lambda x, *, dimensions: x.squeeze(dimensions),
+    "reduce_sum": lambda x, *, axes, **_: x.sum(axes),
+    "copy": lambda x: x,
+    "copy_p": lambda x: x,
+    "stack": lambda *x, **how: np.stack(x, how.get("axis", how.get("dimension", 0))),
+    "convert_element_type": lambda x, *, new_dtype, **_: x.astype(new_dtype),
+    "unstack": lambda x, *, axis, **_: list(np.moveaxis(x, axis, 0)),
+    "sign": np.sign,
+    "rsqrt": lambda x, **_: 1 / np.sqrt(x),
+    "split": lambda x, *, sizes, axis: np.split(x, np.cumsum(sizes)[:-1], axis),
+    "mul_any": np.multiply,
+}
+
+
+def _slice(x, *, start_indices, limit_indices, strides):
+    return x[tuple(slice(*ends) for ends in zip(start_indices, limit_indices, strides or (1,) * x.ndim, strict=True))]
+
+
+def _broadcast(x, *, shape, broadcast_dimensions, **_):
+    full = [1] * len(shape)
+    for at, size in zip(broadcast_dimensions, x.shape, strict=True):
+        full[at] = size
+    return np.broadcast_to(x.reshape(full), shape)
+
+
+def _pad(x, fill, *, padding_config):
+    assert all(low >= 0 and high >= 0 and inner == 0 for low, high, inner in padding_config)
+    return np.pad(x, [config[:2] for config in padding_config], constant_values=fill)
+
+
+def _product(a, b, *, dimension_numbers, **_):
+    (over_a, over_b), (batch_a, batch_b) = dimension_numbers
+    letters = iter("abcdefghijklmnop")
+    one, other = [None] * a.ndim, [None] * b.ndim
+    for i, j in zip((*batch_a, *over_a), (*batch_b, *over_b), strict=True):
+        one[i] = other[j] = next(letters)
+    one, other = ([x or next(letters) for x in names] for names in (one, other))
+    shared = [one[i] for i in batch_a]
+    rest = [x for i, x in enumerate(one) if i not in (*batch_a, *over_a)]
+    rest += [x for j, x in enumerate(other) if j not in (*batch_b, *over_b)]
+    return np.einsum(f"{''.join(one)},{''.join(other)}->{''.join(shared + rest)}", a, b)
+
+
+RULES |= {"slice": _slice, "broadcast_in_dim": _broadcast, "pad": _pad, "dot_general": _product}
+
+
+def run(function, *args):
+    """function(*args), traced by JAX and computed by numpy: no compilation, and no operations but simple ones."""
+    jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+    out = _evaluate(jaxpr.jaxpr, jaxpr.consts, [np.asarray(x) for x in jax.tree.leaves(args)])
+    return jax.tree.unflatten(jax.tree.structure(shape), out)
+
+
+def _evaluate(jaxpr, consts, args):
+    known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*map(np.asarray, consts), *args), strict=True))
+
+    def read(x):
+        return np.asarray(x.val) if isinstance(x, Literal) else known[x]
+
+    for eqn in jaxpr.eqns:
+        inputs = [read(x) for x in eqn.invars]
+        inner = eqn.params.get("jaxpr")
+        if inner is not None:
+            out = _evaluate(inner.jaxpr, inner.consts, inputs)
+        else:
+            out = RULES[eqn.primitive.name](*inputs, **eqn.params if eqn.primitive.name not in PLAIN else {})
+        out = out if isinstance(out, list) else [out]
+        known.update(zip(eqn.outvars, map(np.asarray, out), strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+PLAIN = [name for name, rule in RULES.items() if isinstance(rule, np.ufunc)] + ["copy", "copy_p", "select_n"]
+
+
+def everything(model, q, v, a, tau, wrenches):
+    """All quantities at one sample."""
+    columns = jnp.stack([tau, a], 1)
+    free, times = recursions.aba_with_columns(model, q, v, tau, columns)
+    again, tangent = recursions.aba_tangent(model, q, v, tau, lambda acc: tau - 0.5 * acc)
+    return {
+        "rnea": recursions.rnea(model, q, v, a),
+        "rnea external": recursions.rnea(model, q, v, a, external=wrenches),
+        "bias": recursions.bias_force(model, q, v),
+        "gravity": recursions.gravity_force(model, q),
+        "aba": recursions.aba(model, q, v, tau),
+        "crba": recursions.crba(model, q),
+        "sqrt": recursions.mass_matrix_sqrt(model, q),
+        "inverse": recursions.mass_matrix_inverse_times(model, q, tau),
+        "free": free,
+        "times": times,
+        "again": again,
+        "tangent": tangent,
+    }
+
+
+def expected(model, q, v, a, tau, wrenches):
+    """The same from the matrix form's M, C v + N, N and forces of external wrenches."""
+
+    def at(q, v, wrenches):
+        return (
+            matrix_form.mass_matrix(model, q),
+            matrix_form.inverse_dynamics(model, q, v, None),
+            matrix_form.gravity_force(model, q),
+            matrix_form.generalized_force(model, q, wrenches),
+        )
+
+    mass, bias, weight, pushed = (np.asarray(x) for x in quick(at)(q, v, wrenches))
+    free = np.linalg.solve(mass, tau - bias)
+    return {
+        "rnea": mass @ a + bias,
+        "rnea external": mass @ a + bias - pushed,
+        "bias": bias,
+        "gravity": weight,
+        "aba": free,
+        "crba": mass,
+        "inverse": np.linalg.solve(mass, tau),
+        "free": free,
+        "times": np.linalg.solve(mass, np.stack([tau, a], 1)),
+        "again": free,
+        "tangent": np.linalg.solve(mass, tau - 0.5 * free),
+    }
+
+
+@functools.cache
+def wanted(name):
+    model = TREES[name]()
+    return expected(model, *(x[0] for x in random_states(model, 1, 7)))
+
+
+@pytest.mark.parametrize("traced", [False, True], ids=["known", "traced"])
+@pytest.mark.parametrize("name", TREES)
+def test_against_matrix_form(name, traced):
+    model = TREES[name]()
+    sample = [x[0] for x in random_states(model, 1, 7)]
+    got = run(everything, model, *sample) if traced else run(lambda *x: everything(model, *x), *sample)
+    want = wanted(name)
+    for key, value in want.items():
+        assert_close(got[key], value, 1e-10, key)
+    root = np.asarray(got["sqrt"])
+    assert_close(root @ root.T, want["crba"], 1e-10, "W W^T")
+    assert_close(np.prod(np.diag(root)) ** 2, np.linalg.det(want["crba"]), 1e-9, "det M = prod W_kk^2")
+
+
+def test_against_pinocchio():
+    model = TREES["every kind"]()
+    source, bridge = to_pinocchio(model)
+    data = source.createData()
+    q, v, a, tau, _ = random_states(model, 3, 8)
+
+    def at(q, v, a, tau):
+        return recursions.rnea(model, q, v, a), recursions.aba(model, q, v, tau), recursions.crba(model, q)
+
+    force, acceleration, mass = run(jax.vmap(at), q, v, a, tau)
+    for i, q_pin in enumerate(bridge.q_to_pinocchio(q)):
+        vi, ai, ti = (np.asarray(x[i]) for x in (v, a, tau))
+        M = pin.crba(source, data, q_pin)
+        assert_close(force[i], pin.rnea(source, data, q_pin, vi, ai), 1e-11, "rnea")
+        assert_close(acceleration[i], pin.aba(source, data, q_pin, vi, ti), 1e-10, "aba")
+        assert_close(mass[i], np.triu(M) + np.triu(M, 1).T, 1e-11, "crba")
+
+
+def test_gradients_at_rest():
+    """At the neutral configuration, at rest, without gravity: finite, and those of the matrix form; every leaf."""
+    model = random_tree(2, ["free", "helical", "spherical"], armature=False)
+    arrays, static = eqx.partition(model, eqx.is_inexact_array)
+    zero = jnp.zeros(model.nv)
+    tau = jnp.arange(1.0, model.nv + 1)
+
+    def loss(of):
+        return lambda arrays, *x: jnp.sum(jnp.sin(of(eqx.combine(arrays, static), *x)))
+
+    args = arrays, neutral(model), zero, tau
+    got = run(jax.grad(loss(recursions.aba), (0, 1, 2, 3)), *args)
+    want = quick(jax.grad(loss(matrix_form.forward_dynamics), (0, 1, 2, 3)))(*args)
+    for one, other in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+        assert_close(one, other, 1e-9)
+
+
+def test_a_body_without_mass():
+    """A body without mass in the middle of a chain leaves all numbers and gradients finite."""
+    model = random_tree(4, ["revolute"] * 3, parents=[-1, 0, 1])
+    model = model.replace(inertias=model.inertias * jnp.array([1.0, 0.0, 1.0])[:, None])
+    q, v, _, tau, _ = (x[0] for x in random_states(model, 1, 0))
+    value, slope = run(jax.value_and_grad(lambda q: jnp.sum(recursions.aba(model, q, v, tau))), q)
+    want = jnp.sum(quick(lambda q: matrix_form.forward_dynamics(model, q, v, tau))(q))
+    assert_close(value, want, 1e-10)
+    assert np.isfinite(slope).all()
+
+
+def test_root_of_a_chain_is_triangular():
+    model = random_tree(4, ["revolute", "prismatic", "helical"], parents=[-1, 0, 1])
+    root = run(lambda q: recursions.mass_matrix_sqrt(model, q), random_states(model, 1, 0)[0][0])
+    assert np.array_equal(np.tril(root, -1), np.zeros((3, 3)))
+    assert (np.diag(root) > 0).all()
+
+
+def test_results_keep_the_dtype():
+    """No conversion of numbers anywhere, with known and with traced leaves."""
+    dtype = jnp.float32
+    model = as_dtype(TREES["every kind"](), dtype)
+    sample = [x[0] for x in random_states(model, 1, 5)]
+    for function, args in ((everything, (model, *sample)), (lambda *x: everything(model, *x), sample)):
+        jaxpr = jax.make_jaxpr(function)(*args).jaxpr
+        assert {v.aval.dtype for eqn in jaxpr.eqns for v in eqn.outvars if v.aval.dtype.kind == "f"} == {
+            np.dtype(dtype)
+        }
+
+
+def test_without_gravity_and_without_bodies():
+    model = random_tree(7, ["revolute", "prismatic"]).replace(gravity=None)
+    q, v, a, _, _ = (x[0] for x in random_states(model, 1, 0))
+    source, _ = to_pinocchio(model)
+    assert_close(run(lambda q: recursions.gravity_force(model, q), q), np.zeros(2))
+    want = pin.rnea(source, source.createData(), *map(np.asarray, (q, v, a)))
+    assert_close(run(lambda *x: recursions.rnea(model, *x), q, v, a), want, 1e-12)
+    empty = jaxdyn.ModelBuilder("empty").build()
+    none = jnp.zeros(0)
+    assert recursions.aba(empty, none, none, none).shape == recursions.rnea(empty, none, none, None).shape == (0,)
+    assert recursions.crba(empty, none).shape == recursions.mass_matrix_sqrt(empty, none).shape == (0, 0)
+
+
+def test_canonical_frames_are_the_home_poses():
+    """The factors of the home poses, multiplied, are the home poses; a first child's begins along x."""
+    for seed in range(3):
+        model = random_tree(seed, ["revolute", "helical", "revolute", "prismatic", "revolute", "planar", "revolute"])
+        found = links.links_of(model)
+        chains = links.joint_transforms(found, neutral(model))
+        first = set()
+        for i, chain in enumerate(chains):
+            pose = np.eye(4)
+            for step in chain:
+                R = np.eye(3) if step.rotation is None else step.rotation.matrix(3)
+                r = np.zeros(3) if step.shift is None else step.shift
+                pose = pose @ np.block([[np.asarray(R), np.asarray(r)[:, None]], [np.zeros(3), np.ones(1)]])
+            assert_close(pose, found.frames.home[i], 1e-13)
+            parent = model.topology.parents[i]
+            if parent >= 0 and parent not in first and model.topology.kinds[parent] != "planar":
+                assert found.frames.screws[i].phi == (1, 0) and found.frames.screws[i].e == 0
+            first.add(parent)
+
+
+def test_pose_in_a_link():
+    model = random_tree(1, ["revolute", "helical"])
+    found = links.links_of(model)
+    for body, pose in ((0, model.frame_poses[2]), (1, model.frame_poses[3]), (-1, model.frame_poses[2])):
+        R, p = links.pose_in_link(found, body, pose)
+        B = found.frames.placement[body] if body >= 0 else np.eye(4)
+        assert_close(B[:3, :3] @ R, pose[:3, :3], 1e-15)
+        assert_close(B[:3, :3] @ p + B[:3, 3], pose[:3, 3], 1e-15)
+
+
+def test_nearly_parallel_axes():
+    """Common normals that lie far away are not used."""
+    tilt = 1e-4
+    pose = np.array(
+        [[1, 0, 0, 0.3], [0, np.cos(tilt), -np.sin(tilt), 0.2], [0, np.sin(tilt), np.cos(tilt), 0.1], [0, 0, 0, 1]]
+    )
+    home = frames._screws(pose, 1e-15)
+    assert abs(home.e) + abs(home.d) + np.abs(home.shift).max() < 1
+
+
+def test_masses_on_a_joint_axis_belong_to_the_parent():
+    model = random_tree(1, ["revolute", "revolute", "prismatic"], parents=[-1, 0, 1])
+    moments = inertias.pseudo_inertias(model, frames.canonical_frames(model))
+    for J, kind in zip(moments, model.topology.kinds, strict=True):
+        assert not J[inertias.SHARED[kind]].any()
+
+
+def test_congruence_by_twice_the_angle():
+    rng = np.random.default_rng(0)
+    for size in (4, 6):
+        A = rng.normal(size=(size, size))
+        A = A + A.T
+        for axis in (0, 1, 2):
+            turn = transforms.PlaneRotation(transforms.PlaneRotations(axis, np.cos([0.7]), np.sin([0.7])), 0)
+            R = turn.matrix(size)
+            assert_close(R @ R.T, np.eye(size), 1e-15)
+            assert_close(turn.congruence(A), R @ A @ R.T, 1e-14)
+
+
+def test_imports():
+    """The package knows the model and the Lie groups, not what it is checked against."""
+    allowed = (
+        "jaxdyn.recursions",
+        "jaxdyn.compile",
+        "jaxdyn.joints",
+        "jaxdyn.model",
+        "jaxdyn.so3",
+        "jaxdyn.se3",
+        "jaxdyn.se2",
+    )
+    for file in (Path(jaxdyn.__file__).parent / "recursions").glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("jaxdyn"):
+                assert node.module.startswith(allowed), (file.name, node.module)

@@ -1,0 +1,151 @@
+"""The recursions in kernels, as users call them: accuracy on every joint kind, derivatives, and how many operations they take."""
+
+import itertools
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import as_dtype, assert_close, load_robot, quick, random_states, random_tree
+
+import jaxdyn as jd
+from jaxdyn import matrix_form, recursions
+from jaxdyn.joints import KINDS
+
+
+def program_of(function, *args):
+    """The program of the one kernel that a function is."""
+    (eqn,) = (eqn for eqn in jax.make_jaxpr(function)(*args).eqns if eqn.primitive.name == "jaxdyn_kernel")
+    return eqn.params["program"]
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_forward_dynamics_of_every_joint(dtype):
+    """Against the world-frame matrix form, for one sample, a few and nested batches."""
+    model = as_dtype(random_tree(1, list(KINDS)), dtype)
+    q, v, tau = (jnp.asarray(x, dtype) for x in random_states(model, 6, seed=2)[:3])
+    wanted = quick(jax.vmap(partial(matrix_form.forward_dynamics, model)))(q, v, tau)
+    run = partial(jd.forward_dynamics, model)
+    size = 1e-10 if dtype == jnp.float64 else 4e-4  # 5 eps times the condition number of M, at most 642
+    for found in (
+        jnp.stack([jax.jit(run)(*args) for args in zip(q, v, tau, strict=True)]),
+        jax.jit(jax.vmap(run))(q, v, tau),
+        jax.jit(jax.vmap(jax.vmap(run)))(*(x.reshape(2, 3, -1) for x in (q, v, tau))).reshape(6, -1),
+    ):
+        assert found.dtype == dtype
+        np.testing.assert_allclose(found, wanted, atol=size * float(jnp.abs(wanted).max()), rtol=0)
+
+
+def test_inverse_dynamics_in_float32():
+    model = as_dtype(random_tree(1, list(KINDS)), jnp.float32)
+    q, v, a, _, _ = random_states(model, 3, 5)
+    got = jax.jit(jax.vmap(partial(jd.inverse_dynamics, model)))(q, v, a)
+    assert got.dtype == jnp.float32
+    wide = as_dtype(model, jnp.float64)
+    exact = quick(jax.vmap(partial(matrix_form.inverse_dynamics, wide)))
+    want = exact(*(jnp.asarray(x, jnp.float64) for x in (q, v, a)))
+    # A dozen bodies, each a few roundings of 6e-8 on partly cancelling sums.
+    assert_close(got, want, 2e-5)
+
+
+def test_every_quantity_in_both_modes():
+    """What users call, with the model known, against operations of JAX alone."""
+    model = random_tree(5, list(KINDS))
+    q, v, a, tau, wrenches = (x[0] for x in random_states(model, 1, 7))
+
+    def everything(q, v, a, tau, wrenches):
+        return {
+            "M": jd.mass_matrix(model, q),
+            "C": jd.coriolis_matrix(model, q, v),
+            "N": jd.gravity_force(model, q),
+            "h": jd.bias_force(model, q, v),
+            "tau": jd.inverse_dynamics(model, q, v, a, external=wrenches),
+            "a": jd.forward_dynamics(model, q, v, tau, external=wrenches),
+            "J^T f": jd.generalized_force(model, q, wrenches),
+            "T": jd.kinetic_energy(model, q, v),
+            "V": jd.potential_energy(model, q),
+            "c": jd.center_of_mass(model, q),
+            "momentum": jd.centroidal_momentum(model, q, v),
+            "A": jd.centroidal_momentum_matrix(model, q),
+            "Y": jd.torque_regressor(model, q, v, a),
+            "W W^T": jd.mass_matrix_sqrt(model, q) @ jd.mass_matrix_sqrt(model, q).T,
+            "poses": jd.forward_kinematics(model, q),
+        }
+
+    found = quick(everything)(q, v, a, tau, wrenches)
+    with jd.compilation("plain"):
+        wanted = quick(lambda *x: everything(*x))(q, v, a, tau, wrenches)
+    for name, value in wanted.items():
+        for x, y in zip(jax.tree.leaves(found[name]), jax.tree.leaves(value), strict=True):
+            assert_close(x, y, 1e-10, name)
+    assert_close(found["W W^T"], wanted["M"], 1e-11)
+
+
+def test_known_zeros_are_left_out():
+    """A robot whose numbers are known while tracing costs fewer operations than the same robot as an argument."""
+    _, model, _ = load_robot("panda_description/urdf/panda.urdf", lock=("finger",))
+    states = [jnp.zeros(7)] * 3
+    known, given = program_of(partial(jd.rnea, model), *states).cost, program_of(jd.rnea, model, *states).cost
+    assert known < 0.6 * given, (known, given)
+
+
+def test_operations_grow_with_the_number_of_bodies():
+    """Linearly for the recursions, of known and of given models."""
+    for given in (False, True):
+        costs = []
+        for n in (4, 8, 16):
+            model = random_tree(6, ["revolute"] * n, parents=list(range(-1, n - 1)), armature=False)
+            states = [jnp.zeros(n)] * 3
+            made = program_of(jd.aba, model, *states) if given else program_of(partial(jd.aba, model), *states)
+            costs.append(made.cost)
+        assert costs[2] - costs[1] < 2.1 * (costs[1] - costs[0]), costs
+
+
+def test_derivatives_of_forward_dynamics():
+    """Every argument and leaf, order 2, against the matrix form and finite differences."""
+    model = random_tree(9, ["spherical", "helical"])
+    q, v, _, tau, _ = random_states(model, 4, 3)
+    leaves = eqx.filter(model, eqx.is_array)
+
+    def loss(leaves, q, v, tau):
+        return jnp.sum(jnp.sin(jd.forward_dynamics(eqx.combine(leaves, model), q, v, tau)))
+
+    def gradients(loss):
+        return quick(jax.vmap(jax.grad(loss, (0, 1, 2, 3)), (None, 0, 0, 0)))(leaves, q, v, tau)
+
+    batch = gradients(loss)
+    with jd.compilation("plain"):
+        plain = gradients(lambda *x: loss(*x))
+    for name, one, other in zip(itertools.count(), jax.tree.leaves(batch), jax.tree.leaves(plain), strict=False):
+        assert_close(one, other, 1e-9, f"leaf {name}")
+    # Along a line through (q, v, tau): first and second derivative against five-point differences.
+    rng = np.random.default_rng(1)
+    step = [jnp.asarray(rng.normal(size=x.shape[1:])) for x in (q, v, tau)]
+    h = 2e-4
+
+    def along(s):
+        return loss(leaves, q[0] + s * step[0], v[0] + s * step[1], tau[0] + s * step[2])
+
+    def line(s):
+        return along(s), jax.grad(along)(s), jax.jvp(jax.grad(along), (s,), (jnp.ones(()),))[1]
+
+    value, first, second = map(np.asarray, quick(jax.vmap(line))(h * jnp.arange(-2.0, 3.0)))
+    stencil = np.array([1, -8, 0, 8, -1]) / (12 * h)
+    # Differences of numbers near 1 over steps of 2e-4 keep eleven digits, and leave h^4 times a fifth derivative.
+    assert_close(first[2], stencil @ value, 1e-8)
+    assert_close(second[2], stencil @ first, 1e-8)
+
+
+def test_the_change_of_an_acceleration_is_that_of_its_numbers():
+    """The rule by a second sweep of the recursions against forward and reverse mode of the matrix form."""
+    model = random_tree(7, ["free", "revolute", "prismatic"])
+    q, v, tau = (x[0] for x in random_states(model, 1, seed=3)[:3])
+    wanted = quick(jax.jacfwd(partial(matrix_form.forward_dynamics, model), (0, 1, 2)))(q, v, tau)
+    inside = quick(jax.jacfwd(partial(recursions.aba, model), (0, 1, 2)))(q, v, tau)
+    for way in (jax.jacfwd, jax.jacrev):
+        found = jax.jit(way(partial(jd.forward_dynamics, model), (0, 1, 2)))(q, v, tau)
+        for x, y, z in zip(found, wanted, inside, strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-10 * float(jnp.abs(y).max()), rtol=0)
+            np.testing.assert_allclose(x, z, atol=1e-10 * float(jnp.abs(z).max()), rtol=0)

@@ -1,0 +1,117 @@
+"""What only some samples of a batch need: flags of the whole batch, samples that are computed again, and their derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close
+
+from jaxdyn import compile as backend
+from jaxdyn.repair import any_in_batch, is_rank_safe, recompute_unless, repair_flagged
+
+
+def test_a_flag_of_any_sample_is_one_of_the_batch():
+    def pick(x):
+        return jax.lax.cond(any_in_batch(x > 2.5), lambda: x + 10, lambda: x)
+
+    grid = jnp.arange(4.0).reshape(2, 2)
+    assert jax.vmap(jax.vmap(pick))(grid).tolist() == [[10, 11], [12, 13]]
+    assert jax.jit(jax.vmap(pick))(grid[0]).tolist() == [0, 1]
+    assert jax.vmap(jax.grad(pick))(grid[1]).tolist() == [1, 1]
+    assert pick(jnp.asarray(3.0)) == 13 and pick(jnp.asarray(1.0)) == 1
+    assert "select" not in str(jax.make_jaxpr(jax.vmap(pick))(grid[0]))
+
+
+def test_samples_that_are_not_served_are_computed_again():
+    """Only those, traced as rank-safe, with the dtypes of what is there; nothing is in the program where all are served."""
+    calls, safe = [], []
+
+    def again(x):
+        safe.append(is_rank_safe())
+        jax.debug.callback(lambda: calls.append(1))
+        return {"matrix": jnp.full((2, 2), -x), "n": 7}
+
+    def one(x, served):
+        return recompute_unless(served, again, {"matrix": jnp.full((2, 2), x), "n": jnp.asarray(3)}, (x,))
+
+    x = 1 + jnp.arange(3.0)
+    for flags in ([False] * 3, [False, True, False]):
+        calls.clear()
+        found = jax.jit(jax.vmap(one))(x, ~jnp.asarray(flags))
+        jax.effects_barrier()
+        sign = jnp.where(jnp.asarray(flags), -1.0, 1.0)
+        np.testing.assert_array_equal(found["matrix"], np.broadcast_to((sign * x)[:, None, None], (3, 2, 2)))
+        assert found["n"].tolist() == [7 if flag else 3 for flag in flags] and bool(calls) == any(flags)
+        assert found["n"].dtype == jnp.asarray(3).dtype
+    assert safe and all(safe) and not is_rank_safe()
+    assert "callback" not in str(jax.make_jaxpr(lambda x: one(x, True))(1.0))
+    alone = jax.jit(one)
+    assert alone(2.0, False)["matrix"][0, 0] == -2 and alone(2.0, True)["matrix"][0, 0] == 2
+
+
+def _root(x, scale):
+    """sqrt(scale x) that is computed another way where x is below 1."""
+    found = jnp.sqrt(scale * x), (jnp.asarray(0, jnp.int32),)
+
+    def careful(x, scale):
+        return jnp.exp(0.5 * jnp.log(scale * x)), (jnp.asarray(1, jnp.int32),)
+
+    return repair_flagged(x < 1, careful, lambda x, scale: jnp.sqrt(scale * x), found, (x, scale))
+
+
+@pytest.mark.parametrize("nested", [False, True])
+@pytest.mark.parametrize("few", [0, 1, 50, 96])
+def test_samples_that_need_it_are_repaired(nested, few):
+    """None, one, more than are computed at once, and all; values, which way, and derivatives in both directions."""
+    x = jnp.where(jnp.arange(96) % 96 < few, 0.5, 2.0) + jnp.arange(96) / 1000
+    shape = (8, 12) if nested else (96,)
+    run = jax.vmap(_root, (0, None))
+    scales = jnp.asarray(3.0)
+    if nested:
+        run = jax.vmap(jax.vmap(_root, (0, None)), (0, 0))
+        scales = jnp.arange(1.0, 9.0)
+    y, (way,) = jax.jit(run)(x.reshape(shape), scales)
+    want = np.sqrt(np.asarray(x).reshape(shape) * (np.asarray(scales)[:, None] if nested else 3.0))
+    assert_close(y, want, 1e-14)
+    assert way.reshape(-1).tolist() == [1] * few + [0] * (96 - few)
+    slope = jax.grad(lambda x: jnp.sum(run(x, scales)[0]))(x.reshape(shape))
+    moved = jax.jvp(lambda s: run(x.reshape(shape), s)[0], (scales,), (jnp.ones_like(scales),))[1]
+    assert_close(slope, want / (2 * np.asarray(x).reshape(shape)), 1e-13)
+    assert_close(moved, want / (2 * (np.asarray(scales)[:, None] if nested else 3.0)), 1e-13)
+
+
+def test_one_sample_is_repaired():
+    for run in (_root, jax.jit(_root)):
+        for x, way in ((0.25, 1), (4.0, 0)):
+            y, (found,) = run(jnp.asarray(x), jnp.asarray(1.0))
+            assert found == way
+            assert_close(y, np.sqrt(x), 1e-15)
+
+
+def test_arguments_of_both_batches_of_one_and_of_none():
+    rng = np.random.default_rng(3)
+    x, y, z, w = (jnp.asarray(rng.normal(size=shape)) for shape in ((3, 4, 2), (3,), (4, 2), (2,)))
+
+    def plain(x, rest):
+        y, z, w = rest
+        return {"a": y * jnp.sin(x) @ w, "b": z + w}
+
+    def repaired(x, rest):
+        wrong = jax.tree.map(jnp.zeros_like, plain(x, rest))
+        return repair_flagged(jnp.asarray(True), lambda *a: (plain(*a), ()), plain, (wrong, ()), (x, rest))[0]
+
+    def nested(function):
+        return jax.vmap(jax.vmap(function, (0, (None, 0, None))), (0, (0, None, None)))
+
+    found, want = jax.jit(nested(repaired))(x, (y, z, w)), nested(plain)(x, (y, z, w))
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+        assert_close(one, other, 1e-15)
+    single = x[0, 0], (y[0], z[0], w)
+    for one, other in zip(jax.tree.leaves(repaired(*single)), jax.tree.leaves(plain(*single)), strict=True):
+        assert_close(one, other, 1e-15)
+
+
+def test_in_a_program_of_numbers_flagged_samples_are_no_numbers():
+    found, (way,) = jax.jit(jax.vmap(lambda x: backend.run(lambda _, x: _root(x, 1.0), (), x)))(jnp.array([0.25, 4.0]))
+    np.testing.assert_array_equal(found, [np.nan, 2.0])
+    assert way.tolist() == [0, 0]
