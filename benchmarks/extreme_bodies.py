@@ -8,7 +8,10 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.extremes import Outcome, Study, as_dtype, case, outcome, study, table
-from jaxdyn import constrained, looped, matrix_form, recursions
+from jaxdyn.constraints import dynamics as constrained
+from jaxdyn.dynamics import recursions
+from jaxdyn.dynamics import scans as looped
+from jaxdyn.dynamics import world_frame as matrix_form
 
 FORMS = (matrix_form.forward_dynamics, recursions.aba, looped.forward_dynamics)
 

@@ -7,8 +7,8 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.extremes import FIXED, Outcome, as_dtype, case, outcome, study, table
-from jaxdyn import constrained
-from jaxdyn.report import references
+from jaxdyn.constraints import dynamics as constrained
+from jaxdyn.reports import references
 
 LOOSE = {"float64": 1e-6, "float32": 2e-3}
 # Windows, method, fixed step and tolerance.

@@ -20,7 +20,7 @@ import numpy as np
 import jaxdyn as jd
 from benchmarks import timing
 from benchmarks.operations import operations
-from jaxdyn.projection import project_state
+from jaxdyn.constraints.projection import project_state
 
 STEP = 0.005  # s
 ALL = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")

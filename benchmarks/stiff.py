@@ -20,7 +20,7 @@ import numpy as np
 import jaxdyn as jd
 from benchmarks.extremes import name_of
 from benchmarks.timing import chosen_names
-from jaxdyn.report.references import car_axis
+from jaxdyn.reports.references import car_axis
 
 SOLVERS: dict[str, Any] = {
     "Dopri8": diffrax.Dopri8(),

@@ -4,8 +4,8 @@ import json
 import time
 from pathlib import Path
 
-from jaxdyn.report import timing
-from jaxdyn.report.timing import interleaved as interleaved
+from jaxdyn.reports import timing
+from jaxdyn.reports.timing import interleaved as interleaved
 
 OUT = Path(__file__).resolve().parent.parent / "out"
 

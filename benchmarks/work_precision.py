@@ -18,10 +18,10 @@ from pathlib import Path
 import jax
 
 from benchmarks import peers, timing
-from jaxdyn._table import table
-from jaxdyn.report import Record, Report, beaten_by, report
-from jaxdyn.report.front import TARGETS, cost_at
-from jaxdyn.report.page import figure
+from jaxdyn.model.text_table import table
+from jaxdyn.reports import Record, Report, beaten_by, report
+from jaxdyn.reports.front import TARGETS, cost_at
+from jaxdyn.reports.page import figure
 
 SCENES = ("andrews", "car_axis", "windows_40", "free_body", "rolling_disk")
 

@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.constrained import constrained_dynamics
 from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.systems import velocity_to_rate
+from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.systems.system import velocity_to_rate
 
 
 def admissible(scene, q, chosen, values):

@@ -7,7 +7,7 @@ elsewhere. The order of joints differs.
 import mujoco
 import numpy as np
 
-from jaxdyn.model import Model
+from jaxdyn.model.tree import Model
 
 SIZES = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # free, ball, slide, hinge
 

@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from jaxdyn.joints import KINDS, SCREW_KINDS
-from jaxdyn.model import Model, Topology
+from jaxdyn.model.joints import KINDS, SCREW_KINDS
+from jaxdyn.model.tree import Model, Topology
 
 ROBOTS = os.path.join(os.path.dirname(pin.__file__), "../../../../share/example-robot-data/robots")
 

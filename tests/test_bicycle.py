@@ -21,8 +21,8 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from jaxdyn import scenes
-from jaxdyn.dynamics import mass_matrix
-from jaxdyn.simulate import simulate
+from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.simulation.run import simulate
 
 ROLL, REAR, STEER = 3, 6, 7  # places in v
 GRAVITY, RADIUS = 9.81, 0.3

@@ -8,9 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxdyn import inertia, joints, kinematics, robots
-from jaxdyn import model as mdl
-from jaxdyn.building import ModelBuilder, inertia_report, repair_inertias
+from jaxdyn import inertia, robots
+from jaxdyn.dynamics import kinematics
+from jaxdyn.model import joints
+from jaxdyn.model import tree as mdl
+from jaxdyn.model.builder import ModelBuilder, inertia_report, repair_inertias
 from tests.pinocchio_bridge import quick, to_pinocchio
 
 BALL = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))

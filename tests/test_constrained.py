@@ -10,9 +10,10 @@ from pinocchio_bridge import assert_close, quick, random_tree, to_pinocchio
 
 import jaxdyn as jd
 from jaxdyn import scenes
-from jaxdyn._rank import pseudo_inverse
-from jaxdyn.assembly import assemble, residuals
-from jaxdyn.constrained import (
+from jaxdyn.constraints import Holonomic, Pfaffian, lock_joint, loop, rolling_wheel
+from jaxdyn.constraints.assembly import assemble, residuals
+from jaxdyn.constraints.base import layout, rows
+from jaxdyn.constraints.dynamics import (
     RESULTS,
     constrained_dynamics,
     constraint_forces,
@@ -20,13 +21,12 @@ from jaxdyn.constrained import (
     projections,
     second_fundamental_form,
 )
-from jaxdyn.constraints import Holonomic, Pfaffian, lock_joint, loop, rolling_wheel
-from jaxdyn.constraints.base import layout, rows
-from jaxdyn.dynamics import bias_force, coriolis_matrix, gravity_force, mass_matrix
-from jaxdyn.kinematics import forward_kinematics
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.model import difference, integrate
-from jaxdyn.scene import Scene
+from jaxdyn.constraints.rank import pseudo_inverse
+from jaxdyn.dynamics.kinematics import forward_kinematics
+from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, gravity_force, mass_matrix
+from jaxdyn.model.tree import difference, integrate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
 
 KINDS = ("free", "revolute", "spherical", "prismatic", "revolute", "helical", "revolute")
 
@@ -489,7 +489,7 @@ def test_a_batch_of_mechanisms_of_different_lengths():
 
 def test_a_wheel_built_from_bodies_moves_as_the_disk_in_coordinates():
     """Planar joint and axle with `rolling_wheel` against the Lagrangian of Murray, Li & Sastry."""
-    from jaxdyn.building import ModelBuilder
+    from jaxdyn.model.builder import ModelBuilder
 
     mass, rho, steer, roll = 2.0, 0.5, 0.125, 0.25
     builder = ModelBuilder("disk", gravity=None)

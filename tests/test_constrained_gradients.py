@@ -12,11 +12,11 @@ from jaxtyping import Array
 from pinocchio_bridge import assert_close, quick
 
 from jaxdyn import scenes
-from jaxdyn.constrained_motion import Reduced
 from jaxdyn.constraints import Holonomic
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import simulate
+from jaxdyn.simulation.methods import Reduced
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
 
 TS = jnp.asarray([0.0, 0.3])
 METHODS = {"projected": "projected", "multipliers": "multipliers", "reduced": "reduced", "crank": Reduced((0,))}

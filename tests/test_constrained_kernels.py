@@ -8,15 +8,16 @@ from pinocchio_bridge import assert_close, quick, random_states, random_tree
 
 import jaxdyn as jd
 from jaxdyn import scenes, se3
-from jaxdyn.assembly import residuals
-from jaxdyn.constrained import constrained_dynamics, solve_rows
-from jaxdyn.constrained_motion import consistent
 from jaxdyn.constraints import loop
+from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.base import rows
-from jaxdyn.dynamics import bias_force, mass_matrix
-from jaxdyn.model import integrate
-from jaxdyn.projection import project_state
-from jaxdyn.scene import Scene
+from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
+from jaxdyn.constraints.projection import project_state
+from jaxdyn.dynamics.quantities import bias_force, mass_matrix
+from jaxdyn.model.tree import integrate
+from jaxdyn.simulation.methods import consistent
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import retract
 
 POSE = ((0.1, -0.2, 0.3), (0.5, 0.2, -0.4))
 OTHER = ((-0.3, 0.1, 0.2), (-0.2, 0.7, 0.3))
@@ -226,7 +227,7 @@ def test_systems_of_equations(name):
     """Accelerations, multipliers and derivatives, also off the constraints."""
     scene, q, v = at_start(name)
     tau, t = 0.3 * jnp.cos(jnp.arange(float(scene.nv))), jnp.asarray(0.2)
-    q = jd.systems.retract(scene.system, q + 1e-3 * jnp.sin(jnp.arange(float(scene.nq)) + 1))
+    q = retract(scene.system, q + 1e-3 * jnp.sin(jnp.arange(float(scene.nq)) + 1))
     along = jnp.sin(jnp.arange(float(scene.nv)) + 0.5)
 
     def dynamics(tau):

@@ -13,9 +13,9 @@ from scipy.integrate import solve_ivp
 
 from jaxdyn import scenes
 from jaxdyn.constraints import Holonomic, lock_joint
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import RESULTS, simulate
+from jaxdyn.simulation.run import RESULTS, simulate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 

@@ -7,7 +7,6 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 
 from jaxdyn import inertia, se3
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import (
     Holonomic,
     Pfaffian,
@@ -21,9 +20,10 @@ from jaxdyn.constraints import (
     rolling_wheel,
 )
 from jaxdyn.constraints.base import constraint_jacobian, layout, position_residual, rows, velocity_residual
-from jaxdyn.kinematics import forward_kinematics
-from jaxdyn.model import configuration_rate, difference, integrate
-from jaxdyn.scene import Scene
+from jaxdyn.dynamics.kinematics import forward_kinematics
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.tree import configuration_rate, difference, integrate
+from jaxdyn.systems.scene import Scene
 
 # Twists (v, omega) that each joint leaves free, in frame B.
 FREE = {

@@ -7,8 +7,8 @@ import numpy as np
 import optimistix
 import pytest
 
-from jaxdyn.solvers import differentiable
-from jaxdyn.solvers.first_step import Adaptive
+from jaxdyn.simulation.solvers import differentiable
+from jaxdyn.simulation.solvers.first_step import Adaptive
 
 TS = np.linspace(0.0, 6.0, 5)
 

@@ -7,12 +7,12 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 
 from jaxdyn import scenes
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import Holonomic, Pfaffian
-from jaxdyn.distributions import involutive, spurious_terms
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.reduced import reduced_dynamics
-from jaxdyn.scene import Scene
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.reduction.integrability import involutive, spurious_terms
+from jaxdyn.reduction.minimal import reduced_dynamics
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
 
 
 def free(count):

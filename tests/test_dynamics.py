@@ -21,9 +21,12 @@ from pinocchio_bridge import (
 )
 from scipy.spatial.transform import Rotation
 
-from jaxdyn import dynamics, kinematics, matrix_form, se3
-from jaxdyn.inertia import transform_inertia
-from jaxdyn.model import configuration_rate
+from jaxdyn import se3
+from jaxdyn.dynamics import kinematics
+from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.model.inertia import transform_inertia
+from jaxdyn.model.tree import configuration_rate
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 TREES = {

@@ -9,10 +9,10 @@ import pytest
 import jaxdyn as jd
 from jaxdyn import scenes
 from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.report.cases import cases
-from jaxdyn.scene import Scene
-from jaxdyn.solvers import driver
-from jaxdyn.solvers.explicit import ExplicitSteps
+from jaxdyn.reports.cases import cases
+from jaxdyn.simulation.solvers import driver
+from jaxdyn.simulation.solvers.explicit import ExplicitSteps
+from jaxdyn.systems.scene import Scene
 
 
 def field(t, y, args):
@@ -157,9 +157,11 @@ def test_motions_are_those_without_kernels(name, options):
         run, args = motion(name, **options)
         wanted = jax.jit(run)(*args)
     assert bool(found.success) and bool(wanted.success)
+    # Rounding may decide about a step; two runs at a tolerance of 1e-9 differ by less than ten times that, and those of Andrews'
+    # mechanism, which turns at 1000 rad/s, by less than a hundred times.
+    bound = 1e-7 if name == "andrews" else 1e-8
     for x, y in ((found.q, wanted.q), (found.v, wanted.v)):
-        # Rounding may decide about a step; two runs at a tolerance of 1e-9 differ by less than ten times that.
-        np.testing.assert_allclose(x, y, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(x, y, rtol=bound, atol=bound)
     for key in options.get("outputs", ()):
         np.testing.assert_allclose(getattr(found, key), getattr(wanted, key), rtol=1e-6, atol=1e-6)
 
@@ -202,10 +204,10 @@ def test_derivatives_of_a_constrained_motion():
 
 
 def test_long_chains_that_are_built_in_a_program():
-    q = 0.3 * jnp.cos(jnp.arange(100))
+    q = 0.3 * jnp.cos(jnp.arange(130))
 
     def energies(speed):
-        chain = jd.robots.chain(100)
+        chain = jd.robots.chain(130)
         ts = jnp.asarray([0.0, 0.02])
         found = jd.simulate(chain, q, speed * jnp.sin(q), ts, stepsize=0.001, outputs=("energy",))
         return found.energy, found.q[-1]

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree
 
-from jaxdyn import inertia, looped, matrix_form, recursions, scenes
-from jaxdyn.building import ModelBuilder
-from jaxdyn.constrained import RESULTS, constrained_dynamics
+from jaxdyn import inertia, scenes
 from jaxdyn.constraints import Holonomic
-from jaxdyn.model import Model
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import simulate
-from jaxdyn.systems import ExplicitSystem
+from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
+from jaxdyn.dynamics import recursions
+from jaxdyn.dynamics import scans as looped
+from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.tree import Model
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import ExplicitSystem
 
 FORMS = {"matrices": matrix_form.forward_dynamics, "recursion": recursions.aba, "loops": looped.forward_dynamics}
 

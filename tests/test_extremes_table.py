@@ -10,8 +10,8 @@ import pytest
 from benchmarks import extremes
 from benchmarks.extreme_motions import SOLVERS, run_oscillator, stability_limits
 from jaxdyn import robots, scenes
-from jaxdyn.report import references
-from jaxdyn.simulate import simulate
+from jaxdyn.reports import references
+from jaxdyn.simulation.run import simulate
 
 CASES = extremes.load()
 BOTH, ONE = ("float64", "float32"), ("float64",)

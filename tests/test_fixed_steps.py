@@ -8,7 +8,7 @@ import pytest
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
-from jaxdyn.solution import RESULTS
+from jaxdyn.simulation.solution import RESULTS
 
 SOLVERS = {"RK4": None, "Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8(), "Rodas5P": jd.Rodas5P()}
 

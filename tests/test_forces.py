@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from pinocchio_bridge import quick
 
-from jaxdyn.building import ModelBuilder
-from jaxdyn.dynamics import generalized_force
-from jaxdyn.forces import CoulombFriction, Drive, ExternalWrench, JointDamping, JointSpring
-from jaxdyn.kinematics import forward_kinematics, frame_pose
-from jaxdyn.model import difference, integrate, neutral
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import simulate
+from jaxdyn.dynamics.kinematics import forward_kinematics, frame_pose
+from jaxdyn.dynamics.quantities import generalized_force
+from jaxdyn.forces.elements import CoulombFriction, Drive, ExternalWrench, JointDamping, JointSpring
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.tree import difference, integrate, neutral
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.scene import Scene
 
 MASS = {"coast": 2.0, "drive": 1.5, "dry": 0.8, "pull": 3.0, "ring": 1.2, "shake": 0.7}
 BALL = 0.35  # principal moment of the ball

@@ -7,13 +7,13 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 
 from jaxdyn import scenes
-from jaxdyn.constrained import RESULTS, constrained_dynamics, projections
 from jaxdyn.constraints import Pfaffian
 from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.dynamics import mass_matrix
-from jaxdyn.gauge import gauge_invariant
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
+from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics, projections
+from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.reduction.gauge_invariant import gauge_invariant
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
 
 
 def turned(n, seed=0):

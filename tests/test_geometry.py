@@ -8,18 +8,19 @@ import pytest
 from jax.tree_util import Partial
 from pinocchio_bridge import assert_close, quick
 
-from jaxdyn import dynamics, geometry
-from jaxdyn.building import ModelBuilder
-from jaxdyn.constrained import constrained_dynamics
+from jaxdyn import geometry
 from jaxdyn.constraints import Holonomic
 from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.forces import JointDamping
-from jaxdyn.immersion import constrain_by_immersion, pull_back, reaction_force
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.model import configuration_rate
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import simulate
-from jaxdyn.systems import MetricSystem
+from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.forces.elements import JointDamping
+from jaxdyn.geometry.immersion import constrain_by_immersion, pull_back, reaction_force
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.tree import configuration_rate
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import MetricSystem
 
 STATES = np.random.default_rng(4).normal(size=(4, 20, 3))
 

@@ -12,17 +12,17 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaxdyn import inertia, scenes
-from jaxdyn.building import ModelBuilder
-from jaxdyn.constrained import RESULTS, constrained_dynamics
-from jaxdyn.constrained_motion import Reduced
 from jaxdyn.constraints import Pfaffian, rolling_sphere
 from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.distributions import involutive
-from jaxdyn.dynamics import kinetic_energy, mass_matrix, potential_energy
+from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
+from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
+from jaxdyn.dynamics.quantities import kinetic_energy, mass_matrix, potential_energy
 from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian, internal_forces, object_dynamics, wrench_basis
-from jaxdyn.kinematics import body_jacobian, frame_pose
-from jaxdyn.model import configuration_rate, integrate
-from jaxdyn.simulate import simulate
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.tree import configuration_rate, integrate
+from jaxdyn.reduction.integrability import involutive
+from jaxdyn.simulation.methods import Reduced
+from jaxdyn.simulation.run import simulate
 
 NAMES = ("hand_with_bar", "hand_with_disk", "hand_with_ball", "hand_rolling_ball")
 SPATIAL = NAMES[2:]

@@ -12,7 +12,8 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from jaxdyn import _series, se2, se3, so3
+from jaxdyn import se2, se3, so3
+from jaxdyn.lie import series as _series
 
 GROUPS = {"so3": so3, "se3": se3, "se2": se2}
 DIM = {"so3": 3, "se3": 6, "se2": 3}

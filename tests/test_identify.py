@@ -12,12 +12,12 @@ from jax.flatten_util import ravel_pytree
 from pinocchio_bridge import to_pinocchio
 
 from jaxdyn import identify, inertia, robots
-from jaxdyn.building import ModelBuilder
 from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.feasible import Problem, torque_loss
 from jaxdyn.identify.regression import condense
 from jaxdyn.io.urdf import load_urdf
-from jaxdyn.simulate import simulate
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.simulation.run import simulate
 
 PI = np.pi
 pseudo_inertias = jax.jit(jax.vmap(inertia.pseudo_inertia))

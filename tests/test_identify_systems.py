@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 
-from jaxdyn import dynamics, identify, scenes
-from jaxdyn.building import ModelBuilder
-from jaxdyn.forces import JointDamping
+from jaxdyn import identify, scenes
+from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.forces.elements import JointDamping
 from jaxdyn.identify.chart import check_bodies
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import simulate
-from jaxdyn.systems import ExplicitSystem, MetricSystem
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import ExplicitSystem, MetricSystem
 
 G = 9.81
 TRUE = dict(masses=(1.3, 0.7), length=1.1, reaches=(0.45, 0.4), moments=(0.09, 0.03))

@@ -11,8 +11,8 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.cli.common import output_path
-from jaxdyn.constrained import constraint_forces
-from jaxdyn.solution import from_diffrax
+from jaxdyn.constraints.dynamics import constraint_forces
+from jaxdyn.simulation.solution import from_diffrax
 
 ARM = jd.robots.chain(2)
 BODY = ARM.body_names[-1]

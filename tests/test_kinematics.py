@@ -20,9 +20,10 @@ from pinocchio_bridge import (
 )
 from scipy.linalg import expm
 
-from jaxdyn import kinematics, se3
+from jaxdyn import se3
 from jaxdyn.compile import compilation
-from jaxdyn.model import configuration_rate
+from jaxdyn.dynamics import kinematics
+from jaxdyn.model.tree import configuration_rate
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 CASES = {

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
-from jaxdyn import dynamics, geometry, scenes, se3
-from jaxdyn.building import ModelBuilder
+from jaxdyn import geometry, scenes, se3
 from jaxdyn.compile import compilation
-from jaxdyn.constrained import constrained_dynamics
-from jaxdyn.forces import JointDamping
-from jaxdyn.immersion import constrain_by_immersion, reaction_force
-from jaxdyn.kinematics import body_jacobian, frame_pose, spatial_jacobian
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import simulate
-from jaxdyn.so3 import hat
+from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, spatial_jacobian
+from jaxdyn.forces.elements import JointDamping
+from jaxdyn.geometry.immersion import constrain_by_immersion, reaction_force
+from jaxdyn.lie.so3 import hat
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
 
 G = 9.81
 STATES = np.random.default_rng(8).normal(size=(3, 20, 4))
@@ -410,6 +411,18 @@ def test_block_slides_until_it_stops():
     assert_close(found.q[-1], [2.0**2 / (2 * 0.3 * G)], 1e-13)  # the method is exact for a parabola
     assert_close(found.v[-1], [0.0], 1e-13)
     assert_close(scenes.sliding_block(mass=1.7, direction=-1).applied_force(q0, -v0), [0.3 * 1.7 * G], 1e-15)
+
+
+def test_a_block_that_has_stopped_gains_no_energy():
+    """Past its stop adaptive steps end with a code, and fixed ones stay at rest to the change of a step."""
+    stop, h = 2.0 / (0.3 * G), 1e-3
+    scene, (q0, v0) = scenes.sliding_block(), scenes.sliding_block.start(velocity=2.0)
+    ts = jnp.asarray([0.0, 3 * stop])
+    found = simulate(scene, q0, v0, ts, throw=False, max_steps=500)
+    assert not bool(found.success) and abs(float(found.stats["time_reached"]) - stop) < 1e-3
+    found = simulate(scene, q0, v0, ts, stepsize=h, throw=False)
+    assert abs(float(found.v[-1, 0])) < 0.3 * G * h and abs(float(found.q[-1, 0]) - 4 / (0.6 * G)) < 2 * h
+    assert_close(scene.applied_force(q0, -v0), [0.3 * G], 1e-15)
 
 
 def test_trajectories_are_differentiated_by_parameters_of_the_lagrangian():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jaxdyn import identify
-from jaxdyn.building import ModelBuilder
 from jaxdyn.identify.logs import check_log
 from jaxdyn.io.logs import read_log, write_log
+from jaxdyn.model.builder import ModelBuilder
 
 N = 60
 

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, load_robot, make_model, quick, random_states, random_tree
 
-from jaxdyn import dynamics, kinematics, matrix_form
-from jaxdyn.link_form import newton_euler_matrices
-from jaxdyn.model import configuration_rate
+from jaxdyn.dynamics import kinematics
+from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.dynamics.link_frame import newton_euler_matrices
+from jaxdyn.model.tree import configuration_rate
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 CASES = {

@@ -9,13 +9,14 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
-from jaxdyn import projection, scenes
-from jaxdyn.assembly import residuals
+from jaxdyn import scenes
+from jaxdyn.constraints import projection
+from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
-from jaxdyn.dynamics import mass_matrix
-from jaxdyn.projection import project_state, project_step
-from jaxdyn.scene import Scene
-from jaxdyn.systems import displace
+from jaxdyn.constraints.projection import project_state, project_step
+from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displace
 
 DRIFTS = (0.0, 1e-12, 1e-9, 1e-6, 1e-4)
 

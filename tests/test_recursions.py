@@ -14,9 +14,11 @@ from jax.extend.core import Literal
 from pinocchio_bridge import as_dtype, assert_close, quick, random_states, random_tree, to_pinocchio
 
 import jaxdyn
-from jaxdyn import matrix_form, neutral, recursions
-from jaxdyn.joints import KINDS
-from jaxdyn.recursions import frames, inertias, links, transforms
+from jaxdyn import neutral
+from jaxdyn.dynamics import recursions
+from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.dynamics.recursions import frames, inertias, links, transforms
+from jaxdyn.model.joints import KINDS
 
 # Every kind, as a root, inside the tree and at its end; with and without armature.
 TREES = {
@@ -338,15 +340,16 @@ def test_congruence_by_twice_the_angle():
 def test_imports():
     """The package knows the model and the Lie groups, not what it is checked against."""
     allowed = (
-        "jaxdyn.recursions",
+        "jaxdyn.dynamics.recursions",
         "jaxdyn.compile",
-        "jaxdyn.joints",
-        "jaxdyn.model",
-        "jaxdyn.so3",
-        "jaxdyn.se3",
-        "jaxdyn.se2",
+        "jaxdyn.model.arguments",
+        "jaxdyn.model.joints",
+        "jaxdyn.model.tree",
+        "jaxdyn.lie.so3",
+        "jaxdyn.lie.se3",
+        "jaxdyn.lie.se2",
     )
-    for file in (Path(jaxdyn.__file__).parent / "recursions").glob("*.py"):
+    for file in (Path(jaxdyn.__file__).parent / "dynamics" / "recursions").glob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("jaxdyn"):
                 assert node.module.startswith(allowed), (file.name, node.module)

@@ -11,8 +11,9 @@ import pytest
 from pinocchio_bridge import as_dtype, assert_close, load_robot, quick, random_states, random_tree
 
 import jaxdyn as jd
-from jaxdyn import matrix_form, recursions
-from jaxdyn.joints import KINDS
+from jaxdyn.dynamics import recursions
+from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.model.joints import KINDS
 
 
 def program_of(function, *args):

@@ -10,16 +10,16 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 
 from jaxdyn import scenes
-from jaxdyn.constrained import RESULTS, constrained_dynamics
-from jaxdyn.constrained_motion import Baumgarte, Reduced
 from jaxdyn.constraints import Pfaffian
-from jaxdyn.kinematics import forward_kinematics
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.model import configuration_rate
-from jaxdyn.reduced import as_basis, independent_velocities, reduced_dynamics, tangent_basis
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import RESULTS as SIMULATION
-from jaxdyn.simulate import simulate
+from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
+from jaxdyn.dynamics.kinematics import forward_kinematics
+from jaxdyn.model.tree import configuration_rate
+from jaxdyn.reduction.minimal import as_basis, independent_velocities, reduced_dynamics, tangent_basis
+from jaxdyn.simulation.methods import Baumgarte, Reduced
+from jaxdyn.simulation.run import RESULTS as SIMULATION
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
 
 RHO = 0.5
 

@@ -13,14 +13,13 @@ from scipy.spatial.transform import Rotation
 
 import jaxdyn as jd
 from jaxdyn.cli import main
-from jaxdyn.constrained_motion import chosen_method
-from jaxdyn.report import Record, Report, beaten_by, cases, html_page, pareto_front, standings
-from jaxdyn.report import run as running
-from jaxdyn.report.front import cost_at
-from jaxdyn.report.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
-from jaxdyn.report.programs import FIXED, SOLVERS, Programs, prepare
-from jaxdyn.report.records import Known
-from jaxdyn.report.references import (
+from jaxdyn.reports import Record, Report, beaten_by, cases, html_page, pareto_front, standings
+from jaxdyn.reports import run as running
+from jaxdyn.reports.front import cost_at
+from jaxdyn.reports.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
+from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
+from jaxdyn.reports.records import Known
+from jaxdyn.reports.references import (
     car_axis,
     coin,
     free_top,
@@ -30,10 +29,11 @@ from jaxdyn.report.references import (
     sphere_pendulum,
     windows,
 )
-from jaxdyn.report.timing import interleaved
-from jaxdyn.scene import Scene
-from jaxdyn.solvers import RK4
-from jaxdyn.solvers.choice import checked_method
+from jaxdyn.reports.timing import interleaved
+from jaxdyn.simulation.methods import chosen_method
+from jaxdyn.simulation.solvers import RK4
+from jaxdyn.simulation.solvers.choice import checked_method
+from jaxdyn.systems.scene import Scene
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipk, ellipkinc
 
-from jaxdyn.building import ModelBuilder
-from jaxdyn.simulate import simulate
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.simulation.run import simulate
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
 # Initial angular velocity, period and angular velocity at 20 s (reference problem 4.1, all four rows).

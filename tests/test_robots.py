@@ -10,7 +10,7 @@ import pytest
 from pinocchio_bridge import ROBOTS, Bridge, assert_close, quick, random_states
 
 import jaxdyn as jd
-from jaxdyn import recursions
+from jaxdyn.dynamics import recursions
 
 FEW = {
     "panda.urdf": False,

@@ -9,14 +9,14 @@ from pinocchio_bridge import assert_close, quick
 from scipy.integrate import solve_ivp
 
 from jaxdyn import scenes
-from jaxdyn.assembly import assemble, residuals
-from jaxdyn.constrained import RESULTS, constrained_dynamics, projections
-from jaxdyn.constrained_motion import Projected
+from jaxdyn.constraints.assembly import assemble, residuals
 from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.dynamics import kinetic_energy, potential_energy
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.simulate import simulate
-from jaxdyn.systems import ExplicitSystem
+from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics, projections
+from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.simulation.methods import Projected
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.system import ExplicitSystem
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ from linearisation import admissible, motion_jacobian
 from pinocchio_bridge import assert_close, quick
 
 from jaxdyn import scenes, so3
-from jaxdyn.assembly import residuals
-from jaxdyn.constrained import constrained_dynamics
-from jaxdyn.simulate import simulate
+from jaxdyn.constraints.assembly import residuals
+from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.simulation.run import simulate
 
 
 def motion(scene, state, ts, stepsize):

@@ -11,8 +11,8 @@ from pinocchio_bridge import quick
 from scipy.linalg import expm
 
 import jaxdyn as jd
-from jaxdyn import _float64 as f64
 from jaxdyn.io import NotTakenWarning, UnitsWarning, load_sdf
+from jaxdyn.model import float64 as f64
 
 INERTIAL = """<inertial><pose>0.1 0.02 0.03 0.2 0.1 0.3</pose><mass>2</mass><inertia>
 <ixx>0.3</ixx><iyy>0.4</iyy><izz>0.5</izz><ixy>0.01</ixy><ixz>0.02</ixz><iyz>0.03</iyz></inertia></inertial>"""

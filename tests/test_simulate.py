@@ -14,15 +14,15 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaxdyn import scenes
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints.base import Holonomic
-from jaxdyn.dynamics import forward_dynamics, kinetic_energy, potential_energy
-from jaxdyn.forces import CoulombFriction, JointDamping, JointSpring
-from jaxdyn.kinematics import frame_pose
-from jaxdyn.model import integrate, neutral
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import RESULTS, simulate
-from jaxdyn.solvers import RK4, ExplicitSteps, LieGroup, ProjectedSolver
+from jaxdyn.dynamics.kinematics import frame_pose
+from jaxdyn.dynamics.quantities import forward_dynamics, kinetic_energy, potential_energy
+from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.tree import integrate, neutral
+from jaxdyn.simulation.run import RESULTS, simulate
+from jaxdyn.simulation.solvers import RK4, ExplicitSteps, LieGroup, ProjectedSolver
+from jaxdyn.systems.scene import Scene
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
 SYMMETRIC = np.array([0.4, 0.4, 0.2])
@@ -105,7 +105,7 @@ def test_projected_solver_steps_on_the_manifold_and_evaluates_the_first_stage_an
 def test_only_models_with_quaternions_are_retracted(pendulum, leg, monkeypatch):
     """Nothing to retract, nothing compiled."""
     wrapped = []
-    module = sys.modules["jaxdyn.simulate"]  # as an attribute of the package it is the function
+    module = sys.modules["jaxdyn.simulation.run"]  # as an attribute of the package it is the function
 
     def made(solver, project, *more, **fields):
         wrapped.extend([] if project is None else [project])

@@ -11,9 +11,9 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from benchmarks.extremes import name_of
 from benchmarks.stiff import SOLVERS, cases, program, reference, runner
-from jaxdyn.model import _per_joint
-from jaxdyn.solvers.lie import _local_rate
-from jaxdyn.solvers.rosenbrock import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P
+from jaxdyn.model.tree import _per_joint
+from jaxdyn.simulation.solvers.lie import _local_rate
+from jaxdyn.simulation.solvers.rosenbrock import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P
 
 
 def slider(mass=1.0):
@@ -235,9 +235,28 @@ def roots(mass, damping, spring):
 @pytest.mark.parametrize("damping", [0.0, 3.0, 4e3])
 def test_stiffness_is_that_of_the_linear_system(damping):
     scene = jd.Scene(slider(2.0), forces=(jd.JointSpring(200.0), jd.JointDamping(damping)))
-    np.testing.assert_allclose(jd.stiffness(scene, [0.3], [1.0]), roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(
+        jd.stiffness(scene, [0.3], [1.0])[:2], roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12
+    )
     found = jd.stiffness(jd.Scene(slider(2.0)), [0.0], [0.0], 0.0, lambda q, v, t: -200.0 * q - damping * v)
-    np.testing.assert_allclose(found, roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found[:2], roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("damping", [0.0, 20.0, 400.0, 2e4])
+def test_steps_above_the_explicit_one_are_unstable(damping):
+    """An oscillator of 1000 rad/s, undamped to overdamped, 1000 fixed steps of Dopri8 on both sides of the bound."""
+    scene = jd.Scene(slider(1.0), forces=(jd.JointSpring(1e6), jd.JointDamping(damping)))
+    longest = float(jd.stiffness(scene, [0.1], [0.0]).explicit_step)
+    assert 3.5 < longest * max(1e3, damping) < 5.5
+
+    def end(factor):
+        h = factor * longest
+        ts = jnp.asarray([0.0, 1000 * h])
+        return jd.simulate(scene, [0.1], [0.0], ts, solver=diffrax.Dopri8(), stepsize=h, throw=False)
+
+    within, beyond = end(0.97), end(1.15)
+    assert abs(float(within.q[-1, 0])) < 0.1 * np.exp(1000 * 1e-3)
+    assert not abs(float(beyond.q[-1, 0])) < 1e3 and not bool(beyond.success)
 
 
 def test_stiffness_on_constraints():
@@ -249,7 +268,7 @@ def test_stiffness_on_constraints():
     scene = jd.Scene(builder.build(), (jd.Pfaffian(two_to_one),), forces)
     found = jd.stiffness(scene, [0.0, 0.0], [0.0, 0.0])
     # The constraint leaves two eigenvalues zero, which LAPACK gives to rounding of the largest: 1.5e3 times 2e-16.
-    np.testing.assert_allclose(found, roots(1 + 4 * 3, 4 * 5e3, 5 * 1e4), rtol=1e-10, atol=1e-11)
+    np.testing.assert_allclose(found[:2], roots(1 + 4 * 3, 4 * 5e3, 5 * 1e4), rtol=1e-10, atol=1e-11)
     with pytest.raises(ValueError, match=r"q has shape \(1,\), expected \(2,\)"):
         jd.stiffness(scene, [0.0], [0.0, 0.0])
 
@@ -281,7 +300,7 @@ def test_default_solver_and_advice_follow_stiffness():
         assert found.solver == solver
         np.testing.assert_allclose(found.q, case.exact(stiffness), rtol=0, atol=1e-10)
     with pytest.raises(
-        RuntimeError, match=r"is stiff: the fastest decay is 1.18e\+05 1/s.*above 4.24e-05 s; pass solver=jd.Ro"
+        RuntimeError, match=r"is stiff: the fastest decay is 1.18e\+05 1/s.*above 4.38e-05 s; pass solver=jd.Ro"
     ):
         run(1e9, solver=diffrax.Dopri8())
 

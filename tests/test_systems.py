@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
-from jaxdyn import dynamics
-from jaxdyn.building import ModelBuilder
-from jaxdyn.dissipation import RayleighDissipation, SlidingFriction
-from jaxdyn.forces import JointDamping
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.linear import solve_positive
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import simulate
-from jaxdyn.systems import ExplicitSystem, MetricSystem
+from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.forces.dissipation import RayleighDissipation, SlidingFriction
+from jaxdyn.forces.elements import JointDamping
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.mass_factor import solve_positive
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import ExplicitSystem, MetricSystem
 
 # Planar 2R arm of EQUATIONS section 1: m, l1, r, I.
 MASS, LENGTH, REACH, MOMENT = (1.0, 0.8), 1.0, (0.5, 0.4), (0.1, 0.05)

@@ -9,10 +9,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from jaxdyn import kinematics, robots
-from jaxdyn.building import ModelBuilder, inertia_report
+from jaxdyn import robots
+from jaxdyn.dynamics import kinematics
 from jaxdyn.io import load_urdf, save_urdf, urdf_inertia_report
-from jaxdyn.joints import KINDS
+from jaxdyn.model.builder import ModelBuilder, inertia_report
+from jaxdyn.model.joints import KINDS
 from tests.pinocchio_bridge import ROBOTS, quick, to_jaxdyn
 
 FILES = sorted(str(path.relative_to(ROBOTS)) for path in Path(ROBOTS).rglob("*.urdf"))

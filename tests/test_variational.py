@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 from pinocchio_bridge import quick
 
-from jaxdyn import scenes, variational
-from jaxdyn.building import ModelBuilder
-from jaxdyn.constrained_motion import Variational
+from jaxdyn import scenes
 from jaxdyn.constraints import Holonomic, Pfaffian
-from jaxdyn.dynamics import center_of_mass, centroidal_momentum, kinetic_energy, potential_energy
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.model import integrate, random_configuration
-from jaxdyn.report import references
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import RESULTS, simulate
-from jaxdyn.systems import ExplicitSystem, MetricSystem, displace, displacement
+from jaxdyn.dynamics.quantities import center_of_mass, centroidal_momentum, kinetic_energy, potential_energy
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.tree import integrate, random_configuration
+from jaxdyn.reports import references
+from jaxdyn.simulation import variational
+from jaxdyn.simulation.methods import Variational
+from jaxdyn.simulation.run import RESULTS, simulate
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import ExplicitSystem, MetricSystem, displace, displacement
 
 BODY = (1.2, (0.1, -0.2, 0.3), (0.3, 0.4, 0.5))
 

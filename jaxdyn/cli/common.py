@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn._table import short as short
-from jaxdyn._table import table as table
-from jaxdyn.arguments import as_path
 from jaxdyn.io import load_urdf
-from jaxdyn.joints import KINDS
-from jaxdyn.model import Model
+from jaxdyn.model.arguments import as_path
+from jaxdyn.model.joints import KINDS
+from jaxdyn.model.text_table import short as short
+from jaxdyn.model.text_table import table as table
+from jaxdyn.model.tree import Model
 
 # Unit of one number of q, for joints with one.
 UNITS = {"revolute": "rad", "continuous": "rad", "helical": "rad", "prismatic": "m"}

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from jaxdyn import __version__, identify
-from jaxdyn.building import inertia_report, repair_inertias
 from jaxdyn.cli.common import (
     Stopwatch,
     add_model_options,
@@ -22,7 +21,8 @@ from jaxdyn.cli.common import (
 from jaxdyn.identify import Fit, LeastSquares, Log
 from jaxdyn.io import save_urdf
 from jaxdyn.io.logs import read_log
-from jaxdyn.model import Model
+from jaxdyn.model.builder import inertia_report, repair_inertias
+from jaxdyn.model.tree import Model
 
 # Of the simulation in a trajectory fit (s).
 _LONGEST_STEP = 0.0025
@@ -142,7 +142,7 @@ def run(args: argparse.Namespace) -> None:
         report.write_text(json.dumps(_report(model, result, errors, train, test, args), indent=2) + "\n")
         print(f"Wrote {report}.")
     if plot is not None:
-        from jaxdyn.plotting import torque_figure
+        from jaxdyn.reports.plotting import torque_figure
 
         labels, units = coordinate_labels(model)
         torque_figure(test, result.torques(test), labels, units).savefig(plot)

@@ -5,11 +5,11 @@ import collections
 
 import numpy as np
 
-from jaxdyn.building import inertia_report, repair_inertias
 from jaxdyn.cli.common import UNITS, add_model_options, load_model, output_path, short, table
 from jaxdyn.io import save_urdf, urdf_inertia_report
-from jaxdyn.joints import KINDS
-from jaxdyn.model import Model
+from jaxdyn.model.builder import inertia_report, repair_inertias
+from jaxdyn.model.joints import KINDS
+from jaxdyn.model.tree import Model
 
 HELP = "bodies, joints, limits, frames and faulty inertias of a URDF file"
 DESCRIPTION = """\

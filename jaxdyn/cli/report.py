@@ -3,7 +3,7 @@
 import argparse
 
 from jaxdyn.cli.common import Stopwatch
-from jaxdyn.report import cases, report
+from jaxdyn.reports import cases, report
 
 HELP = "error against run time of scenes whose motion is known"
 DESCRIPTION = """\
@@ -23,7 +23,7 @@ with the same --out, it goes on where it stopped.
 
 output (--out DIR):
   report.html      one page: plots, tables, the machine; needs no network
-  report.json      the same as data; jaxdyn.report.Report.from_json reads it
+  report.json      the same as data; jaxdyn.reports.Report.from_json reads it
   report.txt       what is printed
   records.jsonl    finished groups of runs, from which an interrupted call goes on
 """

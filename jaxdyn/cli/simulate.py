@@ -17,13 +17,13 @@ from jaxdyn.cli.common import (
     per_coordinate,
     vector,
 )
-from jaxdyn.excitation import FourierTorque, random_torque
-from jaxdyn.forces import CoulombFriction, JointDamping
+from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify import SampledTorque
+from jaxdyn.identify.excitation import FourierTorque, random_torque
 from jaxdyn.io.logs import read_log
-from jaxdyn.model import Model, integrate, neutral
-from jaxdyn.scene import Scene
-from jaxdyn.simulate import Solution, simulate
+from jaxdyn.model.tree import Model, integrate, neutral
+from jaxdyn.simulation.run import Solution, simulate
+from jaxdyn.systems.scene import Scene
 
 HELP = "simulate a URDF robot, one motion or a batch, and write or plot the motions"
 DESCRIPTION = """\
@@ -147,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
         _write(out, args.batch, ts, solution, tau)
         print(f"Wrote {out}.")
     if plot is not None:
-        from jaxdyn.plotting import motion_figure
+        from jaxdyn.reports.plotting import motion_figure
 
         motion_figure(model, ts, solution.q, solution.v, tau).savefig(plot)
         print(f"Wrote {plot}.")

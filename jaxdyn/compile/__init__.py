@@ -21,5 +21,9 @@ from jaxdyn.compile.known import is_staged as is_staged
 from jaxdyn.compile.known import partition_traced as partition_traced
 from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import is_expanding as is_expanding
+from jaxdyn.compile.repair import any_in_batch as any_in_batch
+from jaxdyn.compile.repair import is_rank_safe as is_rank_safe
+from jaxdyn.compile.repair import recompute_unless as recompute_unless
+from jaxdyn.compile.repair import repair_flagged as repair_flagged
 from jaxdyn.compile.rules import along as along
 from jaxdyn.compile.rules import implicit as implicit

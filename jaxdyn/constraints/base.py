@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.arguments import batch_hint, check_state, state_dtype
 from jaxdyn.compile import run
-from jaxdyn.scene import Scene, as_pytree, as_scene
-from jaxdyn.so3 import _product
-from jaxdyn.systems import velocity_to_rate
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import batch_hint, check_state, state_dtype
+from jaxdyn.systems.scene import Scene, as_pytree, as_scene
+from jaxdyn.systems.system import velocity_to_rate
 
 
 class Constraint(eqx.Module):

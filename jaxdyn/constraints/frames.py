@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn import se3, so3
 from jaxdyn.compile import is_expanding
 from jaxdyn.constraints.base import Constraint
-from jaxdyn.kinematics import Carried, carried, take
-from jaxdyn.model import Model, frame_index
-from jaxdyn.so3 import _product
+from jaxdyn.dynamics.kinematics import Carried, carried, take
+from jaxdyn.lie import se3, so3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.tree import Model, frame_index
 
 
 def frames_on(model: Model, q, bodies: Sequence[str | None], poses, v=None) -> Carried:

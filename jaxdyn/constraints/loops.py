@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn import _float64 as f64
-from jaxdyn import se3
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
-from jaxdyn.joints import KINDS, SCREW_KINDS, joint_difference
-from jaxdyn.model import Model, body_index
+from jaxdyn.lie import se3
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_difference
+from jaxdyn.model.tree import Model, body_index
 
 
 def _floored(x):

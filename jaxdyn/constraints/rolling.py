@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies, pose_leaf
-from jaxdyn.so3 import _product, cross
+from jaxdyn.lie.so3 import _product, cross
 
 
 class _Contact(NamedTuple):

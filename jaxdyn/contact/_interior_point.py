@@ -21,8 +21,8 @@ from jaxtyping import Array, Bool, Int
 
 from jaxdyn.compile import run
 from jaxdyn.contact import _jordan as jordan
-from jaxdyn.linear import cholesky, solve_factored
-from jaxdyn.so3 import _product
+from jaxdyn.lie.so3 import _product
+from jaxdyn.systems.mass_factor import cholesky, solve_factored
 
 REFINEMENTS = 4  # steps of Newton's method
 Pattern = tuple[bytes | None, ...]  # of each group, which entries of G may differ from zero; None where all may

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.contact.kinds import components
-from jaxdyn.so3 import _product
+from jaxdyn.lie.so3 import _product
 
 SIDES = ("inscribed", "circumscribed")
 

@@ -24,7 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn import se3
 from jaxdyn.compile import compiled, is_concrete
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.surfaces import (
@@ -35,7 +34,8 @@ from jaxdyn.contact.surfaces import (
     geometry_at,
     surface_geometry,
 )
-from jaxdyn.so3 import _product
+from jaxdyn.lie import se3
+from jaxdyn.lie.so3 import _product
 
 
 class ContactKinematics(eqx.Module):

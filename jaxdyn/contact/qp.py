@@ -15,12 +15,12 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxdyn._rank import pseudo_inverse, tolerance
 from jaxdyn.compile import compiled, is_concrete, is_staged
+from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact._interior_point import Point, Program, attached, solve
-from jaxdyn.linear import cholesky, definite, solve_factored
-from jaxdyn.so3 import _product
+from jaxdyn.lie.so3 import _product
+from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
 
 
 class RESULTS(lx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]

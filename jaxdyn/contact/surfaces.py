@@ -23,8 +23,8 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import compiled, is_concrete
 from jaxdyn.contact._checks import as_float, as_number
-from jaxdyn.scene import as_pytree
-from jaxdyn.so3 import _product, cross
+from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.systems.scene import as_pytree
 
 
 class Surface(eqx.Module):

@@ -16,16 +16,16 @@ import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
-from jaxdyn._rank import pseudo_inverse, tolerance
-from jaxdyn.arguments import as_array, batch_hint, check_state, or_zeros
 from jaxdyn.compile import compiled
-from jaxdyn.constrained import RESULTS, Outcome, applied
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
-from jaxdyn.dynamics import coriolis_matrix, gravity_force, mass_matrix
+from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
+from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp, check_grasp
-from jaxdyn.reduced import least_quality
-from jaxdyn.so3 import _product
-from jaxdyn.systems import velocity_to_rate
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.reduction.minimal import least_quality
+from jaxdyn.systems.system import velocity_to_rate
 
 
 class ObjectDynamics(Outcome):

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.arguments import as_array, batch_hint, state_dtype
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.cones import FrictionCone
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp, check_grasp
+from jaxdyn.model.arguments import as_array, batch_hint, state_dtype
 
 
 class ContactForces(eqx.Module):

@@ -7,14 +7,14 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn._rank import pseudo_inverse, tolerance
-from jaxdyn.arguments import as_array, batch_hint
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
+from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.grasp.joining import joined
-from jaxdyn.model import Model
-from jaxdyn.scene import Scene
-from jaxdyn.so3 import _product
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
 
 
 class Grasp(Scene):

@@ -7,8 +7,8 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.joints import KINDS
-from jaxdyn.model import Model, Topology
+from jaxdyn.model.joints import KINDS
+from jaxdyn.model.tree import Model, Topology
 
 
 def joined(models: Sequence[Model], name: str) -> Model:

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn import _float64 as _f64
-from jaxdyn import inertia as _inertia
 from jaxdyn.identify.friction import POSITIVE, TERMS, Friction, check_terms
-from jaxdyn.model import Model
+from jaxdyn.model import float64 as _f64
+from jaxdyn.model import inertia as _inertia
+from jaxdyn.model.tree import Model
 
 INERTIA = ("full", "mass", "fixed")
 

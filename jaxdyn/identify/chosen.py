@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.model import Model
-from jaxdyn.scene import Scene, as_scene
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene, as_scene
 
 
 class Chosen(eqx.Module):

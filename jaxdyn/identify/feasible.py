@@ -10,14 +10,14 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxdyn import inertia as _inertia
 from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart, positive_terms
 from jaxdyn.identify.friction import TERMS, check_terms
 from jaxdyn.identify.logs import Log, check_log, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
 from jaxdyn.identify.regression import condense, free_columns, noise_level
 from jaxdyn.identify.result import Fit
-from jaxdyn.model import Model
+from jaxdyn.model import inertia as _inertia
+from jaxdyn.model.tree import Model
 
 # A fit is never trusted beyond this share of the torque: rounding and noise-free logs stay well posed.
 _FINEST = 1e-6

@@ -8,7 +8,7 @@ import jax.core
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.model import Model
+from jaxdyn.model.tree import Model
 
 
 class Log(eqx.Module):

@@ -11,7 +11,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxdyn.arguments import state_dtype
 from jaxdyn.identify.chosen import Chosen, choose
 from jaxdyn.identify.gauss_newton import Unknowns, gauss_newton, linear, standard_deviation
 from jaxdyn.identify.logs import Log, check_log
@@ -29,7 +28,8 @@ from jaxdyn.identify.replay import (
     simulation_options,
 )
 from jaxdyn.identify.result import ParameterFit, needed_torque
-from jaxdyn.scene import Scene
+from jaxdyn.model.arguments import state_dtype
+from jaxdyn.systems.scene import Scene
 
 ERRORS = ("trajectory", "torque")
 _GAUSS_NEWTON = "gauss-newton"

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn import dynamics
-from jaxdyn.arguments import as_array, check_shapes
+from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
 from jaxdyn.identify.logs import Log, check_log
-from jaxdyn.joints import KINDS
-from jaxdyn.model import Model, integrate, neutral
+from jaxdyn.model.arguments import as_array, check_shapes
+from jaxdyn.model.joints import KINDS
+from jaxdyn.model.tree import Model, integrate, neutral
 
 _NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 # The numbers that stay when a body's ten are grouped, for a joint about z: Khalil & Dombre keep them and put m, m cz

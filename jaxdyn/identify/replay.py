@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.arguments import state_dtype
 from jaxdyn.identify.logs import Log, check_log
-from jaxdyn.model import Model
-from jaxdyn.scene import Scene, as_scene
-from jaxdyn.simulate import simulate
-from jaxdyn.systems import displace, displacement
+from jaxdyn.model.arguments import state_dtype
+from jaxdyn.model.tree import Model
+from jaxdyn.simulation.run import simulate
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import displace, displacement
 
 HOLDS = ("linear", "previous")
 INITIAL = ("measured", "free")

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn import dynamics
-from jaxdyn.arguments import state_dtype
+from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.friction import Friction
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
-from jaxdyn.model import Model
-from jaxdyn.scene import Scene, as_scene
+from jaxdyn.model.arguments import state_dtype
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene, as_scene
 
 
 class AbstractFit(eqx.Module):

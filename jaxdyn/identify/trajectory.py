@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics import mass_matrix
+from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart
 from jaxdyn.identify.friction import check_terms
 from jaxdyn.identify.logs import Log, check_log, root_mean_square
@@ -26,8 +26,8 @@ from jaxdyn.identify.replay import (
     simulation_options,
 )
 from jaxdyn.identify.result import Fit
-from jaxdyn.model import Model
-from jaxdyn.scene import Scene
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
 
 
 class _Unknowns(eqx.Module):

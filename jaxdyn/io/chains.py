@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn import _float64 as f64
-from jaxdyn.building import ModelBuilder
-from jaxdyn.joints import SCREW_KINDS
-from jaxdyn.model import Model
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.tree import Model
 
 
 class Link(NamedTuple):

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn import _float64 as f64
-from jaxdyn.kinematics import body_jacobian
-from jaxdyn.model import Model
-from jaxdyn.scene import Scene
+from jaxdyn.dynamics.kinematics import body_jacobian
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
 
 
 class NotTakenWarning(UserWarning):

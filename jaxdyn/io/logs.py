@@ -4,8 +4,8 @@ import csv
 
 import numpy as np
 
-from jaxdyn.arguments import as_path
 from jaxdyn.identify.logs import Log
+from jaxdyn.model.arguments import as_path
 
 _SIGNALS = ("q", "v", "a", "tau")
 

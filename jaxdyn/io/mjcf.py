@@ -12,16 +12,16 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn import _float64 as f64
-from jaxdyn.arguments import as_path
-from jaxdyn.building import ModelBuilder
-from jaxdyn.forces import CoulombFriction, JointDamping, JointSpring
+from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, built
 from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of_units
 from jaxdyn.io.mjcf_file import BALL, FREE, HINGE, SIZES, SLIDE, Compiled, compiled, library, named, pose_of
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
-from jaxdyn.joints import joint_neutral
-from jaxdyn.model import Model
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import as_path
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.joints import joint_neutral
+from jaxdyn.model.tree import Model
 
 
 def load_mjcf(path: str | os.PathLike, *, dtype=None) -> LoadedScene:

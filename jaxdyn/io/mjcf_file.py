@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn import _float64 as f64
 from jaxdyn.io.chains import Names
 from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import float64 as f64
 
 FREE, BALL, SLIDE, HINGE = range(4)  # mjtJoint
 SIZES = ((7, 6), (4, 3), (1, 1), (1, 1))  # numbers in q and v of each

@@ -6,18 +6,18 @@ from collections.abc import Iterable
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn import _float64 as f64
-from jaxdyn.building import GRAVITY, ModelBuilder
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.loops import gear, loop
-from jaxdyn.forces import CoulombFriction, JointDamping, JointSpring
+from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, built
 from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of_units
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import Axis, Edge, Joint, read_joints, spanning_tree
 from jaxdyn.io.urdf import ROOT_JOINT, _turn_from_z
-from jaxdyn.joints import joint_neutral
-from jaxdyn.model import Model, body_index
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.builder import GRAVITY, ModelBuilder
+from jaxdyn.model.joints import joint_neutral
+from jaxdyn.model.tree import Model, body_index
 
 _KINDS = dict(revolute="revolute", continuous="revolute", revolute2="revolute", universal="revolute")
 _KINDS |= dict(prismatic="prismatic", screw="helical", ball="spherical")

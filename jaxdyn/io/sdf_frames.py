@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn import _float64 as f64
-from jaxdyn.building import unknown
 from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.builder import unknown
 
 WORLD = "world"
 _VERSIONS = tuple(f"1.{minor}" for minor in range(4, 13))

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn import _float64 as f64
-from jaxdyn.building import unknown
 from jaxdyn.io.sdf_frames import SdfFile
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.builder import unknown
 
 # Axes of each kind. A gearbox is a coupling of two other joints, not a joint.
 AXES = dict(revolute=1, continuous=1, prismatic=1, screw=1, revolute2=2, universal=2, ball=0, fixed=0, gearbox=2)

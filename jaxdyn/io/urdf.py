@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn import _float64 as f64
-from jaxdyn.arguments import as_path
-from jaxdyn.building import GRAVITY, ModelBuilder, inertia_problems, unknown
 from jaxdyn.io.urdf_check import JOINTS, NUMBERS, REQUIRED, check_elements
-from jaxdyn.joints import KINDS, SCREW_KINDS, joint_neutral
-from jaxdyn.model import Model
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import as_path
+from jaxdyn.model.builder import GRAVITY, ModelBuilder, inertia_problems, unknown
+from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
+from jaxdyn.model.tree import Model
 
 # URDF has no number for "no limit", and its readers take no "inf"; `save_urdf` writes the largest double.
 NO_LIMIT = float(np.finfo(np.float64).max)

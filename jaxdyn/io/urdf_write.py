@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn import _float64 as f64
-from jaxdyn.arguments import as_path, check_shapes
 from jaxdyn.io.urdf import NO_LIMIT, ROOT_JOINT
-from jaxdyn.model import Model
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import as_path, check_shapes
+from jaxdyn.model.tree import Model
 
 _TYPES = {"free": "floating", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar")}}
 

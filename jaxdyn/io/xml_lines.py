@@ -10,7 +10,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from jaxdyn.arguments import as_path
+from jaxdyn.model.arguments import as_path
 
 
 class Element(ElementTree.Element):

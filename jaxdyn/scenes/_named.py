@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from jaxdyn.scene import Scene
+from jaxdyn.systems.scene import Scene
 
 REGISTRY: dict[str, "NamedScene"] = {}
 

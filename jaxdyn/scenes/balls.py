@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn import inertia, so3
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import Holonomic, rolling_sphere
-from jaxdyn.scene import Scene
+from jaxdyn.lie import so3
+from jaxdyn.model import inertia
+from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.systems.scene import Scene
 
 
 class _Steady(eqx.Module):

@@ -2,9 +2,9 @@
 
 import jax.numpy as jnp
 
-from jaxdyn.building import ModelBuilder
-from jaxdyn.scene import Scene
+from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
+from jaxdyn.systems.scene import Scene
 
 
 def _free_start(rates=(0.3, 0.8, -0.5)):

@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn import inertia
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import rolling_sphere, rolling_wheel
 from jaxdyn.grasp import Grasp, contact
+from jaxdyn.model import inertia
+from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.scenes.linkages import _circles, thin_bar
 

@@ -7,13 +7,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import loop
-from jaxdyn.immersion import constrain_by_immersion
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
+from jaxdyn.geometry.immersion import constrain_by_immersion
+from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
-from jaxdyn.systems import MetricSystem
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import MetricSystem
 
 
 def _planar_metric(q, t, p):

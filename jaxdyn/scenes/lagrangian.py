@@ -3,13 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.building import ModelBuilder
-from jaxdyn.dissipation import SlidingFriction
-from jaxdyn.inertia import box, displaced
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
+from jaxdyn.forces.dissipation import SlidingFriction
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.inertia import box, displaced
 from jaxdyn.scenes._named import named
-from jaxdyn.systems import MetricSystem
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import MetricSystem
 
 
 def _given(position, velocity):
@@ -217,9 +217,9 @@ def _block(q, v, t, p):
 
 @named(_block_start)
 def sliding_block(*, mass=1.0, friction=0.3, gravity=9.81, direction=1) -> Scene:
-    """Block that slides on a table with Coulomb friction: m xdd = u - direction mu m g while xd has that sign.
+    """Block that slides on a table with Coulomb friction: m xdd = u - sign(xd) mu m g, at rest with the sign `direction`.
 
-    Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on; there the scene ceases to hold.
+    Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on. It is not held there (see `jd.SlidingFriction`).
 
     Source: EQUATIONS section 11 and erratum E42.
     """

@@ -5,10 +5,10 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import loop
-from jaxdyn.scene import Scene
+from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
+from jaxdyn.systems.scene import Scene
 
 _DOWN = (0.0, -9.81, 0.0)
 

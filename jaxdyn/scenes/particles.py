@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints import Holonomic
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
 from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
 
 
 class _Rod(eqx.Module):

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import Holonomic, loop
-from jaxdyn.kinematics import frame_pose
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
+from jaxdyn.dynamics.kinematics import frame_pose
+from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
-from jaxdyn.systems import ExplicitSystem
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import ExplicitSystem
 
 # Names as printed; m, I are lists m1..m7 and I1..I7. SI units.
 _ANDREWS = {

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
-from jaxdyn.lagrange import LagrangianSystem
-from jaxdyn.scene import Scene
+from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
 
 
 class _DiskRows(eqx.Module):

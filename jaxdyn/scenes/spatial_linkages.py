@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import loop
-from jaxdyn.scene import Scene
+from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.scenes.linkages import thin_bar
+from jaxdyn.systems.scene import Scene
 
 
 def _link(length, twist):

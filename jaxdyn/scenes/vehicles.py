@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.building import ModelBuilder
 from jaxdyn.constraints import knife_edge, rolling_wheel
-from jaxdyn.scene import Scene
+from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
+from jaxdyn.systems.scene import Scene
 
 _AXLE = (np.zeros(3), (-np.pi / 2, 0.0, 0.0))  # z of the wheel along y of the body
 

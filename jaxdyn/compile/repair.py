@@ -1,0 +1,179 @@
+"""What only some samples of a batch need: computed when one of them does, or for those alone.
+
+Under `jax.vmap` a `lax.cond` whose predicate differs between samples computes both branches. A predicate that has gone
+through `any_in_batch` is one for all samples, however many `vmap`s enclose it, and the branch stays a branch. `repair_flagged`
+computes samples that need it again and leaves the others alone.
+"""
+
+import contextvars
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.core
+import jax.numpy as jnp
+from jax import lax
+from jax.core import ShapedArray
+from jax.custom_batching import custom_vmap
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+
+from jaxdyn.compile.flags import unless
+from jaxdyn.compile.mode import is_expanding
+
+AT_ONCE = 32  # samples that are computed again together
+
+_rank_safe: contextvars.ContextVar[bool] = contextvars.ContextVar("jaxdyn_rank_safe", default=False)
+
+_any_in_batch_p = Primitive("any_in_batch")
+_any_in_batch_p.def_impl(lambda flag: flag)
+_any_in_batch_p.def_abstract_eval(lambda flag: ShapedArray((), flag.dtype))
+mlir.register_lowering(_any_in_batch_p, lambda ctx, flag: [flag])
+
+
+def _over_samples(arrays, axes):
+    return _any_in_batch_p.bind(jnp.any(arrays[0], axis=axes[0])), batching.not_mapped
+
+
+batching.primitive_batchers[_any_in_batch_p] = _over_samples
+
+
+def any_in_batch(flag):
+    """Whether a flag () is set for this sample or for any other one of the batch."""
+    return _any_in_batch_p.bind(flag) if isinstance(flag, jax.core.Tracer) else flag
+
+
+def is_rank_safe() -> bool:
+    """Whether what is traced is computed again for samples that need care: the fast way has failed them already."""
+    return _rank_safe.get()
+
+
+def rank_safe(function: Callable) -> Callable:
+    """The function, traced for samples that need care."""
+
+    @functools.wraps(function)
+    def call(*args):
+        token = _rank_safe.set(True)
+        try:
+            return function(*args)
+        finally:
+            _rank_safe.reset(token)
+
+    return call
+
+
+def recompute_unless(served, again: Callable, found, args: tuple):
+    """`found`, or again(*args), traced `rank_safe`, where a sample is not served; in a batch a few of those at a time.
+
+    `served` is True where every sample is, and `again` is not in the program then; else an array (). `again` depends on nothing
+    traced but `args`. Without derivatives.
+    """
+    return found if served is True else _one(rank_safe(again))(~served, found, args)
+
+
+def repair_flagged(flag, careful: Callable, fast: Callable, found: tuple, args: tuple):
+    """`found` where the flag () is not set, else `careful(*args)`; in a batch only the samples that need it, a few at a time.
+
+    **Arguments:**
+
+    - `careful(*args)` -> what `found` is: a pair of pytrees, of which the first is differentiated. It depends on nothing traced
+      but `args`.
+    - `fast(*args)` -> found[0], whose derivatives serve where the flag is not set.
+
+    Derivatives are those of `fast` if the flag is set in no sample of the batch, else those of `careful` for all of them: in a
+    branch, as what a singular sample makes of the other way is no number, and would reach gradients even times zero.
+
+    While a function is traced to become a program of single numbers, which has no branches, floats of flagged samples are NaN,
+    and the program knows it (`jaxdyn.compile.run(..., served=True)`).
+    """
+    if is_expanding():
+        return jax.tree.map(lambda x: unless(flag, x) if jnp.issubdtype(x.dtype, jnp.floating) else x, found)
+
+    @jax.custom_jvp
+    def run(flag, found, args):
+        return _one(careful)(flag, found, args)
+
+    @run.defjvp
+    def _(primals, tangents):
+        flag, _, args = primals
+        _, (_, plain_step), args_step = tangents
+
+        def by(function):
+            return lambda: jax.jvp(function, args, args_step)[1]
+
+        step = lax.cond(any_in_batch(flag), by(lambda *args: careful(*args)[0]), by(fast))
+        return run(*primals), (step, plain_step)
+
+    return run(flag, lax.stop_gradient(found), args)
+
+
+def _one(careful: Callable):
+    @custom_vmap
+    def one(flag, found, args):
+        return lax.cond(flag, lambda: _like(careful(*args), found), lambda: found)
+
+    @one.def_vmap
+    def _(size, batched, flag, found, args):
+        leaves, structure = jax.tree.flatten(args)
+        axes = [0 if varies else None for varies in jax.tree.leaves(batched[2])]
+        flag, found = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, found), tuple(batched[:2]))
+        fixed = _many(lambda *leaves: careful(*jax.tree.unflatten(structure, leaves)), axes)(flag, found, leaves)
+        return fixed, jax.tree.map(lambda _: True, fixed)
+
+    return one
+
+
+def _many(careful: Callable, axes: list):
+    """The same for samples along the leading axis; `axes` says which of the arguments have it."""
+
+    def some(flag, found, args):
+        size = flag.shape[0]
+        count = min(AT_ONCE, size)
+        places = jnp.nonzero(flag, size=size + count, fill_value=size)[0]
+
+        def mend(i, found):
+            here = lax.dynamic_slice_in_dim(places, i * count, count)
+            taken = [x if axis is None else x.at[here].get(mode="clip") for x, axis in zip(args, axes, strict=True)]
+            new = _like(jax.vmap(careful, axes)(*taken), found)
+            return jax.tree.map(lambda old, new: old.at[here].set(new, mode="drop"), found, new)
+
+        return lax.fori_loop(0, (jnp.sum(flag) + count - 1) // count, mend, found)
+
+    @custom_vmap
+    def many(flag, found, args):
+        # A branch, as to look for places takes longer than the dynamics, and XLA takes out of a loop what does not change.
+        return lax.cond(jnp.any(flag), some, lambda flag, found, args: found, flag, found, args)
+
+    @many.def_vmap
+    def _(size, batched, flag, found, args):
+        flag, found = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, found), tuple(batched[:2]))
+        shape = flag.shape
+        flat, over = _along_one_axis(args, axes, batched[2], shape)
+        flag, found = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (flag, found))
+        found = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), _many(careful, over)(flag, found, flat))
+        return found, jax.tree.map(lambda _: True, found)
+
+    return many
+
+
+def _like(new, found):
+    """The same arrays with the dtypes of `found`."""
+    return jax.tree.map(lambda x, y: jnp.asarray(x, y.dtype), new, found)
+
+
+def _along_one_axis(args, axes, batched, shape):
+    """Arguments of a batch of the given shape along one axis, and which of them have it; `axes`: which have the inner one."""
+    flat, over = [], []
+    for x, axis, varies in zip(args, axes, batched, strict=True):
+        if axis == 0:
+            x = _rows(x, varies, shape[0]).reshape(-1, *x.shape[1 + varies :])
+        elif varies:
+            x = jnp.repeat(x, shape[1], 0)
+        flat.append(x)
+        over.append(0 if axis == 0 or varies else None)
+    return flat, over
+
+
+def _rows(x, varies: bool, size: int):
+    """With a leading axis of the batch."""
+    return x if varies else jnp.broadcast_to(x, (size, *x.shape))

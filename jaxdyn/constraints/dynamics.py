@@ -1,0 +1,400 @@
+"""Dynamics under constraints: M a + h = tau + A^T lam, A a = gamma.
+
+In the metric of M everything is one least-squares problem. With M = L L^T, Y = L^-1 A^T and the free acceleration
+a0 = M^-1 (tau - h), the constraint force L^-1 A^T lam is the shortest w with Y^T w = gamma - A a0: Gauss's principle of
+least constraint. Its pseudo-inverse gives accelerations, multipliers and projections, for dependent rows too:
+
+    w = (Y^+)^T c,   lam = Y^+ w,   a = a0 + L^-T w,   P_T = L^-T (1 - Y Y^+) L^T,   c = gamma - A a0.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import optimistix
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxdyn.compile import is_rank_safe, partition_traced, repair_flagged, run
+from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
+from jaxdyn.constraints.frames import Pair, relative_poses
+from jaxdyn.constraints.rank import checked_tolerance, eps_of, least_pivot, pseudo_inverse, quality_of, tolerance
+from jaxdyn.dynamics.quantities import bias_force, mass_matrix
+from jaxdyn.dynamics.recursions import aba_with_columns
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_factored
+from jaxdyn.systems.scene import Scene, as_scene, checked_force
+
+METHODS = ("rank_aware", "schur", "range_space")
+
+
+class RESULTS(optimistix.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How a computation ended: one enumeration for constrained dynamics and for simulations."""
+
+    singular_mass_matrix = (
+        "The mass matrix is not positive definite to rounding: a joint moves no inertia, or next to none."
+    )
+    dependent_rows = "The constraint rows are dependent; take method='rank_aware'."
+    contradictory_rows = "No acceleration satisfies the constraint rows: they contradict each other."
+    singular_basis = "The minimal velocities do not determine the others here; choose another basis."
+    not_assembled = "No configuration and velocity that satisfy the constraints were found."
+    # Of simulations: those of diffrax, by its names, and ours.
+    dt_min_reached = "The minimum step size was reached in the differential equation solver."
+    event_occurred = "An event ended the motion."
+    max_steps_rejected = "Too many steps were rejected."
+    internal_error = "diffrax met an error of its own."
+    nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
+    nonfinite_state = "The state became NaN or infinite."
+    unordered_times = "The save points are not finite and increasing."
+    bad_stepsize = "The step is not positive and finite."
+    bad_tolerance = "A tolerance is negative or not finite."
+    coarse_steps = (
+        "The fixed steps are too long, or too many for the dtype: the motion may be wrong by a tenth of it or more."
+    )
+    coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
+    inconsistent_start = "The initial state is not on the constraints."
+    open_constraints = "The constraints opened, and the projection could not close them."
+
+
+# Of optimistix the message of this one is empty, which prints as nothing.
+RESULTS._index_to_message[RESULTS.successful._value.item()] = "successful"
+
+
+class Outcome(eqx.Module):
+    """What has a `result`, one of `RESULTS`."""
+
+    @property
+    def success(self) -> Bool[Array, "..."]:
+        """Whether `result` is `RESULTS.successful`."""
+        return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class ConstrainedDynamics(Outcome):
+    """Accelerations and constraint forces of a scene.
+
+    - `acceleration` (nv,); `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for
+      rows in m and N m for rows in rad.
+    - `rank` (): number of independent rows. `result`: one of `RESULTS`; `success`: whether it is `successful`.
+    - `layout`: name and place of each constraint's rows.
+    """
+
+    acceleration: Float[Array, " nv"]
+    multipliers: Float[Array, " nc"]
+    rank: Int[Array, ""]
+    result: Any
+    layout: tuple[Layout, ...] = eqx.field(static=True)
+
+    def by_name(self) -> dict[str, Array]:
+        """Multipliers of each constraint, by its name."""
+        return {place.name: self.multipliers[..., place.start : place.end] for place in self.layout}
+
+
+class Projections(NamedTuple):
+    """P_T (nv, nv) maps velocities to admissible ones; P_omega = P_T^T removes constraint forces from forces."""
+
+    P_T: Float[Array, "nv nv"]
+    P_omega: Float[Array, "nv nv"]
+
+
+def constrained_dynamics(
+    scene: Scene,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    tau: Float[Array, " nv"] | None = None,
+    t=0.0,
+    *,
+    method: str = "rank_aware",
+    rank_tol: float | None = None,
+) -> ConstrainedDynamics:
+    """Acceleration and multipliers: M a + h = tau + forces + A^T lam, A a = gamma = -(Adot v) + bdot.
+
+    The state has to satisfy the constraints (`assemble`); what it violates is not corrected here.
+
+    **Arguments:**
+
+    - `q` (nq,), `v` (nv,), `tau` (nv,) in N m or N (None: zero), `t` in s. The scene's forces are added to tau.
+    - `method`: "rank_aware" for any rows: where they are dependent the acceleration is still right and the multipliers
+      are those of least norm. "schur" forms A M^-1 A^T and its Cholesky factor: faster, for independent rows.
+      "range_space" is the same without ever forming M: M^-1 is applied to the k rows by the articulated bodies of a
+      `Model`, in O(nb k) operations; for few rows on a large tree, in batches. Other systems take their dense M.
+    - `rank_tol`: singular values of L^-1 A^T below `rank_tol` times the largest count as zero. Default eps^(4/7),
+      1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which rows that depend on each other differ
+      when loops are open by rounding and projection errors, below the least singular values of mechanisms that move.
+
+    **Returns:** `ConstrainedDynamics`. Under "schur" and "range_space", dependent rows give the code `dependent_rows`.
+
+    Differentiable any number of times where the rank is constant; the pseudo-inverse has a rule of its own, no
+    factorisation is differentiated.
+
+    **Raises:** ValueError for shapes that do not fit, unknown methods, and constraints of the scene that are none.
+
+    Source: EQUATIONS section 7; Udwadia & Kalaba (1992).
+    """
+    if method not in METHODS:
+        raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}")
+    rank_tol = checked_tolerance(rank_tol)
+    scene = as_scene(scene)
+    tau = or_zeros(tau, scene.nv)
+    q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
+    places = layout(scene)
+    if not places:
+        return _free(scene, q, v, applied(scene, q, v, tau, t), t)
+    state = q, v, tau, t
+    if method != "rank_aware":
+        return _by_schur(scene, *state, method=method)
+    if places[-1].end > scene.nv or is_rank_safe():
+        return _by_rank(scene, *state, rank_tol)
+    found = run(_by_pivots, scene, *state, otherwise=_nothing)
+    if found is None and scene.forces:
+        # Forces may be anything. The rest may be a program of numbers without them.
+        bare = Scene(scene.system, scene.constraints)
+        return constrained_dynamics(bare, q, v, applied(scene, q, v, tau, t), t, rank_tol=rank_tol)
+    return _by_rank(scene, *state, rank_tol) if found is None else _repaired(scene, found, state, rank_tol)
+
+
+def _nothing(*_):
+    """Instead of a kernel that there is not."""
+    return None
+
+
+def _by_pivots(scene: Scene, q, v, tau, t):
+    """(a, lam, least over largest pivot of A M^-1 A^T) without branches; NaN where M is not positive definite."""
+    metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
+    normal = cholesky(_product(Y.T, Y))
+    lam = _refined(normal, Y, wanted)
+    quality = jnp.where(metric.definite(), quality_of(normal), jnp.nan)
+    return metric.unwhiten(free + _product(Y, lam)), lam, quality
+
+
+def _whitened(scene: Scene, q, v, tau, t):
+    """The mass matrix's factor, Y = U^-1 A^T, U^-1 (tau + forces - h), gamma - A M^-1 (tau + forces - h), and gamma."""
+    row = rows(scene, q, v, t)
+    metric, Y, free = _weighted(scene, q, v, applied(scene, q, v, tau, t), t, row.A)
+    return metric, Y, free, row.gamma - _product(Y.T, free), row.gamma
+
+
+def _by_rank(scene: Scene, q, v, tau, t, rank_tol) -> ConstrainedDynamics:
+    """For rows that may depend on each other."""
+    metric, Y, free, wanted, gamma = run(_whitened, scene, q, v, tau, t)
+    return _shortest_push(scene, metric, Y, free, wanted, gamma, rank_tol)
+
+
+def _judged(scene: Scene, q, quality):
+    """Rank and code of rows that were taken for independent, from the ratio of their pivots."""
+    rank = jnp.asarray(layout(scene)[-1].end, jnp.int32)
+    result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
+
+
+def _repaired(scene: Scene, found, state, rank_tol) -> ConstrainedDynamics:
+    """`found` = (a, lam, quality of the rows), with the rank-aware solve for the samples whose rows it could not serve."""
+    a, lam, quality = found
+    traced, known = partition_traced(scene)
+
+    def careful(traced, state):
+        q, v, tau, t = state
+        found = _by_rank(known(traced), q, v, tau, t, rank_tol)
+        return (found.acceleration, found.multipliers), (found.rank, found.result)
+
+    def fast(traced, state):
+        return run(_by_pivots, known(traced), *state)[:2]
+
+    # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
+    careful = jax.checkpoint(careful, prevent_cse=False)
+    flag = ~(quality > least_pivot(state[0], rank_tol))
+    start = (a, lam), _judged(scene, state[0], quality)
+    (a, lam), (rank, result) = repair_flagged(flag, careful, fast, start, (traced, state))
+    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+
+
+def applied(scene: Scene, q, v, tau, t) -> Array:
+    """tau plus the scene's forces, (nv,)."""
+    tau = jnp.zeros_like(v) if tau is None else checked_force(tau, q, scene.nv, "tau")
+    force = scene.applied_force(q, v, t)
+    return tau if force is None else tau + force
+
+
+def _free(scene, q, v, force, t) -> ConstrainedDynamics:
+    metric = mass_factor(mass_matrix(scene.system, q, t))
+    a = metric.solve(force - bias_force(scene.system, q, v, t))
+    result = RESULTS.where(metric.definite(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
+
+
+def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None = None) -> ConstrainedDynamics:
+    """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
+    bare = Scene(scene.system)
+    metric, Y, free = run(_weighted, bare, q, v, force, t, row.A)
+    return _shortest_push(scene, metric, Y, free, row.gamma - _product(Y.T, free), row.gamma, rank_tol)
+
+
+def _shortest_push(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, rank_tol) -> ConstrainedDynamics:
+    """By Gauss's principle: what is added to the free acceleration is as short as can be."""
+    lam, pushed, rank = _shortest(Y, wanted, rank_tol)
+    # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
+    missed = jnp.abs(wanted - _product(Y.T, pushed))
+    sizes = jnp.abs(gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
+    met = jnp.all(missed <= eps_of(Y) ** 0.5 * (sizes + jnp.max(sizes)))
+    result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(metric.definite(), result, RESULTS.singular_mass_matrix)
+    return ConstrainedDynamics(metric.unwhiten(free + pushed), lam, rank, result, layout(scene))
+
+
+def _weighted(scene: Scene, q, v, force, t, A):
+    """M = U U^T, Y = U^-1 A^T and U^-1 (force - h)."""
+    metric = mass_factor(mass_matrix(scene.system, q, t))
+    columns = jnp.concatenate([A, (force - bias_force(scene.system, q, v, t))[None]]).T
+    whitened = metric.whiten(columns)
+    return metric, whitened[:, :-1], whitened[:, -1]
+
+
+def _refined(factor, Y, right):
+    """(Y^T Y)^-1 right from the Cholesky factor: one correction takes the squared condition number out of the error."""
+    x = solve_factored(factor, right)
+    return x + solve_factored(factor, right - _product(Y.T, _product(Y, x)))
+
+
+def _shortest(Y, wanted, rank_tol):
+    """lam and w = Y lam, the shortest w with Y^T w = wanted, and the rank of Y."""
+
+    inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
+    pushed = _product(inverse.T, wanted)
+    return _product(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
+
+
+def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:
+    """Rows that are taken for independent: the Cholesky factor of A M^-1 A^T."""
+    by_bodies = method == "range_space" and isinstance(scene.system, Model)
+    a, lam, fine, definite = run(_by_bodies if by_bodies else _by_delassus, scene, q, v, tau, t)
+    result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(definite, result, RESULTS.singular_mass_matrix)
+    rank = jnp.asarray(lam.shape[0], jnp.int32)
+    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+
+
+def _by_delassus(scene: Scene, q, v, tau, t):
+    metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
+    lam, fine = _solve_delassus(_product(Y.T, Y), wanted, scene.nv)
+    return metric.unwhiten(free + _product(Y, lam)), lam, fine, metric.definite()
+
+
+def _by_bodies(scene: Scene, q, v, tau, t):
+    """The same from a0 and X = M^-1 A^T of one articulated-body factorisation: a = a0 + X lam."""
+    row, force = rows(scene, q, v, t), applied(scene, q, v, tau, t)
+    free, X = aba_with_columns(scene.system, q, v, force, row.A.T)
+    lam, fine = _solve_delassus(_product(row.A, X), row.gamma - _product(row.A, free), scene.nv)
+    return free + _product(X, lam), lam, fine, jnp.isfinite(free).all()
+
+
+def _solve_delassus(delassus, wanted, nv: int):
+    """lam with A M^-1 A^T lam = wanted by Cholesky, and whether the rows were independent."""
+    factor = cholesky(0.5 * (delassus + delassus.T))
+    pivots = jnp.diagonal(factor)
+    # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
+    fine = jnp.min(pivots) > (10 * nv * eps_of(delassus)) ** 0.5 * jnp.max(pivots)
+    return solve_factored(factor, wanted), fine
+
+
+def constraint_forces(
+    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t=0.0
+) -> dict[str, Float[Array, " nv"]]:
+    """Generalised force A_i^T lam_i (nv,) of each constraint on the system, by name; N m or N."""
+    scene = as_scene(scene)
+    A = constraint_jacobian(scene, q, t)
+    multipliers = _checked_multipliers(multipliers, A.shape[0], A.dtype)
+    return {p.name: _product(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
+
+
+def constraint_wrenches(
+    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"]
+) -> dict[str, Float[Array, "6"]]:
+    """Wrench (f, tau) of each constraint between two frames on its body B, at the origin and in the axes of its frame A.
+
+    N and N m, by name. The wrench on body A is the negative of it. A loop has its frames A and B as given; for a rolling
+    contact A is on the surface and B on the body that rolls, for a contact of a grasp A is on the object and B on the finger.
+    """
+    scene, found = as_scene(scene), {}
+    (q,) = check_state(scene.system, q=q)
+    places = layout(scene)
+    multipliers = _checked_multipliers(multipliers, places[-1].end if places else 0, q.dtype)
+    for constraint, place in zip(scene.constraints, places, strict=True):
+        if isinstance(constraint, Pair):
+            rotation, position = relative_poses([constraint], scene.system, q)
+            found[place.name] = constraint.wrench(rotation[0], position[0], multipliers[place.start : place.end])
+    return found
+
+
+def _checked_multipliers(multipliers, count: int, dtype) -> Array:
+    multipliers = as_array(multipliers, "multipliers", dtype)
+    if multipliers.shape != (count,):
+        hint = batch_hint(multipliers, (1,))
+        raise ValueError(f"multipliers has shape {multipliers.shape}, expected {(count,)}, one per row{hint}")
+    return multipliers
+
+
+def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None) -> Projections:
+    """Projections P_T = 1 - M^-1 A^T (A M^-1 A^T)^+ A of velocities and P_omega = P_T^T of forces.
+
+    P_T is orthogonal in the metric M and keeps what satisfies A v = 0; P_omega removes every constraint force A^T lam.
+
+    **Arguments:** `q` (nq,); `t`, s; `rank_tol` as in `constrained_dynamics`.
+
+    **Returns:** (P_T, P_omega), each (nv, nv).
+
+    Source: EQUATIONS section 7.
+    """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
+    metric, Y = run(whitened_rows, scene, q, t)
+    inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
+    kept = jnp.eye(Y.shape[0], dtype=Y.dtype) - _product(Y, inverse)
+    # U^-T (1 - Y Y^+) U^T, of which the columns of U^T are found from the unit velocities.
+    P_T = metric.unwhiten(_product(kept, metric.momentum(jnp.eye(scene.nv, dtype=Y.dtype))))
+    return Projections(P_T, P_T.T)
+
+
+def whitened_rows(scene: Scene, q, t):
+    """M = U U^T and Y = U^-1 A^T."""
+    metric = mass_factor(mass_matrix(scene.system, q, t))
+    return metric, metric.whiten(constraint_jacobian(scene, q, t).T)
+
+
+def second_fundamental_form(
+    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0, *, rank_tol: float | None = None
+) -> Float[Array, " nv"]:
+    """S(v, v) = (1 - P_T)(a + M^-1 C v): the covariant acceleration that the constraints prescribe.
+
+    S = M^-1 A^T (A M^-1 A^T)^+ (gamma + A M^-1 C v) needs q and v alone. M S is the force, normal to the constraints,
+    that keeps the motion on them.
+
+    **Arguments:** `q` (nq,); `v` (nv,), admissible. **Returns:** (nv,), an acceleration.
+
+    Source: EQUATIONS section 7 and erratum E20.
+    """
+    scene = as_scene(scene)
+    q, v, t = check_state(scene.system, q=q, v=v, t=t)
+    coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
+    metric, Y = run(whitened_rows, scene, q, t)
+    wanted = rows(scene, q, v, t).gamma + _product(Y.T, metric.whiten(coriolis))
+    return metric.unwhiten(_product(pseudo_inverse(Y, tolerance(rank_tol, Y)).T, wanted))
+
+
+def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
+    """B (nv, n) such that -B r is the shortest step, in the metric M(q), that removes the residual r of the rows.
+
+    Rows: the holonomic ones, or all.
+    """
+    metric, Y = run(whitened_rows, scene, q, t)
+    return _unwhitened_inverse(metric, Y[:, holonomic_rows(layout(scene))] if holonomic else Y, rank_tol)
+
+
+def right_inverse(metric: MassFactor, A, rank_tol) -> Array:
+    """B (nv, n) with A B = 1 and columns as short as can be in the metric, for rows A (n, nv)."""
+    return _unwhitened_inverse(metric, metric.whiten(A.T), rank_tol)
+
+
+def _unwhitened_inverse(metric, Y, rank_tol):
+    return metric.unwhiten(pseudo_inverse(Y, tolerance(rank_tol, Y)).T)

@@ -1,0 +1,252 @@
+"""Putting a state that has drifted from its constraints by little back onto them, by the least change."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxdyn.compile import along, implicit, is_expanding, is_rank_safe, partition_traced, repair_flagged, run
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
+from jaxdyn.constraints.dynamics import correction, whitened_rows
+from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, tolerance
+from jaxdyn.lie.so3 import _product
+from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displace, retract
+
+_STEPS_A_ROUND, _MOST_ROUNDS = 2, 3
+_STEPS_DIFFERENTIATED = 4
+
+
+def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
+    """q and v moved by the least change, in the metric M(q), onto the constraints, from a small distance.
+
+    One factorisation serves all steps: with B fixed, each step multiplies the residual by the size of the correction
+    times the curvature of the constraint, 1e-8 -> 1e-16 after one. The steps end when the next one would be lost in rounding.
+    Those that are differentiated are a fixed number, so that derivatives converge as far. A projection that does not
+    reduce the residual is not applied.
+    """
+    return project_step(scene, q, v, t, (), rank_tol)[:2]
+
+
+def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | None = None) -> Any:
+    """`project_state` for the end of a step with estimated errors of q, and of v, each (nv,): (q, v, errors).
+
+    Errors come back without their parts normal to the constraints: as far as small ones go, those are what is removed from
+    q and v. Near a singular position they are large, and shorter steps make them no smaller. What the projection leaves open
+    is added.
+    """
+
+    def project(scene, q, v, t, *errors):
+        return _projected(scene, rank_tol, q, v, t, errors)
+
+    def tangent(scene, q, v, t, *rest):
+        *errors, steps = rest
+
+        def careful(scene, q, v, t, *errors):
+            return _in_fixed_steps(scene, q, v, t, errors, rank_tol)
+
+        found, moved = along(careful, (scene, q, v, t, *errors), steps)
+        return found, jax.tree.map(jnp.zeros_like, found) if moved is None else moved
+
+    errors = lax.stop_gradient(tuple(errors))
+    return implicit(Scene(scene.system, scene.constraints), (q, v, t, *errors), project, tangent)
+
+
+def _projected(scene: Scene, rank_tol, q, v, t, errors):
+    """A few steps from one factorisation of the rows; where these were not enough, the next round factors them anew."""
+    q = retract(scene.system, q)
+    if layout(scene)[-1].end > scene.nv or is_rank_safe():
+        return _by_rank(scene, rank_tol, q, v, t, errors)
+    found = run(_by_pivots, scene, q, v, t, *errors, otherwise=lambda *_: None)
+    if found is None:
+        return _by_rank(scene, rank_tol, q, v, t, errors)
+    place, speed, errors_left, more, quality = found
+    if is_expanding():
+        quality = jnp.where(more, jnp.nan, quality)
+    else:
+
+        def again(q, v, quality):
+            *found, pivots = run(_by_pivots, scene, q, v, t, *errors)
+            return *found, jnp.minimum(quality, pivots)
+
+        place, speed, errors_left, quality = _in_rounds(again, found)
+    traced, known = partition_traced(scene)
+
+    def careful(traced, q, v, t, errors):
+        return _by_rank(known(traced), rank_tol, q, v, t, errors), ()
+
+    flag = ~(quality > least_pivot(q, rank_tol))
+    start = ((place, speed, errors_left), ())
+    # Derivatives are given by `project_step`.
+    return repair_flagged(flag, careful, lambda *args: careful(*args)[0], start, (traced, q, v, t, errors))[0]
+
+
+def _in_rounds(again: Callable, found):
+    """`found` = (q, v, errors, whether to go on, anything), and again(q, v, anything) until that is not, `_MOST_ROUNDS` in
+    all."""
+
+    def step(state):
+        count, (q, v, _, _, more) = state
+        return count + 1, again(q, v, more)
+
+    def unfinished(state):
+        count, found = state
+        return found[3] & (count < _MOST_ROUNDS)
+
+    q, v, errors, _, anything = lax.while_loop(unfinished, step, (1, tuple(found)))[1]
+    return q, v, errors, anything
+
+
+def _by_rank(scene: Scene, rank_tol, q, v, t, errors):
+    """For rows that may depend on each other."""
+    held = holonomic_rows(layout(scene))
+
+    def again(q, v, _):
+        metric, Y = run(whitened_rows, scene, q, t)
+        every = pseudo_inverse(Y, tolerance(rank_tol, Y))
+        some = every if held.size in (0, Y.shape[1]) else pseudo_inverse(Y[:, held], tolerance(rank_tol, Y))
+        return *run(_moved_by_matrices, scene, q, v, t, errors, metric, every, some), ()
+
+    return _in_rounds(again, again(q, v, ()))[:3]
+
+
+def _moved_by_matrices(scene: Scene, q, v, t, errors, metric, every, some):
+    """`_moved` with the pseudo-inverses of U^-1 A^T for all rows, and for those on positions."""
+
+    def steps(inverse):
+        return lambda residual: metric.unwhiten(_product(inverse.T, residual))
+
+    return _moved(scene, q, v, t, errors, steps(every), steps(some))
+
+
+def _by_pivots(scene: Scene, q, v, t, *errors):
+    """q, v and errors after a few steps, whether a step more would help, and the ratio of the rows' pivots."""
+    held = holonomic_rows(layout(scene))
+    metric, Y = whitened_rows(scene, q, t)
+
+    def steps(Y):
+        factor = cholesky(_product(Y.T, Y))
+        return (lambda residual: metric.unwhiten(_product(Y, solve_factored(factor, residual)))), quality_of(factor)
+
+    every, quality = steps(Y)
+    some = every
+    if held.size not in (0, Y.shape[1]):
+        some, of_held = steps(Y[:, held])
+        quality = jnp.minimum(quality, of_held)
+    quality = jnp.where(metric.definite(), quality, jnp.nan)
+    return *_moved(scene, q, v, t, errors, every, some), quality
+
+
+def _moved(scene: Scene, q, v, t, errors, every: Callable, some: Callable):
+    """q, v and errors on the constraints, and whether another step would help.
+
+    `every(r)` is the shortest step, in the metric M, that removes the residual r of all rows, `some(r)` of those on positions.
+    """
+    held = holonomic_rows(layout(scene))
+    position_left, is_open = jnp.zeros((), q.dtype), jnp.asarray(False)
+    if held.size:
+        q, position_left, is_open = _closed(scene, q, some, lambda place: position_residual(scene, place, t))
+
+    def velocity_rows(v):
+        return velocity_residual(scene, q, v, t)
+
+    v, velocity_left, is_slipping = _descend(v, every, velocity_rows, lambda v, step: v - step)
+    if errors:
+        A = constraint_jacobian(scene, q, t)
+        of_place = some if held.size else None
+        errors = _allowed(
+            errors,
+            (of_place, partial(_product, A[held]), position_left),
+            (every, partial(_product, A), velocity_left),
+        )
+    return q, v, errors, is_open | is_slipping
+
+
+def _allowed(errors: tuple, *ways) -> tuple:
+    """Errors less the least change that removes what they add to the rows, and with what is left open.
+
+    A way is (step, rate of the rows along an error, distance left); its step is None for no rows.
+    """
+
+    def allowed(error, step, rate, left):
+        return error if step is None else enlarged(error - step(rate(error)), left)
+
+    return tuple(allowed(error, *way) for error, way in zip(errors, ways, strict=False))
+
+
+def enlarged(error, by):
+    """An error of either sign, larger by the size of another one."""
+    return error + jnp.where(error < 0, -jnp.abs(by), jnp.abs(by))
+
+
+def _closed(scene: Scene, q, step, residual):
+    """q on the holonomic constraints, about how far it still is from them, and whether another step would bring it closer."""
+
+    def move(place, change):
+        return retract(scene.system, displace(scene.system, place, -change))
+
+    return _descend(q, step, residual, move)
+
+
+def _descend(x, step, residual, move):
+    """x moved by x -> move(x, step(residual(x))) until that would change it by rounding alone, `_STEPS_A_ROUND` times at most.
+
+    Also the largest entry of the next step, which is about how far x is still away, and whether to take it.
+    """
+    rounding = float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.abs(x))
+
+    def improve(state):
+        x, r, _, _ = state
+        change = step(r)
+        tried = move(x, change)
+        left = residual(tried)
+        before, after, way = (jnp.max(jnp.abs(y)) for y in (r, left, change))
+        falls = after < before
+        # The next step is about this one times what it has left of the residual.
+        more = falls & (way * after > rounding * before)
+        away = jnp.where(falls, way * after / before, jnp.where(before > 0, way, jnp.zeros_like(way)))
+        return jnp.where(falls, tried, x), jnp.where(falls, left, r), more, away
+
+    first = residual(x)
+    state = x, first, jnp.max(jnp.abs(first)) > 0, jnp.zeros((), x.dtype)
+    for _ in range(_STEPS_A_ROUND):
+        state = jax.tree.map(partial(jnp.where, state[2]), improve(state), state)
+    x, _, more, away = state
+    return x, away, more
+
+
+def _in_fixed_steps(scene: Scene, q, v, t, errors, rank_tol):
+    """The same for derivatives, which are those of the steps as they are."""
+    q = retract(scene.system, q)
+    held = holonomic_rows(layout(scene))
+    B = correction(scene, q, t, rank_tol, holonomic=False)
+    B_held = B if held.size in (0, B.shape[1]) else correction(scene, q, t, rank_tol, holonomic=True)
+    apart = jnp.zeros((), q.dtype)
+    if held.size:
+
+        def move(place, _):
+            step = _product(B_held, position_residual(scene, place, t))
+            return displace(scene.system, place, -step), None
+
+        moved, _ = lax.scan(move, q, None, length=_STEPS_DIFFERENTIATED)
+        before, after = (position_residual(scene, x, t) for x in (q, moved))
+        better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
+        q = jnp.where(better, retract(scene.system, moved), q)
+        apart = jnp.max(jnp.abs(_product(B_held, jnp.where(better, after, before))))
+
+    def slow(v, _):
+        return v - _product(B, velocity_residual(scene, q, v, t)), None
+
+    projected, _ = lax.scan(slow, v, None, length=_STEPS_DIFFERENTIATED)
+    before, after = (velocity_residual(scene, q, x, t) for x in (v, projected))
+    better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
+    if errors:
+        A, slip = constraint_jacobian(scene, q, t), jnp.max(jnp.abs(_product(B, jnp.where(better, after, before))))
+        of_place = partial(_product, B_held) if held.size else None
+        ways = (of_place, partial(_product, A[held]), apart), (partial(_product, B), partial(_product, A), slip)
+        errors = lax.stop_gradient(_allowed(errors, *ways))
+    return q, jnp.where(better, projected, v), errors

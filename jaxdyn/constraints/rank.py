@@ -1,0 +1,84 @@
+"""Whether rows are independent, and pseudo-inverses of those that may not be."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.core
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import any_in_batch, pseudo_inverse_by_rotations, run
+from jaxdyn.lie.so3 import _product
+from jaxdyn.systems.mass_factor import cholesky, solve_factored
+
+# Operations of the normal equations up to which they are written out: LLVM takes 50 to 100 microseconds for each of them.
+_MOST_STRAIGHT = 10_000
+
+
+def checked_tolerance(rank_tol: float | None) -> float | None:
+    """The rank tolerance as a float, or None for the default. **Raises:** ValueError outside (0, 1)."""
+    if rank_tol is None:
+        return None
+    if isinstance(rank_tol, jax.core.Tracer) or not 0 < float(rank_tol) < 1:
+        raise ValueError(f"rank_tol is {rank_tol}; give a number between 0 and 1 that is not traced, or None")
+    return float(rank_tol)
+
+
+def tolerance(rank_tol: float | None, like) -> float:
+    """The rank tolerance as given, or the default for the dtype."""
+    return eps_of(like) ** (4 / 7) if rank_tol is None else float(rank_tol)
+
+
+def eps_of(like) -> float:
+    """Rounding error of the dtype."""
+    return float(jnp.finfo(like.dtype).eps)
+
+
+def least_pivot(like, rank_tol: float | None) -> float:
+    """Ratio of the pivots of A M^-1 A^T above which the rows are independent whatever the rounding, and Cholesky serves."""
+    return max(eps_of(like) ** 0.4, (100 * tolerance(rank_tol, like)) ** 2)
+
+
+def quality_of(factor):
+    """Least over largest pivot, from a Cholesky factor."""
+    pivots = jnp.diagonal(factor) ** 2
+    return jnp.min(pivots) / jnp.max(pivots)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = False) -> Float[Array, "m n"]:
+    """Moore-Penrose inverse of Y, singular values below `rank_tol` times the largest taken for zero.
+
+    Values: (Y^T Y)^-1 Y^T where that is as good; else by singular values, of all samples if one in a batch needs it; at
+    once where the columns are known to be `dependent`. Derivative: the formula of Golub & Pereyra (1973), eq. 4.12, right
+    wherever the rank is constant; no factorisation is differentiated.
+    """
+    if dependent or Y.shape[1] > Y.shape[0]:
+        return pseudo_inverse_by_rotations(Y, rank_tol)
+    found: Any = run(_by_normal_equations, None, Y, most=_MOST_STRAIGHT, otherwise=lambda *_: None)
+    if found is None:
+        return pseudo_inverse_by_rotations(Y, rank_tol)
+    inverse, quality = found
+    doubtful = any_in_batch(~(quality > least_pivot(Y, rank_tol)))
+    return lax.cond(doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
+
+
+def _by_normal_equations(_, Y):
+    """(Y^T Y)^-1 Y^T, and the least over the largest pivot of Y^T Y."""
+    factor = cholesky(_product(Y.T, Y))
+    inverse = solve_factored(factor, Y.T)
+    # One step of Newton and Schulz takes the squared condition number out of the error.
+    return 2 * inverse - _product(_product(inverse, Y), inverse), quality_of(factor)
+
+
+@pseudo_inverse.defjvp
+def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
+    (Y,), (dY,) = primals, tangents
+    P = pseudo_inverse(Y, rank_tol, dependent)
+    across = dY.T - _product(_product(dY.T, Y), P)  # dY^T (1 - Y P)
+    along = dY.T - _product(P, _product(Y, dY.T))  # (1 - P Y) dY^T
+    dP = -_product(_product(P, dY), P)
+    dP = dP + _product(_product(P, P.T), across) + _product(along, _product(P.T, P))
+    return P, dP

@@ -1,0 +1,380 @@
+"""Kinematics of trees: products of exponentials, Jacobians of named frames and their rates.
+
+Body i stands at T_i = (product over its ancestors j, root first, of home_j exp(hat(S_j) q_j)), the product of
+exponentials of Murray, Li & Sastry (1994), eq. 3.3, with body frames in place of base-frame screws. The product along
+the tree is taken by pointer jumping: after step k every body holds the product of its last 2^k joints, so log2(depth)
+batched 4x4 products give all poses and the program stays short however many bodies there are.
+
+Everything that is summed over bodies lives in one *tree frame*: axes parallel to the world's, origin at the origin of
+the tree's root body. Positions in it are built without ever adding the root's own position, so a robot far from the
+world's origin is computed exactly as one at home.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import is_expanding, run
+from jaxdyn.lie import se3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
+from jaxdyn.model.tree import Model, Topology, frame_index, geometry
+
+
+class TreeFrame(NamedTuple):
+    """A configuration seen from the tree frames (one per root body).
+
+    - `pose` (nb, 4, 4): body frame in its tree frame (m).
+    - `origin` (nb, 3): world position of the tree frame's origin, for each body (m).
+    - `subspace` (nv, 6): row k is the twist, in the tree frame, of the motion with v_k = 1 alone. As a twist of the
+      fixed frame that coincides with the tree frame at this instant it does not depend on where the root body is.
+    """
+
+    pose: Float[Array, "nb 4 4"]
+    origin: Float[Array, "nb 3"]
+    subspace: Float[Array, "nv 6"]
+
+
+def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
+    """Pose of each body frame in its parent body frame (the world's for roots), home @ exp(hat(S) q)."""
+    topology = model.topology
+    home, screws = map(jnp.asarray, geometry(model))
+    order, transforms = [], []
+    for kind, bodies in _groups(topology):
+        if kind in SCREW_KINDS:
+            coordinates = np.array([topology.q_slices[i].start for i in bodies])
+            place = jax.vmap(functools.partial(screw_transform, kind))
+            transforms.append(place(take(screws, bodies), take(q, coordinates)))
+        else:
+            coordinates = np.array([np.arange(topology.nq)[topology.q_slices[i]] for i in bodies])
+            # The screw is not read by these kinds.
+            transforms.append(jax.vmap(lambda qj, kind=kind: joint_transform(kind, screws[0], qj))(q[coordinates]))
+        order.extend(bodies)
+    if not transforms:
+        return home
+    moved = transforms[0] if len(transforms) == 1 else jnp.concatenate(transforms)
+    return _product(home, take(moved, np.argsort(order)))
+
+
+def body_subspace(model: Model) -> Float[Array, "nv 6"]:
+    """Motion subspace of every joint in its own body frame, one row per velocity coordinate."""
+    topology = model.topology
+    fixed = np.zeros((topology.nv, 6))
+    is_screw = np.zeros(topology.nv, bool)
+    for kind, place in zip(topology.kinds, topology.v_slices, strict=True):
+        if kind in SCREW_KINDS:
+            is_screw[place] = True
+        else:
+            fixed[place] = np.eye(6)[list(KINDS[kind].columns)]
+    constant = jnp.asarray(fixed, model.screws.dtype)
+    if not is_screw.any():
+        return constant
+    screws = take(jnp.asarray(geometry(model)[1]), topology.dof_body)
+    return screws if is_screw.all() else jnp.where(is_screw[:, None], screws, constant)
+
+
+def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
+    """Poses and motion subspace in the tree frames (see `TreeFrame`)."""
+    topology = model.topology
+    local = relative_poses(model, q)
+    is_root = np.array([parent < 0 for parent in topology.parents], bool)
+    origin = take(local[:, :3, 3], topology.roots)
+    # A root's own translation is replaced by zero before the product, not subtracted after it.
+    keep = np.ones((topology.nb, 4, 4), bool)
+    keep[is_root, :3, 3] = False
+    pose = jnp.where(keep, local, jnp.zeros_like(local))
+    pose = _along_tree(topology, pose)
+    subspace = jax.vmap(se3.Ad_apply)(take(pose, topology.dof_body), body_subspace(model))
+    return TreeFrame(pose, origin, subspace)
+
+
+def _along_tree(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
+    """Products of the poses of all bodies above each body, root first.
+
+    As operations on arrays by pointer jumping, in log2(depth) products of all bodies; as single numbers one product a body.
+    """
+    if is_expanding():
+        found: list = []
+        for i, parent in enumerate(topology.parents):
+            found.append(pose[i] if parent < 0 else _product(found[parent], pose[i]))
+        return jnp.stack(found) if found else pose
+    world = jnp.eye(4, dtype=pose.dtype)[None]
+    for table in topology.jumps:
+        pose = _product(jnp.concatenate([pose, world])[table], pose)
+    return pose
+
+
+class Carried(NamedTuple):
+    """A few frames, and the coordinates that move them.
+
+    - `pose` (n, 4, 4): in the tree frame of the body that carries it; `origin` (n, 3): of that tree frame in the world.
+    - `coordinates` (k,): velocity coordinates that move any of them; `subspace` (k, 6): their rows of `TreeFrame.subspace`.
+    - `moves` (n, k) of bool: which frame each of these coordinates moves.
+    - `twist`, `bias` (n, 6): twist of each frame, as a twist of the fixed frame that now coincides with the tree frame, and
+      its rate at a = 0; None when no velocity was given.
+    """
+
+    pose: Float[Array, "n 4 4"]
+    origin: Float[Array, "n 3"]
+    subspace: Float[Array, "k 6"]
+    coordinates: np.ndarray
+    moves: np.ndarray
+    twist: Float[Array, "n 6"] | None = None
+    bias: Float[Array, "n 6"] | None = None
+
+
+def carried(
+    model: Model, q: Float[Array, " nq"], bodies: Sequence[int], v: Float[Array, " nv"] | None = None
+) -> Carried:
+    """The frames of a few bodies (-1 is the world), and with v their twists, computed on their ancestors alone."""
+    topology, n = model.topology, len(bodies)
+    named = np.array([body for body in bodies if body >= 0], int)
+    kept = np.flatnonzero(topology.ancestors[named].any(0)).tolist()
+    if not kept:
+        pose = jnp.broadcast_to(jnp.eye(4, dtype=q.dtype), (n, 4, 4))
+        none, still = np.zeros(0, int), None if v is None else jnp.zeros((n, 6), q.dtype)
+        nowhere = jnp.zeros((0, 6), q.dtype)
+        return Carried(pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), still, still)
+    coordinates = _places(topology.v_slices, kept)
+    if len(kept) < model.nb:
+        model, q = _pruned(model, kept), take(q, _places(topology.q_slices, kept))
+    frame = tree_frame(model, q)
+    index = np.array([kept.index(body) if body >= 0 else len(kept) for body in bodies])
+    pose = jnp.concatenate([frame.pose, jnp.eye(4, dtype=q.dtype)[None]])
+    origin = jnp.concatenate([frame.origin, jnp.zeros((1, 3), q.dtype)])
+    moves = np.concatenate([model.topology.dof_ancestors, np.zeros((1, model.nv), bool)])[index]
+    found = Carried(take(pose, index), take(origin, index), frame.subspace, coordinates, moves)
+    if v is None:
+        return found
+    v = take(v, coordinates)
+    rates = subspace_rate(model, frame, body_twists(model, frame, v))
+    # One product gives the twists and their rates.
+    sums = _product(jnp.asarray(moves, q.dtype), jnp.concatenate([frame.subspace, rates], axis=1) * v[:, None])
+    return found._replace(twist=sums[:, :6], bias=sums[:, 6:])
+
+
+def _pruned(model: Model, kept: list[int]) -> Model:
+    """The model with some of its bodies alone, which include the parent of each; what kinematics does not read is left out."""
+    old, index = model.topology, np.array(kept)
+
+    def chosen(names):
+        return tuple(names[i] for i in kept)
+
+    parents = tuple(kept.index(parent) if parent >= 0 else -1 for parent in chosen(old.parents))
+    names = chosen(old.body_names)
+    topology = Topology(
+        old.name, parents, chosen(old.kinds), names, chosen(old.joint_names), names, tuple(range(len(kept)))
+    )
+    at_q, at_v = _places(old.q_slices, kept), _places(old.v_slices, kept)
+    return Model(
+        home=take(model.home, index),
+        screws=take(model.screws, index),
+        inertias=take(model.inertias, index),
+        frame_poses=jnp.zeros((len(kept), 4, 4), model.home.dtype),
+        gravity=None,
+        armature=None,
+        damping=None,
+        friction=None,
+        lower=take(model.lower, at_q),
+        upper=take(model.upper, at_q),
+        velocity_limit=take(model.velocity_limit, at_v),
+        effort_limit=take(model.effort_limit, at_v),
+        topology=topology,
+    )
+
+
+def _places(slices, kept: list[int]) -> np.ndarray:
+    return np.concatenate([np.arange(slices[i].start, slices[i].stop) for i in kept])
+
+
+def body_twists(model: Model, frame: TreeFrame, v: Float[Array, " nv"]) -> Float[Array, "nb 6"]:
+    """Twist of every body in its tree frame: V_i = sum of S_k v_k over the coordinates k that move body i."""
+    return sum_to_bodies(model, frame.subspace * v[:, None])
+
+
+def subspace_rate(model: Model, frame: TreeFrame, twists: Float[Array, "nb 6"]) -> Float[Array, "nv 6"]:
+    """Rate of the motion subspace: dS_k/dt = ad_V S_k, V the twist of the body that carries S_k with it."""
+    return jax.vmap(se3.ad_apply)(take(twists, model.topology.dof_body), frame.subspace)
+
+
+def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
+    """G rows: for each body the sum of the rows of the coordinates that move it."""
+    return _product(jnp.asarray(model.topology.dof_ancestors, rows.dtype), rows)
+
+
+def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
+    """G^T rows: for each velocity coordinate the sum of the rows of the bodies that it moves."""
+    return _product(jnp.asarray(model.topology.dof_ancestors.T, rows.dtype), rows)
+
+
+def forward_kinematics(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
+    """Pose of every body frame in the world, T_i = product of home_j exp(hat(S_j) q_j) over the joints above body i.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (nb, 4, 4) in the order of `model.body_names`; maps body coordinates to world coordinates (m).
+
+    **Raises:** ValueError when the shape of q does not fit the model.
+
+    Source: Murray, Li & Sastry (1994), eq. 3.3; EQUATIONS section 2.
+    """
+    (q,) = check_shapes(model, q=q)
+    return run(_world_poses, model, q)
+
+
+def _world_poses(model: Model, q):
+    frame = tree_frame(model, q)
+    return _moved(frame.pose, frame.origin)
+
+
+def _moved(pose: Float[Array, "*n 4 4"], shift: Float[Array, "*n 3"]) -> Float[Array, "*n 4 4"]:
+    """Poses with their positions moved by a shift in the axes that they are given in."""
+    step = jnp.concatenate([shift[..., None], jnp.zeros_like(shift[..., :1, None])], -2)
+    return jnp.concatenate([pose[..., :3], pose[..., 3:] + step], -1)
+
+
+def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[Array, "4 4"]:
+    """Pose of a named frame in the world.
+
+    **Arguments:** `q` (nq,); `name`, one of `model.frame_names` (None: the world itself).
+
+    **Returns:** (4, 4), maps frame coordinates to world coordinates (m).
+
+    **Raises:** ValueError for an unknown name (near names are listed) or a q that does not fit.
+    """
+    (q,) = check_shapes(model, q=q)
+    body, offset = _named_frame(model, name)
+    return offset if body < 0 else run(_pose_in_body, (_kinematic(model), offset), q, static=(body,))
+
+
+def _pose_in_body(body: int, tree, q):
+    model, offset = tree
+    found = carried(model, q, [body])
+    return _moved(_product(found.pose[0], offset), found.origin[0])
+
+
+def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
+    """Body Jacobian of a named frame: J v is the frame's body twist, hat(J v) = T^-1 dT/dt.
+
+    **Arguments:** `q` (nq,); `frame`, one of `model.frame_names` (None: the world, J = 0).
+
+    **Returns:** (6, nv): linear then angular velocity of the frame, at its origin and in its own axes (m/s, rad/s per
+    unit of v). Its transpose maps a wrench at that origin, in those axes, to generalised forces.
+
+    **Raises:** ValueError for an unknown name or a q that does not fit.
+
+    Source: Murray, Li & Sastry (1994), eq. 3.55; EQUATIONS section 2.
+    """
+    (q,) = check_shapes(model, q=q)
+    body, offset = _named_frame(model, frame)
+    if body < 0:
+        return jnp.zeros((6, model.nv), model.home.dtype)
+    return run(_body_jacobian, (_kinematic(model), offset), q, static=(body,))
+
+
+def _body_jacobian(body: int, tree, q):
+    model, offset = tree
+    frame = tree_frame(model, q)
+    return _body_twist_columns(model, frame, body, offset, frame.subspace).T
+
+
+def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
+    """Spatial Jacobian of a named frame: J v is the frame's spatial twist, hat(J v) = (dT/dt) T^-1.
+
+    **Arguments:** `q` (nq,); `frame`, one of `model.frame_names` (None: the world, J = 0).
+
+    **Returns:** (6, nv): velocity of the point of the body that is now at the world's origin, and angular velocity, in
+    world axes. Loses accuracy with the distance from the world's origin; `body_jacobian` does not.
+
+    **Raises:** ValueError for an unknown name or a q that does not fit.
+
+    Source: Murray, Li & Sastry (1994), eq. 3.54.
+    """
+    (q,) = check_shapes(model, q=q)
+    body, _ = _named_frame(model, frame)
+    if body < 0:
+        return jnp.zeros((6, model.nv), model.home.dtype)
+    return run(_spatial_jacobian, _kinematic(model), q, static=(body,))
+
+
+def _spatial_jacobian(body: int, model: Model, q):
+    frame = tree_frame(model, q)
+    shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frame.origin[body])
+    return jax.vmap(se3.Ad_apply, (None, 0), 1)(shift, _moving(model, body, frame.subspace))
+
+
+def jacobian_dot_v(
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], frame: str | None
+) -> Float[Array, "6"]:
+    """Velocity-dependent part of a frame's body acceleration: (d/dt J_b) v, with J_b the body Jacobian.
+
+    The body twist V_b = J_b v has the rate dV_b/dt = J_b a + (d/dt J_b) v. In a fixed frame the second part is the sum
+    of (ad_V S_k) v_k over the coordinates that move the frame, carried into it by Ad^-1.
+
+    **Arguments:** `q` (nq,); `v` (nv,); `frame`, one of `model.frame_names` (None: the world, zero).
+
+    **Returns:** (6,), linear then angular, in the frame's axes (m/s^2, rad/s^2). It is the rate of the body twist, not
+    the acceleration of the origin: that is its linear part plus omega x v.
+
+    **Raises:** ValueError for an unknown name or shapes that do not fit.
+    """
+    q, v = check_shapes(model, q=q, v=v)
+    body, offset = _named_frame(model, frame)
+    if body < 0:
+        return jnp.zeros((6,), model.home.dtype)
+    return run(_jacobian_dot_v, (_kinematic(model), offset), q, v, static=(body,))
+
+
+def _jacobian_dot_v(body: int, tree, q, v):
+    model, offset = tree
+    frame = tree_frame(model, q)
+    rate = subspace_rate(model, frame, body_twists(model, frame, v)) * v[:, None]
+    return jnp.sum(_body_twist_columns(model, frame, body, offset, rate), axis=0)
+
+
+def _kinematic(model: Model) -> Model:
+    """The model as kinematics read it, so that programs do not depend on its other numbers."""
+    if all(x is None for x in (model.gravity, model.armature)):
+        return model
+    return model.replace(gravity=None, armature=None)
+
+
+def take(rows: Array, index: np.ndarray) -> Array:
+    """`rows[index]` for a constant index; no operation when the index lists all rows in order."""
+    index = np.asarray(index)
+    if len(index) == rows.shape[0] and (index == np.arange(len(index))).all():
+        return rows
+    return rows[index]
+
+
+def _groups(topology: Topology) -> list[tuple[str, np.ndarray]]:
+    labels = np.array(["revolute" if kind == "continuous" else kind for kind in topology.kinds], str)
+    return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]
+
+
+def _named_frame(model: Model, name: str | None) -> tuple[int, Float[Array, "4 4"]]:
+    """Body that carries a frame (-1: the world) and the frame's pose in it."""
+    if name is None:
+        return -1, jnp.eye(4, dtype=model.home.dtype)
+    index = frame_index(model, name)
+    return model.topology.frame_bodies[index], model.frame_poses[index]
+
+
+def _moving(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:
+    """Rows of the coordinates that move a body, the others zero."""
+    moves = model.topology.dof_ancestors[body] if body >= 0 else np.zeros(model.nv, bool)
+    return jnp.where(moves[:, None], rows, jnp.zeros_like(rows))
+
+
+def _body_twist_columns(model: Model, tree: TreeFrame, body: int, offset: Array, rows: Array) -> Float[Array, "nv 6"]:
+    """Twists of the tree frame (one per coordinate) seen from a frame that stands at `offset` in a body."""
+    if body < 0:
+        return jnp.zeros_like(rows)
+    pose = _product(tree.pose[body], offset)
+    return jax.vmap(se3.Ad_inv_apply, (None, 0))(pose, _moving(model, body, rows))

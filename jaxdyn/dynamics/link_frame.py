@@ -1,0 +1,175 @@
+"""The Newton-Euler equations of the whole tree as block matrices in link frames, literally as written on paper.
+
+With A_i = Ad^-1 of the pose of link i in its parent, in block (i, parent(i)) of Gamma, and G = (I - Gamma)^-1,
+
+    V = G P0 V_0 + G xi v,    Vdot = G (xi a + P0 Vdot_0 + ad_xi P0 V_0 + ad_xi Gamma V),
+    F = G^T (M Vdot + Pt^T F_t + ad_V^T M V),    tau = xi^T F
+
+(EQUATIONS section 4). This is the form to read, to teach and to check against: it costs O(nb^3). What users call runs
+on `matrix_form` or `recursive`, and shares with this module the joints' own transforms and screws alone.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
+from jaxdyn.lie import se3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.inertia import spatial_inertia
+from jaxdyn.model.tree import Model, frame_index
+
+
+class NewtonEulerMatrices(eqx.Module):
+    """Block matrices of the Newton-Euler equations; n = nb bodies, blocks of 6 in the order of `model.body_names`.
+
+    - `G` (6n, 6n): (I - Gamma)^-1; block (i, j) is Ad^-1 of the pose of body i in its ancestor j.
+    - `Gamma` (6n, 6n): A_i in block (i, parent(i)); nilpotent, its index is the depth of the tree.
+    - `xi` (6n, nv): joint screws, a block of 6 x (coordinates of the joint) for each body.
+    - `M` (6n, 6n): spatial inertias of the bodies, block diagonal.
+    - `P0` (6n, 6): A_i for the bodies that hang on the world.
+    - `Pt` (6, 6n): body twist of the tip frame from the body twists, or None without a tip.
+    - `ad_xi`, `ad_V`, `ad_V_T` (6n, 6n): blkdiag(-ad of xi_i v_i), blkdiag(-ad of V_i), blkdiag(-ad^T of V_i). The
+      minus signs are part of the definition.
+    - `V0_dot` (6,): acceleration of the world, (-g, 0); zero without gravity.
+    - `V` (6n,): body twists.
+
+    The products of these matrices are properties. Rotor inertia (armature) belongs to no link and is in none of them.
+    """
+
+    G: Float[Array, "n6 n6"]
+    Gamma: Float[Array, "n6 n6"]
+    xi: Float[Array, "n6 nv"]
+    M: Float[Array, "n6 n6"]
+    P0: Float[Array, "n6 6"]
+    Pt: Float[Array, "6 n6"] | None
+    ad_xi: Float[Array, "n6 n6"]
+    ad_V: Float[Array, "n6 n6"]
+    ad_V_T: Float[Array, "n6 n6"]
+    V0_dot: Float[Array, "6"]
+    V: Float[Array, " n6"]
+
+    @property
+    def mass_matrix(self) -> Float[Array, "nv nv"]:
+        """M(q) = xi^T G^T M G xi (nv, nv), without armature."""
+        jacobian = self.jacobians
+        return _product(jacobian.T, _product(self.M, jacobian))
+
+    @property
+    def jacobians(self) -> Float[Array, "n6 nv"]:
+        """G xi (6n, nv): the body Jacobians of all bodies, stacked."""
+        return _product(self.G, self.xi)
+
+    @property
+    def phi(self) -> Float[Array, " nv"]:
+        """Gravity force phi = xi^T G^T M G P0 V0_dot = +dV/dq (nv,)."""
+        return _product(self.jacobians.T, _product(self.M, _product(self.G, _product(self.P0, self.V0_dot))))
+
+    @property
+    def Jt(self) -> Float[Array, "6 nv"]:
+        """Body Jacobian of the tip frame, Jt = Pt G xi (6, nv).
+
+        **Raises:** ValueError when the matrices were built without a tip.
+        """
+        if self.Pt is None:
+            raise ValueError("Jt needs a tip frame, tip is None; call newton_euler_matrices(..., tip=<frame name>)")
+        return _product(self.Pt, self.jacobians)
+
+    @property
+    def C0(self) -> Float[Array, "nv nv"]:
+        """C0 = xi^T G^T (M G ad_xi Gamma + ad_V^T M) G xi (nv, nv), as printed by Li & Wu.
+
+        C0 v is the vector of Coriolis and centrifugal forces, but Mdot - 2 C0 is not skew. Use `Cs` where that matters.
+        """
+        return self._coriolis(_product(self.ad_V_T, self.M))
+
+    @property
+    def Cs(self) -> Float[Array, "nv nv"]:
+        """Cs = xi^T G^T (M G ad_xi Gamma + ad_V^T M - M ad_V) G xi (nv, nv): Cs v = C0 v and Mdot - 2 Cs is skew."""
+        return self._coriolis(_product(self.ad_V_T, self.M) - _product(self.M, self.ad_V))
+
+    def _coriolis(self, transport):
+        jacobian = self.jacobians
+        inner = _product(self.M, _product(self.G, _product(self.ad_xi, self.Gamma))) + transport
+        return _product(jacobian.T, _product(inner, jacobian))
+
+
+def newton_euler_matrices(
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], *, tip: str | None = None
+) -> NewtonEulerMatrices:
+    """Block matrices of the Newton-Euler equations in link frames.
+
+    **Arguments:** `q` (nq,); `v` (nv,); `tip`, name of the frame where the tip wrench F_t acts, or None.
+
+    **Returns:** `NewtonEulerMatrices`. M(q) a + Cs v + phi + Jt^T F_t = tau, with F_t the wrench that the tip applies
+    TO its surroundings, at the tip frame's origin in its axes.
+
+    **Raises:** ValueError for shapes that do not fit, an unknown tip, or a tip fixed to the world.
+
+    Source: EQUATIONS section 4; Park, Bobrow & Ploen (1995), Murray, Li & Sastry (1994) section 4.3.
+    """
+    q, v = check_shapes(model, q=q, v=v)
+    topology, n = model.topology, model.nb
+    tip_selector = None if tip is None else _tip_selector(model, tip)
+    to_child = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))(relative_poses(model, q))
+    parents = np.array(topology.parents, int)
+    gamma = _place(to_child, parents[:, None] == np.arange(n))
+    p0 = jnp.where((parents < 0)[:, None, None], to_child, jnp.zeros_like(to_child)).reshape(6 * n, 6)
+    columns = body_subspace(model).T[None]
+    own = np.arange(n)[:, None, None] == topology.dof_body[None, None]
+    xi = jnp.where(own, columns, jnp.zeros_like(columns)).reshape(6 * n, topology.nv)
+    g = _nilpotent_inverse(gamma, int(topology.depths.max(initial=1)))
+
+    rates = _product(xi, v)
+    twists = _product(g, rates)
+    ad_xi = -jax.vmap(se3.ad)(rates.reshape(n, 6))
+    ad_v = -jax.vmap(se3.ad)(twists.reshape(n, 6))
+    at_rest = jnp.zeros((3,), model.home.dtype)
+    gravity = at_rest if model.gravity is None else model.gravity
+    return NewtonEulerMatrices(
+        G=g,
+        Gamma=gamma,
+        xi=xi,
+        M=_block_diagonal(jax.vmap(spatial_inertia)(model.inertias)),
+        P0=p0,
+        Pt=tip_selector,
+        ad_xi=_block_diagonal(ad_xi),
+        ad_V=_block_diagonal(ad_v),
+        ad_V_T=_block_diagonal(ad_v.transpose(0, 2, 1)),
+        V0_dot=jnp.concatenate([-gravity, at_rest]),
+        V=twists,
+    )
+
+
+def _nilpotent_inverse(gamma, depth: int):
+    """(I - Gamma)^-1 = I + Gamma + ... + Gamma^(depth-1), as the product of the factors I + Gamma^(2^k)."""
+    identity = jnp.eye(gamma.shape[0], dtype=gamma.dtype)
+    total, power, terms = identity + gamma, gamma, 2
+    while terms < depth:
+        power = _product(power, power)
+        total = _product(total, identity + power)
+        terms *= 2
+    return total
+
+
+def _place(blocks: Float[Array, "n 6 6"], where: np.ndarray) -> Float[Array, "n6 n6"]:
+    """Block matrix with block i in row i, in the columns that the constant mask (n, n) marks."""
+    n = blocks.shape[0]
+    spread = jnp.broadcast_to(blocks[:, :, None, :], (n, 6, n, 6))
+    return jnp.where(where[:, None, :, None], spread, jnp.zeros_like(spread)).reshape(6 * n, 6 * n)
+
+
+def _block_diagonal(blocks: Float[Array, "n 6 6"]) -> Float[Array, "n6 n6"]:
+    return _place(blocks, np.eye(blocks.shape[0], dtype=bool))
+
+
+def _tip_selector(model: Model, tip: str) -> Float[Array, "6 n6"]:
+    index = frame_index(model, tip)
+    body = model.topology.frame_bodies[index]
+    if body < 0:
+        raise ValueError(f"tip {tip!r} is fixed to the world and cannot move; name a frame that a joint moves")
+    selector = jnp.zeros((6, 6 * model.nb), model.home.dtype)
+    return selector.at[:, 6 * body : 6 * body + 6].set(se3.Ad(se3.inverse(model.frame_poses[index])))

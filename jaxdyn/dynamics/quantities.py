@@ -1,0 +1,427 @@
+"""The dynamics of a model as users call it: M(q) a + C(q, v) v + N(q) = tau + sum of J_i^T f_i.
+
+All functions take one sample, are pure, and can be batched, compiled and differentiated in every argument and in every
+leaf of the model. Velocities and accelerations are the model's v and a (body-fixed, not dq/dt). Joint damping and
+friction are forces of a scene and do not enter here; rotor inertia (armature) does.
+
+Every function raises a ValueError that names the argument when a shape does not fit the model. Those with a time `t`
+(s) take any `System` in the model's place; a Model's dynamics do not depend on it.
+"""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import along, implicit, native, run
+from jaxdyn.dynamics import recursions
+from jaxdyn.dynamics import scans as looped
+from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, sum_to_coordinates, take, tree_frame
+from jaxdyn.dynamics.world_frame import momentum, tree_inertias
+from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.model.arguments import check_shapes, check_state
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.system import System, symbols
+
+
+def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv"]:
+    """Mass matrix M(q) = sum of J_i^T M_i J_i over the bodies + diag(armature), symmetric.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (nv, nv), kg m^2 for pairs of rotations, kg m and kg where translations take part. Positive definite
+    when every joint moves some inertia.
+
+    Source: Murray, Li & Sastry (1994), eq. 4.19; EQUATIONS sections 2 and 4.
+    """
+    if isinstance(model, System):
+        return _of_system(model, "mass_matrix", *check_state(model, q=q, t=t))
+    (q,) = check_shapes(model, q=q)
+    return _by_recursion(recursions.crba, matrix_form.mass_matrix, model, q)
+
+
+def coriolis_matrix(
+    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0
+) -> Float[Array, "nv nv"]:
+    """Coriolis matrix C(q, v) with the skew property: C v are the Coriolis and centrifugal forces, dM/dt = C + C^T.
+
+    C = sum of J_i^T (M_i Jdot_i + (M_i ad_{V_i} - ad_{V_i}^T M_i) J_i) in link frames. The matrix is not unique: other
+    choices (Christoffel symbols, Pinocchio's) have the same C v and the same C + C^T.
+
+    **Arguments:** `q` (nq,); `v` (nv,).
+
+    **Returns:** (nv, nv). Linear in v.
+
+    Source: EQUATIONS section 4, Cs and erratum E11.
+    """
+    if isinstance(model, System):
+        return _of_system(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
+    q, v = check_shapes(model, q=q, v=v)
+    return _by_recursion(matrix_form.coriolis_matrix, matrix_form.coriolis_matrix, model, q, v)
+
+
+def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nv"]:
+    """Generalised gravity force N(q) = +dV/dq along the velocity coordinates; it stands on the left, with M a.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (nv,), N m or N: the torques that hold the mechanism at rest. Zero when `model.gravity` is None.
+    """
+    if isinstance(model, System):
+        return _of_system(model, "gravity_force", *check_state(model, q=q, t=t))
+    (q,) = check_shapes(model, q=q)
+    if model.gravity is None:
+        return jnp.zeros((model.nv,), model.home.dtype)
+    return _by_recursion(recursions.gravity_force, matrix_form.gravity_force, model, q)
+
+
+def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"]:
+    """Bias force h = C(q, v) v + N(q): what tau must be for zero acceleration a.
+
+    **Arguments:** `q` (nq,); `v` (nv,).
+
+    **Returns:** (nv,), N m or N.
+    """
+    if isinstance(model, System):
+        return _of_system(model, "bias_force", *check_state(model, q=q, v=v, t=t))
+    q, v = check_shapes(model, q=q, v=v)
+    return _by_recursion(recursions.bias_force, _bias_force, model, q, v)
+
+
+def inverse_dynamics(
+    model: Model | System,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    a: Float[Array, " nv"],
+    t=0.0,
+    *,
+    external: Float[Array, "nb 6"] | None = None,
+) -> Float[Array, " nv"]:
+    """Generalised forces of a motion: tau = M(q) a + C(q, v) v + N(q) - sum of J_i^T f_i.
+
+    **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,), rate of v; `external` (nb, 6), wrench (f, tau) ON each body, at its
+    frame's origin and in its axes (N, N m), or None.
+
+    **Returns:** (nv,), N m or N.
+
+    Source: EQUATIONS section 4.
+    """
+    if isinstance(model, System):
+        q, v, a, t, _ = check_state(model, q=q, v=v, a=a, t=t, external=external)
+        return _of_system(model, "inverse_dynamics", q, v, a, t)
+    q, v, a, external = check_shapes(model, q=q, v=v, a=a, external=external)
+    tau = _by_recursion(recursions.rnea, _inverse_dynamics, model, q, v, a)
+    return tau if external is None else tau - generalized_force(model, q, external)
+
+
+def forward_dynamics(
+    model: Model | System,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    tau: Float[Array, " nv"],
+    t=0.0,
+    *,
+    external: Float[Array, "nb 6"] | None = None,
+) -> Float[Array, " nv"]:
+    """Acceleration under given forces: a = M(q)^-1 (tau - C(q, v) v - N(q) + sum of J_i^T f_i).
+
+    **Arguments:** `q` (nq,); `v` (nv,); `tau` (nv,), N m or N; `external` (nb, 6), wrench (f, tau) ON each body, at its
+    frame's origin and in its axes (N, N m), or None.
+
+    **Returns:** (nv,), the rate of v. NaN when M is not positive definite, which a joint that moves no inertia causes;
+    the error grows with the condition number of M.
+
+    **Raises:** ValueError, on concrete numbers, for a `System` without a motion here: M singular (its rank is named), a
+    Lagrangian that is not finite, an immersion of too low a rank.
+    """
+    if isinstance(model, System):
+        q, v, tau, t, _ = check_state(model, q=q, v=v, tau=tau, t=t, external=external)
+        model.check_start(q, v, t)
+        return _of_system(model, "forward_dynamics", q, v, tau, t)
+    q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
+    if external is not None:
+        tau = tau + generalized_force(model, q, external)
+    if model.nb > MAX_BODIES or model.nb == 0:
+        return _solve_for_acceleration(model, q, v, tau)
+    return run(recursions.aba, model, q, v, tau, otherwise=_solve_for_acceleration, tangent=_acceleration_change)
+
+
+def _public(recursion: Callable) -> Callable:
+    """recursion(model, *args) as a kernel of arguments that were checked."""
+    by_kernel, signature = native(recursion), inspect.signature(recursion)
+
+    @functools.wraps(recursion)
+    def call(*args, **named):
+        (_, model), *rest = signature.bind(*args, **named).arguments.items()
+        return by_kernel(model, *check_shapes(model, **dict(rest)))
+
+    return call
+
+
+rnea, crba, aba, mass_matrix_sqrt = map(
+    _public, (recursions.rnea, recursions.crba, recursions.aba, recursions.mass_matrix_sqrt)
+)
+
+# Beyond, programs of single numbers compile for longer than a few seconds, and recursions run as loops over the bodies.
+MAX_BODIES = 128
+# In small batches the mask form of the matrices is as fast as the loops.
+_MAX_BODIES_IN_MATRICES = 16
+
+
+def _by_recursion(recursion, matrices, model: Model, *args):
+    """recursion(model, *args) as a kernel, else by products of matrices."""
+    if model.nb > MAX_BODIES or model.nb == 0:
+        return matrices(model, *args)
+    return run(recursion, model, *args, otherwise=matrices)
+
+
+def _inverse_dynamics(model: Model, q, v, a):
+    return (looped if model.nb > MAX_BODIES else matrix_form).inverse_dynamics(model, q, v, a)
+
+
+def _bias_force(model: Model, q, v):
+    return _inverse_dynamics(model, q, v, None)
+
+
+def _solve_for_acceleration(model: Model, q, v, tau):
+    """Forward dynamics where there is no kernel, differentiated by the implicit function theorem."""
+    form = looped if model.nb > _MAX_BODIES_IN_MATRICES else matrix_form
+
+    def tangent(model, q, v, tau, steps):
+        return form.forward_dynamics_tangent(
+            model, q, v, tau, _force_change(_inverse_dynamics, model, q, v, tau, steps)
+        )
+
+    return implicit(model, (q, v, tau), form.forward_dynamics, tangent)
+
+
+def _acceleration_change(model: Model, q, v, tau, steps):
+    """M^-1 (dtau - dID at fixed a) for changes in the leaves of (model, q, v, tau)."""
+    return recursions.aba_tangent(model, q, v, tau, _force_change(recursions.rnea, model, q, v, tau, steps))[1]
+
+
+def _force_change(inverse, model, q, v, tau, steps):
+    """a -> dtau - dID(q, v, a) at fixed a."""
+    *steps, tau_step = steps
+
+    def change(a):
+        total = jnp.zeros_like(tau) if tau_step is None else tau_step
+        _, moved = along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
+        return total if moved is None else total - moved
+
+    return change
+
+
+def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:
+    """Generalised forces of wrenches on the bodies: sum of J_i^T f_i.
+
+    **Arguments:** `q` (nq,); `external` (nb, 6), wrench (f, tau) ON each body, at its frame's origin and in its axes
+    (N, N m).
+
+    **Returns:** (nv,), N m or N; it stands on the right, with tau.
+    """
+    q, external = check_shapes(model, q=q, external=external)
+    return _by_recursion(matrix_form.generalized_force, matrix_form.generalized_force, model, q, external)
+
+
+def kinetic_energy(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, ""]:
+    """Kinetic energy T = 1/2 sum of V_i . M_i V_i + 1/2 sum of armature v^2 = 1/2 v . M(q) v.
+
+    **Arguments:** `q` (nq,); `v` (nv,).
+
+    **Returns:** (), J.
+    """
+    if isinstance(model, System):
+        return _of_system(model, "kinetic_energy", *check_state(model, q=q, v=v, t=t))
+    q, v = check_shapes(model, q=q, v=v)
+    return _by_recursion(_kinetic_energy, _kinetic_energy, model, q, v)
+
+
+def _kinetic_energy(model: Model, q, v):
+    frame = tree_frame(model, q)
+    twists = body_twists(model, frame, v)
+    energy = 0.5 * jnp.sum(twists * jax.vmap(momentum)(tree_inertias(model, frame), twists))
+    return energy if model.armature is None else energy + 0.5 * jnp.sum(model.armature * v * v)
+
+
+def potential_energy(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, ""]:
+    """Potential energy of gravity, V = -sum of m_i g . c_i with c_i the world position of each centre of mass.
+
+    Zero height is the plane through the world's origin. Far from it the value is large, and small differences of it are
+    lost to rounding.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (), J. Zero when `model.gravity` is None.
+    """
+    if isinstance(model, System):
+        return _of_system(model, "potential_energy", *check_state(model, q=q, t=t))
+    (q,) = check_shapes(model, q=q)
+    if model.gravity is None:
+        return jnp.zeros((), model.home.dtype)
+    return _by_recursion(_potential_energy, _potential_energy, model, q)
+
+
+def _potential_energy(model: Model, q):
+    mass, first, origin, shift = _first_moments(model, tree_frame(model, q))
+    gravity: Any = model.gravity
+    return -jnp.sum(gravity * (jnp.sum(mass) * origin + jnp.sum(first + mass[:, None] * shift, axis=0)))
+
+
+def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
+    """Centre of mass of all bodies, c = sum of m_i c_i / sum of m_i.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (3,), world position, m. NaN when no body has mass.
+    """
+    (q,) = check_shapes(model, q=q)
+    return _by_recursion(_center_of_mass, _center_of_mass, model, q)
+
+
+def _center_of_mass(model: Model, q):
+    mass, first, origin, shift = _first_moments(model, tree_frame(model, q))
+    return origin + jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
+
+
+def centroidal_momentum(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "6"]:
+    """Momentum of the whole mechanism about its centre of mass, in world axes.
+
+    (l, k) = (sum of m_i cdot_i, sum of (c_i - c) x m_i cdot_i + I_i omega_i), c the common centre of mass. Without
+    contact and joint torques on the world, k is constant and dl/dt = m g.
+
+    **Arguments:** `q` (nq,); `v` (nv,).
+
+    **Returns:** (6,), linear (kg m/s) then angular (kg m^2/s). Rotors (armature) are left out. NaN when no body has
+    mass.
+
+    Source: Orin, Goswami & Lee (2013), eq. 21.
+    """
+    q, v = check_shapes(model, q=q, v=v)
+    return _by_recursion(_centroidal_momentum, _centroidal_momentum, model, q, v)
+
+
+def _centroidal_momentum(model: Model, q, v):
+    frame = tree_frame(model, q)
+    momenta = jax.vmap(momentum)(tree_inertias(model, frame), body_twists(model, frame, v))
+    return jnp.sum(_about_center(model, frame, momenta), axis=0)
+
+
+def centroidal_momentum_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Array, "6 nv"]:
+    """Centroidal momentum matrix A(q): `centroidal_momentum(model, q, v)` = A v.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (6, nv), rows linear then angular, about the centre of mass in world axes.
+
+    Source: Orin, Goswami & Lee (2013), eq. 22.
+    """
+    (q,) = check_shapes(model, q=q)
+    return _by_recursion(_centroidal_momentum_matrix, _centroidal_momentum_matrix, model, q)
+
+
+def _centroidal_momentum_matrix(model: Model, q):
+    frame = tree_frame(model, q)
+    composite = sum_to_coordinates(model, tree_inertias(model, frame))
+    momenta = jax.vmap(momentum)(composite, frame.subspace)
+    return _about_center(model, frame, momenta, model.topology.dof_body).T
+
+
+def torque_regressor(
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"]
+) -> Float[Array, "nv nb10"]:
+    """Regressor Y(q, v, a) of inverse dynamics: tau = Y pi, linear in the inertial parameters.
+
+    pi = `model.inertias.reshape(-1)`, the numbers (m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) of one body after
+    the other. Rotor inertia is not among them: `inverse_dynamics` = Y pi + armature a.
+
+    **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,).
+
+    **Returns:** (nv, 10 nb).
+
+    Source: Atkeson, An & Hollerbach (1986).
+    """
+    q, v, a = check_shapes(model, q=q, v=v, a=a)
+    return _by_recursion(matrix_form.torque_regressor, matrix_form.torque_regressor, model, q, v, a)
+
+
+def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
+    """Derivative of the mass matrix, D_ijk = dM_ij/dq_k, in closed form.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (nv, nv, nv).
+
+    **Raises:** ValueError when the model has a joint whose v is not dq/dt (planar, spherical, free).
+
+    Source: Li & Wu, Property 2, corrected (EQUATIONS section 2, E8).
+    """
+    (q,) = check_shapes(model, q=q)
+    _check_coordinates(model, "mass_matrix_derivative")
+    return _by_recursion(matrix_form.mass_matrix_derivative, matrix_form.mass_matrix_derivative, model, q)
+
+
+def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv nv"]:
+    """Christoffel symbols of the first kind, Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i).
+
+    The matrix C_ij = sum_k Gamma_ijk v_k has the same C v and C + C^T as `coriolis_matrix`.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (nv, nv, nv), symmetric in j and k.
+
+    **Raises:** ValueError when the model has a joint whose v is not dq/dt (planar, spherical, free).
+
+    Source: Murray, Li & Sastry (1994), eq. 4.23; EQUATIONS section 0.
+    """
+    if isinstance(model, System):
+        return _of_system(model, "christoffel_symbols", *check_state(model, q=q, t=t))
+    (q,) = check_shapes(model, q=q)
+    _check_coordinates(model, "christoffel_symbols")
+    return symbols(mass_matrix_derivative(model, q))
+
+
+def _of_system(system: System, name: str, *args):
+    """A quantity of a system that is no tree of bodies."""
+    return run(_method, system, *args, static=(name,))
+
+
+def _method(name: str, system: System, *args):
+    return getattr(system, name)(*args)
+
+
+def _check_coordinates(model: Model, name: str) -> None:
+    joints = zip(model.topology.kinds, model.joint_names, strict=True)
+    other = [f"{joint!r} ({kind})" for kind, joint in joints if kind in ("planar", "spherical", "free")]
+    if other:
+        raise ValueError(
+            f"{name}: symbols need coordinates with v = dq/dt (nq = nv), but model {model.name!r} has joints"
+            f" {', '.join(other)} (nq = {model.nq}, nv = {model.nv}); use coriolis_matrix, which needs none"
+        )
+
+
+def _first_moments(model: Model, frame: TreeFrame):
+    """Masses (nb,), first moments (nb, 3) in the tree frames, world position (3,) of the first tree's origin, and shifts.
+
+    A shift (3,) is the place of a body's tree frame relative to the first one: zero, not a difference of far
+    positions, for one tree.
+    """
+    mass = model.inertias[:, 0]
+    rotated = _product(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
+    origin = frame.origin[0]
+    return mass, rotated + mass[:, None] * frame.pose[:, :3, 3], origin, frame.origin - origin[None]
+
+
+def _about_center(model: Model, frame: TreeFrame, momenta: Array, bodies=None) -> Array:
+    """Momenta (n, 6) taken in tree frames, of the given bodies, moved to the centre of mass."""
+    mass, first, _, shift = _first_moments(model, frame)
+    center = jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
+    lever = shift - center[None]
+    lever = lever if bodies is None else take(lever, bodies)
+    angular = momenta[:, 3:] + jax.vmap(cross)(lever, momenta[:, :3])
+    return jnp.concatenate([momenta[:, :3], angular], axis=1)

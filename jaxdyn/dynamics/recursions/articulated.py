@@ -1,0 +1,149 @@
+"""Articulated-body inertias: the factorisation M = W W^T over the tree, and M^-1 times a vector by two sweeps.
+
+Body i with all bodies that it carries, their joints free to move, answers an acceleration of its frame like one body of the
+articulated inertia A. To pass a joint with the motion subspace s, one degree of freedom is eliminated,
+
+    U = A s,   D = s^T U + armature,   A <- A - U U^T / D,
+
+a joint of several by one after the other. The gains U/D and pivots D are all that the sweeps need.
+
+Source: EQUATIONS section 5; Featherstone (2008) section 7.3; Rodriguez, Jain & Kreutz-Delgado (1992).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.dynamics.recursions._arrays import constants, contract, dot, entry, outer, select, symmetric
+from jaxdyn.dynamics.recursions.links import (
+    Links,
+    as_vector,
+    by_joint,
+    columns_of,
+    from_unit_velocity,
+    joint_transforms,
+    links_of,
+    unit_force,
+)
+from jaxdyn.dynamics.recursions.transforms import Chain, inertia_to_parent, twist_to_child, wrench_to_parent
+from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.tree import Model
+
+
+class ArticulatedFactors(NamedTuple):
+    """M factored: per body and degree of freedom, in the order of elimination, the gain U/D (6,) and 1/D."""
+
+    links: Links
+    chains: list[Chain]
+    gains: list[list]
+    inverses: list[list]
+
+
+def spatial_inertia(moments):
+    """Spatial inertia (6, 6) of a pseudo-inertia (4, 4): [[m, -hat(h)], [hat(h), tr(S) 1 - S]] with second moments S."""
+    # Twist a moves the point r at the velocity E_a (r, 1) with E = `moment`, so I_ab = sum of m E_a (r, 1) . E_b (r, 1).
+    field = constants(moments.dtype).moment
+    tensor = np.einsum("aik,bil->abkl", field, field)
+    return contract(tensor, moments, (2, 3), (0, 1))
+
+
+def factorize(model: Model, q: Float[Array, " nq"]) -> ArticulatedFactors:
+    """Articulated-body factors of M(q): gains and pivots of every degree of freedom, from the leaves to the root."""
+    check_shapes(model, q=q)
+    links = links_of(model)
+    return factorize_at(links, joint_transforms(links, q))
+
+
+def factorize_at(links: Links, chains: list[Chain]) -> ArticulatedFactors:
+    """`factorize` with the links and joint transforms given."""
+    nb = links.model.nb
+    total = [spatial_inertia(moments) for moments in links.moments]
+    armatures = None if links.armature is None else by_joint(links, links.armature)
+    gains: list = [None] * nb
+    inverses: list = [None] * nb
+    for i in reversed(range(nb)):
+        A, gains[i], inverses[i] = total[i], [], []
+        for j, k in enumerate(columns_of(links.model.topology.kinds[i])):
+            armature = None if armatures is None else entry(armatures[i], j)
+            A, gain, inverse = _eliminate(A, entry(links.subspaces[i], j, 1), k, armature)
+            gains[i].append(gain)
+            inverses[i].append(inverse)
+        parent = links.parents[i]
+        if parent >= 0:
+            total[parent] = total[parent] + inertia_to_parent(chains[i], A)
+    return ArticulatedFactors(links, chains, gains, inverses)
+
+
+def _eliminate(A, s, k, armature):
+    """One degree of freedom eliminated: A - U U^T/D, U/D and 1/D; `k` is the coordinate that s spans alone, or None."""
+    U = dot(A, s)
+    D = dot(s, U)
+    inverse = 1 / (D if armature is None else D + armature)
+    gain = U * inverse
+    rest = A - outer(U, gain)
+    if armature is None and k is not None:
+        # Along that coordinate nothing is left, and the gain is one.
+        along = np.eye(6, dtype=A.dtype)[k]
+        gain = select(along > 0, along, gain)
+        cross = np.maximum.outer(along, along) > 0
+        rest = select(cross, np.zeros((6, 6), A.dtype), rest)
+    return symmetric(rest), gain, inverse
+
+
+def inward(factors: ArticulatedFactors, force: list, wrenches: list | None = None) -> list[list]:
+    """What is left of the forces at each joint once the wrenches on the bodies that it carries are met: D^(1/2) W^-1 tau.
+
+    **Arguments:** `force`, per joint (nj,), on unit screws; `wrenches`, per body (6,), that its motion needs, or None.
+
+    **Returns:** per joint, a list of numbers, one for each degree of freedom.
+    """
+    links = factors.links
+    bias: list = [None] * links.model.nb if wrenches is None else list(wrenches)
+    left: list = [None] * links.model.nb
+    for i in reversed(range(links.model.nb)):
+        F, left[i] = bias[i], []
+        for j, (k, gain) in enumerate(zip(columns_of(links.model.topology.kinds[i]), factors.gains[i], strict=True)):
+            tau = entry(force[i], j)
+            u = tau if F is None else tau - dot(entry(links.subspaces[i], j, 1), F)
+            left[i].append(u)
+            given = gain * u if F is None else F + gain * u
+            if k is not None and links.armature is None:  # the joint transmits its own force
+                along = np.eye(6, dtype=gain.dtype)[k]
+                given = select(along > 0, along * tau, given)
+            F = given
+        parent = links.parents[i]
+        if parent >= 0:
+            up = wrench_to_parent(factors.chains[i], F)
+            bias[parent] = up if bias[parent] is None else bias[parent] + up
+    return left
+
+
+def outward(factors: ArticulatedFactors, left: list[list]) -> list:
+    """Accelerations (nj,) of the joints, on unit screws, from what `inward` left at each."""
+    links = factors.links
+    twists: list = [None] * links.model.nb
+    out: list = []
+    for i, parent in enumerate(links.parents):
+        V = twist_to_child(factors.chains[i], twists[parent]) if parent >= 0 else None
+        found: list = [None] * len(left[i])
+        for j in reversed(range(len(found))):
+            s, gain = entry(links.subspaces[i], j, 1), factors.gains[i][j]
+            free = left[i][j] * factors.inverses[i][j]
+            if V is None:
+                found[j] = free
+                V = s * free
+                continue
+            x = found[j] = free - dot(gain, V)
+            V = V + s * x
+        out.append(found)
+        twists[i] = V
+    return out
+
+
+def solve(factors: ArticulatedFactors, force: Float[Array, " nv"], wrenches: list | None = None) -> Float[Array, " nv"]:
+    """M^-1 times generalised forces (nv,), less what `wrenches` on the bodies ask for; `jax.vmap` for several columns."""
+    links = factors.links
+    left = inward(factors, by_joint(links, unit_force(links, force)), wrenches)
+    flat = [x for joint in outward(factors, left) for x in joint]
+    return from_unit_velocity(links, as_vector(flat, force))

@@ -1,0 +1,145 @@
+"""Inverse dynamics by the recursive Newton-Euler algorithm, with the acceleration of a body as one matrix.
+
+Every point r of a body (in its frame) has the acceleration a + K r, where a is that of the frame's origin and
+
+    K = hat(dw) + hat(w)^2.
+
+Multiplied by the body's moments J (4 x 4, see `inertias`), Y = [K a] J = sum of m (a + K r)(r, 1)^T is the flux of momentum:
+its last column is the force that the motion needs, and vee(Y - Y^T) the moment. The velocity of the origin is never needed.
+
+Source: Luh, Walker & Paul (1980); K as in Balafoutis, Patel & Misra (1988); EQUATIONS section 4.
+"""
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.dynamics.recursions._arrays import constants, contract, dot, entry, join, part, transposed_dot
+from jaxdyn.dynamics.recursions.links import (
+    Links,
+    as_vector,
+    by_joint,
+    from_unit_force,
+    joint_transforms,
+    links_of,
+    unit_velocity,
+    wrench_in_link,
+)
+from jaxdyn.dynamics.recursions.transforms import Chain, origin_in_parent, rotate_to_child, wrench_to_parent
+from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.tree import Model
+
+
+def wrench_of_acceleration(K, a, moments):
+    """Wrench (f, n) (6,) that a body of the given moments (4, 4) needs for the accelerations a + K r of its points r."""
+    table = constants(moments.dtype)
+    Y = dot(join([K, a.reshape(3, 1)], 1), moments)
+    return contract(table.moment, Y, (1, 2), (0, 1))
+
+
+def _hat(w):
+    return dot(constants(w.dtype).hat, w)
+
+
+def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=None) -> list:
+    """Wrenches (6,) that the motion of each body needs, gravity included: the outward pass.
+
+    **Arguments:** `chains` from `joint_transforms`; `v`, `a` (nv,) of unit screws, None for zero; `external` (nb, 6), wrenches
+    that act on the bodies in the model's body frames, or None.
+    """
+    dtype = links.frames.home.dtype
+    zero = np.zeros(3, dtype)
+    weight = zero if links.gravity is None else -links.gravity  # the world accelerates upward
+    speeds = None if v is None else by_joint(links, v)
+    rates = None if a is None else by_joint(links, a)
+    motion: list = []  # w, dw, K, acceleration of the origin
+    wrenches = []
+    for i, parent in enumerate(links.parents):
+        w, dw, K, acc = motion[parent] if parent >= 0 else (zero, zero, np.zeros((3, 3), dtype), weight)
+        chain = chains[i]
+        r = origin_in_parent(chain)
+        acc = rotate_to_child(chain, acc if r is None else acc + dot(K, r))
+        w, dw = rotate_to_child(chain, w), rotate_to_child(chain, dw)
+        S = links.subspaces[i]
+        slides, turns = _moves(S[:3]), _moves(S[3:])
+        if speeds is not None:
+            if slides:
+                slide = dot(part(S, 0, 3), speeds[i])
+                acc = acc + dot(_hat(w + w), slide)
+            if turns:
+                omega = dot(part(S, 3, 6), speeds[i])
+                dw = dw + dot(_hat(w), omega)
+                w = w + omega
+                if slides:
+                    acc = acc + dot(_hat(omega), slide)
+        if rates is not None:
+            acc = acc + dot(part(S, 0, 3), rates[i]) if slides else acc
+            dw = dw + dot(part(S, 3, 6), rates[i]) if turns else dw
+        if speeds is not None or rates is not None:
+            square = _hat(w)
+            K = _hat(dw) + dot(square, square)
+        motion.append((w, dw, K, acc))
+        wrench = wrench_of_acceleration(K, acc, links.moments[i])
+        if external is not None:
+            wrench = wrench - wrench_in_link(links, i, entry(external, i))
+        wrenches.append(wrench)
+    return wrenches
+
+
+def _moves(S) -> bool:
+    """Whether part of a motion subspace is other than zero by declaration."""
+    return not isinstance(S, np.ndarray) or bool(S.any())
+
+
+def joint_forces(links: Links, chains: list[Chain], wrenches: list) -> list:
+    """Inward pass: generalised forces (nj,) of each joint, S^T times the wrenches of all bodies that the joint carries."""
+    total: list = list(wrenches)
+    tau: list = [None] * len(wrenches)
+    for i in reversed(range(len(wrenches))):
+        tau[i] = transposed_dot(links.subspaces[i], total[i])
+        if links.parents[i] >= 0:
+            total[links.parents[i]] = total[links.parents[i]] + wrench_to_parent(chains[i], total[i])
+    return tau
+
+
+def _inverse(model: Model, q, v=None, a=None, external=None):
+    links = links_of(model)
+    v, a = (None if x is None else unit_velocity(links, x) for x in (v, a))
+    chains = joint_transforms(links, q)
+    tau = as_vector(joint_forces(links, chains, body_wrenches(links, chains, v, a, external)), q)
+    if a is not None and links.armature is not None:
+        tau = tau + links.armature * a
+    return from_unit_force(links, tau)
+
+
+def rnea(
+    model: Model,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    a: Float[Array, " nv"] | None,
+    *,
+    external: Float[Array, "nb 6"] | None = None,
+) -> Float[Array, " nv"]:
+    """Inverse dynamics tau = M a + C v + N - sum of J_i^T F_i by the recursive Newton-Euler algorithm.
+
+    **Arguments:** `q` (nq,); `v`, `a` (nv,) joint velocities and accelerations (rad/s or m/s, rad/s^2 or m/s^2); `a` None is
+    zero acceleration, whose terms are left out. `external` (nb, 6): wrenches F_i that act on the bodies, at their origins
+    in their axes (N, N m), or None.
+
+    **Returns:** generalised forces (nv,), N m or N. Armature included.
+
+    Source: EQUATIONS section 4; Luh, Walker & Paul (1980); Featherstone (2008) table 5.1.
+    """
+    check_shapes(model, q=q, v=v, a=a, external=external)
+    return _inverse(model, q, v, a, external)
+
+
+def bias_force(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """Bias force C v + N (nv,), N m or N: `rnea` at zero acceleration."""
+    check_shapes(model, q=q, v=v)
+    return _inverse(model, q, v)
+
+
+def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """Gravity force N = +dV/dq (nv,), N m or N: `rnea` at rest."""
+    check_shapes(model, q=q)
+    return _inverse(model, q)

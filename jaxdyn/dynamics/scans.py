@@ -1,0 +1,159 @@
+"""The recursions as loops over the bodies: time in proportion to their number, a program that does not grow with it.
+
+For mechanisms of hundreds of bodies, whose matrices would cost the third power and whose recursion, written out, would
+take minutes to compile. Link frames as in EQUATIONS sections 4 and 5, so that long chains lose nothing by distance.
+Joints of several degrees of freedom are eliminated at once; all joints are padded to the largest of them.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
+from jaxdyn.lie import se3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.inertia import spatial_inertia
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.mass_factor import solve_positive
+
+
+class _Links(NamedTuple):
+    """Per body: its parent (the world is nb), Ad of the parent's frame seen from it, subspace (d, 6), spatial inertia."""
+
+    parent: Int[Array, " nb"]
+    down: Float[Array, "nb 6 6"]
+    subspace: Float[Array, "nb d 6"]
+    inertia: Float[Array, "nb 6 6"]
+
+
+class Factor(NamedTuple):
+    """M factored: per body D^-1 (d, d) and D^-1 U^T (d, 6) of its articulated inertia."""
+
+    links: _Links
+    inverse: Float[Array, "nb d d"]
+    gain: Float[Array, "nb d 6"]
+
+
+def _padding(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """For each body the places (nb, d) of its velocities in v, and which of them are its own."""
+    slices = model.topology.v_slices
+    most = max(part.stop - part.start for part in slices)
+    places = np.array([part.start for part in slices])[:, None] + np.arange(most)
+    own = places < np.array([part.stop for part in slices])[:, None]
+    return np.where(own, places, 0), own
+
+
+def _per_body(model: Model, rows: Array) -> Array:
+    """Rows (nv, ...) as (nb, d, ...), zero where a joint has fewer than d."""
+    places, own = _padding(model)
+    return jnp.where(own.reshape(own.shape + (1,) * (rows.ndim - 1)), rows[places], jnp.zeros((), rows.dtype))
+
+
+def _links(model: Model, q) -> _Links:
+    topology = model.topology
+    parent = jnp.asarray([p if p >= 0 else topology.nb for p in topology.parents])
+    down = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))(relative_poses(model, q))
+    return _Links(parent, down, _per_body(model, body_subspace(model)), jax.vmap(spatial_inertia)(model.inertias))
+
+
+def _wrenches(model: Model, links: _Links, v, a) -> Float[Array, "nb 6"]:
+    """Wrench that each body's motion needs in its own frame, gravity included: the outward pass of Newton-Euler."""
+    zero = jnp.zeros((model.nb + 1, 6), v.dtype)
+    rest = zero if model.gravity is None else zero.at[-1, :3].set(-model.gravity)
+    own_v = jnp.einsum("bd,bdk->bk", _per_body(model, v), links.subspace)
+    own_a = jnp.zeros_like(own_v) if a is None else jnp.einsum("bd,bdk->bk", _per_body(model, a), links.subspace)
+
+    def outward(carry, link):
+        twists, rates = carry
+        i, parent, down, turn, push, inertia = link
+        twist = _product(down, twists[parent]) + turn
+        rate = _product(down, rates[parent]) + push + se3.ad_apply(twist, turn)
+        wrench = _product(inertia, rate) - se3.adT_apply(twist, _product(inertia, twist))
+        return (twists.at[i].set(twist), rates.at[i].set(rate)), wrench
+
+    each = jnp.arange(model.nb), links.parent, links.down, own_v, own_a, links.inertia
+    return lax.scan(outward, (zero, rest), each)[1]
+
+
+def inverse_dynamics(model: Model, q, v, a) -> Float[Array, " nv"]:
+    """tau = M a + C v + N (nv,) by the recursive Newton-Euler algorithm; `a` None means zero."""
+    links = _links(model, q)
+    wrenches = _wrenches(model, links, v, a)
+
+    def inward(total, link):
+        i, parent, down, subspace = link
+        wrench = total[i]
+        return total.at[parent].add(_product(down.T, wrench)), _product(subspace, wrench)
+
+    start = jnp.concatenate([wrenches, jnp.zeros((1, 6), v.dtype)])
+    each = jnp.arange(model.nb), links.parent, links.down, links.subspace
+    tau = _flat(model, lax.scan(inward, start, each, reverse=True)[1])
+    return tau if a is None or model.armature is None else tau + model.armature * a
+
+
+def _flat(model: Model, values: Float[Array, "nb d"]) -> Float[Array, " nv"]:
+    return values[np.nonzero(_padding(model)[1])]
+
+
+def _factorize(model: Model, links: _Links) -> Factor:
+    """Articulated inertias from the leaves to the root."""
+    dtype, own = links.down.dtype, jnp.asarray(_padding(model)[1])
+    armature = jnp.zeros((model.nv,), dtype) if model.armature is None else model.armature
+    # Coordinates that a joint does not have get a pivot of one and no coupling.
+    extra = jnp.where(own, _per_body(model, armature), jnp.ones((), dtype))
+
+    def inward(total, link):
+        i, parent, down, S, extra = link
+        inertia = total[i]
+        U = _product(S, inertia)
+        inverse = solve_positive(_product(U, S.T) + jnp.diag(extra), jnp.eye(S.shape[0], dtype=dtype))
+        gain = _product(inverse, U)
+        left = inertia - _product(U.T, gain)
+        return total.at[parent].add(_product(down.T, _product(left, down))), (inverse, gain)
+
+    start = jnp.concatenate([links.inertia, jnp.zeros((1, 6, 6), dtype)])
+    each = jnp.arange(model.nb), links.parent, links.down, links.subspace, extra
+    return Factor(links, *lax.scan(inward, start, each, reverse=True)[1])
+
+
+def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
+    """M^-1 (tau - forces that the wrenches ask for), by two sweeps."""
+    links, dtype = factor.links, tau.dtype
+    numbers = jnp.arange(model.nb)
+
+    def inward(total, link):
+        i, parent, down, S, gain, force = link
+        left = force - _product(S, total[i])
+        return total.at[parent].add(_product(down.T, total[i] + _product(left, gain))), left
+
+    start = jnp.zeros((model.nb + 1, 6), dtype)
+    start = start if wrenches is None else start.at[:-1].set(wrenches)
+    each = numbers, links.parent, links.down, links.subspace, factor.gain, _per_body(model, tau)
+    residual = lax.scan(inward, start, each, reverse=True)[1]
+
+    def outward(twists, link):
+        i, parent, down, S, gain, inverse, left = link
+        twist = _product(down, twists[parent])
+        a = _product(inverse, left) - _product(gain, twist)
+        return twists.at[i].set(twist + _product(a, S)), a
+
+    each = numbers, links.parent, links.down, links.subspace, factor.gain, factor.inverse, residual
+    return _flat(model, lax.scan(outward, jnp.zeros((model.nb + 1, 6), dtype), each)[1])
+
+
+def forward_dynamics(model: Model, q, v, tau) -> Float[Array, " nv"]:
+    """a = M^-1 (tau - C v - N) (nv,) by the articulated-body algorithm."""
+    links = _links(model, q)
+    return _solve(model, _factorize(model, links), tau, _wrenches(model, links, v, None))
+
+
+def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
+    """Forward dynamics a and M^-1 times `force_change(a)` (nv,), both from one factorisation."""
+    links = _links(model, q)
+    factor = _factorize(model, links)
+    a = _solve(model, factor, tau, _wrenches(model, links, v, None))
+    return a, _solve(model, factor, force_change(a), None)

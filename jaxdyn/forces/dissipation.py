@@ -1,0 +1,108 @@
+"""Forces that take energy away: Rayleigh's dissipation function, and Coulomb friction while it slides a given way."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.systems.scene import as_pytree
+
+
+class RayleighDissipation(eqx.Module):
+    """Friction with a dissipation function: tau = -dR/dv.
+
+    It takes the power v . dR/dv: 2R where R is quadratic in v, (n + 1) R where it is of degree n + 1.
+
+    **Arguments:** `function`, R(q, v, t) -> () in W, differentiable; a plain function is static, a Module or
+    `jax.tree_util.Partial` carries numbers as leaves.
+
+    **Raises:** ValueError for a function that cannot be called; (when called) one that does not return one number.
+
+    Source: Goldstein, Classical Mechanics, section 1.5.
+    """
+
+    function: Callable
+
+    def __init__(self, function):
+        self.function = as_pytree(function, "RayleighDissipation: function")
+
+    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+        def value(v):
+            R = self.function(q, v, t)
+            if jnp.shape(R) != ():
+                raise ValueError(f"RayleighDissipation: function returned shape {jnp.shape(R)}; return one number, ()")
+            return jnp.asarray(R, v.dtype)
+
+        return -jax.grad(value)(v)
+
+
+_ROUNDING = 100.0  # m/s (rad/s) times eps
+
+
+class SlidingFriction(eqx.Module):
+    """Coulomb friction of a contact that slides: tau = -sign(A v) mu N A^T, for the sliding velocity A v.
+
+    At A v = 0 the sign is that of `direction`, so that the force is smooth while it slides that way and where it comes to rest.
+    A contact that turns round is braked the other way. One that sticks is not held: the sign of the force changes from step to
+    step, velocities stay as small as a step's change, and adaptive steps become short until the run ends with a code.
+
+    **Arguments:**
+
+    - `coefficient`: mu.
+    - `normal`: N, in N, a number or a function normal(system, q, v, t) -> ().
+    - `direction`: 1 or -1, the sign of A v where the motion starts and where it is zero.
+    - `along`: index of the coordinate that slides, or a function A(q, t) -> (nv,).
+
+    **Raises:** ValueError for another direction, a negative coefficient, an index that is none; (when called) for one
+    beyond the system's velocities, and for shapes that do not fit.
+
+    Source: EQUATIONS section 11 and erratum E42.
+    """
+
+    coefficient: Float[Array, ""]
+    normal: Any
+    direction: int = eqx.field(static=True)
+    along: Any
+
+    def __init__(self, coefficient, normal, direction: int, along: Any = 0):
+        if direction not in (1, -1):
+            raise ValueError(
+                f"SlidingFriction: direction is {direction!r}; give the sign of the sliding velocity, 1 or -1"
+            )
+        if isinstance(coefficient, (int, float)) and coefficient < 0:
+            raise ValueError(f"SlidingFriction: coefficient is {coefficient}; give mu >= 0 and turn direction round")
+        if not callable(along) and (isinstance(along, bool) or not isinstance(along, int) or along < 0):
+            raise ValueError(f"SlidingFriction: along is {along!r}; give an index of v or a function A(q, t) -> (nv,)")
+        self.coefficient = jnp.asarray(coefficient)
+        self.normal = as_pytree(normal, "SlidingFriction: normal") if callable(normal) else jnp.asarray(normal)
+        self.direction = direction
+        self.along = as_pytree(along, "SlidingFriction: along") if callable(along) else _Coordinate(along)
+
+    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+        row: Any = self.along.row(v) if isinstance(self.along, _Coordinate) else self.along(q, t)
+        normal: Any = self.normal(system, q, v, t) if callable(self.normal) else self.normal
+        if jnp.shape(row) != v.shape or jnp.shape(normal) != ():
+            raise ValueError(
+                f"SlidingFriction: along gives shape {jnp.shape(row)}, normal {jnp.shape(normal)}; expected {v.shape} = "
+                "(nv,) and ()"
+            )
+        limit = self.coefficient.astype(v.dtype) * jnp.asarray(normal, v.dtype)
+        row = jnp.asarray(row, v.dtype)
+        # Rounding of a velocity that ends at zero is no reversal.
+        turned = self.direction * jnp.sum(row * v) < -_ROUNDING * float(jnp.finfo(v.dtype).eps)
+        return jnp.where(turned, self.direction, -self.direction) * limit * row
+
+
+class _Coordinate(eqx.Module):
+    """One of the velocities."""
+
+    index: int = eqx.field(static=True)
+
+    def row(self, v):
+        """The row that picks it."""
+        if self.index >= v.shape[0]:
+            raise ValueError(f"SlidingFriction: along is {self.index}, but the system has nv = {v.shape[0]}")
+        return jnp.zeros_like(v).at[self.index].set(1)

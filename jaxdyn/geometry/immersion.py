@@ -1,0 +1,315 @@
+"""Immersions q = xi(s, t): what lives on q pulled back to s, and the motion of systems that an immersion holds together.
+
+For a system with M a + h = F + R and velocity v = J(s, t) sdot + v0(s, t) on q = xi, c = Jdot sdot + v0dot, the forces R of
+the constraint do no virtual work, J^T R = 0, so that they are gone from
+
+    J^T M J sddot + J^T (M c + h) = J^T F,   a = J sddot + c,   R = M a + h - F.
+
+Several systems, each a unit of its own, add their sides: rho = sum of J_i^T M_i J_i, force = sum of J_i^T F_i, and no
+matrix of all units is formed. Source: EQUATIONS section 12; Loparo & Vakalis on interacting bodies, after Kron.
+"""
+
+from collections.abc import Callable
+from functools import reduce
+from operator import add
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import is_known
+from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_state
+from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
+from jaxdyn.systems.start import place_of
+from jaxdyn.systems.system import System, checked_size, rate_to_velocity
+
+
+class PullBack(eqx.Module):
+    """A covariant tensor field on q, pulled back to s; call it at s (m,)."""
+
+    field: Callable
+    immersion: Callable
+
+    def __call__(self, s: Float[Array, " m"]) -> Array:
+        """The tensor at s: every index of the field's contracted with J = dxi/ds."""
+        q = self.immersion(s)
+        value = jnp.asarray(self.field(q), s.dtype)
+        if any(size != q.shape[0] for size in value.shape):
+            raise ValueError(
+                f"field returned shape {value.shape}, expected ({q.shape[0]}, ...) with q = xi(s) {q.shape}"
+            )
+        J = jax.jacfwd(self.immersion)(s)
+        if is_known(J):
+            _check_rank(J, s, None)
+        for axis in range(value.ndim):
+            value = jnp.moveaxis(_product(jnp.moveaxis(value, axis, -1), J), -1, axis)
+        return value
+
+
+def pull_back(field: Any, immersion: Any) -> PullBack:
+    """The pull-back of a covariant tensor by q = xi(s): J^T g J of a metric, J^T F of a one-form, V(xi(s)) of a function.
+
+    **Arguments:**
+
+    - `field`: function of q (n,) -> (), (n,), (n, n), ...; one index per argument of the tensor.
+    - `immersion`: xi(s) -> (n,), of s (m,), with J = dxi/ds of rank m.
+
+    **Returns:** a function of s that gives (), (m,), (m, m), ...; `jd.MetricSystem` takes it for a metric.
+
+    **Raises:** ValueError for what cannot be called, and (when called) for shapes that do not fit and, on concrete
+    numbers, for an immersion whose rank is below m, with the rank and the point.
+
+    Source: EQUATIONS section 12.
+    """
+    return PullBack(as_pytree(field, "field"), as_pytree(immersion, "immersion"))
+
+
+class _Motion(NamedTuple):
+    """One unit on the immersion: its q, v, the matrix J of v = J sdot + ..., and c, the rate of v at sddot = 0."""
+
+    q: Array
+    v: Array
+    J: Array
+    drift: Array
+
+
+class ImmersedSystem(System):
+    """Systems held on q = xi(s, t), as a system in s; made by `constrain_by_immersion`."""
+
+    units: tuple
+    immersion: Callable
+    nq: int = eqx.field(static=True)
+    moving: bool = eqx.field(static=True)
+    joined: bool = eqx.field(static=True)
+
+    def place(self, s, t) -> tuple[Array, ...]:
+        """Configuration of each unit at s, each (nq,) of its system."""
+        found = self.immersion(s, t) if self.moving else self.immersion(s)
+        found = tuple(found) if self.joined else (found,)
+        sizes = [jnp.shape(q) for q in found]
+        wanted = [(unit.nq,) for unit in self.units]
+        if sizes != wanted:
+            raise ValueError(
+                f"xi returned shapes {sizes}, expected {wanted}: "
+                + ("one configuration for each of the systems" if self.joined else "the system's configuration")
+            )
+        return tuple(jnp.asarray(q, s.dtype) for q in found)
+
+    def velocities(self, s, v, t) -> tuple[Array, ...]:
+        """Velocity of each unit at s and sdot = v, each (nv,) of its system."""
+        q, rates = self._pushed(self.place, s, t, v)
+        return tuple(rate_to_velocity(*of) for of in zip(self.units, q, rates, strict=True))
+
+    def _pushed(self, function, s, t, v):
+        """`function(s, t)` and its rate along the motion; time stands still where xi does not depend on it."""
+        if self.moving:
+            return jax.jvp(function, (s, t), (v, jnp.ones_like(t)))
+        return jax.jvp(lambda s: function(s, t), (s,), (v,))
+
+    def _columns(self, s, t):
+        """J (nv, m) of each unit."""
+        q, push = jax.linearize(lambda s: self.place(s, t), s)
+        rates = jax.vmap(push)(jnp.eye(self.nq, dtype=s.dtype))
+        columns = jax.vmap(lambda *rates: [rate_to_velocity(*of) for of in zip(self.units, q, rates, strict=True)])
+        return q, [J.T for J in columns(*rates)]
+
+    def motions(self, s, v, t) -> list[_Motion]:
+        """Where each unit is and how it moves."""
+        q, J = self._columns(s, t)
+        w, drift = self._pushed(lambda s, t: self.velocities(s, v, t), s, t, v)
+        return [_Motion(*of) for of in zip(q, w, J, drift, strict=True)]
+
+    def mass_matrix(self, s, t):
+        """rho = sum of J^T M J, (m, m)."""
+        placed = zip(self.units, *self._columns(s, t), strict=True)
+        return _sum(_product(J.T, _product(dynamics.mass_matrix(unit, q, t), J)) for unit, q, J in placed)
+
+    def bias_force(self, s, v, t):
+        """Sum of J^T (M c + h), (m,)."""
+        return self._inverse(s, v, t, None)
+
+    def inverse_dynamics(self, s, v, a, t):
+        """Sum of J^T (M (J a + c) + h), (m,)."""
+        return self._inverse(s, v, t, a)
+
+    def _inverse(self, s, v, t, a):
+        needed = self._needed(self.motions(s, v, t), a, t)
+        return _sum(_product(motion.J.T, force) for motion, force in needed)
+
+    def _needed(self, motions, a, t):
+        """Each unit's motion, and the force it takes."""
+        for unit, motion in zip(self.units, motions, strict=True):
+            acceleration = motion.drift if a is None else motion.drift + _product(motion.J, a)
+            yield motion, dynamics.inverse_dynamics(unit, motion.q, motion.v, acceleration, t)
+
+    def gravity_force(self, s, t):
+        """Bias force at rest, (m,); sum of J^T N where xi does not move."""
+        if self.moving:
+            return super().gravity_force(s, t)
+        placed = zip(self.units, *self._columns(s, t), strict=True)
+        return _sum(_product(J.T, dynamics.gravity_force(unit, q, t)) for unit, q, J in placed)
+
+    def kinetic_energy(self, s, v, t):
+        """Sum of the units' kinetic energies, (), J."""
+        placed = zip(self.units, self.place(s, t), self.velocities(s, v, t), strict=True)
+        return _sum(dynamics.kinetic_energy(unit, q, w, t) for unit, q, w in placed)
+
+    def potential_energy(self, s, t):
+        """Sum of the units' potential energies, (), J."""
+        placed = zip(self.units, self.place(s, t), strict=True)
+        return _sum(dynamics.potential_energy(unit, q, t) for unit, q in placed)
+
+    def check_start(self, q, v, t) -> None:
+        """As for any system; also that the immersion has full rank."""
+        if is_known(self, q, v, t):
+            _check_rank(np.concatenate([np.asarray(J) for J in _columns_compiled(self, q, t)]), q, t)
+        super().check_start(q, v, t)
+
+
+class PulledForce(eqx.Module):
+    """Forces on the units of an `ImmersedSystem`, pulled back: xi*F = sum of J_i^T F_i."""
+
+    forces: tuple[tuple, ...]
+    common: Callable | None
+
+    def on_units(self, system: ImmersedSystem, q, v, t) -> list[Array]:
+        """Sum of each unit's forces, (nv,) of its system, at their q and v."""
+        total = [
+            _sum(
+                [jnp.zeros_like(w)]
+                + [checked_force(f(unit, place, w, t), place, unit.nv, f"forces[{i}]") for i, f in enumerate(forces)]
+            )
+            for unit, forces, place, w in zip(system.units, self.forces, q, v, strict=True)
+        ]
+        if self.common is None:
+            return total
+        found = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
+        return _added(total, found, "force")
+
+    def __call__(self, system, s, v, t):
+        if not isinstance(system, ImmersedSystem):
+            raise ValueError(f"a pulled-back force needs its immersed system, not a {type(system).__name__}")
+        _, pull = jax.vjp(lambda v: system.velocities(s, v, t), v)
+        return pull(tuple(self.on_units(system, system.place(s, t), system.velocities(s, v, t), t)))[0]
+
+
+def constrain_by_immersion(system: Any, xi: Callable, nq: int, *, moving: bool = False, force: Any = None) -> Any:
+    """The motion of a system held on q = xi(s), or of several independent ones joined by it, as a system in s.
+
+    M becomes rho = J^T M J, forces become J^T F, and the reaction forces are gone; `reaction_force` gives them. Equal to
+    the same constraint by multipliers, without multipliers, and without drift from the constraint.
+
+    **Arguments:**
+
+    - `system`: a `Model` or another system; a `Scene` without constraints, whose forces are pulled back with it; or a
+      tuple of these, each an independent unit. The mass of a unit may be zero as long as that of the whole is not.
+    - `xi`: xi(s) -> configuration (nq,) of the system, for a tuple of systems a tuple of configurations; unit
+      quaternions where they have some. With `moving=True` xi(s, t). Twice differentiable. A plain function is static; a
+      Module or `jax.tree_util.Partial` carries numbers as leaves.
+    - `nq`: number of coordinates s; sdot is their velocity.
+    - `moving`: whether xi takes the time.
+    - `force`: force(q, v, t) -> (nv,), N m or N, on the system, or a tuple of them for a tuple of systems, then of the
+      tuples of their q and v: what acts between them. None for none.
+
+    **Returns:** a system in s; a `Scene` with the pulled-back forces when a `Scene` or `force` was given.
+
+    **Raises:** ValueError for what is no system, a scene with constraints, an nq that is no positive integer; (when used)
+    for configurations of a wrong shape; before a motion from concrete numbers is computed, for an immersion of a rank
+    below nq, with the rank and the point.
+
+    Source: EQUATIONS section 12.
+
+    ```python
+    rod = jd.constrain_by_immersion(particle, lambda s: jnp.concatenate([jnp.sin(s), -jnp.cos(s)]), 1)
+    ```
+    """
+    joined = isinstance(system, (tuple, list))
+    given = tuple(system) if joined else (system,)
+    if not given:
+        raise ValueError("system is an empty tuple; give at least one system")
+    scenes = [as_scene(unit) for unit in given]
+    for scene in scenes:
+        if scene.constraints:
+            raise ValueError(
+                f"a scene has {len(scene.constraints)} constraints; an immersion takes their place, so leave them out, or "
+                "list them on the scene of the result"
+            )
+    units = tuple(scene.system for scene in scenes)
+    immersed = ImmersedSystem(
+        units=units, immersion=as_pytree(xi, "xi"), nq=checked_size(nq), moving=bool(moving), joined=joined
+    )
+    if force is None and not any(isinstance(unit, Scene) for unit in given):
+        return immersed
+    forces = tuple(scene.forces for scene in scenes)
+    pulled = PulledForce(forces, None if force is None else as_pytree(force, "force"))
+    return Scene(immersed, forces=(pulled,) if force is not None or any(forces) else ())
+
+
+def reaction_force(system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], force: Any = None, t: Any = 0.0) -> Any:
+    """Force R = M a + h - F with which an immersion holds its system, in the coordinates of the system; J^T R = 0.
+
+    **Arguments:**
+
+    - `system`: what `constrain_by_immersion` returned.
+    - `q`, `v` (nq,): s and sdot. `t`, s.
+    - `force`: force on the system (nv,), N m or N, one for each unit when it is a tuple, besides the forces of its scene.
+      None for zero.
+
+    **Returns:** (nv,) of the system, or a tuple, one for each unit.
+
+    **Raises:** ValueError for what is not immersed, forces that were not pulled back, and shapes that do not fit.
+    """
+    scene = as_scene(system)
+    immersed = scene.system
+    if not isinstance(immersed, ImmersedSystem):
+        raise ValueError(f"system is a {type(immersed).__name__}; pass what constrain_by_immersion returned")
+    if any(not isinstance(f, PulledForce) for f in scene.forces) or scene.constraints:
+        raise ValueError(
+            "the scene has forces or constraints in s, whose share in q is not known; list forces on the systems that go "
+            "into constrain_by_immersion"
+        )
+    q, v, t = check_state(immersed, q=q, v=v, t=t)
+    motions = immersed.motions(q, v, t)
+    places, speeds = [m.q for m in motions], [m.v for m in motions]
+    applied = [jnp.zeros_like(w) for w in speeds]
+    if force is not None:
+        applied = _added(applied, force if immersed.joined else (force,), "force")
+    for pulled in scene.forces:
+        applied = [a + f for a, f in zip(applied, pulled.on_units(immersed, places, speeds, t), strict=True)]
+    tau = _sum(_product(m.J.T, f) for m, f in zip(motions, applied, strict=True))
+    a = dynamics.forward_dynamics(immersed, q, v, tau, t)
+    reactions = tuple(needed - f for (_, needed), f in zip(immersed._needed(motions, a, t), applied, strict=True))
+    return reactions if immersed.joined else reactions[0]
+
+
+def _added(total, found, argument: str) -> list[Array]:
+    """Forces on each unit, and others that a user gave."""
+    if len(found) != len(total):
+        raise ValueError(f"{argument} has {len(found)} entries; give one for each of the {len(total)} systems")
+    return [f + checked_force(g, f, f.shape[0], argument) for f, g in zip(total, found, strict=True)]
+
+
+def _sum(terms):
+    return reduce(add, terms)
+
+
+_columns_compiled = eqx.filter_jit(lambda system, q, t: system._columns(q, t)[1])
+
+
+def _check_rank(J, s, t) -> None:
+    """Refuse a matrix (n, m) of a rank below m."""
+    J = np.asarray(J, float)
+    least = 10 * max(J.shape) * float(np.finfo(np.asarray(s).dtype).eps)
+    sizes = np.linalg.svd(J, compute_uv=False) if np.isfinite(J).all() else np.full(1, np.nan)
+    rank = int(np.sum(sizes > least * sizes.max(initial=0.0)))
+    if rank < J.shape[1]:
+        place = f"s = {np.asarray(s).tolist()}" if t is None else place_of(s, t).replace("q =", "s =")
+        raise ValueError(
+            f"the immersion has rank {rank} at {place}, expected {J.shape[1]}, one for each coordinate; start elsewhere, "
+            "or take coordinates that are regular there"
+        )

@@ -1,0 +1,189 @@
+"""Riemannian geometry of a metric in coordinates: flat and sharp maps, connection, covariant derivatives, curvature.
+
+A metric is a function g(q) -> (n, n), symmetric positive definite, or a system whose mass matrix it is (a `System`, or a
+`Model` with v = dq/dt), at t = 0. The connection is that of Levi-Civita: no torsion, and the metric is constant along it. The
+symbols of the second kind are Gamma^i_jk = 1/2 g^il (dg_lj/dq_k + dg_lk/dq_j - dg_jk/dq_l). What needs their product with
+two vectors alone does not form them.
+
+Newton's law in these terms: flat(nabla_v v) = F, with a one-form F. Source: EQUATIONS sections 0, 7 and 12; do Carmo
+(1992), Riemannian Geometry, chapters 2 to 4.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint, check_state, check_system, state_dtype
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.mass_factor import solve_positive
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import System, symbols
+
+KINDS = ("first", "second")
+
+
+def flat(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+    """One-form of a vector, g(q) v: the momentum of a velocity, the force of an acceleration.
+
+    **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
+    """
+    q, v = _vectors(metric, q=q, v=v)
+    return _product(_at(metric)(q), v)
+
+
+def sharp(metric: Any, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Vector of a one-form, g(q)^-1 p: the inverse of `flat`.
+
+    **Arguments:** `metric` as above; `q`, `p` (n,). **Returns:** (n,); NaN where g is not positive definite.
+    """
+    q, p = _vectors(metric, q=q, p=p)
+    return solve_positive(_at(metric)(q), p)
+
+
+def christoffel_symbols(metric: Any, q: Float[Array, " n"], kind: str = "second") -> Float[Array, "n n n"]:
+    """Christoffel symbols: Gamma^i_jk ("second" kind) or Gamma_ijk = g_il Gamma^l_jk ("first"), the index i in front.
+
+    **Arguments:** `metric` as above; `q` (n,).
+
+    **Returns:** (n, n, n), symmetric in the last two indices.
+
+    **Raises:** ValueError for another kind.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"kind is {kind!r}; choose from {', '.join(KINDS)}")
+    (q,) = _vectors(metric, q=q)
+    g = _at(metric)
+    first = symbols(jax.jacfwd(g)(q))
+    return first if kind == "first" else solve_positive(g(q), first.reshape(q.shape[0], -1)).reshape(first.shape)
+
+
+def connection(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Gamma(v, w)^i = Gamma^i_jk v_j w_k, symmetric and bilinear in v and w; the symbols are not formed.
+
+    **Arguments:** `metric` as above; `q`, `v`, `w` (n,). **Returns:** (n,).
+    """
+    q, v, w = _vectors(metric, q=q, v=v, w=w)
+    g = _at(metric)
+    _, along_v = jax.jvp(lambda q: _product(g(q), w), (q,), (v,))
+    _, along_w = jax.jvp(lambda q: _product(g(q), v), (q,), (w,))
+    slope = jax.grad(lambda q: jnp.sum(v * _product(g(q), w)))(q)
+    return solve_positive(g(q), 0.5 * (along_v + along_w - slope))
+
+
+def covariant_rate(
+    metric: Any, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"], rate: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """Covariant derivative along a curve, Dw/dt = dw/dt + Gamma(dq/dt, w), of a vector w(t) that is carried along.
+
+    With w = v = dq/dt and rate = a it is the covariant acceleration nabla_v v. It is zero for parallel transport.
+
+    **Arguments:** `metric` as above; `q`, its rate `v`, `w` and its `rate` dw/dt, each (n,). **Returns:** (n,).
+    """
+    q, v, w, rate = _vectors(metric, q=q, v=v, w=w, rate=rate)
+    return rate + connection(metric, q, v, w)
+
+
+def covariant_derivative(
+    metric: Any, field: Callable, q: Float[Array, " n"], v: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """Covariant derivative nabla_v X = dX(v) + Gamma(v, X) of a vector field X(q) -> (n,) in the direction v.
+
+    **Arguments:** `metric` as above; `field`, X; `q`, `v` (n,). **Returns:** (n,).
+    """
+    q, v = _vectors(metric, q=q, v=v)
+    w, rate = jax.jvp(field, (q,), (v,))
+    return covariant_rate(metric, q, v, w, rate)
+
+
+def geodesic_acceleration(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+    """d2q/dt2 = -Gamma(v, v) of the geodesic through q with velocity v. `jd.MetricSystem(metric, n)` simulates it.
+
+    **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
+    """
+    return -connection(metric, q, v, v)
+
+
+def riemann_tensor(metric: Any, q: Float[Array, " n"]) -> Float[Array, "n n n n"]:
+    """Curvature tensor R^i_jkl, with R(u, w) z = nabla_u nabla_w z - nabla_w nabla_u z - nabla_[u,w] z:
+
+        (R(u, w) z)^i = R^i_jkl z^j u^k w^l,
+        R^i_jkl = dGamma^i_lj/dq_k - dGamma^i_kj/dq_l + Gamma^i_km Gamma^m_lj - Gamma^i_lm Gamma^m_kj.
+
+    **Arguments:** `metric` as above, twice differentiable; `q` (n,). **Returns:** (n, n, n, n), index i in front.
+
+    Source: do Carmo (1992), chapter 4, with the opposite sign of R.
+    """
+    (q,) = _vectors(metric, q=q)
+    gamma = christoffel_symbols(metric, q)
+    slope = jax.jacfwd(lambda q: christoffel_symbols(metric, q))(q)
+    half = slope.transpose(0, 2, 3, 1) + jnp.einsum("ikm,mlj->ijkl", gamma, gamma)
+    return half - half.transpose(0, 1, 3, 2)
+
+
+def sectional_curvature(
+    metric: Any, q: Float[Array, " n"], u: Float[Array, " n"], w: Float[Array, " n"]
+) -> Float[Array, ""]:
+    """Curvature <R(u, w) w, u> / (|u|^2 |w|^2 - <u, w>^2) of the plane of u and w: 1/r^2 on a sphere of radius r.
+
+    **Arguments:** `metric` as above; `q`, `u`, `w` (n,), u and w independent. **Returns:** ().
+    """
+    q, u, w = _vectors(metric, q=q, u=u, w=w)
+    g = _at(metric)(q)
+    turned = jnp.einsum("ijkl,j,k,l->i", riemann_tensor(metric, q), w, u, w)
+    dot = lambda a, b: jnp.sum(a * _product(g, b))  # noqa: E731
+    return dot(turned, u) / (dot(u, u) * dot(w, w) - dot(u, w) ** 2)
+
+
+def _vectors(metric, **arguments) -> tuple[Array, ...]:
+    """The arguments as vectors (n,) of the metric's dtype, which for a function is that of q or else jax's default.
+
+    **Raises:** ValueError that names the argument.
+    """
+    if isinstance(metric, (Model, System)):
+        return check_state(metric, **arguments)
+    q = as_array(arguments["q"], "q")
+    dtype = state_dtype(None, q)
+    for name, value in arguments.items():
+        if np.ndim(value) != 1 or np.shape(value) != q.shape:
+            raise ValueError(f"{name} has shape {np.shape(value)}, expected (n,) as q has{batch_hint(value, (1,))}")
+    return tuple(as_array(value, name, dtype) for name, value in arguments.items())
+
+
+def _at(metric) -> Callable:
+    """The metric as a function of q.
+
+    **Raises:** ValueError for what gives no metric.
+    """
+    if isinstance(metric, Model) and metric.nq != metric.nv:
+        raise ValueError(
+            f"metric is model {metric.name!r} with nq = {metric.nq}, nv = {metric.nv}; a metric needs coordinates with "
+            "v = dq/dt, so build the model without spherical and free joints, or give g(q) in coordinates"
+        )
+    if isinstance(metric, Model) and "planar" in metric.topology.kinds:
+        raise ValueError(
+            f"metric is model {metric.name!r}, which has a planar joint, whose v is not dq/dt; give g(q) in coordinates"
+        )
+    if isinstance(metric, (Model, System)):
+        return lambda q: mass_matrix(metric, q)
+    if isinstance(metric, Scene):
+        check_system(metric, "metric")
+    if not callable(metric):
+        raise ValueError(f"metric is {metric!r}; pass a function g(q) -> (n, n) or a system")
+
+    given: Callable = metric
+
+    def checked(q):
+        g = given(q)
+        if jnp.shape(g) != (q.shape[0], q.shape[0]):
+            raise ValueError(
+                f"metric returned shape {jnp.shape(g)}, expected {(q.shape[0], q.shape[0])} for this q{batch_hint(g, (1, 1))}"
+            )
+        return jnp.asarray(g, q.dtype)
+
+    return checked

@@ -1,0 +1,245 @@
+"""Rotations of space: SO(3) as 3x3 matrices and as unit quaternions.
+
+A rotation vector phi (3,) is axis times angle in radians. A matrix R_ab (3, 3) maps coordinates in frame b to
+coordinates in frame a. Quaternions (4,) are (w, x, y, z), scalar first, and act by the Hamilton product. Every
+function takes one sample; batch with `jax.vmap`. Values and first and second derivatives are finite at every angle.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.lie.series import angle_ratio, inverse_coefficient, stumpff
+
+Vector = Float[Array, "3"]
+Matrix = Float[Array, "3 3"]
+Quaternion = Float[Array, "4"]
+
+
+def _product(a: Array, b: Array) -> Array:
+    # GPUs may round float32 products to TF32 unless asked not to.
+    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Cross product a x b = hat(a) b, without the matrix.
+
+    **Arguments:** `a`, `b`: (3,), in the same frame. **Returns:** (3,), product of their units.
+    """
+    ax, ay, az = jnp.unstack(a)
+    bx, by, bz = jnp.unstack(b)
+    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def hat(phi: Vector) -> Matrix:
+    """Skew matrix of a vector: hat(a) b = a x b.
+
+    **Arguments:** `phi`: (3,). **Returns:** (3, 3), same unit and frame.
+
+    Source: Murray, Li, Sastry, A Mathematical Introduction to Robotic Manipulation (1994), eq. 2.4.
+    """
+    x, y, z = jnp.unstack(phi)
+    o = jnp.zeros_like(x)
+    return jnp.stack([o, -z, y, z, o, -x, -y, x, o]).reshape(3, 3)
+
+
+def vee(matrix: Matrix) -> Vector:
+    """Vector of a skew matrix, the inverse of `hat`; of any other matrix, the vector of its skew part.
+
+    **Arguments:** `matrix`: (3, 3). **Returns:** (3,), half the differences of opposite entries.
+    """
+    _, m01, m02, m10, _, m12, m20, m21, _ = jnp.unstack(matrix.reshape(9))
+    return 0.5 * jnp.stack([m21 - m12, m02 - m20, m10 - m01])
+
+
+def _isotropic_sum(a: Float[Array, ""], b: Float[Array, ""], c: Float[Array, ""], phi: Vector) -> Matrix:
+    # a 1 + b hat(phi) + c phi phi^T: since hat(phi)^2 = phi phi^T - s 1, every function of hat(phi) has this form.
+    identity = jnp.eye(3, dtype=phi.dtype)
+    return a * identity + b * hat(phi) + c * (phi[:, None] * phi[None, :])
+
+
+def exp(phi: Vector) -> Matrix:
+    """Rotation matrix of a rotation vector (Rodrigues).
+
+    R = cos(theta) 1 + (sin(theta)/theta) hat(phi) + ((1 - cos(theta))/theta^2) phi phi^T, theta = |phi|.
+
+    **Arguments:** `phi`: (3,), rad, of any length. **Returns:** (3, 3). The error grows as eps theta for many turns.
+
+    Source: Murray, Li, Sastry (1994), eq. 2.14.
+    """
+    c0, c1, c2, _ = stumpff(jnp.sum(phi * phi))
+    return _isotropic_sum(c0, c1, c2, phi)
+
+
+def log(rotation: Matrix) -> Vector:
+    """Rotation vector of a rotation matrix, of length at most pi.
+
+    phi = quat_log(matrix_to_quat(R)). Branch at theta = pi, where +phi and -phi are the same rotation: the sign of
+    the quaternion's scalar part decides, and where that is exactly zero, the component of the axis with the largest
+    magnitude comes out positive (the first of equals). Derivatives there are one-sided, those of the branch returned;
+    at an angle within rounding of pi either sign may come out.
+
+    **Arguments:** `rotation`: (3, 3), orthogonal to rounding. **Returns:** (3,), rad.
+
+    Derivatives are meant along the group: off it, the entries of the matrix may be extended in other ways.
+    """
+    return quat_log(matrix_to_quat(rotation))
+
+
+def inverse(rotation: Matrix) -> Matrix:
+    """Inverse rotation, R^T. **Arguments:** `rotation`: (3, 3). **Returns:** (3, 3)."""
+    return rotation.T
+
+
+def Ad(rotation: Matrix) -> Matrix:
+    """Adjoint of a rotation on angular velocities: R hat(w) R^T = hat(Ad_R w), so Ad_R = R.
+
+    **Arguments:** `rotation`: R_ab, (3, 3). **Returns:** (3, 3), maps angular velocities in b to a.
+    """
+    return rotation
+
+
+def ad(phi: Vector) -> Matrix:
+    """Adjoint of the algebra: ad_a b = a x b, so ad_a = hat(a).
+
+    **Arguments:** `phi`: (3,). **Returns:** (3, 3).
+    """
+    return hat(phi)
+
+
+def left_jacobian(phi: Vector) -> Matrix:
+    """Left Jacobian of exp: (d/dt R) R^T = hat(J phidot), R = exp(phi).
+
+    J = sum_k hat(phi)^k / (k+1)! = c1 1 + c2 hat(phi) + c3 phi phi^T (Stumpff functions of theta^2). The right
+    Jacobian, which gives R^T dR/dt, is left_jacobian(-phi) = J^T.
+
+    **Arguments:** `phi`: (3,), rad. **Returns:** (3, 3). Singular at theta = 2 pi n, n > 0.
+
+    Source: Barfoot, State Estimation for Robotics (2017), eq. 7.77.
+    """
+    _, c1, c2, c3 = stumpff(jnp.sum(phi * phi))
+    return _isotropic_sum(c1, c2, c3, phi)
+
+
+def left_jacobian_inverse(phi: Vector) -> Matrix:
+    """Inverse of the left Jacobian: phidot = J^-1 w, w the angular velocity in the fixed frame.
+
+    J^-1 = 1 - hat(phi)/2 + d hat(phi)^2, d = (1 - (theta/2) cot(theta/2)) / theta^2.
+
+    **Arguments:** `phi`: (3,), rad, |phi| < 2 pi. **Returns:** (3, 3). Unbounded towards |phi| = 2 pi.
+
+    Source: Barfoot (2017), eq. 7.76; Bullo and Murray, PD control on the Euclidean group (1995).
+    """
+    s = jnp.sum(phi * phi)
+    d = inverse_coefficient(s)
+    return _isotropic_sum(1.0 - s * d, jnp.full_like(s, -0.5), d, phi)
+
+
+def quat_exp(phi: Vector) -> Quaternion:
+    """Unit quaternion of a rotation vector: (cos(theta/2), phi sin(theta/2)/theta).
+
+    **Arguments:** `phi`: (3,), rad, of any length. **Returns:** (4,). Its sign is that of the half angle: adding a
+    full turn to phi negates it.
+
+    Source: Murray, Li, Sastry (1994), chapter 2, section 2.3.
+    """
+    # sin(theta/2)/theta is half of sin(h)/h at the half angle h, so the same functions serve.
+    c0, c1, _, _ = stumpff(0.25 * jnp.sum(phi * phi))
+    return jnp.concatenate([c0[None], (0.5 * c1) * phi])
+
+
+def quat_log(q: Quaternion) -> Vector:
+    """Rotation vector of a quaternion, of length at most pi.
+
+    phi = 2 atan2(|v|, w) v / |v| for q = (w, v) with w >= 0, and the same of -q (the same rotation) for w < 0. Branch
+    at theta = pi (w = 0): phi = pi v / |v|, with the sign of v as given.
+
+    **Arguments:** `q`: (4,), of any length but zero, which does not matter. **Returns:** (3,), rad.
+    """
+    q = jnp.where(q[0] < 0.0, -q, q)
+    v = q[1:]
+    return angle_ratio(jnp.sum(v * v), q[0]) * v
+
+
+def quat_multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Hamilton product; quat_to_matrix(a b) = quat_to_matrix(a) quat_to_matrix(b).
+
+    (wa, va)(wb, vb) = (wa wb - va.vb, wa vb + wb va + va x vb).
+
+    **Arguments:** `a`, `b`: (4,). **Returns:** (4,), not normalised.
+    """
+    aw, ax, ay, az = jnp.unstack(a)
+    bw, bx, by, bz = jnp.unstack(b)
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
+
+
+def quat_conjugate(q: Quaternion) -> Quaternion:
+    """Conjugate (w, -v), the inverse of a unit quaternion. **Arguments:** `q`: (4,). **Returns:** (4,)."""
+    return jnp.concatenate([q[:1], -q[1:]])
+
+
+def quat_normalize(q: Quaternion) -> Quaternion:
+    """Unit quaternion q / |q|, sign kept. **Arguments:** `q`: (4,), not zero (NaN). **Returns:** (4,)."""
+    return q / jnp.sqrt(jnp.sum(q * q))
+
+
+def quat_to_matrix(q: Quaternion) -> Matrix:
+    """Rotation matrix of a quaternion of any length.
+
+    R = 1 + (2/|q|^2) (w hat(v) + hat(v)^2) for q = (w, v). Dividing by |q|^2 makes R orthogonal to rounding even
+    where q has drifted from unit length, as it does between the steps of an integrator. The derivative along q is
+    zero.
+
+    **Arguments:** `q`: (4,), not zero (NaN). **Returns:** (3, 3).
+
+    Source: Murray, Li, Sastry (1994), chapter 2, section 2.3.
+    """
+    w, v = q[0], q[1:]
+    v2 = jnp.sum(v * v)
+    k = 2.0 / (w * w + v2)
+    # hat(v)^2 = v v^T - |v|^2 1
+    identity = jnp.eye(3, dtype=q.dtype)
+    return (1.0 - k * v2) * identity + (k * w) * hat(v) + (k * v)[:, None] * v[None, :]
+
+
+def quat_rotate(q: Quaternion, x: Vector) -> Vector:
+    """Rotated vector, quat_to_matrix(q) x without the matrix; q of any length, as there.
+
+    x + (2/|q|^2) (w v x x + v x (v x x)) for q = (w, v).
+
+    **Arguments:** `q`: (4,), of R_ab, not zero (NaN); `x`: (3,), in frame b. **Returns:** (3,), in frame a.
+    """
+    w, v = q[0], q[1:]
+    moved = (2.0 / jnp.sum(q * q)) * cross(v, x)
+    return x + w * moved + cross(v, moved)
+
+
+def matrix_to_quat(rotation: Matrix) -> Quaternion:
+    """Unit quaternion of a rotation matrix, with scalar part w >= 0.
+
+    The rows of 4 q q^T are linear in R. The row with the largest diagonal entry 4 q_i^2 >= 1 is normalised, so no
+    root meets zero, and the four cases differ only by a selection. Branch at theta = pi (w = 0): the component with
+    the largest magnitude is positive (the first of equals).
+
+    **Arguments:** `rotation`: (3, 3), orthogonal to rounding. **Returns:** (4,). If R is orthogonal to e only, q is
+    a unit quaternion off by about e. Derivatives are meant along the group.
+
+    Source: Shepperd, Quaternion from rotation matrix (1978).
+    """
+    xx, r01, r02, r10, yy, r12, r20, r21, zz = jnp.unstack(rotation.reshape(9))
+    wx, wy, wz = r21 - r12, r02 - r20, r10 - r01
+    yz, zx, xy = r21 + r12, r02 + r20, r10 + r01
+    ww = 1.0 + xx + yy + zz
+    x4, y4, z4 = 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz
+    rows = jnp.stack([ww, wx, wy, wz, wx, x4, xy, zx, wy, xy, y4, yz, wz, zx, yz, z4]).reshape(4, 4)
+    of_wx = jnp.where(ww >= x4, rows[0], rows[1])
+    of_yz = jnp.where(y4 >= z4, rows[2], rows[3])
+    row = jnp.where(jnp.maximum(ww, x4) >= jnp.maximum(y4, z4), of_wx, of_yz)
+    return quat_normalize(jnp.where(row[0] < 0.0, -row, row))

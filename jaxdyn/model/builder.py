@@ -1,0 +1,398 @@
+"""Building mechanisms in code, and looking at and repairing their inertias.
+
+`ModelBuilder` collects bodies and joints; `build` merges what is fixed, puts the tree in order and returns a `Model`.
+All arithmetic of a build is float64 on concrete numbers; the result is stored in jax's default dtype.
+"""
+
+import dataclasses
+import difflib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.model import float64 as f64
+from jaxdyn.model import inertia as _inertia
+from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
+from jaxdyn.model.tree import Model, Topology
+
+GRAVITY = (0.0, 0.0, -9.81)
+_JOINT_LEAVES = {"armature": "nv", "damping": "nv", "friction": "nv"}
+_LIMITS = {
+    "lower": ("nq", -np.inf),
+    "upper": ("nq", np.inf),
+    "velocity_limit": ("nv", np.inf),
+    "effort_limit": ("nv", np.inf),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Body:
+    name: str
+    parent: str | None
+    kind: str
+    joint_name: str
+    pose: np.ndarray
+    screw: np.ndarray
+    inertia: np.ndarray
+    leaves: dict[str, np.ndarray | None]
+
+
+class ModelBuilder:
+    """Collects bodies, joints and frames, and builds a `Model` from them.
+
+    **Arguments:**
+
+    - `name`: name of the mechanism.
+    - `gravity`: gravitational acceleration (3,) in world axes, m/s^2; None leaves gravity out of all that is compiled.
+    - `dtype`: floating-point type of the leaves; jax's default when None.
+
+    **Raises:** ValueError for a gravity that is not three finite numbers, and for float64 while jax runs in 32 bits.
+
+    ```python
+    builder = ModelBuilder("pendulum")
+    builder.add_body("bob", joint="revolute", axis=(0, 1, 0), inertia=(1.0, (0, 0, -0.5), (0, 0, 0)))
+    model = builder.build()
+    ```
+    """
+
+    def __init__(self, name: str = "mechanism", *, gravity=GRAVITY, dtype=None):
+        self._name = name
+        three = {(3,): "three numbers (3,) or None"}
+        self._gravity = None if gravity is None else f64.numbers(gravity, three, "gravity")
+        self._dtype = _float_dtype(dtype)
+        self._bodies: dict[str, _Body] = {}
+        self._joints: dict[str, str] = {}  # joint name -> body name
+        self._frames: dict[str, tuple[str | None, np.ndarray]] = {}
+        self._couplings: dict[str, tuple[str, float, float]] = {}
+
+    def add_body(
+        self,
+        name: str,
+        parent: str | None = None,
+        joint: str = "revolute",
+        inertia=None,
+        *,
+        joint_name: str | None = None,
+        pose=None,
+        axis=(0.0, 0.0, 1.0),
+        pitch=0.0,
+        screw=None,
+        armature=None,
+        damping=None,
+        friction=None,
+        lower=None,
+        upper=None,
+        velocity_limit=None,
+        effort_limit=None,
+    ) -> "ModelBuilder":
+        """Add a body and the joint that carries it. Returns the builder.
+
+        **Arguments:**
+
+        - `name`: of the body, and of its frame.
+        - `parent`: name of a body added before, or None for the world.
+        - `joint`: revolute, continuous, prismatic, helical, planar, spherical, free or fixed. A fixed body is merged
+          into the one that carries it; its frame stays reachable by name. Inertia fixed to the world has no effect.
+        - `inertia`: None (massless), the ten numbers (10,) about the body frame's origin, or (mass, centre of mass
+          (3,), rotational inertia (3, 3) or principal moments (3,) about it); kg, m, kg m^2, in the body frame.
+        - `joint_name`: `name` + "_joint" when None. Siblings stand in the model in the order of their joint names.
+        - `pose`: of the body frame in the parent's at the joint's zero: None (identity), (4, 4), (3,) or (xyz, rpy).
+        - `axis`: direction (3,) of a revolute, continuous, prismatic or helical joint in the body frame, of any
+          length but zero. A planar joint moves in the x-y plane of its body frame at home.
+        - `pitch`: of a helical joint, m per rad.
+        - `screw`: twist (v, omega) (6,) of a one-degree-of-freedom joint in the body frame, instead of axis and
+          pitch; it is scaled to |omega| = 1 (|v| = 1 for prismatic). Any screw is helical; the axis of a revolute or
+          continuous joint passes through the body's origin.
+        - `armature`, `damping`, `friction`: rotor inertia, viscous and Coulomb friction of the joint, a number or
+          (nv,). When no joint of the model has one, the model's leaf is None.
+        - `lower`, `upper`: position limits, a number or (nq,); `velocity_limit`, `effort_limit`: a number or (nv,).
+          Infinite when None.
+
+        **Raises:** ValueError that names the body and what is wrong with it.
+        """
+        what = f"body {name!r}"
+        self._check_new(name, parent)
+        if joint not in KINDS and joint != "fixed":
+            raise ValueError(f"{what}: joint kind {joint!r} is unknown; kinds are fixed, {', '.join(KINDS)}")
+        joint_name = f"{name}_joint" if joint_name is None else joint_name
+        if not isinstance(joint_name, str) or not joint_name:
+            raise ValueError(f"{what}: joint_name is {joint_name!r}; give a non-empty string")
+        if joint_name in self._joints:
+            raise ValueError(
+                f"{what}: joint name {joint_name!r} is that of body {self._joints[joint_name]!r}; rename one"
+            )
+        sizes = KINDS.get(joint)
+        nq, nv = (sizes.nq, sizes.nv) if sizes else (0, 0)
+        given = dict(armature=armature, damping=damping, friction=friction)
+        given |= dict(lower=lower, upper=upper, velocity_limit=velocity_limit, effort_limit=effort_limit)
+        leaves = {}
+        for key, value in given.items():
+            size = nq if key in ("lower", "upper") else nv
+            leaves[key] = None if value is None else _joint_numbers(value, size, joint, key, what)
+        low, high = leaves["lower"], leaves["upper"]
+        if low is not None and high is not None and np.any(low > high):
+            raise ValueError(f"{what}: lower limit {lower} is above upper limit {upper}; swap them")
+        body = _Body(
+            name,
+            parent,
+            joint,
+            joint_name,
+            f64.pose_matrix(pose, f"{what}: pose"),
+            _screw(joint, axis, pitch, screw, what),
+            f64.inertia_numbers(inertia, f"{what}: inertia"),
+            leaves,
+        )
+        self._bodies[name] = body
+        self._joints[joint_name] = name
+        return self
+
+    def add_frame(self, name: str, parent: str | None = None, pose=None) -> "ModelBuilder":
+        """Name a frame on a body: `pose` (as in `add_body`) in the frame of the body `parent`, None for the world.
+
+        Returns the builder. **Raises:** ValueError for a name in use, an unknown parent or a bad pose.
+        """
+        self._check_new(name, parent)
+        self._frames[name] = (parent, f64.pose_matrix(pose, f"frame {name!r}: pose"))
+        return self
+
+    def add_coupling(self, joint: str, source: str, multiplier=1.0, offset=0.0) -> "ModelBuilder":
+        """Record that q[joint] = multiplier q[source] + offset for two one-degree-of-freedom joints (a gear, a mimic).
+
+        The joint stays free in the model; a scene takes the coupling as a constraint. Returns the builder.
+
+        **Raises:** ValueError for an unknown joint or one of several degrees of freedom, a joint coupled twice or to
+        itself (also by way of others), or numbers that are not finite.
+        """
+        what = f"coupling of {joint!r} to {source!r}"
+        for name in (joint, source):
+            if name not in self._joints:
+                raise ValueError(f"{what}: {unknown('joint', name, self._joints)}")
+            if (kind := self._bodies[self._joints[name]].kind) not in SCREW_KINDS:
+                raise ValueError(f"{what}: joint {name!r} is {kind}; couple joints of one degree of freedom")
+        if joint in self._couplings:
+            raise ValueError(f"{what}: it follows {self._couplings[joint][0]!r} already; leave one coupling out")
+        followed = source
+        while followed is not None:
+            if followed == joint:
+                raise ValueError(f"{what}: the joint would follow itself; leave one coupling out")
+            followed = self._couplings[followed][0] if followed in self._couplings else None
+        values = f64.numbers([multiplier, offset], {(2,): "two numbers"}, f"{what}: (multiplier, offset)")
+        self._couplings[joint] = (source, float(values[0]), float(values[1]))
+        return self
+
+    def build(self) -> Model:
+        """The model: depth-first order with siblings sorted by joint name, fixed bodies merged.
+
+        Frames are the bodies in their order, then all others sorted by the body that carries them and by name.
+
+        **Raises:** ValueError that names a joint which moves no inertia, so that the mass matrix is singular in every
+        configuration: S^T I S = 0 with the composite or the articulated inertia I of what it carries.
+        """
+        moving, carriers, parents, home, inertias = self._merged()
+        others = [(carriers[b][0], name, carriers[b][1] @ pose) for name, (b, pose) in self._frames.items()]
+        fixed = [name for name, body in self._bodies.items() if body.kind == "fixed"]
+        others += [(carriers[name][0], name, carriers[name][1]) for name in fixed]
+        others.sort(key=lambda frame: frame[:2])
+        index = {body.joint_name: i for i, body in enumerate(moving)}
+        couplings = {(index[joint], index[c[0]]): c[1:] for joint, c in self._couplings.items()}
+        topology = Topology(
+            name=self._name,
+            parents=tuple(parents),
+            kinds=tuple(body.kind for body in moving),
+            body_names=tuple(body.name for body in moving),
+            joint_names=tuple(body.joint_name for body in moving),
+            frame_names=tuple(body.name for body in moving) + tuple(name for _, name, _ in others),
+            frame_bodies=tuple(range(len(moving))) + tuple(body for body, _, _ in others),
+            couplings=tuple(sorted(couplings)),
+        )
+        screws = np.array([body.screw for body in moving]).reshape(-1, 6)
+        leaves = {key: _stacked(moving, key, size, 0.0) for key, size in _JOINT_LEAVES.items()}
+        _check_regular(topology, home, screws, inertias, leaves["armature"])
+        leaves |= {key: _stacked(moving, key, size, fill, always=True) for key, (size, fill) in _LIMITS.items()}
+        leaves |= dict(home=home, screws=screws, inertias=inertias, gravity=self._gravity)
+        leaves["frame_poses"] = np.array([np.eye(4)] * len(moving) + [pose for *_, pose in others]).reshape(-1, 4, 4)
+        leaves["coupling_values"] = np.array([couplings[pair] for pair in topology.couplings]) if couplings else None
+        stored: dict[str, Any] = {
+            key: None if value is None else jnp.asarray(value, self._dtype) for key, value in leaves.items()
+        }
+        return Model(**stored, topology=topology)
+
+    def _check_new(self, name, parent) -> None:
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"name is {name!r}; give a non-empty string")
+        if name in self._bodies or name in self._frames:
+            raise ValueError(f"the name {name!r} is taken by another body or frame; rename one")
+        if parent is not None and parent not in self._bodies:
+            raise ValueError(f"{name!r}: {unknown('parent', parent, self._bodies)}; add a parent before its children")
+
+    def _merged(self):
+        """The moving bodies in order; (index, pose) of what carries each body; parents, homes and merged inertias."""
+        children: dict[str | None, list[_Body]] = {}
+        for body in sorted(self._bodies.values(), key=lambda body: body.joint_name, reverse=True):
+            children.setdefault(body.parent, []).append(body)
+        moving, parents, home, inertias = [], [], [], []
+        carriers: dict[str | None, tuple[int, np.ndarray]] = {None: (-1, np.eye(4))}
+        stack = list(children.get(None, ()))
+        while stack:
+            body = stack.pop()
+            stack.extend(children.get(body.name, ()))
+            carrier, pose = carriers[body.parent]
+            pose = pose @ body.pose
+            if body.kind != "fixed":
+                parents.append(carrier)
+                home.append(pose)
+                inertias.append(body.inertia)
+                carriers[body.name] = (len(moving), np.eye(4))
+                moving.append(body)
+                continue
+            carriers[body.name] = (carrier, pose)
+            if carrier >= 0:
+                inertias[carrier] = inertias[carrier] + f64.move_inertia(pose, body.inertia)
+        return moving, carriers, parents, np.array(home).reshape(-1, 4, 4), np.array(inertias).reshape(-1, 10)
+
+
+def inertia_report(model: Model) -> list[tuple[str, str]]:
+    """What is unphysical in the inertias of a model, as (body, problem).
+
+    Listed are bodies that are massless, whose rotational inertia about the centre of mass is not positive definite, or
+    whose principal moments break the triangle inequality (one exceeds the sum of the other two).
+
+    Such bodies are common in files made by hand and harmless where others move with them; see `repair_inertias`.
+    """
+    return [
+        (name, problem)
+        for name, parameters in zip(model.body_names, np.asarray(model.inertias), strict=True)
+        for problem in inertia_problems(parameters)
+    ]
+
+
+def inertia_problems(parameters) -> list[str]:
+    """What is unphysical in ten inertial parameters (10,), in words; empty when nothing is."""
+    parameters = np.asarray(parameters)
+    # The shift from the origin to the centre of mass leaves a few roundings of the precision the numbers came in.
+    rounding = 64 * np.finfo(parameters.dtype).eps
+    parameters = parameters.astype(np.float64)
+    if not parameters.any():
+        return ["massless"]
+    if parameters[0] <= 0:
+        return [f"mass {parameters[0]} kg with first moments and inertia {parameters[1:].tolist()}"]
+    moments = np.linalg.eigvalsh(f64.about_com(parameters)[2])
+    slack = rounding * np.abs(f64.rotational_inertia(parameters)).max()
+    text = ", ".join(f"{moment:.6g}" for moment in moments)
+    if moments[0] <= slack:
+        return [f"not positive definite: principal moments {text} kg m^2"]
+    if moments[2] > moments[0] + moments[1] + slack:
+        return [f"triangle inequality violated: principal moments {text} kg m^2"]
+    return []
+
+
+def repair_inertias(model: Model) -> Model:
+    """A copy in which every body with mass has physical inertial parameters (`inertia.nearest_feasible`).
+
+    Bodies that `inertia_report` does not list are left as they are, and massless ones too.
+    """
+    inertias = np.array(model.inertias)
+    for i, parameters in enumerate(inertias):
+        if parameters[0] > 0 and inertia_problems(parameters):
+            inertias[i] = _inertia.nearest_feasible(parameters)
+    return model.replace(inertias=jnp.asarray(inertias))
+
+
+def _float_dtype(dtype):
+    default = jnp.zeros(()).dtype
+    if dtype is None:
+        return default
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(f"dtype is {dtype!r}; give a floating-point type such as jax.numpy.float32")
+    if jax.dtypes.canonicalize_dtype(dtype) != jnp.dtype(dtype):
+        name = jnp.dtype(dtype).name
+        raise ValueError(
+            f"dtype is {name}, but jax runs in 32 bits; call jax.config.update('jax_enable_x64', True) first"
+        )
+    return jnp.dtype(dtype)
+
+
+def unknown(role: str, name, known) -> str:
+    near = difflib.get_close_matches(str(name), [str(k) for k in known], n=3, cutoff=0.4)
+    return f"{role} {name!r} is unknown" + (f" (did you mean {', '.join(near)}?)" if near else "")
+
+
+def _joint_numbers(value, size: int, kind: str, key: str, what: str) -> np.ndarray:
+    if size == 0:
+        raise ValueError(f"{what}: {key} is {value!r}, but the joint is fixed; leave it out")
+    limit = key in _LIMITS
+    if kind == "continuous" and key in ("lower", "upper"):
+        raise ValueError(f"{what}: {key} is {value!r}, but a continuous joint has no position limits; use revolute")
+    shapes = {(size,): f"({size},)"}
+    # One number cannot bound metres, radians and quaternion entries at once.
+    if size == 1 or key not in ("lower", "upper"):
+        shapes = {(): "a number", **shapes}
+    array = f64.numbers(value, shapes, f"{what}: {key}", finite=not limit)
+    if not limit and np.any(array < 0):
+        raise ValueError(f"{what}: {key} is {value!r}; it must not be negative")
+    return np.broadcast_to(array, (size,))
+
+
+def _screw(kind: str, axis, pitch, screw, what: str) -> np.ndarray:
+    axis = f64.numbers(axis, {(3,): "(3,)"}, f"{what}: axis")
+    pitch = float(f64.numbers(pitch, {(): "a number"}, f"{what}: pitch"))
+    turned = not np.array_equal(axis, [0, 0, 1])
+    if kind not in SCREW_KINDS:
+        if turned or pitch or screw is not None:
+            raise ValueError(f"{what}: a {kind} joint has no axis, pitch or screw; turn its pose instead")
+        return np.zeros(6)
+    if pitch and kind != "helical":
+        raise ValueError(f"{what}: pitch is {pitch}, but the joint is {kind}; use joint='helical'")
+    if screw is None:
+        axis = f64.unit(axis, f"{what}: axis")
+        return np.concatenate([axis, np.zeros(3)]) if kind == "prismatic" else np.concatenate([pitch * axis, axis])
+    if turned or pitch:
+        raise ValueError(f"{what}: screw is given together with axis or pitch; give one of them")
+    screw = f64.numbers(screw, {(6,): "(v, omega) (6,)"}, f"{what}: screw")
+    v, omega = screw[:3], screw[3:]
+    size = np.linalg.norm(v if kind == "prismatic" else omega)
+    if size == 0:
+        part = "v" if kind == "prismatic" else "omega"
+        raise ValueError(f"{what}: screw is {screw.tolist()}; a {kind} joint needs {part} other than zero")
+    if kind == "prismatic" and omega.any():
+        raise ValueError(f"{what}: screw {screw.tolist()} turns, but the joint is prismatic; use joint='helical'")
+    if kind in ("revolute", "continuous") and v.any():
+        raise ValueError(
+            f"{what}: screw {screw.tolist()} has a pitch or passes beside the body's origin; use joint='helical', "
+            f"which takes any screw"
+        )
+    return screw / size
+
+
+def _stacked(moving: list[_Body], key: str, size: str, fill: float, *, always: bool = False):
+    values = [body.leaves[key] for body in moving]
+    if not always and all(value is None for value in values):
+        return None
+    sizes = [getattr(KINDS[body.kind], size) for body in moving]
+    parts = [np.full(n, fill) if value is None else value for value, n in zip(values, sizes, strict=True)]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _check_regular(topology: Topology, home, screws, inertias, armature) -> None:
+    # A mass matrix that is singular at one configuration is legitimate; at a random one too, it is so at all of them.
+    rng = np.random.default_rng(0)
+    neutral = [joint_neutral(kind) for kind in topology.kinds]
+    if not f64.idle_joints(topology, home, screws, inertias, armature, neutral):
+        return
+    anywhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
+    if not (idle := f64.idle_joints(topology, home, screws, inertias, armature, anywhere)):
+        return
+    names = [topology.joint_names[i] for i in sorted(idle)]
+    i, alone = next(iter(idle.items()))
+    fault = (
+        "moves no inertia: S^T I S = 0 for all that it carries"
+        if alone
+        else "can move (together with joints beyond it, if any) without moving any inertia"
+    )
+    others = "" if len(idle) == 1 else f" (so it is, in all, with {', '.join(names)})"
+    raise ValueError(
+        f"joint {topology.joint_names[i]!r} (body {topology.body_names[i]!r}) {fault}, so the mass matrix is singular"
+        f"{others}; give the bodies an inertia, give the joints an armature, or fix them (load_urdf: lock={names})"
+    )

@@ -1,0 +1,247 @@
+"""Rigid-body arithmetic on concrete numbers, in numpy and always in float64.
+
+Models are built here and not with the traced functions of `se3` and `inertia`: a chain of fixed links merged in float32
+would lose digits before the model exists, and what is refused must be refused on numbers.
+"""
+
+import numpy as np
+
+from jaxdyn.model.joints import KINDS, SCREW_KINDS
+
+_SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
+_TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
+# Rotations further than this from orthonormal are mistakes and not rounding (float32 files reach 1e-7).
+_ORTHONORMAL = 1e-6
+_V, _W = slice(0, 3), slice(3, 6)
+
+
+def numbers(value, shapes: dict[tuple[int, ...], str], what: str, *, finite: bool = True) -> np.ndarray:
+    """`value` as a float64 array of one of the `shapes` (a description for each, used in the message).
+
+    **Raises:** ValueError naming `what` for another shape, what is not a number, NaN, and infinity when `finite`.
+    """
+    expected = " or ".join(shapes.values())
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what} is {value!r}, expected {expected}") from error
+    if array.shape not in shapes:
+        raise ValueError(f"{what} has shape {array.shape}, expected {expected}")
+    if not np.all(np.isfinite(array) | (~np.isnan(array) & (not finite))):
+        raise ValueError(f"{what} is {array.tolist()}; every number must be finite")
+    return array
+
+
+def unit(axis, what: str) -> np.ndarray:
+    """A direction (3,) of length one. **Raises:** ValueError naming `what` for another shape, NaN or a zero vector."""
+    axis = numbers(axis, {(3,): "(3,)"}, what)
+    if not axis.any():
+        raise ValueError(f"{what} is {axis.tolist()}; give a direction other than zero")
+    axis = axis / np.abs(axis).max()  # so that the squares of very short or long vectors neither vanish nor overflow
+    return axis / np.linalg.norm(axis)
+
+
+def hat(vector: np.ndarray) -> np.ndarray:
+    """(3, 3) with hat(a) b = a x b."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_from_rpy(rpy) -> np.ndarray:
+    """R = Rz(yaw) Ry(pitch) Rx(roll), the fixed-axis angles of URDF (rad)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def rpy_from_rotation(rotation: np.ndarray) -> np.ndarray:
+    """Inverse of `rotation_from_rpy`, exact to rounding at pitch = +-pi/2 too.
+
+    There yaw is whatever rounding makes of it; roll is measured after yaw has been undone, so the product is right.
+    """
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    roll = np.arctan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
+def pose_matrix(pose, what: str) -> np.ndarray:
+    """(4, 4) from None (identity), a (4, 4) matrix, a position (3,) or a pair (xyz, rpy).
+
+    **Raises:** ValueError naming `what` for another shape, NaN, a rotation that is not orthonormal, a reflection.
+    """
+    matrix = np.eye(4)
+    if pose is None:
+        return matrix
+    given = numbers(pose, {(4, 4): "a (4, 4) matrix", (3,): "a position (3,)", (2, 3): "a pair (xyz, rpy)"}, what)
+    if given.shape == (3,):
+        matrix[:3, 3] = given
+        return matrix
+    if given.shape == (2, 3):
+        matrix[:3, :3], matrix[:3, 3] = rotation_from_rpy(given[1]), given[0]
+        return matrix
+    rotation = given[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > _ORTHONORMAL or np.linalg.det(rotation) < 0:
+        fault = "is a reflection" if error <= _ORTHONORMAL else f"is not orthonormal: |R^T R - 1| = {error:.2g}"
+        raise ValueError(f"{what}: the rotation {rotation.tolist()} {fault}; give a proper rotation or (xyz, rpy)")
+    if np.any(given[3] != [0, 0, 0, 1]):
+        raise ValueError(f"{what}: the last row is {given[3].tolist()}, expected [0, 0, 0, 1]")
+    return given
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    """Inverse of a motion (4, 4)."""
+    result = np.eye(4)
+    result[:3, :3] = pose[:3, :3].T
+    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return result
+
+
+def adjoint(pose: np.ndarray) -> np.ndarray:
+    """Ad = [[R, hat(p) R], [0, R]] (6, 6)."""
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = pose[:3, :3]
+    result[:3, 3:] = hat(pose[:3, 3]) @ pose[:3, :3]
+    return result
+
+
+def rotation_matrix(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation (3, 3) about a unit axis: 1 + sin(a) hat(n) + (1 - cos(a)) hat(n)^2."""
+    cross = hat(axis)
+    return np.eye(3) + np.sin(angle) * cross + 2 * np.sin(angle / 2) ** 2 * cross @ cross
+
+
+def joint_pose(kind: str, screw: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """`joints.joint_transform` in float64: pose of the body frame relative to its home pose."""
+    pose = np.eye(4)
+    if kind in SCREW_KINDS:
+        v, axis = screw[:3], screw[3:]
+        if axis.any():
+            # The screw is a turn about the line through axis x v, and a slide of v . axis along it.
+            pose[:3, :3] = rotation_matrix(axis, q[0])
+            pose[:3, 3] = (np.eye(3) - pose[:3, :3]) @ np.cross(axis, v) + axis * (v @ axis) * q[0]
+        else:
+            pose[:3, 3] = v * q[0]
+    elif kind == "planar":
+        pose[:3, :3] = rotation_matrix(np.array([0.0, 0.0, 1.0]), q[2])
+        pose[:2, 3] = q[:2]
+    else:
+        w, v = q[-4] / np.linalg.norm(q[-4:]), q[-3:] / np.linalg.norm(q[-4:])
+        pose[:3, :3] = np.eye(3) + 2 * hat(v) @ (w * np.eye(3) + hat(v))
+        if kind == "free":
+            pose[:3, 3] = q[:3]
+    return pose
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of a rotation (3, 3), w >= 0: the largest of four equal forms, so that no digits cancel."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    squares = np.array([1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i])  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
+    products = np.array(
+        [[0, h - f, c - g, d - b], [h - f, 0, b + d, c + g], [c - g, b + d, 0, f + h], [d - b, c + g, f + h, 0]]
+    )
+    k = int(np.argmax(squares))
+    found = products[k].copy()
+    found[k] = squares[k]
+    found = found / np.linalg.norm(found)
+    return found if found[0] >= 0 else -found
+
+
+def motion_subspace(kind: str, screw: np.ndarray) -> np.ndarray:
+    """`joints.motion_subspace` in float64, (6, nv of the joint)."""
+    return screw[:, None] if kind in SCREW_KINDS else np.eye(6)[:, KINDS[kind].columns]
+
+
+def inertia_numbers(inertia, what: str) -> np.ndarray:
+    """The ten inertial parameters from None (massless), (10,), or (mass, com, inertia about the com).
+
+    **Raises:** ValueError naming `what` for another shape, NaN, a negative mass or a matrix that is not symmetric.
+    """
+    if inertia is None:
+        return np.zeros(10)
+    if isinstance(inertia, tuple | list) and len(inertia) == 3:
+        mass = numbers(inertia[0], {(): "a number"}, f"{what}: mass")
+        com = numbers(inertia[1], {(3,): "(3,)"}, f"{what}: centre of mass")
+        shapes = {(3, 3): "(3, 3)", (3,): "principal moments (3,)"}
+        at_com = numbers(inertia[2], shapes, f"{what}: rotational inertia")
+        at_com = np.diag(at_com) if at_com.ndim == 1 else at_com
+        if np.abs(at_com - at_com.T).max() > _ORTHONORMAL * np.abs(at_com).max():
+            raise ValueError(f"{what}: the rotational inertia {at_com.tolist()} is not symmetric")
+        about_origin = at_com + mass * (com @ com * np.eye(3) - np.outer(com, com))
+        parameters = np.concatenate([[mass], mass * com, about_origin[_TRIANGLE]])
+    else:
+        parameters = numbers(inertia, {(10,): "ten numbers (10,), (mass, com, inertia about the com) or None"}, what)
+    if parameters[0] < 0:
+        raise ValueError(f"{what}: the mass is {parameters[0]} kg; it must not be negative")
+    return parameters
+
+
+def rotational_inertia(parameters: np.ndarray) -> np.ndarray:
+    """Rotational inertia (3, 3) about the frame's origin."""
+    return parameters[4:][_SYMMETRIC]
+
+
+def about_com(parameters: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre of mass (3,), rotational inertia about it (3, 3). A massless body has its centre at the origin."""
+    mass, first = parameters[0], parameters[1:4]
+    com = first / mass if mass != 0 else np.zeros(3)
+    return float(mass), com, rotational_inertia(parameters) - (com @ first * np.eye(3) - np.outer(com, first))
+
+
+def spatial_inertia(parameters: np.ndarray) -> np.ndarray:
+    """Spatial inertia (6, 6), linear part first."""
+    first = hat(parameters[1:4])
+    return np.block([[parameters[0] * np.eye(3), -first], [first, rotational_inertia(parameters)]])
+
+
+def move_inertia(pose: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """The ten numbers in frame a of a body given in frame b; `pose` T_ab (`inertia.transform_inertia` in float64)."""
+    rotation, shift = pose[:3, :3], pose[:3, 3]
+    mass, first = parameters[0], rotation @ parameters[1:4]
+    inertia = rotation @ rotational_inertia(parameters) @ rotation.T
+    ph = np.outer(shift, first)
+    scale = 2 * shift @ first + mass * shift @ shift
+    inertia = inertia + scale * np.eye(3) - ph - ph.T - mass * np.outer(shift, shift)
+    return np.concatenate([[mass], first + mass * shift, inertia[_TRIANGLE]])
+
+
+def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool]:
+    """Joints whose articulated inertia S^T I^A S (plus armature) is singular, when those found further out are held.
+
+    det M is the product of det(S^T I^A S) over the joints (Featherstone 2008, section 7.2), so the mass matrix is
+    singular exactly when there is one, and is regular once all of them are held. `q` lists each joint's coordinates.
+
+    **Returns:** the joints, each with whether S^T I S vanishes for the composite inertia of all that it carries.
+    """
+    composite = np.array([spatial_inertia(parameters) for parameters in inertias])
+    articulated = composite.copy()
+    idle = {}
+    for i in reversed(range(topology.nb)):
+        S = motion_subspace(topology.kinds[i], screws[i])
+        rotor = np.zeros(S.shape[1]) if armature is None else armature[topology.v_slices[i]]
+        whole = np.diag(S.T @ composite[i] @ S) + rotor
+        D = S.T @ articulated[i] @ S + np.diag(rotor)
+        v, w = np.linalg.norm(S[:3], axis=0), np.linalg.norm(S[3:], axis=0)
+        mass, first, second = (np.linalg.norm(composite[i][a, b]) for a, b in ((_V, _V), (_W, _V), (_W, _W)))
+        carried = articulated[i]
+        # Where the exact value is zero, rounding leaves about 1e-16 of the products that S^T I S is summed from.
+        if np.any(np.abs(whole) <= 1e-13 * (v * v * mass + 2 * v * w * first + w * w * second)):
+            idle[i] = True
+        # D of exactly dependent joints is rounding of the numbers it is the difference of; 1e-12 of them is a margin.
+        elif np.abs(np.linalg.eigvalsh(D / np.sqrt(np.abs(np.outer(whole, whole))))).min() <= 1e-12:
+            idle[i] = False
+        else:
+            U = articulated[i] @ S
+            carried = articulated[i] - U @ np.linalg.solve(D, U.T)
+        if (parent := topology.parents[i]) >= 0:
+            X = adjoint(inverse(home[i] @ joint_pose(topology.kinds[i], screws[i], q[i])))
+            composite[parent] += X.T @ composite[i] @ X
+            articulated[parent] += X.T @ carried @ X
+    return idle

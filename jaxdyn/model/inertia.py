@@ -1,0 +1,189 @@
+"""Inertial parameters of a body: ten numbers, the 6x6 spatial inertia, the pseudo-inertia and its log-Cholesky factor.
+
+The ten numbers are (m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) about the body frame's origin and in its axes
+(the order of Pinocchio's regressors): dynamics is linear in them.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.lie import so3
+
+# Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
+_SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
+_TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
+
+
+def rotational_inertia(parameters: Float[Array, "10"]) -> Float[Array, "3 3"]:
+    """Rotational inertia (3, 3) about the frame's origin (kg m^2) from the ten numbers."""
+    return parameters[4:][_SYMMETRIC]
+
+
+def spatial_inertia(parameters: Float[Array, "10"]) -> Float[Array, "6 6"]:
+    """Spatial inertia M = [[m 1, -hat(m c)], [hat(m c), I]] (6, 6), linear part first (EQUATIONS section 0)."""
+    first = so3.hat(parameters[1:4])
+    mass = parameters[0] * jnp.eye(3, dtype=parameters.dtype)
+    return jnp.block([[mass, -first], [first, rotational_inertia(parameters)]])
+
+
+def parameters_from_spatial(matrix: Float[Array, "6 6"]) -> Float[Array, "10"]:
+    """The ten numbers of a spatial inertia (6, 6); inverse of `spatial_inertia`."""
+    return jnp.concatenate([matrix[:1, 0], so3.vee(matrix[3:, :3]), matrix[3:, 3:][_TRIANGLE]])
+
+
+def inertial_parameters(mass, com, inertia_com) -> Float[Array, "10"]:
+    """The ten numbers from mass (kg), centre of mass (3,) (m) and rotational inertia (3, 3) about it (kg m^2).
+
+    Steiner's theorem: I_origin = I_com - m hat(c)^2.
+    """
+    com, inertia_com = jnp.asarray(com), jnp.asarray(inertia_com)
+    mass = jnp.asarray(mass, com.dtype)
+    outer = com[:, None] * com[None, :]
+    about_origin = inertia_com + mass * (jnp.sum(com**2) * jnp.eye(3, dtype=com.dtype) - outer)
+    return jnp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
+
+
+def mass_com_inertia(parameters: Float[Array, "10"]):
+    """Mass (), centre of mass (3,) and rotational inertia about it (3, 3). A massless body has its centre at the origin."""
+    mass, first = parameters[0], parameters[1:4]
+    massless = mass == 0
+    com = jnp.where(massless, jnp.zeros_like(first), first / jnp.where(massless, jnp.ones_like(mass), mass))
+    outer = com[:, None] * first[None, :]
+    shift = jnp.sum(com * first) * jnp.eye(3, dtype=parameters.dtype) - outer
+    return mass, com, rotational_inertia(parameters) - shift
+
+
+def transform_inertia(pose: Float[Array, "4 4"], parameters: Float[Array, "10"]) -> Float[Array, "10"]:
+    """The ten numbers in frame a of a body whose numbers in frame b are given; `pose` T_ab maps b coordinates to a.
+
+    No mass is divided by, so massless bodies are allowed and gradients stay finite.
+    """
+    rotation, shift = pose[:3, :3], pose[:3, 3]
+    mass = parameters[0]
+    first = rotation @ parameters[1:4]
+    inertia = rotation @ rotational_inertia(parameters) @ rotation.T
+    # About a point displaced by p: I + (2 p.h + m p.p) 1 - (p h^T + h p^T + m p p^T), h = rotated first moment.
+    ph = shift[:, None] * first[None, :]
+    scale = 2 * jnp.sum(shift * first) + mass * jnp.sum(shift * shift)
+    inertia = inertia + scale * jnp.eye(3, dtype=pose.dtype) - ph - ph.T - mass * shift[:, None] * shift[None, :]
+    return jnp.concatenate([mass[None], first + mass * shift, inertia[_TRIANGLE]])
+
+
+def pseudo_inertia(parameters: Float[Array, "10"]) -> Float[Array, "4 4"]:
+    """Pseudo-inertia [[Sigma, m c], [m c^T, m]] (4, 4), Sigma = tr(I)/2 1 - I.
+
+    The parameters belong to a physical body if and only if this matrix is positive definite (Wensing, Kim & Slotine 2018,
+    eq. 7; a positive semidefinite one is the limit of point, line and plane bodies).
+    """
+    inertia = rotational_inertia(parameters)
+    sigma = 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=parameters.dtype) - inertia
+    first = parameters[1:4]
+    return jnp.block([[sigma, first[:, None]], [first[None, :], parameters[:1, None]]])
+
+
+def parameters_from_pseudo(matrix: Float[Array, "4 4"]) -> Float[Array, "10"]:
+    """The ten numbers of a pseudo-inertia (4, 4); inverse of `pseudo_inertia`: I = tr(Sigma) 1 - Sigma."""
+    sigma = matrix[:3, :3]
+    inertia = jnp.trace(sigma) * jnp.eye(3, dtype=matrix.dtype) - sigma
+    return jnp.concatenate([matrix[3:, 3], matrix[:3, 3], inertia[_TRIANGLE]])
+
+
+def log_cholesky_factor(theta: Float[Array, "10"]) -> Float[Array, "4 4"]:
+    """Upper-triangular factor U (4, 4) of the pseudo-inertia U U^T that ten unconstrained numbers stand for.
+
+    theta = (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3) and U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2],
+    [0, 0, exp d3, t3], [0, 0, 0, 1]] (Rucker & Wensing 2022, eq. 16): the affine map (stretch, shear, shift, and exp(2 alpha)
+    the mass) that carries a reference body of unit pseudo-inertia to the body. It is the identity at theta = 0.
+    """
+    alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = theta
+    zero, one = jnp.zeros_like(alpha), jnp.ones_like(alpha)
+    rows = [jnp.exp(d1), s12, s13, t1, zero, jnp.exp(d2), s23, t2, zero, zero, jnp.exp(d3), t3, zero, zero, zero, one]
+    return jnp.exp(alpha) * jnp.stack(rows).reshape(4, 4)
+
+
+def from_log_cholesky(theta: Float[Array, "10"]) -> Float[Array, "10"]:
+    """Physically feasible parameters from ten unconstrained numbers (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3).
+
+    Pseudo-inertia = U U^T with U = `log_cholesky_factor(theta)` (Rucker & Wensing 2022, eq. 16). Every theta gives a feasible
+    body and every strictly feasible body has exactly one theta, so nothing infeasible can be represented.
+    """
+    upper = log_cholesky_factor(theta)
+    return parameters_from_pseudo(upper @ upper.T)
+
+
+def to_log_cholesky(parameters: Float[Array, "10"]) -> Float[Array, "10"]:
+    """Inverse of `from_log_cholesky`. NaN when the parameters are not strictly feasible (see `is_feasible`)."""
+    matrix = pseudo_inertia(parameters)
+    # U U^T with U upper triangular is the Cholesky factorisation of the matrix with rows and columns reversed.
+    upper = jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
+    alpha = jnp.log(upper[3, 3])
+    unit = upper / upper[3, 3]
+    diagonal = jnp.log(jnp.stack([unit[0, 0], unit[1, 1], unit[2, 2]]))
+    off = jnp.stack([unit[0, 1], unit[1, 2], unit[0, 2]])
+    return jnp.concatenate([alpha[None], diagonal, off, unit[:3, 3]])
+
+
+def is_feasible(parameters, *, tolerance: float = 0.0) -> bool:
+    """Whether concrete parameters (10,) belong to a physical body: pseudo-inertia positive semidefinite to `tolerance`
+    (relative to its largest eigenvalue)."""
+    values = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(parameters)), np.float64))
+    return bool(values[0] >= -tolerance * max(values[-1], 0.0))
+
+
+def nearest_feasible(parameters, *, floor: float = 1e-6) -> np.ndarray:
+    """Feasible parameters close to infeasible ones: pseudo-inertia eigenvalues raised to `floor` times the largest.
+
+    **Raises:** ValueError when the mass is not positive, because then there is no body to repair.
+    """
+    parameters = np.asarray(parameters, np.float64)
+    if not parameters[0] > 0:
+        raise ValueError(f"mass is {parameters[0]}, cannot be repaired; give the body a positive mass")
+    values, vectors = np.linalg.eigh(np.asarray(pseudo_inertia(jnp.asarray(parameters)), np.float64))
+    values = np.maximum(values, floor * values[-1])
+    repaired = (vectors * values) @ vectors.T
+    repaired *= parameters[0] / repaired[3, 3]
+    return np.asarray(parameters_from_pseudo(jnp.asarray(repaired)))
+
+
+def box(mass: float, size) -> np.ndarray:
+    """Uniform box with edges `size` (3,) along x, y, z, about its centre (EQUATIONS section 1)."""
+    x, y, z = np.asarray(size, float)
+    return _centred(mass, mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y]))
+
+
+def sphere(mass: float, radius: float) -> np.ndarray:
+    """Uniform solid ball about its centre."""
+    return _centred(mass, np.full(3, 0.4 * mass * radius**2))
+
+
+def cylinder(mass: float, radius: float, length: float) -> np.ndarray:
+    """Uniform solid cylinder along z about its centre; a disk for length 0."""
+    across = mass * (3 * radius**2 + length**2) / 12
+    return _centred(mass, np.array([across, across, 0.5 * mass * radius**2]))
+
+
+def rod(mass: float, length: float, axis: str = "x") -> np.ndarray:
+    """Uniform thin rod along an axis about its centre."""
+    moments = np.full(3, mass * length**2 / 12)
+    moments["xyz".index(axis)] = 0.0
+    return _centred(mass, moments)
+
+
+def point_mass(mass: float, position=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Point mass at a position (3,) in the body frame."""
+    position = np.asarray(position, float)
+    return displaced(_centred(mass, np.zeros(3)), position)
+
+
+def displaced(parameters, position, rotation=None) -> np.ndarray:
+    """Concrete parameters of the same body placed at `position` (3,), turned by `rotation` (3, 3), in a new frame."""
+    pose = np.eye(4)
+    pose[:3, 3] = position
+    if rotation is not None:
+        pose[:3, :3] = rotation
+    return np.asarray(transform_inertia(jnp.asarray(pose), jnp.asarray(parameters, jnp.asarray(pose).dtype)))
+
+
+def _centred(mass, moments) -> np.ndarray:
+    return np.array([mass, 0, 0, 0, moments[0], 0, moments[1], 0, 0, moments[2]], float)

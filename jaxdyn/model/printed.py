@@ -1,0 +1,111 @@
+"""Models, scenes and solutions in words, for `print`. Numbers that are traced or batched are left out."""
+
+import numpy as np
+
+from jaxdyn.compile import is_concrete
+from jaxdyn.model.arguments import state_dtype
+from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.text_table import short, table
+
+
+def tree_of(model) -> str:
+    """A line for each joint, indented as the bodies hang on each other: body, kind, axis, mass, limits."""
+    top = model.topology
+    rows = [
+        [
+            "  " * (int(top.depths[i]) - 1) + top.body_names[i],
+            top.joint_names[i],
+            kind,
+            _axis(model.screws, i, kind),
+            _entry(model.inertias, (i, 0)),
+            _limits(model, top.q_slices[i]),
+        ]
+        for i, kind in enumerate(top.kinds)
+    ]
+    head = f"Model {model.name!r}: {model.nb} bodies, nq = {model.nq}, nv = {model.nv}, {model.home.dtype}"
+    if not rows:
+        return head
+    return f"{head}\n{table(['body', 'joint', 'kind', 'axis', 'mass kg', 'limits'], rows)}"
+
+
+def system_line(system) -> str:
+    """A system as one line or, of a model, as its tree."""
+    if hasattr(system, "topology"):
+        return tree_of(system)
+    return f"{type(system).__name__}: nq = {system.nq}, nv = {system.nv}"
+
+
+def scene_lines(scene) -> str:
+    """The system, each constraint with its numbers of rows, and the forces."""
+    lines = [f"{type(scene).__name__} of {system_line(scene.system)}"]
+    lines += [f"constraint {_label(one)}: {_rows(one, scene.system)}" for one in scene.constraints]
+    lines += [f"force {_name(one)}" for one in scene.forces]
+    return "\n".join(lines)
+
+
+def _name(force) -> str:
+    function = getattr(force, "function", None)
+    return getattr(function, "__name__", type(force).__name__)
+
+
+def _label(constraint) -> str:
+    return f"{getattr(constraint, 'name', '')!r} ({type(constraint).__name__})"
+
+
+def _rows(constraint, system) -> str:
+    try:
+        held, slips = constraint.sizes(system, state_dtype(system))
+    except Exception:
+        return "does not fit the system"
+    return ", ".join(
+        f"{n} {kind} row{'s' * (n > 1)}" for n, kind in ((held, "holonomic"), (slips, "nonholonomic")) if n
+    )
+
+
+def solution_lines(solution) -> str:
+    """How a motion ended, and what there is of it."""
+    t, count = solution.ts, solution.stats["num_steps"]
+    if not is_concrete(solution) or np.ndim(t) > 1 or np.ndim(count) > 0:
+        ended = (
+            "traced" if not is_concrete(solution) else f"{int(np.sum(solution.success))} of {np.size(count)} successful"
+        )
+        return f"Solution: {ended}; q {solution.q.shape}, v {solution.v.shape}; {solution.solver}"
+    words = str(solution.result).partition("<")[2].rstrip(">")
+    steps, rejected = int(count), int(solution.stats["num_rejected_steps"])
+    given = [name for name in ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
+             if getattr(solution, name) is not None]  # fmt: skip
+    more = [*given, *(f"pose:{name}" for name in solution.poses)]
+    return (
+        f"Solution: {words}, t = {short(float(t[0]))} to {short(float(solution.stats['time_reached']))} s of "
+        f"{short(float(t[-1]))} s\n  {solution.solver}: {steps} steps, {rejected} rejected\n"
+        f"  {t.shape[0]} rows of q ({solution.q.shape[1]}), v ({solution.v.shape[1]})"
+        f"{', ' if more else ''}{', '.join(more)}"
+    )
+
+
+def _known(leaf, ndim: int) -> bool:
+    return is_concrete(leaf) and np.ndim(leaf) == ndim
+
+
+def _entry(leaf, place) -> str:
+    return short(float(leaf[place])) if _known(leaf, len(place)) else "?"
+
+
+def _axis(screws, i: int, kind: str) -> str:
+    """Direction of a joint of one freedom in its body frame; the linear part of a prismatic one."""
+    if kind not in SCREW_KINDS:
+        return ""
+    if not _known(screws, 2):
+        return "?"
+    screw = np.asarray(screws)[i]
+    axis = screw[:3] if kind == "prismatic" else screw[3:]
+    return " ".join(short(float(x)) for x in np.round(axis, 6) + 0.0)
+
+
+def _limits(model, place: slice) -> str:
+    if not (_known(model.lower, 1) and _known(model.upper, 1)):
+        return "?"
+    low, high = np.asarray(model.lower)[place], np.asarray(model.upper)[place]
+    if not (np.isfinite(low).any() or np.isfinite(high).any()):
+        return ""
+    return ", ".join(f"{short(float(a))} to {short(float(b))}" for a, b in zip(low, high, strict=True))

@@ -1,0 +1,163 @@
+"""The gauge-invariant form of constrained dynamics: quasi velocities in which the mass matrix is 1.
+
+With any W, W W^T = M, the quasi velocity w = W^T v, the force u = W^-1 (tau - N), rows Lam = A W^-T:
+
+    wdot + Gamma w = u + Lam^T lam,   Lam wdot = kappa = gamma + A W^-T Wdot^T v,   Gamma = W^-1 (C - W Wdot^T) W^-T,
+
+Gamma skew. An orthogonal V = [V1 V2] with Lam V = [Lam_r 0] splits this into equations of motion and of constraint force:
+
+    wdot_r + Gamma_r w_r = u_r,               Gamma_r = V2^T Gamma V2 + V2^T V2dot,
+    Gamma_o w_r          = u_o + Lam_r^T lam,   Gamma_o = V1^T Gamma V2 + V1^T V2dot,
+
+for w_r = V2^T w and constraints A v = 0; rows A v = b add terms in V1^T w = Lam_r^+ b. W -> W Q and V2 -> V2 Q with
+orthogonal Q change the form and not the motion: the gauge. Here V is carried along in parallel, V2^T V2dot = 0, and
+V1^T V2dot = -Lam_r^+ Lamdot V2. Source: EQUATIONS section 9, with errata E23 to E26.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import compiled
+from jaxdyn.constraints.base import constraint_jacobian, layout, rows
+from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
+from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import batch_hint, check_state, or_zeros
+from jaxdyn.reduction.minimal import freedoms, orthonormal, split_directions
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import velocity_to_rate
+
+
+class GaugeInvariant(Outcome):
+    """Quasi velocities, the equations in them, and the motion they give.
+
+    - `W` (nv, nv), M = W W^T. `velocity` (nv,), w = W^T v. `Gamma` (nv, nv), skew. `Lambda` (nc, nv) = A W^-T. `force`
+      (nv,), u. Quasi velocities are in sqrt(J), forces and accelerations in sqrt(J)/s.
+    - `V1` (nv, nv - nr), `V2` (nv, nr): orthonormal bases of the constraint forces and of the motions.
+    - Equation of motion: `reduced_velocity` (nr,) w_r, `Gamma_r` (nr, nr), skew, `reduced_force` (nr,) u_r, and
+      `reduced_acceleration` (nr,), the rate of w_r.
+    - Equation of constraint force: `Gamma_o` (nv - nr, nr), `normal_force` (nv - nr,) u_o, `Lambda_r` (nc, nv - nr).
+    - `acceleration` (nv,), rate of v; `multipliers` (nc,), those of least norm; `result` as in `ConstrainedDynamics`.
+    """
+
+    W: Float[Array, "nv nv"]
+    velocity: Float[Array, " nv"]
+    Gamma: Float[Array, "nv nv"]
+    Lambda: Float[Array, "nc nv"]
+    force: Float[Array, " nv"]
+    V1: Float[Array, "nv no"]
+    V2: Float[Array, "nv nr"]
+    reduced_velocity: Float[Array, " nr"]
+    Gamma_r: Float[Array, "nr nr"]
+    reduced_force: Float[Array, " nr"]
+    reduced_acceleration: Float[Array, " nr"]
+    Gamma_o: Float[Array, "no nr"]
+    normal_force: Float[Array, " no"]
+    Lambda_r: Float[Array, "nc no"]
+    acceleration: Float[Array, " nv"]
+    multipliers: Float[Array, " nc"]
+    result: Any
+
+
+def gauge_invariant(
+    scene: Scene,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    tau: Float[Array, " nv"] | None = None,
+    t=0.0,
+    *,
+    rotation: Float[Array, "n n"] | None = None,
+    motion_rotation: Float[Array, "k k"] | None = None,
+    dof: int | None = None,
+    rank_tol: float | None = None,
+) -> GaugeInvariant:
+    """Equations of motion and of constraint force in quasi velocities w = W^T v, decoupled.
+
+    wdot_r = u_r - Gamma_r w_r,   Lam_r^T lam = Gamma_o w_r - u_o   (both with further terms where b(q, t) != 0)
+
+    **Arguments:**
+
+    - `q` (nq,), `v` (nv,), on the constraints; `tau` (nv,), N m or N (None: zero); `t`, s.
+    - `rotation`, orthogonal (nv, nv): W is the Cholesky factor of M times this. `motion_rotation`, orthogonal (nr, nr):
+      V2 is turned by it. Neither changes the motion.
+    - `dof`, `rank_tol` as in `tangent_basis`.
+
+    **Returns:** `GaugeInvariant`. Where the rank of A is not nv - nr the result is `singular_basis`.
+
+    Derivatives are right where the rank is constant; V1 and V2 are carried along without a turn in themselves.
+
+    **Raises:** ValueError for a scene without constraints, shapes that do not fit, and no freedom.
+
+    Source: EQUATIONS section 9.
+    """
+    scene = as_scene(scene)
+    tau = or_zeros(tau, scene.nv)
+    q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
+    if not layout(scene):
+        raise ValueError("the scene has no constraints, so there is nothing to decouple; use jd.forward_dynamics")
+    dof = freedoms(scene, q, t, dof, rank_tol)
+    for name, value, size in (("rotation", rotation, scene.nv), ("motion_rotation", motion_rotation, dof)):
+        if value is not None and value.shape != (size, size):
+            raise ValueError(
+                f"{name} has shape {value.shape}, expected {(size, size)}; give an orthogonal matrix{batch_hint(value, (1, 1))}"
+            )
+    return _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol)
+
+
+@compiled
+def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> GaugeInvariant:
+    system, unit = scene.system, jnp.eye(scene.nv, dtype=q.dtype)
+    motion = velocity_to_rate(system, q, v), jnp.ones_like(t)
+    turn = unit if rotation is None else rotation
+
+    def root(q, t):
+        return _product(jnp.linalg.cholesky(mass_matrix(system, q, t)), turn)
+
+    W, Wdot = jax.jvp(root, (q, t), motion)
+    A, Adot = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), (q, t), motion)
+    inverse = _product(turn.T, solve_triangular(_product(W, turn.T), unit, lower=True))
+    C = coriolis_matrix(system, q, v, t)
+    w = _product(W.T, v)
+    Gamma = _product(_product(inverse, C) - Wdot.T, inverse.T)
+    u = _product(inverse, applied(scene, q, v, tau, t) - bias_force(system, q, v, t) + _product(C, v))
+    Lambda = _product(A, inverse.T)
+    rate = _product(Adot - _product(Lambda, Wdot.T), inverse.T)
+    wanted = rows(scene, q, v, t).gamma + _product(Lambda, _product(Wdot.T, v))
+
+    back = pseudo_inverse(Lambda, tolerance(rank_tol, Lambda))
+    keep = unit - _product(back, Lambda)
+    reference = split_directions(keep)
+    V1, _ = orthonormal(_product(unit - keep, reference[:, : scene.nv - dof]))
+    V2, _ = orthonormal(_product(keep, reference[:, scene.nv - dof :]))
+    V2 = V2 if motion_rotation is None else _product(V2, motion_rotation)
+    Lambda_r = _product(Lambda, V1)
+    # V1^T V2dot, from d/dt (Lam V2) = 0; Lam_r has independent columns and Lam_r^+ = V1^T Lam^+.
+    leaning = -_product(_product(V1.T, back), _product(rate, V2))
+    free = u - _product(Gamma, w)
+    change = _product(keep, free) + _product(back, wanted)
+    rank = jnp.round(jnp.sum(back * Lambda.T))
+    result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)  # pyright: ignore[reportArgumentType]
+    return GaugeInvariant(
+        W=W,
+        velocity=w,
+        Gamma=Gamma,
+        Lambda=Lambda,
+        force=u,
+        V1=V1,
+        V2=V2,
+        reduced_velocity=_product(V2.T, w),
+        Gamma_r=_product(V2.T, _product(Gamma, V2)),
+        reduced_force=_product(V2.T, u),
+        reduced_acceleration=_product(V2.T, free) + _product(leaning.T, _product(V1.T, w)),
+        Gamma_o=_product(V1.T, _product(Gamma, V2)) + leaning,
+        normal_force=_product(V1.T, u),
+        Lambda_r=Lambda_r,
+        acceleration=_product(inverse.T, change - _product(Wdot.T, v)),
+        multipliers=_product(back.T, _product(back, wanted) - free),
+        result=result,
+    )

@@ -1,0 +1,240 @@
+"""What kind of constraints a scene has: whether they can be integrated, and what substituting them into L does wrong."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import compiled, is_concrete, is_known
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, velocity_residual
+from jaxdyn.constraints.dynamics import tolerance
+from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.reduction.minimal import (
+    Independent,
+    Orthonormal,
+    as_basis,
+    constraint_jacobian_compiled,
+    reduce,
+    tangent_basis,
+)
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import velocity_to_rate
+
+
+class Involutivity(NamedTuple):
+    """Whether a distribution is integrable, with the evidence.
+
+    - `value`: whether brackets leave it. True: the motion stays on a family of surfaces, as under holonomic rows.
+    - `ranks`: dimensions of the distribution and of what its brackets span, level by level, until they stop growing.
+    - `singular_values`: of the unit fields of each level, on which the ranks stand.
+    """
+
+    value: bool
+    ranks: tuple[int, ...]
+    singular_values: tuple[np.ndarray, ...]
+
+
+def involutive(
+    scene: Scene, q: Float[Array, " nq"], t=0.0, *, dof: int | None = None, rank_tol: float | None = None
+) -> Involutivity:
+    """Whether the velocities that the constraints allow can be integrated to surfaces: Frobenius's test at a place.
+
+    Fields X_i span ker A; each level adds the brackets [X_i, Y] = (dY) X_i - (dX_i) Y with the fields Y of the level
+    before, until the rank stops growing or the holonomic rows allow no more. nv - ranks[-1] is the number of holonomic
+    constraints in the rows, ranks[-1] - ranks[0] that of the truly nonholonomic ones. Rows A v = b with b != 0 are
+    tested together with their drift v0 + d/dt.
+
+    **Arguments:** `q` (nq,) and `t`, concrete; `dof` and `rank_tol` as in `tangent_basis`. The ranks are assumed to be
+    constant around q: at a singular place they are those of the place alone.
+
+    **Returns:** `Involutivity`.
+
+    **Raises:** ValueError for traced numbers and scenes without constraints.
+
+    ```python
+    jd.involutive(jd.scenes.rolling_disk(), q).ranks  # (2, 3, 4)
+    ```
+
+    Source: Murray, Li & Sastry (1994), section 7.2; EQUATIONS section 6.
+    """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
+    if not layout(scene):
+        raise ValueError("the scene has no constraints; every velocity is allowed")
+    if not is_known(scene, q, t):
+        raise ValueError(
+            "involutive looks at ranks, which decide what it computes next; call it outside of jit and vmap"
+        )
+    reference = tangent_basis(scene, q, t, dof=dof, rank_tol=rank_tol)
+    count, limit = reference.shape[1], tolerance(rank_tol, q)
+    # Brackets stay tangent to the holonomic constraints.
+    held = np.asarray(constraint_jacobian_compiled(scene, q, t))[holonomic_rows(layout(scene))]
+    most = scene.nv - (int(np.linalg.matrix_rank(held, tol=1e-9 * np.abs(held).max())) if held.size else 0)
+    # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
+    # bracketed with the others and spans nothing itself.
+    levels: tuple[tuple[tuple[int, int], ...], ...] = ()
+    new = np.asarray(_fields_compiled(scene, reference, q, t, levels), float)[:, :count]
+    spanned, ranks, evidence = np.zeros((scene.nq, 0)), [], []
+    while True:
+        sizes = np.linalg.svd(np.concatenate([spanned, new], 1), compute_uv=False)
+        evidence.append(sizes)
+        ranks.append(int(np.sum(sizes > limit * sizes[0])))
+        if len(ranks) > 1 and ranks[-1] in (ranks[-2], most):
+            return Involutivity(ranks[-1] == ranks[0], tuple(ranks), tuple(evidence))
+        # With constant rank, the fields that are independent at q span the level around it.
+        kept = _independent(spanned, new, limit * sizes[0])
+        spanned = np.concatenate([spanned, new[:, kept]], 1)
+        pairs = [(i, k) for k in kept for i in range(count + 1) if levels or i > k]  # [X_k, X_i] = -[X_i, X_k]
+        levels = (*levels, tuple(pairs))
+        new = np.asarray(_fields_compiled(scene, reference, q, t, levels), float)
+
+
+def _independent(spanned, new, limit) -> list[int]:
+    """Columns of `new` that add a direction to those of `spanned`, the largest first."""
+    rest, kept = new - spanned @ np.linalg.lstsq(spanned, new, rcond=None)[0] if spanned.shape[1] else new, []
+    while True:
+        sizes = np.linalg.norm(rest, axis=0)
+        k = int(np.argmax(sizes))
+        if sizes[k] <= limit:
+            return kept
+        along = rest[:, k] / sizes[k]
+        rest = rest - np.outer(along, along @ rest)
+        kept.append(k)
+
+
+def _fields(scene, reference, q, t, levels):
+    """Rates of q (nq, n) of the last level of brackets; level 0 has the columns of N(q, t) and the drift (v0, d/dt)."""
+
+    @jax.jit
+    def generators(x):
+        q, t = x[:-1], x[-1]
+        found = Orthonormal(reference).at(scene, q, t)
+        rates = jax.vmap(lambda v: velocity_to_rate(scene.system, q, v))(jnp.concatenate([found.N.T, found.v0[None]]))
+        times = jnp.zeros((rates.shape[0], 1), q.dtype).at[-1].set(1.0)
+        return jnp.concatenate([rates, times], 1)
+
+    def brackets(inner, pairs):
+        outer, within = np.array(pairs).T
+
+        def fields(x):
+            X, forward = jax.linearize(generators, x)
+            Y, inward = jax.linearize(inner, x)
+            along = jax.vmap(inward)(X), jax.vmap(forward)(Y)
+            return along[0][outer, within] - along[1][within, outer]
+
+        return fields
+
+    last = generators
+    for pairs in levels:
+        last = brackets(last, pairs)
+    return last(jnp.concatenate([q, t[None]]))[:, :-1].T
+
+
+_fields_compiled = eqx.filter_jit(_fields)
+
+
+class SpuriousTerms(NamedTuple):
+    """Equations of motion M_r nudot + bias = tau_r, right and with the constraints substituted into L.
+
+    - `terms` (nr,): the spurious terms, right bias minus wrong bias, N or N m. Zero where substitution is allowed.
+    - `bias_force`, `wrong_bias_force` (nr,); `acceleration`, `wrong_acceleration` (nr,): nudot from each.
+    - `mass_matrix` (nr, nr), the same in both.
+    """
+
+    terms: Float[Array, " nr"]
+    bias_force: Float[Array, " nr"]
+    wrong_bias_force: Float[Array, " nr"]
+    acceleration: Float[Array, " nr"]
+    wrong_acceleration: Float[Array, " nr"]
+    mass_matrix: Float[Array, "nr nr"]
+
+
+def spurious_terms(
+    scene: Scene,
+    q: Float[Array, " nq"],
+    nu: Float[Array, " nr"],
+    tau: Float[Array, " nv"] | None = None,
+    t=0.0,
+    *,
+    independent: Sequence[int],
+) -> SpuriousTerms:
+    """What goes wrong when sdot = -a(r)^T rdot is put into L before differentiating.
+
+    With q = (r, s), the Lagrange equations of L_c(r, rdot) = L(r, rdot, -a^T rdot) differ from the right ones by
+
+        terms_i = dL/dsdot . (d a_i/dt - sum_j da_j/dr_i rdot_j),
+
+    which vanish identically when the rows are integrable, and by accident elsewhere (an upright rolling disk).
+
+    **Arguments:** `q` (nq,); `nu` (nr,) = rdot; `tau` (nv,), N m or N (None: zero); `t`, s; `independent`: indices of r in
+    q. Neither L nor the rows may depend on s (a Chaplygin system), nor may the rows prescribe a slip.
+
+    **Returns:** `SpuriousTerms`.
+
+    **Raises:** ValueError for a system with v other than dq/dt, and, on concrete numbers, for rows and L that depend on s.
+
+    Source: Murray, Li & Sastry (1994), eq. 6.15; EQUATIONS section 6, errata E32 and E33.
+    """
+    scene = as_scene(scene)
+    tau = or_zeros(tau, scene.nv)
+    q, tau, t = check_state(scene.system, q=q, tau=tau, t=t)
+    nu = as_array(nu, "nu", q.dtype)
+    if not layout(scene):
+        raise ValueError("the scene has no constraints, so there is nothing to substitute; add some")
+    if scene.nq != scene.nv:
+        raise ValueError(f"the system has nq = {scene.nq}, nv = {scene.nv}; substitution needs v = dq/dt")
+    choice = as_basis(tuple(independent), scene)
+    if not isinstance(choice, Independent) or nu.shape != (choice.size(scene),):
+        raise ValueError(f"nu has shape {nu.shape}, expected {(choice.size(scene),)} = (nr,){batch_hint(nu, (1,))}")
+    found, depends = _substituted(scene, choice, q, nu, tau, t)
+    if is_concrete(depends) and float(depends) > 1e-9:
+        raise ValueError(
+            f"L or the rows depend on the eliminated coordinates (by {float(depends):.3g}), or the rows prescribe a slip; "
+            "choose other independent velocities, or use jd.reduced_dynamics"
+        )
+    return found
+
+
+@compiled
+def _substituted(scene, choice: Independent, q, nu, tau, t):
+    kept = np.asarray(choice.velocities, int)
+    rest = np.setdiff1d(np.arange(scene.nv), kept)
+    right = reduce(scene, choice, q, nu, tau, t)
+
+    def at(r):
+        return choice.at(scene, q.at[kept].set(r), t).N
+
+    def substituted(r, rdot):
+        return _lagrangian(scene.system, q.at[kept].set(r), _product(at(r), rdot), t)
+
+    r = q[kept]
+    momentum = jax.grad(substituted, argnums=1)
+    _, change = jax.jvp(lambda r: momentum(r, nu), (r,), (nu,))
+    wrong = change - jax.grad(substituted)(r, nu)
+    # a = -N on the eliminated rows: (rate of a_i) - d/dr_i (a . rdot).
+    push = jax.grad(lambda v: _lagrangian(scene.system, q, v, t))(right.velocity)[rest]
+    _, along = jax.jvp(lambda r: -at(r)[rest], (r,), (nu,))
+    slope = jax.jacfwd(lambda r: -_product(at(r)[rest], nu))(r)
+    terms = _product(push, along - slope)
+    rate = jnp.linalg.solve(right.mass_matrix, right.force - wrong)
+    value = SpuriousTerms(terms, right.bias_force, wrong, right.nu_rate, rate, right.mass_matrix)
+    # How much anything changes with s, at this velocity.
+    forms = jax.jacfwd(lambda s: constraint_jacobian(scene, q.at[rest].set(s), t))(q[rest])
+    pull = jax.grad(lambda s: _lagrangian(scene.system, q.at[rest].set(s), right.velocity, t))(q[rest])
+    slip = velocity_residual(scene, q, jnp.zeros_like(q), t)
+    return value, jnp.max(jnp.abs(jnp.concatenate([forms.ravel(), pull, slip])))
+
+
+def _lagrangian(system, q, v, t):
+    """L of a system: as given, or T - V."""
+    if isinstance(system, LagrangianSystem):
+        # Not T - V, which lacks terms linear in v.
+        return system.value(q, v, t)
+    return kinetic_energy(system, q, v, t) - potential_energy(system, q, t)

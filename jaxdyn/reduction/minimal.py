@@ -1,0 +1,406 @@
+"""Reduction to minimal velocities: v = N(q, t) nu + v0(q, t) with A N = 0 and A v0 = b, so that no multipliers are left.
+
+With s = Ndot nu + v0dot, the rate of v at constant nu, the motion along the columns of N is
+
+    N^T M N nudot + N^T (M s + h) = N^T tau,   a = N nudot + s.
+
+The columns of N are the partial velocities of Kane's equations, whose generalised active and inertia forces these are.
+N comes from the user, from a choice of independent velocities, or as an orthonormal basis near a given one.
+Source: Murray, Li & Sastry (1994), section 6.1; EQUATIONS section 6.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import compiled, is_concrete, is_known
+from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
+from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
+from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored, solve_lower
+from jaxdyn.systems.scene import Scene, as_pytree, as_scene
+from jaxdyn.systems.system import velocity_to_rate
+
+
+class Parametrization(NamedTuple):
+    """v = N nu + v0 at one place: N (nv, nr), v0 (nv,), and `quality`, which vanishes where N does not serve.
+
+    `quality` () is the reciprocal of a condition number, and 0 for an N that is not tangent to the constraints. Where
+    the sign of a determinant is defined it bears that sign, so that passing a singular place shows.
+    """
+
+    N: Float[Array, "nv nr"]
+    v0: Float[Array, " nv"]
+    quality: Float[Array, ""]
+
+
+class Basis(eqx.Module):
+    """A choice of N(q, t) and v0(q, t)."""
+
+    def size(self, scene: Scene) -> int | None:
+        """Number of minimal velocities, or None where only N itself tells."""
+        return None
+
+    def at(self, scene: Scene, q, t) -> Parametrization:
+        """N, v0 and their quality at a place."""
+        raise NotImplementedError
+
+    def advice(self, scene: Scene, q, t) -> str:
+        """What to do where N does not serve, for concrete places."""
+        raise NotImplementedError
+
+
+class Independent(Basis):
+    """The velocities `nu = v[velocities]` are kept: A = [A1 A2], the others are v2 = A2^+ (b - A1 nu).
+
+    A2^+ is the inverse of A2, or of its independent rows. N is singular where A2 loses rank: the others are then not
+    determined by nu, as at a dead centre.
+    """
+
+    velocities: tuple[int, ...] = eqx.field(static=True)
+
+    def size(self, scene):
+        """Number of velocities kept."""
+        return len(self.velocities)
+
+    def at(self, scene, q, t):
+        """N with a unit matrix in the rows of the independent velocities."""
+        A, b = _affine_rows(scene, q, t)
+        kept = np.asarray(self.velocities, int)
+        rest = np.setdiff1d(np.arange(scene.nv), kept)
+        A2 = A[:, rest]
+        inverse = pseudo_inverse(A2, tolerance(None, A2))
+        N = jnp.zeros((scene.nv, kept.size), A.dtype).at[kept].set(jnp.eye(kept.size, dtype=A.dtype))
+        N = N.at[rest].set(-_product(inverse, A[:, kept]))
+        v0 = jnp.zeros((scene.nv,), A.dtype).at[rest].set(_product(inverse, b))
+        size = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
+        whole = jnp.round(jnp.sum(inverse * A2.T)) == rest.size
+        quality = jnp.where(whole, 1.0 / jnp.where(whole, size, jnp.ones_like(size)), jnp.zeros_like(size))
+        if A2.shape[0] == A2.shape[1]:
+            quality = quality * jnp.where(jnp.linalg.slogdet(lax.stop_gradient(A2))[0] < 0, -1.0, 1.0).astype(A.dtype)
+        return Parametrization(N, v0, _tangent_only(A, N, quality))
+
+    def advice(self, scene, q, t):
+        """Another choice, from the pivots of the rows."""
+        other = independent_velocities(scene, q, t)
+        return f"choose other independent velocities, here {other} of {scene.nv}"
+
+
+class Given(Basis):
+    """N(q, t), or (N, v0), from a function of the user; v0 defaults to the shortest one with A v0 = b."""
+
+    function: Callable
+
+    def at(self, scene, q, t):
+        """N as given, and its v0."""
+        A, b = _affine_rows(scene, q, t)
+        value = self.function(q, t)
+        N, v0 = value if isinstance(value, tuple) else (value, None)
+        N = jnp.asarray(N, q.dtype)
+        if N.ndim != 2 or N.shape[0] != scene.nv:
+            raise ValueError(f"basis returned shape {N.shape}; return N with shape ({scene.nv}, nr) = (nv, nr)")
+        inverse = pseudo_inverse(A, tolerance(None, A))
+        v0 = _product(inverse, b) if v0 is None else jnp.asarray(v0, q.dtype)
+        if v0.shape != (scene.nv,):
+            raise ValueError(f"basis returned v0 with shape {v0.shape}, expected {(scene.nv,)} = (nv,)")
+        lengths = jnp.sqrt(jnp.sum(lax.stop_gradient(N * N), 0))
+        some = jnp.all(lengths > 0)
+        pivot = _least_pivot(N / jnp.where(some, lengths, jnp.ones_like(lengths))[None])
+        whole = scene.nv - jnp.round(jnp.sum(inverse * A.T)) == N.shape[1]
+        off = jnp.abs(_product(A, v0) - b)
+        met = jnp.max(off) <= _rounding(A) * (jnp.max(jnp.abs(b)) + jnp.sqrt(jnp.sum(A * A) * jnp.sum(v0 * v0)))
+        quality = jnp.where(some & whole & met, pivot, jnp.zeros_like(pivot))
+        return Parametrization(N, v0, _tangent_only(A, N, quality))
+
+    def advice(self, scene, q, t):
+        """The residual of its columns."""
+        A, N = constraint_jacobian(scene, q, t), self.at(scene, q, t).N
+        most = scene.nv - np.linalg.matrix_rank(np.asarray(A), tol=1e-9 * float(jnp.max(jnp.abs(A))))
+        return (
+            f"return {most} independent columns with A N = 0 and, where b != 0, a v0 with A v0 = b (rank "
+            f"{np.linalg.matrix_rank(np.asarray(N))} of {N.shape[1]}, largest |A N| "
+            f"{float(jnp.max(jnp.abs(_product(A, N)))):.3g})"
+        )
+
+
+class Orthonormal(Basis):
+    """The orthonormal basis of ker A(q, t) that a reference R (nv, nr) gives: N = P R T^-1, with P = 1 - A^+ A.
+
+    T is the Cholesky factor of R^T P R, so N is as smooth as A wherever the rank of A is constant and R^T P R regular: no
+    signs or pivots are chosen on the way, as a QR factorisation of A^T would. R = `tangent_basis` at one place serves
+    around it; to go on, take N(q) as the new R, which leaves N(q), and therefore nu, as they are.
+    """
+
+    reference: Float[Array, "nv nr"]
+
+    def size(self, scene):
+        """Number of columns of the reference."""
+        return self.reference.shape[1]
+
+    def at(self, scene, q, t):
+        """The reference, projected and made orthonormal."""
+        A, b = _affine_rows(scene, q, t)
+        reference = self.reference.astype(A.dtype)
+        # A factorisation waits for that which gave the reference: two of a large batch at once can block jaxlib 0.10 for ever.
+        A = A + 0 * reference[0, 0]
+        inverse = pseudo_inverse(A, tolerance(None, A))
+        N, pivot = orthonormal(reference - _product(inverse, _product(A, reference)))
+        free = scene.nv - jnp.round(jnp.sum(inverse * A.T))
+        quality = jnp.where(free == N.shape[1], pivot, jnp.zeros_like(pivot))
+        return Parametrization(N, _product(inverse, b), quality)
+
+    def advice(self, scene, q, t):
+        """A reference that serves here."""
+        rank = np.linalg.matrix_rank(np.asarray(constraint_jacobian_compiled(scene, q, t)), tol=1e-9)
+        return f"take jd.tangent_basis(scene, q) for reference; the rows have rank {rank} of nv = {scene.nv}"
+
+
+def as_basis(basis: Any, scene: Scene) -> Basis:
+    """A `Basis` from indices of independent velocities, a reference matrix or a function.
+
+    **Raises:** ValueError for anything else, and for indices and shapes that do not fit.
+    """
+    if isinstance(basis, Basis):
+        return basis
+    if callable(basis):
+        return Given(as_pytree(basis, "basis"))
+    if isinstance(basis, (tuple, list)) and all(isinstance(i, int) and not isinstance(i, bool) for i in basis):
+        if not basis or len(set(basis)) < len(basis) or not all(0 <= i < scene.nv for i in basis):
+            raise ValueError(f"basis is {basis}; give different indices of velocities, each 0 to {scene.nv - 1}")
+        return Independent(tuple(basis))
+    if not isinstance(basis, (np.ndarray, jax.Array)):
+        raise ValueError(
+            f"basis is {basis!r}; give a tuple of indices of independent velocities, a function N(q, t) -> (nv, nr), "
+            "or a reference matrix (nv, nr) from jd.tangent_basis"
+        )
+    if basis.ndim != 2 or basis.shape[0] != scene.nv or not 0 < basis.shape[1] <= scene.nv:
+        raise ValueError(f"basis has shape {basis.shape}, expected ({scene.nv}, nr) = (nv, nr)")
+    return Orthonormal(jnp.asarray(basis))
+
+
+class ReducedDynamics(Outcome):
+    """Equations of motion in minimal velocities, M_r nudot + h_r = tau_r, and their solution.
+
+    - `nu_rate` (nr,): nudot. `velocity`, `acceleration` (nv,): v = N nu + v0 and its rate a.
+    - `mass_matrix` (nr, nr) = N^T M N; `bias_force` (nr,) = N^T (M s + h) with s = Ndot nu + v0dot; `force` (nr,) =
+      N^T (tau + forces). Units: those of N^T times N or N m.
+    - `basis` (nv, nr): N. `result`: one of `jd.RESULTS`.
+    """
+
+    nu_rate: Float[Array, " nr"]
+    velocity: Float[Array, " nv"]
+    acceleration: Float[Array, " nv"]
+    mass_matrix: Float[Array, "nr nr"]
+    bias_force: Float[Array, " nr"]
+    force: Float[Array, " nr"]
+    basis: Float[Array, "nv nr"]
+    result: Any
+
+
+def reduced_dynamics(
+    scene: Scene,
+    q: Float[Array, " nq"],
+    nu: Float[Array, " nr"],
+    tau: Float[Array, " nv"] | None = None,
+    t=0.0,
+    *,
+    basis: Any,
+) -> ReducedDynamics:
+    """Motion in minimal velocities: N^T M N nudot + N^T (M (Ndot nu + v0dot) + h) = N^T (tau + forces).
+
+    The rates of N and v0 along the motion come from automatic differentiation, also for b(q, t) != 0.
+
+    **Arguments:**
+
+    - `q` (nq,), on the constraints; `nu` (nr,), minimal velocities; `tau` (nv,), N m or N (None: zero); `t`, s.
+    - `basis`, what N and nu are. A tuple of indices: nu are these entries of v. A function N(q, t) -> (nv, nr), or
+      -> (N, v0), with A N = 0 and A v0 = b; a plain function is static, a Module carries leaves. A matrix R (nv, nr),
+      such as `tangent_basis`: N is the orthonormal basis of ker A nearest to R in the sense of `Orthonormal`.
+
+    **Returns:** `ReducedDynamics`. Where N does not serve (a singular A2, columns that depend on each other or break
+    the rows, a rank other than nv - nr) the result is `singular_basis`.
+
+    **Raises:** ValueError for shapes that do not fit, a scene without constraints, and, on concrete numbers, a basis
+    that does not serve, with what to take instead.
+
+    Source: EQUATIONS section 6; Kane & Levinson (1985), section 6.1.
+    """
+    scene = as_scene(scene)
+    tau = or_zeros(tau, scene.nv)
+    q, tau, t = check_state(scene.system, q=q, tau=tau, t=t)
+    nu = as_array(nu, "nu", q.dtype)
+    if not layout(scene):
+        raise ValueError("the scene has no constraints, so there is nothing to reduce; use jd.forward_dynamics")
+    choice = as_basis(basis, scene)
+    size = choice.size(scene)
+    if size is not None and nu.shape != (size,):
+        raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns{batch_hint(nu, (1,))}")
+    found = _reduce_compiled(scene, choice, q, nu, tau, t)
+    singular = found.result == RESULTS.singular_basis
+    if is_concrete(singular) and bool(singular):
+        raise ValueError(f"basis does not serve at this q: {choice.advice(scene, q, t)}")
+    return found
+
+
+def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
+    """`reduced_dynamics` in traced numbers, for a `Basis` that fits."""
+    return solve_reduced(scene, moving(scene, choice, q, nu, t), q, tau, t)
+
+
+class Moving(NamedTuple):
+    """Velocity v (nv,) by minimal velocities, its rate (nv,) as these stay, N (nv, nr) and its quality ()."""
+
+    v: Array
+    drift: Array
+    N: Array
+    quality: Array
+
+
+def moving(scene: Scene, choice: Basis, q, nu, t) -> Moving:
+    """v = N nu + v0 and Ndot nu + v0dot, from one factorisation of the rows."""
+
+    def velocity(q, t):
+        place = choice.at(scene, q, t)
+        if nu.shape != place.N.shape[1:]:
+            raise ValueError(
+                f"nu has shape {nu.shape}, expected {place.N.shape[1:]} as the basis has columns{batch_hint(nu, (1,))}"
+            )
+        return _product(place.N, nu) + place.v0, place
+
+    v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
+    return Moving(v, push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t)), N, quality)
+
+
+def solve_reduced(scene: Scene, place: Moving, q, tau, t) -> ReducedDynamics:
+    """The equations of motion in the minimal velocities of a `Moving` place, and their solution."""
+    v, drift, N, quality = place
+    mass = _product(N.T, _product(mass_matrix(scene.system, q, t), N))
+    bias = _product(N.T, inverse_dynamics(scene.system, q, v, drift, t))
+    force = _product(N.T, applied(scene, q, v, tau, t))
+    factor = cholesky(mass)
+    rate = solve_factored(factor, force - bias)
+    result = RESULTS.where(definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    serves = jnp.abs(quality) > least_quality(q.dtype)
+    result = RESULTS.where(serves, result, RESULTS.singular_basis)
+    return ReducedDynamics(rate, v, _product(N, rate) + drift, mass, bias, force, N, result)
+
+
+_reduce_compiled = compiled(reduce)
+
+
+def tangent_basis(
+    scene: Scene, q: Float[Array, " nq"], t: Any = 0.0, *, dof: int | None = None, rank_tol: float | None = None
+) -> Float[Array, "nv nr"]:
+    """An orthonormal basis (nv, nr) of the velocities with A(q, t) v = 0, as a constant: a reference for `basis`.
+
+    Which one of them is arbitrary, so it is not differentiated; `Orthonormal` continues it smoothly to other places.
+
+    **Arguments:** `q` (nq,); `t`, s; `dof`: nr, by default nv less the rank of A on concrete numbers and less the number
+    of rows on traced ones; `rank_tol` as in `constrained_dynamics`.
+
+    **Raises:** ValueError when no freedom is left, or when `dof` has to be given.
+    """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
+    if not layout(scene):
+        raise ValueError("the scene has no constraints, so every velocity is tangent; add some")
+    dof = freedoms(scene, q, t, dof, rank_tol)
+    keep, _ = _tangent_projection(scene, q, t, rank_tol)
+    return split_directions(keep)[:, scene.nv - dof :]
+
+
+def freedoms(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None = None) -> int:
+    """Number of minimal velocities: as given, else nv less the rank of A, or less the number of rows where traced.
+
+    **Raises:** ValueError when none is left.
+    """
+    if dof is not None:
+        if isinstance(dof, bool) or not isinstance(dof, int) or not 0 < dof <= scene.nv:
+            raise ValueError(f"dof is {dof!r}; give the number of freedoms, 1 to nv = {scene.nv}")
+        return dof
+    count = layout(scene)[-1].end
+    known = is_known(scene, q, t)
+    dof = scene.nv - (int(_tangent_projection(scene, q, t, rank_tol)[1]) if known else count)
+    if dof < 1:
+        fix = "leave one out" if known else "if some of them depend on others, give dof, the number of freedoms"
+        raise ValueError(f"{count} constraint rows leave no freedom of nv = {scene.nv}: {fix}")
+    return dof
+
+
+@compiled
+def _tangent_projection(scene, q, t, rank_tol):
+    """1 - A^+ A, and the rank of A."""
+    A = constraint_jacobian(scene, q, t)
+    inverse = pseudo_inverse(A, tolerance(rank_tol, A))
+    return jnp.eye(scene.nv, dtype=A.dtype) - _product(inverse, A), jnp.round(jnp.sum(inverse * A.T))
+
+
+def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Orthonormal eigenvectors of an orthogonal projection, those that it keeps last; constants."""
+    return lax.stop_gradient(jnp.linalg.eigh(lax.stop_gradient(0.5 * (projection + projection.T)))[1])
+
+
+def independent_velocities(scene: Scene, q, t=0.0) -> tuple[int, ...]:
+    """Indices of velocities that determine the others at a concrete place: those left by the pivots of A's columns."""
+    A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
+    rest, found = A.copy(), []
+    for _ in range(min(A.shape)):
+        sizes = np.linalg.norm(rest, axis=0)
+        pivot = int(np.argmax(sizes))
+        if sizes[pivot] <= 1e-9 * np.linalg.norm(A):
+            break
+        along = rest[:, pivot] / sizes[pivot]
+        rest = rest - np.outer(along, along @ rest)
+        found.append(pivot)
+    return tuple(i for i in range(scene.nv) if i not in found)
+
+
+def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, ""]]:
+    """X T^-1 with T^T T = X^T X for columns X, and the least pivot of T relative to the largest; smooth in X."""
+    factor = cholesky(_product(columns.T, columns))
+    pivots = jnp.diagonal(factor)
+    return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots)
+
+
+def minimal_velocity(place: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
+    """nu (nr,) with N nu + v0 = v for an admissible v: its coefficients in the columns of N."""
+    factor = cholesky(_product(place.N.T, place.N))
+    return solve_factored(factor, _product(place.N.T, v - place.v0))
+
+
+def least_quality(dtype) -> float:
+    """Quality of a parametrisation below which it counts as singular: reciprocal condition 5e-7 in float64."""
+    return float(jnp.finfo(dtype).eps) ** 0.4
+
+
+constraint_jacobian_compiled = compiled(constraint_jacobian)
+
+
+def _affine_rows(scene, q, t):
+    return constraint_jacobian(scene, q, t), -velocity_residual(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
+
+
+def _least_pivot(columns):
+    """Least pivot of the triangle T with T^T T = columns^T columns, and 0 where they depend on each other."""
+    pivot = jnp.min(jnp.diagonal(cholesky(lax.stop_gradient(_product(columns.T, columns)))))
+    return jnp.where(jnp.isfinite(pivot), pivot, jnp.zeros_like(pivot))
+
+
+def _tangent_only(A, N, quality):
+    """The quality, or 0 where A N is not 0 but for rounding."""
+    limit = _rounding(A) * jnp.sqrt(jnp.sum(A * A) * jnp.sum(N * N))
+    return jnp.where(jnp.max(jnp.abs(_product(A, N))) <= limit, quality, jnp.zeros_like(quality))
+
+
+def _rounding(like) -> float:
+    """Relative size of a residual that is taken for rounding."""
+    return float(jnp.finfo(like.dtype).eps) ** 0.5

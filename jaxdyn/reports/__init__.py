@@ -1,0 +1,12 @@
+"""Error against run time: scenes with known motions, integrated in every sensible way, as records, a table and a page."""
+
+from jaxdyn.reports.cases import Case as Case
+from jaxdyn.reports.cases import cases as cases
+from jaxdyn.reports.front import beaten_by as beaten_by
+from jaxdyn.reports.front import pareto_front as pareto_front
+from jaxdyn.reports.front import standings as standings
+from jaxdyn.reports.page import html_page as html_page
+from jaxdyn.reports.page import write as write
+from jaxdyn.reports.records import Record as Record
+from jaxdyn.reports.records import Report as Report
+from jaxdyn.reports.run import report as report

@@ -1,0 +1,220 @@
+"""The scenes a report runs: each with its reference, what is measured of it, and points that others have published."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn import scenes
+from jaxdyn.forces.elements import Drive
+from jaxdyn.model import robots
+from jaxdyn.reports import references
+from jaxdyn.reports.references import Reference
+from jaxdyn.systems.scene import Scene
+
+
+class Published(NamedTuple):
+    """Somebody else's run of the same motion: CPU `seconds`, and the largest `error` or `energy_error` (J) if stated."""
+
+    label: str
+    seconds: float
+    error: float | None = None
+    energy_error: float | None = None
+
+
+class Case(NamedTuple):
+    """A scene of the report.
+
+      - `name`, `text`: what it is called and what it is; `kind`: the class of scenes for which defaults are compared.
+      - `build()` -> (scene, (q0, v0)); `reference(start)` -> `Reference`, or None where a
+    converged solution at `ts` serves.
+      - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
+      - `largest`: the most trajectories at once that are measured unless `ways` are chosen; None for any number.
+    """
+
+    name: str
+    text: str
+    kind: str
+    build: Callable[[], tuple[Scene, tuple]]
+    reference: Callable[[Any], Reference] | None
+    ts: np.ndarray
+    steps: int
+    conserves: bool = True
+    stiff: bool = False
+    largest: int | None = None
+    published: tuple[Published, ...] = ()
+
+
+def named(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
+    """`build` of a scene of `jaxdyn.scenes`, its start in numpy."""
+
+    def build():
+        scene = getattr(scenes, name)
+        taken = {key: value for key, value in parameters.items() if key in ("formulation", "count")}
+        q, v = scene.start(**parameters)
+        return scene(**taken), (np.asarray(q), np.asarray(v))
+
+    return build
+
+
+def _held_elbow() -> tuple[Scene, tuple]:
+    drive = Drive(kp=jnp.asarray([0.0, 1e5]), kd=jnp.asarray([0.1, 1e4]), target=jnp.asarray([0.0, 0.5]))
+    return Scene(robots.chain(2), forces=(drive,)), (np.array([1.0, 0.8]), np.zeros(2))
+
+
+def _cases() -> tuple[Case, ...]:
+    ten = np.linspace(0.0, 10.0, 11)
+    i5 = "Intel i5-4570, date not stated"
+    return (
+        Case(
+            "pendulum_in_plane",
+            "Plane pendulum in x and y, 10 s (problem A01 of the IFToMM library)",
+            "holonomic",
+            named("pendulum_in_plane"),
+            lambda start: references.plane_pendulum(ten),
+            ten,
+            500,
+            published=(
+                Published(f"OpenSim 3.2 ({i5})", 0.637),
+                Published("Exudyn, step 0.8 ms (Intel i7 laptop, date not stated)", 0.037, energy_error=5e-5),
+            ),
+        ),
+        Case(
+            "spherical_pendulum",
+            "Spherical pendulum in x, y and z, 10 s",
+            "holonomic",
+            named("spherical_pendulum"),
+            lambda start: references.sphere_pendulum(ten),
+            ten,
+            250,
+        ),
+        Case(
+            "free_body",
+            "Free rigid body with three different moments of inertia, 20 s",
+            "free",
+            named("free_body"),
+            lambda start: references.free_top(2 * ten),
+            2 * ten,
+            100,
+        ),
+        Case(
+            "double_pendulum",
+            "Double pendulum of two bodies in a chain, 5 s",
+            "free",
+            named("double_pendulum", formulation="model"),
+            None,
+            ten / 2,
+            100,
+        ),
+        Case(
+            "rolling_disk",
+            "Upright disk that rolls on a circle, 10 s",
+            "nonholonomic",
+            named("rolling_disk"),
+            lambda start: references.upright_disk(ten),
+            ten,
+            50,
+        ),
+        Case(
+            "chaplygin_sleigh",
+            "Chaplygin's sleigh, 10 s",
+            "nonholonomic",
+            named("chaplygin_sleigh"),
+            lambda start: references.sleigh(ten),
+            ten,
+            50,
+        ),
+        Case(
+            "rolling_coin",
+            "Leaning disk that rolls steadily on a circle, 5 s: close to one turn",
+            "nonholonomic",
+            named("rolling_coin"),
+            lambda start: references.coin(ten / 2),
+            ten / 2,
+            250,
+        ),
+        Case(
+            "bicycle",
+            "Whipple's bicycle at 4.6 m/s after a push to its side, 3 s",
+            "nonholonomic",
+            named("bicycle", roll_rate=0.5),
+            None,
+            np.linspace(0.0, 3.0, 7),
+            150,
+        ),
+        Case(
+            "four_bar",
+            "Four-bar linkage, 5 s",
+            "holonomic",
+            named("four_bar"),
+            None,
+            ten / 2,
+            100,
+        ),
+        Case(
+            "windows",
+            "Two four-bar windows, 10 s (problem A02 of the IFToMM library, N = 2), through positions where rows lose rank",
+            "holonomic, losing rank",
+            named("windows", count=2),
+            lambda start: references.windows(ten, 2),
+            ten,
+            500,
+            published=(
+                Published(f"OpenSim 3.2 ({i5})", 0.455),
+                Published("Exudyn, step 10 ms (date not stated)", 0.0776, energy_error=0.114),
+            ),
+        ),
+        Case(
+            "windows_40",
+            "Forty four-bar windows, 1 s of the 20 s of problem A02 of the IFToMM library, through one position where rows "
+            "lose rank",
+            "holonomic, losing rank",
+            named("windows", count=40),
+            lambda start: references.windows(ten / 10, 40),
+            ten / 10,
+            10,
+            # Programs for a batch compile for a minute and more each.
+            largest=1,
+        ),
+        Case(
+            "andrews",
+            "Andrews' squeezing mechanism, 0.03 s (test set for IVP solvers)",
+            "holonomic",
+            named("andrews"),
+            references.andrews,
+            np.array([0.0, 0.03]),
+            250,
+            published=(
+                Published("PSIDE at 1e-14 (Cray C90, 1990s)", 56.74, error=3e-8),
+                Published(f"OpenSim 3.2 on 0.05 s, problem A03 ({i5})", 0.384),
+            ),
+        ),
+        Case(
+            "held_elbow",
+            "Double pendulum whose elbow a stiff drive holds, 2 s: decays of 1e5 1/s",
+            "free, stiff",
+            _held_elbow,
+            None,
+            ten / 5,
+            1000,
+            conserves=False,
+            stiff=True,
+        ),
+        Case(
+            "car_axis",
+            "Car axis on a bumpy road, 3 s (test set for IVP solvers): constraints that move with time",
+            "driven",
+            named("car_axis"),
+            references.car_axis,
+            np.array([0.0, 3.0]),
+            250,
+            conserves=False,
+            stiff=True,
+        ),
+    )
+
+
+def cases() -> dict[str, Case]:
+    """Every scene of the report by its name."""
+    return {case.name: case for case in _cases()}

@@ -1,0 +1,107 @@
+"""Who is on the front of a work-precision plot, and which way to integrate serves a whole class of scenes."""
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from jaxdyn.reports.records import Record
+
+TARGETS = (1e-3, 1e-5, 1e-7, 1e-9)
+
+
+def pareto_front(records: Iterable[Record], *, error: str = "error_path", cost: str = "seconds_best") -> list[Record]:
+    """Records that no other one beats in both `error` and `cost`, from cheap to exact; failed runs are left out."""
+    usable = [r for r in records if getattr(r, error) is not None and getattr(r, cost) is not None]
+    usable.sort(key=lambda r: (getattr(r, cost), getattr(r, error)))
+    front: list[Record] = []
+    for record in usable:
+        if not front or getattr(record, error) < getattr(front[-1], error):
+            front.append(record)
+    return front
+
+
+def cost_at(
+    records: Iterable[Record], target: float, *, error: str = "error_path", cost: str = "seconds_best"
+) -> float:
+    """Cost at which a ladder reaches an error: on straight lines between its rungs in the log-log plot.
+
+    Infinite where no rung reaches it; that of the cheapest rung where all are better.
+    """
+    points = [(getattr(r, error), getattr(r, cost)) for r in pareto_front(records, error=error, cost=cost)]
+    for (rough, cheap), (fine, dear) in zip([(math.inf, 0.0), *points], points, strict=False):
+        if fine > target:
+            continue
+        if rough == math.inf or fine == 0.0:
+            return dear
+        share = math.log(rough / target) / math.log(rough / fine)
+        return cheap * (dear / cheap) ** share
+    return math.inf
+
+
+def beaten_by(
+    records: Iterable[Record], *, error: str = "error_path", cost: str = "seconds_best"
+) -> list[tuple[Record, float]]:
+    """Peers' runs that lie below our front, each with how many times its cost we take to its error; the worst first.
+
+    Between our rungs the front goes on straight lines in the log-log plot. The number is infinite where no run of ours
+    is as exact. `records` are of one plot: one scene, dtype and batch.
+
+    **Raises:** ValueError for records of several plots.
+    """
+    records = list(records)
+    plots = {(r.scene, r.dtype, r.batch) for r in records}
+    if len(plots) > 1:
+        raise ValueError(f"records has runs of {len(plots)} plots; give those of one scene, dtype and batch")
+    ours = [r for r in records if r.source == "jaxdyn"]
+    found = []
+    for r in records:
+        if r.source != "jaxdyn" and getattr(r, error) is not None:
+            factor = cost_at(ours, getattr(r, error), error=error, cost=cost) / getattr(r, cost)
+            if factor > 1:
+                found.append((r, factor))
+    return sorted(found, key=lambda pair: -pair[1])
+
+
+class Standing(NamedTuple):
+    """How one way to integrate does in a class of scenes.
+
+    `ratio`: its cost over that of the best way, geometric mean over scenes and target errors that it reaches; `reached`
+    of `wanted`: how many of those that some way reaches.
+    """
+
+    kind: str
+    label: str
+    ratio: float
+    reached: int
+    wanted: int
+
+
+def standings(
+    records: Iterable[Record], *, targets: Sequence[float] = TARGETS, cost: str = "seconds_best"
+) -> list[Standing]:
+    """Ways to integrate by class of scenes (with dtype and batch), best first: those that reach most, then the cheapest.
+
+    Only runs of jaxdyn are compared; peers are on the plots.
+    """
+    ladders: dict[tuple, dict[str, list[Record]]] = defaultdict(lambda: defaultdict(list))
+    for r in records:
+        if r.source == "jaxdyn":
+            kind = f"{r.kind}, {r.dtype}, batch {r.batch}"
+            ladders[kind, r.label][r.scene].append(r)
+    found = []
+    for kind in dict.fromkeys(kind for kind, _ in ladders):
+        ways = {label: scenes for (k, label), scenes in ladders.items() if k == kind}
+        goals = [(scene, target) for scene in {s for x in ways.values() for s in x} for target in targets]
+        costs = {
+            label: [cost_at(scenes.get(scene, ()), target, cost=cost) for scene, target in goals]
+            for label, scenes in ways.items()
+        }
+        best = [min(column) for column in zip(*costs.values(), strict=True)]
+        rows = []
+        for label, row in costs.items():
+            ratios = [x / b for x, b in zip(row, best, strict=True) if math.isfinite(x)]
+            mean = math.exp(sum(map(math.log, ratios)) / len(ratios)) if ratios else math.inf
+            rows.append(Standing(kind, label, mean, len(ratios), sum(map(math.isfinite, best))))
+        found += sorted(rows, key=lambda row: (-row.reached, row.ratio))
+    return found

@@ -1,0 +1,85 @@
+"""What a report has finished, kept in a file line by line, so that an interrupted one goes on where it stopped."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxdyn.reports.records import Known, Record, Report
+
+NAME = "records.jsonl"
+
+
+class _Entry(NamedTuple):
+    scene: str
+    known: Known
+    records: list[Record]
+
+
+class Journal:
+    """Groups of records by key; with a directory, also in its file: a line for the head, then one for each group.
+
+    **Raises:** ValueError when the file's records are of another commit, machine, set of versions or kind of report, or
+    cannot be read.
+    """
+
+    def __init__(self, directory: Path | None, head: dict):
+        self.head = head
+        self.path = None if directory is None else directory / NAME
+        self._entries: dict[str, _Entry] = {}
+        if self.path is None:
+            return
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists():
+            self._read(self.path)
+        # Written anew, without a line that an interruption has cut.
+        lines = [json.dumps(self.head), *(_line(key, entry) for key, entry in self._entries.items())]
+        self.path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+    def _read(self, path: Path) -> None:
+        first, *lines = path.read_text(encoding="utf-8").splitlines() or ["{}"]
+        if not lines:
+            return
+        remedy = "name another directory, or remove the file to start anew"
+        try:
+            before = json.loads(first)
+            for name, of in (
+                ("commit", lambda head: head["commit"]),
+                ("machine", lambda head: [head["machine"][key] for key in ("processor", "device", "cores")]),
+                ("versions", lambda head: head["machine"]["versions"]),
+                ("full", lambda head: head["full"]),
+            ):
+                if of(before) != of(self.head):
+                    raise ValueError(f"out has {path} with {name} {of(before)}, and this is {of(self.head)}; {remedy}")
+            for line in lines:
+                try:
+                    entry = json.loads(line)
+                except json.JSONDecodeError:  # cut by an interruption
+                    continue
+                records = [Record(**x) for x in entry["records"]]
+                self._entries[entry["key"]] = _Entry(entry["scene"], Known.from_dict(entry["known"]), records)
+        except (KeyError, TypeError, json.JSONDecodeError) as error:
+            raise ValueError(f"out has {path}, which is no file of this version's ({error!r}); {remedy}") from error
+        self.head = before
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._entries
+
+    def add(self, key: str, scene: str, known: Known, records: list[Record]) -> None:
+        """Keep a finished group."""
+        self._entries[key] = _Entry(scene, known, records)
+        if self.path is not None:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(_line(key, self._entries[key]) + "\n")
+
+    def report(self, keys: Iterable[str]) -> Report:
+        """The report of these groups."""
+        entries = [self._entries[key] for key in keys]
+        scenes = {entry.scene: entry.known for entry in entries}
+        return Report(self.head, scenes, tuple(record for entry in entries for record in entry.records))
+
+
+def _line(key: str, entry: _Entry) -> str:
+    records = [asdict(record) for record in entry.records]
+    return json.dumps({"key": key, "scene": entry.scene, "known": asdict(entry.known), "records": records})

@@ -1,0 +1,185 @@
+"""Running one scene by many methods: compare every run with the reference, and time all of them in turn."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared
+from jaxdyn.reports.records import Record
+from jaxdyn.reports.timing import interleaved
+from jaxdyn.simulation.methods import Method, Reduced, chosen_method
+from jaxdyn.simulation.run import RESULTS
+from jaxdyn.simulation.solvers.explicit import passes_last_stage_on
+from jaxdyn.systems.scene import Scene
+
+
+class Motion(NamedTuple):
+    """What a run gave: states at the reference's times, and counts if known."""
+
+    q: np.ndarray
+    v: np.ndarray
+    result: str = "successful"
+    steps: int | None = None
+    rejected: int | None = None
+    evaluations: int | None = None
+
+
+class Contestant(NamedTuple):
+    """One rung of a ladder, of ours or of a peer.
+
+    `call()` runs all trajectories and blocks until they are done, which is what is timed; `motion(call())` is the first
+    one, in the coordinates of the scene.
+    """
+
+    source: str
+    method: str
+    solver: str
+    setting: float
+    fixed: bool
+    call: Callable[[], Any]
+    motion: Callable[[Any], Motion]
+    compile_seconds: float | None = None
+    flops: Callable[[Motion], float | None] = lambda motion: None
+
+
+def ladder(
+    prepared: Prepared, method: str, solver: str, settings: Sequence[float], dtype: str, starts, flops: Callable
+) -> list[Contestant]:
+    """Contestants of ours that differ in tolerance or step alone, one compiled program; `starts` as `Programs.lanes`."""
+    batch = len(starts[0])
+    run, seconds = prepared.programs.get(method, solver, dtype, batch)
+    inputs = [jnp.asarray(x[0] if batch == 1 else x, dtype) for x in starts]
+    chosen = chosen_method(prepared.scene, method)
+
+    def motion(found) -> Motion:
+        q, v, result, stats = found
+        codes = np.atleast_1d(np.asarray(result._value))
+        # Of a batch the first trajectory is judged, if none of them failed: those that stop early cost less time.
+        code = next((code for code in codes if code != RESULTS.successful._value), codes[0])
+        name = next(name for name in RESULTS._name_to_item if code == getattr(RESULTS, name)._value)
+        q, v, stats = jax.tree.map(lambda x: np.asarray(x if batch == 1 else x[0]), (q, v, stats))
+        steps = int(stats["num_steps"])
+        count = evaluations(solver, steps, prepared.scene, chosen)
+        return Motion(q, v, name, steps, int(stats["num_rejected_steps"]), count)
+
+    def contestant(setting):
+        number = jnp.asarray(setting, dtype)
+        call = lambda: jax.block_until_ready(run(*inputs, number))  # noqa: E731
+        return Contestant("jaxdyn", method, solver, setting, solver in FIXED, call, motion, seconds, flops)
+
+    return [contestant(setting) for setting in settings]
+
+
+def evaluations(solver: str, steps: int, scene: Scene, method: Method) -> int | None:
+    """Evaluations of the vector field in so many steps; None for implicit methods, whose iterations are not counted.
+
+    A solver whose last evaluation of a step is the first of the next one saves it, unless the state is corrected after it.
+    Two more choose the first step.
+    """
+    if solver in FIXED:
+        return 4 * steps
+    tableau: Any = getattr(SOLVERS[solver](), "tableau", None)
+    if tableau is None or tableau.implicit:
+        return None
+    saves = passes_last_stage_on(tableau, method.jumping, method.projects) if method.corrects(scene) else tableau.fsal
+    saved = steps - 1 if saves else 0
+    return tableau.num_stages * steps - saved + 2
+
+
+def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[Motion], float | None]:
+    """Floating-point operations of a motion: those of its evaluations and of the projections after its steps.
+
+    Per sample of a batch, as large ones run on another program. XLA counts those of the compiled expressions; calls of LAPACK
+    and repetitions of loops inside them are left out.
+    """
+    scene = prepared.scene
+    chosen = chosen_method(scene, method)
+    q, v, t = (jnp.asarray(x, float) for x in (*prepared.programs.start, prepared.reference.ts[0]))
+    if isinstance(chosen, Reduced):
+        chosen = chosen.fitted(scene, None)
+    state = chosen.start(scene, q, v, t)
+
+    def rates(y, t):
+        q, v = chosen.place(scene, y, t)
+        return chosen.rates(scene, y, q, v, t, scene.applied_force(q, v, t))
+
+    def cost(function):
+        many, inputs = function, (state, t)
+        if batch > 1:
+            many, inputs = jax.vmap(function), jax.tree.map(lambda x: jnp.tile(x, (batch, *[1] * x.ndim)), inputs)
+        found = jax.jit(many).lower(*inputs).compile().cost_analysis() or {}
+        return float(found.get("flops", 0.0)) / batch
+
+    once = cost(rates)
+    again = cost(lambda y, t: chosen.corrected(scene, y, t)) if chosen.corrects(scene) else 0.0
+
+    def count(motion: Motion) -> float | None:
+        if motion.evaluations is None or motion.steps is None:
+            return None
+        return once * motion.evaluations + again * motion.steps
+
+    return count
+
+
+def judge(prepared: Prepared, motion: Motion) -> dict:
+    """Errors, residuals and energy error of a motion; None where it did not succeed or there is nothing to measure."""
+    names = ("error_end", "error_path", "residual_position", "residual_velocity", "energy_error")
+    if motion.result != "successful":
+        return dict.fromkeys(names)
+    error = prepared.errors(motion.q, motion.v)
+    _, energy, residual = prepared.values(motion.q, motion.v)
+    values: list[Any] = [error[-1], error.max(), *residual.max(0), np.abs(energy - energy[0]).max()]
+    if not prepared.scene.constraints:
+        values[2] = values[3] = None
+    if not prepared.case.conserves:
+        values[4] = None
+    return {name: None if x is None else float(x) for name, x in zip(names, values, strict=True)}
+
+
+def measure(
+    prepared: Prepared, contestants: Sequence[Contestant], dtype: str, batch: int, rounds: int = 20, most: float = 10.0
+) -> list[Record]:
+    """Run every contestant, judge its motion, and time them all in turn within one loop.
+
+    `most`: seconds after which a slow one drops out of the rounds; one whose first run takes a quarter of that is timed
+    by it alone. Its record says how many rounds it took.
+    """
+    motions, times, calls = [], {}, {}
+    for i, contestant in enumerate(contestants):
+        began = time.perf_counter()
+        found = contestant.call()
+        passed = time.perf_counter() - began
+        motions.append(contestant.motion(found))
+        if passed > most / 4:
+            times[i] = {"best": passed, "median": passed, "rounds": 1}
+        else:
+            calls[i] = contestant.call
+    times |= interleaved(calls, rounds, most=most)
+    return [
+        Record(
+            scene=prepared.case.name,
+            kind=prepared.case.kind,
+            source=one.source,
+            method=one.method,
+            solver=one.solver,
+            dtype=dtype,
+            batch=batch,
+            setting=float(one.setting),
+            fixed=one.fixed,
+            result=motion.result,
+            seconds_best=times[i]["best"] / batch,
+            seconds_median=times[i]["median"] / batch,
+            rounds=times[i]["rounds"],
+            compile_seconds=one.compile_seconds,
+            steps=motion.steps,
+            rejected=motion.rejected,
+            evaluations=motion.evaluations,
+            flops=one.flops(motion),
+            **judge(prepared, motion),
+        )
+        for i, (one, motion) in enumerate(zip(contestants, motions, strict=True))
+    ]

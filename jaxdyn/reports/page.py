@@ -1,0 +1,165 @@
+"""The page of a report: one HTML file with its plots inside, readable without a network."""
+
+import html
+import io
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxdyn.reports.front import pareto_front, standings
+from jaxdyn.reports.plotting import GREY, SERIES, new_figure
+from jaxdyn.reports.records import COLUMNS, Known, Record, Report, rows
+
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; }
+table { border-collapse: collapse; font-size: 12px; font-variant-numeric: tabular-nums; }
+th, td { padding: 1px 8px; text-align: right; border-bottom: 1px solid #e5e5e5; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+.wide { overflow-x: auto; } svg { max-width: 100%; height: auto; } .note { color: #555; }
+"""
+_READING = """
+Each line is one way to integrate the scene, each point a tolerance or a step: further left is more exact, further down is
+cheaper. Points with a grey disc are on the front: no other one beats them in both. The error is the largest |y - r|/(1 + |r|)
+over the entries y of position and velocity and over the save points, r the reference; quaternions are compared as rotation
+matrices. In the grey band on the left the reference itself is not known well enough. Times are the best of the rounds, per
+trajectory, without compilation. All runs of a plot were timed in turn within one loop, so its lines compare; plots of different
+machines do not. Stars and dotted lines are figures published by others, of the machines that they name. Evaluations of implicit
+methods are not counted.
+"""
+
+
+def write(report: Report, directory: str | Path) -> None:
+    """Write report.json, report.txt and report.html."""
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    # The page last: it needs matplotlib, the others nothing.
+    for kind, text in (
+        ("json", report.to_json),
+        ("txt", lambda: report.table() + "\n"),
+        ("html", lambda: html_page(report)),
+    ):
+        (directory / f"report.{kind}").write_text(text(), encoding="utf-8")
+
+
+def html_page(report: Report) -> str:
+    """The report as one HTML page without anything outside it: plots as SVG, tables, the machine."""
+    head = report.head
+    parts = [
+        "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Error against run time</title>",
+        f"<style>{_STYLE}</style></head><body><h1>Error against run time</h1>",
+        f"<p>{_escaped(_machine(head))}</p><p class='note'>{_READING}</p>",
+        "<h2>Ways to integrate, by class of scene</h2>",
+        "<p class='note'>Cost relative to the best way at the errors 1e-3, 1e-5, 1e-7 and 1e-9, geometric mean over the "
+        "scenes of the class and the errors that it reaches; how many of those that any way reaches.</p>",
+        _standings(report.records),
+    ]
+    for name, known in report.scenes.items():
+        parts += _scene(name, known, report.of(name))
+    return "\n".join([*parts, "</body></html>\n"])
+
+
+def _machine(head) -> str:
+    machine = head["machine"]
+    versions = ", ".join(f"{name} {x}" for name, x in machine["versions"].items() if x)
+    return (
+        f"{machine['processor']}, {machine['cores']} cores, device {machine['device']}, load {machine['load']} at the start; "
+        f"{versions}; commit {head['commit'] or 'unknown'}; {head['date']}"
+    )
+
+
+def _escaped(value) -> str:
+    return html.escape(str(value))
+
+
+def _table(header: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
+    lines = [f"<tr>{''.join(f'<th>{_escaped(x)}</th>' for x in header)}</tr>"]
+    lines += [f"<tr>{''.join(f'<td>{_escaped(x)}</td>' for x in row)}</tr>" for row in cells]
+    return f"<div class='wide'><table>{''.join(lines)}</table></div>"
+
+
+def _standings(records) -> str:
+    cells = [
+        (s.kind, s.label, f"{s.ratio:.2f}" if math.isfinite(s.ratio) else "-", f"{s.reached}/{s.wanted}")
+        for s in standings(records)
+    ]
+    return _table(("class", "way", "cost", "reached"), cells)
+
+
+def _scene(name: str, known: Known, records: tuple[Record, ...]) -> list[str]:
+    reference = f"Reference: {known.kind}, {known.source}; its own error is about {known.error:.0e}."
+    parts = [f"<h2 id='{_escaped(name)}'>{_escaped(known.text)}</h2>", f"<p>{_escaped(reference)}</p>"]
+    for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
+        group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
+        drawn = figure(f"{dtype}, {batch} at once", known, group)
+        parts.append(_svg(drawn, f"{name}{dtype}{batch}"))
+    cells = _table(COLUMNS, rows(records))
+    return [*parts, f"<details><summary>{len(records)} runs</summary>{cells}</details>"]
+
+
+def figure(title: str, known: Known, records: Sequence[Record]) -> Any:
+    """Log-log plots of one scene: error against time, against evaluations, and the energy error against time.
+
+    **Returns:** a matplotlib figure, or None when no run succeeded.
+    """
+    panels = [("error_path", "seconds_best", "time per trajectory (s)")]
+    panels += [("error_path", "evaluations", "evaluations of the vector field")]
+    panels += [("energy_error", "seconds_best", "time per trajectory (s)")]
+    panels = [p for p in panels if any(getattr(r, p[0]) is not None and getattr(r, p[1]) is not None for r in records)]
+    if not panels:
+        return None
+    drawn, axes = new_figure(4.3 * len(panels), 4.4, 1, len(panels))
+    for ax, (error, cost, label) in zip(axes[0], panels, strict=True):
+        _panel(ax, records, error, cost)
+        ax.set(xscale="log", yscale="log", ylabel=label)
+        ax.set_xlabel("energy error (J)" if error == "energy_error" else "error")
+        if error == "error_path":
+            ax.axvspan(ax.get_xlim()[0], max(known.error, ax.get_xlim()[0]), color="0.93", zorder=0)
+        if cost == "seconds_best":
+            _published(ax, known, error)
+    shown = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    drawn.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    drawn.suptitle(title, fontsize=10)
+    return drawn
+
+
+def _svg(drawn, salt: str) -> str:
+    """A figure as an element of a page; `salt` keeps the names of its parts apart from those of other figures."""
+    import matplotlib
+
+    if drawn is None:
+        return "<p>No run succeeded; see the results below.</p>"
+    text = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
+        drawn.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    return text.getvalue()[text.getvalue().index("<svg") :]
+
+
+def _panel(ax, records, error: str, cost: str) -> None:
+    smallest = 1e-16  # a logarithmic axis has no zero
+    for i, label in enumerate(dict.fromkeys(r.label for r in records)):
+        ladder = [r for r in records if r.label == label and None not in (getattr(r, error), getattr(r, cost))]
+        points = [(max(getattr(r, error), smallest), getattr(r, cost)) for r in ladder]
+        ours = all(r.source == "jaxdyn" for r in records if r.label == label)
+        line, marker = ("-", "o") if ours else ("--", "s")
+        colour = SERIES[i % len(SERIES)]
+        filled = colour if ours else "white"
+        style = {"color": colour, "markersize": 4, "linewidth": 1.2, "markerfacecolor": filled}
+        ax.plot(*(zip(*points, strict=True) if points else ((), ())), line, marker=marker, label=label, **style)
+    front = [
+        (max(getattr(r, error), smallest), getattr(r, cost)) for r in pareto_front(records, error=error, cost=cost)
+    ]
+    halo = {"markersize": 10, "alpha": 0.35, "markeredgewidth": 0, "zorder": 1}
+    ax.plot(*zip(*front, strict=True), "o", color=GREY, label="on the front", **halo)
+
+
+def _published(ax, known: Known, error: str) -> None:
+    for point in known.published:
+        value = point["error" if error == "error_path" else "energy_error"]
+        if value is not None:
+            ax.plot([value], [point["seconds"]], "*", color="black", markersize=9, label=point["label"])
+        elif point["error"] is None and point["energy_error"] is None and error == "error_path":
+            ax.axhline(
+                point["seconds"], color="black", linestyle=":", linewidth=1, label=f"{point['label']}, no error given"
+            )

@@ -1,0 +1,175 @@
+"""A scene made ready for measuring: its compiled simulations, its known motion, and how far another one is from it."""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.constraints.assembly import residuals
+from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.lie.so3 import quat_to_matrix
+from jaxdyn.model.tree import Model
+from jaxdyn.reports.cases import Case
+from jaxdyn.reports.references import Reference
+from jaxdyn.simulation.methods import chosen_method
+from jaxdyn.simulation.run import simulate
+from jaxdyn.simulation.solvers import RK4, Rodas5P
+from jaxdyn.systems.scene import Scene
+
+# By name; those in FIXED run with fixed steps.
+SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
+    "Dopri8": diffrax.Dopri8,
+    "Dopri5": diffrax.Dopri5,
+    "Tsit5": diffrax.Tsit5,
+    "Kvaerno3": diffrax.Kvaerno3,
+    "Kvaerno5": diffrax.Kvaerno5,
+    "Rodas5P": Rodas5P,
+    "RK4": RK4,
+}
+FIXED = frozenset({"RK4"})
+MOST_STEPS = 2**17
+# Share of the span over which the starts of a batch are spread along the motion.
+SPREAD = 0.1
+
+
+class Program(NamedTuple):
+    """A compiled simulation: `run(q, v, ts, setting)` -> (q, v, result, stats), each with a leading axis if `batch` > 1."""
+
+    run: Callable
+    seconds: float
+
+
+class Programs:
+    """The compiled simulations of a scene, each made once: start, times and tolerance or step are arguments of them."""
+
+    def __init__(self, scene: Scene, start, ts):
+        self.scene, self.start, self.ts = scene, start, ts
+        self._made: dict[tuple, Program] = {}
+
+    def get(self, method: str, solver: str, dtype: str = "float64", batch: int = 1) -> Program:
+        """The program for a method, a solver, a dtype and a number of trajectories."""
+        key = (chosen_method(self.scene, method).name, solver, dtype, batch)
+        if key not in self._made:
+            self._made[key] = self._compile(*key)
+        return self._made[key]
+
+    def _compile(self, method, solver, dtype, batch) -> Program:
+        scene = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, self.scene)
+
+        def one(q, v, ts, setting):
+            steps = {"stepsize": setting} if solver in FIXED else {"rtol": setting, "atol": setting}
+            options = {"method": method, "solver": SOLVERS[solver](), "max_steps": MOST_STEPS, "throw": False}
+            found = simulate(scene, q, v, ts, **steps, **options)
+            return found.q, found.v, found.result, found.stats
+
+        several = one if batch == 1 else jax.vmap(one, (0, 0, 0, None))
+        sizes = () if batch == 1 else (batch,)
+        shapes = [jax.ShapeDtypeStruct((*sizes, len(x)), dtype) for x in (*self.start, self.ts)]
+        began = time.perf_counter()
+        run = jax.jit(several).lower(*shapes, jax.ShapeDtypeStruct((), dtype)).compile()
+        return Program(run, time.perf_counter() - began)
+
+    def solve(self, method: str, solver: str, tolerance: float, start=None, ts=None) -> tuple[np.ndarray, np.ndarray]:
+        """One motion in float64: q (nt, nq) and v (nt, nv); NaN in rows that were not reached."""
+        inputs = *(self.start if start is None else start), self.ts if ts is None else ts, tolerance
+        q, v, _, _ = self.get(method, solver).run(*(jnp.asarray(x, float) for x in inputs))
+        return np.asarray(q), np.asarray(v)
+
+    def lanes(self, batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Starts q (batch, nq), v (batch, nv) and times (batch, nt): states along the first tenth of the motion.
+
+        All are on the constraints, and no two trajectories take quite the same steps; the first is the reference's.
+
+        **Raises:** RuntimeError when the motion along which they lie stops early.
+        """
+        ts, (q, v) = self.ts, self.start
+        delays = SPREAD * (ts[-1] - ts[0]) * np.arange(batch) / batch
+        states, ahead = [(q, v)], len(ts) - 1
+        while len(states) < batch:
+            first = len(states) - 1
+            times = ts[0] + SPREAD * (ts[-1] - ts[0]) * np.arange(first, first + ahead + 1) / batch
+            found = self.solve("auto", "Dopri8", 1e-12, states[-1], times)
+            if not all(np.isfinite(x).all() for x in found):
+                raise RuntimeError("no starts for a batch: a simulation at tolerances of 1e-12 stopped early")
+            states += [*zip(*(x[1:] for x in found), strict=True)]
+        q, v = (np.stack(x) for x in zip(*states[:batch], strict=True))
+        return q, v, ts + delays[:, None]
+
+
+class Prepared(NamedTuple):
+    """A case with its scene built and its motion known.
+
+    `values(q, v)` -> what is compared (nt, n), energy (nt,) and residuals (nt, 2) of a motion, in float64.
+    """
+
+    case: Case
+    scene: Scene
+    reference: Reference
+    programs: Programs
+    values: Callable[[Any, Any], list[np.ndarray]]
+
+    def errors(self, q, v) -> np.ndarray:
+        """Error of a motion q (nt, nq), v (nt, nv) in each row, (nt,): see `largest_error`."""
+        return largest_error(self.values(q, v)[0], self.values(self.reference.q, self.reference.v)[0])
+
+
+def prepare(case: Case) -> Prepared:
+    """Build the scene, and find its reference.
+
+    **Raises:** RuntimeError when a solution of our own is the reference and cannot be computed.
+    """
+    scene, start = case.build()
+    known = None if case.reference is None else case.reference(start)
+    ts = case.ts if known is None else known.ts
+    programs, numbers = Programs(scene, start, ts), jnp.asarray(ts, float)
+
+    def row(q, v, t):
+        energy = kinetic_energy(scene.system, q, v, t) + potential_energy(scene.system, q, t)
+        return observed(scene, q, v), energy, residuals(scene, q, v, t) if scene.constraints else jnp.zeros(2)
+
+    compiled = jax.jit(jax.vmap(row))
+
+    def values(q, v):
+        return [np.asarray(x) for x in compiled(jnp.asarray(q, float), jnp.asarray(v, float), numbers)]
+
+    return Prepared(case, scene, known or converged(programs, values), programs, values)
+
+
+def observed(scene: Scene, q, v):
+    """What is compared, (n,): the entries of q, with rotation matrices for quaternions, and those of v."""
+    parts = [q]
+    if isinstance(scene.system, Model):
+        parts = []
+        for kind, place in zip(scene.system.topology.kinds, scene.system.topology.q_slices, strict=True):
+            turning = kind in ("spherical", "free")
+            parts += [q[place][:-4], quat_to_matrix(q[place][-4:]).reshape(-1)] if turning else [q[place]]
+    return jnp.concatenate([*parts, v])
+
+
+def largest_error(found: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """max |y - r|/(1 + |r|) over the columns of y (nt, n) and r (nt, n), (nt,).
+
+    It is absolute for entries that are small and relative for large ones, as in the test set for IVP solvers.
+    """
+    return np.max(np.abs(found - known) / (1 + np.abs(known)), 1)
+
+
+def converged(programs: Programs, values: Callable) -> Reference:
+    """A solution of our own at tolerances of 1e-13, its error estimated from another way to integrate it.
+
+    That is other velocities (method "reduced") for a scene with constraints, another solver for one without. The two
+    share the equations of motion, so the estimate is of the integration alone.
+
+    **Raises:** RuntimeError when one of them does not come to the end.
+    """
+    other = ("reduced", "Dopri8") if programs.scene.constraints else ("auto", "Tsit5")
+    fine, rough = (programs.solve(*way, 1e-13) for way in (("auto", "Dopri8"), other))
+    error = float(largest_error(values(*rough)[0], values(*fine)[0]).max())
+    if not np.isfinite(error):
+        raise RuntimeError("no converged reference: a simulation at tolerances of 1e-13 stopped early; loosen them")
+    return Reference(programs.ts, *fine, "converged", f"Dopri8 at 1e-13, compared with {', '.join(other)}", error)

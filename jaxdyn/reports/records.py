@@ -1,0 +1,132 @@
+"""What a report holds: one record a run, and the machine it ran on; as JSON and as text."""
+
+import dataclasses
+import json
+from collections.abc import Iterable
+from typing import Any
+
+from jaxdyn.model.text_table import short, table
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """One rung of a ladder: a scene, how it was integrated, how wrong and how long. None is what is not known.
+
+    - `source`: "jaxdyn", or the name of a peer; `method`, `solver`, `dtype`; `batch`: trajectories at once.
+    - `setting`: rtol = atol, or the step (s) when `fixed`.
+    - `result`: "successful", or the name of the result code; then there are no errors.
+    - `error_end`, `error_path`: error at the last save point and the largest of all (`cases.errors`).
+    - `residual_position`, `residual_velocity`: largest |phi| and |A v - b|; `energy_error`: largest |E - E(0)|, J.
+    - `seconds_best`, `seconds_median`: wall time per trajectory, of `rounds`; `compile_seconds`, apart, of all rungs.
+    - `steps`, rejected ones included, and `rejected`; `evaluations` of the vector field; `flops` that XLA counts.
+      Of the first trajectory of a batch, whose start is the reference's.
+    """
+
+    scene: str
+    kind: str
+    source: str
+    method: str
+    solver: str
+    dtype: str
+    batch: int
+    setting: float
+    fixed: bool
+    result: str
+    error_end: float | None
+    error_path: float | None
+    residual_position: float | None
+    residual_velocity: float | None
+    energy_error: float | None
+    seconds_best: float
+    seconds_median: float
+    rounds: int
+    compile_seconds: float | None
+    steps: int | None
+    rejected: int | None
+    evaluations: int | None
+    flops: float | None
+
+    @property
+    def label(self) -> str:
+        """The ladder this record is a rung of, within its scene."""
+        ours = self.source == "jaxdyn"
+        return f"{self.method}, {self.solver}" if ours else f"{self.source}, {self.solver}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """What a scene is compared with, and what others have published of it."""
+
+    text: str
+    kind: str
+    source: str
+    error: float
+    published: tuple[dict, ...] = ()
+
+    @staticmethod
+    def from_dict(data: dict) -> "Known":
+        """Back from `dataclasses.asdict`, also by way of JSON, which has no tuples."""
+        values: dict[str, Any] = data | {"published": tuple(data["published"])}
+        return Known(**values)
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """Records with what is needed to read them: `head` (machine, versions, commit, date) and each scene's reference."""
+
+    head: dict[str, Any]
+    scenes: dict[str, Known]
+    records: tuple[Record, ...]
+
+    def of(self, scene: str) -> tuple[Record, ...]:
+        """Records of one scene."""
+        return tuple(record for record in self.records if record.scene == scene)
+
+    def to_json(self) -> str:
+        """The report as JSON; `from_json` reads it back."""
+        return json.dumps(dataclasses.asdict(self), indent=1)
+
+    @staticmethod
+    def from_json(text: str) -> "Report":
+        """The report that `to_json` wrote."""
+        data = json.loads(text)
+        scenes = {name: Known.from_dict(known) for name, known in data["scenes"].items()}
+        return Report(data["head"], scenes, tuple(Record(**record) for record in data["records"]))
+
+    def table(self, scene: str | None = None) -> str:
+        """Records as text, of one scene or of all."""
+        names = [scene] if scene else list(self.scenes)
+        return "\n\n".join(self._section(name) for name in names)
+
+    def _section(self, name: str) -> str:
+        known, records = self.scenes[name], self.of(name)
+        head = f"{known.text}\nReference: {known.kind}, {known.source}; its own error about {short(known.error, 1)}"
+        return f"{head}\n{table(COLUMNS, rows(records))}" if records else head
+
+
+COLUMNS = (
+    "method", "dtype", "batch", "setting", "error", "at end", "residual", "energy", "us", "median", "rounds", "steps", "evals",
+    "Mflop", "compile s", "result",
+)  # fmt: skip
+
+
+def rows(records: Iterable[Record]) -> list[list[str]]:
+    """Cells of a table, one row a record: COLUMNS."""
+    found = []
+    for r in records:
+        residuals = [x for x in (r.residual_position, r.residual_velocity) if x is not None]
+        found.append(
+            [
+                r.label,
+                r.dtype,
+                str(r.batch),
+                f"{'h ' if r.fixed else ''}{r.setting:.1e}",
+                *(short(x, 2) for x in (r.error_path, r.error_end, max(residuals, default=None), r.energy_error)),
+                *(f"{1e6 * x:.4g}" for x in (r.seconds_best, r.seconds_median)),
+                *("-" if x is None else str(x) for x in (r.rounds, r.steps, r.evaluations)),
+                short(None if r.flops is None else r.flops / 1e6, 3),
+                short(r.compile_seconds, 2),
+                "" if r.result == "successful" else r.result,
+            ]
+        )
+    return found

@@ -1,0 +1,189 @@
+"""Which runs a report makes, and making them: scene by scene, resumed from what an earlier call has finished."""
+
+import datetime
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.reports.cases import Case, cases
+from jaxdyn.reports.journal import Journal
+from jaxdyn.reports.measure import Contestant, flop_counter, ladder, measure
+from jaxdyn.reports.page import write
+from jaxdyn.reports.plotting import new_figure
+from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared, prepare
+from jaxdyn.reports.records import Known, Record, Report
+from jaxdyn.reports.timing import commit, machine
+from jaxdyn.simulation.methods import chosen_method
+
+# Contestants of others for a scene, a dtype and starts (q, v, ts); see `Contestant`.
+Peers = Callable[[Prepared, str, tuple], Sequence[Contestant]]
+
+
+def combinations(case: Case, constrained: bool, *, full: bool, plain: bool = True) -> list[tuple[str, str]]:
+    """Methods with solvers: the usual ones, or every sensible pair; `plain` is float64 and one trajectory."""
+    stiff = ["Rodas5P", "Kvaerno5", "Kvaerno3"] if full else ["Rodas5P", "Kvaerno5"]
+    implicit = stiff if case.stiff or (full and plain) else []
+    explicit = ["Dopri8", "Tsit5", "RK4"]
+    if not constrained:
+        return [("free", solver) for solver in [*explicit, *(["Dopri5"] if full and plain else []), *implicit]]
+    pairs = [("projected", solver) for solver in [*explicit, *implicit]]
+    if not full:
+        return [*pairs, ("reduced", "Dopri8")]
+    return pairs + [(method, solver) for method in ("reduced", "multipliers") for solver in explicit]
+
+
+def settings(case: Case, solver: str, dtype: str, *, full: bool) -> list[float]:
+    """Tolerances, or steps (s), from the coarsest to the finest."""
+    single = dtype == "float32"
+    if solver in FIXED:
+        doublings = (range(5) if single else range(7)) if full else ((0, 2) if single else (0, 2, 4))
+        return [float(np.ptp(case.ts)) / case.steps / 2**k for k in doublings]
+    digits = (range(2, 7) if single else range(3, 13)) if full else ((2, 4, 6) if single else (4, 6, 8, 11))
+    return [10.0**-k for k in digits]
+
+
+def report(
+    scenes: str | Iterable[str] | None = None,
+    *,
+    full: bool = False,
+    dtypes: Sequence[str] | None = None,
+    batches: Sequence[int] | None = None,
+    ways: Sequence[Sequence[str]] | None = None,
+    rounds: int = 20,
+    out: str | Path | None = None,
+    peers: Peers | None = None,
+    echo: Callable[[str], object] | None = None,
+) -> Report:
+    """Measure error against run time of scenes whose motion is known, by every sensible way to integrate them.
+
+    Tolerances and steps are traced, so one compiled program serves a whole ladder. All runs of one scene, dtype and batch are
+    timed in turn within one loop; compilation is apart. float64 has to be enabled, as references are.
+
+    **Arguments:**
+
+    - `scenes`: a name or names of `jaxdyn.reports.cases()`; None for all.
+    - `full`: many methods, solvers and rungs, in float64 and float32, one trajectory and 256 at once; else a quick
+      ladder of the usual ones in float64, one trajectory.
+    - `dtypes`, `batches`: others than those. `ways`: pairs of a method and a solver in place of those.
+    - `rounds`: timings of each run, at least 20 for a figure to be quoted.
+    - `out`: directory for report.json, report.txt and report.html, and for records.jsonl, from which a call that was
+      interrupted goes on.
+    - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.reports.measure`.
+    - `echo`: takes lines of progress, e.g. `print`.
+
+    **Returns:** a `Report`; `print(report.table())`; `jaxdyn.reports.write(report, directory)` makes its page.
+
+    **Raises:** ValueError for a name that is not known, a dtype, batch or way that cannot be, nothing to measure, float64 that
+    is not enabled, and a directory that holds records of another commit, machine or set of versions; ImportError for `out`
+    without matplotlib.
+
+    ```python
+    quick = jd.report("pendulum_in_plane")
+    ```
+    """
+    chosen = _checked(scenes, dtypes, batches, ways, rounds)
+    dtypes = dtypes or (("float64", "float32") if full else ("float64",))
+    batches = batches or ((1, 256) if full else (1,))
+    say = echo or (lambda line: None)
+    groups = []
+    for case in chosen:
+        sizes = [batch for batch in batches if ways or case.largest is None or batch <= case.largest]
+        groups += [(case, dtype, batch) for dtype in dtypes for batch in sizes]
+        if len(sizes) < len(batches):
+            say(f"{case.name}: batches above {case.largest} are left out: they take minutes, unless `ways` are chosen")
+    if not groups:
+        raise ValueError(
+            f"batches {list(batches)} leave nothing to measure of {', '.join(case.name for case in chosen)}; choose `ways`, "
+            "or smaller batches"
+        )
+    if out is not None:
+        new_figure(1.0, 1.0)  # without matplotlib there is no page, which is better known before hours of runs
+    head = {
+        "machine": machine(),
+        "commit": commit(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "full": full,
+    }
+    journal = Journal(None if out is None else Path(out), head)
+    prepared, began = None, time.perf_counter()
+    only = "".join(f", {method} {solver}" for method, solver in ways or ()) + (", with peers" if peers else "")
+    keys = [f"{case.name}, {dtype}, batch {batch}, {rounds} rounds{only}" for case, dtype, batch in groups]
+    todo = [(key, *group) for key, group in zip(keys, groups, strict=True) if key not in journal]
+    if len(todo) < len(groups):
+        say(f"{len(groups) - len(todo)} of {len(groups)} are finished already, in {journal.path}")
+    for done, (key, case, dtype, batch) in enumerate(todo, 1):
+        if prepared is None or prepared.case is not case:
+            prepared = prepare(case)
+        records = _group(prepared, dtype, batch, ways, full, rounds, peers)
+        journal.add(key, case.name, _known(prepared), records)
+        passed = time.perf_counter() - began
+        left = passed / done * (len(todo) - done)
+        say(f"{done}/{len(todo)} {key}: {len(records)} runs; {passed:.0f} s, about {left:.0f} s left")
+    found = journal.report(keys)
+    if out is not None:
+        write(found, out)
+    return found
+
+
+def _group(prepared: Prepared, dtype, batch, ways, full, rounds, peers) -> list[Record]:
+    """Records of one scene in one dtype and number of trajectories: what is timed in one loop."""
+    case, scene = prepared.case, prepared.scene
+    starts = prepared.programs.lanes(batch)
+    plain = dtype == "float64" and batch == 1
+    pairs = list(ways) if ways else combinations(case, bool(scene.constraints), full=full, plain=plain)
+    counters = {method: flop_counter(prepared, method, batch) for method in dict(pairs)}
+    contestants = [
+        rung
+        for method, solver in pairs
+        for rung in ladder(
+            prepared, method, solver, settings(case, solver, dtype, full=full), dtype, starts, counters[method]
+        )
+    ]
+    if peers is not None:
+        contestants += peers(prepared, dtype, starts)
+    return measure(prepared, contestants, dtype, batch, rounds)
+
+
+def _known(prepared: Prepared) -> Known:
+    reference = prepared.reference
+    published = tuple(x._asdict() for x in prepared.case.published)
+    return Known(prepared.case.text, reference.kind, reference.source, reference.error, published)
+
+
+def _checked(scenes, dtypes, batches, ways, rounds) -> list[Case]:
+    """The cases, after a check of the arguments of `report`."""
+    known = cases()
+    names = list(known) if scenes is None else [scenes] if isinstance(scenes, str) else list(scenes)
+    for argument, given in (("scenes", names), ("dtypes", dtypes), ("batches", batches), ("ways", ways)):
+        if given is not None and len(given) == 0:
+            raise ValueError(f"{argument} is empty; leave it out for the usual ones")
+    for name in names:
+        if name not in known:
+            raise ValueError(f"scenes has {name!r}; choose from {', '.join(known)}")
+    for dtype in dtypes or ():
+        if dtype not in ("float64", "float32"):
+            raise ValueError(f"dtypes has {dtype!r}; choose from float64, float32")
+    for pair in ways or ():
+        if not isinstance(pair, tuple | list) or len(pair) != 2 or pair[1] not in SOLVERS:
+            raise ValueError(
+                f'ways has {pair!r}; give pairs such as ("projected", "Dopri8"), solvers: {", ".join(SOLVERS)}'
+            )
+    for batch in batches or ():
+        if isinstance(batch, bool) or not isinstance(batch, int) or batch < 1:
+            raise ValueError(f"batches has {batch!r}; give positive integers")
+    if isinstance(rounds, bool) or not isinstance(rounds, int) or rounds < 1:
+        raise ValueError(f"rounds is {rounds!r}; give a positive integer")
+    if jnp.zeros(()).dtype != jnp.float64:
+        raise ValueError('a report compares in float64; call jax.config.update("jax_enable_x64", True) first')
+    chosen = [known[name] for name in dict.fromkeys(names)]
+    for case in chosen if ways else ():
+        scene, _ = case.build()
+        for method in dict(ways or ()):
+            try:
+                chosen_method(scene, method)
+            except ValueError as error:
+                raise ValueError(f"ways has {method!r}, which {case.name} cannot take: {error}") from None
+    return chosen

@@ -1,0 +1,450 @@
+"""How a scene becomes an ordinary differential equation: the methods of `simulate`, and the check of a start.
+
+A method says what the state y of the equation is, how it changes, and what is done to it after a step:
+
+    free         y = (q, v), no constraints
+    multipliers  y = (q, v), accelerations with multipliers
+    projected    the same, and q and v put back on the constraints after every step
+    baumgarte    the same as multipliers, with A a = gamma - 2 alpha psi - beta^2 phi
+    reduced      y = (q, nu), v = N(q, t) nu + v0(q, t)
+    variational  no differential equation: steps of its own, for y = (q, v)
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.assembly import open_constraints, residuals, start_evidence
+from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
+from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
+from jaxdyn.constraints.projection import project_state, project_step
+from jaxdyn.constraints.rank import checked_tolerance
+from jaxdyn.dynamics.quantities import forward_dynamics
+from jaxdyn.lie.so3 import _product
+from jaxdyn.reduction.minimal import (
+    Basis,
+    Given,
+    Orthonormal,
+    as_basis,
+    least_quality,
+    minimal_velocity,
+    moving,
+    solve_reduced,
+    tangent_basis,
+)
+from jaxdyn.simulation import variational
+from jaxdyn.simulation.solvers import Stepper
+from jaxdyn.simulation.solvers.choice import is_fixed
+from jaxdyn.systems.scene import Scene, as_pytree
+from jaxdyn.systems.system import has_quaternions, rate_to_velocity, retract, velocity_to_rate
+
+
+class Method(eqx.Module):
+    """How a scene is integrated. The state is a dictionary of arrays with the entry "q"."""
+
+    name: ClassVar[str] = "free"
+    projects: ClassVar[bool] = False
+
+    def stepper(self, solver: Any, stepsize: Any) -> Any:
+        """The solver to take: the one given, or the method's own."""
+        return solver
+
+    def start(self, scene: Scene, q, v, t) -> dict[str, Array]:
+        """State of the equation at (q, v)."""
+        return {"q": q, "v": v}
+
+    def place(self, scene: Scene, y, t) -> tuple[Array, Array]:
+        """q, with unit quaternions, and v of a state."""
+        return retract(scene.system, y["q"]), y["v"]
+
+    def rates(self, scene: Scene, y, q, v, t, force) -> dict[str, Array]:
+        """dy/dt; q and v are those of `place`, `force` (nv,) is tau plus the scene's forces, or None."""
+        return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
+
+    def evaluated(self, scene: Scene, y, t, effort) -> tuple[dict[str, Array], Array | None, Array]:
+        """dy/dt with effort(q, v, t) for the force; the force (nv,) or None; and v (nv,)."""
+        q, v = self.place(scene, y, t)
+        force = effort(q, v, t)
+        return self.rates(scene, y, q, v, t, force), force, v
+
+    def acceleration(self, scene: Scene, q, v, t, force) -> Array:
+        """Rate of v, (nv,)."""
+        return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force, t)
+
+    def multipliers(self, scene: Scene, q, v, t, force) -> Array:
+        """Constraint forces along the rows, (nc,)."""
+        return dynamics(scene, q, v, t, force).multipliers
+
+    def corrects(self, scene: Scene) -> bool:
+        """Whether `stepped` and `corrected` change a state."""
+        return self.projects or has_quaternions(scene.system)
+
+    def corrected(self, scene: Scene, y, t) -> dict[str, Array]:
+        """The state put back between steps, where it is saved."""
+        return self.stepped(scene, y, t, None)[0]
+
+    def onto_constraints(self, scene: Scene, q, v, t) -> tuple[Array, Array]:
+        """q and v by the least change on the constraints, where the motion starts."""
+        return project_state(scene, q, v, t)
+
+    def stepped(self, scene: Scene, y, t, error):
+        """The state put back after a step, and its estimated error (a state, or None) less what constraints remove."""
+        return y | {"q": retract(scene.system, y["q"])}, error
+
+    def continued(self, scene: Scene, y, t) -> dict[str, Array]:
+        """The state as the next step starts from it: entries in `jumping` may have changed."""
+        return y
+
+    @property
+    def jumping(self) -> tuple[str, ...]:
+        """Entries of the state that are constant during a step."""
+        return ()
+
+    def quality(self, scene: Scene, y, t) -> Array | None:
+        """How far the state is from where the method fails (`Parametrization.quality`), None when it never does."""
+        return None
+
+
+class Free(Method):
+    """No constraints."""
+
+
+class Multipliers(Method):
+    """Accelerations with multipliers; nothing keeps the constraints from opening as the local errors add up.
+
+    **Arguments:** `rank_tol`, as in `constrained_dynamics`. Rows that depend on each other only on the constraints, as those
+    of an overconstrained loop do, need one above what the stages of a step open: 1e-4 to 1e-6.
+    """
+
+    rank_tol: float | None = eqx.field(static=True, default=None, kw_only=True)
+    name: ClassVar[str] = "multipliers"
+
+    def __check_init__(self):
+        checked_tolerance(self.rank_tol)
+
+    def acceleration(self, scene, q, v, t, force):
+        """From `constrained_dynamics`."""
+        return dynamics(scene, q, v, t, force, self.rank_tol).acceleration
+
+    def multipliers(self, scene, q, v, t, force):
+        """From `constrained_dynamics`."""
+        return dynamics(scene, q, v, t, force, self.rank_tol).multipliers
+
+
+class Projected(Multipliers):
+    """Accelerations with multipliers, and the least change, in the mass metric, back onto the constraints.
+
+    **Arguments:** `rank_tol`, as in `Multipliers`.
+    """
+
+    name: ClassVar[str] = "projected"
+    projects: ClassVar[bool] = True
+
+    def stepped(self, scene, y, t, error):
+        """q and v on the constraints, quaternions of unit length; the error without its part normal to the constraints."""
+        errors = () if error is None else (_error_of_place(scene, y["q"], error), error["v"])
+        q, v, errors = project_step(scene, y["q"], y["v"], t, errors, self.rank_tol)
+        if error is not None:
+            error = error | {"q": velocity_to_rate(scene.system, q, errors[0]), "v": errors[1]}
+        return y | {"q": q, "v": v}, error
+
+    def corrected(self, scene, y, t):
+        """q and v on the constraints."""
+        q, v = self.onto_constraints(scene, y["q"], y["v"], t)
+        return y | {"q": q, "v": v}
+
+    def onto_constraints(self, scene, q, v, t):
+        """By the programs that correct a step."""
+        none = jnp.zeros_like(v)
+        return project_step(scene, q, v, t, (none, none), self.rank_tol)[:2]
+
+
+class Baumgarte(Multipliers):
+    """Accelerations that pull violated rows back, for comparison: the pull is an error where it is not zero.
+
+    Holonomic rows: d2 phi/dt2 + 2 alpha dphi/dt + beta^2 phi = 0. Nonholonomic rows: d psi/dt + 2 alpha psi = 0.
+
+    **Arguments:** `alpha`, `beta`, 1/s, positive.
+
+    Source: Baumgarte (1972).
+    """
+
+    alpha: Float[Array, ""]
+    beta: Float[Array, ""]
+    name: ClassVar[str] = "baumgarte"
+
+    def __init__(self, alpha: Any = 10.0, beta: Any = 10.0):
+        self.alpha, self.beta = jnp.asarray(alpha, float), jnp.asarray(beta, float)
+
+    def acceleration(self, scene, q, v, t, force):
+        """Under the rows A a = gamma - 2 alpha psi - beta^2 phi."""
+        row, held = rows(scene, q, v, t), holonomic_rows(layout(scene))
+        alpha, beta = self.alpha.astype(q.dtype), self.beta.astype(q.dtype)
+        wanted = row.gamma - 2 * alpha * row.velocity
+        wanted = wanted.at[held].add(-(beta**2) * position_residual(scene, q, t))
+        force = jnp.zeros_like(v) if force is None else force
+        return solve_rows(scene, q, v, force, t, Rows(row.A, wanted, row.velocity)).acceleration
+
+
+class Reduced(Method):
+    """Minimal velocities nu are integrated, and q with the velocity v = N nu + v0 that they determine.
+
+    Velocities satisfy the constraints by construction. For holonomic rows q is put back on them after every step.
+
+    **Arguments:**
+
+    - `basis`: what nu is, as in `reduced_dynamics`: a tuple of indices of independent velocities, or a function N(q, t).
+      Where N becomes singular on the way the run ends with the code `singular_basis`. By default an orthonormal basis
+      that is continued from step to step, which serves as long as the rank of the rows is constant.
+    - `dof`: number of minimal velocities of the default basis. By default nv less the rank of the rows on concrete
+      numbers, and less their number on traced ones.
+    """
+
+    basis: Any
+    dof: int | None = eqx.field(static=True)
+    name: ClassVar[str] = "reduced"
+    projects: ClassVar[bool] = True
+
+    def __init__(self, basis: Any = None, *, dof: int | None = None):
+        given = callable(basis) and not isinstance(basis, Basis)
+        self.basis = Given(as_pytree(basis, "basis")) if given else basis
+        self.dof = dof
+
+    def fitted(self, scene: Scene, dof: int | None) -> "Reduced":
+        """The method with its basis made for the scene; `dof` where it is known."""
+        basis = None if self.basis is None else as_basis(self.basis, scene)
+        return Reduced(basis, dof=dof if self.dof is None else self.dof)
+
+    @property
+    def jumping(self):
+        """The reference of an orthonormal basis."""
+        return ("frame",) if self.basis is None or isinstance(self.basis, Orthonormal) else ()
+
+    def _basis(self, y):
+        return Orthonormal(y["frame"]) if self.jumping else self.basis
+
+    def _at(self, scene, y, q, t):
+        return self._basis(y).at(scene, q, t)
+
+    def start(self, scene, q, v, t):
+        """q, nu and, for an orthonormal basis, its reference."""
+        y = {"q": q}
+        if self.jumping:
+            reference = tangent_basis(scene, q, t, dof=self.dof) if self.basis is None else self.basis.reference
+            y["frame"] = reference.astype(q.dtype)
+        return y | {"nu": minimal_velocity(self._at(scene, y, q, t), v)}
+
+    def place(self, scene, y, t):
+        """q, with unit quaternions, and v = N nu + v0."""
+        q = retract(scene.system, y["q"])
+        found = self._at(scene, y, q, t)
+        return q, _product(found.N, y["nu"]) + found.v0
+
+    def evaluated(self, scene, y, t, effort):
+        """From the reduced equations, which share one factorisation of the rows with v."""
+        q = retract(scene.system, y["q"])
+        place = moving(scene, self._basis(y), q, y["nu"], t)
+        force = effort(q, place.v, t)
+        return self._rates(scene, y, place, q, t, force), force, place.v
+
+    def rates(self, scene, y, q, v, t, force):
+        """From the reduced equations; v is found anew."""
+        return self._rates(scene, y, moving(scene, self._basis(y), q, y["nu"], t), q, t, force)
+
+    def _rates(self, scene, y, place, q, t, force):
+        found = solve_reduced(Scene(scene.system, scene.constraints), place, q, force, t)
+        fixed = {name: jnp.zeros_like(y[name]) for name in self.jumping}
+        return {"q": velocity_to_rate(scene.system, q, place.v), "nu": found.nu_rate} | fixed
+
+    def acceleration(self, scene, q, v, t, force):
+        """Rate of v."""
+        return dynamics(scene, q, v, t, force).acceleration
+
+    def corrects(self, scene):
+        """Where there are holonomic rows, quaternions, or a reference to be renewed."""
+        return bool(holonomic_rows(layout(scene)).size or self.jumping or has_quaternions(scene.system))
+
+    def stepped(self, scene, y, t, error):
+        """q on the holonomic constraints, its error without the part normal to them; nu stays."""
+        if not holonomic_rows(layout(scene)).size:
+            return super().stepped(scene, y, t, error)
+        errors = () if error is None else (_error_of_place(scene, y["q"], error),)
+        q, _, errors = project_step(scene, y["q"], jnp.zeros((scene.nv,), y["q"].dtype), t, errors)
+        if error is not None:
+            error = error | {"q": velocity_to_rate(scene.system, q, errors[0])}
+        return y | {"q": q}, error
+
+    def continued(self, scene, y, t):
+        """N(q) as the new reference, which leaves N(q) and nu as they are."""
+        return y | {"frame": self._at(scene, y, y["q"], t).N} if self.jumping else y
+
+    def quality(self, scene, y, t):
+        """Of N at the state."""
+        return self._at(scene, y, retract(scene.system, y["q"]), t).quality
+
+
+class Variational(Multipliers):
+    """Steps of a fixed length that follow a discrete principle of d'Alembert for long motions
+    (see `jaxdyn.simulation.variational`).
+
+    Order 2. Without forces and rows on velocities the steps are symplectic: the error of the energy stays as it is after
+    a few oscillations, of the order h^2, however many steps follow, and momenta that symmetries conserve are conserved
+    to rounding. Rows on positions are closed at the end of every step, and velocities projected. For rows on velocities
+    (rolling, knife edges) the steps are those of the discrete Lagrange-d'Alembert principle, equal to their inverse with
+    -h; energy is then kept well in reversible motions and not in general.
+
+    Each step solves for its mean velocity by Newton's method, with the exact Jacobian; where that fails the run ends with
+    the code `nonlinear_divergence`. Derivatives are those of the solved equations.
+
+    **Arguments:** `rank_tol`, as in `Multipliers`.
+
+    Sources: Marsden & West (2001); Hairer, Lubich & Wanner (2006), chapters VI and VII; Cortes & Martinez (2001).
+
+    ```python
+    motion = jd.simulate(scene, q0, v0, ts, method="variational", stepsize=0.01)
+    ```
+    """
+
+    name: ClassVar[str] = "variational"
+    projects: ClassVar[bool] = True
+
+    def stepper(self, solver, stepsize):
+        """Its own. **Raises:** ValueError for another one, and for steps that are not fixed."""
+        if solver is not None:
+            raise ValueError(
+                f"solver is {type(solver).__name__}; method 'variational' makes its steps itself: leave solver out"
+            )
+        if not is_fixed(stepsize):
+            raise ValueError(
+                f"stepsize is {stepsize!r}; method 'variational' takes fixed steps, as changing ones lose what it "
+                "conserves: pass a number (s), e.g. stepsize=0.01"
+            )
+        return Stepper()
+
+    def begin(self, scene: Scene, y, t) -> variational.Carried:
+        """What the first step takes beside y."""
+        return variational.begin(scene, *self.place(scene, y, t), t, self.rank_tol)
+
+    def advance(self, scene: Scene, y, t0, t1, carried: variational.Carried, effort: Callable):
+        """y at t1, the mean velocity on the way, what is carried on, and whether the step succeeded."""
+        found = variational.step(scene, y["q"], y["v"], carried, t0, t1, effort, self.rank_tol)
+        mean, y1 = found.carried.mean, {"q": found.q, "v": found.v}
+        if "work" in y:
+            done = 0.0 if found.force is None else (t1 - t0) * jnp.sum(found.force * mean)
+            y1 = y1 | {"work": y["work"] + done}
+        return y1, mean, found.carried, found.solved
+
+    def acceleration(self, scene, q, v, t, force):
+        """Of the continuous motion."""
+        return (super() if scene.constraints else Free()).acceleration(scene, q, v, t, force)
+
+    def corrects(self, scene):
+        """No: steps end on the constraints."""
+        return False
+
+    def corrected(self, scene, y, t):
+        """Between steps: q and v on the constraints."""
+        if not scene.constraints:
+            return y
+        q, v = project_state(scene, y["q"], y["v"], t, self.rank_tol)
+        return y | {"q": q, "v": v}
+
+
+METHODS: dict[str, type[Method]] = {
+    kind.name: kind for kind in (Multipliers, Projected, Reduced, Baumgarte, Variational)
+}
+
+
+def chosen_method(scene: Scene, method: str | Method) -> Method:
+    """How to integrate: "auto" is "projected" for a scene with constraints and "free" for one without.
+
+    "projected" is the rule because it serves where the others fail: dependent rows, and places where rows lose rank on
+    the way, and needs no choice of velocities.
+
+    **Raises:** ValueError for a method that does not fit the scene.
+    """
+    if not scene.constraints:
+        if method in ("auto", "free") or isinstance(method, Free):
+            return Free()
+        if method == "variational" or isinstance(method, Variational):
+            return Variational() if isinstance(method, str) else method
+        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free', or 'variational'")
+    if method == "auto":
+        return Projected()
+    if isinstance(method, Method) and not isinstance(method, Free):
+        chosen = method
+    elif isinstance(method, str) and method in METHODS:
+        chosen = METHODS[method]()
+    else:
+        names = ", ".join(map(repr, METHODS))
+        raise ValueError(
+            f"method is {method!r}; a scene with constraints takes 'auto' or {names}, or e.g. jd.Reduced(...)"
+        )
+    return chosen.fitted(scene, None) if isinstance(chosen, Reduced) else chosen
+
+
+def _error_of_place(scene: Scene, q, error) -> Array:
+    """Estimated error of q as a displacement (nv,)."""
+    return rate_to_velocity(scene.system, retract(scene.system, q), error["q"])
+
+
+def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
+    """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
+    return constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
+
+
+def serves(quality) -> Array:
+    """Whether a quality (see `Method.quality`) is far enough from zero, also for NaN."""
+    return jnp.abs(quality) > least_quality(quality.dtype)
+
+
+def start_limit(dtype) -> float:
+    """Largest residual (m, rad, m/s, rad/s) of a start that counts as rounding of the numbers that were given."""
+    return float(jnp.finfo(dtype).eps) ** 0.4
+
+
+def consistent(scene: Scene, q, v, t):
+    """Whether a state is on the constraints but for rounding."""
+    return jnp.max(lax.stop_gradient(residuals(scene, q, v, t))) <= start_limit(q.dtype)
+
+
+def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
+    """The method for a start with concrete numbers, which must be on the constraints and have some freedom.
+
+    **Raises:** ValueError that names the constraints and by how much they are violated, and the fix; for a basis that
+    does not serve at the start.
+    """
+    found, rank = start_evidence(scene, q, v, np.asarray(t, q.dtype))
+    limit = start_limit(q.dtype)
+    if float(np.max(found)) > limit:
+        raise ValueError(
+            f"q0, v0 are not on the constraints: {open_constraints(scene, q, v, t, limit)} (position residual "
+            f"{float(found[0]):.3g}, velocity residual {float(found[1]):.3g}); start from "
+            "state = jd.assemble(scene, q0, v0), with state.q and state.v"
+        )
+    if int(rank) == scene.nv:
+        names = ", ".join(repr(place.name) for place in layout(scene))
+        raise ValueError(
+            f"the constraints {names} remove all freedom: {int(rank)} independent rows for nv = {scene.nv}; "
+            "leave one out, or free a joint"
+        )
+    if not isinstance(method, Reduced):
+        return method
+    # Inside a jit, jax would trace operations on known numbers too.
+    with jax.ensure_compile_time_eval():
+        q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
+        method = method.fitted(scene, scene.nv - int(rank))
+        if method.basis is not None and not bool(_serves_at(scene, method.basis, q, t)):
+            raise ValueError(f"the basis does not serve at q0: {method.basis.advice(scene, q, t)}")
+    return method
+
+
+@eqx.filter_jit
+def _serves_at(scene, basis, q, t):
+    return serves(basis.at(scene, q, t).quality)

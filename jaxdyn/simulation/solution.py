@@ -1,0 +1,95 @@
+"""What a simulation gives back: the motion, how it ended, and in words what to do when it ended early."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.dynamics import RESULTS as RESULTS
+from jaxdyn.constraints.dynamics import Outcome
+from jaxdyn.model.printed import solution_lines
+from jaxdyn.simulation.solvers.choice import for_stiff, known_stiffness, unwrapped
+from jaxdyn.systems.scene import Scene
+
+
+def from_diffrax(result) -> Any:
+    """A code of diffrax as one of `RESULTS`, by its name."""
+    found: Any = RESULTS.successful
+    for name, code in diffrax.RESULTS._name_to_item.items():
+        found = RESULTS.where(result == code, getattr(RESULTS, name), found)
+    return found
+
+
+ADVICE = {
+    "max_steps_reached": "raise max_steps (now {max_steps}), loosen rtol and atol, or take an implicit solver if stiff",
+    "dt_min_reached": "the acceleration is NaN or grows without bound: look for a singular mass matrix (a joint that "
+    "moves no inertia) or a force or control that is not finite there; or constraints whose rows lose rank on the way, "
+    "which fixed steps pass (stepsize=0.01); or rtol and atol are below the rounding error",
+    "nonfinite_start": "give finite q0 and v0 and unit quaternions",
+    "unordered_times": "give times ts that increase from each to the next",
+    "bad_stepsize": "give a positive stepsize (s)",
+    "bad_tolerance": "give finite rtol and atol that are not negative",
+    "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+    "coarse_steps": "take a smaller stepsize, or None for steps that keep a tolerance; if stiff, solver=jd.Rodas5P(); beyond "
+    "some 1e5 steps, float64",
+    "coarse_start": "subtract whole turns from q0, use float64, or take fixed steps",
+    "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
+    "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
+    "method='projected' needs none",
+    "nonlinear_divergence": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+    "open_constraints": "take smaller steps (stepsize, or rtol and atol), or look for constraints that contradict each other "
+    "on the way",
+}
+
+
+class Solution(Outcome):
+    """A simulated motion; every row belongs to one save point. Rows not reached are NaN.
+
+    - `ts` (nt,) in s, as given; `q` (nt, nq); `v` (nt, nv), body-fixed.
+    - `result`, a `RESULTS` code; `success` tells whether the motion was computed to its end, by steps short enough; `solver`,
+      the name of the method that was used.
+    - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
+    - What `outputs` asked for, else None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
+      scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
+      (nt, nc); `constraint_residual` (nt, 2), the largest |phi| and |A v - b|; `poses`, one array
+      (nt, 4, 4) by name for each frame asked for as "pose:<frame>".
+    """
+
+    ts: Float[Array, " nt"]
+    q: Float[Array, "nt nq"]
+    v: Float[Array, "nt nv"]
+    result: Any
+    stats: dict[str, Array]
+    energy: Float[Array, " nt"] | None = None
+    power: Float[Array, " nt"] | None = None
+    work: Float[Array, " nt"] | None = None
+    acceleration: Float[Array, "nt nv"] | None = None
+    multipliers: Float[Array, "nt nc"] | None = None
+    constraint_residual: Float[Array, "nt 2"] | None = None
+    poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
+    solver: str = eqx.field(static=True, default="")
+
+    def __str__(self) -> str:
+        return solution_lines(self)
+
+
+def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
+    if bool(solution.success):
+        return
+    name = next(name for name in RESULTS._name_to_item if bool(solution.result == getattr(RESULTS, name)))
+    reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])
+    advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
+    if name == "max_steps_reached" and isinstance(unwrapped(options["solver"]), diffrax.AbstractERK):
+        last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
+        rates = known_stiffness(scene, solution.q[last], solution.v[last], solution.ts[last], control)
+        if rates is not None and for_stiff(rates, end - float(solution.ts[0])):
+            advice = (
+                f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
+                f"{float(rates.explicit_step):.3g} s; pass solver=jd.Rodas5P(), or raise max_steps (now {options['max_steps']})"
+            )
+    raise RuntimeError(
+        f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: {advice}. "
+        "With throw=False, what was reached is returned."
+    )

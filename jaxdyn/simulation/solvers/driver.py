@@ -1,0 +1,226 @@
+"""Explicit steps one after the other, as one loop around kernels: what diffrax does for them, in a program that compiles in
+a second.
+
+The rules are diffrax's: the step-size control is that of its `PIDController` with an integral part alone, and fixed steps are
+those of its `ConstantStepSize`. Lanes of a batch that have ended take steps of no length until the last one has ended.
+
+Where reverse mode comes through, the steps are taken again by diffrax, which remembers what it needs (see `differentiable`).
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jaxdyn.compile import any_in_batch, recompute_unless, run
+from jaxdyn.simulation.solvers.explicit import Plan, Step, bent_output, step_in_turn, whole_step
+from jaxdyn.simulation.solvers.first_step import first_step
+from jaxdyn.simulation.solvers.fixed_steps import no_sums, watched
+
+_SAFETY, _LEAST_FACTOR, _MOST_FACTOR = 0.9, 0.2, 10.0  # of diffrax's PIDController
+_ROUNDED = 100  # numbers before the end from which on a step goes to the end
+
+
+class Adaptive(NamedTuple):
+    """Steps that keep a tolerance: order of the error estimate, and the size of a scaled error."""
+
+    order: Any
+    size: Any
+
+
+class Fixed(NamedTuple):
+    """Steps of one length: orders of the method and of its error estimate."""
+
+    order: Any
+    error_order: Any
+
+
+class Driven(NamedTuple):
+    """Rows of the state at ts[1:], diffrax's result, counts, the time reached, and sums about fixed steps (`watched`)."""
+
+    rows: Array
+    result: Any
+    counts: dict[str, Array]
+    reached: Array
+    sums: tuple[Array, Array] | None
+
+
+class _Limits(NamedTuple):
+    """Numbers that do not change on the way: the ends of the run, from where on a step goes to the end, and what sets its
+    length."""
+
+    start: Array
+    end: Array
+    floor: Array
+    least_at_end: Array
+    steps: Array
+    rtol: Array
+    atol: Array
+    y0: Array
+
+
+class _Lane(NamedTuple):
+    """Where a run is: the next step goes from t to t_next, from the state y with the rate of change `rate`."""
+
+    t: Array
+    t_next: Array
+    y: Array
+    rate: Array
+    at_least: Array  # whether the step has the least length
+    taken: Array
+    kept: Array
+    failed: Array
+    sums: tuple[Array, Array]
+
+
+def drive(plan: Plan, how: Adaptive | Fixed, y0, args, ts, rtol, atol, stepsize, max_steps: int) -> Driven:
+    """The solution from ts[0] to ts[-1].
+
+    **Arguments:** `y0` (n,), flat; `stepsize` (s) for `Fixed`, else None; tolerances for `Adaptive`.
+    """
+    start, end, count = ts[0], ts[-1], ts.shape[0] - 1
+    eps, none = float(jnp.finfo(ts.dtype).eps), jnp.zeros((), jnp.int32)
+    floor = end - _ROUNDED * eps / 2 * jnp.abs(end)
+    rtol, atol = (jnp.zeros_like(start) if x is None else x for x in (rtol, atol))
+    begin: Any = partial(_begin, plan, how)
+    given = args, start, end, y0, rtol, atol
+    (rate, length), served = run(_begin, *given, static=(plan, how), calls=True, served=True)
+    rate, length = recompute_unless(served, begin, (rate, length), given)
+    steps = none
+    if not isinstance(how, Adaptive):
+        length = stepsize
+        steps = jnp.ceil((end - start) / jnp.nextafter(stepsize, jnp.inf)).astype(jnp.int32)
+    least_at_end = 16 * eps * jnp.maximum(jnp.abs(start), jnp.abs(end))
+    limits = _Limits(start, end, floor, least_at_end, steps, rtol, atol, y0)
+    no = jnp.asarray(False)
+    lane = _Lane(start, jnp.minimum(start + length, end), y0, rate, no, none, none, no, no_sums(plan.structure(y0)))
+    rows = jnp.broadcast_to(jnp.full_like(y0, jnp.inf), (count, y0.size))
+
+    def is_active(lane: _Lane):
+        return (lane.t < end) & ~lane.failed & (lane.taken < max_steps)
+
+    def body(carry):
+        lane, saved, rows = carry
+        after, kept, found = _advanced(plan, how, args, limits, lane, is_active(lane))
+        return after, *_save(plan, ts, lane, after, kept, found, saved, rows)
+
+    def unfinished(carry):
+        return any_in_batch(is_active(carry[0]))
+
+    lane, _, rows = lax.while_loop(unfinished, body, (lane, none, rows))
+    codes: Any = diffrax.RESULTS
+    result = codes.where(lane.t < end, codes.max_steps_reached, codes.successful)
+    result = codes.where(lane.failed, codes.dt_min_reached, result)
+    counts = {"num_steps": lane.taken, "num_accepted_steps": lane.kept, "num_rejected_steps": lane.taken - lane.kept}
+    return Driven(rows, result, counts, lane.t, None if isinstance(how, Adaptive) else lane.sums)
+
+
+def _advanced(plan: Plan, how, args, limits: _Limits, lane: _Lane, active) -> tuple[_Lane, Array, Step]:
+    """The lane after a step, whether that is kept, and the step; all of it one kernel where it is numbers."""
+    advance: Any = partial(run, _advance, args, limits, lane, active, static=(plan, how), calls=True, served=True)
+    found, served = advance(otherwise=lambda *_: None)
+
+    given = args, limits, lane, active
+    if found is None:
+        return _advance_in_turn(plan, how, *given)
+    served = served if served is True else served | ~active
+    return recompute_unless(served, partial(_advance_in_turn, plan, how), found, given)
+
+
+def _advance(plan: Plan, how, args, limits: _Limits, lane: _Lane, active):
+    step = whole_step(plan, args, lane.t, jnp.where(active, lane.t_next, lane.t), lane.y, lane.rate)
+    return *_accepted(plan, how, None, limits, lane, active, step), step
+
+
+def _advance_in_turn(plan: Plan, how, args, limits: _Limits, lane: _Lane, active):
+    """The same, one stage after the other."""
+    step = step_in_turn(plan, args, lane.t, jnp.where(active, lane.t_next, lane.t), lane.y, lane.rate)
+    return *_accepted(plan, how, None, limits, lane, active, step), step
+
+
+def _accepted(plan: Plan, how, _, limits: _Limits, lane: _Lane, active, step: Step) -> tuple[_Lane, Array]:
+    """The lane after a step that is kept or refused."""
+    t_next, end = jnp.where(active, lane.t_next, lane.t), limits.end
+    if isinstance(how, Adaptive):
+        kept, t, after, at_least, failed = _controlled(plan, how, limits, lane, t_next, step)
+        sums = lane.sums
+    else:
+        kept, t, at_least, failed = jnp.asarray(True), t_next, lane.at_least, jnp.asarray(False)
+        start, before, y, error = (plan.structure(x) for x in (limits.y0, lane.y, step.projected, step.error))
+        sums = watched(how.order, how.error_order, start, before, y, error, *lane.sums)
+        done = (lane.taken + 2).astype(end.dtype) / limits.steps.astype(end.dtype)
+        after = limits.start + (end - limits.start) * done
+        after = jnp.where((lane.taken + 2 >= limits.steps) | (after > limits.floor), end, after)
+    kept, one = kept & active, active.astype(jnp.int32)
+    lane = _Lane(
+        jnp.where(active, t, lane.t),
+        jnp.where(active, jnp.minimum(after, end), lane.t_next),
+        jnp.where(kept, step.projected, lane.y),
+        jnp.where(kept, step.rate, lane.rate),
+        at_least,
+        lane.taken + one,
+        lane.kept + kept.astype(jnp.int32),
+        lane.failed | (failed & active),
+        jax.tree.map(lambda new, old: jnp.where(active, new, old), sums, lane.sums),
+    )
+    return lane, kept
+
+
+def _save(plan: Plan, ts, before: _Lane, after: _Lane, kept, step: Step, saved, rows):
+    """How many save points have been passed, and their rows."""
+    count = ts.shape[0] - 1
+
+    def is_passed(saved):
+        return kept & (saved < count) & (ts[jnp.minimum(saved + 1, count)] <= after.t)
+
+    def body(carry):
+        saved, rows = carry
+        here, place = is_passed(saved), jnp.minimum(saved, count - 1)
+        at = ts[place + 1], before.t, after.t, before.y, step.raw, step.stages, step.shift
+        row = run(bent_output, None, *at, static=(plan,))
+        rows = rows.at[place].set(jnp.where(here, row, rows[place]))
+        return saved + here.astype(jnp.int32), rows
+
+    return lax.while_loop(lambda carry: any_in_batch(is_passed(carry[0])), body, (saved, rows))
+
+
+def _begin(plan: Plan, how, args, t0, t1, y, rtol, atol):
+    """The rate of change at the start, if steps pass it on, and the length of the first adaptive step."""
+    rate = plan.field_of(args, t0, y) if plan.passes_rate_on else jnp.zeros_like(y)
+    if not isinstance(how, Adaptive):
+        return rate, t1 - t0
+    term = diffrax.ODETerm(plan.field)
+    length = first_step(term, t0, t1, plan.structure(y), args, how.order, rtol, atol, how.size)
+    return rate, jnp.where(jnp.isfinite(length), length, t1 - t0)
+
+
+def _controlled(plan: Plan, how: Adaptive, limits: _Limits, lane: _Lane, t1, step: Step):
+    """Whether a step is kept, where the next one begins and ends, whether it has the least length, and whether that is too
+    long."""
+    t0, end = lane.t, limits.end
+    before, after = plan.structure(lane.y), plan.structure(step.projected)
+
+    def scaled(y0, y1, error):
+        y1 = jnp.where(jnp.isnan(y1).any(), y0, y1)
+        return error / (limits.atol + limits.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1)))
+
+    size = how.size(jax.tree.map(scaled, before, after, plan.structure(step.error)))
+    kept = (size < 1) | lane.at_least
+    factor = _SAFETY * (1 / size) ** (1 / how.order)
+    factor = jnp.where(jnp.isnan(factor), _LEAST_FACTOR, factor)
+    factor = jnp.clip(factor, jnp.where(kept, 1.0, _LEAST_FACTOR), jnp.where(kept, _MOST_FACTOR, _SAFETY))
+    length = (t1 - t0) * factor.astype(t0.dtype)
+    eps = float(jnp.finfo(t0.dtype).eps)
+    least = jnp.clip(16 * eps * jnp.abs(t0), eps * limits.least_at_end, limits.least_at_end)
+    failed = length < least
+    length = jnp.where(lane.at_least & (factor == 1), least, length)
+    at_least, length = length <= least, jnp.maximum(length, least)
+    t = jnp.where(kept, t1, t0)
+    following = t + length
+    clipped = jnp.where(kept, end, t + 0.5 * (end - t))
+    following = jnp.where(following > limits.floor, clipped, following)
+    return kept, jnp.minimum(t, end), following, at_least, failed

@@ -1,0 +1,132 @@
+"""How stiff a scene is: the rates of its linearised motion."""
+
+import functools
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import compiled, is_known
+from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_state
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.mass_factor import solve_positive
+from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
+from jaxdyn.systems.system import displace
+
+# A step of an undamped oscillation may grow it by this much: explicit methods of order 8 do so at any length, if by little.
+_GROWTH = 1e-3
+
+
+class Stiffness(NamedTuple):
+    """Rates of a linearised motion, and what they demand of explicit steps.
+
+    - `decay`, 1/s: the fastest at which anything dies out; `frequency`, rad/s: the fastest at which anything oscillates.
+    - `explicit_step`, s: length above which steps of Dopri8 are unstable, whatever the tolerance: an eigenvalue times the step is
+      outside of the region where a step grows what it should not by less than 1e-3. Infinite where nothing moves by itself.
+      Other explicit methods are unstable earlier: RK4 from 0.54 of it on, Dopri5 and Tsit5 from 0.64 (decay) and 0.34
+      (oscillation).
+    """
+
+    decay: Float[Array, "..."]
+    frequency: Float[Array, "..."]
+    explicit_step: Float[Array, "..."]
+
+
+@functools.cache
+def _stable_radii() -> tuple[np.ndarray, np.ndarray]:
+    """Angles from the negative real axis to the imaginary one, and how far Dopri8 is stable along each.
+
+    Source: Hairer & Wanner 1996, section IV.2.
+    """
+    tableau: Any = diffrax.Dopri8.tableau
+    A = np.zeros((tableau.num_stages,) * 2)
+    for i, row in enumerate(tableau.a_lower):
+        A[i + 1, : i + 1] = row
+    # R(z) = 1 + z b^T (1 - z A)^-1 1, a polynomial as A is nilpotent.
+    coefficients, power = [1.0], np.ones(len(A))
+    for _ in range(len(A)):
+        coefficients.append(float(np.asarray(tableau.b_sol) @ power))
+        power = A @ power
+    angles, radii = np.linspace(0.0, np.pi / 2, 91), np.linspace(1e-3, 6.0, 6000)
+    growth = np.abs(np.polyval(coefficients[::-1], -radii * np.exp(1j * angles[:, None])))
+    return angles, radii[np.argmax(growth > 1 + _GROWTH, axis=1)]
+
+
+def _longest_step(values) -> Array:
+    """Of Dopri8, for the eigenvalues of a motion; what grows by itself counts as an oscillation."""
+    size = jnp.abs(values)
+    angles = jnp.arctan2(jnp.abs(values.imag), jnp.maximum(-values.real, 0.0))
+    stable = jnp.interp(angles, *(jnp.asarray(x, size.dtype) for x in _stable_radii()))
+    rest = size <= 0
+    return jnp.min(jnp.where(rest, jnp.inf, stable / jnp.where(rest, jnp.ones_like(size), size)), initial=jnp.inf)
+
+
+def stiffness(scene: Any, q: Any, v: Any, t: Any = 0.0, control: Any = None) -> Stiffness:
+    """Fastest rates of the motion M da + D dv + K dq = 0 near a state, D = -df/dv and K = -df/dq.
+
+    f is the sum of the scene's forces, of `control(q, v, t)` and, for a system that is not a `Model`, of -dV/dq. What
+    velocity does through inertia and the gravity of a `Model` are left out, as neither makes a motion stiff. dq is along the
+    manifold. On constraints da, dv and dq are projected on their tangent space in the mass metric; the change of the rows
+    along dq is left out.
+
+    **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `v` (nv,); `t`, s.
+
+    **Raises:** ValueError for wrong shapes, and where forces or masses are not finite (NaN where numbers are traced).
+
+    **Returns:** `Stiffness`, from the eigenvalues of [[0, 1], [-M^-1 K, -M^-1 D]]. An explicit method needs steps below
+    `explicit_step`; where the motion itself would allow much longer ones, it is stiff.
+
+    Source: Hairer & Wanner 1996, section IV.2.
+
+    ```python
+    rates = jd.stiffness(jd.Scene(model, forces=(jd.JointDamping(1e3),)), q, v)
+    ```
+    """
+    scene = as_scene(scene)
+    control = None if control is None else as_pytree(control, "control")
+    q, v, t = check_state(scene.system, q=q, v=v, t=t)
+    matrix = _linearised(scene, q, v, t, control)
+    if is_known(matrix):
+        # LAPACK by numpy, which compiles nothing.
+        known = np.asarray(matrix, float)
+        if not np.isfinite(known).all():
+            raise ValueError(f"forces or masses are not finite at q = {q}, v = {v}, t = {t}; look at another state")
+        values = np.linalg.eigvals(known)
+    else:
+        values = jnp.linalg.eigvals(matrix)
+    fastest = (jnp.max(jnp.asarray(x), initial=0.0) for x in (-values.real, values.imag))
+    return Stiffness(*(x.astype(q.dtype) for x in (*fastest, _longest_step(jnp.asarray(values)))))
+
+
+@compiled
+def _linearised(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
+    """The matrix (2 nv, 2 nv) of d(dq, dv)/dt."""
+    system, n = scene.system, scene.nv
+    if n == 0:
+        return jnp.zeros((0, 0), q.dtype)
+
+    def force(dq, dv):
+        at, speed = displace(system, q, dq), v + dv
+        total = scene.applied_force(at, speed, t)
+        total = jnp.zeros_like(v) if total is None else total
+        if not isinstance(system, Model):
+            total = total - gravity_force(system, at, t)
+        return total if control is None else total + checked_force(control(at, speed, t), q, n, "control")
+
+    mass = mass_matrix(system, q, t)
+    unit = jnp.eye(n, dtype=mass.dtype)
+    if scene.constraints:
+        bare = Scene(system, scene.constraints)
+        inverse = jax.jacfwd(lambda f: constrained_dynamics(bare, q, v, f, t).acceleration)(jnp.zeros_like(v))
+        tangent = _product(inverse, mass)
+    else:
+        inverse, tangent = solve_positive(mass, unit), unit
+    by_place, by_speed = jax.jacfwd(force, (0, 1))(jnp.zeros_like(v), jnp.zeros_like(v))
+    pull = _product(inverse, jnp.concatenate([_product(by_place, tangent), _product(by_speed, tangent)], 1))
+    return jnp.concatenate([jnp.concatenate([jnp.zeros_like(tangent), tangent], 1), pull])

@@ -1,0 +1,255 @@
+"""Variational steps on the joints' groups: the discrete principle of d'Alembert, solved for one step after another.
+
+A step of length h goes from q0 along one constant velocity xi through the midpoint q = q0 exp(x), x = h xi/2, to
+q1 = q0 exp(h xi). For the discrete Lagrangian h L(q, xi), with forces f at the midpoint and constraint forces at the
+ends, the discrete Euler-Lagrange equations in left-trivialised momenta p = dL/dv are
+
+    2 dL/dxi = J^T (p0+ + a + c),   p0+ = p0 + A(q0)^T lam0,   a = Ad^T p0+,   c = h (dL/dq + f)
+    p1 = Ad^T (a + c) + A(q1)^T lam1,   J the left Jacobian of exp at x, Ad the adjoint of exp(x).
+
+lam0 is such that phi(q1, t1) = 0 and, for rows on velocities, A xi = b at the midpoint; lam1 such that the velocity v1 of
+p1 satisfies A v1 = b. On coordinates J and Ad are 1: this is the implicit midpoint rule, and with lam that of RATTLE.
+The map (q0, p0) -> (q1, p1) is its own inverse with -h. Without forces and rows on velocities it is symplectic and keeps
+the momenta of symmetries.
+
+Sources: Marsden & West (2001), Discrete mechanics and variational integrators, sections 1.3, 3.2, 3.5; Hairer, Lubich &
+Wanner (2006), Geometric Numerical Integration, sections VI.6, VII.1.4; Cortes & Martinez (2001), Non-holonomic
+integrators; McLachlan & Perlmutter (2006), Integrators for nonholonomic mechanical systems; Lee, Liu, Park & Srinivasa
+(2016), A linear-time variational integrator for multibody systems.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxdyn.constraints.base import (
+    constraint_jacobian,
+    holonomic_rows,
+    layout,
+    position_residual,
+    slip_rows,
+    velocity_residual,
+)
+from jaxdyn.constraints.dynamics import correction
+from jaxdyn.dynamics.kinematics import body_twists, sum_to_coordinates, take, tree_frame
+from jaxdyn.dynamics.quantities import bias_force, mass_matrix
+from jaxdyn.dynamics.world_frame import momentum, tree_inertias
+from jaxdyn.lie import se2, se3, so3
+from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.mass_factor import solve_positive
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displace
+
+_GROUPS: dict[str, Any] = {"planar": se2, "spherical": so3, "free": se3}
+_MOST_JACOBIANS = 8
+_MOST_REPEATS = 6
+_CONTRACTION = 0.3
+
+
+class Carried(NamedTuple):
+    """What a step hands to the next one beside (q, v).
+
+    - `momentum` (nv,), but for the last A^T lam1, which changes nothing; `mean` (nv,), the velocity xi of the last step.
+    - `A` (nc, nv) of the rows, and `spare` (nc, nc), the projection on the combinations of them that vanish; or None.
+    """
+
+    momentum: Float[Array, " nv"]
+    mean: Float[Array, " nv"]
+    A: Float[Array, "nc nv"] | None
+    spare: Float[Array, "nc nc"] | None
+
+
+class Step(NamedTuple):
+    """State (q, v) at the end of a step, what is carried on, the force f at the midpoint, and whether it was solved."""
+
+    q: Float[Array, " nq"]
+    v: Float[Array, " nv"]
+    carried: Carried
+    force: Float[Array, " nv"] | None
+    solved: Bool[Array, ""]
+
+
+def begin(scene: Scene, q, v, t, rank_tol: float | None) -> Carried:
+    """What the first step takes, for a state on the constraints."""
+    A, _, spare = _rows(scene, q, t, rank_tol)
+    return Carried(_slopes(scene.system, q, v, t)[0], v, A, spare)
+
+
+def step(scene: Scene, q, v, carried: Carried, t0, t1, effort: Callable, rank_tol: float | None) -> Step:
+    """One step from t0 to t1.
+
+    `effort(q, v, t)` (nv,) is tau plus the scene's forces, or None. `v` only serves to guess the next velocity.
+    Derivatives are those of the solved equations, by the implicit function theorem.
+    """
+    system, n = scene.system, scene.nv
+    h, middle = t1 - t0, 0.5 * (t0 + t1)
+    A = carried.A
+    held, slipping = holonomic_rows(layout(scene)), slip_rows(layout(scene))
+
+    def halfway(xi):
+        return displace(system, q, 0.5 * h * xi)
+
+    def balance(z):
+        """2 dL/dxi - J^T (p0+ + a + c), and Ad^T (a + c)."""
+        xi, x = z[:n], 0.5 * h * z[:n]
+        own, push = _slopes(system, halfway(xi), xi, middle)
+        force = effort(halfway(xi), xi, middle)
+        push = h * (push if force is None else push + force)
+        left = carried.momentum if A is None else carried.momentum + _product(A.T, z[n:])
+        arrived = _turned(system, x, left)
+        return 2 * own - _gathered(system, x, left + arrived + push), _turned(system, x, arrived + push)
+
+    def conditions(z):
+        xi, moved = z[:n], balance(z)[0]
+        if A is None:
+            return moved
+        opened = jnp.zeros_like(z[n:])
+        if held.size:
+            opened = opened.at[held].set(position_residual(scene, displace(system, q, h * xi), t1) / h)
+        if slipping.size:
+            opened = opened.at[slipping].set(velocity_residual(scene, halfway(xi), xi, middle)[slipping])
+        return jnp.concatenate([moved, opened])
+
+    def slope(function, z):
+        """Jacobian. What rows that depend on each other leave undetermined is set to zero by `spare`."""
+        matrix = jax.jacfwd(function)(z)
+        return matrix if carried.spare is None else matrix.at[n:, n:].add(carried.spare)
+
+    def solve_linear(linear, right):
+        return jnp.linalg.solve(slope(linear, jnp.zeros_like(right)), right)
+
+    guess = lax.stop_gradient(2 * v - carried.mean)
+    if A is not None:
+        guess = jnp.concatenate([guess, jnp.zeros((A.shape[0],), q.dtype)])
+    z, change = lax.custom_root(
+        conditions, guess, lambda f, z: _newton(f, lambda z: slope(f, z), z, n), solve_linear, has_aux=True
+    )
+    xi = z[:n]
+    # Rounding of positions, of size q, is one of velocities, of size q/h.
+    size = jnp.max(jnp.abs(xi)) + jnp.max(jnp.abs(q)) / jnp.abs(h)
+    solved = change <= float(jnp.finfo(q.dtype).eps) ** 0.75 * size
+    end, last = displace(system, q, h * xi), balance(z)[1]
+    velocity = _velocity(system, end, last, t1)
+    rows, right_inverse, spare = _rows(scene, end, t1, rank_tol)
+    if right_inverse is not None:
+        for _ in range(2):
+            velocity = velocity - _product(right_inverse, velocity_residual(scene, end, velocity, t1))
+    return Step(end, velocity, Carried(last, xi, rows, spare), effort(halfway(xi), xi, middle), solved)
+
+
+def _newton(function, slope, z, n: int):
+    """Root of `function`, and the last change of its first n entries.
+
+    A Jacobian serves as long as the changes shrink well, to rounding; where they do not, a new one is taken.
+    """
+    eps = float(jnp.finfo(z.dtype).eps)
+
+    def size(z):
+        return jnp.max(jnp.abs(z[:n]))
+
+    def repeats(state):
+        z, change, before, count = state
+        # The next change is estimated by the ratio of the last two.
+        far = change * jnp.minimum(change / before, 1.0) > eps * size(z)
+        return (count == 0) | (far & (change < _CONTRACTION * before) & (count < _MOST_REPEATS))
+
+    def renew(state):
+        z, _, before, count = state
+        inverse = jnp.linalg.inv(slope(z))
+
+        def repeat(state):
+            z, change, _, count = state
+            move = -_product(inverse, function(z))
+            return z + move, size(move), change, count + 1
+
+        z, change, before, _ = lax.while_loop(repeats, repeat, (z, before, before, 0))
+        return z, change, before, count + 1
+
+    def unfinished(state):
+        z, change, _, count = state
+        return (change > eps**0.75 * size(z)) & (count < _MOST_JACOBIANS)
+
+    unknown = jnp.asarray(jnp.inf, z.dtype)
+    z, change, _, _ = lax.while_loop(unfinished, renew, (z, unknown, unknown, 0))
+    return z, change
+
+
+def _slopes(system, q, v, t):
+    """Momentum dL/dv (nv,), and dL/dq (nv,) along the velocity coordinates."""
+    if isinstance(system, Model):
+        return _tree_slopes(system, q, v)
+    if isinstance(system, LagrangianSystem):
+        pull, momentum = jax.grad(system.value, argnums=(0, 1))(q, v, t)
+        return momentum, pull
+    # M and h are all there is: dL/dq is what makes M a + h of the Euler-Lagrange equations.
+    p, rate = jax.jvp(lambda q, t: _product(mass_matrix(system, q, t), v), (q, t), (v, jnp.ones_like(t)))
+    return p, rate - bias_force(system, q, v, t)
+
+
+def _tree_slopes(model: Model, q, v):
+    """p_k = S_k . H_k and dL/dq_k = ad_V(S_k) . H_k + S_k . W_k, in the tree frame.
+
+    H_k and W_k are momentum and weight of all bodies that coordinate k moves, V the twist of the body that carries its
+    joint: a displacement along S_k turns these bodies as one, and leaves V as it is.
+    """
+    topology = model.topology
+    frame = tree_frame(model, q)
+    inertias = tree_inertias(model, frame)
+    twists = body_twists(model, frame, v)
+    wrenches = [jax.vmap(momentum)(inertias, twists)]
+    if model.gravity is not None:
+        g = jnp.broadcast_to(model.gravity.astype(q.dtype)[None], (topology.nb, 3))
+        wrenches += [inertias[:, :1] * g, jax.vmap(cross)(inertias[:, 1:4], g)]
+    moved = sum_to_coordinates(model, jnp.concatenate(wrenches, axis=1))
+    carrier = np.array(topology.parents)[topology.dof_body]
+    still = jnp.zeros((1, 6), q.dtype)
+    bent = jax.vmap(se3.ad_apply)(take(jnp.concatenate([twists, still]), carrier % (topology.nb + 1)), frame.subspace)
+    p, pull = (jnp.sum(rows * moved[:, :6], axis=1) for rows in (frame.subspace, bent))
+    if model.gravity is not None:
+        pull = pull + jnp.sum(frame.subspace * moved[:, 6:], axis=1)
+    return p if model.armature is None else p + model.armature * v, pull
+
+
+def _velocity(system, q, p, t):
+    """v (nv,) of the momentum dL/dv = p."""
+    if isinstance(system, LagrangianSystem):  # L may have terms linear in v
+        p = p - _slopes(system, q, jnp.zeros_like(p), t)[0]
+    return solve_positive(mass_matrix(system, q, t), p)
+
+
+def _turned(system, x, p):
+    """Ad_exp(x)^T p (nv,), joint by joint."""
+    return _by_joint(system, x, p, lambda group, x, p: _product(p, group.Ad(group.exp(x))))
+
+
+def _gathered(system, x, p):
+    """J(x)^T p (nv,), J the left Jacobian of exp, joint by joint."""
+    return _by_joint(system, x, p, lambda group, x, p: _product(p, group.left_jacobian(x)))
+
+
+def _by_joint(system, x, p, function):
+    """`function(group, x, p)` for joints that move on a group; p of the others, whose coordinates commute."""
+    if not isinstance(system, Model) or set(system.topology.kinds) <= set(SCREW_KINDS):
+        return p
+    parts = []
+    for kind, place in zip(system.topology.kinds, system.topology.v_slices, strict=True):
+        parts.append(p[place] if kind in SCREW_KINDS else function(_GROUPS[kind], x[place], p[place]))
+    return jnp.concatenate(parts)
+
+
+def _rows(scene: Scene, q, t, rank_tol):
+    """A, its right inverse in the metric M(q), and what is left of 1 - A A^-1: the rows' dependencies."""
+    if not scene.constraints:
+        return None, None, None
+    A = constraint_jacobian(scene, q, t)
+    right_inverse = correction(scene, q, t, rank_tol, holonomic=False)
+    spare = jnp.eye(A.shape[0], dtype=A.dtype) - _product(A, right_inverse)
+    return A, right_inverse, lax.stop_gradient(spare)

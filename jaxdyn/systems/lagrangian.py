@@ -1,0 +1,147 @@
+"""Systems given by their Lagrangian: everything comes from L by automatic differentiation."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.compile import is_known
+from jaxdyn.systems.scene import as_pytree
+from jaxdyn.systems.start import check_mass_matrix, place_of
+from jaxdyn.systems.system import System, as_parameter, called, checked_size
+
+
+class LagrangianSystem(System):
+    """A system given by its Lagrangian: d/dt dL/dv - dL/dq = tau.
+
+    M = d2L/dv2 and h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq come from automatic differentiation, the first rate as one
+    derivative along the motion, so L may hold any coordinates, gyroscopic terms and time. L is quadratic in v. The
+    potential energy is -L(q, 0); the kinetic energy is what the Jacobi integral v . dL/dv - L adds to it, so for
+    L = T - V they are T and V.
+
+    **Arguments:**
+
+    - `lagrangian`: L(q, v) -> () in J, or L(q, v, t, parameters) when parameters are given. A plain function is static:
+      define it once.
+    - `nq`: number of coordinates.
+    - `parameters`: any pytree of numbers; its leaves can be differentiated and batched.
+    - `potential`: V(q) -> () in J, or V(q, t, parameters), when it is split off: the Lagrangian of the system is then
+      lagrangian - V, `lagrangian` has to vanish at v = 0, and V is differentiated once instead of with the rest.
+
+    **Raises:** ValueError for an nq that is no positive integer, a lagrangian that cannot be called, and (when used) a
+    Lagrangian that does not return one number. Before a motion from concrete numbers is computed (`forward_dynamics`,
+    `simulate`): for a Lagrangian that is not finite there, reads coordinates beyond nq, is not quadratic in v, or is
+    degenerate (M not positive definite; its rank is named).
+
+    Source: EQUATIONS sections 0 and 1.
+
+    ```python
+    pendulum = jd.LagrangianSystem(lambda q, v: 0.5 * v[0] ** 2 + 9.81 * jnp.cos(q[0]), 1)
+    ```
+    """
+
+    lagrangian: Callable
+    nq: int = eqx.field(static=True)
+    parameters: Any = None
+    potential: Callable | None = None
+
+    def __init__(self, lagrangian, nq, *, parameters=None, potential=None):
+        self.lagrangian = as_pytree(lagrangian, "lagrangian")
+        self.potential = None if potential is None else as_pytree(potential, "potential")
+        self.nq = checked_size(nq)
+        self.parameters = jax.tree.map(as_parameter, parameters)
+
+    def value(self, q, v, t):
+        """L(q, v, t), (), J; less the potential that is split off."""
+        value = self._moving(q, v, t)
+        return value if self.potential is None else value - self._held(q, t)
+
+    def _moving(self, q, v, t):
+        return called(self.lagrangian, (), "lagrangian", (q, v), t, self.parameters)
+
+    def _held(self, q, t):
+        return called(self.potential, (), "potential", (q,), t, self.parameters)
+
+    def _momentum(self, q, v, t):
+        return jax.grad(self._moving, argnums=1)(q, v, t)
+
+    def mass_matrix(self, q, t):
+        """M = d2L/dv2 at v = 0, (nv, nv)."""
+        return jax.jacfwd(self._momentum, argnums=1)(q, jnp.zeros_like(q), t)
+
+    def bias_force(self, q, v, t):
+        """h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq, (nv,)."""
+        if self.parameters is None:  # then L knows no time
+            _, rate = jax.jvp(lambda q: self._momentum(q, v, t), (q,), (v,))
+        else:
+            _, rate = jax.jvp(lambda q, t: self._momentum(q, v, t), (q, t), (v, jnp.ones_like(t)))
+        force = rate - jax.grad(self._moving)(q, v, t)
+        return force if self.potential is None else force + jax.grad(self._held)(q, t)
+
+    def gravity_force(self, q, t):
+        """dV/dq where the potential is split off, else the bias force at rest, (nv,)."""
+        return super().gravity_force(q, t) if self.potential is None else jax.grad(self._held)(q, t)
+
+    def coriolis_matrix(self, q, v, t):
+        """C with C v = h - h(v = 0), (nv, nv): that of the Christoffel symbols, plus the matrix of terms linear in v.
+
+        The latter is skew where M does not depend on t: gyroscopic forces of terms of L linear in v.
+        """
+        # h is of second degree in v: half of its slope is the symbols' matrix plus half of the linear terms'.
+        slope = jax.jacfwd(self.bias_force, argnums=1)
+        return 0.5 * (slope(q, v, t) + slope(q, jnp.zeros_like(v), t))
+
+    def kinetic_energy(self, q, v, t):
+        """v . dL/dv - L(q, v) + L(q, 0), (), J."""
+        energy = jnp.sum(v * self._momentum(q, v, t)) - self._moving(q, v, t)
+        return energy if self.potential is not None else energy + self._moving(q, jnp.zeros_like(v), t)
+
+    def potential_energy(self, q, t):
+        """-L(q, 0), or V as split off, (), J."""
+        return -self._moving(q, jnp.zeros_like(q), t) if self.potential is None else self._held(q, t)
+
+    def check_start(self, q, v, t) -> None:
+        """As for any system; also that L is finite, fits nq, and is quadratic in v."""
+        if not is_known(self, q, v, t):
+            return
+        place = place_of(q, t, v)
+        self._check_coordinates(q, v, t)
+        value, rest, mass, moved = (np.asarray(x, float) for x in _probe_compiled(self, q, v, t))
+        if not np.isfinite(value):
+            raise ValueError(f"lagrangian is {value} at {place}; start where it is finite, or write it without a pole")
+        if self.potential is not None and abs(rest) > 1e-6 * (abs(value) + np.abs(mass).max()):
+            raise ValueError(
+                f"lagrangian is {rest:.6g} at rest at {place}, but with potential= it has to vanish there; move what "
+                "does not depend on v into potential"
+            )
+        check_mass_matrix(mass, "LagrangianSystem", q, t)
+        if not np.abs(moved - mass).max() <= 1e-3 * np.abs(mass).max():
+            raise ValueError(
+                f"lagrangian is not quadratic in v at {place}: d2L/dv2 is {mass.tolist()} at v = 0 and "
+                f"{moved.tolist()} at v + 1; give the equations of motion as a jd.ExplicitSystem"
+            )
+
+    def _check_coordinates(self, q, v, t):
+        # jax clamps an index that is too large; numpy refuses it.
+        state = [np.asarray(x) for x in (q, v)]
+        given = state if self.parameters is None else [*state, t, self.parameters]
+        try:
+            with np.errstate(all="ignore"):
+                jax.eval_shape(lambda: self.lagrangian(*given))
+        except (IndexError, ValueError) as error:
+            raise ValueError(f"lagrangian does not fit nq = {self.nq}: {error}; pass the number it reads") from error
+        except (TypeError, AttributeError):
+            return  # it needs arrays of jax (`.at`, or their dtypes), and this cannot be told
+
+
+def _probe(system: LagrangianSystem, q, v, t):
+    """L, L without the potential at rest, and d2L/dv2 at v = 0 and at v + 1."""
+    hessian = jax.jacfwd(system._momentum, argnums=1)
+    zero = jnp.zeros_like(v)
+    return system.value(q, v, t), system._moving(q, zero, t), hessian(q, zero, t), hessian(q, v + 1, t)
+
+
+_probe_compiled = eqx.filter_jit(_probe)

@@ -1,0 +1,269 @@
+"""Systems beside `Model`: what every one of them offers, and those given by a metric or by their equations of motion.
+
+All have as many velocities as coordinates, v = dq/dt. They are taken wherever a `Model` is taken that needs no bodies:
+`mass_matrix`, `bias_force`, `forward_dynamics`, energies, constraints, `simulate`. Generalised forces are the components
+of one-forms in these coordinates: what acts on dq by tau . dq. Those of a scene are its forces.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import is_known, run
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import batch_hint
+from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, normalize
+from jaxdyn.systems.mass_factor import solve_positive
+from jaxdyn.systems.scene import as_pytree
+from jaxdyn.systems.start import check_mass_matrix
+
+
+class System(eqx.Module):
+    """What the dynamics need of a system in coordinates with v = dq/dt: M(q, t) and h(q, v, t)."""
+
+    nq: eqx.AbstractVar[int]
+
+    @property
+    def nv(self) -> int:
+        """Number of velocity coordinates, equal to nq."""
+        return self.nq
+
+    @abc.abstractmethod
+    def mass_matrix(self, q, t) -> Array:
+        """M(q, t), (nv, nv), symmetric."""
+
+    @abc.abstractmethod
+    def bias_force(self, q, v, t) -> Array:
+        """h(q, v, t) in M a + h = tau, (nv,)."""
+
+    @abc.abstractmethod
+    def kinetic_energy(self, q, v, t) -> Array:
+        """Kinetic energy, (), J."""
+
+    @abc.abstractmethod
+    def potential_energy(self, q, t) -> Array:
+        """Potential energy, (), J."""
+
+    def gravity_force(self, q, t):
+        """Bias force at rest, (nv,)."""
+        return self.bias_force(q, jnp.zeros_like(q), t)
+
+    def christoffel_symbols(self, q, t):
+        """Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i), of the first kind, (nv, nv, nv)."""
+        return symbols(jax.jacfwd(self.mass_matrix)(q, t))
+
+    def coriolis_matrix(self, q, v, t):
+        """C_ij = sum_k Gamma_ijk v_k with the Christoffel symbols of M, (nv, nv): dM/dt = C + C^T for constant t."""
+        derivative = jax.jacfwd(self.mass_matrix)(q, t)
+        rate = jnp.einsum("ijk,k->ij", derivative, v)
+        turned = jnp.einsum("ikj,k->ij", derivative, v)
+        return 0.5 * (rate + turned - turned.T)
+
+    def inverse_dynamics(self, q, v, a, t):
+        """M a + h, (nv,)."""
+        return _product(self.mass_matrix(q, t), a) + self.bias_force(q, v, t)
+
+    def forward_dynamics(self, q, v, tau, t):
+        """M^-1 (tau - h), (nv,)."""
+        return run(_acceleration, self, q, v, tau, t, otherwise=_acceleration)
+
+    def check_start(self, q, v, t) -> None:
+        """Refuse a state from which no motion can be computed. Nothing is done where a number is traced.
+
+        **Raises:** ValueError for a mass matrix that is not finite or not positive definite, with its rank.
+        """
+        if is_known(self, q, v, t):
+            check_mass_matrix(_mass_matrix_compiled(self, q, t), type(self).__name__, q, t)
+
+
+def _acceleration(system: System, q, v, tau, t):
+    return solve_positive(system.mass_matrix(q, t), tau - system.bias_force(q, v, t))
+
+
+class MetricSystem(System):
+    """A system given by a metric and a potential: L = 1/2 v . M(q) v - V(q). Without a potential it moves on geodesics.
+
+    h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq takes one derivative along the motion and one gradient: neither the Christoffel
+    symbols nor second derivatives are formed.
+
+    **Arguments:**
+
+    - `metric`: M(q) -> (nq, nq), symmetric positive definite; or M(q, t, parameters) when parameters are given.
+    - `nq`: number of coordinates.
+    - `potential`: V(q) -> () in J, or V(q, t, parameters); None for none.
+    - `parameters`: any pytree of numbers; its leaves can be differentiated and batched.
+
+    **Raises:** ValueError for an nq that is no positive integer, functions that cannot be called, and (when used) for
+    results of a wrong shape.
+
+    Source: EQUATIONS section 12.
+
+    ```python
+    sphere = jd.MetricSystem(lambda q: jnp.diag(jnp.stack([jnp.ones(()), jnp.sin(q[0]) ** 2])), 2)
+    ```
+    """
+
+    metric: Callable
+    nq: int = eqx.field(static=True)
+    potential: Callable | None = None
+    parameters: Any = None
+
+    def __init__(self, metric, nq, *, potential=None, parameters=None):
+        self.metric = as_pytree(metric, "metric")
+        self.potential = None if potential is None else as_pytree(potential, "potential")
+        self.nq = checked_size(nq)
+        self.parameters = jax.tree.map(as_parameter, parameters)
+
+    def mass_matrix(self, q, t):
+        """M as given, (nv, nv)."""
+        return called(self.metric, (self.nq, self.nq), "metric", (q,), t, self.parameters)
+
+    def bias_force(self, q, v, t):
+        """h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq, (nv,)."""
+
+        def momentum(q, t):
+            return _product(self.mass_matrix(q, t), v)
+
+        _, rate = jax.jvp(momentum, (q, t), (v, jnp.ones_like(t)))
+        _, pull = jax.vjp(lambda q: momentum(q, t), q)
+        force = rate - 0.5 * pull(v)[0]
+        return force if self.potential is None else force + self.gravity_force(q, t)
+
+    def gravity_force(self, q, t):
+        """dV/dq, (nv,)."""
+        return jnp.zeros_like(q) if self.potential is None else jax.grad(self.potential_energy)(q, t)
+
+    def kinetic_energy(self, q, v, t):
+        """v . M v / 2, (), J."""
+        return 0.5 * jnp.sum(v * _product(self.mass_matrix(q, t), v))
+
+    def potential_energy(self, q, t):
+        """V as given, (), J; zero when there is none."""
+        if self.potential is None:
+            return jnp.zeros((), q.dtype)
+        return called(self.potential, (), "potential", (q,), t, self.parameters)
+
+
+class ExplicitSystem(System):
+    """A system given by its equations of motion: M(q) a + h(q, v) = tau.
+
+    **Arguments:**
+
+    - `mass_matrix`: M(q) -> (nq, nq), symmetric positive definite; or M(q, t, parameters) when parameters are given.
+    - `bias_force`: h(q, v) -> (nq,); or h(q, v, t, parameters).
+    - `nq`: number of coordinates.
+    - `parameters`: any pytree of numbers; its leaves can be differentiated and batched.
+    - `potential`: V(q) -> () in J, or V(q, t, parameters), for energies; None when there is none to report.
+
+    **Raises:** ValueError for an nq that is no positive integer, functions that cannot be called, and (when used) for
+    results of a wrong shape or a potential energy that was not given.
+    """
+
+    _mass_matrix: Callable
+    _bias_force: Callable
+    nq: int = eqx.field(static=True)
+    parameters: Any = None
+    _potential: Callable | None = None
+
+    def __init__(self, mass_matrix, bias_force, nq, *, parameters=None, potential=None):
+        self._mass_matrix = as_pytree(mass_matrix, "mass_matrix")
+        self._bias_force = as_pytree(bias_force, "bias_force")
+        self._potential = None if potential is None else as_pytree(potential, "potential")
+        self.nq = checked_size(nq)
+        self.parameters = jax.tree.map(as_parameter, parameters)
+
+    def mass_matrix(self, q, t):
+        """M as given, (nv, nv)."""
+        return called(self._mass_matrix, (self.nq, self.nq), "mass_matrix", (q,), t, self.parameters)
+
+    def bias_force(self, q, v, t):
+        """h as given, (nv,)."""
+        return called(self._bias_force, (self.nq,), "bias_force", (q, v), t, self.parameters)
+
+    def kinetic_energy(self, q, v, t):
+        """v . M v / 2, (), J."""
+        return 0.5 * jnp.sum(v * _product(self.mass_matrix(q, t), v))
+
+    def potential_energy(self, q, t):
+        """V as given, (), J. **Raises:** ValueError when it was not."""
+        if self._potential is None:
+            raise ValueError("this ExplicitSystem has no potential energy; pass potential= when making it")
+        return called(self._potential, (), "potential", (q,), t, self.parameters)
+
+
+def velocity_to_rate(system, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nq"]:
+    """dq/dt (nq,) for the velocity v of any system: H(q) v for a `Model`, else v."""
+    return configuration_rate(system, q, v) if isinstance(system, Model) else v
+
+
+def rate_to_velocity(system, q: Float[Array, " nq"], rate: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """Velocity v (nv,) of any system whose dq/dt is `rate` (nq,), tangent to its manifold."""
+    if not isinstance(system, Model):
+        return rate
+    (v,) = jax.linear_transpose(lambda v: configuration_rate(system, q, v), jnp.zeros(system.nv, rate.dtype))(rate)
+    if not has_quaternions(system):
+        return v
+    # H^T H is 1 but for angular velocities, where unit quaternions move at half the rate: 1/4.
+    weight = np.ones(system.nv)
+    for kind, place in zip(system.topology.kinds, system.topology.v_slices, strict=True):
+        if kind in ("spherical", "free"):
+            weight[place][-3:] = 4.0
+    return jnp.asarray(weight, rate.dtype) * v
+
+
+def displace(system, q: Float[Array, " nq"], step: Float[Array, " nv"]) -> Float[Array, " nq"]:
+    """Configuration reached from q by the displacement `step` (nv,) of any system, on the manifold of a `Model`."""
+    return integrate(system, q, step) if isinstance(system, Model) else q + step
+
+
+def displacement(system, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """Displacement (nv,) from q0 to q1 of any system, the inverse of `displace`."""
+    return difference(system, q0, q1) if isinstance(system, Model) else q1 - q0
+
+
+def has_quaternions(system) -> bool:
+    """Whether q holds numbers that must stay on a unit sphere."""
+    return isinstance(system, Model) and any(kind in ("spherical", "free") for kind in system.topology.kinds)
+
+
+def retract(system, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
+    """q with unit quaternions, of any system."""
+    return normalize(system, q) if has_quaternions(system) else q
+
+
+def symbols(derivative: Float[Array, "n n n"]) -> Float[Array, "n n n"]:
+    """Christoffel symbols of the first kind from dM_ij/dq_k: 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i)."""
+    return 0.5 * (derivative + derivative.transpose(0, 2, 1) - derivative.transpose(2, 1, 0))
+
+
+def called(function, shape, name, state, t, parameters):
+    """What a function of the user returned for the state, or for (state, t, parameters) when it has parameters."""
+    value = function(*state) if parameters is None else function(*state, t, parameters)
+    if jnp.shape(value) != shape:
+        size = state[0].shape[0]
+        wanted = "return one number, ()" if shape == () else f"expected {shape} for nq = {size}"
+        raise ValueError(
+            f"{name} returned shape {jnp.shape(value)}{';' if shape == () else ','} {wanted}{batch_hint(value, shape)}"
+        )
+    return jnp.asarray(value, state[0].dtype)
+
+
+_mass_matrix_compiled = eqx.filter_jit(lambda system, q, t: system.mass_matrix(q, t))
+
+
+def checked_size(nq) -> int:
+    """nq, a positive integer."""
+    if isinstance(nq, bool) or not isinstance(nq, int) or nq < 1:
+        raise ValueError(f"nq is {nq!r}; pass the number of coordinates, a positive integer")
+    return nq
+
+
+def as_parameter(leaf):
+    """A Python number as a float array, so that it is a leaf that can be differentiated; anything else as it is."""
+    return jnp.asarray(leaf, float) if isinstance(leaf, (int, float)) and not isinstance(leaf, bool) else leaf
