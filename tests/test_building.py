@@ -349,6 +349,7 @@ def test_inertia_report_and_repair():
     assert all(inertia.is_feasible(repaired.inertias[i]) for i in (0, 1, 2))
     np.testing.assert_array_equal(repaired.inertias[jnp.array([0, 3, 4])], model.inertias[jnp.array([0, 3, 4])])
     np.testing.assert_allclose(repaired.inertias[:, 0], model.inertias[:, 0], rtol=1e-14)
+    # What is not feasible has to change; first moments (kg m) stay near those that were given.
     np.testing.assert_allclose(repaired.inertias[1:3, 1:4], model.inertias[1:3, 1:4], atol=0.1)
     assert inertia_report(robots.iiwa()) == inertia_report(robots.iiwa(dtype=jnp.float32)) == []
 

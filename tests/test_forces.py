@@ -172,6 +172,7 @@ def test_effort_limit(arm):
     held = evaluate(Drive(50.0, 1.0, target, effort_limit=limits), arm, q, v)
     np.testing.assert_allclose(held[::2], free[::2], rtol=1e-15)
     np.testing.assert_allclose(held[1::2], 4 * np.tanh(free[1::2] / 4), rtol=1e-14)
+    # Far below the limit tanh is the identity but for a third of the squared ratio to it.
     small, same = (evaluate(Drive(0.05, 0.0, target, effort_limit=x), arm, q, v) for x in (4.0, np.inf))
     np.testing.assert_allclose(small, same, rtol=1e-2)
     total = quick(jax.grad(lambda limit: jnp.sum(Drive(50.0, 1.0, target, 0.0, limit)(arm, q, v, 0.0))))

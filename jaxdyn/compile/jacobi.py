@@ -25,6 +25,7 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
 
     INT, POINTER = ir.IntType(64), ir.PointerType()
 
+# Sweeps converge quadratically, six to ten serve; the bound ends those over numbers that are not finite.
 MAX_SWEEPS = 60
 
 

@@ -55,6 +55,7 @@ _COSINE = {
 }
 
 
+# Comparisons of stores grow with the square of this number and fences with its inverse; 8, 32 and 128 compile equally fast.
 STORES_BETWEEN_FENCES = 32
 
 

@@ -8,23 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.simulation.solvers.interpolation import StageInterpolation
+
 _B = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
 
 
-class _Interpolation(diffrax.AbstractLocalInterpolation):
+class _Interpolation(StageInterpolation):
     """Third-order continuous extension from the four stages, without a further evaluation."""
 
-    t0: jax.Array
-    t1: jax.Array
-    y0: object
-    y1: object
-    k: object
-
-    def evaluate(self, t0, t1=None, left=True):
-        if t1 is not None:
-            return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
-        step = self.t1 - self.t0
-        x = (t0 - self.t0) / jnp.where(step == 0, jnp.ones_like(step), step)
+    def at(self, x):
         middle = x * x * (1 - 2 * x / 3)
         weights = jnp.stack([x * (1 - x * (1.5 - 2 * x / 3)), middle, middle, x * x * (2 * x / 3 - 0.5)])
         return jax.tree.map(lambda y, k: y + jnp.tensordot(weights.astype(y.dtype), k, 1), self.y0, self.k)

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import lu_factor, lu_solve
 
 from jaxdyn.lie.so3 import _product
+from jaxdyn.simulation.solvers.interpolation import StageInterpolation
 
 _GAMMA = 0.21193756319429014
 # Stage i starts from y0 + A[i] U, at t0 + c[i] h.
@@ -58,20 +59,10 @@ _H = np.array(
 )
 
 
-class _Interpolation(diffrax.AbstractLocalInterpolation):
+class _Interpolation(StageInterpolation):
     """The method's own dense output, of order 4."""
 
-    t0: jax.Array
-    t1: jax.Array
-    y0: object
-    y1: object
-    k: object
-
-    def evaluate(self, t0, t1=None, left=True):
-        if t1 is not None:
-            return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
-        step = self.t1 - self.t0
-        x = (t0 - self.t0) / jnp.where(step == 0, jnp.ones_like(step), step)
+    def at(self, x):
         z = 1 - x
         return jax.tree.map(
             lambda a, b, k: z * a + x * (b + z * (k[0] + x * (k[1] + x * k[2]))), self.y0, self.y1, self.k
