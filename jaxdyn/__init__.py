@@ -1,6 +1,7 @@
 """Rigid-body dynamics in JAX: pure functions of one sample, to be batched, compiled and differentiated."""
 
 from jaxdyn import contact as contact
+from jaxdyn import control as control
 from jaxdyn import geometry as geometry
 from jaxdyn import grasp as grasp
 from jaxdyn import identify as identify
@@ -21,6 +22,9 @@ from jaxdyn.constraints.dynamics import RESULTS as RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics as constrained_dynamics
 from jaxdyn.constraints.dynamics import projections as projections
 from jaxdyn.constraints.dynamics import second_fundamental_form as second_fundamental_form
+from jaxdyn.control.legs import LeggedDynamics as LeggedDynamics
+from jaxdyn.control.legs import underactuated_inverse_dynamics as underactuated_inverse_dynamics
+from jaxdyn.dynamics.centroidal import com_jacobian as com_jacobian
 from jaxdyn.dynamics.kinematics import body_jacobian as body_jacobian
 from jaxdyn.dynamics.kinematics import forward_kinematics as forward_kinematics
 from jaxdyn.dynamics.kinematics import frame_pose as frame_pose
@@ -47,6 +51,8 @@ from jaxdyn.dynamics.quantities import mass_matrix_sqrt as mass_matrix_sqrt
 from jaxdyn.dynamics.quantities import potential_energy as potential_energy
 from jaxdyn.dynamics.quantities import rnea as rnea
 from jaxdyn.dynamics.quantities import torque_regressor as torque_regressor
+from jaxdyn.dynamics.workspace import WorkspaceDynamics as WorkspaceDynamics
+from jaxdyn.dynamics.workspace import workspace_dynamics as workspace_dynamics
 from jaxdyn.forces.dissipation import RayleighDissipation as RayleighDissipation
 from jaxdyn.forces.dissipation import SlidingFriction as SlidingFriction
 from jaxdyn.forces.elements import CoulombFriction as CoulombFriction
@@ -74,6 +80,7 @@ from jaxdyn.model import robots as robots
 from jaxdyn.model.builder import ModelBuilder as ModelBuilder
 from jaxdyn.model.builder import inertia_report as inertia_report
 from jaxdyn.model.builder import repair_inertias as repair_inertias
+from jaxdyn.model.joining import join as join
 from jaxdyn.model.tree import Model as Model
 from jaxdyn.model.tree import Topology as Topology
 from jaxdyn.model.tree import configuration_rate as configuration_rate
@@ -89,6 +96,8 @@ from jaxdyn.reduction.minimal import reduced_dynamics as reduced_dynamics
 from jaxdyn.reduction.minimal import tangent_basis as tangent_basis
 from jaxdyn.reports import report as report
 from jaxdyn.simulation import solvers as solvers
+from jaxdyn.simulation.controls import Controller as Controller
+from jaxdyn.simulation.controls import Sampled as Sampled
 from jaxdyn.simulation.methods import Baumgarte as Baumgarte
 from jaxdyn.simulation.methods import Multipliers as Multipliers
 from jaxdyn.simulation.methods import Projected as Projected

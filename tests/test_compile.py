@@ -913,6 +913,39 @@ def test_exported_programs():
     assert "refused:" in done.stdout.decode() and "compiled by another process" in done.stdout.decode()
 
 
+def test_exported_programs_of_a_batch_of_any_size():
+    """Without kernels and with them, and where samples are solved again one by one (`repair_flagged`)."""
+    model = jd.robots.chain(2)
+    scene = jd.Scene(model, (jd.gear(model.joint_names[1], model.joint_names[0], 2.0),))
+
+    def both(q, v):
+        return jd.forward_dynamics(model, q, v, v), jd.constrained_dynamics(scene, q, v).acceleration
+
+    (size,) = jax.export.symbolic_shape("n")
+    batch = jax.ShapeDtypeStruct((size, 2), jnp.float64)
+    allowed = [jax.export.DisabledSafetyCheck.custom_call(target.TARGET)]
+    run = jax.jit(jax.vmap(both))
+    exported = jax.export.export(run, disabled_checks=allowed)(batch, batch)
+    for n in (1, 3):
+        q = jnp.linspace(0.1, 0.9, 2 * n).reshape(n, 2)
+        for found, known in zip(exported.call(q, q[::-1]), run(q, q[::-1]), strict=True):
+            np.testing.assert_allclose(found, known, rtol=1e-13, atol=1e-13)
+
+
+def test_without_jit_kernels_are_still_compiled():
+    model, state = jd.robots.chain(2), (jnp.ones(2), jnp.zeros(2))
+
+    def results():
+        motion = jd.simulate(model, *state, [0.0, 0.1], stepsize=0.05)
+        return jd.forward_dynamics(model, *state, jnp.zeros(2)), motion.q
+
+    known = results()
+    with jax.disable_jit():
+        found = results()
+    for x, y in zip(found, known, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-13)
+
+
 def test_a_kernel_that_is_missing_is_said():
     """A program whose kernels this process does not have, as after it was stored by another one."""
     x = jnp.ones(3)

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 from jaxdyn import scenes
 from jaxdyn.constraints import Holonomic, lock_joint
+from jaxdyn.simulation.methods import Multipliers
 from jaxdyn.simulation.run import RESULTS, simulate
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
@@ -231,6 +232,29 @@ def test_bad_starts_and_methods_are_refused():
         simulate(Scene(scene.system, (*scene.constraints, Holonomic(lambda q, t: q[1], name="wall"))), q, v, ts)
     codes = quick(lambda q: simulate(scene, q, v, jnp.asarray(ts), stepsize=0.1).result == RESULTS.inconsistent_start)
     assert [bool(codes(x * q)) for x in (0.9, 1.0)] == [True, False]
+
+
+@pytest.mark.parametrize("method", ["multipliers", "baumgarte"])
+def test_rows_that_contradict_each_other_end_with_a_code(method):
+    """q1 = 0 and q1 = t^2 meet at t = 0, with their rates. Without a projection no open constraint would tell."""
+    system = LagrangianSystem(double_pendulum, 2)
+    still, leaving = Holonomic(lambda q, t: q[0], name="still"), Holonomic(lambda q, t: q[0] - t * t, name="leaving")
+    run = quick(lambda scene: simulate(scene, [0.0, 0.1], [0.0, 0.0], [0.0, 0.1], method=method, stepsize=0.02).result)
+    assert run(Scene(system, (still, leaving))) == RESULTS.contradictory_rows
+    assert run(Scene(system, (still, still))) == RESULTS.successful
+
+
+def test_rows_that_open_within_their_rank_tolerance_do_not_contradict():
+    """The five rows of Bennett's linkage, of which two are independent where the loop is closed."""
+    start = scenes.bennett.start()
+
+    @quick
+    def run(q, v):
+        options = {"method": Multipliers(rank_tol=1e-4), "outputs": ("constraint_residual",)}
+        return simulate(scenes.bennett(), q, v, [0.0, 3.0], rtol=1e-5, atol=1e-5, **options)
+
+    found = run(*start)
+    assert found.success and 1e-7 < float(found.constraint_residual[-1].max()) < 1e-4
 
 
 def test_a_joint_lock_holds_a_moving_mechanism():

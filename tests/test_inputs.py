@@ -184,6 +184,18 @@ def test_options_of_simulate_are_refused_before_the_motion(options, said):
         jd.simulate(ARM, [0, 0], [0, 0], [0, 1], **options)
 
 
+def test_a_model_without_moving_bodies():
+    """What is summed over no bodies is zero, what is divided by their mass is NaN, and nothing is simulated."""
+    empty, none = jd.ModelBuilder("base").build(), jnp.zeros(0)
+    assert jd.potential_energy(empty, none) == 0 == jd.kinetic_energy(empty, none, none)
+    assert jd.mass_matrix(empty, none).shape == (0, 0) and jd.forward_dynamics(empty, none, none, none).shape == (0,)
+    assert np.isnan(jd.center_of_mass(empty, none)).all()
+    assert not jd.centroidal_momentum(empty, none, none).any()
+    assert jd.centroidal_momentum_matrix(empty, none).shape == (6, 0)
+    with pytest.raises(ValueError, match=r"no coordinates \(nq = nv = 0\), so nothing moves"):
+        jd.simulate(empty, none, none, [0.0, 1.0])
+
+
 def test_forces_that_do_not_fit_are_named():
     with pytest.raises(ValueError, match=r"forces\[0\] takes \(q, v, t\), but is called as force\(system, q, v, t\)"):
         jd.simulate(jd.Scene(ARM, forces=(stiffer,)), [0, 0], [0, 0], [0, 1], stepsize=0.1)

@@ -27,7 +27,7 @@ FLOORS = (
     "constraints forces geometry",
     "contact reduction",
     "grasp simulation",
-    "identify scenes",
+    "control identify scenes",
     "io reports",
     "cli demo",
     "__main__",

@@ -42,7 +42,7 @@ def test_states_come_back_by_the_least_change(name, parameters):
 
     def both(q, v):
         found = project_state(scene, q, v, zero, rank_tol)
-        fixed = projection._in_fixed_steps(scene, q, v, zero, (), rank_tol)
+        fixed = projection._in_fixed_steps(rank_tol, scene, q, v, zero, ())
         M, A = mass_matrix(scene.system, found[0]), constraint_jacobian(scene, found[0])
         return found, fixed, residuals(scene, *found), (M, A)
 
@@ -113,7 +113,7 @@ def test_a_singular_sample_of_a_batch_is_projected_by_its_rank(mode):
     scene, q, v = drifted("windows", count=2)
     zero = jnp.asarray(0.0)
     program = jax.jit(jax.vmap(lambda q, v: project_state(scene, q, v, zero)))
-    matrices = jax.jit(jax.vmap(lambda q, v: projection._in_fixed_steps(scene, q, v, zero, (), None)[:2]))
+    matrices = jax.jit(jax.vmap(lambda q, v: projection._in_fixed_steps(None, scene, q, v, zero, ())[:2]))
     # Uprights and couplers in one line: the rows of the windows lose rank.
     flat = jnp.asarray([-np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, -np.pi / 2])
     for states in (q, q.at[1].set(flat)):
@@ -156,7 +156,7 @@ def test_derivatives_are_those_of_the_steps():
         return sum(jnp.vdot(w, x) for w, x in zip(weights, way(here, q, v, jnp.asarray(0.0)), strict=True))
 
     def fixed(scene, q, v, t):
-        return projection._in_fixed_steps(scene, q, v, t, (), None)[:2]
+        return projection._in_fixed_steps(None, scene, q, v, t, ())[:2]
 
     at = scene.system.inertias, q, v
     steps = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in at)

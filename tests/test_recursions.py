@@ -15,7 +15,7 @@ from pinocchio_bridge import as_dtype, assert_close, quick, random_states, rando
 
 import jaxdyn
 from jaxdyn import neutral
-from jaxdyn.dynamics import recursions
+from jaxdyn.dynamics import recursions, scans
 from jaxdyn.dynamics import world_frame as matrix_form
 from jaxdyn.dynamics.recursions import frames, inertias, links, transforms
 from jaxdyn.model.joints import KINDS
@@ -44,6 +44,7 @@ RULES = {
     "sqrt": np.sqrt,
     "square": np.square,
     "lt": np.less,
+    "gt": np.greater,
     "eq": np.equal,
     "iota": lambda *, dtype, shape, dimension, **_: np.moveaxis(
         np.broadcast_to(
@@ -244,6 +245,17 @@ def test_a_body_without_mass():
     want = jnp.sum(quick(lambda q: matrix_form.forward_dynamics(model, q, v, tau))(q))
     assert_close(value, want, 1e-10)
     assert np.isfinite(slope).all()
+
+
+def test_a_mass_matrix_that_is_not_positive_definite_gives_no_numbers():
+    """A body of negative mass at the end of a chain: every pivot above it would be wrong."""
+    model = random_tree(4, ["revolute", "helical", "prismatic"], parents=[-1, 0, 1])
+    model = model.replace(inertias=model.inertias * jnp.array([1.0, 1.0, -1.5])[:, None])
+    q, v, _, tau, _ = (x[0] for x in random_states(model, 1, 0))
+    assert np.linalg.eigvalsh(matrix_form.mass_matrix(model, q))[0] < -0.01
+    assert np.isnan(run(lambda q: recursions.aba(model, q, v, tau), q)).all()
+    for form in (matrix_form.forward_dynamics, scans.forward_dynamics, jaxdyn.forward_dynamics):
+        assert np.isnan(quick(lambda q, form=form: form(model, q, v, tau))(q)).all()
 
 
 def test_root_of_a_chain_is_triangular():

@@ -13,6 +13,9 @@ from jaxdyn import scenes
 from jaxdyn.constraints import Pfaffian
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
 from jaxdyn.dynamics.kinematics import forward_kinematics
+from jaxdyn.dynamics.quantities import bias_force, forward_dynamics, mass_matrix
+from jaxdyn.forces.elements import JointDamping
+from jaxdyn.model import robots
 from jaxdyn.model.tree import configuration_rate
 from jaxdyn.reduction.minimal import as_basis, independent_velocities, reduced_dynamics, tangent_basis
 from jaxdyn.simulation.methods import Baumgarte, Reduced
@@ -412,3 +415,17 @@ for _ in range(4):
     assert np.all(found(np.linspace(0.5, 1.0, 1024)))
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=600)
+
+
+def test_without_constraints_it_is_the_dynamics_of_the_scene():
+    """nu = v, N = 1, with the scene's forces."""
+    model = robots.chain(3)
+    scene = Scene(model, forces=(JointDamping(0.3),))
+    q, v, tau = jnp.array([0.4, -0.9, 1.3]), jnp.array([1.1, 0.2, -0.7]), jnp.array([0.5, -0.2, 0.1])
+    found = quick(lambda q, v, tau: reduced_dynamics(scene, q, v, tau))(q, v, tau)
+    assert bool(found.success)
+    assert_close(found.mass_matrix, mass_matrix(model, q), 1e-13)
+    assert_close(found.bias_force, bias_force(model, q, v), 1e-12)
+    assert_close(found.acceleration, forward_dynamics(model, q, v, tau - 0.3 * v), 1e-12)
+    assert_close(found.nu_rate, found.acceleration, 1e-13)
+    assert_close(found.velocity, v, 1e-15)

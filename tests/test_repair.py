@@ -112,6 +112,15 @@ def test_arguments_of_both_batches_of_one_and_of_none():
 
 
 def test_in_a_program_of_numbers_flagged_samples_are_no_numbers():
-    found, (way,) = jax.jit(jax.vmap(lambda x: backend.run(lambda _, x: _root(x, 1.0), (), x)))(jnp.array([0.25, 4.0]))
+    def root(_, x):
+        return _root(x, 1.0)
+
+    x = jnp.array([0.25, 4.0])
+    (found, (way,)), served = jax.jit(jax.vmap(lambda x: backend.run(root, (), x, served=True)))(x)
     np.testing.assert_array_equal(found, [np.nan, 2.0])
     assert way.tolist() == [0, 0]
+    assert served.tolist() == [False, True]
+    # Whoever does not ask gets no program, and whoever wants all samples right gets them.
+    for run in (backend.run, backend.run_repaired):
+        found, _ = jax.jit(jax.vmap(lambda x, run=run: run(root, (), x)))(x)
+        np.testing.assert_array_equal(found, [0.5, 2.0])

@@ -16,6 +16,7 @@ from jaxdyn.cli import main
 from jaxdyn.reports import Record, Report, beaten_by, cases, html_page, pareto_front, standings
 from jaxdyn.reports import run as running
 from jaxdyn.reports.front import cost_at
+from jaxdyn.reports.journal import Journal
 from jaxdyn.reports.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
 from jaxdyn.reports.records import Known
@@ -156,18 +157,15 @@ def test_integral_knows_its_error():
     assert 0.1 * abs(found[-1] - np.sqrt(np.pi) / 6) < error < 1e-2
 
 
-class Counter:
-    """A force of zero that counts how often it is asked for."""
+def counting():
+    """A force of zero, and a list that grows by one whenever it is asked for."""
+    calls: list[None] = []
 
-    def __init__(self):
-        self.count = 0
-
-    def add(self):
-        self.count += 1
-
-    def __call__(self, system, q, v, t):
-        jax.debug.callback(self.add)
+    def force(system, q, v, t):
+        jax.debug.callback(lambda: calls.append(None))
         return jnp.zeros_like(v)
+
+    return force, calls
 
 
 @pytest.mark.parametrize(
@@ -181,13 +179,13 @@ class Counter:
     ],
 )
 def test_evaluations_are_those_that_are_made(name, solver):
-    scene, counter = getattr(jd.scenes, name), Counter()
-    counted = Scene(scene().system, scene().constraints, (counter,))
+    scene, (force, calls) = getattr(jd.scenes, name), counting()
+    counted = Scene(scene().system, scene().constraints, (force,))
     method = {"Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8, "RK4": RK4}[solver]()
     steps = {"stepsize": 0.05} if solver == "RK4" else {"rtol": 1e-6, "atol": 1e-6}
     found = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, **steps)
     jax.effects_barrier()
-    assert counter.count == evaluations(solver, int(found.stats["num_steps"]), scene(), chosen_method(scene(), "auto"))
+    assert len(calls) == evaluations(solver, int(found.stats["num_steps"]), scene(), chosen_method(scene(), "auto"))
 
 
 def test_evaluations_of_implicit_methods_are_not_known():
@@ -439,6 +437,14 @@ def test_command(small, rungs, capsys):
 def test_empty_arguments_are_refused(name):
     with pytest.raises(ValueError, match=f"{name} is empty"):
         jd.report(**({"scenes": "free_body"} | {name: []}))
+
+
+def test_a_journal_that_is_not_text_is_named(tmp_path):
+    (tmp_path / "records.jsonl").write_bytes(b"\xff\xfe{}\n{}\n")
+    with pytest.raises(
+        ValueError, match=r"out has .*records\.jsonl, which is no text in UTF-8.*name another directory"
+    ):
+        Journal(tmp_path, {})
 
 
 def test_nothing_to_measure_is_refused():

@@ -25,5 +25,6 @@ from jaxdyn.compile.repair import any_in_batch as any_in_batch
 from jaxdyn.compile.repair import is_rank_safe as is_rank_safe
 from jaxdyn.compile.repair import recompute_unless as recompute_unless
 from jaxdyn.compile.repair import repair_flagged as repair_flagged
+from jaxdyn.compile.repair import run_repaired as run_repaired
 from jaxdyn.compile.rules import along as along
 from jaxdyn.compile.rules import implicit as implicit

@@ -26,12 +26,12 @@ LEAST_CALLED = 300
 
 
 def expand(
-    closed: ClosedJaxpr, most: int, name: str = "", calls: bool = False, served: bool = False
+    closed: ClosedJaxpr, most: int, name: str = "", calls: bool = False, served: bool = False, flags: bool = False
 ) -> tuple[Program, bool]:
     """The program of a jaxpr, and whether it has functions whose derivatives are given by rules of their own.
 
     With `calls`, functions under `jax.jit` of at least `LEAST_CALLED` operations become subprograms. With `served`, there is
-    one more output: whether no number is flagged (see `flags`).
+    one more output: whether no number is flagged (see `flags`); without it none may be, unless `flags`.
 
     **Raises:** `NotNumbers`, `TooLong`.
     """
@@ -43,7 +43,10 @@ def expand(
             raise NotNumbers(f"an array of {array.dtype}")
     expansion = _Expansion(graph, calls)
     entries = [graph.inputs(place, array) for place, array in enumerate(inputs)]
-    found = expansion.evaluate(closed.jaxpr, closed.consts, entries)
+    with np.errstate(all="ignore"):  # known numbers may be none, as in branches that are not taken
+        found = expansion.evaluate(closed.jaxpr, closed.consts, entries)
+    if expansion.flagged is not False and not (served or flags):
+        raise NotNumbers("samples that need more care than a program of numbers takes")
     if served:
         outputs.append(_FLAG)
         found.append(objects([graph.invert(expansion.flagged)], ()))
@@ -328,6 +331,8 @@ class _Expansion:
             raise NotNumbers(inner.name)
         shaped = [as_objects(x).reshape(array.shape) for x, array in zip(args, inner.inputs, strict=True)]
         self.has_rules |= inner.derivative is not None
+        if self.calls and inner.cost >= LEAST_CALLED and not inner.subprograms:
+            return [x.ravel() for x in self.graph.call(inner, shaped)]
         return [x.ravel() for x in self.graph.replay(inner, shaped)[1]]
 
     def _cholesky(self, params, args, eqn):

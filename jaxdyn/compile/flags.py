@@ -34,5 +34,10 @@ def _jvp(primals, tangents):
     return unless_p.bind(flag, x), step if type(step) is ad.Zero else unless_p.bind(flag, step)
 
 
+def _transpose(cotangent, flag, x):
+    return [None, cotangent if type(cotangent) is ad.Zero else unless_p.bind(flag, cotangent)]
+
+
 batching.primitive_batchers[unless_p] = _batched
+ad.primitive_transposes[unless_p] = _transpose
 ad.primitive_jvps[unless_p] = _jvp

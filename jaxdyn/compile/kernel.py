@@ -41,6 +41,7 @@ def run(
     most: int = mode.MAX_OPERATIONS,
     calls: bool = False,
     served: bool = False,
+    apart: bool = False,
 ) -> Any:
     """function(*static, tree, *args) by a kernel; by `otherwise` (default: the function itself) where there is none.
 
@@ -55,10 +56,12 @@ def run(
       are written once and called, which does for a function that is not differentiated.
     - `served`: whether to return a pair: what the function does, and whether this sample is one that a program of numbers can
       serve (see `flags`): True where every sample is, else a bool array ().
+    - `apart`: whether the function is a program of its own within another one too: its derivatives are then those of its
+      numbers, and a long one is called.
 
     **Returns:** what the function does.
     """
-    if mode.is_expanding():
+    if mode.is_expanding() and not apart:
         found = _inside(function, static, tree, args)
         return (found, True) if served else found
 
@@ -139,9 +142,9 @@ def _program(function, static, known: Known, count: int, structure, shapes, tang
     except (NotNumbers, TooLong) as reason:
         return str(reason)
     if tangent is not None:
-        program.derivative = _by_rule(functools.partial(tangent, *static), known, count, structure, avals)
+        program.derivative = _by_rule(functools.partial(tangent, *static), known, count, structure, avals, served)
     elif has_rules:
-        program.derivative = _by_jax(flat, avals)
+        program.derivative = _by_jax(flat, avals, served)
     return program, jax.tree.structure(out)
 
 
@@ -168,7 +171,7 @@ def _inside(function, static, tree, args):
     return _traced_once(function, static, known, len(traced), structure)(*traced, *leaves)
 
 
-def _by_rule(tangent: Callable, known: Known, count: int, structure, avals):
+def _by_rule(tangent: Callable, known: Known, count: int, structure, avals, served: bool):
     """The program of the change that a rule gives."""
 
     def derivative(moving):
@@ -181,12 +184,12 @@ def _by_rule(tangent: Callable, known: Known, count: int, structure, avals):
             args = jax.tree.unflatten(structure, primal[count:])
             return tangent(known(primal[:count]), *args, [*every, *given[count:]])
 
-        return _expanded_change(change, avals, moving)
+        return _expanded_change(change, avals, moving, served)
 
     return derivative
 
 
-def _by_jax(flat: Callable, avals):
+def _by_jax(flat: Callable, avals, served: bool):
     """The program of the change that JAX finds, which asks functions for their own rules."""
 
     def derivative(moving):
@@ -202,16 +205,17 @@ def _by_jax(flat: Callable, avals):
 
             return jax.jvp(moved, [primal[i] for i in places], list(steps))[1]
 
-        return _expanded_change(change, avals, moving)
+        return _expanded_change(change, avals, moving, served)
 
     return derivative
 
 
-def _expanded_change(change: Callable, avals, moving) -> Program:
+def _expanded_change(change: Callable, avals, moving, served: bool) -> Program:
+    """The change as a program; NaN at samples that are flagged, where whoever runs the function is told of them."""
     steps = [aval for aval, moves in zip(avals, moving, strict=True) if moves]
     with mode.expanding():
         closed = jax.make_jaxpr(change)(*avals, *steps)
-    return expand(closed, 10 * mode.MAX_OPERATIONS, "change")[0]
+    return expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=served)[0]
 
 
 # --- the primitive ---
@@ -225,7 +229,11 @@ def _jitted(program):
     return jax.jit(lambda *args: kernel_p.bind(*args, program=program))
 
 
-kernel_p.def_impl(lambda *args, program: _jitted(program)(*args))
+@kernel_p.def_impl
+def _(*args, program):
+    # A kernel is always compiled: under `jax.disable_jit()` it would be called by itself for ever.
+    with jax.disable_jit(False):
+        return _jitted(program)(*args)
 
 
 @kernel_p.def_abstract_eval

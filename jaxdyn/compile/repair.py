@@ -19,6 +19,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
 from jaxdyn.compile.flags import unless
+from jaxdyn.compile.kernel import run
+from jaxdyn.compile.known import partition_traced
 from jaxdyn.compile.mode import is_expanding
 
 AT_ONCE = 32  # samples that are computed again together
@@ -107,6 +109,27 @@ def repair_flagged(flag, careful: Callable, fast: Callable, found: tuple, args: 
     return run(flag, lax.stop_gradient(found), args)
 
 
+def run_repaired(function: Callable, tree, *args, static: tuple = ()):
+    """function(*static, tree, *args) by a kernel; samples that it cannot serve by the function itself, traced `rank_safe`.
+
+    **Arguments:** as of `run`. Only floats that the function returns are differentiated.
+    """
+    found, served = run(function, tree, *args, static=static, served=True)
+    if served is True:
+        return found
+    traced, known = partition_traced(tree)
+
+    def careful(traced, args):
+        return rank_safe(function)(*static, known(traced), *args), ()
+
+    def fast(traced, args):
+        return run(function, known(traced), *args, static=static, served=True)[0]
+
+    # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
+    careful = jax.checkpoint(careful, prevent_cse=False)
+    return repair_flagged(~served, careful, fast, (found, ()), (traced, args))[0]
+
+
 def _one(careful: Callable):
     @custom_vmap
     def one(flag, found, args):
@@ -128,7 +151,7 @@ def _many(careful: Callable, axes: list):
 
     def some(flag, found, args):
         size = flag.shape[0]
-        count = min(AT_ONCE, size)
+        count = min(AT_ONCE, size) if isinstance(size, int) else AT_ONCE  # `jax.export` has sizes without a number
         places = jnp.nonzero(flag, size=size + count, fill_value=size)[0]
 
         def mend(i, found):
@@ -174,6 +197,6 @@ def _along_one_axis(args, axes, batched, shape):
     return flat, over
 
 
-def _rows(x, varies: bool, size: int):
-    """With a leading axis of the batch."""
+def _rows(x, varies: bool, size):
+    """With a leading axis of the batch, whose size may be a symbol of `jax.export`."""
     return x if varies else jnp.broadcast_to(x, (size, *x.shape))

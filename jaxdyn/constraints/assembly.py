@@ -13,6 +13,7 @@ from jaxdyn.compile import along, compiled, compute, implicit, is_concrete, is_s
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import RESULTS, Outcome, correction, right_inverse, whitened_rows
 from jaxdyn.constraints.rank import tolerance
+from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, openness, row_limits
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import check_state, or_zeros
@@ -63,10 +64,16 @@ def assemble(
     concrete = is_concrete(scene, q, v, t)
     found = _assemble(scene, q, v, t, rank_tol)
     if concrete and (throw is None or throw) and not bool(found.result == RESULTS.successful):
-        raise ValueError(f"not assembled: {open_constraints(scene, found.q, found.v, t)}; give a better guess")
+        left = open_constraints(scene, found.q, found.v, t, _closed_to(q.dtype))
+        raise ValueError(f"not assembled: {left}; give a better guess")
     if throw and not concrete:
         found = found.result.error_if(found, found.result != RESULTS.successful)
     return found
+
+
+def _closed_to(dtype) -> float:
+    """Part of the mechanism's length that counts as rounding of what has converged."""
+    return float(jnp.finfo(dtype).eps) ** 0.7
 
 
 @compiled
@@ -77,7 +84,7 @@ def _assemble(scene, q, v, t, rank_tol):
     for _ in range(2):
         v = v - _product(B, velocity_residual(scene, q, v, t))
     residual = _sizes(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
-    good = jnp.all(residual <= float(jnp.finfo(q.dtype).eps) ** 0.7 * (1.0 + jnp.max(jnp.abs(v))))
+    good = openness(scene, q, v, t, _closed_to(q.dtype)) <= 1.0
     return Assembly(q, v, residual, RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled))  # pyright: ignore[reportArgumentType]
 
 
@@ -118,11 +125,13 @@ def _nearest(scene, guess, t, rank_tol):
     def residual(e):
         return position_residual(scene, displace(scene.system, guess, e), t)
 
+    sizes, _ = coordinate_sizes(scene.system, guess.dtype)
+
     def improve(state):
         e, _, count = state
         phi, A = run(_linearized, scene, guess, t, e)
         new = _product(right_inverse(metric, A, rank_tol), _product(A, e) - phi)
-        return new, jnp.max(jnp.abs(new - e)), count + 1
+        return new, jnp.max(jnp.abs(new - e) / sizes), count + 1
 
     def unfinished(state):
         e, change, count = state
@@ -204,34 +213,37 @@ def _sizes(*parts):
     return jnp.stack([jnp.max(jnp.abs(part), initial=0.0) for part in parts])
 
 
-def open_constraints(scene: Scene, q, v, t=0.0, limit: float = 0.0) -> str:
-    """In words, which constraints are violated by more than `limit`, the worst first; for concrete states."""
+def open_constraints(scene: Scene, q, v, t: Any = 0.0, relative: float = 0.0) -> str:
+    """In words, which constraints are violated by more than `row_limits`, the worst first; for concrete states."""
     t = jnp.asarray(t, q.dtype)
-    phi, psi = (np.asarray(x) for x in _both_residuals(scene, q, v, t))
+    phi, psi, *limits = (np.asarray(x) for x in _residuals_and_limits(scene, q, v, t, relative))
     found, first = [], 0
     for constraint, place in zip(scene.constraints, layout(scene), strict=True):
         count = place.slip - place.start
-        apart = float(np.max(np.abs(phi[first : first + count]), initial=0.0))
-        fast = float(np.max(np.abs(psi[place.start : place.end]), initial=0.0))
-        first += count
         kind = type(constraint).__name__.lower()
-        if apart > limit:
-            found.append((apart, f"{kind} {place.name!r} open by {apart:.3g}"))
-        if fast > limit:
-            found.append((fast, f"{kind} {place.name!r} slips at {fast:.3g}"))
+        for values, most, rows, words in (
+            (phi, limits[0], slice(first, first + count), "open by"),
+            (psi, limits[1], slice(place.start, place.end), "slips at"),
+        ):
+            if np.any(np.abs(values[rows]) > most[rows]):
+                size = float(np.max(np.abs(values[rows])))
+                found.append((size, f"{kind} {place.name!r} {words} {size:.3g}"))
+        first += count
     # Those that print alike stay in the scene's order, whatever their rounding errors.
     return ", ".join(text for _, text in sorted(found, key=lambda entry: -float(f"{entry[0]:.3g}"))[:6])
 
 
 @eqx.filter_jit
-def _both_residuals(scene, q, v, t):
-    return position_residual(scene, q, t), velocity_residual(scene, q, v, t)
+def _residuals_and_limits(scene, q, v, t, relative):
+    limits = row_limits(scene, q, v, t, relative)
+    return position_residual(scene, q, t), velocity_residual(scene, q, v, t), *limits
 
 
-def start_evidence(scene: Scene, q, v, t) -> tuple[np.ndarray, int]:
-    """Largest residuals (2,) and the rank of the rows at a concrete state."""
+def start_evidence(scene: Scene, q, v, t, relative: float) -> tuple[np.ndarray, float, int]:
+    """Largest residuals (2,), `openness`, and the rank of the rows at a concrete state."""
     bare, given = Scene(scene.system, scene.constraints), not is_staged()
     _, Y = compute(whitened_rows, bare, q, t, given=given)
     sizes = np.linalg.svd(Y, compute_uv=False)
     rank = int(np.sum(sizes > tolerance(None, Y) * sizes[0])) if sizes.size else 0
-    return compute(_largest_residuals, bare, q, v, t, given=given), rank
+    ratio = compute(largest_ratio, bare, q, v, t, static=(relative,), given=given)
+    return compute(_largest_residuals, bare, q, v, t, given=given), float(ratio), rank

@@ -44,6 +44,13 @@ class Constraint(eqx.Module):
         free = eqx.filter_eval_shape(self.slip, system, q, v, t)
         return 0 if held is None else held.shape[0], 0 if free is None else free.shape[0]
 
+    def wrench_components(self) -> tuple[int, ...] | None:
+        """Where the components of a contact's force (`jd.contact.wrench_basis`) stand among its multipliers, in their order.
+
+        None for a constraint that is no contact with a normal force.
+        """
+        return None
+
     def group(self):
         """Constraints whose groups are equal and not None are evaluated together, by the functions below."""
         return None

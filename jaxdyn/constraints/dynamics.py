@@ -57,6 +57,7 @@ class RESULTS(optimistix.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
     inconsistent_start = "The initial state is not on the constraints."
     open_constraints = "The constraints opened, and the projection could not close them."
+    contact_lost = "A contact pulled or left its friction cone."
 
 
 # Of optimistix the message of this one is empty, which prints as nothing.
@@ -237,7 +238,9 @@ def _shortest_push(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, ran
     # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
     missed = jnp.abs(wanted - _product(Y.T, pushed))
     sizes = jnp.abs(gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
-    met = jnp.all(missed <= eps_of(Y) ** 0.5 * (sizes + jnp.max(sizes)))
+    # Rows that count as dependent differ by as much as the rank tolerance.
+    limit = max(eps_of(Y) ** 0.5, tolerance(rank_tol, Y))
+    met = jnp.all(missed <= limit * (sizes + jnp.max(sizes)))
     result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(metric.definite(), result, RESULTS.singular_mass_matrix)
     return ConstrainedDynamics(metric.unwhiten(free + pushed), lam, rank, result, layout(scene))

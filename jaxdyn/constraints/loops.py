@@ -21,8 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
-from jaxdyn.lie import se3
-from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import pose_leaf
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_difference
 from jaxdyn.model.tree import Model, body_index
 
@@ -306,15 +305,6 @@ def model_couplings(model: Model) -> tuple[Gear, ...]:
         gear(names[joint], names[source], *(model.coupling_values[i]))  # pyright: ignore[reportOptionalSubscript]
         for i, (joint, source) in enumerate(model.topology.couplings)
     )
-
-
-def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
-    """A pose as an array leaf; arrays (4, 4) of jax are taken as they are, so that they can be traced."""
-    if isinstance(pose, jax.Array) and pose.shape == (4, 4):
-        return pose
-    if isinstance(pose, jax.Array) and pose.shape == (3,):
-        return se3.from_parts(jnp.eye(3, dtype=pose.dtype), pose)
-    return jnp.asarray(f64.pose_matrix(pose, what), float)
 
 
 def check_bodies(name: str, system, bodies) -> None:

@@ -8,7 +8,16 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import along, implicit, is_expanding, is_rank_safe, partition_traced, repair_flagged, run
+from jaxdyn.compile import (
+    along,
+    implicit,
+    is_expanding,
+    is_rank_safe,
+    partition_traced,
+    repair_flagged,
+    run,
+    run_repaired,
+)
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import correction, whitened_rows
 from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, tolerance
@@ -46,10 +55,10 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
     def tangent(scene, q, v, t, *rest):
         *errors, steps = rest
 
-        def careful(scene, q, v, t, *errors):
-            return _in_fixed_steps(scene, q, v, t, errors, rank_tol)
+        def again(scene, q, v, t, *errors):
+            return run_repaired(_in_fixed_steps, scene, q, v, t, errors, static=(rank_tol,))
 
-        found, moved = along(careful, (scene, q, v, t, *errors), steps)
+        found, moved = along(again, (scene, q, v, t, *errors), steps)
         return found, jax.tree.map(jnp.zeros_like, found) if moved is None else moved
 
     errors = lax.stop_gradient(tuple(errors))
@@ -219,7 +228,7 @@ def _descend(x, step, residual, move):
     return x, away, more
 
 
-def _in_fixed_steps(scene: Scene, q, v, t, errors, rank_tol):
+def _in_fixed_steps(rank_tol, scene: Scene, q, v, t, errors):
     """The same for derivatives, which are those of the steps as they are."""
     q = retract(scene.system, q)
     held = holonomic_rows(layout(scene))

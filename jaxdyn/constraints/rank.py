@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import any_in_batch, pseudo_inverse_by_rotations, run
+from jaxdyn.compile import any_in_batch, is_expanding, pseudo_inverse_by_rotations, run, unless
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_factored
 
@@ -51,12 +51,18 @@ def quality_of(factor):
 def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = False) -> Float[Array, "m n"]:
     """Moore-Penrose inverse of Y, singular values below `rank_tol` times the largest taken for zero.
 
-    Values: (Y^T Y)^-1 Y^T where that is as good; else by singular values, of all samples if one in a batch needs it; at
-    once where the columns are known to be `dependent`. Derivative: the formula of Golub & Pereyra (1973), eq. 4.12, right
+    Values: (Y^T Y)^-1 Y^T, or the transpose of that of Y^T, where that is as good; else by singular values, of all samples
+    if one in a batch needs it; at once where the columns are known to be `dependent`. Derivative: the formula of
+    Golub & Pereyra (1973), eq. 4.12, right
     wherever the rank is constant; no factorisation is differentiated.
     """
-    if dependent or Y.shape[1] > Y.shape[0]:
+    if dependent:
         return pseudo_inverse_by_rotations(Y, rank_tol)
+    if Y.shape[1] > Y.shape[0]:
+        return pseudo_inverse(Y.T, rank_tol).T
+    if is_expanding():  # which has no branches: other samples are computed again
+        inverse, quality = _by_normal_equations(None, Y)
+        return unless(~(quality > least_pivot(Y, rank_tol)), inverse)
     found: Any = run(_by_normal_equations, None, Y, most=_MOST_STRAIGHT, otherwise=lambda *_: None)
     if found is None:
         return pseudo_inverse_by_rotations(Y, rank_tol)
@@ -82,3 +88,28 @@ def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
     dP = -_product(_product(P, dY), P)
     dP = dP + _product(_product(P, P.T), across) + _product(along, _product(P.T, P))
     return P, dP
+
+
+def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:
+    """-1 where the determinant is negative, else 1; a constant."""
+    return run(_sign, None, lax.stop_gradient(A), otherwise=_sign_by_lapack)
+
+
+def _sign(_, A):
+    """By elimination; rows change places until the largest entry of a column is its pivot."""
+    sign = jnp.ones((), A.dtype)
+    rows = list(A)
+    for k in range(len(rows)):
+        for i in range(k + 1, len(rows)):
+            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+            rows[k], rows[i] = jnp.where(swap, rows[i], rows[k]), jnp.where(swap, rows[k], rows[i])
+            sign = jnp.where(swap, -sign, sign)
+        sign = jnp.where(rows[k][k] < 0, -sign, sign)
+        scale = 1 / jnp.where(rows[k][k] == 0, 1.0, rows[k][k])
+        for i in range(k + 1, len(rows)):
+            rows[i] = rows[i] - rows[i][k] * scale * rows[k]
+    return sign
+
+
+def _sign_by_lapack(_, A):
+    return jnp.where(jnp.linalg.slogdet(A)[0] < 0, -1.0, 1.0).astype(A.dtype)

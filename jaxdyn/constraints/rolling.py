@@ -20,8 +20,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.frames import Pair
-from jaxdyn.constraints.loops import check_bodies, pose_leaf
+from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.model.arguments import pose_leaf
 
 
 class _Contact(NamedTuple):
@@ -58,6 +59,13 @@ class _Touching(Pair):
         check_bodies(self.name, system, (self.body, self.surface_body))
         return int(self.contact), self.count + int(self.spin)
 
+    def wrench_components(self):
+        """The rows are the normal force, those that do not slip, and the torque that does not spin."""
+        if not self.contact:
+            return None
+        slips = self.count
+        return (*range(1, 1 + slips), 0, *((1 + slips,) if self.spin else ()))
+
     def likeness(self):
         """Which rows there are."""
         return self.contact, self.spin, self.count
@@ -69,6 +77,8 @@ class _Touching(Pair):
     def sliding(self, R, p, U):
         """Velocities of slipping (m/s), and of spinning (rad/s) where it is resisted."""
         touch = self._touch(R, p)
+        if not self.count:
+            return jnp.sum(touch.normal * U[3:])[None] if self.spin else None
         found = _product(touch.directions, U[:3] + cross(U[3:], touch.point))
         return jnp.concatenate([found, jnp.sum(touch.normal * U[3:])[None]]) if self.spin else found
 
@@ -235,7 +245,7 @@ class RollingSphere(_Touching):
             gap = reach - distance - radius if self.inside else distance - reach - radius
             normal = -outward if self.inside else outward
             directions = _tangents(normal)
-        return _Contact(p - radius * normal, normal, gap, directions)
+        return _Contact(p - radius * normal, normal, gap, directions[: self.count])
 
 
 def rolling_sphere(
@@ -248,11 +258,14 @@ def rolling_sphere(
     surface_body: str | None = None,
     surface_radius=None,
     inside: bool = False,
+    slip: bool = False,
     spin: bool = False,
     contact: bool = True,
     name: str | None = None,
 ) -> RollingSphere:
     """A sphere that rolls without slipping on a plane, or outside or inside of a sphere or a cylinder.
+
+    With `slip=True` it slides there instead, without friction.
 
     **Arguments:**
 
@@ -260,11 +273,12 @@ def rolling_sphere(
     - `on`: "plane", "sphere" or "cylinder". `surface`: pose of the surface in `surface_body` (None: the world): a
       plane's z is its normal, a sphere's origin its centre, a cylinder's z its axis. `surface_radius`: m, of these two.
     - `inside`: whether the sphere rolls on the inner side.
+    - `slip`: whether the sphere may slide; the height is then the only row, or the height and the spin.
     - `spin`: whether the contact also resists spinning about the normal (a soft contact).
     - `contact`: whether the height is constrained.
 
     **Raises:** ValueError for an unknown surface, radii that are missing, not positive or too small for one
-    inside, or a bad pose; when used, for unknown bodies.
+    inside, a bad pose, or no rows at all; when used, for unknown bodies.
     """
     name = f"sphere {body}" if name is None else name
     if on not in ("plane", "sphere", "cylinder"):
@@ -274,6 +288,10 @@ def rolling_sphere(
         raise ValueError(f"{name!r}: surface_radius is {surface_radius} on a {on}; {fix}")
     if on == "plane" and inside:
         raise ValueError(f"{name!r}: a plane has no inside; turn the plane over")
+    if slip and not (spin or contact):
+        raise ValueError(
+            f"{name!r}: slip is True and contact and spin are False, which leaves no rows; set contact=True"
+        )
     radius = _length(radius, f"{name!r}: radius")
     reach = None if surface_radius is None else _length(surface_radius, f"{name!r}: surface_radius")
     concrete = reach is not None and not isinstance(radius - reach, jax.core.Tracer)
@@ -291,6 +309,7 @@ def rolling_sphere(
         inside=bool(inside),
         contact=bool(contact),
         spin=bool(spin),
+        count=0 if slip else 2,
     )
 
 

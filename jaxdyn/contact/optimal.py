@@ -44,17 +44,26 @@ def optimal_forces(G, wrench, cones, *, preload=0.0, target=None, weights=None, 
     preload = as_float(preload, "preload", (), G.dtype)
     target = jnp.zeros((m,), G.dtype) if target is None else as_float(target, "target", (m,), G.dtype)
     weights = jnp.ones((m,), G.dtype) if weights is None else as_float(weights, "weights", (m,), G.dtype)
+    bounds = cone_bounds(cones, preload, G.dtype)
+    return solve_qp(jnp.diag(weights), -weights * target, A=G, b=wrench, tol=tol, **bounds)
+
+
+def cone_bounds(cones, preload, dtype) -> dict:
+    """Rows and cones of `solve_qp`, by their names there, for margins of at least `preload` in every cone.
+
+    The forces are those of the cones one after the other.
+    """
+    sizes = [cone.size for cone in cones]
     linear, second, place = [], [], 0
     for cone, size in zip(cones, sizes, strict=True):
-        sides = (place, m - place - size)
-        linear.append(_widened(cone.linear_rows().astype(G.dtype), sides))
-        second.append(_widened(cone.second_order_rows().astype(G.dtype), sides))
+        sides = (place, sum(sizes) - place - size)
+        linear.append(_widened(cone.linear_rows().astype(dtype), sides))
+        second.append(_widened(cone.second_order_rows().astype(dtype), sides))
         place += size
     rows, round_rows = jnp.concatenate(linear), jnp.concatenate(second)
-    lifted = jnp.zeros(round_rows.shape[:2], G.dtype).at[:, 0].set(-preload)
-    bounds: dict = {"G": rows, "h": jnp.full((rows.shape[0],), -1, G.dtype) * preload} if rows.shape[0] else {}
-    bounds |= {"cones": [(-round_rows, lifted)]} if round_rows.shape[0] else {}
-    return solve_qp(jnp.diag(weights), -weights * target, A=G, b=wrench, tol=tol, **bounds)
+    lifted = jnp.zeros(round_rows.shape[:2], dtype).at[:, 0].set(-preload)
+    bounds: dict = {"G": rows, "h": jnp.full((rows.shape[0],), -1, dtype) * preload} if rows.shape[0] else {}
+    return bounds | ({"cones": [(-round_rows, lifted)]} if round_rows.shape[0] else {})
 
 
 def _widened(rows: Float[Array, "..."], sides) -> Float[Array, "..."]:

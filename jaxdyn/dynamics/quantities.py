@@ -278,7 +278,7 @@ def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
 
     **Arguments:** `q` (nq,).
 
-    **Returns:** (3,), world position, m. NaN when no body has mass.
+    **Returns:** (3,), world position, m. NaN when no moving body has mass.
     """
     (q,) = check_shapes(model, q=q)
     return _by_recursion(_center_of_mass, _center_of_mass, model, q)
@@ -413,7 +413,7 @@ def _first_moments(model: Model, frame: TreeFrame):
     """
     mass = model.inertias[:, 0]
     rotated = _product(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
-    origin = frame.origin[0]
+    origin = frame.origin[0] if model.nb else jnp.zeros((3,), mass.dtype)
     return mass, rotated + mass[:, None] * frame.pose[:, :3, 3], origin, frame.origin - origin[None]
 
 

@@ -15,9 +15,10 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
-from jaxdyn.constraints.loops import attitude, check_bodies, pose_leaf
+from jaxdyn.constraints.loops import attitude, check_bodies
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.kinds import components
+from jaxdyn.model.arguments import pose_leaf
 
 
 class Contact(Pair):
@@ -25,7 +26,7 @@ class Contact(Pair):
 
     name: str = eqx.field(static=True)
     kind: str = eqx.field(static=True)
-    finger: str = eqx.field(static=True)
+    finger: str | None = eqx.field(static=True)
     object: str | None = eqx.field(static=True)
     in_plane: bool = eqx.field(static=True)
     pose: Float[Array, "4 4"]
@@ -50,6 +51,10 @@ class Contact(Pair):
         check_bodies(self.name, system, (self.object, self.finger))
         return len(self.components) - int(self._spins), int(self._spins)
 
+    def wrench_components(self):
+        """The rows are the components themselves."""
+        return tuple(range(len(self.components)))
+
     def likeness(self):
         """The kind of contact."""
         return self.kind, self.in_plane
@@ -67,7 +72,7 @@ class Contact(Pair):
 
 def contact(
     kind: str,
-    finger: str,
+    finger: str | None,
     pose,
     *,
     finger_pose=None,
@@ -84,19 +89,20 @@ def contact(
     **Arguments:**
 
     - `kind`: "frictionless", "hard-finger" (a point with friction), "soft-finger" or "rigid".
-    - `finger`: body or frame that touches; `finger_pose`: of the fingertip in it, by default its own frame. The origin
-      is the point that touches; the axes matter in a rigid contact alone, where they are those of the contact frame.
+    - `finger`: body or frame that touches, or None for the world, as a table; `finger_pose`: of the fingertip in it, by
+      default its own frame. The origin is the point that touches; the axes matter in a rigid contact alone, where they are
+      those of the contact frame.
     - `pose`: of the contact frame in the object: z is the normal into the object. Poses are None (identity), (4, 4), (3,)
       or (xyz, rpy); m and rad.
-    - `object`: body that is touched; None: the one of the `Grasp` that the contact is given to.
+    - `object`: body that is touched; None: the one of the `Grasp` that the contact is given to, the world in a `Scene`.
     - `in_plane`: only rows within the x-z plane of the contact frame, for mechanisms that move in that plane.
-    - `name`: for errors and reports; by default that of the finger.
+    - `name`: for errors and reports; by default that of the finger, or "world".
 
     **Raises:** ValueError for an unknown kind or a bad pose; when used, for unknown bodies.
 
     Source: Murray, Li & Sastry (1994), eq. 5.14; EQUATIONS section 10.
     """
-    name = finger if name is None else name
+    name = (finger or "world") if name is None else name
     components(kind, in_plane, f"contact {name!r}")
     return Contact(
         name=name,

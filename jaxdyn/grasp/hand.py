@@ -9,10 +9,11 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.grasp.contacts import on_object
-from jaxdyn.grasp.joining import joined
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.joining import joined
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
@@ -34,17 +35,20 @@ class Grasp(Scene):
     - `contacts`: `contact(...)` for contacts fixed on the object; `jd.rolling_sphere` and `jd.rolling_wheel` between a
       finger and the object, either of which may be the one that rolls: pressing is a positive normal force; other
       constraints of the library.
-    - `forces`: as of a `Scene`.
+    - `forces`, `cones`: as of a `Scene`. Without cones contacts are two-sided: they pull as well as press.
 
     **Raises:** ValueError for models that do not fit together, an object that is no single body of its own, an empty
-    list of contacts, contacts with bodies or frames that the models do not have, and contacts that prescribe a slip.
+    list of contacts, contacts with bodies or frames that the models do not have, contacts that prescribe a slip, and cones
+    that do not fit their contacts.
 
     Source: Murray, Li & Sastry (1994), sections 5.5 and 6.3; EQUATIONS section 10.
     """
 
     object: str = eqx.field(static=True, kw_only=True)
 
-    def __init__(self, fingers: Model | Sequence[Model], object: Model | str, contacts: Sequence, forces=()):
+    def __init__(
+        self, fingers: Model | Sequence[Model], object: Model | str, contacts: Sequence, forces=(), cones=None
+    ):
         models = [fingers] if isinstance(fingers, Model) else list(fingers)
         if not models or not all(isinstance(model, Model) for model in models):
             raise ValueError("fingers is no Model and no list of Models; pass what carries the fingertips")
@@ -59,9 +63,11 @@ class Grasp(Scene):
         for one in contacts:
             if isinstance(one, Pfaffian) and one.b is not None:
                 raise ValueError(f"contact {one.name!r} prescribes a slip b; contacts of a grasp have none")
-        super().__init__(model, tuple(on_object(one, object) for one in contacts), forces)
+        super().__init__(model, tuple(on_object(one, object) for one in contacts), forces, cones)
         self.object = object
         layout(self)  # refuses unknown bodies
+        if cones is not None:
+            coned_contacts(self)  # refuses cones that do not fit
 
     @property
     def object_velocities(self) -> tuple[int, ...]:

@@ -8,9 +8,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_concrete
+from jaxdyn.lie import se3
+from jaxdyn.model import float64 as f64
 
 _OPTIONAL = ("a", "external")
 
@@ -131,3 +133,12 @@ def check_shapes(model, **arguments) -> tuple[Any, ...]:
     if not hasattr(model, "topology"):
         raise ValueError(f"model is a {type(model).__name__}, which has no bodies; pass a Model")
     return check_state(model, **arguments)
+
+
+def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
+    """A pose as an array leaf; arrays (4, 4) of jax are taken as they are, so that they can be traced."""
+    if isinstance(pose, jax.Array) and pose.shape == (4, 4):
+        return pose
+    if isinstance(pose, jax.Array) and pose.shape == (3,):
+        return se3.from_parts(jnp.eye(3, dtype=pose.dtype), pose)
+    return jnp.asarray(f64.pose_matrix(pose, what), float)

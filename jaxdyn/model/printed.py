@@ -72,7 +72,8 @@ def solution_lines(solution) -> str:
         return f"Solution: {ended}; q {solution.q.shape}, v {solution.v.shape}; {solution.solver}"
     words = str(solution.result).partition("<")[2].rstrip(">")
     steps, rejected = int(count), int(solution.stats["num_rejected_steps"])
-    given = [name for name in ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
+    given = [name for name in ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual",
+                          "torque", "control_state")
              if getattr(solution, name) is not None]  # fmt: skip
     more = [*given, *(f"pose:{name}" for name in solution.poses)]
     return (

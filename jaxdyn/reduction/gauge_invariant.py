@@ -132,8 +132,8 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     back = pseudo_inverse(Lambda, tolerance(rank_tol, Lambda))
     keep = unit - _product(back, Lambda)
     reference = split_directions(keep)
-    V1, _ = orthonormal(_product(unit - keep, reference[:, : scene.nv - dof]))
-    V2, _ = orthonormal(_product(keep, reference[:, scene.nv - dof :]))
+    V1, *_ = orthonormal(_product(unit - keep, reference[:, : scene.nv - dof]))
+    V2, *_ = orthonormal(_product(keep, reference[:, scene.nv - dof :]))
     V2 = V2 if motion_rotation is None else _product(V2, motion_rotation)
     Lambda_r = _product(Lambda, V1)
     # V1^T V2dot, from d/dt (Lam V2) = 0; Lam_r has independent columns and Lam_r^+ = V1^T Lam^+.

@@ -19,10 +19,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_concrete, is_known
+from jaxdyn.compile import compiled, is_concrete, is_known, run_repaired
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
-from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
@@ -53,6 +53,16 @@ class Basis(eqx.Module):
     def at(self, scene: Scene, q, t) -> Parametrization:
         """N, v0 and their quality at a place."""
         raise NotImplementedError
+
+    def along(self, scene: Scene, q, nu, t) -> "Moving":
+        """v = N nu + v0 and its rate Ndot nu + v0dot, by differentiation of `at`."""
+
+        def velocity(q, t):
+            place = self.at(scene, q, t)
+            return _product(place.N, _fitting(nu, place.N)) + place.v0, place
+
+        v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
+        return Moving(v, push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t)), N, quality)
 
     def advice(self, scene: Scene, q, t) -> str:
         """What to do where N does not serve, for concrete places."""
@@ -86,7 +96,7 @@ class Independent(Basis):
         whole = jnp.round(jnp.sum(inverse * A2.T)) == rest.size
         quality = jnp.where(whole, 1.0 / jnp.where(whole, size, jnp.ones_like(size)), jnp.zeros_like(size))
         if A2.shape[0] == A2.shape[1]:
-            quality = quality * jnp.where(jnp.linalg.slogdet(lax.stop_gradient(A2))[0] < 0, -1.0, 1.0).astype(A.dtype)
+            quality = quality * sign_of_determinant(A2)
         return Parametrization(N, v0, _tangent_only(A, N, quality))
 
     def advice(self, scene, q, t):
@@ -148,20 +158,60 @@ class Orthonormal(Basis):
 
     def at(self, scene, q, t):
         """The reference, projected and made orthonormal."""
+        return self._at(scene, q, t)[0]
+
+    def _at(self, scene, q, t):
+        """Also A, A^+, and T."""
         A, b = _affine_rows(scene, q, t)
         reference = self.reference.astype(A.dtype)
         # A factorisation waits for that which gave the reference: two of a large batch at once can block jaxlib 0.10 for ever.
         A = A + 0 * reference[0, 0]
         inverse = pseudo_inverse(A, tolerance(None, A))
-        N, pivot = orthonormal(reference - _product(inverse, _product(A, reference)))
+        N, pivot, factor = orthonormal(reference - _product(inverse, _product(A, reference)))
         free = scene.nv - jnp.round(jnp.sum(inverse * A.T))
         quality = jnp.where(free == N.shape[1], pivot, jnp.zeros_like(pivot))
-        return Parametrization(N, _product(inverse, b), quality)
+        return Parametrization(N, _product(inverse, b), quality), A, inverse, factor
+
+    def along(self, scene, q, nu, t):
+        """The same, with the rate of N nu in closed form.
+
+        P = 1 - A^+ A has the rate Pdot = -S - S^T, S = A^+ Adot P, wherever the rank is constant. With L = (A^+)^T R T^-1 and
+        B = Adot N follows T^-T d(T^T T)/dt T^-1 = -Z - Z^T, Z = L^T B, and
+
+            Ndot nu = -A^+ B nu - P Adot^T L nu + N U nu,   U the upper triangle of Z + Z^T with half of its diagonal.
+        """
+        place, A, inverse, factor = self._at(scene, q, t)
+        N = place.N
+        nu = _fitting(nu, N)
+        v = _product(N, nu) + place.v0
+        way = (q, t), (velocity_to_rate(scene.system, q, v), jnp.ones_like(t))
+        rate = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), *way)[1]
+        drift = jax.jvp(lambda q, t: self.at(scene, q, t).v0, *way)[1]
+        turned, L = _product(rate, N), solve_lower(factor, _product(self.reference.astype(A.dtype).T, inverse)).T
+        Z = _product(L.T, turned)
+        Z = Z + Z.T
+        U = jnp.triu(Z) - 0.5 * jnp.diag(jnp.diag(Z))
+        across = _product(rate.T, _product(L, nu))
+        across = across - _product(inverse, _product(A, across))
+        drift = drift - _product(inverse, _product(turned, nu)) - across + _product(N, _product(U, nu))
+        return Moving(v, drift, N, place.quality)
 
     def advice(self, scene, q, t):
         """A reference that serves here."""
         rank = np.linalg.matrix_rank(np.asarray(constraint_jacobian_compiled(scene, q, t)), tol=1e-9)
         return f"take jd.tangent_basis(scene, q) for reference; the rows have rank {rank} of nv = {scene.nv}"
+
+
+class Whole(Basis):
+    """All velocities of a scene without constraints: nu = v."""
+
+    def size(self, scene):
+        """nv."""
+        return scene.nv
+
+    def at(self, scene, q, t):
+        """N = 1."""
+        return Parametrization(jnp.eye(scene.nv, dtype=q.dtype), jnp.zeros((scene.nv,), q.dtype), jnp.ones((), q.dtype))
 
 
 def as_basis(basis: Any, scene: Scene) -> Basis:
@@ -213,7 +263,7 @@ def reduced_dynamics(
     tau: Float[Array, " nv"] | None = None,
     t=0.0,
     *,
-    basis: Any,
+    basis: Any = None,
 ) -> ReducedDynamics:
     """Motion in minimal velocities: N^T M N nudot + N^T (M (Ndot nu + v0dot) + h) = N^T (tau + forces).
 
@@ -224,13 +274,14 @@ def reduced_dynamics(
     - `q` (nq,), on the constraints; `nu` (nr,), minimal velocities; `tau` (nv,), N m or N (None: zero); `t`, s.
     - `basis`, what N and nu are. A tuple of indices: nu are these entries of v. A function N(q, t) -> (nv, nr), or
       -> (N, v0), with A N = 0 and A v0 = b; a plain function is static, a Module carries leaves. A matrix R (nv, nr),
-      such as `tangent_basis`: N is the orthonormal basis of ker A nearest to R in the sense of `Orthonormal`.
+      such as `tangent_basis`: N is the orthonormal basis of ker A nearest to R in the sense of `Orthonormal`. A scene
+      without constraints has nothing to choose: leave it out, and nu = v, M_r = M, h_r = h.
 
     **Returns:** `ReducedDynamics`. Where N does not serve (a singular A2, columns that depend on each other or break
     the rows, a rank other than nv - nr) the result is `singular_basis`.
 
-    **Raises:** ValueError for shapes that do not fit, a scene without constraints, and, on concrete numbers, a basis
-    that does not serve, with what to take instead.
+    **Raises:** ValueError for shapes that do not fit, a basis that is missing or, without constraints, given, and, on
+    concrete numbers, a basis that does not serve, with what to take instead.
 
     Source: EQUATIONS section 6; Kane & Levinson (1985), section 6.1.
     """
@@ -238,9 +289,12 @@ def reduced_dynamics(
     tau = or_zeros(tau, scene.nv)
     q, tau, t = check_state(scene.system, q=q, tau=tau, t=t)
     nu = as_array(nu, "nu", q.dtype)
-    if not layout(scene):
-        raise ValueError("the scene has no constraints, so there is nothing to reduce; use jd.forward_dynamics")
-    choice = as_basis(basis, scene)
+    if layout(scene):
+        choice = as_basis(basis, scene)
+    elif basis is None:
+        choice = Whole()
+    else:
+        raise ValueError(f"the scene has no constraints, so that nu = v; basis is {basis!r}, leave it out")
     size = choice.size(scene)
     if size is not None and nu.shape != (size,):
         raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns{batch_hint(nu, (1,))}")
@@ -253,6 +307,11 @@ def reduced_dynamics(
 
 def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
     """`reduced_dynamics` in traced numbers, for a `Basis` that fits."""
+    return run_repaired(_reduce, (scene, choice), q, nu, tau, t)
+
+
+def _reduce(given: tuple[Scene, Basis], q, nu, tau, t) -> ReducedDynamics:
+    scene, choice = given
     return solve_reduced(scene, moving(scene, choice, q, nu, t), q, tau, t)
 
 
@@ -268,16 +327,15 @@ class Moving(NamedTuple):
 def moving(scene: Scene, choice: Basis, q, nu, t) -> Moving:
     """v = N nu + v0 and Ndot nu + v0dot, from one factorisation of the rows."""
 
-    def velocity(q, t):
-        place = choice.at(scene, q, t)
-        if nu.shape != place.N.shape[1:]:
-            raise ValueError(
-                f"nu has shape {nu.shape}, expected {place.N.shape[1:]} as the basis has columns{batch_hint(nu, (1,))}"
-            )
-        return _product(place.N, nu) + place.v0, place
+    return choice.along(scene, q, nu, t)
 
-    v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
-    return Moving(v, push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t)), N, quality)
+
+def _fitting(nu, N):
+    if nu.shape != N.shape[1:]:
+        raise ValueError(
+            f"nu has shape {nu.shape}, expected {N.shape[1:]} as the basis has columns{batch_hint(nu, (1,))}"
+        )
+    return nu
 
 
 def solve_reduced(scene: Scene, place: Moving, q, tau, t) -> ReducedDynamics:
@@ -364,11 +422,11 @@ def independent_velocities(scene: Scene, q, t=0.0) -> tuple[int, ...]:
     return tuple(i for i in range(scene.nv) if i not in found)
 
 
-def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, ""]]:
-    """X T^-1 with T^T T = X^T X for columns X, and the least pivot of T relative to the largest; smooth in X."""
+def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, ""], Float[Array, "k k"]]:
+    """X T^-1 with T^T T = X^T X for columns X, the least pivot of T relative to the largest, and T^T; smooth in X."""
     factor = cholesky(_product(columns.T, columns))
     pivots = jnp.diagonal(factor)
-    return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots)
+    return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots), factor
 
 
 def minimal_velocity(place: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:

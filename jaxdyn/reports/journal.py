@@ -38,10 +38,13 @@ class Journal:
         self.path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def _read(self, path: Path) -> None:
-        first, *lines = path.read_text(encoding="utf-8").splitlines() or ["{}"]
+        remedy = "name another directory, or remove the file to start anew"
+        try:
+            first, *lines = path.read_text(encoding="utf-8").splitlines() or ["{}"]
+        except UnicodeDecodeError as error:
+            raise ValueError(f"out has {path}, which is no text in UTF-8 ({error}); {remedy}") from error
         if not lines:
             return
-        remedy = "name another directory, or remove the file to start anew"
         try:
             before = json.loads(first)
             for name, of in (

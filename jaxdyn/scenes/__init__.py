@@ -2,6 +2,8 @@
 
 from jaxdyn.scenes._named import REGISTRY as _REGISTRY
 from jaxdyn.scenes._named import NamedScene as NamedScene
+from jaxdyn.scenes.arms import coordinated_lifting as coordinated_lifting
+from jaxdyn.scenes.arms import sphere_arm as sphere_arm
 from jaxdyn.scenes.balls import ball_on_incline as ball_on_incline
 from jaxdyn.scenes.balls import ball_on_turntable as ball_on_turntable
 from jaxdyn.scenes.balls import bowling_ball as bowling_ball

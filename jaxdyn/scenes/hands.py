@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.constraints import rolling_sphere, rolling_wheel
+from jaxdyn.contact.cones import friction_cone
 from jaxdyn.grasp import Grasp, contact
 from jaxdyn.model import inertia
 from jaxdyn.model.builder import ModelBuilder
@@ -31,6 +32,11 @@ def _carried(position, velocity, omega, point):
 def _turn(angle):
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _cones(mu, kind="hard-finger", in_plane=False):
+    """The friction cone of all contacts, none for a `mu` of None."""
+    return None if mu is None else friction_cone(kind, mu if kind == "hard-finger" else None, in_plane=in_plane)
 
 
 # Two fingers in the x-y plane, their bases on the x axis.
@@ -79,13 +85,15 @@ def _bar_start(center=(0.02, 0.38), angle=0.1, velocity=(0.2, -0.1, 0.5), links=
 
 @named(_bar_start)
 def hand_with_bar(
-    *, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, length=0.3, gravity=9.81, kind="hard-finger"
+    *, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, length=0.3, gravity=9.81, kind="hard-finger", mu=0.8
 ) -> Grasp:
     """Two fingers of two joints each, in the x-y plane, whose tips hold the ends of a bar.
 
     q = (joints of finger 1, of finger 2, x, y and angle of the bar). `links`, `masses`: of a finger's two uniform bars
     (m, kg); `palm`: distance of the bases (m); `mass`, `length` of the bar. Contact frames have x along the bar's y.
-    Start: the bar's centre, angle and body velocity (vx, vy, w), the knees outside.
+    Start: the bar's centre, angle and body velocity (vx, vy, w), the knees outside. Hands have friction cones of coefficient
+    `mu`, so that `jd.simulate` ends where a finger pulls or slips, as they do without torques that grip; None: two-sided
+    contacts.
 
     Source: Murray, Li & Sastry (1994), example 5.3 and section 6.3.
     """
@@ -97,7 +105,7 @@ def hand_with_bar(
         pose[:3, :3] = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -side], [-side, 0.0, 0.0]]).T
         pose[0, 3] = side * length / 2
         contacts.append(contact(kind, f"tip{i}", pose, in_plane=True))
-    return Grasp(builder.build(), "bar", contacts)
+    return Grasp(builder.build(), "bar", contacts, cones=_cones(mu, kind, in_plane=True))
 
 
 def _disk_start(
@@ -122,7 +130,7 @@ def _disk_start(
 
 
 @named(_disk_start)
-def hand_with_disk(*, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, radius=0.1, gravity=9.81) -> Grasp:
+def hand_with_disk(*, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, radius=0.1, gravity=9.81, mu=0.8) -> Grasp:
     """The hand of `hand_with_bar` with a disk that rolls between the flat inner faces of the outer links.
 
     q = (joints of finger 1, of finger 2, x, y and angle of the disk). Each contact has a holonomic row, the gap, and a
@@ -137,7 +145,7 @@ def hand_with_disk(*, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, rad
         finger = f"finger{i}_2"
         rolling = rolling_wheel("disk", None, radius, plane=face, plane_body=finger, lateral=False, name=f"finger{i}")
         contacts.append(rolling)
-    return Grasp(builder.build(), "disk", contacts)
+    return Grasp(builder.build(), "disk", contacts, cones=_cones(mu, in_plane=True))
 
 
 # Three fingers in space: their bases on a circle in the x-y plane, a yaw joint and two pitch joints each.
@@ -219,7 +227,7 @@ def _ball_start(
 
 @named(_ball_start)
 def hand_with_ball(
-    *, links=_SPATIAL_LINKS, masses=(0.1, 0.2, 0.15), circle=_CIRCLE, mass=0.4, radius=0.1, gravity=9.81
+    *, links=_SPATIAL_LINKS, masses=(0.1, 0.2, 0.15), circle=_CIRCLE, mass=0.4, radius=0.1, gravity=9.81, mu=0.8
 ) -> Grasp:
     """Three fingers of three joints each, whose tips hold a ball at three points of its equator, with friction.
 
@@ -235,7 +243,7 @@ def hand_with_ball(
         pose[:3, :3] = np.stack([np.cross(_UP, -direction), _UP, -direction], 1)
         pose[:3, 3] = radius * direction
         contacts.append(contact("hard-finger", f"tip{i}", pose))
-    return Grasp(builder.build(), "ball", contacts)
+    return Grasp(builder.build(), "ball", contacts, cones=_cones(mu))
 
 
 def _rolling_start(
@@ -260,6 +268,7 @@ def hand_rolling_ball(
     radius=0.1,
     tip_radius=0.02,
     gravity=9.81,
+    mu=0.8,
 ) -> Grasp:
     """The hand of `hand_with_ball` with spherical fingertips, between which the ball rolls: truly nonholonomic.
 
@@ -274,4 +283,4 @@ def hand_rolling_ball(
         )
         for i in (1, 2, 3)
     ]
-    return Grasp(builder.build(), "ball", contacts)
+    return Grasp(builder.build(), "ball", contacts, cones=_cones(mu))

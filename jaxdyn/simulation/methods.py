@@ -17,14 +17,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.assembly import open_constraints, residuals, start_evidence
+from jaxdyn.constraints.assembly import open_constraints, start_evidence
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
-from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
+from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
 from jaxdyn.constraints.rank import checked_tolerance
+from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import _product
 from jaxdyn.reduction.minimal import (
@@ -81,6 +81,10 @@ class Method(eqx.Module):
         """Constraint forces along the rows, (nc,)."""
         return dynamics(scene, q, v, t, force).multipliers
 
+    def satisfies(self, scene: Scene, q, v, t, force) -> Array:
+        """Whether some acceleration meets all rows, ()."""
+        return jnp.asarray(True)
+
     def corrects(self, scene: Scene) -> bool:
         """Whether `stepped` and `corrected` change a state."""
         return self.projects or has_quaternions(scene.system)
@@ -135,6 +139,10 @@ class Multipliers(Method):
     def multipliers(self, scene, q, v, t, force):
         """From `constrained_dynamics`."""
         return dynamics(scene, q, v, t, force, self.rank_tol).multipliers
+
+    def satisfies(self, scene, q, v, t, force):
+        """From `constrained_dynamics`."""
+        return dynamics(scene, q, v, t, force, self.rank_tol).result != RESULTS.contradictory_rows
 
 
 class Projected(Multipliers):
@@ -405,13 +413,13 @@ def serves(quality) -> Array:
 
 
 def start_limit(dtype) -> float:
-    """Largest residual (m, rad, m/s, rad/s) of a start that counts as rounding of the numbers that were given."""
+    """Part of the mechanism's length by which a start may be open: rounding of the numbers that were given."""
     return float(jnp.finfo(dtype).eps) ** 0.4
 
 
 def consistent(scene: Scene, q, v, t):
     """Whether a state is on the constraints but for rounding."""
-    return jnp.max(lax.stop_gradient(residuals(scene, q, v, t))) <= start_limit(q.dtype)
+    return openness(scene, q, v, t, start_limit(q.dtype)) <= 1.0
 
 
 def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
@@ -420,18 +428,18 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
     **Raises:** ValueError that names the constraints and by how much they are violated, and the fix; for a basis that
     does not serve at the start.
     """
-    found, rank = start_evidence(scene, q, v, np.asarray(t, q.dtype))
     limit = start_limit(q.dtype)
-    if float(np.max(found)) > limit:
+    found, ratio, rank = start_evidence(scene, q, v, np.asarray(t, q.dtype), limit)
+    if not ratio <= 1:
         raise ValueError(
             f"q0, v0 are not on the constraints: {open_constraints(scene, q, v, t, limit)} (position residual "
             f"{float(found[0]):.3g}, velocity residual {float(found[1]):.3g}); start from "
             "state = jd.assemble(scene, q0, v0), with state.q and state.v"
         )
-    if int(rank) == scene.nv:
+    if rank == scene.nv:
         names = ", ".join(repr(place.name) for place in layout(scene))
         raise ValueError(
-            f"the constraints {names} remove all freedom: {int(rank)} independent rows for nv = {scene.nv}; "
+            f"the constraints {names} remove all freedom: {rank} independent rows for nv = {scene.nv}; "
             "leave one out, or free a joint"
         )
     if not isinstance(method, Reduced):
@@ -439,7 +447,7 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
     # Inside a jit, jax would trace operations on known numbers too.
     with jax.ensure_compile_time_eval():
         q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
-        method = method.fitted(scene, scene.nv - int(rank))
+        method = method.fitted(scene, scene.nv - rank)
         if method.basis is not None and not bool(_serves_at(scene, method.basis, q, t)):
             raise ValueError(f"the basis does not serve at q0: {method.basis.advice(scene, q, t)}")
     return method

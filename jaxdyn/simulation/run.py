@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile import compiled, is_concrete, is_expanding, is_known, is_rank_safe, partition_traced
 from jaxdyn.constraints.assembly import residuals
@@ -23,6 +22,8 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.model.arguments import as_array, state_dtype
 from jaxdyn.model.tree import Model, frame_index, neutral
+from jaxdyn.simulation import contacts as unilateral
+from jaxdyn.simulation import controls
 from jaxdyn.simulation.methods import Method, Reduced, checked_start, chosen_method, consistent, serves, start_limit
 from jaxdyn.simulation.solution import RESULTS, Solution, from_diffrax, raise_failure
 from jaxdyn.simulation.solvers import ExplicitSteps, LieGroup, ProjectedSolver, Stepper, driver
@@ -37,7 +38,9 @@ from jaxdyn.simulation.solvers.choice import (
     progress_meter,
     stepping,
 )
-from jaxdyn.simulation.solvers.differentiable import COUNTS, ROOM, run, run_adaptively, run_driven
+from jaxdyn.simulation.solvers.differentiable import COUNTS, ROOM, run, run_adaptively
+from jaxdyn.simulation.solvers.driver import Drive
+from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.first_step import Adaptive
 from jaxdyn.simulation.solvers.fixed_steps import Watched, too_coarse
 from jaxdyn.simulation.solvers.inputs import (
@@ -49,10 +52,20 @@ from jaxdyn.simulation.solvers.inputs import (
     turning,
     usable_steps,
 )
-from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_callback, checked_force
+from jaxdyn.systems.scene import Scene, as_scene, check_callback
 from jaxdyn.systems.system import System, displace, retract, velocity_to_rate
 
-_OUTPUTS = ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual")
+_OUTPUTS = (
+    "energy",
+    "power",
+    "work",
+    "acceleration",
+    "multipliers",
+    "constraint_residual",
+    "torque",
+    "control_state",
+    *unilateral.OUTPUTS,
+)
 _POSE = "pose:"
 
 
@@ -70,6 +83,7 @@ def simulate(
     atol: Any = 1e-8,
     adjoint: str | diffrax.AbstractAdjoint | None = None,
     outputs: Sequence[str] = (),
+    contacts: str = "stop",
     progress: bool = False,
     max_steps: int | None = None,
     throw: bool | None = None,
@@ -88,7 +102,8 @@ def simulate(
     - `ts` (nt,): strictly increasing times (s), nt >= 2; the first is the start.
     - `control(q, v, t) -> (nv,)`: tau (N m or N); q comes with unit quaternions. An equinox Module or a
       `jax.tree_util.Partial` carries leaves that can be differentiated and batched; a plain function is static: define
-      it once.
+      it once. A `jd.Controller` has a state of its own, integrated with the motion, and is told the multipliers; a
+      `jd.Sampled` law is called once a period, and its torque is held.
     - `method`: "free" or "variational" for a scene without constraints. With them
       "projected": accelerations with multipliers, and q and v put back on the constraints after every step and at save
       points, by the least change in the mass metric;
@@ -109,8 +124,12 @@ def simulate(
       forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration",
-      "multipliers", "constraint_residual" and
+      "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control), "control_state" (of
+      a controller) and
       "pose:<frame>". They are computed only if asked for.
+    - `contacts`: of a scene with `cones`. "stop": where a contact pulls or leaves its cone (a margin below zero by more than
+      rounding, eps^(1/2) of its force) the run ends, with the code `contact_lost` and the time, which is found within the
+      step. "report": it goes on, and contacts hold on both sides.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
       4096 with "direct", and where reverse mode goes through adaptive steps: it remembers where each one ends, at 8 bytes a
@@ -146,12 +165,18 @@ def simulate(
             scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
     if not is_fixed(stepsize) and is_concrete(q0):
         check_turns(scene, q0, state_dtype(scene.system))
-    control = None if control is None else as_pytree(control, "control")
+    control = controls.as_control(control)
+    controls.check_steps(control, stepsize)
     backwards = adjoint == "backsolve" or isinstance(adjoint, diffrax.BacksolveAdjoint)
     if solver is None and scene.forces and not (is_fixed(stepsize) or backwards):
-        solver = for_start(scene, control, q0, v0, ts)
+        solver = for_start(scene, controls.at_start(control, q0, v0, ts[0]), q0, v0, ts)
     solver = checked_method(method.stepper(solver, stepsize), stepsize)
     adjoint = checked_adjoint(adjoint, solver)
+    if isinstance(solver, Stepper) and isinstance(control, (controls.Controller, controls.Sampled)):
+        raise ValueError(
+            f"control is a {type(control).__name__}, whose state the steps of method 'variational' do not integrate; take "
+            "another method"
+        )
     if isinstance(solver, Stepper) and isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
@@ -161,10 +186,13 @@ def simulate(
             "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards; take 'reverse', or "
             "jd.Reduced with independent velocities or a function"
         )
+    outputs = _checked_outputs(scene, outputs)
+    unilateral.check_contacts(scene, contacts, outputs)
     options = {
         "solver": solver,
         "adjoint": adjoint,
-        "outputs": _checked_outputs(scene, outputs),
+        "outputs": outputs,
+        "contacts": contacts,
         "progress": bool(progress),
         "max_steps": checked_step_limit(max_steps, ts, stepsize, adjoint),
         "limit_is_given": max_steps is not None,
@@ -200,14 +228,25 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
         """The scene, the control and the method."""
         return known(args or ())
 
-    def effort(args, q, v, t):
+    def torque(args, y, q, v, t):
+        """Of the control, or None when there is none."""
+        scene, control, method = given(args)
+
+        def multipliers(tau):
+            force = scene.applied_force(q, v, t)
+            return method.multipliers(scene, q, v, t, tau if force is None else tau + force)
+
+        return controls.torque(control, scene, y, q, v, t, multipliers)
+
+    def effort(args, y, q, v, t):
         """Tau plus the scene's forces, or None when there are none."""
-        scene, control, _ = given(args)
-        force = scene.applied_force(q, v, t)
-        if control is None:
-            return force
-        tau = checked_force(control(q, v, t), q, scene.nv, "control")
-        return tau if force is None else tau + force
+        force, tau = given(args)[0].applied_force(q, v, t), torque(args, y, q, v, t)
+        return force if tau is None else tau if force is None else tau + force
+
+    def of_control(args, y, q, v, t, force):
+        """Rates of what the control adds to the state."""
+        scene, control, method = given(args)
+        return controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
 
     def power(force, v):
         return jnp.zeros((), v.dtype) if force is None else jnp.sum(v * force)
@@ -216,7 +255,9 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     @functools.partial(jax.jit, static_argnums=0)
     def traced(way, t, y, args):
         scene, _, method = given(args)
-        rates, force, v = method.evaluated(scene, y, t, functools.partial(effort, args))
+        rates, force, v = method.evaluated(scene, y, t, functools.partial(effort, args, y))
+        if added:
+            rates = rates | of_control(args, y, retract(system, y["q"]), v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
 
     def derivative(t, y, args):
@@ -225,11 +266,12 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     @jax.jit
     def explicit_part(t, y, args):
         """All rates but those of `implicit_part`."""
-        scene, control, method = given(args)
+        scene, _, method = given(args)
         q, v = method.place(scene, y, t)
-        tau = None if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
-        rates = method.rates(scene, y, q, v, t, tau) | {"q": jnp.zeros_like(y["q"])}
-        return rates | {"work": power(effort(args, q, v, t), v)} if "work" in y else rates
+        rates = method.rates(scene, y, q, v, t, torque(args, y, q, v, t)) | {"q": jnp.zeros_like(y["q"])}
+        force = effort(args, y, q, v, t) if added or "work" in y else None
+        rates = rates | of_control(args, y, q, v, t, force)
+        return rates | {"work": power(force, v)} if "work" in y else rates
 
     @jax.jit
     def implicit_part(t, y, args):
@@ -239,16 +281,19 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
         rates = jax.tree.map(jnp.zeros_like, y)
         force = scene.applied_force(q, v, t)
         if force is not None:
-            by_force = {name: y[name] for name in y if name != "work"}
-            _, added = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
-            rates = rates | added
+            by_force = {name: y[name] for name in y if name not in ("work", *added)}
+            _, pushed = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
+            rates = rates | pushed
         return rates | {"q": velocity_to_rate(scene.system, q, v)}
 
     def project(t, y, error, args):
         scene, _, method = given(args)
         y, error = method.stepped(scene, y, t, error)
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
-        return method.continued(scene, y, t), error, diffrax.RESULTS.successful
+        y = method.continued(scene, y, t)
+        if controls.HELD in y:
+            y = y | {controls.HELD: controls.sampled(given(args)[1], y[controls.HELD], *method.place(scene, y, t), t)}
+        return y, error, diffrax.RESULTS.successful
 
     def quality(t, y, args, **_):
         scene, _, method = given(args)
@@ -258,10 +303,21 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
         scene, _, method = given(args)
         return method.begin(scene, y, t)
 
+    def allowances(args, y, q, v, t):
+        """How far the contacts are from being lost."""
+        scene, _, method = given(args)
+        return unilateral.allowances(scene, method.multipliers(scene, q, v, t, effort(args, y, q, v, t)))
+
+    @jax.jit
+    def least_allowance(t, y, args):
+        scene, _, method = given(args)
+        q, v = method.place(scene, y, t)
+        return jnp.min(allowances(args, y, q, v, t))
+
     @jax.jit
     def advance(t0, t1, y, args, carried):
         scene, _, method = given(args)
-        return method.advance(scene, y, t0, t1, carried, lambda q, v, t: effort(args, q, v, t))
+        return method.advance(scene, y, t0, t1, carried, functools.partial(effort, args, y))
 
     if isinstance(options["solver"], Stepper):
         options = options | {"solver": Stepper(begin, advance, functools.partial(displace, system))}
@@ -288,10 +344,11 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     # Refuses callbacks that do not fit before diffrax meets them.
     for i, force in enumerate(scene.forces):
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", q0, v0, ts[0], first=(system,))
-    if control is not None:
-        check_callback(control, "control", "control(q, v, t)", q0, v0, ts[0])
-    eqx.filter_eval_shape(effort, args, q0, v0, ts[0])
-    y0 = method.start(scene, q0, v0, ts[0])
+    controls.check_control(scene, control, q0, v0, ts[0])
+    states = controls.started(control, q0, v0, ts[0])
+    added = tuple(states)  # names alone, as the functions above hold no arrays
+    eqx.filter_eval_shape(effort, args, states, q0, v0, ts[0])
+    y0 = method.start(scene, q0, v0, ts[0]) | states
     first = method.quality(scene, y0, ts[0])
     y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
     solver = options["solver"]
@@ -299,12 +356,16 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
         solver = solver.fitted(system)
     # Of what a projection does, local coordinates leave nothing to be done about quaternions.
     corrects = method.projects or bool(method.jumping) if isinstance(solver, LieGroup) else method.corrects(scene)
+    corrects = corrects or controls.HELD in added
     term = diffrax.ODETerm(derivative)
     if is_split(solver):
         term = diffrax.MultiTerm(diffrax.ODETerm(explicit_part), diffrax.ODETerm(implicit_part))
     options = options | {"solver": solver}
     corrector = project if corrects else None
-    rows, result, counts, time_reached = _integrate(term, corrector, quality, method, y0, ts, args, steps, options)
+    watched = least_allowance if unilateral.can_end(scene, options["contacts"]) else None
+    rows, result, counts, time_reached, last = _integrate(
+        term, corrector, quality, watched, method, y0, ts, args, steps, options
+    )
 
     y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, rows)
     finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]
@@ -318,6 +379,16 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
 
     # One after the other, by the kernels that have put the start on the constraints.
     q, v = lax.map(place, (y, ts))
+    lost = None
+    if watched:
+        margins, within = lax.map(lambda row: allowances(args, *row), (y, q, v, ts)), None
+        if last is not None:
+            there = allowances(args, last, *method.place(scene, last, time_reached), time_reached)
+            within = (result == RESULTS.event_occurred, time_reached, there)
+        lost = unilateral.first_loss(margins, reached, ts, within)
+        reached = reached & ~(lost.happened & (ts > lost.time))
+        time_reached = jnp.where(lost.happened, lost.time, time_reached)
+        result = RESULTS.where(lost.happened, RESULTS.contact_lost, result)
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
     ended = (result == RESULTS.successful) | (result == RESULTS.coarse_steps)
     result = RESULTS.where(ended & ~reached.all(), RESULTS.nonfinite_state, result)
@@ -327,6 +398,9 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     if method.projects and scene.constraints:
         closed = lax.map(lambda row: consistent(scene, *row), (q, v, ts))
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
+    elif scene.constraints:
+        met = lax.map(lambda row: method.satisfies(scene, *row[1:], effort(args, *row)), (y, q, v, ts))  # pyright: ignore[reportCallIssue]
+        result = RESULTS.where((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows, result)
     if first is not None:
         result = RESULTS.where(serves(first), result, RESULTS.singular_basis)
     result = RESULTS.where(held, result, RESULTS.inconsistent_start)
@@ -342,51 +416,70 @@ def _motion(scene: Scene, control, method: Method, numbers, options) -> Solution
     ):
         result = RESULTS.where(fine, result, code)
 
-    def report(q, v, t):
+    def report(q, v, t, of_control):
         values = {}
-        force = effort(args, q, v, t) if {"power", "acceleration", "multipliers"} & set(outputs) else None
+        pushed = {"power", "acceleration", "multipliers", *unilateral.OUTPUTS} & set(outputs)
+        force = effort(args, of_control, q, v, t) if pushed else None
         if "energy" in outputs:
             values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
         if "power" in outputs:
             values["power"] = power(force, v)
         if "acceleration" in outputs:
             values["acceleration"] = method.acceleration(scene, q, v, t, force)
-        if "multipliers" in outputs:
-            values["multipliers"] = method.multipliers(scene, q, v, t, force)
+        if {"multipliers", *unilateral.OUTPUTS} & set(outputs):
+            multipliers = method.multipliers(scene, q, v, t, force)
+            values |= {"multipliers": multipliers} if "multipliers" in outputs else {}
+            values |= unilateral.reported(scene, multipliers, outputs)
         if "constraint_residual" in outputs:
             values["constraint_residual"] = residuals(scene, q, v, t)
+        if "torque" in outputs:
+            tau = torque(args, of_control, q, v, t)
+            values["torque"] = jnp.zeros_like(v) if tau is None else tau
+        if "control_state" in outputs:
+            values["control_state"] = controls.state_of(control, of_control, q, v, t)
         frames = [name.removeprefix(_POSE) for name in outputs if name.startswith(_POSE)]
         return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
 
     def or_nan(rows):
         return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
 
-    rows = {"q": q, "v": v} | jax.vmap(report)(q, v, ts) | ({} if work is None else {"work": work})
+    rows = (
+        {"q": q, "v": v}
+        | jax.vmap(report)(q, v, ts, {name: y[name] for name in added})
+        | ({} if work is None else {"work": work})
+    )
     whole = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
     result = RESULTS.where((result == RESULTS.successful) & ~whole, RESULTS.nonfinite_state, result)
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
+    if lost is not None:
+        stats["lost_contact"] = lost.contact
     return Solution(ts=given_times, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
 
 
-def _integrate(term, project, quality, method, y0, ts, args, steps, options):
-    """Rows of the state at ts[1:], how it ended, counts, and the time it came to."""
+def _integrate(term, project, quality, allowance, method, y0, ts, args, steps, options):
+    """Rows of the state at ts[1:], how it ended, counts, the time it came to, and the state there if an event may end it."""
     adjoint = options["adjoint"]
     solver: Any
     solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which integrates another vector field
     # Of a method that wraps an explicit one, diffrax says that it is one.
     explicit = isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
+    jumping = (*method.jumping, *({controls.HELD} & set(y0)))
     if explicit and not continuous:
-        solver = ExplicitSteps(solver, project, method.jumping, method.projects, field=term.vector_field)
+        solver = ExplicitSteps(solver, project, jumping, method.projects, field=term.vector_field)
     elif project:
-        solver = ProjectedSolver(solver, project, method.jumping, method.projects)
+        solver = ProjectedSolver(solver, project, jumping, method.projects)
     if continuous and isinstance(controller, Watched):
         controller = diffrax.ConstantStepSize()  # backwards the state is another one
     event = None
-    if isinstance(method, Reduced) and not continuous:
-        # Near a singular basis steps become short; a long one may pass it, which the sign shows.
-        event = diffrax.Event(lambda t, y, args, **_: _signed(quality(t, y, args)))
+    # Near a singular basis steps become short; a long one may pass it, which the sign shows.
+    watched = isinstance(method, Reduced) and not continuous
+    basis = (lambda t, y, args, **_: _signed(quality(t, y, args))) if watched else None
+    if allowance and not continuous:
+        event = unilateral.event(allowance, basis, basis and basis(ts[0], y0, args), ts.dtype)
+    elif basis:
+        event = diffrax.Event(basis)
     how = {
         "term": term,
         "solver": solver,
@@ -398,17 +491,18 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
         "dt0": dt0,
     }
     sums = None
-    if explicit and not continuous and event is None and _is_driven(controller, adjoint, options):
+    if explicit and not continuous and not allowance and _is_driven(controller, adjoint, options):
         stepper: Any = solver
-        drive = _driver(stepper, controller, y0, steps, options)
-        room = options["max_steps"] if options["limit_is_given"] else min(options["max_steps"], ROOM)
-        rows, facts, sums = run_driven((y0, args, ts), drive, how, room)
+        plan = stepper.plan(y0)
+        if watched:
+            plan = plan._replace(quality=lambda t, y, args: _signed(quality(t, y, args)))
+        rows, facts, sums = _drive(plan, stepper, controller, steps, options)(y0, args, ts)
     elif is_fixed(steps[-1]):
         rows, facts, solved = run((y0, args, ts), **how)
         sums = solved.controller_state[2:] if isinstance(controller, Watched) else None
     else:
         rows, facts = run_adaptively((y0, args, ts), how, options["limit_is_given"])
-    result, stats, reached = facts
+    result, stats, reached, *last = facts
     result = from_diffrax(result)
     if is_fixed(steps[-1]):
         if sums is not None:
@@ -417,7 +511,7 @@ def _integrate(term, project, quality, method, y0, ts, args, steps, options):
         # diffrax is at the end of the step that could not be solved; what is known ends where it began.
         began = ts[0] + (stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
         reached = jnp.where(result == RESULTS.nonlinear_divergence, began, reached)
-    return rows, result, stats, reached
+    return rows, result, stats, reached, last[0] if last else None
 
 
 def _is_driven(controller, adjoint, options) -> bool:
@@ -426,21 +520,14 @@ def _is_driven(controller, adjoint, options) -> bool:
     return known and isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) and not options["progress"]
 
 
-def _driver(solver: ExplicitSteps, controller, y0, steps, options):
-    """drive(y0, args, ts) -> (rows, facts, sums about fixed steps) for `run_driven`."""
-    plan, structure = solver.plan(y0), ravel_pytree(y0)[1]
-    order = solver.error_order(None)
+def _drive(plan: Plan, solver: ExplicitSteps, controller, steps, options) -> Drive:
+    """How the run is made by a loop of our own."""
+    order, most = solver.error_order(None), options["max_steps"]
     if isinstance(controller, Adaptive):
-        how, stepsize = driver.Adaptive(order, controller.norm), None
-        rtol, atol = controller.rtol, controller.atol
-    else:
-        how, stepsize, rtol, atol = driver.Fixed(solver.order(None), order), steps[-1], None, None
-
-    def drive(y0, args, ts):
-        found = driver.drive(plan, how, ravel_pytree(y0)[0], args, ts, rtol, atol, stepsize, options["max_steps"])
-        return jax.vmap(structure)(found.rows), (found.result, found.counts, found.reached), found.sums
-
-    return drive
+        room = most if options["limit_is_given"] else min(most, ROOM)
+        how = driver.Adaptive(order, controller.norm)
+        return Drive(plan, how, controller.rtol, controller.atol, None, most, room)
+    return Drive(plan, driver.Fixed(solver.order(None), order), None, None, steps[-1], most, most)
 
 
 def _signed(quality):

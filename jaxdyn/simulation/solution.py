@@ -9,7 +9,9 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.dynamics import RESULTS as RESULTS
 from jaxdyn.constraints.dynamics import Outcome
+from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.model.printed import solution_lines
+from jaxdyn.simulation.controls import at_start
 from jaxdyn.simulation.solvers.choice import for_stiff, known_stiffness, unwrapped
 from jaxdyn.systems.scene import Scene
 
@@ -39,8 +41,11 @@ ADVICE = {
     "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
     "method='projected' needs none",
     "nonlinear_divergence": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+    "contradictory_rows": "remove a constraint, or change one that moves with time, so that some motion satisfies all of them",
     "open_constraints": "take smaller steps (stepsize, or rtol and atol), or look for constraints that contradict each other "
     "on the way",
+    "contact_lost": "grip harder (jd.contact.optimal_forces finds forces within the cones, jd.grasp.internal_forces what "
+    "squeezes), or pass contacts='report' to go on with two-sided contacts",
 }
 
 
@@ -53,8 +58,11 @@ class Solution(Outcome):
     - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
     - What `outputs` asked for, else None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
       scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
-      (nt, nc); `constraint_residual` (nt, 2), the largest |phi| and |A v - b|; `poses`, one array
-      (nt, 4, 4) by name for each frame asked for as "pose:<frame>".
+      (nt, nc); `constraint_residual` (nt, 2), the largest |phi| and |A v - b|; `torque` (nt, nv), of the control, N m or N;
+      `control_state`, rows of the controller's state, a pytree; `poses`, one array (nt, 4, 4) by name for each frame asked for
+      as "pose:<frame>"; `contact_forces` (nt, m) and `contact_margins` (nt,), by the names of the contacts that have a cone,
+      along the columns of `jd.contact.wrench_basis`, N and N m.
+    - Of a scene with cones `stats["lost_contact"]` is the contact that ended the run, an index among those with a cone, or -1.
     """
 
     ts: Float[Array, " nt"]
@@ -68,7 +76,11 @@ class Solution(Outcome):
     acceleration: Float[Array, "nt nv"] | None = None
     multipliers: Float[Array, "nt nc"] | None = None
     constraint_residual: Float[Array, "nt 2"] | None = None
+    torque: Float[Array, "nt nv"] | None = None
+    control_state: Any = None
     poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
+    contact_forces: dict[str, Float[Array, "nt m"]] = eqx.field(default_factory=dict)
+    contact_margins: dict[str, Float[Array, " nt"]] = eqx.field(default_factory=dict)
     solver: str = eqx.field(static=True, default="")
 
     def __str__(self) -> str:
@@ -83,12 +95,16 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
     if name == "max_steps_reached" and isinstance(unwrapped(options["solver"]), diffrax.AbstractERK):
         last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
-        rates = known_stiffness(scene, solution.q[last], solution.v[last], solution.ts[last], control)
+        state = solution.q[last], solution.v[last], solution.ts[last]
+        rates = known_stiffness(scene, *state, at_start(control, *state))
         if rates is not None and for_stiff(rates, end - float(solution.ts[0])):
             advice = (
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
                 f"{float(rates.explicit_step):.3g} s; pass solver=jd.Rodas5P(), or raise max_steps (now {options['max_steps']})"
             )
+    if name == "contact_lost":
+        contact = coned_contacts(scene)[int(solution.stats["lost_contact"])].name
+        advice = f"the contact is {contact!r}; {advice}"
     raise RuntimeError(
         f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: {advice}. "
         "With throw=False, what was reached is returned."

@@ -1,16 +1,21 @@
 """A scene: one system, the constraints on it and the forces in it. What it lists is all that is compiled."""
 
+import functools
 import inspect
+import types
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.model.arguments import as_array, batch_hint, check_system
 from jaxdyn.model.printed import scene_lines
+
+_FUNCTIONS = types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type, np.ufunc
 
 
 class _Static(eqx.Module):
@@ -24,16 +29,42 @@ class _Static(eqx.Module):
 
 def as_pytree(function: Any, argument: str) -> Callable:
     """The callable itself if it is a pytree (an equinox Module, a `jax.tree_util.Partial`), else a static wrapper of
-    it.
+    it. A method of a pytree becomes a `Partial` that holds the pytree.
 
-    A plain function is compared by identity: the same one gives the same compiled program, a lambda written anew in
-    every call gives a new one.
+    A plain function is compared by identity: the same one gives the same compiled program, with the numbers it read when
+    it was traced; a lambda written anew in every call gives a new one.
 
-    **Raises:** ValueError when `function` cannot be called; `argument` says where it came from.
+    **Raises:** ValueError when `function` cannot be called, and for an object with attributes that is no pytree: the
+    compiled program would keep their first values; `argument` says where it came from.
     """
     if not callable(function):
         raise ValueError(f"{argument} is {function!r}, which cannot be called; pass a function or a callable Module")
-    return _Static(function) if jax.tree_util.all_leaves([function]) else function
+    if not jax.tree_util.all_leaves([function]):
+        return function
+    owner = function.__self__ if isinstance(function, types.MethodType) else function
+    if owner is not function and not (isinstance(owner, type) or jax.tree_util.all_leaves([owner])):
+        return jax.tree_util.Partial(function.__func__, owner)
+    while isinstance(owner, functools.partial):
+        owner = owner.func
+    names = _attributes(owner)
+    if names:
+        kind = type(owner).__name__
+        what = f"a method of a {kind}" if isinstance(function, types.MethodType) else f"a {kind}"
+        raise ValueError(
+            f"{argument} is {what}, whose attributes ({', '.join(names)}) would keep the values of the first run in the "
+            f"compiled program; make it an equinox Module (class {kind}(eqx.Module): with a field for each of them), or pass a "
+            "function that is written anew for new values"
+        )
+    return _Static(function)
+
+
+def _attributes(owner: Any) -> list[str]:
+    """Names of the attributes of an object that is no function, class or wrapper of a function."""
+    if isinstance(owner, _FUNCTIONS) or hasattr(owner, "__wrapped__"):
+        return []
+    slots = [name for kind in type(owner).__mro__ for name in np.atleast_1d(getattr(kind, "__slots__", ())).tolist()]
+    names = [*getattr(owner, "__dict__", ()), *(name for name in slots if hasattr(owner, name))]
+    return [name for name in names if not name.startswith("__")]
 
 
 class Scene(eqx.Module):
@@ -46,20 +77,26 @@ class Scene(eqx.Module):
     - `forces`: sequence of `f(system, q, v, t) -> (nv,)`, generalised forces (N m or N) that are added to tau. Those of
       the library (`JointDamping`, `JointSpring`, ...) and your own equinox Modules hold numbers as leaves, which
       `jax.grad` and `jax.vmap` reach. A plain function is static: define it once, outside of loops, and let it hold
-      no arrays.
+      no arrays. An object with attributes that is no pytree is refused.
+    - `cones`: what the contacts among the constraints can exert: a `jd.contact.friction_cone(...)` or `surface_cone(...)`
+      for all of them, a list with one for each, or a dictionary by the constraints' names, which leaves those that it does
+      not name two-sided. The rows stay as they are; `simulate` ends where a contact pulls or leaves its cone.
 
-    **Raises:** ValueError when `system` is no system, or `constraints` or `forces` is not a sequence of callables.
+    **Raises:** ValueError when `system` is no system, or `constraints` or `forces` is not a sequence of callables; when
+    used, for cones that do not fit the constraints.
     """
 
     system: Any
     constraints: tuple = ()
     forces: tuple = ()
+    cones: Any = None
 
-    def __init__(self, system, constraints=(), forces=()):
+    def __init__(self, system, constraints=(), forces=(), cones=None):
         check_system(system, "system")
         self.system = system
         self.constraints = _sequence(constraints, "constraints")
         self.forces = tuple(as_pytree(f, f"forces[{i}]") for i, f in enumerate(_sequence(forces, "forces")))
+        self.cones = cones
 
     def __str__(self) -> str:
         return scene_lines(self)

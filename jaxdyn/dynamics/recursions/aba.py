@@ -25,7 +25,7 @@ def aba(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float
 
     **Arguments:** `q` (nq,); `v` (nv,) rad/s or m/s; `tau` (nv,) generalised forces, N m or N.
 
-    **Returns:** joint accelerations (nv,), rad/s^2 or m/s^2. NaN or infinite where M is singular.
+    **Returns:** joint accelerations (nv,), rad/s^2 or m/s^2. NaN where M is not positive definite.
 
     Source: EQUATIONS section 5 with b_i started from the bias wrench; Featherstone (2008), section 7.3.
     """

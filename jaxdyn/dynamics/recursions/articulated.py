@@ -12,6 +12,7 @@ Source: EQUATIONS section 5; Featherstone (2008) section 7.3; Rodriguez, Jain & 
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -78,8 +79,8 @@ def factorize_at(links: Links, chains: list[Chain]) -> ArticulatedFactors:
 def _eliminate(A, s, k, armature):
     """One degree of freedom eliminated: A - U U^T/D, U/D and 1/D; `k` is the coordinate that s spans alone, or None."""
     U = dot(A, s)
-    D = dot(s, U)
-    inverse = 1 / (D if armature is None else D + armature)
+    D = dot(s, U) if armature is None else dot(s, U) + armature
+    inverse = 1 / jnp.where(D > 0, D, jnp.full_like(D, jnp.nan))  # a pivot of M, positive if M is positive definite
     gain = U * inverse
     rest = A - outer(U, gain)
     if armature is None and k is not None:

@@ -23,11 +23,13 @@ def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress
     **Arguments:** `moving`, what may be differentiated: the initial state, `args`, and the save points (nt,), of which the first
     is the start; the rest as diffrax's.
 
-    **Returns:** rows of the state at ts[1:]; the result, the counts and the time reached; all that diffrax returned, where
-    `record` the times at which steps ended among it.
+    **Returns:** rows of the state at ts[1:]; the result, the counts, the time reached and, if the time of an event is looked
+    for, the state there; all that diffrax returned, where `record` the times at which steps ended among it.
     """
     y0, args, ts = moving
-    saves, last = diffrax.SubSaveAt(ts=ts[1:]), diffrax.SubSaveAt(t1=True, fn=_nothing)
+    located = event is not None and event.root_finder is not None
+    saves = diffrax.SubSaveAt(ts=ts[1:])
+    last = diffrax.SubSaveAt(t1=True, fn=_state if located else _nothing)
     ends = (diffrax.SubSaveAt(steps=True, fn=_nothing),) if record else ()
     saveat = diffrax.SaveAt(subs=(saves, last, *ends), controller_state=True)
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else
@@ -51,7 +53,8 @@ def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress
     if continuous:
         reached = jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
         return solved.ys, (solved.result, counts, reached), solved
-    return solved.ys[0], (solved.result, counts, solved.ts[1][0]), solved
+    end = (jax.tree.map(lambda rows: rows[0], solved.ys[1]),) if located else ()
+    return solved.ys[0], (solved.result, counts, solved.ts[1][0], *end), solved
 
 
 def run_adaptively(moving, options, limit_is_given: bool):
@@ -84,34 +87,6 @@ def _(perturbed, moving, options, room):
 @_run.def_bwd
 def _(taken, gradients, perturbed, moving, options, room):
     return _pulled(perturbed, moving, _again(options, taken), gradients[0])
-
-
-def run_driven(moving, drive, options, room):
-    """As `run`, by steps that are not diffrax's: drive(y0, args, ts) -> (rows, facts, sums about fixed steps).
-
-    Reverse mode takes the steps by diffrax, with the `options` of `run`.
-    """
-    numbers, rest = eqx.partition(options, eqx.is_array)
-    return _driven(moving, drive, eqx.combine(jax.lax.stop_gradient(numbers), rest), room)
-
-
-@eqx.filter_custom_vjp
-def _driven(moving, drive, options, room):
-    return drive(*moving)
-
-
-@_driven.def_fwd
-def _(perturbed, moving, drive, options, room):
-    if options["dt0"] is not None:
-        return drive(*moving), None
-    rows, facts, taken = _recorded(moving, options, room)
-    return (rows, facts, None), taken
-
-
-@_driven.def_bwd
-def _(taken, gradients, perturbed, moving, drive, options, room):
-    again = options if taken is None else _again(options, taken)
-    return _pulled(perturbed, moving, again, gradients[0])
 
 
 def _pulled(perturbed, moving, options, gradients):
@@ -188,3 +163,7 @@ def _along(t, base):
 
 def _nothing(t, y, args):
     return None
+
+
+def _state(t, y, args):
+    return y

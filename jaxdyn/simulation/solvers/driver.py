@@ -4,19 +4,22 @@ a second.
 The rules are diffrax's: the step-size control is that of its `PIDController` with an integral part alone, and fixed steps are
 those of its `ConstantStepSize`. Lanes of a batch that have ended take steps of no length until the last one has ended.
 
-Where reverse mode comes through, the steps are taken again by diffrax, which remembers what it needs (see `differentiable`).
+Reverse mode goes back through the same steps (see `reverse`).
 """
 
 from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jaxdyn.compile import any_in_batch, recompute_unless, run
+from jaxdyn.simulation.solvers import reverse
 from jaxdyn.simulation.solvers.explicit import Plan, Step, bent_output, step_in_turn, whole_step
 from jaxdyn.simulation.solvers.first_step import first_step
 from jaxdyn.simulation.solvers.fixed_steps import no_sums, watched
@@ -40,13 +43,72 @@ class Fixed(NamedTuple):
 
 
 class Driven(NamedTuple):
-    """Rows of the state at ts[1:], diffrax's result, counts, the time reached, and sums about fixed steps (`watched`)."""
+    """Rows of the state at ts[1:], diffrax's result, counts, the time reached, sums about fixed steps (`watched`), and, where
+    asked for, what reverse mode needs."""
 
     rows: Array
     result: Any
     counts: dict[str, Array]
     reached: Array
     sums: tuple[Array, Array] | None
+    history: reverse.History | None
+
+
+class Drive(eqx.Module):
+    """How a run is made: drive(y0, args, ts) -> rows of the state at ts[1:]; result, counts and time reached; sums.
+
+    - `plan`, `how`: the steps and their control; `structure(y)`: the state of a vector.
+    - `rtol`, `atol`, for adaptive steps; `stepsize` (s), for fixed ones.
+    - `max_steps`; `room`, the most where reverse mode comes through.
+
+    Steps are constants to reverse mode, but that they begin and end with the run; tolerances and `stepsize` too.
+    """
+
+    plan: Plan = eqx.field(static=True)
+    how: Adaptive | Fixed = eqx.field(static=True)
+    rtol: Any
+    atol: Any
+    stepsize: Any
+    max_steps: int = eqx.field(static=True)
+    room: int = eqx.field(static=True)
+
+    def __call__(self, y0, args, ts):
+        return _driven((y0, args, ts), jax.lax.stop_gradient(self))
+
+    def found(self, moving, room: int | None):
+        """What a call returns, and the `History` of at most `room` steps, or None."""
+        y0, args, ts = moving
+        most = self.max_steps if room is None else room
+        steps = self.rtol, self.atol, self.stepsize
+        found = drive(self.plan, self.how, ravel_pytree(y0)[0], args, ts, *steps, most, room is not None)
+        rows = jax.vmap(self.plan.structure)(found.rows)
+        return (rows, (found.result, found.counts, found.reached), found.sums), found.history
+
+
+@eqx.filter_custom_vjp
+def _driven(moving, how: Drive):
+    return how.found(moving, None)[0]
+
+
+@_driven.def_fwd
+def _(perturbed, moving, how: Drive):
+    return how.found(moving, how.room)
+
+
+@_driven.def_bwd
+def _(history, gradients, perturbed, moving, how: Drive):
+    y0, args, ts = moving
+    count = ts.shape[0] - 1
+    given = jax.tree.map(lambda y, g: jnp.zeros((count, *y.shape), y.dtype) if g is None else g, y0, gradients[0])
+    rows = jax.vmap(lambda y: ravel_pytree(y)[0])(given)
+    start, structure = ravel_pytree(y0)
+    steps = None if isinstance(how.how, Adaptive) else number_of_steps(ts[0], ts[-1], how.stepsize)
+    of_y, of_args, of_ts = reverse.pulled(how.plan, history, start, args, ts, steps, rows, perturbed[1:])
+
+    def keep(x, moves):
+        return x if moves else None
+
+    return jax.tree.map(keep, structure(of_y), perturbed[0]), of_args, keep(of_ts, perturbed[2])
 
 
 class _Limits(NamedTuple):
@@ -74,13 +136,18 @@ class _Lane(NamedTuple):
     taken: Array
     kept: Array
     failed: Array
+    quality: Array  # where the method may fail on the way (`Plan.quality`), else one
+    stopped: Array  # whether that has changed its sign
     sums: tuple[Array, Array]
 
 
-def drive(plan: Plan, how: Adaptive | Fixed, y0, args, ts, rtol, atol, stepsize, max_steps: int) -> Driven:
+def drive(
+    plan: Plan, how: Adaptive | Fixed, y0, args, ts, rtol, atol, stepsize, max_steps: int, record: bool
+) -> Driven:
     """The solution from ts[0] to ts[-1].
 
-    **Arguments:** `y0` (n,), flat; `stepsize` (s) for `Fixed`, else None; tolerances for `Adaptive`.
+    **Arguments:** `y0` (n,), flat; `stepsize` (s) for `Fixed`, else None; tolerances for `Adaptive`; `record`: whether to write
+    down what reverse mode needs.
     """
     start, end, count = ts[0], ts[-1], ts.shape[0] - 1
     eps, none = float(jnp.finfo(ts.dtype).eps), jnp.zeros((), jnp.int32)
@@ -88,35 +155,45 @@ def drive(plan: Plan, how: Adaptive | Fixed, y0, args, ts, rtol, atol, stepsize,
     rtol, atol = (jnp.zeros_like(start) if x is None else x for x in (rtol, atol))
     begin: Any = partial(_begin, plan, how)
     given = args, start, end, y0, rtol, atol
-    (rate, length), served = run(_begin, *given, static=(plan, how), calls=True, served=True)
-    rate, length = recompute_unless(served, begin, (rate, length), given)
+    found, served = run(_begin, *given, static=(plan, how), calls=True, served=True)
+    rate, length, quality = recompute_unless(served, begin, found, given)
     steps = none
     if not isinstance(how, Adaptive):
         length = stepsize
-        steps = jnp.ceil((end - start) / jnp.nextafter(stepsize, jnp.inf)).astype(jnp.int32)
+        steps = number_of_steps(start, end, stepsize)
     least_at_end = 16 * eps * jnp.maximum(jnp.abs(start), jnp.abs(end))
     limits = _Limits(start, end, floor, least_at_end, steps, rtol, atol, y0)
     no = jnp.asarray(False)
-    lane = _Lane(start, jnp.minimum(start + length, end), y0, rate, no, none, none, no, no_sums(plan.structure(y0)))
+    sums = no_sums(plan.structure(y0))
+    lane = _Lane(start, jnp.minimum(start + length, end), y0, rate, no, none, none, no, quality, quality == 0, sums)
     rows = jnp.broadcast_to(jnp.full_like(y0, jnp.inf), (count, y0.size))
 
     def is_active(lane: _Lane):
-        return (lane.t < end) & ~lane.failed & (lane.taken < max_steps)
+        return (lane.t < end) & ~lane.failed & ~lane.stopped & (lane.taken < max_steps)
 
     def body(carry):
-        lane, saved, rows = carry
+        lane, saved, rows, history = carry
         after, kept, found = _advanced(plan, how, args, limits, lane, is_active(lane))
-        return after, *_save(plan, ts, lane, after, kept, found, saved, rows)
+        if history is not None:
+            history = reverse.written(history, lane.y, lane.t, lane.t_next, kept)
+        return after, *_save(plan, ts, lane, after, kept, found, saved, rows), history
 
     def unfinished(carry):
         return any_in_batch(is_active(carry[0]))
 
-    lane, _, rows = lax.while_loop(unfinished, body, (lane, none, rows))
+    history = reverse.blank(y0, start, max_steps) if record else None
+    lane, _, rows, history = lax.while_loop(unfinished, body, (lane, none, rows, history))
     codes: Any = diffrax.RESULTS
     result = codes.where(lane.t < end, codes.max_steps_reached, codes.successful)
     result = codes.where(lane.failed, codes.dt_min_reached, result)
+    result = codes.where(lane.stopped, codes.event_occurred, result)
     counts = {"num_steps": lane.taken, "num_accepted_steps": lane.kept, "num_rejected_steps": lane.taken - lane.kept}
-    return Driven(rows, result, counts, lane.t, None if isinstance(how, Adaptive) else lane.sums)
+    return Driven(rows, result, counts, lane.t, None if isinstance(how, Adaptive) else lane.sums, history)
+
+
+def number_of_steps(start, end, stepsize):
+    """Of fixed ones: see diffrax's `ConstantStepSize`."""
+    return jnp.ceil((end - start) / jnp.nextafter(stepsize, jnp.inf)).astype(jnp.int32)
 
 
 def _advanced(plan: Plan, how, args, limits: _Limits, lane: _Lane, active) -> tuple[_Lane, Array, Step]:
@@ -133,16 +210,16 @@ def _advanced(plan: Plan, how, args, limits: _Limits, lane: _Lane, active) -> tu
 
 def _advance(plan: Plan, how, args, limits: _Limits, lane: _Lane, active):
     step = whole_step(plan, args, lane.t, jnp.where(active, lane.t_next, lane.t), lane.y, lane.rate)
-    return *_accepted(plan, how, None, limits, lane, active, step), step
+    return *_accepted(plan, how, args, limits, lane, active, step), step
 
 
 def _advance_in_turn(plan: Plan, how, args, limits: _Limits, lane: _Lane, active):
     """The same, one stage after the other."""
     step = step_in_turn(plan, args, lane.t, jnp.where(active, lane.t_next, lane.t), lane.y, lane.rate)
-    return *_accepted(plan, how, None, limits, lane, active, step), step
+    return *_accepted(plan, how, args, limits, lane, active, step), step
 
 
-def _accepted(plan: Plan, how, _, limits: _Limits, lane: _Lane, active, step: Step) -> tuple[_Lane, Array]:
+def _accepted(plan: Plan, how, args, limits: _Limits, lane: _Lane, active, step: Step) -> tuple[_Lane, Array]:
     """The lane after a step that is kept or refused."""
     t_next, end = jnp.where(active, lane.t_next, lane.t), limits.end
     if isinstance(how, Adaptive):
@@ -156,6 +233,7 @@ def _accepted(plan: Plan, how, _, limits: _Limits, lane: _Lane, active, step: St
         after = limits.start + (end - limits.start) * done
         after = jnp.where((lane.taken + 2 >= limits.steps) | (after > limits.floor), end, after)
     kept, one = kept & active, active.astype(jnp.int32)
+    quality = jnp.where(kept, plan.quality_of(args, t_next, step.projected), lane.quality)
     lane = _Lane(
         jnp.where(active, t, lane.t),
         jnp.where(active, jnp.minimum(after, end), lane.t_next),
@@ -165,6 +243,8 @@ def _accepted(plan: Plan, how, _, limits: _Limits, lane: _Lane, active, step: St
         lane.taken + one,
         lane.kept + kept.astype(jnp.int32),
         lane.failed | (failed & active),
+        quality,
+        lane.stopped | (quality * lane.quality <= 0),
         jax.tree.map(lambda new, old: jnp.where(active, new, old), sums, lane.sums),
     )
     return lane, kept
@@ -189,13 +269,14 @@ def _save(plan: Plan, ts, before: _Lane, after: _Lane, kept, step: Step, saved, 
 
 
 def _begin(plan: Plan, how, args, t0, t1, y, rtol, atol):
-    """The rate of change at the start, if steps pass it on, and the length of the first adaptive step."""
+    """The rate of change at the start, if steps pass it on, the length of the first adaptive step, and the quality."""
     rate = plan.field_of(args, t0, y) if plan.passes_rate_on else jnp.zeros_like(y)
+    quality = plan.quality_of(args, t0, y)
     if not isinstance(how, Adaptive):
-        return rate, t1 - t0
+        return rate, t1 - t0, quality
     term = diffrax.ODETerm(plan.field)
     length = first_step(term, t0, t1, plan.structure(y), args, how.order, rtol, atol, how.size)
-    return rate, jnp.where(jnp.isfinite(length), length, t1 - t0)
+    return rate, jnp.where(jnp.isfinite(length), length, t1 - t0), quality
 
 
 def _controlled(plan: Plan, how: Adaptive, limits: _Limits, lane: _Lane, t1, step: Step):

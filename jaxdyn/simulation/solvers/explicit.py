@@ -98,7 +98,7 @@ class ExplicitSteps(ProjectedSolver):
 
 
 class Plan(NamedTuple):
-    """How a step is made. Equal plans share their programs."""
+    """How a step is made. Equal plans share their programs. `quality(t, y, args)`: see `quality_of`."""
 
     solver: type
     field: Callable
@@ -107,6 +107,7 @@ class Plan(NamedTuple):
     branching: bool
     tree: Any
     shapes: tuple
+    quality: Callable | None = None
 
     @property
     def tableau(self) -> Any:
@@ -156,6 +157,10 @@ class Plan(NamedTuple):
     def field_of(self, args, t, y):
         """The vector field on a flat state."""
         return ravel_pytree(self.field(t, self.structure(y), args))[0]
+
+    def quality_of(self, args, t, y):
+        """How far a flat state is from where the method fails, which a change of sign tells; one where it never does."""
+        return jnp.ones((), y.dtype) if self.quality is None else self.quality(t, self.structure(y), args)
 
     def rate(self, args, t0, t1, y, c):
         """A stage: (t1 - t0) times the vector field."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 ALLOWED = 0.1  # of how far positions, or velocities, come from where they started
-_PASSED_OVER = ("frame", "work")  # constants of a step, and what nothing depends on
+_PASSED_OVER = ("frame", "held", "work")  # constants of a step, and what nothing depends on
 
 
 class Watched(diffrax.ConstantStepSize):

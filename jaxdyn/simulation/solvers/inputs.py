@@ -12,7 +12,9 @@ from jaxdyn.systems.system import has_quaternions
 
 
 def check_start(scene: Scene, q0, v0) -> None:
-    """Refuse states of a wrong shape, NaN, and quaternions that are far from unit length."""
+    """Refuse systems that cannot move, states of a wrong shape, NaN, and quaternions that are far from unit length."""
+    if scene.nv == 0:
+        raise ValueError("the system has no coordinates (nq = nv = 0), so nothing moves; add a body with a joint")
     for name, value in (("q0", q0), ("v0", v0)):
         check_shape(scene.system, name, value)
         if is_concrete(value):

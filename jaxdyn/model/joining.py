@@ -1,5 +1,6 @@
 """One model of several: the trees of all stand side by side in one world."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,8 +8,65 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import pose_leaf
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, Topology
+
+
+def join(left: Any, right: Any, *, prefix: Any = ("", ""), pose: Any = None, name: str | None = None) -> Model:
+    """Two models in one: their trees side by side, in one world and with one gravity.
+
+    All names of bodies, joints and frames stay, behind their prefix. The coordinates of `left` come first in q and v, then
+    those of `right`, each in its own order: M is block-diagonal.
+
+    **Arguments:**
+
+    - `left`, `right`: models without a name in common, or with different prefixes.
+    - `prefix`: put before the names of `left` and of `right`; one string: before those of `right`.
+    - `pose`: where the world of `right` stands in that of `left`: None (identity), (4, 4), (3,) or (xyz, rpy). It moves all
+      that `right` fixes to its world; gravity stays as it is in the common world.
+    - `name`: of the whole; by default both names.
+
+    **Raises:** ValueError for what is no Model, names that both have, a bad pose or prefix, and, on concrete numbers, unlike
+    gravities.
+
+    ```python
+    arms = jd.join(arm, arm, prefix=("left_", "right_"), pose=(0.0, 1.2, 0.0))
+    scene = jd.join(arms, box)
+    ```
+    """
+    for argument, model in (("left", left), ("right", right)):
+        if not isinstance(model, Model):
+            raise ValueError(f"{argument} is a {type(model).__name__}; pass a Model")
+    prefixes = ("", prefix) if isinstance(prefix, str) else prefix
+    if not isinstance(prefixes, (tuple, list)) or len(prefixes) != 2 or not all(isinstance(x, str) for x in prefixes):
+        raise ValueError(f"prefix is {prefix!r}; give a string for the right model, or one for each")
+    first, second = (renamed(model, before) for model, before in zip((left, right), prefixes, strict=True))
+    whole = f"{left.name} and {right.name}" if name is None else name
+    return _side_by_side(
+        [first, second if pose is None else _moved(second, pose)], whole, "pass prefix=", by_name=False
+    )
+
+
+def renamed(model: Model, prefix: str) -> Model:
+    """The model with a prefix before the names of all bodies, joints and frames."""
+    top = model.topology
+    names = {
+        what: tuple(prefix + own for own in getattr(top, what)) for what in ("body_names", "joint_names", "frame_names")
+    }
+    return dataclasses.replace(model, topology=dataclasses.replace(top, **names)) if prefix else model
+
+
+def _moved(model: Model, pose) -> Model:
+    """The model in a world that stands at a pose: what hangs on the world, and its named frames, are moved."""
+    pose, top = pose_leaf(pose, "pose").astype(model.home.dtype), model.topology
+    home, frames = model.home, model.frame_poses
+    for i in np.flatnonzero(np.array(top.parents) < 0):
+        home = home.at[i].set(_product(pose, home[i]))
+    for i in np.flatnonzero(np.array(top.frame_bodies) < 0):
+        frames = frames.at[i].set(_product(pose, frames[i]))
+    return model.replace(home=home, frame_poses=frames)
 
 
 def joined(models: Sequence[Model], name: str) -> Model:
@@ -16,19 +74,24 @@ def joined(models: Sequence[Model], name: str) -> Model:
 
     **Raises:** ValueError for names that two of them share, and, on concrete numbers, for unlike gravities.
     """
+    return _side_by_side(models, name, "join them by jd.join(..., prefix=)", by_name=True)
+
+
+def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -> Model:
     tops = [model.topology for model in models]
     for what in ("joint_names", "frame_names"):
         names = [n for top in tops for n in getattr(top, what)]
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
-            raise ValueError(f"the names {twice} are in two models; {what} have to differ")
+            raise ValueError(f"the names {twice} are in two models; {what} have to differ: {fix}")
     first = np.cumsum([0] + [top.nb for top in tops])
     trees = [
         (top.joint_names[root], first[k] + np.flatnonzero(top.roots == root))
         for k, top in enumerate(tops)
         for root in sorted(set(top.roots.tolist()))
     ]
-    order = np.concatenate([bodies for _, bodies in sorted(trees, key=lambda tree: tree[0])])
+    trees = sorted(trees, key=lambda tree: tree[0]) if by_name else trees
+    order = np.concatenate([bodies for _, bodies in trees]) if trees else np.zeros(0, int)
     place = np.append(np.argsort(order), -1)  # of each body of the list of all; -1, the world, stays
 
     def listed(attribute, shift=False):

@@ -1,0 +1,85 @@
+"""When a state counts as being on its constraints: residuals against the mechanism's own length, whatever that is.
+
+Let s_j be the size of coordinate j: 1 for an angle, the length L of the mechanism for a distance. A row of A has the size
+a_i = max_j |A_ij| s_j in the units of its residual, m or rad, so that phi_i / a_i says by which part of L, or by which angle,
+the coordinates would have to move to close it. A mechanism scaled by a millionth has the same ratios.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import run
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
+from jaxdyn.model.joints import KINDS
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
+
+# Rows vanish at singular positions. Below this part of a usual row their own size says nothing.
+_LEAST_ROW = 1e-3
+# Numbers of rounding errors in a residual.
+_ROUNDING = 32
+
+
+def own_length(model: Model) -> Float[Array, ""]:
+    """Length of a mechanism, m: the largest of the distances between its joints and of the radii of gyration of its bodies.
+
+    Where the mechanism stands does not count. 1 for one without any length.
+    """
+    roots = np.array([parent < 0 for parent in model.topology.parents], bool)
+    places, inertias = model.home[:, :3, 3], model.inertias
+    mass = inertias[:, 0]
+    # About the origin of a joint's frame, which the centre of mass may be far from.
+    moments = jnp.abs(inertias[:, 4] + inertias[:, 6] + inertias[:, 9]) / jnp.where(
+        mass > 0, 2 * mass, jnp.ones_like(mass)
+    )
+    squares = [jnp.where(mass > 0, moments, jnp.zeros_like(mass)), jnp.sum(places[~roots] ** 2, 1)]
+    squares.append(jnp.sum((places[roots] - places[roots][:1]) ** 2, 1))
+    length = jnp.sqrt(jnp.max(jnp.concatenate(squares), initial=0.0))
+    return jnp.where(length > 0, length, jnp.ones_like(length))
+
+
+def coordinate_sizes(system, dtype) -> tuple[Float[Array, " nv"], Float[Array, ""]]:
+    """s (nv,), the size of a change of each coordinate that is of the order of the mechanism, and its length L ().
+
+    Coordinates of systems other than a `Model` have sizes of 1, in whatever units they are.
+    """
+    if not isinstance(system, Model):
+        return jnp.ones((system.nv,), dtype), jnp.ones((), dtype)
+    length = lax.stop_gradient(own_length(system)).astype(dtype)
+    is_distance = np.zeros(system.nv, bool)
+    for kind, place in zip(system.topology.kinds, system.topology.v_slices, strict=True):
+        columns = KINDS[kind].columns
+        is_distance[place] = [column < 3 for column in columns] if columns else kind == "prismatic"
+    return jnp.where(is_distance, length, jnp.ones_like(length)), length
+
+
+def row_limits(scene: Scene, q, v, t, relative: float) -> tuple[Float[Array, " nh"], Float[Array, " nc"]]:
+    """Residuals phi (nh,) and A v - b (nc,) that count as closed, for a `relative` tolerance; rounding is allowed for.
+
+    Velocities count in units of 1 + max_j |v_j| / s_j, 1/s.
+    """
+    sizes, length = coordinate_sizes(scene.system, q.dtype)
+    A = constraint_jacobian(scene, q, t)
+    rows = jnp.max(jnp.abs(A) * sizes[None], axis=1)
+    rows = jnp.maximum(rows, _LEAST_ROW * jnp.minimum(length, jnp.ones_like(length)))
+    rounding = _ROUNDING * float(jnp.finfo(q.dtype).eps) * jnp.maximum(length, jnp.ones_like(length))
+    limits = relative * rows + rounding
+    return limits[holonomic_rows(layout(scene))], limits * (1.0 + jnp.max(jnp.abs(v) / sizes))
+
+
+def openness(scene: Scene, q, v, t, relative: float) -> Float[Array, ""]:
+    """Largest residual over what counts as closed (see `row_limits`): at most 1 for a state on the constraints. A constant."""
+    bare = lax.stop_gradient(Scene(scene.system, scene.constraints))
+    q, v, t = lax.stop_gradient((q, v, jnp.asarray(t, q.dtype)))
+    return run(largest_ratio, bare, q, v, t, static=(relative,))
+
+
+def largest_ratio(relative: float, scene: Scene, q, v, t):
+    """`openness` as a function of numbers."""
+    limits = row_limits(scene, q, v, t, relative)
+    found = position_residual(scene, q, t), velocity_residual(scene, q, v, t)
+    ratios = jax.tree.map(lambda x, limit: jnp.abs(x) / limit, found, limits)
+    return jnp.max(jnp.concatenate(ratios), initial=0.0)

@@ -1,0 +1,283 @@
+"""Laws of motion and force on constraints: what moves follows a target, and what is held is pressed as wanted.
+
+    tau = M a + h - forces + A^T (-lam_d + KI z),    dz/dt = lam - lam_d,
+
+with the acceleration a that the constraints allow, A a = gamma, and the task asks for. As a is what then happens,
+A^T (lam - lam_d + KI z) = 0: the loops of motion and of force are separate, whatever the rows are, holonomic or not.
+With q = psi(x), qdot = J xdot, a is  J (xdd_d - Kv ed - Kp e) + Jdot xdot,  as the documents write it.
+
+The force loop goes through the integral z alone, so tau does not depend on lam of the same moment.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
+from jaxdyn.constraints.dynamics import projections
+from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.control.errors import RateError, TaskError, as_target, least_acceleration, wanted_rows
+from jaxdyn.control.gains import gain, times
+from jaxdyn.control.motion import torque_for
+from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.reduction.gauge_invariant import gauge_invariant
+from jaxdyn.simulation.controls import Controller
+from jaxdyn.systems.scene import Scene, as_pytree
+from jaxdyn.systems.system import velocity_to_rate
+
+
+class _ForceLoop(Controller):
+    """Laws whose state is the integral of lam - lam_d, (nc,), where they have integral action."""
+
+    scene: eqx.AbstractVar[Scene]
+    force: eqx.AbstractVar[Callable | None]
+    ki: eqx.AbstractVar[Array | None]
+
+    def start(self, q, v, t):
+        """No integral yet."""
+        return None if self.ki is None else jnp.zeros((_count(self.scene),), q.dtype)
+
+    def rate(self, q, v, t, state, multipliers):
+        """lam - lam_d."""
+        return multipliers - self.wanted_force(q, t)
+
+    def wanted_force(self, q, t) -> Float[Array, " nc"]:
+        """lam_d (nc,)."""
+        count = _count(self.scene)
+        if self.force is None:
+            return jnp.zeros((count,), q.dtype)
+        found = self.force(t)
+        if jnp.shape(found) != (count,):
+            raise ValueError(
+                f"force has shape {jnp.shape(found)}, expected {(count,)}, one per row of the constraints"
+                f"{batch_hint(found, (count,))}"
+            )
+        return jnp.asarray(found, q.dtype)
+
+    def pressed(self, q, t, state) -> Float[Array, " nc"]:
+        """-lam_d + KI z."""
+        wanted = -self.wanted_force(q, t)
+        return wanted if state is None or self.ki is None else wanted + times(self.ki, state, "ki")
+
+
+class HybridForce(_ForceLoop):
+    """Motion along constraints and force against them: edd + Kd ed + Kp e = 0 and (lam - lam_d) + KI z = 0.
+
+    For constraints of every kind. A task of positions x(q), `of="position"`, follows x_d(t) by the gains `kp` and `kd`; a task
+    of velocities u(q, v), linear in v, `of="velocity"`, follows u_d(t) by  du/dt - du_d/dt = -Kp (u - u_d): for nonholonomic
+    constraints, whose velocities v = J u are free and whose positions are not. Where task and constraints together leave
+    some motion open, it is the one of least acceleration in the metric M.
+
+    Errors decay as the gains say where the model is that of the plant. With a wrong one, M' and h' in the law, the force is
+    off by  -(A M^-1 A^T)^-1 A M^-1 ((M' - M) a + h' - h),  which integral action takes away: lam - lam_d decays with KI.
+
+    **Arguments:**
+
+    - `scene`: with constraints; its forces are compensated.
+    - `task`: x(q) -> (m,), or u(q, v) -> (m,); `target`: (m,), or a function of t, differentiable twice (once for velocities).
+    - `kp`, `kd`: positive definite, numbers, (m,) or (m, m); 1/s^2 and 1/s, or 1/s for `kp` of velocities, without `kd`.
+    - `force`: lam_d (nc,), or a function of t; None for zero. `ki` (1/s): positive definite, or None for no integral action.
+    - `actuated`: indices of the velocities that have a motor; None: all. Of their torques those of least size are taken that
+      give the motion, plus what `internal` (na,), N m, has along directions that change forces alone: with as many motors as
+      freedoms there are none. Forces are then not controlled, and `force` and `ki` are to be left out.
+
+    **Raises:** ValueError for a scene without constraints, gains that are not positive definite, gains that do not fit the
+    kind of task; (when called) for shapes that do not fit.
+
+    Source: EQUATIONS section 8 (the documents' law for holonomic and for nonholonomic constraints, and for motors that are
+    fewer than joints); Murray, Li & Sastry (1994), section 6.4.
+    """
+
+    scene: Scene
+    error: Constraint
+    kp: Array
+    kd: Array | None
+    force: Callable | None
+    ki: Array | None
+    actuated: tuple[int, ...] | None = eqx.field(static=True)
+    internal: Array | None
+
+    def __init__(
+        self,
+        scene: Any,
+        task: Any,
+        target: Any,
+        kp: Any,
+        kd: Any = None,
+        *,
+        of: str = "position",
+        force: Any = None,
+        ki: Any = None,
+        actuated: Any = None,
+        internal: Any = None,
+    ):
+        self.scene = constrained(scene)
+        self.kp, self.kd = gain(kp, "kp"), None if kd is None else gain(kd, "kd")
+        self.error = _error(task, target, of, self.kd)
+        self.force = None if force is None else as_target(force, "force")
+        self.ki = None if ki is None else gain(ki, "ki")
+        self.actuated = None if actuated is None else _indices(actuated, scene.nv)
+        self.internal = None if internal is None else jnp.asarray(as_array(internal, "internal"), float)
+        if self.actuated is None and self.internal is not None:
+            raise ValueError("internal is given without actuated; name the velocities that have a motor")
+        if self.actuated is not None and not (self.force is None and self.ki is None):
+            raise ValueError("force or ki is given with actuated, where forces follow from the motion; leave them out")
+        if self.internal is not None and self.internal.shape != (len(self.actuated or ()),):
+            raise ValueError(f"internal has shape {self.internal.shape}; give one torque per motor of {self.actuated}")
+
+    def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " nv"]:
+        """The acceleration that the law asks for, (nv,): on the constraints, and towards the target."""
+        t = jnp.asarray(t, q.dtype)
+        A, wanted = self._rows(q, v, t)
+        return least_acceleration(self.scene.system, q, t, A, wanted, jnp.zeros_like(v))
+
+    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Bool[Array, ""]:
+        """Whether the constraints leave all of the task free, so that the law can do what it promises."""
+        t = jnp.asarray(t, q.dtype)
+        A = constraint_jacobian(self.scene, q, t)
+        both, _ = self._rows(q, v, t)
+        return _rank(both) == _rank(A) + both.shape[0] - A.shape[0]
+
+    def __call__(self, q, v, t=0.0, state=None, multipliers=None) -> Float[Array, " nv"]:
+        """Torques (nv,), N m or N."""
+        t = jnp.asarray(t, q.dtype)
+        tau = torque_for(self.scene, q, v, self.acceleration(q, v, t), t)
+        if self.actuated is None:
+            return tau + _product(constraint_jacobian(self.scene, q, t).T, self.pressed(q, t, state))
+        keep, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)  # pyright: ignore[reportArgumentType]
+        by_motors = keep[:, motors]
+        inverse = pseudo_inverse(by_motors, tolerance(None, keep), True)
+        pushed = _product(inverse, _product(keep, tau))
+        if self.internal is not None:
+            internal = self.internal.astype(q.dtype)
+            pushed = pushed + internal - _product(inverse, _product(by_motors, internal))
+        return jnp.zeros_like(tau).at[motors].set(pushed)
+
+    def _rows(self, q, v, t):
+        row = rows(self.scene, q, v, t)
+        A, wanted = wanted_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
+        return jnp.concatenate([row.A, A]), jnp.concatenate([row.gamma, wanted])
+
+
+class GaugeInvariant(_ForceLoop):
+    """Hybrid law in quasi velocities: with eps = B (ed + Kp e), B = V2^T W^T J,
+
+        u_r = sdot + Gamma_r s - Kd eps,  s = B (xd_d - Kp e):   d eps/dt = -(Gamma_r + Kd) eps,
+        u_o = Gamma_o w_r - Lam_r^T lam_d + Lam_r^T KI z:        (lam - lam_d) + KI z = 0.
+
+    Gamma_r is skew, so |eps| decays for every Kd > 0, for Kd = k 1 exactly as exp(-k t), and does not depend on the choice of
+    W and V: the square of |eps| is the kinetic energy, times two, of the velocity error ed + Kp e. Unlike `HybridForce` it
+    cancels no Coriolis force of the error.
+
+    With V2^T V2dot = 0,  sdot + Gamma_r s = V2^T W^-1 (M J (xdd_d - Kp ed) + (M Jdot + C J)(xd_d - Kp e)).
+
+    **Arguments:**
+
+    - `scene`: with constraints A v = 0; its forces are compensated.
+    - `task`: x(q) -> (nr,), as many coordinates as freedoms; `target`: (nr,), or a function of t, differentiable twice.
+    - `kp` (1/s), of ed + Kp e; `kd` (1/s), of eps: positive definite, numbers, (nr,) or (nr, nr). A `kd` that is no number acts
+      along V2, which is carried along.
+    - `force`, `ki` as in `HybridForce`.
+
+    **Raises:** ValueError for a scene without constraints, gains that are not positive definite; (when called) for shapes that
+    do not fit and a task of another size than the freedoms.
+
+    Source: EQUATIONS section 9 and errata E23 to E26.
+    """
+
+    scene: Scene
+    error: Constraint
+    kp: Array
+    kd: Array
+    force: Callable | None
+    ki: Array | None
+
+    def __init__(self, scene: Any, task: Any, target: Any, kp: Any, kd: Any, *, force: Any = None, ki: Any = None):
+        self.scene = constrained(scene)
+        self.error = TaskError(as_pytree(task, "task"), as_target(target))  # pyright: ignore[reportCallIssue]
+        self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
+        self.force = None if force is None else as_target(force, "force")
+        self.ki = None if ki is None else gain(ki, "ki")
+
+    def __call__(self, q, v, t=0.0, state=None, multipliers=None) -> Float[Array, " nv"]:
+        """Torques (nv,), N m or N."""
+        scene, system, t = self.scene, self.scene.system, jnp.asarray(t, q.dtype)
+        errors = Scene(system, (self.error,))
+        m = self.error.sizes(system, q.dtype)[0]
+        if m + _count(scene) < scene.nv:
+            raise ValueError(
+                f"task returned {m} coordinates, and the constraints have {_count(scene)} rows of nv = {scene.nv}; give as many "
+                "coordinates as freedoms"
+            )
+        motion = velocity_to_rate(system, q, v), jnp.ones_like(t)
+
+        def both(q, t):
+            return jnp.concatenate([constraint_jacobian(scene, q, t), constraint_jacobian(errors, q, t)])
+
+        def reference(q, t):
+            """xd_d - Kp e."""
+            speed = -rows(errors, q, jnp.zeros_like(v), t).velocity
+            return speed - times(self.kp, self.error.position(system, q, t), "kp")  # pyright: ignore[reportArgumentType]
+
+        stacked, turning = jax.jvp(both, (q, t), motion)
+        inverse = pseudo_inverse(stacked, tolerance(None, stacked))
+        J = inverse[:, -m:]
+        s, sdot = jax.jvp(reference, (q, t), motion)
+        along = _product(J, s)
+        change = _product(J, sdot) - _product(inverse, _product(turning, along))
+        M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)  # pyright: ignore[reportArgumentType]
+        gauge = gauge_invariant(scene, q, v, None, t, dof=m)  # pyright: ignore[reportArgumentType]
+        # W^T J (ed + Kp e), which lies along V2.
+        eps = _product(gauge.V2.T, _product(gauge.W.T, v - along))
+        push = _product(M, change) + _product(C, along)
+        push = push - _product(gauge.W, _product(gauge.V2, times(self.kd, eps, "kd")))
+        normal = _product(gauge.Gamma_o, gauge.reduced_velocity) + _product(gauge.Lambda_r.T, self.pressed(q, t, state))
+        # Of `push` the part of the motion, W V2 V2^T W^-1, in the place of which the normal one stands.
+        free = _product(gauge.V2, _product(gauge.V2.T, jnp.linalg.solve(gauge.W, push)))
+        tau = _product(gauge.W, free + _product(gauge.V1, normal))
+        potential, force = bias_force(system, q, v, t) - _product(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
+        return tau + potential if force is None else tau + potential - force
+
+
+def constrained(scene: Any) -> Scene:
+    """A scene with constraints. **Raises:** ValueError for anything else."""
+    if not isinstance(scene, Scene) or not scene.constraints:
+        raise ValueError(
+            "scene has no constraints, so there is no force to control; take jd.control.ComputedTorque or "
+            "jd.control.OperationalSpace"
+        )
+    layout(scene)
+    return scene
+
+
+def _error(task: Any, target: Any, of: str, kd) -> Constraint:
+    if of not in ("position", "velocity"):
+        raise ValueError(f"of is {of!r}; choose 'position' for a task x(q), or 'velocity' for a task u(q, v)")
+    if (kd is None) == (of == "position"):
+        raise ValueError(
+            f"kd is {'None' if kd is None else 'given'} for a task of {of}; positions take kp and kd, velocities kp"
+        )
+    function = as_pytree(task, "task")
+    return TaskError(function, as_target(target)) if of == "position" else RateError(function, as_target(target))  # pyright: ignore[reportCallIssue]
+
+
+def _indices(actuated: Any, nv: int) -> tuple[int, ...]:
+    found = np.asarray(actuated, int)
+    if found.ndim != 1 or not found.size or found.min() < 0 or found.max() >= nv or np.unique(found).size < found.size:
+        raise ValueError(f"actuated is {actuated!r}; give different indices of velocities from 0 to {nv - 1}")
+    return tuple(found.tolist())
+
+
+def _count(scene: Scene) -> int:
+    return layout(scene)[-1].end
+
+
+def _rank(matrix: Float[Array, "m n"]) -> Array:
+    return jnp.round(jnp.sum(pseudo_inverse(matrix, tolerance(None, matrix), True) * matrix.T))

@@ -1,0 +1,145 @@
+"""What a law controls: errors e(q, t), and errors of rates w(q, v, t), that are to vanish.
+
+An error is written as a constraint that the motion need not satisfy yet. Its rows are those of any constraint
+(`jaxdyn.constraints.base`): de/dt = A v - b and d2e/dt2 = A a - gamma, on manifold-valued q and moving targets too. A law
+asks for the acceleration that makes an error decay,
+
+    A a = gamma - Kd de/dt - Kp e     of positions,        A a = gamma - Kp w     of rates,
+
+so that  d2e/dt2 + Kd de/dt + Kp e = 0  and  dw/dt + Kp w = 0.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.base import Constraint, position_residual, rows
+from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.control.gains import times
+from jaxdyn.dynamics.kinematics import frame_pose
+from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.lie import so3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.tree import Model, frame_index
+from jaxdyn.systems.mass_factor import mass_factor
+from jaxdyn.systems.scene import Scene, as_pytree
+from jaxdyn.systems.system import displacement
+
+TASKS = {"position": (3,), "orientation": (3, 3), "pose": (4, 4)}
+
+
+class Fixed(eqx.Module):
+    """A target that does not move."""
+
+    value: Array
+
+    def __call__(self, t):
+        return self.value
+
+
+def as_target(target: Any, name: str = "target") -> Callable:
+    """A target as a function of time: a function as it is, numbers as one that is constant.
+
+    **Raises:** ValueError for what is neither.
+    """
+    if callable(target):
+        return as_pytree(target, name)
+    found = as_array(target, name)
+    return Fixed(jnp.asarray(found, found.dtype if jnp.issubdtype(found.dtype, jnp.floating) else float))
+
+
+def _placed(target: Callable, t, shape: tuple, like) -> Array:
+    found = target(t)
+    if jnp.shape(found) != shape:
+        raise ValueError(f"target has shape {jnp.shape(found)}, expected {shape}{batch_hint(found, shape)}")
+    return jnp.asarray(found, like.dtype)
+
+
+class ConfigurationError(Constraint):
+    """The displacement (nv,) from the target q_d(t) (nq,) to q, along the manifold of the system."""
+
+    target: Callable
+    name: str = eqx.field(static=True, default="configuration")
+
+    def position(self, system, q, t):
+        """q - q_d, and the twists from the target in joints that turn in space."""
+        return displacement(system, _placed(self.target, t, q.shape, q), q)
+
+
+class FrameError(Constraint):
+    """How far a named frame is from its target: p - p_d in world axes, log(R_d^T R) in the target's axes, or both."""
+
+    target: Callable
+    frame: str = eqx.field(static=True)
+    task: str = eqx.field(static=True)
+    name: str = eqx.field(static=True, default="frame")
+
+    def position(self, system, q, t):
+        """(3,) m, (3,) rad, or both."""
+        pose, target = frame_pose(system, q, self.frame), _placed(self.target, t, TASKS[self.task], q)
+        if self.task == "position":
+            return pose[:3, 3] - target
+        turned = so3.log(_product(target[:3, :3].T, pose[:3, :3]))
+        return turned if self.task == "orientation" else jnp.concatenate([pose[:3, 3] - target[:3, 3], turned])
+
+
+class TaskError(Constraint):
+    """task(q) - target(t), (m,)."""
+
+    task: Callable
+    target: Callable
+    name: str = eqx.field(static=True, default="task")
+
+    def position(self, system, q, t):
+        """task(q) - target(t)."""
+        found = jnp.asarray(self.task(q), q.dtype)
+        if found.ndim != 1:
+            raise ValueError(f"task returned shape {found.shape}; return a vector (m,){batch_hint(found, (1,))}")
+        return found - _placed(self.target, t, found.shape, q)
+
+
+class RateError(Constraint):
+    """task(q, v) - target(t), (m,), of velocities: the task is linear in v."""
+
+    task: Callable
+    target: Callable
+    name: str = eqx.field(static=True, default="rates")
+
+    def slip(self, system, q, v, t):
+        """task(q, v) - target(t)."""
+        found = jnp.asarray(self.task(q, v), q.dtype)
+        if found.ndim != 1:
+            raise ValueError(f"task returned shape {found.shape}; return a vector (m,){batch_hint(found, (1,))}")
+        return found - _placed(self.target, t, found.shape, q)
+
+
+def frame_error(model: Any, frame: str, target: Any, task: str) -> FrameError:
+    """The error of a frame. **Raises:** ValueError for an unknown task or frame, and for what is no `Model`."""
+    if task not in TASKS:
+        raise ValueError(f"task is {task!r}; choose from {', '.join(TASKS)}")
+    if not isinstance(model, Model):
+        raise ValueError(f"model is a {type(model).__name__}, which has no named frames; pass a Model")
+    frame_index(model, frame)
+    return FrameError(as_target(target), frame, task)  # pyright: ignore[reportCallIssue]
+
+
+def wanted_rows(system, error: Constraint, kp, kd, q, v, t) -> tuple[Float[Array, "m nv"], Float[Array, " m"]]:
+    """A (m, nv) and the right side (m,) of A a = gamma - Kd de/dt - Kp e, or gamma - Kp w without `kd`."""
+    scene = Scene(system, (error,))
+    row = rows(scene, q, v, t)
+    if kd is None:
+        return row.A, row.gamma - times(kp, row.velocity, "kp")
+    return row.A, row.gamma - times(kd, row.velocity, "kd") - times(kp, position_residual(scene, q, t), "kp")
+
+
+def least_acceleration(system, q, t, A, wanted, start) -> Float[Array, " nv"]:
+    """The acceleration nearest to `start` (nv,), in the metric M, with A a = wanted; where rows of A depend, as near as
+    can be."""
+    metric = mass_factor(mass_matrix(system, q, t))
+    Y = metric.whiten(A.T)
+    missing = wanted - _product(A, start)
+    return start + metric.unwhiten(_product(pseudo_inverse(Y, tolerance(None, Y)).T, missing))

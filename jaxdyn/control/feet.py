@@ -1,0 +1,108 @@
+"""Feet: where a robot with legs touches the ground, which forces it may take there, and the rows that hold it there."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.loops import Loop, loop, pose_leaf
+from jaxdyn.contact.cones import FrictionCone
+from jaxdyn.contact.kinds import wrench_basis
+from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
+from jaxdyn.lie import se3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array
+from jaxdyn.model.tree import Model, frame_index
+
+_FLAT = ("rigid", "surface")
+
+
+class Foot(eqx.Module):
+    """A place on a body that touches the ground; made by `foot`.
+
+    Its force f (m,), N and N m, is along the columns of the wrench basis of its cone's kind, in the contact frame: z is the
+    normal out of the ground. A point's contact frame has the axes of the `ground`, a flat foot's those of its `pose`.
+    """
+
+    frame: str = eqx.field(static=True)
+    cone: FrictionCone
+    pose: Float[Array, "4 4"]
+    ground: Float[Array, "3 3"]
+
+    @property
+    def size(self) -> int:
+        """Number m of components of the foot's force."""
+        return self.cone.size
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the foot takes torques about all axes, and stands with its own attitude."""
+        return self.cone.kind in _FLAT
+
+    def contact_pose(self, model: Model, q: Float[Array, " nq"]) -> Float[Array, "4 4"]:
+        """The contact frame in the world."""
+        pose = _product(frame_pose(model, q, self.frame), self.pose.astype(q.dtype))
+        return pose if self.is_flat else pose.at[:3, :3].set(self.ground.astype(q.dtype))
+
+    def jacobian(self, model: Model, q: Float[Array, " nq"]) -> Float[Array, "m nv"]:
+        """J (m, nv): J v are the velocities of the foot along the components of its force, and J^T f the force on v."""
+        to_contact = _product(se3.inverse(frame_pose(model, q, self.frame)), self.contact_pose(model, q))
+        twist = _product(se3.Ad(se3.inverse(to_contact)), body_jacobian(model, q, self.frame))
+        kind = "rigid" if self.cone.kind == "surface" else self.cone.kind
+        return _product(jnp.asarray(wrench_basis(kind).T, q.dtype), twist)
+
+    def hold(self, model: Model, q: Float[Array, " nq"]) -> Loop:
+        """The constraint that keeps the foot where it is at q (nq,).
+
+        For a point its rows' multipliers are the force f of a hard finger. A flat foot is welded; its wrench is that of
+        `jaxdyn.constraints.dynamics.constraint_wrenches`.
+        """
+        local = self.pose if self.is_flat else self.pose.at[:3, :3].set(jnp.eye(3, dtype=self.pose.dtype))
+        joint = "weld" if self.is_flat else "point"
+        return loop(None, self.contact_pose(model, q), self.frame, local, joint, name=self.frame)
+
+
+def foot(frame: str, cone: Any, *, pose: Any = None, ground: Any = None) -> Foot:
+    """A place on a body that touches the ground, and the cone of forces that it may take from it.
+
+    **Arguments:**
+
+    - `frame`: name of a body or frame of the model.
+    - `cone`: from `jd.contact.friction_cone`, for a point, or `jd.contact.surface_cone(jd.contact.wrench_cone(...))` for a
+      flat foot.
+    - `pose`: of the place in the frame: None (identity), (4, 4), (3,) or (xyz, rpy); m and rad. Of a point only the position
+      counts; a flat foot's z is the normal out of the ground.
+    - `ground` (3, 3): axes of the ground in the world, z its normal; by default those of the world. For points alone.
+
+    **Raises:** ValueError for a cone that is none, a bad pose, and axes that are no rotation.
+    """
+    if not isinstance(cone, FrictionCone) or cone.in_plane:
+        raise ValueError(f"foot {frame!r}: cone is {cone!r}; give one in space from jd.contact.friction_cone(...)")
+    if ground is not None and cone.kind in _FLAT:
+        raise ValueError(f"foot {frame!r}: a flat foot stands in the axes of its pose; leave ground out")
+    found = as_array(np.eye(3) if ground is None else ground, f"foot {frame!r}: ground")
+    if found.shape != (3, 3):
+        raise ValueError(f"foot {frame!r}: ground has shape {found.shape}; give a rotation (3, 3)")
+    if not isinstance(found, Tracer):
+        known = np.asarray(found, float)
+        # Numbers as people write them, with some six digits.
+        if np.abs(known @ known.T - np.eye(3)).max() > 1e-5 or np.linalg.det(known) < 0:
+            raise ValueError(f"foot {frame!r}: ground is {known.tolist()}, which is no rotation; give orthogonal axes")
+    return Foot(frame, cone, pose_leaf(pose, f"foot {frame!r}: pose"), jnp.asarray(found, float))
+
+
+def check_feet(model: Any, feet: Any) -> tuple[Foot, ...]:
+    """Feet of a model. **Raises:** ValueError for what is no list of feet, frames it does not have, and twice the same."""
+    if not isinstance(model, Model):
+        raise ValueError(f"model is a {type(model).__name__}, which has no bodies; pass a Model")
+    if not isinstance(feet, (tuple, list)) or not all(isinstance(one, Foot) for one in feet):
+        raise ValueError(f"contacts is {feet!r}; pass a list of jd.control.foot(frame, cone)")
+    for one in feet:
+        frame_index(model, one.frame)
+    names = [one.frame for one in feet]
+    if len(set(names)) < len(names):
+        raise ValueError(f"contacts name a frame twice: {names}; give every place a frame of its own")
+    return tuple(feet)

@@ -1,0 +1,64 @@
+"""Gains of control laws: a number, one number per row of an error, or a matrix; leaves, checked where they are known."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint
+
+
+def gain(value: Any, name: str) -> Array:
+    """A gain as an array leaf: (), (n,) for a diagonal matrix, or (n, n).
+
+    **Raises:** ValueError, where the numbers are known, for a gain that is not positive definite: its symmetric part has
+    an eigenvalue that is zero, negative or not finite.
+    """
+    found = as_array(value, name)
+    if found.ndim > 2 or (found.ndim == 2 and found.shape[0] != found.shape[1]):
+        raise ValueError(
+            f"{name} has shape {found.shape}; give a number, (n,) for a diagonal matrix, or a matrix (n, n)"
+        )
+    if not isinstance(found, Tracer):
+        known = np.asarray(found, float)
+        least = np.linalg.eigvalsh((known + known.T) / 2).min() if _is_matrix(known) else known.min(initial=np.inf)
+        if not (np.isfinite(known).all() and least > 0):
+            raise ValueError(f"{name} is {known.tolist()}, which is not positive definite; give positive gains")
+    return jnp.asarray(found, found.dtype if jnp.issubdtype(found.dtype, jnp.floating) else float)
+
+
+def non_negative(value: Any, name: str) -> Array:
+    """A number that damps or weighs, as a leaf: (), zero allowed.
+
+    **Raises:** ValueError for another shape and, where it is known, for a negative number.
+    """
+    found = as_array(value, name)
+    if found.ndim:
+        raise ValueError(f"{name} has shape {found.shape}; give one number{batch_hint(found, ())}")
+    if not isinstance(found, Tracer) and not 0 <= float(found) < np.inf:
+        raise ValueError(f"{name} is {float(found)}; give zero or a positive number")
+    return jnp.asarray(found, found.dtype if jnp.issubdtype(found.dtype, jnp.floating) else float)
+
+
+def times(gain: Array, error: Float[Array, " n"], name: str) -> Float[Array, " n"]:
+    """K e for a gain of any of the shapes. **Raises:** ValueError for one of another size."""
+    if gain.ndim and gain.shape[0] != error.shape[0]:
+        raise ValueError(
+            f"{name} has shape {gain.shape} for an error of {error.shape[0]} rows; give a number, {error.shape} or "
+            f"{error.shape * 2}"
+        )
+    gain = gain.astype(error.dtype)
+    return _product(gain, error) if gain.ndim == 2 else gain * error
+
+
+def as_matrix(gain: Array, like: Float[Array, " n"], name: str) -> Float[Array, "n n"]:
+    """The gain as a matrix (n, n)."""
+    unit = jnp.eye(like.shape[0], dtype=like.dtype)
+    return jnp.stack([times(gain, column, name) for column in unit], 1)
+
+
+def _is_matrix(known: np.ndarray) -> bool:
+    return known.ndim == 2

@@ -1,0 +1,190 @@
+"""Inverse dynamics of robots with legs: torques and ground forces together, as the base has no motor.
+
+    M a + h = S^T tau + sum of J_i^T f_i,    f_i in its cone.
+
+The rows without a motor say which forces balance the motion, the others give the torques: with G = (J^T)_base and
+w = (M a + h)_base,  G f = w  and  tau = (M a + h - J^T f)_motors, so that a quadratic program in f alone is left.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.contact._checks import as_float
+from jaxdyn.contact.optimal import cone_bounds
+from jaxdyn.contact.qp import RESULTS, solve_qp
+from jaxdyn.control.feet import check_feet
+from jaxdyn.control.gains import non_negative
+from jaxdyn.dynamics.quantities import inverse_dynamics
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.tree import Model
+
+
+class LeggedDynamics(eqx.Module):
+    """Torques and ground forces of a wanted acceleration.
+
+    - `tau` (nv,), N m: zero where there is no motor. `forces` (m,), N and N m: of all feet, in their order, each in its
+      contact frame (`Foot`). `margins` (k,): how far each foot's force is from leaving its cone; negative outside.
+    - `result`: one of `jd.contact.RESULTS`; `infeasible` where no forces in the cones balance the motion within the
+      limits of the torques (`missing_wrench` says what is missing). Forces and torques then leave a cone or a limit.
+    """
+
+    tau: Float[Array, " nv"]
+    forces: Float[Array, " m"]
+    margins: Float[Array, " k"]
+    result: Any
+    feet: tuple[tuple[str, int], ...] = eqx.field(static=True)
+
+    @property
+    def success(self) -> Array:
+        """Whether `result` is `successful`."""
+        return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
+
+    def by_foot(self) -> dict[str, Array]:
+        """Force of each foot, by the name of its frame."""
+        ends = np.cumsum([size for _, size in self.feet])[:-1]
+        return dict(zip([name for name, _ in self.feet], jnp.split(self.forces, ends, -1), strict=True))
+
+
+def underactuated_inverse_dynamics(
+    model: Model,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    a: Float[Array, " nv"],
+    contacts,
+    *,
+    passive: tuple[int, ...] | None = None,
+    preload: Any = 0.0,
+    torque_weight: Any = 1.0,
+    force_weight: Any = 1e-3,
+    effort_limit: Any = None,
+    tol: float | None = None,
+) -> LeggedDynamics:
+    """Torques and contact forces that give the acceleration a, the forces inside their cones.
+
+        minimise torque_weight |tau|^2 + force_weight |f|^2
+        with M a + h = S^T tau + sum of J_i^T f_i,  margins(f_i) >= preload,  |tau| <= effort_limit
+
+    One small quadratic program a sample (`jd.contact.solve_qp`): batched, and differentiable in the state, the
+    acceleration, the model and the coefficients of friction. The feet are not asked to stand still: take an `a` with
+    J a + Jdot v = 0 for feet that do.
+
+    **Arguments:**
+
+    - `q` (nq,), `v` (nv,), `a` (nv,), the wanted acceleration.
+    - `contacts`: list of `jd.control.foot(frame, cone)`; empty in flight.
+    - `passive`: indices of the velocities without a motor; by default those of all free joints.
+    - `preload` (), N: least margin of every cone. `torque_weight`, `force_weight`: the second one positive, N m against N.
+    - `effort_limit`: N m, a number or one per velocity, of which those of motors count; None: no limit.
+    - `tol`: of `solve_qp`.
+
+    **Returns:** `LeggedDynamics`.
+
+    **Raises:** ValueError for shapes that do not fit, frames that the model does not have, a list that holds anything but
+    feet, a model whose every velocity has a motor.
+
+    Source: Righetti, Buchli, Mistry, Kalakrishnan & Schaal (2013), section 3; EQUATIONS section 11.
+
+    ```python
+    feet = [jd.control.foot(name, jd.contact.friction_cone("hard-finger", mu=0.6)) for name in ("FL", "FR", "HL", "HR")]
+    still = jnp.zeros(model.nv)
+    found = jd.underactuated_inverse_dynamics(model, q, still, still, feet)
+    ```
+    """
+    q, v, a = check_shapes(model, q=q, v=v, a=a)
+    feet = check_feet(model, contacts)
+    base = _passive(model, passive)
+    motors = np.setdiff1d(np.arange(model.nv), base)
+    preload = as_float(preload, "preload", (), q.dtype)
+    torque_weight = non_negative(torque_weight, "torque_weight").astype(q.dtype)
+    force_weight = non_negative(force_weight, "force_weight").astype(q.dtype)
+    needed = inverse_dynamics(model, q, v, a)
+    if not feet:
+        result = RESULTS.where(jnp.any(needed[base] != 0), RESULTS.infeasible, RESULTS.successful)  # pyright: ignore[reportArgumentType]
+        tau = needed.at[base].set(0)
+        return LeggedDynamics(tau, jnp.zeros((0,), q.dtype), jnp.zeros((0,), q.dtype), result, ())
+    J = jnp.concatenate([one.jacobian(model, q) for one in feet])
+    across, along = J[:, motors], J[:, base].T
+    Q = torque_weight * _product(across, across.T) + force_weight * jnp.eye(J.shape[0], dtype=q.dtype)
+    bounds = cone_bounds([one.cone for one in feet], preload, q.dtype)
+    if effort_limit is not None:
+        limit = as_float(effort_limit, "effort_limit", None, q.dtype)
+        if limit.shape not in ((), (model.nv,)):
+            raise ValueError(
+                f"effort_limit has shape {limit.shape}; give one number or ({model.nv},), one per velocity"
+            )
+        limit = jnp.broadcast_to(limit, (model.nv,))[motors]
+        rows, levels = bounds.get("G", jnp.zeros((0, J.shape[0]), q.dtype)), bounds.get("h", jnp.zeros((0,), q.dtype))
+        bounds["G"] = jnp.concatenate([rows, -across.T, across.T])
+        bounds["h"] = jnp.concatenate([levels, limit - needed[motors], limit + needed[motors]])
+    linear = -torque_weight * _product(across, needed[motors])
+    found = solve_qp(Q, linear, A=along, b=needed[base], tol=tol, **bounds)
+    sizes = np.cumsum([one.size for one in feet])[:-1]
+    margins = [one.cone.margin(f) for one, f in zip(feet, jnp.split(found.x, sizes), strict=True)]
+    tau = (needed - _product(J.T, found.x)).at[base].set(0)
+    return LeggedDynamics(
+        tau=tau,
+        forces=found.x,
+        margins=jnp.stack(margins),
+        result=found.result,
+        feet=tuple((one.frame, one.size) for one in feet),
+    )
+
+
+def missing_wrench(
+    model: Model,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    a: Float[Array, " nv"],
+    contacts,
+    *,
+    passive: tuple[int, ...] | None = None,
+) -> Float[Array, " np"]:
+    """What feet in their cones leave of the generalised force that an acceleration needs at the base: (M a + h)_base - G f.
+
+    f is the one in the cones for which it is shortest. Zero, but for the tolerance of the program and some 1e-6 of its
+    size, where the feet can carry the robot.
+
+    **Arguments:** as of `underactuated_inverse_dynamics`.
+
+    **Returns:** (np,), N and N m, in the order of the base's velocities: for a free joint the wrench at its origin, in its
+    axes.
+
+    **Raises:** ValueError as there.
+    """
+    q, v, a = check_shapes(model, q=q, v=v, a=a)
+    feet, base = check_feet(model, contacts), _passive(model, passive)
+    needed = inverse_dynamics(model, q, v, a)[base]
+    if not feet:
+        return needed
+    G = jnp.concatenate([one.jacobian(model, q) for one in feet])[:, base].T
+    # Forces that add up to nothing are kept short, as they would not be determined.
+    Q = _product(G.T, G) + 1e-6 * jnp.eye(G.shape[1], dtype=q.dtype)
+    bounds = cone_bounds([one.cone for one in feet], jnp.zeros((), q.dtype), q.dtype)
+    return needed - _product(G, solve_qp(Q, -_product(G.T, needed), **bounds).x)
+
+
+def _passive(model: Model, passive) -> np.ndarray:
+    """Indices of the velocities without a motor. **Raises:** ValueError for none, and for indices that there are not."""
+    top = model.topology
+    if passive is None:
+        places = [
+            np.arange(part.start, part.stop)
+            for kind, part in zip(top.kinds, top.v_slices, strict=True)
+            if kind == "free"
+        ]
+        found = np.concatenate([*places, np.zeros(0, int)])
+        if not found.size:
+            raise ValueError(
+                f"model {model.name!r} has no free joint, so every velocity has a motor; take jd.inverse_dynamics, or name "
+                "the velocities without one in passive"
+            )
+        return found
+    found = np.unique(np.asarray(passive, int))
+    if not found.size or found[0] < 0 or found[-1] >= model.nv:
+        raise ValueError(f"passive is {passive!r}; give indices of velocities from 0 to {model.nv - 1}")
+    return found

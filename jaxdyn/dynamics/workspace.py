@@ -1,0 +1,155 @@
+"""Dynamics of an arm as one of its frames feels them: mass, Coriolis forces and gravity in the workspace.
+
+With V = J v the velocity of the frame, in the metric of M, and Jbar = M^-1 J^T Lambda:
+
+    Lambda = (J M^-1 J^T)^-1,   mu = Jbar^T C v - Lambda Jdot v,   p = Jbar^T N,   F = Jbar^T tau,
+    Lambda Vdot + mu + p = F.
+
+J Jbar = 1, and for a square J it is the inverse: Lambda = M_x = J^-T M J^-1, mu = C_x V with
+C_x = J^-T (C - M J^-1 Jdot) J^-1, p = N_x = J^-T N. Where J loses rank Lambda has no bound. There it is damped: scaled to a
+unit diagonal, S = D J M^-1 J^T D, with the least eigenvalue s of S,
+
+    Lambda = D (S + max(0, least - s) 1)^-1 D.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxdyn.compile import compiled
+from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
+from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.tree import Model, configuration_rate
+from jaxdyn.systems.mass_factor import mass_factor, solve_positive
+
+
+class WorkspaceDynamics(eqx.Module):
+    """M_x Vdot + mu + p = F in the velocity V = J v of a frame (see `workspace_dynamics`); m is its number of components.
+
+    - `mass_matrix` (m, m): M_x, also called Lambda. `coriolis_matrix` (m, m): C_x, with dM_x/dt - 2 C_x skew.
+    - `coriolis_force` (m,): mu; C_x V where J is square, and for a redundant arm what its inner motion adds too.
+    - `gravity_force` (m,): N_x, also called p.
+    - `jacobian` (m, nv): J. `jacobian_rate` (m, nv): Jdot along v, so that Vdot = J a + Jdot v.
+    - `inverse` (nv, m): Jbar, the dynamically consistent inverse; joint velocities Jbar V have the least kinetic energy of
+      those that move the frame with V. Jbar^T tau is the force on the frame that tau stands for, J^T F the torques of F.
+    - `condition` (): least eigenvalue of J M^-1 J^T scaled to a unit diagonal, 0 where J has lost rank, at most 1.
+    - `damped` (): whether that is below `least`, so that Lambda is the damped one, finite and smaller than the true one.
+    """
+
+    mass_matrix: Float[Array, "m m"]
+    coriolis_matrix: Float[Array, "m m"]
+    coriolis_force: Float[Array, " m"]
+    gravity_force: Float[Array, " m"]
+    jacobian: Float[Array, "m nv"]
+    jacobian_rate: Float[Array, "m nv"]
+    inverse: Float[Array, "nv m"]
+    condition: Float[Array, ""]
+    damped: Bool[Array, ""]
+
+
+def workspace_dynamics(
+    model: Model,
+    frame: str,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    *,
+    axes: str = "body",
+    rows: Sequence[int] = (0, 1, 2, 3, 4, 5),
+    least: float | None = None,
+) -> WorkspaceDynamics:
+    """Mass matrix, Coriolis forces and gravity of an arm in the velocity of one of its frames.
+
+    **Arguments:**
+
+    - `frame`: one of `model.frame_names`. `q` (nq,), `v` (nv,).
+    - `axes`: "body" for the frame's body twist, in its own axes; "world" for the velocity of its origin and the angular
+      velocity in world axes.
+    - `rows`: components of (vx, vy, vz, wx, wy, wz) that are taken, at most as many as the model has freedoms: of an arm
+      in the x-y plane e.g. (0, 1, 5).
+    - `least`: value of `condition` below which Lambda is damped; eps^0.4 by default, 5e-7 in float64. An entry that no joint
+      moves is damped everywhere, and stands for nothing: leave it out of `rows`.
+
+    **Returns:** `WorkspaceDynamics`; m, m/s and N for linear components, rad, rad/s and N m for angular ones. Damped, M_x
+    is positive definite and finite with a finite gradient, and J Jbar and dM_x/dt - 2 C_x are not 1 and skew any more.
+
+    **Raises:** ValueError for shapes that do not fit, an unknown frame, axes, components that are none or more than nv, and
+    a `least` outside of (0, 1).
+
+    ```python
+    found = jd.workspace_dynamics(arm, "tip", q, v)
+    tau = found.jacobian.T @ (found.mass_matrix @ wanted + found.coriolis_force + found.gravity_force)
+    ```
+
+    Source: Khatib (1987), eqs 19-22 and 50; Murray, Li & Sastry (1994), eq. 4.33; EQUATIONS section 10.
+    """
+    q, v = check_shapes(model, q=q, v=v)
+    rows = tuple(rows)
+    if not rows or len(set(rows)) < len(rows) or not set(rows) <= set(range(6)) or len(rows) > model.nv:
+        raise ValueError(
+            f"rows is {rows}; give different components 0 to 5 of the twist, at most nv = {model.nv} of them"
+        )
+    if axes not in ("body", "world"):
+        raise ValueError(f"axes is {axes!r}; choose from body, world")
+    limit = float(jnp.finfo(q.dtype).eps) ** 0.4 if least is None else least
+    if not 0 < limit < 1:
+        raise ValueError(f"least is {least}; give a number between 0 and 1, or None")
+    frame_pose(model, q, frame)  # refuses unknown names
+    return _workspace(model, _Choice(frame, axes, rows, limit), q, v)
+
+
+class _Choice(eqx.Module):
+    frame: str = eqx.field(static=True)
+    axes: str = eqx.field(static=True)
+    rows: tuple[int, ...] = eqx.field(static=True)
+    least: float = eqx.field(static=True)
+
+
+@compiled
+def _workspace(model: Model, choice: _Choice, q, v) -> WorkspaceDynamics:
+    def velocity_map(q):
+        J = body_jacobian(model, q, choice.frame)
+        if choice.axes == "world":
+            turn = frame_pose(model, q, choice.frame)[:3, :3]
+            J = jnp.concatenate([_product(turn, J[:3]), _product(turn, J[3:])])
+        return J[np.array(choice.rows)]
+
+    J, J_rate = jax.jvp(velocity_map, (q,), (configuration_rate(model, q, v),))
+    factor = mass_factor(mass_matrix(model, q))
+    whitened = factor.whiten(J.T)
+    scale, scaled = _unit_diagonal(_product(whitened.T, whitened))
+    # Where joints are as many as components, the least eigenvalue is that of a square of a matrix: never below zero but for
+    # rounding.
+    condition = jnp.maximum(jnp.linalg.eigvalsh(scaled)[0], jnp.zeros((), q.dtype))
+    damping = jnp.maximum(choice.least - condition, jnp.zeros_like(condition))
+    unit = jnp.eye(J.shape[0], dtype=q.dtype)
+    mass = scale[:, None] * solve_positive(scaled + damping * unit, unit) * scale[None]
+    mass = 0.5 * (mass + mass.T)
+    inverse = _product(factor.unwhiten(whitened), mass)
+    C = coriolis_matrix(model, q, v)
+    return WorkspaceDynamics(
+        mass_matrix=mass,
+        coriolis_matrix=_product(inverse.T, _product(C, inverse)) - _product(mass, _product(J_rate, inverse)),
+        coriolis_force=_product(inverse.T, _product(C, v)) - _product(mass, _product(J_rate, v)),
+        gravity_force=_product(inverse.T, gravity_force(model, q)),
+        jacobian=J,
+        jacobian_rate=J_rate,
+        inverse=inverse,
+        condition=condition,
+        damped=damping > 0,
+    )
+
+
+def _unit_diagonal(matrix):
+    """D (m,) and D matrix D with ones on its diagonal; a row of zeros stays one, with 1 in D."""
+    diagonal = jnp.diagonal(matrix)
+    moved = diagonal > 0
+    scale = jnp.where(
+        moved, 1.0 / jnp.sqrt(jnp.where(moved, diagonal, jnp.ones_like(diagonal))), jnp.ones_like(diagonal)
+    )
+    return scale, scale[:, None] * matrix * scale[None]

@@ -1,0 +1,184 @@
+"""Arms that touch something with their tip, and arms that lift something together."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.constraints import rolling_sphere
+from jaxdyn.contact import Sphere, montana
+from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
+from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
+from jaxdyn.lie import se3
+from jaxdyn.model import inertia, robots
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.joining import join
+from jaxdyn.model.tree import Model
+from jaxdyn.scenes._named import named
+from jaxdyn.scenes.hands import _spatial_finger, _turn
+from jaxdyn.scenes.linkages import thin_bar
+from jaxdyn.systems.scene import Scene
+
+_LINKS = (0.4, 0.4, 0.1)
+_MASSES = (1.0, 1.5, 1.0, 0.3, 0.3, 0.2)
+_HEIGHT = 0.3
+_CENTER = (0.5, 0.0, 0.0)
+_RADIUS, _TIP_RADIUS = 0.15, 0.03
+_ETA = (0.2, -0.1, 0.15, 0.1, 0.3)
+
+
+def _six_joints(links, masses, height, tip_radius, gravity) -> Model:
+    """Yaw, two pitches, and a wrist of a roll, a pitch and a roll; the last body is a ball, its frame `tip` at the centre."""
+    upper, lower, hand = links
+    pitch, roll = (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)
+    wrist = [inertia.sphere(mass, 0.03) for mass in masses[3:5]]
+    ball = masses[5], (hand, 0.0, 0.0), (0.4 * masses[5] * tip_radius**2,) * 3
+    builder = ModelBuilder("arm of six joints", gravity=(0.0, 0.0, -gravity))
+    builder.add_body("link_1", None, "continuous", inertia.sphere(masses[0], 0.1), pose=(0.0, 0.0, height))
+    builder.add_body("link_2", "link_1", "continuous", thin_bar(masses[1], upper), axis=pitch)
+    builder.add_body("link_3", "link_2", "continuous", thin_bar(masses[2], lower), axis=pitch, pose=(upper, 0.0, 0.0))
+    builder.add_body("link_4", "link_3", "continuous", wrist[0], axis=roll, pose=(lower, 0.0, 0.0))
+    builder.add_body("link_5", "link_4", "continuous", wrist[1], axis=pitch)
+    builder.add_body("link_6", "link_5", "continuous", ball, axis=roll)
+    return builder.add_frame("tip", "link_6", (hand, 0.0, 0.0)).build()
+
+
+def _joint_angles(pose, links, height):
+    """Angles (6,) of the arm whose frame `tip` is to be at a pose (4, 4), the elbow above."""
+    base = np.eye(4)
+    base[2, 3] = height
+    wrist = pose[:3, 3] - links[2] * pose[:3, 0]
+    angles, _ = _spatial_finger(base, links[:2], wrist, wrist, np.zeros(3))
+    yaw, lift = angles[0], angles[1] + angles[2]
+    ahead, up = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([0.0, 0.0, 1.0])
+    forearm = np.cos(lift) * ahead + np.sin(lift) * up
+    left = np.cross(up, ahead)
+    turn = np.stack([forearm, left, np.cross(forearm, left)]) @ pose[:3, :3]
+    # Of a roll a, a pitch b about -y and a roll c: the first row and column have b and one of the rolls each.
+    roll, pitch = np.arctan2(-turn[1, 0], turn[2, 0]), np.arctan2(np.hypot(*turn[0, 1:]), turn[0, 0])
+    return np.array([*angles, roll, pitch, np.arctan2(-turn[0, 1], -turn[0, 2])])
+
+
+def _sphere_arm_start(
+    contact="frictionless",
+    eta=_ETA,
+    rolling=(0.5, -0.3),
+    slide=(0.0, 0.0),
+    spin=0.0,
+    links=_LINKS,
+    height=_HEIGHT,
+    center=_CENTER,
+    radius=_RADIUS,
+    tip_radius=_TIP_RADIUS,
+):
+    _check_contact(contact)
+    if contact == "rolling" and (np.any(slide) or spin):
+        raise ValueError(f"slide is {slide}, spin is {spin}; a rolling contact has neither, leave them out")
+    found = montana(*_surfaces(radius, tip_radius), jnp.asarray(eta, float))
+    pose = np.array(found.g_of)
+    pose[:3, 3] += center
+    q = jnp.asarray(_joint_angles(pose, links, height))
+    twist = se3.Ad_apply(found.finger.pose, jnp.asarray([*slide, 0.0, *rolling, spin], float))
+    arm = _six_joints(links, _MASSES, height, tip_radius, 0.0)
+    return q, jnp.linalg.solve(body_jacobian(arm, q, "tip"), twist)
+
+
+def _surfaces(radius, tip_radius):
+    # The contact is about the top of the sphere, and about the x axis of the tip: both in the middle of their charts.
+    return Sphere(radius, poles="y"), Sphere(tip_radius)
+
+
+def _check_contact(contact):
+    if contact not in ("frictionless", "rolling"):
+        raise ValueError(f"contact is {contact!r}; choose from frictionless, rolling")
+
+
+@named(_sphere_arm_start)
+def sphere_arm(
+    *,
+    contact="frictionless",
+    links=_LINKS,
+    masses=_MASSES,
+    height=_HEIGHT,
+    center=_CENTER,
+    radius=_RADIUS,
+    tip_radius=_TIP_RADIUS,
+    gravity=9.81,
+) -> Scene:
+    """An arm of six joints whose tip, a ball, stays in touch with a sphere that stands still.
+
+    - `contact="frictionless"`: the tip slides. One row, the gap; five coordinates of contact.
+    - `contact="rolling"`: it neither slips nor spins. Four rows, the gap, two slips and the spin; two minimal velocities,
+      the rates of the contact's place on the tip. From these motions one reaches all five coordinates of contact
+      (`involutive` finds (2, 3, 5)) unless both radii are equal, where it is (2,).
+
+    q = (yaw, shoulder, elbow, and the wrist's roll, pitch, roll), rad. `links`: upper arm, forearm, and from the wrist to
+    the middle of the ball (m); `masses` of the six bodies (kg), the last one the ball; `height` of the shoulder (m);
+    `center`, `radius` of the sphere, `tip_radius` of the ball (m). The frame "tip" is in the middle of the ball. A positive
+    normal force presses the tip off the sphere; nothing keeps it positive.
+
+    Start: contact coordinates `eta` of `jd.contact.montana(Sphere(radius, poles="y"), Sphere(tip_radius), eta)`, and the
+    twist of the tip against the sphere, in the axes of its contact frame C_f: `rolling` (wx, wy) and `spin` wz (rad/s),
+    `slide` (vx, vy) (m/s).
+
+    Source: EQUATIONS section 8 and errata E21, E22; Murray, Li & Sastry (1994), section 5.6.
+    """
+    _check_contact(contact)
+    arm = _six_joints(links, masses, height, tip_radius, gravity)
+    free = contact == "frictionless"
+    touch = rolling_sphere(
+        "tip",
+        None,
+        tip_radius,
+        on="sphere",
+        surface=jnp.asarray(center, float),
+        surface_radius=radius,
+        slip=free,
+        spin=not free,
+        name=contact,
+    )
+    return Scene(arm, (touch,))
+
+
+# Angles at which an arm's flange points forward and level.
+_HOLDING = (0.0, 0.6, 0.0, -1.2, 0.0, np.pi / 2 - 1.8, 0.0)
+_FLANGE = "iiwa_link_7"
+
+
+def _lifting_start(count=2, radius=0.3, twist=(0.05, 0.0, 0.1, 0.0, 0.2, 0.3)):
+    scene: Any = coordinated_lifting(count=count, radius=radius)
+    height = float(frame_pose(robots.iiwa(), jnp.asarray(_HOLDING), _FLANGE)[2, 3])
+    q = jnp.asarray([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
+    twist = jnp.asarray(twist, float)
+    # Of all joint velocities that move the flanges with the plate, the smallest.
+    rates = jnp.linalg.pinv(hand_jacobian(scene, q)) @ (grasp_map(scene, q).T @ twist)
+    return q, jnp.concatenate([rates, twist])
+
+
+@named(_lifting_start)
+def coordinated_lifting(*, count=2, radius=0.3, mass=4.0, thickness=0.04, gravity=9.81) -> Grasp:
+    """`count` arms (KUKA iiwa, seven joints each) around a round plate that all of them hold by its rim, rigidly.
+
+    q = (joints of arm 1, of arm 2, ..., the plate's free joint), 7 count + 7 numbers. Each grip has six rows (B = 1): the
+    flange moves as the plate does, so that 6 count rows leave 6 + count freedoms, and 6 count - 6 internal forces. Names of
+    arm i start with "arm<i>_". The arms stand evenly around the z axis, the first one at -x. `radius`, `thickness` (m) and
+    `mass` (kg) of the plate. Start: the plate level with the flanges, with a body `twist`.
+
+    Source: EQUATIONS section 10, coordinated lifting; Murray, Li & Sastry (1994), section 6.4.
+    """
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ValueError(f"count is {count!r}; give the number of arms, a positive integer")
+    fall = (0.0, 0.0, -gravity)
+    arm = robots.iiwa(gravity=fall)
+    flange = np.asarray(frame_pose(arm, jnp.asarray(_HOLDING, arm.home.dtype), _FLANGE))
+    whole, grips = ModelBuilder("no arm", gravity=fall).build(), []
+    for i in range(count):
+        turn = np.eye(4)
+        turn[:3, :3] = _turn(2 * np.pi / count * i)
+        base, grip = np.eye(4), np.eye(4)
+        base[0, 3], grip[:3, :3], grip[0, 3] = -radius - flange[0, 3], flange[:3, :3], -radius
+        whole = join(whole, arm, prefix=f"arm{i + 1}_", pose=turn @ base)
+        grips.append(contact("rigid", f"arm{i + 1}_{_FLANGE}", turn @ grip, name=f"arm{i + 1}"))
+    plate = ModelBuilder("plate", gravity=fall)
+    plate.add_body("plate", None, "free", inertia.cylinder(mass, radius, thickness), joint_name="object")
+    return Grasp(join(whole, plate.build(), name=f"{count} arms and a plate"), "plate", grips)

@@ -1,0 +1,106 @@
+"""Functions that users pass: what a compiled program would keep of them is refused, what it takes as an input is not."""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+from jaxdyn.systems.scene import as_pytree
+
+ARM = jd.robots.chain(2)
+TIMES = [0.0, 0.1]
+
+
+class Gain:
+    def __init__(self, k):
+        self.k = k
+
+    def __call__(self, *state):
+        return -self.k * state[-3]
+
+    def damping(self, q, v, t):
+        return -self.k * v
+
+
+class Slotted:
+    __slots__ = ("k",)
+
+    def __init__(self, k):
+        self.k = k
+
+    def __call__(self, q, v, t):
+        return -self.k * q
+
+
+class Module(eqx.Module):
+    k: jax.Array
+
+    def __call__(self, q, v, t):
+        return -self.k * q
+
+
+class Tuple(NamedTuple):
+    k: jax.Array
+
+    def spring(self, q, v, t):
+        return -self.k * q
+
+
+class Bare:
+    def __call__(self, q, v, t):
+        return -q
+
+    def method(self, q, v, t):
+        return -q
+
+
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        (Gain(1.0), r"control is a Gain, whose attributes \(k\) would keep .*class Gain\(eqx\.Module\)"),
+        (Gain(1.0).damping, r"control is a method of a Gain, whose attributes \(k\)"),
+        (Slotted(1.0), r"control is a Slotted, whose attributes \(k\)"),
+        (functools.partial(Gain(1.0)), r"control is a Gain, whose attributes \(k\)"),
+    ],
+    ids=["object", "method", "slots", "partial"],
+)
+def test_objects_with_attributes_are_refused(function, said):
+    with pytest.raises(ValueError, match=said):
+        jd.simulate(ARM, [0, 0], [0, 0], TIMES, control=function)
+
+
+def test_in_scenes_too():
+    with pytest.raises(ValueError, match=r"forces\[0\] is a Gain"):
+        jd.Scene(ARM, forces=(Gain(1.0),))
+    with pytest.raises(ValueError, match="phi is a Gain"):
+        jd.Holonomic(Gain(1.0))
+    with pytest.raises(ValueError, match="metric is a Gain"):
+        jd.MetricSystem(Gain(1.0), 2)
+
+
+def test_functions_and_what_wraps_them_stay_static():
+    def plain(q, v, t):
+        return -q
+
+    wrapped = (plain, jax.jit(plain), functools.lru_cache(plain), functools.partial(plain), jax.custom_jvp(plain))
+    for function in (*wrapped, Bare(), Bare().method, jnp.sin, np.sin):
+        assert not jax.tree.leaves(as_pytree(function, "control"))
+
+
+def test_attributes_of_pytrees_are_inputs():
+    """A method of a pytree as well; each value has its own motion, by one program, equal to that of a new function."""
+    pendulum = jd.robots.chain(1)
+
+    def reached(control):
+        return jd.simulate(pendulum, [0.3], [0], TIMES, control=control, stepsize=0.05).q[-1]
+
+    for function in (Module(jnp.ones(())), Module(jnp.ones(())).__call__, Tuple(jnp.ones(())).spring):
+        assert len(jax.tree.leaves(as_pytree(function, "control"))) == 1
+    soft, stiff = (reached(Tuple(jnp.asarray(k)).spring) for k in (1.0, 9.0))
+    np.testing.assert_allclose(stiff, reached(lambda q, v, t: -9.0 * q), rtol=1e-12)
+    assert np.abs(stiff - soft).max() > 1e-3

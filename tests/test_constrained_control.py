@@ -1,0 +1,299 @@
+"""Laws of motion and force on constraints: errors decay as the gains say, forces follow, and where the laws differ."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import quick
+from test_control import KD, KP, assert_decays, decayed
+
+import jaxdyn as jd
+from jaxdyn import scenes
+from jaxdyn.contact import Sphere, montana
+from jaxdyn.reduction.gauge_invariant import gauge_invariant
+
+TS = jnp.linspace(0.0, 2.0, 21)
+PRESS = jnp.asarray([2.0])
+
+
+def first_two(q):
+    return q[:2]
+
+
+def circle(t):
+    """A moving target for two coordinates."""
+    return jnp.stack([0.3 * jnp.sin(t), 0.4 * jnp.cos(t)])
+
+
+def start_rate(task, target, q, v):
+    """Rate of the error at the start."""
+    return jax.jvp(task, (q,), (v,))[1] - jax.jvp(target, (0.0,), (1.0,))[1]
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """A particle on a sphere below its centre, and a start."""
+    return scenes.spherical_pendulum(mass=1.3), *scenes.spherical_pendulum.start(theta=1.0, phi_rate=0.7)
+
+
+@pytest.fixture(scope="module")
+def torques(pendulum):
+    """The laws on the sphere as functions of the state: geometric and gauge-invariant, of matched gains p and k."""
+    p, k, scene = 2.0, 3.0, pendulum[0]
+    hybrid = jd.control.HybridForce(scene, first_two, circle, k * p, p + k, force=PRESS)
+    gauge = jd.control.GaugeInvariant(scene, first_two, circle, p, k, force=PRESS)
+    return p, quick(lambda q, v, t: (hybrid(q, v, t), gauge(q, v, t)))
+
+
+@pytest.mark.parametrize("ki", [None, 4.0])
+def test_motion_and_force_on_a_sphere(pendulum, ki):
+    """Errors by the closed form; the force is the wanted one at every moment."""
+    scene, q0, v0 = pendulum
+    law = jd.control.HybridForce(scene, first_two, circle, KP, KD, force=lambda t: PRESS + jnp.sin(t), ki=ki)
+    found = jd.simulate(scene, q0, v0, TS, control=law, stepsize=0.005, outputs=("multipliers",))
+    assert_decays(TS, found.q[:, :2] - jax.vmap(circle)(TS), start_rate=start_rate(first_two, circle, q0, v0))
+    np.testing.assert_allclose(found.multipliers[:, 0], 2.0 + np.sin(TS), rtol=1e-10)
+
+
+def test_wrong_mass_shifts_the_force_by_the_stated_error(pendulum):
+    """lam - lam_d = -(A M^-1 A^T)^-1 A M^-1 ((M' - M) a + h' - h), which bounds it."""
+    plant, q, v = pendulum
+    law = jd.control.HybridForce(scenes.spherical_pendulum(mass=1.6), first_two, circle, KP, KD, force=PRESS)
+    lam = jd.constrained_dynamics(plant, q, v, law(q, v, 0.3), 0.3).multipliers
+    a, A = np.asarray(law.acceleration(q, v, 0.3)), np.asarray(jd.constraint_jacobian(plant, q))
+    # M = m 1 and h = (0, 0, m g).
+    wrong = 0.3 * a + np.array([0.0, 0.0, 0.3 * 9.81])
+    normal = np.linalg.inv(A @ A.T / 1.3) @ A / 1.3
+    np.testing.assert_allclose(lam - PRESS, -normal @ wrong, rtol=1e-10)
+    assert np.abs(lam - PRESS)[0] > 1.0
+
+
+def test_integral_action_takes_a_force_error_away():
+    """At the lowest place a wrong mass moves nothing and presses with a constant error, which decays as exp(-KI t)."""
+    plant, q0, v0 = scenes.spherical_pendulum(mass=1.3), jnp.asarray([0.0, 0.0, -1.0]), jnp.zeros(3)
+    model = scenes.spherical_pendulum(mass=1.6)
+    law = jd.control.HybridForce(model, first_two, jnp.zeros(2), KP, KD, force=PRESS, ki=4.0)
+    outputs = ("multipliers", "control_state", "torque")
+    found = jd.simulate(plant, q0, v0, TS, control=law, stepsize=0.005, outputs=outputs)
+    np.testing.assert_allclose(found.q, np.tile(q0, (TS.size, 1)), atol=1e-12)
+    error = found.multipliers[:, 0] - PRESS[0]
+    np.testing.assert_allclose(error, 0.3 * 9.81 * np.exp(-4.0 * TS), atol=1e-7)  # of RK4's steps
+    fitted = np.polyfit(TS, np.log(error), 1)[0]
+    np.testing.assert_allclose(fitted, -4.0, rtol=0.01)
+    np.testing.assert_allclose(found.control_state[:, 0], 0.3 * 9.81 * (1 - np.exp(-4.0 * TS)) / 4.0, atol=1e-7)
+    again = jax.vmap(law)(found.q, found.v, TS, found.control_state)
+    np.testing.assert_allclose(found.torque, again, atol=1e-12)
+
+
+def test_velocities_of_a_rolling_disk():
+    """A J = 0: steering and rolling rates follow by one gain each, the forces of both rows as wanted."""
+    scene = scenes.rolling_disk()
+    q0, v0 = scenes.rolling_disk.start()
+
+    def rates(q, v):
+        return v[2:]
+
+    def target(t):
+        return jnp.stack([jnp.sin(t), 1.0 + 0.5 * t])
+
+    kp, force = np.array([3.0, 5.0]), jnp.asarray([0.7, -0.4])
+    law = jd.control.HybridForce(scene, rates, target, kp, of="velocity", force=force, ki=2.0)
+    found = jd.simulate(scene, q0, v0, TS, control=law, stepsize=0.005, outputs=("multipliers",))
+    errors = np.asarray(found.v[:, 2:] - jax.vmap(target)(TS))
+    np.testing.assert_allclose(errors, errors[0] * np.exp(-np.outer(TS, kp)), atol=1e-8)
+    np.testing.assert_allclose(found.multipliers, np.tile(force, (TS.size, 1)), atol=1e-10)
+
+
+def test_three_motors_of_a_parallel_manipulator():
+    """The carried point follows; torques are the shortest that do it, and internal ones move nothing."""
+    scene = scenes.parallel_manipulator()
+    q, v = scenes.parallel_manipulator.start()
+
+    def point(q):
+        tip = jd.frame_pose(scene.system, q, "a2")
+        return tip[:2, 3] + tip[:2, 0]
+
+    def target(t):
+        return jnp.stack([0.2 * jnp.cos(t), 0.15 * jnp.sin(t)])
+
+    motors, internal = (0, 2, 4), jnp.asarray([1.0, -2.0, 0.5])
+    laws = [jd.control.HybridForce(scene, point, target, KP, KD, actuated=motors, internal=x) for x in (None, internal)]
+
+    @quick
+    def compute(q, v):
+        tau = [law(q, v, 0.3) for law in laws]
+        moved = [jd.constrained_dynamics(scene, q, v, x, 0.3) for x in tau]
+        M, h = jd.mass_matrix(scene.system, q), jd.bias_force(scene.system, q, v)
+        full = M @ laws[0].acceleration(q, v, 0.3) + h
+        bend = jax.jvp(lambda q: jax.jvp(point, (q,), (v,))[1], (q,), (v,))[1]
+        return tau, moved, full, jd.projections(scene, q).P_omega, jax.jacfwd(point)(q), bend, point(q)
+
+    tau, moved, full, P_w, J, bend, place = compute(q, v)
+    rate = jax.jvp(target, (0.3,), (1.0,))[1]
+    wanted = -target(0.3) - KD * (J @ v - rate) - KP * (place - target(0.3))
+    for x, found in zip(tau, moved, strict=True):
+        assert not np.asarray(x)[[1, 3, 5]].any()
+        np.testing.assert_allclose(J @ found.acceleration + bend, wanted, rtol=1e-9)
+    shortest = np.linalg.pinv(np.asarray(P_w)[:, motors], rcond=1e-9) @ np.asarray(P_w @ full)
+    np.testing.assert_allclose(tau[0][np.array(motors)], shortest, rtol=1e-9)
+    assert np.abs(tau[1] - tau[0]).max() > 0.01
+    assert np.abs(moved[1].multipliers - moved[0].multipliers).max() > 0.01
+    np.testing.assert_allclose(moved[1].acceleration, moved[0].acceleration, atol=1e-9)
+
+
+def test_gauge_invariant_law_decays_as_its_gain_says(pendulum):
+    """|W^T J (ed + Kp e)| is exp(-kd t) of its first value; the force as wanted."""
+    scene, q0, v0 = pendulum
+    p, k = 2.0, 3.0
+    law = jd.control.GaugeInvariant(scene, first_two, circle, p, k, force=PRESS, ki=1.0)
+    found = jd.simulate(scene, q0, v0, TS, control=law, stepsize=0.01, outputs=("multipliers",))
+    moved = jax.vmap(jax.jacfwd(circle))(TS)
+    slow = found.v[:, :2] - moved + p * (found.q[:, :2] - jax.vmap(circle)(TS))
+    # On the sphere a velocity (x', y') of the first two coordinates is one of z' = -(x x' + y y')/z.
+    up = -jnp.sum(found.q[:, :2] * slow, 1) / found.q[:, 2]
+    size = jnp.sqrt(1.3 * (jnp.sum(slow**2, 1) + up**2))
+    np.testing.assert_allclose(size, size[0] * np.exp(-k * TS), rtol=1e-6)
+    np.testing.assert_allclose(found.multipliers, np.tile(PRESS, (TS.size, 1)), atol=1e-9)
+
+
+def test_geometric_and_gauge_invariant_laws_are_equal_for_matched_gains(pendulum, torques):
+    """Kd' = Kp + Kd, Kp' = Kd Kp: equal where ed + Kp e = 0, elsewhere different by the Coriolis force of that error."""
+    _, q, v = pendulum
+    p, both = torques
+    hybrid, gauge = both(q, v, 0.3)
+
+    def motion(q):
+        """J: columns of motions of unit rates of the first two coordinates."""
+        return jnp.linalg.inv(jnp.concatenate([q[None], jnp.eye(3)[:2]]))[:, 1:]
+
+    slow = v[:2] - jax.jacfwd(circle)(0.3) + p * (q[:2] - circle(0.3))
+    turning = jax.jvp(motion, (q,), (v,))[1]
+    # M = 1.3 and C = 0, of which the part along the sphere.
+    apart = 1.3 * turning @ slow
+    apart = apart - q * (q @ apart) / (q @ q)
+    np.testing.assert_allclose(hybrid - gauge, apart, atol=1e-10)
+    assert np.abs(apart).max() > 0.01
+    v = motion(q) @ (jax.jacfwd(circle)(0.3) - p * (q[:2] - circle(0.3)))
+    np.testing.assert_allclose(*both(q, v, 0.3), atol=1e-10)
+
+
+def test_laws_are_equal_everywhere_on_a_plane():
+    """A particle held on a plane: no Coriolis forces at all."""
+    rows = jnp.asarray([[0.5, -0.3, 1.0]])
+    metric = jnp.diag(jnp.asarray([1.0, 2.0, 3.0]))
+    system = jd.MetricSystem(lambda q: metric, 3, potential=lambda q: 9.81 * q[2])
+    scene = jd.Scene(system, (jd.Holonomic(lambda q, t: rows @ q),))
+    q, v = jnp.asarray([0.2, 0.1, -0.07]), jnp.asarray([0.4, -1.0, -0.5])
+    hybrid = jd.control.HybridForce(scene, first_two, circle, 6.0, 5.0, force=PRESS)
+    gauge = jd.control.GaugeInvariant(scene, first_two, circle, 2.0, 3.0, force=PRESS)
+    np.testing.assert_allclose(*quick(lambda q, v: (hybrid(q, v, 0.4), gauge(q, v, 0.4)))(q, v), atol=1e-10)
+
+
+def test_gauge_invariant_law_gives_its_own_u(pendulum):
+    """u_r = sdot + Gamma_r s - Kd eps and u_o of EQUATIONS section 9, by differences of B along the motion."""
+    scene, q, v = pendulum
+    p, k, t, step = 2.0, 3.0, 0.3, 1e-5
+    law = jd.control.GaugeInvariant(scene, first_two, circle, p, k, force=PRESS)
+
+    @quick
+    def at(q, v, t):
+        gauge = gauge_invariant(scene, q, v, law(q, v, t), t, dof=2)
+        J = jnp.linalg.inv(jnp.concatenate([q[None], jnp.eye(3)[:2]]))[:, 1:]
+        s = jax.jacfwd(circle)(t) - p * (q[:2] - circle(t))
+        return gauge, gauge.W.T @ J @ s, gauge.W.T @ J @ (v[:2] - s)
+
+    gauge, _, eps = at(q, v, t)
+    a = jd.constrained_dynamics(scene, q, v, law(q, v, t), t).acceleration
+    ahead, behind = (at(q + h * v + 0.5 * h * h * a, v + h * a, t + h)[1] for h in (step, -step))
+    # V2 is carried along: V2^T d/dt (V2 s) = sdot, and Gamma_r = V2^T Gamma V2.
+    want = gauge.V2.T @ ((ahead - behind) / (2 * step) + gauge.Gamma @ gauge.V2 @ gauge.V2.T @ at(q, v, t)[1] - k * eps)
+    np.testing.assert_allclose(gauge.reduced_force, want, rtol=1e-7)  # of differences
+    np.testing.assert_allclose(
+        gauge.Gamma_o @ gauge.reduced_velocity - gauge.Lambda_r.T @ PRESS, gauge.normal_force, rtol=1e-10
+    )
+
+
+def test_rank_loss_is_told(pendulum):
+    """At the equator the first two coordinates do not tell the motion, and the law says so."""
+    scene = pendulum[0]
+    law = jd.control.HybridForce(scene, first_two, circle, KP, KD)
+    told = quick(lambda q, v: law.is_regular(q, v))
+    assert bool(told(pendulum[1], pendulum[2]))
+    equator = jnp.asarray([0.6, 0.8, 0.0])
+    assert not bool(told(equator, jnp.zeros(3)))
+    assert np.isfinite(law(equator, jnp.zeros(3))).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contact", ["frictionless", "rolling"])
+def test_arm_on_a_sphere(contact):
+    """The documents' arm, sliding and rolling: contact coordinates, or rolling rates, follow; the normal force as wanted."""
+    scene = scenes.sphere_arm(contact=contact)
+    model = scene.system
+    q0, v0 = scenes.sphere_arm.start(contact=contact, rolling=(0.2, -0.1))
+    if contact == "frictionless":
+        # The direction of the tip from the sphere, and its own attitude.
+        center = jnp.asarray([0.5, 0.0, 0.0])
+        home = jd.frame_pose(model, q0, "tip")[:3, :3]
+
+        def task(q):
+            pose = jd.frame_pose(model, q, "tip")
+            return jnp.concatenate([(pose[:3, 3] - center)[:2] / 0.18, jd.so3.log(home.T @ pose[:3, :3])])
+
+        goal = task(q0) + jnp.asarray([0.05, -0.04, 0.1, 0.0, -0.1])
+        law = jd.control.HybridForce(scene, task, goal, KP, KD, force=jnp.asarray([5.0]), ki=2.0)
+    else:
+
+        def task(q, v):
+            return (jd.body_jacobian(model, q, "tip") @ v)[4:]
+
+        goal = task(q0, v0) + jnp.asarray([0.3, -0.2])
+        law = jd.control.HybridForce(
+            scene, task, goal, 4.0, of="velocity", force=jnp.asarray([5.0, 0.3, -0.2, 0.01]), ki=2.0
+        )
+    ts = TS[:11]
+    found = jd.simulate(scene, q0, v0, ts, control=law, stepsize=0.01, outputs=("multipliers",))
+    lam = np.asarray(law.wanted_force(q0, 0.0))
+    np.testing.assert_allclose(found.multipliers, np.tile(lam, (ts.size, 1)), atol=1e-7)
+    if contact == "frictionless":
+        errors = np.asarray(jax.vmap(lambda q: task(q) - goal)(found.q))
+        rate = jax.jvp(task, (q0,), (v0,))[1]
+        np.testing.assert_allclose(
+            errors, decayed(np.asarray(ts), errors[0], np.asarray(rate)), atol=1e-6
+        )  # RK4, 10 ms
+    else:
+        errors = np.asarray(jax.vmap(lambda q, v: task(q, v) - goal)(found.q, found.v))
+        np.testing.assert_allclose(errors, errors[0] * np.exp(-4.0 * np.asarray(ts))[:, None], atol=1e-6)
+    # The contact that the documents' kinematics see: the distance of the centres.
+    pose = jax.vmap(lambda q: jd.frame_pose(model, q, "tip"))(found.q)
+    gap = np.linalg.norm(np.asarray(pose)[:, :3, 3] - np.array([0.5, 0.0, 0.0]), axis=1)
+    at = montana(Sphere(0.15, poles="y"), Sphere(0.03), jnp.asarray([0.2, -0.1, 0.15, 0.1, 0.3]))
+    np.testing.assert_allclose(gap, np.linalg.norm(at.g_of[:3, 3]), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda s: jd.control.HybridForce(s.system, first_two, circle, 1.0, 1.0), "no constraints"),
+        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, of="force"), "of is 'force'"),
+        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0), "kd is None for a task of position"),
+        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, of="velocity"), "kd is given"),
+        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, ki=-2.0), "ki is -2.0"),
+        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, internal=[1.0]), "internal is given without"),
+        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, actuated=[0, 7]), "actuated is"),
+        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, actuated=[0], ki=1.0), "leave them out"),
+        (
+            lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, force=jnp.zeros(2))(*_state(s)),
+            r"force has shape \(2,\), expected \(1,\)",
+        ),
+        (lambda s: jd.control.GaugeInvariant(s, first_two, circle, 1.0, 0.0), "kd is 0.0"),
+        (lambda s: jd.control.GaugeInvariant(s, lambda q: q[:1], jnp.zeros(1), 1.0, 1.0)(*_state(s)), "1 coordinates"),
+    ],
+)
+def test_bad_input_is_refused(pendulum, build, message):
+    with pytest.raises(ValueError, match=message):
+        build(pendulum[0])
+
+
+def _state(scene):
+    return jnp.asarray([0.6, 0.0, -0.8]), jnp.zeros(3), 0.0

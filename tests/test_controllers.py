@@ -1,0 +1,226 @@
+"""Controllers with a state, sampled ones, and their outputs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import random_tree
+
+import jaxdyn as jd
+from jaxdyn import scenes
+
+Q0, V0, TS = jnp.asarray([0.4, -0.2]), jnp.asarray([0.3, 0.1]), jnp.linspace(0.0, 0.5, 6)
+
+
+class Integral(jd.Controller):
+    """A force that grows with the integral of q."""
+
+    gain: jax.Array
+
+    def start(self, q, v, t):
+        return {"sum": jnp.zeros_like(q)}
+
+    def __call__(self, q, v, t, state):
+        return -self.gain * state["sum"]
+
+    def rate(self, q, v, t, state, multipliers):
+        return {"sum": q}
+
+
+class Feedback(jd.Controller):
+    """A torque along the rows in proportion to the multipliers of the same moment."""
+
+    takes_multipliers = True
+    scene: jd.Scene
+    gain: jax.Array
+
+    def __call__(self, q, v, t, state, multipliers):
+        return jd.constraint_jacobian(self.scene, q).T @ (self.gain * (multipliers - 2.0)) - 0.3 * v
+
+    def rate(self, q, v, t, state, multipliers):
+        return None
+
+
+class Filtered(jd.Controller):
+    """The multipliers through a filter of first order."""
+
+    def start(self, q, v, t):
+        return jnp.zeros(1)
+
+    def __call__(self, q, v, t, state):
+        return jnp.zeros_like(v)
+
+    def rate(self, q, v, t, state, multipliers):
+        return 5.0 * (multipliers - state)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return random_tree(1, ("revolute",) * 2, parents=[-1, 0])
+
+
+def test_a_controllers_state_is_integrated_with_the_motion():
+    """A mass with xdd = -g int x: the third-order equation s^3 + g = 0 in closed form; its gradient in the gain too."""
+    mass = jd.ExplicitSystem(lambda q: jnp.eye(1), lambda q, v: jnp.zeros(1), 1)
+
+    def end(gain):
+        given = {"control": Integral(gain), "stepsize": 0.01, "outputs": ("control_state", "torque")}
+        found = jd.simulate(mass, jnp.ones(1), jnp.zeros(1), TS, **given)
+        return found.q[-1, 0], found
+
+    (last, found), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(jnp.asarray(2.0))
+
+    def closed(g):
+        """x = sum c_i exp(s_i t) with x, xd, xdd = 1, 0, 0 at the start."""
+        roots = np.roots([1.0, 0.0, 0.0, g])
+        c = np.linalg.solve(np.vander(roots, increasing=True).T, [1.0, 0.0, 0.0])
+        return (np.exp(np.outer(TS, roots)) @ c).real, (np.exp(np.outer(TS, roots)) @ (c / roots)).real - np.sum(
+            c / roots
+        ).real
+
+    x, integral = closed(2.0)
+    np.testing.assert_allclose(found.q[:, 0], x, atol=1e-9)  # RK4's steps of 10 ms
+    np.testing.assert_allclose(found.control_state["sum"][:, 0], integral, atol=1e-9)
+    np.testing.assert_allclose(found.torque, -2.0 * found.control_state["sum"], atol=1e-14)
+    step = 1e-4
+    change = (closed(2.0 + step)[0][-1] - closed(2.0 - step)[0][-1]) / (2 * step)
+    np.testing.assert_allclose(slope, change, rtol=1e-6)  # differences, and RK4's steps
+    assert last == found.q[-1, 0]
+
+
+def test_adaptive_steps_integrate_a_state_as_fixed_ones_do():
+    """Multipliers reach a filter: z = the solution of dz/dt = 5 (lam - z) with the lam of the output."""
+    scene = scenes.spherical_pendulum()
+    q0, v0 = scenes.spherical_pendulum.start()
+    outputs = ("control_state", "multipliers")
+    ends = [
+        jd.simulate(scene, q0, v0, TS, control=Filtered(), outputs=outputs, stepsize=step) for step in (None, 0.002)
+    ]
+    np.testing.assert_allclose(ends[0].control_state, ends[1].control_state, atol=1e-7)
+    fine = jnp.linspace(0.0, 0.5, 501)
+    lam = jd.simulate(scene, q0, v0, fine, outputs=("multipliers",), stepsize=0.001).multipliers[:, 0]
+    weights = np.exp(-5.0 * (0.5 - fine))
+    want = 5.0 * np.trapezoid(weights * lam, fine)  # of order h^2: 1e-6 here
+    np.testing.assert_allclose(ends[0].control_state[-1, 0], want, rtol=1e-5)
+
+
+def test_feedback_of_the_multipliers_is_solved():
+    """lam of the output is that of the torque of the output, which is the law's at that lam."""
+    scene = scenes.spherical_pendulum()
+    q0, v0 = scenes.spherical_pendulum.start()
+    law = Feedback(scene, jnp.asarray(0.8))
+    found = jd.simulate(scene, q0, v0, TS, control=law, outputs=("multipliers", "torque"), stepsize=0.01)
+    again = jax.vmap(lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).multipliers)(
+        found.q, found.v, found.torque
+    )
+    np.testing.assert_allclose(found.multipliers, again, rtol=1e-10)
+    told = jax.vmap(lambda q, v, lam: law(q, v, 0.0, None, lam))(found.q, found.v, found.multipliers)
+    np.testing.assert_allclose(found.torque, told, rtol=1e-10)
+
+
+def digital(q, v, t, state):
+    """A proportional law with a sum, on samples."""
+    state = {"sum": state["sum"] + 0.05 * q}
+    return -3.0 * q - 0.5 * v - 2.0 * state["sum"] + 0.1 * t, state
+
+
+def test_a_sampled_law_equals_a_loop_by_hand(arm):
+    """A scan over the periods, four steps of the classical Runge-Kutta method in each, at 1e-10."""
+    period, step = 0.05, 0.0125
+    start = {"sum": jnp.zeros(2)}
+    given = {"stepsize": step, "outputs": ("torque", "control_state")}
+    law = jd.Sampled(digital, start, period)
+    found = jd.simulate(arm, Q0, V0, TS, control=law, **given)
+    between = jd.simulate(arm, Q0, V0, jnp.concatenate([TS[:1], TS[1:] - period / 2]), control=law, **given)
+
+    def classical(state, tau):
+        """One step of the classical Runge-Kutta method."""
+
+        def rate(state):
+            return jnp.stack([state[1], jd.forward_dynamics(arm, *state, tau)])
+
+        first = rate(state)
+        second = rate(state + step / 2 * first)
+        third = rate(state + step / 2 * second)
+        return state + step / 6 * (first + 2 * second + 2 * third + rate(state + step * third))
+
+    def one(carry, t):
+        state, total = carry
+        tau, total = digital(*state, t, total)
+        state = jax.lax.fori_loop(0, 4, lambda _, state: classical(state, tau), state)
+        return (state, total), (*state, tau, total["sum"])
+
+    _, (q, v, tau, total) = jax.jit(
+        lambda: jax.lax.scan(one, (jnp.stack([Q0, V0]), start), period * jnp.arange(10.0))
+    )()
+    np.testing.assert_allclose(found.q[1:], q[1::2], atol=1e-10)
+    np.testing.assert_allclose(found.v[1:], v[1::2], atol=1e-10)
+    np.testing.assert_allclose(between.torque[1:], tau[1::2], atol=1e-10)
+    np.testing.assert_allclose(between.control_state["sum"][1:], total[1::2], atol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_sampled_law_is_differentiated(arm):
+    """Reverse mode in a gain, against differences."""
+
+    def end(gain):
+        law = jax.tree_util.Partial(lambda gain, q, v, t, state: (-gain * q - state, state + 0.1 * q), gain)
+        return jd.simulate(arm, Q0, V0, TS, control=jd.Sampled(law, jnp.zeros(2), 0.05), stepsize=0.025).q[-1, 0]
+
+    value, slope, step = jax.jit(end), jax.jit(jax.grad(end))(2.0), 1e-5
+    np.testing.assert_allclose(slope, (value(2.0 + step) - value(2.0 - step)) / (2 * step), rtol=1e-6)
+
+
+def test_a_law_without_a_state_is_sampled(arm):
+    """With a short period it comes to the continuous law, in proportion to the period."""
+    law = jd.control.ComputedTorque(arm, jnp.zeros(2), 6.0, 5.0)
+    want = jd.simulate(arm, Q0, V0, TS, control=law, stepsize=0.01).q
+    apart = [
+        np.abs(jd.simulate(arm, Q0, V0, TS, control=jd.Sampled(law, None, p), stepsize=0.005).q - want).max()
+        for p in (0.01, 0.005)
+    ]
+    assert 1e-6 < apart[1] < apart[0] < 0.01
+    np.testing.assert_allclose(apart[0] / apart[1], 2.0, rtol=0.05)
+
+
+def changing(q, v, t, state):
+    return -q, jnp.zeros(3)
+
+
+class Wrong(Integral):
+    """Its rate has another structure than its state."""
+
+    def rate(self, q, v, t, state, multipliers):
+        return {"sum": jnp.zeros(5)}
+
+
+@pytest.mark.parametrize(
+    ("control", "given", "message"),
+    [
+        (jd.Sampled(digital, {"sum": np.zeros(2)}, 0.05), {}, "takes fixed steps"),
+        (jd.Sampled(digital, {"sum": np.zeros(2)}, 0.05), {"stepsize": 0.03}, "take a whole part of it"),
+        (jd.Sampled(changing, np.zeros(2), 0.05), {"stepsize": 0.05}, "keep its structure"),
+        (Wrong(np.ones(())), {"stepsize": 0.05}, "keep its structure"),
+        (Integral(np.ones(())), {"stepsize": 0.05, "method": "variational"}, "variational"),
+        (lambda q, v, t: jnp.zeros(3), {"stepsize": 0.05}, "control returned shape"),
+    ],
+)
+def test_controls_that_do_not_fit_are_refused(arm, control, given, message):
+    with pytest.raises(ValueError, match=message):
+        jd.simulate(arm, Q0, V0, TS, control=control, **given)
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, np.nan, [0.1, 0.2]])
+def test_periods_are_positive(period):
+    with pytest.raises(ValueError, match="period is"):
+        jd.Sampled(digital, None, period)
+
+
+def nowhere(q, v, t):
+    return jnp.full_like(v, jnp.nan)
+
+
+def test_a_control_that_returns_nan_ends_with_a_code(arm):
+    found = jd.simulate(arm, Q0, V0, TS, control=nowhere, stepsize=0.05, throw=False)
+    assert found.result == jd.RESULTS.nonfinite_state
+    assert not bool(found.success)

@@ -1,0 +1,241 @@
+"""Robots with legs: the centre of mass, forces of feet and inverse dynamics without a motor at the base, against Pinocchio."""
+
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pinocchio as pin
+import pytest
+from pinocchio_bridge import assert_close, quick, random_states
+from test_robots import PATHS, both
+
+import jaxdyn as jd
+
+# File, feet, and whether they are flat.
+ROBOTS = {
+    "solo12.urdf": (("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), False),
+    "hyq_no_sensors.urdf": (("lf_foot", "rf_foot", "lh_foot", "rh_foot"), False),
+    "go2.urdf": (("FL_foot", "FR_foot", "RL_foot", "RR_foot"), False),
+    "talos_reduced.urdf": (("left_sole_link", "right_sole_link"), True),
+    "g1_29dof_rev_1_0.urdf": (("left_ankle_roll_link", "right_ankle_roll_link"), True),
+}
+CASES = [pytest.param(file, marks=() if file == "solo12.urdf" else pytest.mark.slow) for file in ROBOTS]
+
+
+def feet_of(file, mu=0.6):
+    """The robot's feet: points with friction, or rectangles of 16 by 10 cm."""
+    names, flat = ROBOTS[file]
+    cone = jd.contact.friction_cone("hard-finger", mu=mu)
+    if flat:
+        cone = jd.contact.surface_cone(jd.contact.wrench_cone(0.08, 0.05, mu))
+    return [jd.control.foot(name, cone) for name in names]
+
+
+def crouched(model, file):
+    """A configuration with bent legs, the base level."""
+    q = np.array(jd.neutral(model))
+    bent = {"HFE": 0.8, "KFE": -1.6, "thigh": 0.8, "calf": -1.6, "hip_pitch": -0.3, "knee": 0.6, "ankle_pitch": -0.3}
+    bent |= {"leg_left_3": -0.4, "leg_left_4": 0.8, "leg_left_5": -0.4} | {"hfe": 0.6, "kfe": -1.2}
+    bent |= {"leg_right_3": -0.4, "leg_right_4": 0.8, "leg_right_5": -0.4}
+    top = model.topology
+    for name, kind, part in zip(top.joint_names, top.kinds, top.q_slices, strict=True):
+        if kind != "free":
+            q[part] = next((angle for key, angle in bent.items() if key in name), 0.0)
+    if file == "hyq_no_sensors.urdf":  # its hind legs bend the other way
+        for name, part in zip(top.joint_names, top.q_slices, strict=True):
+            q[part] *= -1.0 if "h_" in name and ("hfe" in name or "kfe" in name) else 1.0
+    return jnp.asarray(q)
+
+
+@pytest.fixture(scope="module")
+def solo():
+    model, source, bridge = both("solo12.urdf", True)
+    return model, source, bridge, crouched(model, "solo12.urdf"), feet_of("solo12.urdf")
+
+
+@pytest.mark.parametrize("file", CASES)
+def test_centre_of_mass_agrees_with_pinocchio(file):
+    """Jacobian, momentum and its matrix at 1e-9; N = -m J^T g."""
+    model, source, bridge = both(file, True)
+    q, v, *_ = random_states(model, 1, 3)
+    at = quick(
+        lambda q, v: (
+            jd.com_jacobian(model, q),
+            jd.centroidal_momentum_matrix(model, q),
+            jd.centroidal_momentum(model, q, v),
+            jd.gravity_force(model, q),
+        )
+    )
+    J, matrix, momentum, gravity = at(q[0], v[0])
+    data, there = source.createData(), bridge.q_to_pinocchio(q[0])
+    assert_close(J, pin.jacobianCenterOfMass(source, data, there), 1e-9)
+    want = pin.ccrba(source, data, there, np.asarray(v[0]))
+    assert_close(matrix, want, 1e-9)
+    assert_close(momentum, data.hg.np, 1e-9)
+    mass = float(model.inertias[:, 0].sum())
+    assert_close(gravity, -mass * np.asarray(J).T @ np.asarray(model.gravity), 1e-9)
+
+
+@pytest.mark.parametrize("file", CASES)
+def test_inverse_dynamics_agrees_with_pinocchio(file):
+    """Pinocchio's rnea under the feet's wrenches gives our torques, and none at the base; forces are in their cones."""
+    model, source, bridge = both(file, True)
+    feet, q = feet_of(file), crouched(model, file)
+    rng = np.random.default_rng(0)
+    v, a = (jnp.asarray(x) for x in 0.1 * rng.normal(size=(2, model.nv)))
+    found = quick(lambda q, v, a: jd.underactuated_inverse_dynamics(model, q, v, a, feet))(q, v, a)
+    assert bool(found.success)
+    assert np.asarray(found.margins).min() > -1e-6  # the tolerance of the quadratic program, forces of some 100 N
+    there, data = bridge.q_to_pinocchio(q), source.createData()
+    pin.framesForwardKinematics(source, data, there)
+    wrenches = [pin.Force.Zero() for _ in range(source.njoints)]
+    for one, force in zip(feet, found.by_foot().values(), strict=True):
+        frame = source.frames[source.getFrameId(one.frame, pin.FrameType.BODY)]
+        placed = data.oMf[source.getFrameId(one.frame, pin.FrameType.BODY)]
+        wrench = np.zeros(6)
+        wrench[: force.shape[0]] = force
+        if not one.is_flat:
+            wrench[:3] = placed.rotation.T @ wrench[:3]
+        wrenches[frame.parentJoint] += frame.placement.act(pin.Force(wrench))
+    want = pin.rnea(source, data, there, np.asarray(v), np.asarray(a), wrenches)
+    assert_close(found.tau, want, 1e-9)
+    assert not np.asarray(found.tau)[:6].any()
+
+
+@pytest.mark.parametrize("file", CASES)
+def test_standing_agrees_with_pinocchios_constraint_dynamics(file):
+    """Held feet: acceleration and forces under given torques."""
+    model, source, bridge = both(file, True)
+    feet, q = feet_of(file), crouched(model, file)
+    rng = np.random.default_rng(1)
+    tau = jnp.asarray(rng.normal(size=model.nv)).at[:6].set(0.0)
+    scene = jd.Scene(model, [one.hold(model, q) for one in feet])
+    found = quick(lambda q, tau: jd.constrained_dynamics(scene, q, jnp.zeros(model.nv), tau))(q, tau)
+
+    there, data = bridge.q_to_pinocchio(q), source.createData()
+    pin.framesForwardKinematics(source, data, there)
+    contacts = pin.StdVec_RigidConstraintModel()
+    for one in feet:
+        index = source.getFrameId(one.frame, pin.FrameType.BODY)
+        frame, flat = source.frames[index], pin.ContactType.CONTACT_6D if one.is_flat else pin.ContactType.CONTACT_3D
+        contacts.append(pin.RigidConstraintModel(flat, source, frame.parentJoint, frame.placement))
+    datas = pin.StdVec_RigidConstraintData()
+    datas.extend([one.createData() for one in contacts])
+    pin.initConstraintDynamics(source, data, contacts, datas)
+    settings = pin.ProximalSettings(1e-14, 0.0, 10)
+    want = pin.constraintDynamics(
+        source, data, there, np.zeros(model.nv), np.asarray(tau), contacts, datas, settings
+    ).copy()
+    # Contacts of both feet of a standing biped are rigid: cond(M) amplifies rounding.
+    assert_close(found.acceleration, want, 1e-8 if ROBOTS[file][1] else 1e-9)
+    pushed = sum(
+        pin.getFrameJacobian(source, data, source.getFrameId(one.frame, pin.FrameType.BODY), pin.LOCAL).T
+        @ _local_wrench(source, contact, part, one)
+        for one, contact, part in zip(feet, contacts, datas, strict=True)
+    )
+    scene_force = np.asarray(jd.constraint_jacobian(scene, q)).T @ np.asarray(found.multipliers)
+    assert_close(scene_force, pushed, 1e-8 if ROBOTS[file][1] else 1e-9)
+
+
+def _local_wrench(source, contact, data, one):
+    """Pinocchio's force of a contact as a wrench at its frame."""
+    wrench = data.contact_force.np.copy()
+    return wrench if one.is_flat else np.concatenate([wrench[:3], np.zeros(3)])
+
+
+def test_solo_stands_with_forces_in_its_cones(solo):
+    """The torques of the program, applied: the held robot does not move, and the multipliers are the program's forces."""
+    model, _, _, q, feet = solo
+    still = jnp.zeros(model.nv)
+    scene = jd.Scene(model, [one.hold(model, q) for one in feet])
+
+    @quick
+    def stand(q):
+        wanted = jd.underactuated_inverse_dynamics(model, q, still, still, feet, preload=0.5)
+        return wanted, jd.constrained_dynamics(scene, q, still, wanted.tau)
+
+    wanted, found = stand(q)
+    assert bool(wanted.success) and wanted.margins.min() > 0.5 - 1e-6
+    np.testing.assert_allclose(found.acceleration, 0.0, atol=1e-8)
+    np.testing.assert_allclose(found.multipliers, wanted.forces, atol=1e-7)
+    weight = float(model.inertias[:, 0].sum()) * 9.81
+    np.testing.assert_allclose(sum(f[2] for f in wanted.by_foot().values()), weight, rtol=1e-7)
+
+
+def test_what_the_feet_cannot_carry_has_a_code(solo):
+    """A wanted fall faster than free fall asks feet to pull; a limit on torques that is too low."""
+    model, _, _, q, feet = solo
+    still, down = jnp.zeros(model.nv), jnp.zeros(model.nv).at[2].set(-15.0)
+    solve = quick(lambda a, limit: jd.underactuated_inverse_dynamics(model, q, still, a, feet, effort_limit=limit))
+    assert bool(solve(still, 10.0).success)
+    for a, limit in ((down, 10.0), (still, 0.01)):
+        found = solve(a, limit)
+        assert found.result == jd.contact.RESULTS.infeasible
+    missing = quick(lambda a: jd.control.missing_wrench(model, q, still, a, feet))
+    # Feet cannot pull: what is left is what the base needs, but for torques that no normal force could change.
+    mass = float(model.inertias[:, 0].sum())
+    np.testing.assert_allclose(missing(down)[2], mass * (9.81 - 15.0), rtol=1e-5)
+    # The weight is 24 N, and the regularisation 1e-6.
+    np.testing.assert_allclose(missing(still), 0.0, atol=1e-4)
+    limited = solve(still, 0.9)
+    assert bool(limited.success) and np.abs(limited.tau).max() < 0.9 + 1e-6
+    flying = jd.underactuated_inverse_dynamics(model, q, still, still, [])
+    assert flying.result == jd.contact.RESULTS.infeasible
+
+
+def test_forces_are_differentiable(solo):
+    """Gradients in the acceleration and in friction against differences, forces on the boundary of their cones."""
+    model, _, _, q, _ = solo
+    names, still = ROBOTS["solo12.urdf"][0], jnp.zeros(model.nv)
+    push = jnp.zeros(model.nv).at[0].set(3.0)
+
+    def torque(mu, scale):
+        feet = [jd.control.foot(name, jd.contact.friction_cone("hard-finger", mu=mu)) for name in names]
+        found = jd.underactuated_inverse_dynamics(model, q, still, scale * push, feet)
+        return jnp.sum(found.tau**2)
+
+    value = quick(torque)
+    slopes = quick(jax.grad(torque, argnums=(0, 1)))(0.35, 1.0)
+    step = 1e-5
+    for i, slope in enumerate(slopes):
+        high, low = (value(0.35 + s * step * (i == 0), 1.0 + s * step * (i == 1)) for s in (1, -1))
+        # Differences of numbers with the tolerance of the program, 1e-9, over 2e-5.
+        np.testing.assert_allclose(slope, (high - low) / (2 * step), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), [jd.control.foot("no", f[0].cone)]),
+            "'no'",
+        ),
+        (lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), [f[0], f[0]]), "name a frame twice"),
+        (lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), ["FL_FOOT"]), "contacts is"),
+        (lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), f, passive=(99,)), "passive is"),
+        (
+            lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), f, effort_limit=[1.0, 2.0]),
+            "effort_limit",
+        ),
+        (lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), f, force_weight=-1.0), "force_weight is"),
+        (lambda m, q, f: jd.control.foot("FL_FOOT", 0.6), "cone is 0.6"),
+        (lambda m, q, f: jd.control.foot("FL_FOOT", f[0].cone, ground=2 * np.eye(3)), "no rotation"),
+        (
+            lambda m, q, f: jd.underactuated_inverse_dynamics(jd.robots.iiwa(), *3 * [jnp.zeros(7)], f),
+            "frame 'FL_FOOT' is not in model 'iiwa'",
+        ),
+    ],
+)
+def test_bad_input_is_refused(solo, call, message):
+    model, _, _, q, feet = solo
+    with pytest.raises(ValueError, match=message):
+        call(model, q, feet)
+
+
+def _still(model):
+    return jnp.zeros(model.nv), jnp.zeros(model.nv)
+
+
+def test_files_of_all_robots_are_there():
+    assert all(os.path.exists(PATHS[file]) for file in ROBOTS)
