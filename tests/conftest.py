@@ -6,6 +6,7 @@ There is no persistent compilation cache. It was tried: programs with host callb
 never stored, what is stored logs machine-feature errors when loaded, and its files are not written atomically.
 """
 
+import gc
 import os
 import shutil
 import tempfile
@@ -24,8 +25,15 @@ jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# From here on every annotation in jaxdyn is checked, so this precedes the first import of it.
-install_import_hook("jaxdyn", "beartype.beartype")
+# From here on annotations are checked, so this precedes the first import of jaxdyn. Those of `compile/`, whose functions are
+# called a million times a test, are left to pyright: checked here they would double the time of many tests.
+ROOMS = sorted(
+    path.name for path in (ROOT / "jaxdyn").iterdir() if (path / "__init__.py").exists() and path.name != "compile"
+)
+install_import_hook([f"jaxdyn.{room}" for room in ROOMS], "beartype.beartype")
+
+# Traces are large graphs of objects that live as long as the process: the collector would walk through them again and again.
+gc.set_threshold(200_000, 20, 50)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -254,6 +254,7 @@ def test_identify_by_trajectory_from_a_log_taken_as_filtered(arm, tmp_path, caps
         (["simulate", "ARM", "--dt", "0"], "--dt"),
         (["simulate", "ARM", "--duration", "-1"], "--duration"),
         (["simulate", "ARM", "--out", "motion.txt"], "--out"),
+        (["simulate", "ARM", "--html", "motion.txt"], "--html"),
         (["simulate", "ARM", "--torque", "nowhere.csv"], "nowhere.csv"),
         (["identify", "--urdf", "ARM", "--log", "nowhere.csv"], "nowhere.csv"),
         (["identify", "--urdf", "ARM", "--log", "SHORT"], "lock"),
@@ -290,3 +291,13 @@ def test_bad_input_is_one_line_and_exit_status_2(arguments, words, arm, tmp_path
 def test_debug_shows_where_an_error_arose():
     with pytest.raises(ValueError, match=r"nowhere\.urdf"):
         main(["info", "nowhere.urdf", "--debug"])
+
+
+@pytest.mark.slow
+def test_simulate_writes_a_page_that_plays(arm, tmp_path, capsys):
+    pytest.importorskip("viser")
+    page = tmp_path / "motion.html"
+    args = ["simulate", str(arm), "--duration", "0.1", "--dt", "0.01", "--torque", "gravity", "--html", str(page)]
+    assert main(args) == 0
+    assert f"Wrote {page}." in capsys.readouterr().out
+    assert 300_000 < page.stat().st_size <= 2_000_000

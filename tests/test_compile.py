@@ -899,6 +899,25 @@ except Exception as error:
 """
 
 
+def test_what_a_user_holds_fixed_stays_fixed():
+    """lax.stop_gradient in a kernel, in a kernel called by it, and to second order."""
+
+    def inner(x):
+        return jnp.sin(x) * jax.lax.stop_gradient(x * x)
+
+    def outer(x):
+        return native(inner)(x) * jax.lax.stop_gradient(x) + x
+
+    x = jnp.asarray(0.7)
+    known = 0.7**3 * np.cos(0.7) + 1
+    for function in (native(outer), lambda x: native(outer)(jnp.stack([x, x])[0])):
+        np.testing.assert_allclose(jax.grad(function)(x), known, rtol=1e-14)
+        np.testing.assert_allclose(jax.jvp(function, (x,), (jnp.ones(()),))[1], known, rtol=1e-14)
+        np.testing.assert_allclose(jax.grad(jax.grad(function))(x), jax.grad(jax.grad(outer))(x), rtol=1e-14)
+    # No native inside: the derivative by hand.
+    np.testing.assert_allclose(jax.grad(jax.grad(native(inner)))(x), -(0.7**2) * np.sin(0.7), rtol=1e-14)
+
+
 def test_exported_programs():
     """They run in the process that has their kernels; in another one they say what is missing."""
     x = jnp.linspace(0.1, 0.3, 3)

@@ -16,12 +16,11 @@ from jaxdyn.constraints.base import layout, rows
 from jaxdyn.constraints.dynamics import (
     RESULTS,
     constrained_dynamics,
-    constraint_forces,
-    constraint_wrenches,
     projections,
     second_fundamental_form,
 )
 from jaxdyn.constraints.rank import pseudo_inverse
+from jaxdyn.constraints.reactions import constraint_forces, constraint_wrenches
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.model.tree import difference, integrate
@@ -438,6 +437,35 @@ def test_assemble_fails_clearly():
     both = [Holonomic(lambda q, t, x=x: q[0] - x, name=f"x = {x}") for x in (0.0, 1.0)]
     with pytest.raises(ValueError, match=r"not assembled: holonomic 'x = 0.0' open by 0.5, holonomic 'x = 1.0' open"):
         assemble(Scene(system, both), jnp.asarray([0.2, 0.1]))
+
+
+def test_assembling_with_a_joint_held():
+    """The crank where it was told to be, the loop closed; velocities are those of the free mechanism."""
+    scene, (q, v) = scenes.four_bar(), scenes.four_bar.start()
+    names = scene.system.joint_names
+    wanted = float(q[0]) + 0.2
+    found = assemble(scene, q, v, hold={names[0]: wanted})
+    np.testing.assert_allclose(found.q[0], wanted, atol=1e-12)
+    np.testing.assert_allclose(residuals(scene, found.q, found.v), 0, atol=1e-12)
+    assert float(jnp.max(jnp.abs(found.v))) > 0.1
+    again = assemble(scene, found.q, found.v)
+    np.testing.assert_allclose(again.q, found.q, atol=1e-12)
+    with pytest.raises(ValueError, match="'elbow9' is not in model"):
+        assemble(scene, q, hold={"elbow9": 0.1})
+    with pytest.raises(ValueError, match=r"not assembled: .*nor are they from 3 configurations"):
+        assemble(scene, q, hold={names[0]: wanted, names[1]: 2.9}, guesses=4)
+
+
+def test_assembling_from_a_bad_guess():
+    """Stretched out, the loop's equations do not say to which side it closes; a configuration beside it does."""
+    scene, straight = scenes.four_bar(), jnp.zeros(3)
+    assert not bool(assemble(scene, straight, guesses=1, throw=False).success)
+    found = assemble(scene, straight)
+    assert found.guesses == 2
+    np.testing.assert_allclose(residuals(scene, found.q, found.v), 0, atol=1e-12)
+    np.testing.assert_array_equal(found.q, assemble(scene, straight).q)
+    with pytest.raises(ValueError, match="guesses is 0"):
+        assemble(scene, straight, guesses=0)
 
 
 @pytest.mark.slow

@@ -14,7 +14,8 @@ from scipy.integrate import solve_ivp
 from jaxdyn import scenes
 from jaxdyn.constraints import Holonomic, lock_joint
 from jaxdyn.simulation.methods import Multipliers
-from jaxdyn.simulation.run import RESULTS, simulate
+from jaxdyn.simulation.run import simulate
+from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 

@@ -69,6 +69,7 @@ def test_computed_torque_takes_matrices_of_gains(arm):
     np.testing.assert_allclose(jd.forward_dynamics(arm, Q0, V0, tau), want, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_computed_torque_of_a_free_body_turns_it_to_its_target():
     """Twists from the target to q decay as the gains say, for large turns too."""
     body = random_tree(2, ("free",))
@@ -81,7 +82,7 @@ def test_computed_torque_of_a_free_body_turns_it_to_its_target():
     assert_decays(TS, errors, start_rate=moved)
 
 
-@pytest.mark.parametrize("task", ["position", "orientation"])
+@pytest.mark.parametrize("task", ["position", pytest.param("orientation", marks=pytest.mark.slow)])
 def test_operational_space_decays_as_the_gains_say(long_arm, task):
     """Three rows on four joints; the null motion is damped."""
     frame = "f3"

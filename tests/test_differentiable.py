@@ -54,7 +54,7 @@ START = jnp.asarray([1.0, 2.0, 20.0]), jnp.asarray(28.0), jnp.asarray(TS)
 @pytest.mark.parametrize(
     ("kind", "solver"),
     [
-        ("own", diffrax.Tsit5()),
+        pytest.param("own", diffrax.Tsit5(), marks=pytest.mark.slow),
         pytest.param("save points", diffrax.Tsit5(), marks=pytest.mark.slow),
         ("jump", diffrax.Dopri5()),
     ],
@@ -99,6 +99,7 @@ def test_reverse_mode_takes_the_steps_of_the_forward_run(kind, solver):
         np.testing.assert_allclose(direct, reverse[1], rtol=1e-5)  # a run of its own
 
 
+@pytest.mark.slow
 def test_room_for_steps(monkeypatch):
     """Where no limit is given, reverse mode has one of its own, and beyond it the run says so."""
     monkeypatch.setattr(differentiable, "ROOM", 64)

@@ -22,7 +22,7 @@ def field(t, y, args):
     return {"angles": y["rates"].reshape(y["angles"].shape), "rates": pull - 0.05 * y["rates"]}
 
 
-@pytest.mark.parametrize("shape", [(1,), (5,), (7,), (3, 4), (40,)], ids=str)
+@pytest.mark.parametrize("shape", [(1,), (7,), (3, 4), pytest.param((40,), marks=pytest.mark.slow)], ids=str)
 @pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Heun()], ids=lambda s: type(s).__name__)
 def test_steps_are_those_of_diffrax(solver, shape):
     """States of one piece, of several, and of one that is too large to be cut."""
@@ -77,7 +77,7 @@ def twice(scene):
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(name, marks=[pytest.mark.slow] * (name not in ("free body", "disk"))) for name in CASES]
+    "case", [pytest.param(name, marks=[pytest.mark.slow] * (name != "free body")) for name in CASES]
 )
 def test_stages_at_once_are_those_in_turn(case, monkeypatch):
     """A whole step in one kernel, its stages in turn, and without kernels; a batch and one sample."""
@@ -108,6 +108,7 @@ def test_stages_at_once_are_those_in_turn(case, monkeypatch):
     np.testing.assert_allclose(alone.q, found.q[1], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_without_kernels():
     one, vs = batch(*CASES["free body"]())
 
@@ -144,7 +145,7 @@ def motion(name, **options):
         ("double_pendulum", {"outputs": ("energy", "acceleration")}),
         ("rolling_disk", {"outputs": ("multipliers", "constraint_residual")}),
         pytest.param("four_bar", {}, marks=pytest.mark.slow),
-        ("car_axis", {"stepsize": 0.003}),
+        pytest.param("car_axis", {"stepsize": 0.003}, marks=pytest.mark.slow),
         pytest.param("andrews", {}, marks=pytest.mark.slow),
         pytest.param("double_pendulum", {"solver": jd.Rodas5P()}, marks=pytest.mark.slow),
         pytest.param("double_pendulum", {"method": "variational", "stepsize": 0.01}, marks=pytest.mark.slow),
@@ -166,6 +167,7 @@ def test_motions_are_those_without_kernels(name, options):
         np.testing.assert_allclose(getattr(found, key), getattr(wanted, key), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_dependent_rows_take_the_careful_way():
     """Two rows that say the same, which kernels do not serve anywhere."""
     once = scenes.pendulum_in_plane()
@@ -185,6 +187,7 @@ def test_dependent_rows_take_the_careful_way():
         np.testing.assert_allclose(found.v, wanted.v, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_constrained_motion():
     scene, (q, v) = cases()["rolling_disk"].build()
     v, ts = jnp.asarray(v), jnp.linspace(0.0, 0.5, 3)
@@ -203,6 +206,7 @@ def test_derivatives_of_a_constrained_motion():
     np.testing.assert_allclose(forward, wanted, rtol=1e-5, atol=1e-5)  # steps of their own at tolerances of 1e-6
 
 
+@pytest.mark.slow
 def test_long_chains_that_are_built_in_a_program():
     q = 0.3 * jnp.cos(jnp.arange(130))
 

@@ -100,6 +100,7 @@ def test_what_to_do_is_said():
         jd.simulate(scene, [0.01], [0.0], [0.0, 0.002], stepsize=0.001)
 
 
+@pytest.mark.slow
 def test_reduced_and_projected_steps_are_watched():
     """A four-bar loop by both methods, at a step that serves and at one that is as long as the motion."""
     scene = jd.scenes.windows(count=1)

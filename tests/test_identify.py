@@ -308,7 +308,7 @@ def noisy(iiwa, wrong_iiwa):
     return log, identify.fit_torques(wrong_iiwa, log)
 
 
-@pytest.mark.parametrize("method", ["newton", "lbfgs", "adam"])
+@pytest.mark.parametrize("method", ["newton", "lbfgs", pytest.param("adam", marks=pytest.mark.slow)])
 def test_every_iterate_is_feasible_and_the_optimum_is_one(wrong_iiwa, noisy, method):
     """Whatever the method, it stays among physical models and goes to the one minimum of a convex loss."""
     log, newton = noisy
@@ -456,6 +456,7 @@ def simulated_log(model, seed=0, noise=0.0):
     return identify.Log(t, motion.q + measured[0], motion.v + measured[1], None, tau)
 
 
+@pytest.mark.slow
 def test_trajectory_fit_recovers_a_mass_without_noise():
     """A pendulum of unknown mass; its bob is a point, no solid body, so its density alone is fitted."""
     builder = ModelBuilder("pendulum")

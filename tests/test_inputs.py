@@ -11,7 +11,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.cli.common import output_path
-from jaxdyn.constraints.dynamics import constraint_forces
+from jaxdyn.constraints.reactions import constraint_forces
 from jaxdyn.simulation.solution import from_diffrax
 
 ARM = jd.robots.chain(2)

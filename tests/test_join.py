@@ -22,6 +22,7 @@ def states():
     return tuple(tuple(x[0] for x in random_states(model, 1, 5)[:3]) for model in (LEFT, RIGHT))
 
 
+@pytest.mark.slow
 def test_joined_models_move_side_by_side(states):
     """M, biases, poses and accelerations of both are those of each alone, the right one in a world that is turned."""
     both = jd.join(LEFT, RIGHT, prefix=("l.", "r."), pose=POSE)

@@ -22,7 +22,7 @@ from scipy.linalg import expm
 
 from jaxdyn import se3
 from jaxdyn.compile import compilation
-from jaxdyn.dynamics import kinematics
+from jaxdyn.dynamics import frame_motion, kinematics
 from jaxdyn.model.tree import configuration_rate
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
@@ -52,13 +52,16 @@ def case(name):
             out[f"body{i}"] = kinematics.body_jacobian(model, q, frame)
             out[f"spatial{i}"] = kinematics.spatial_jacobian(model, q, frame)
             out[f"rate{i}"] = kinematics.jacobian_dot_v(model, q, v, frame)
+            out[f"aligned{i}"] = frame_motion.frame_jacobian(model, q, frame)
+            out[f"velocity{i}"] = frame_motion.frame_velocity(model, q, v, frame)
+            out[f"acceleration{i}"] = frame_motion.frame_acceleration(model, q, v, jnp.cos(v), frame)
         return out
 
     compiled = quick(jax.vmap(values, (None, 0, 0)))
     return source, model, bridge, frames, q, v, jax.tree.map(np.asarray, compiled(model, q, v))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "g1")) for name in CASES])
 def test_agrees_with_pinocchio(name):
     source, model, bridge, frames, q, v, ours = case(name)
     data = source.createData()
@@ -84,6 +87,15 @@ def test_agrees_with_pinocchio(name):
             assert_close(ours[f"spatial{i}"][s], world, label="spatial jacobian")
             rate = pin.getFrameAcceleration(source, data, index, pin.ReferenceFrame.LOCAL).vector
             assert_close(ours[f"rate{i}"][s], rate, label="rate")
+            aligned = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+            there = pin.getFrameJacobian(source, data, index, aligned)
+            assert_close(ours[f"aligned{i}"][s], there, label="jacobian in world axes")
+            velocity = pin.getFrameVelocity(source, data, index, aligned).vector
+            assert_close(ours[f"velocity{i}"][s], velocity, label="velocity")
+            pin.forwardKinematics(source, data, qs, vs, np.cos(vs))
+            acceleration = pin.getFrameClassicalAcceleration(source, data, index, aligned).vector
+            assert_close(ours[f"acceleration{i}"][s], acceleration, label="acceleration")
+            pin.forwardKinematics(source, data, qs, vs, np.zeros(model.nv))
 
 
 def test_jacobians_are_derivatives_of_the_pose():
@@ -106,6 +118,31 @@ def test_jacobians_are_derivatives_of_the_pose():
     assert_close(ours["rate2"], rate)
     adjoint = jax.vmap(se3.Ad)(jnp.asarray(ours["pose2"]))
     assert_close(ours["spatial2"], adjoint @ ours["body2"])
+
+
+def test_acceleration_is_the_rate_of_the_velocity():
+    # The second derivative of the pose's origin along a motion q(t) with dq/dt = H v, dv/dt = a, and that of its rotation.
+    _, model, _, frames, q, v, ours = case("every_kind")
+
+    @quick
+    @jax.vmap
+    def along(q, v):
+        step = configuration_rate(model, q, v), jnp.cos(v)
+        return jax.jvp(lambda q, v: frame_motion.frame_velocity(model, q, v, frames[-1]), (q, v), step)
+
+    velocity, rate = along(q, v)
+    assert_close(velocity, np.einsum("sij,sj->si", ours["aligned2"], v))
+    assert_close(ours["acceleration2"], rate)
+
+
+def test_joints_name_the_frames_of_their_bodies():
+    model = random_tree(1, ALL_KINDS)
+    q = random_states(model, 5, 1)[0][0]
+    for joint, body in zip(model.joint_names, model.body_names, strict=True):
+        assert joint not in model.frame_names
+        np.testing.assert_array_equal(kinematics.frame_pose(model, q, joint), kinematics.frame_pose(model, q, body))
+    with pytest.raises(ValueError, match="axes is 'local'; choose from world, body"):
+        frame_motion.frame_jacobian(model, q, None, axes="local")
 
 
 def _hat(screw):

@@ -10,6 +10,7 @@ from jaxdyn import geometry, scenes, se3
 from jaxdyn.compile import compilation
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, spatial_jacobian
 from jaxdyn.forces.elements import JointDamping
 from jaxdyn.geometry.immersion import constrain_by_immersion, reaction_force
@@ -170,7 +171,7 @@ def spatial_arm(q, v, a):
         pushed = pushed + Jt.T @ force + JR.T @ torque
         at_joint = R.T @ torque + jnp.cross(jnp.asarray(CENTRES[i]), R.T @ force)
         wrenches.append(jnp.concatenate([R.T @ force, at_joint]))
-    whole = jax.jacfwd(lambda q: dynamics.center_of_mass(model, q))(q)
+    whole = jax.jacfwd(lambda q: center_of_mass(model, q))(q)
     mass_rate = jax.jvp(lambda q: dynamics.mass_matrix(model, q), (q,), (v,))[1]
     h1, h2 = 0.2, 0.5 - 0.25 * jnp.sin(q[1])
     h3 = 0.5 - 0.4 * jnp.sin(q[1]) - 0.15 * jnp.sin(q[1] + q[2])

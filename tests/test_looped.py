@@ -48,6 +48,7 @@ def test_derivatives():
         assert_close(x, y, 1e-9)  # M is factored in two ways
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("branching", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_five_hundred_links(branching):
     """A chain and a binary tree: residual at rounding, Pinocchio's accelerations, and derivatives by the implicit function."""

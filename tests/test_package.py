@@ -29,6 +29,7 @@ FLOORS = (
     "grasp simulation",
     "control identify scenes",
     "io reports",
+    "pictures",
     "cli demo",
     "__main__",
 )
@@ -36,7 +37,7 @@ RANK = {name: rank for rank, floor in enumerate(FLOORS) for name in floor.split(
 PROGRAMS = {"cli", "demo", "__main__"}
 ABOVE_DYNAMICS = {name for name, rank in RANK.items() if rank > RANK["dynamics"]}
 FROM_SIMULATION = {name for name, rank in RANK.items() if rank >= RANK["simulation"]}
-FILES_AND_PLOTS = {"io", "reports"} | PROGRAMS
+FILES_AND_PLOTS = {"io", "reports", "pictures"} | PROGRAMS
 
 # Two implementations that check each other share nothing above the kinematics.
 INDEPENDENT = [
@@ -58,6 +59,9 @@ USERS = {
     | FILES_AND_PLOTS,  # a dependency of jax, so always there; not when jaxdyn is imported
     "yourdfpy": FILES_AND_PLOTS,
     "mujoco": FILES_AND_PLOTS,
+    "trimesh": {"pictures"},
+    "viser": {"pictures"},
+    "xarray": {"simulation"},
 }
 LIGHT = {"equinox", "jax", "jaxtyping", "numpy"}
 
@@ -201,7 +205,7 @@ def test_import_is_light_and_leaves_jax_unconfigured():
     program = """
 import sys
 import jaxdyn
-heavy = {"matplotlib", "mujoco", "scipy", "yourdfpy"} & sys.modules.keys()
+heavy = {"matplotlib", "mujoco", "scipy", "trimesh", "viser", "xarray", "yourdfpy"} & sys.modules.keys()
 assert not heavy, f"importing jaxdyn imports {heavy}"
 import jax
 try:

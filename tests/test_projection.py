@@ -33,7 +33,11 @@ def drifted(name, **parameters):
 
 @pytest.mark.parametrize(
     "name, parameters",
-    [("windows", {"count": 2}), ("rolling_coin", {}), pytest.param("bennett", {}, marks=pytest.mark.slow)],
+    [
+        ("windows", {"count": 2}),
+        pytest.param("rolling_coin", {}, marks=pytest.mark.slow),
+        pytest.param("bennett", {}, marks=pytest.mark.slow),
+    ],
 )
 def test_states_come_back_by_the_least_change(name, parameters):
     scene, q, v = drifted(name, **parameters)
@@ -62,7 +66,7 @@ def test_states_come_back_by_the_least_change(name, parameters):
 
 @pytest.mark.parametrize(
     "name, parameters",
-    [("windows", {"count": 2}), ("rolling_coin", {})],
+    [("windows", {"count": 2}), pytest.param("rolling_coin", {}, marks=pytest.mark.slow)],
 )
 def test_errors_of_a_step_lose_what_the_projection_removes(name, parameters, mode):
     """e - M^-1 A^T (A M^-1 A^T)^+ A e in numpy, with rows on velocities alone for v."""
@@ -121,7 +125,10 @@ def test_a_singular_sample_of_a_batch_is_projected_by_its_rank(mode):
             assert_close(x, y, 1e-12)
 
 
-@pytest.mark.parametrize("name", ["andrews", "car_axis", "rolling_disk", "chaplygin_sleigh", "rolling_coin"])
+@pytest.mark.parametrize(
+    "name",
+    ["andrews", "car_axis", "rolling_disk", "chaplygin_sleigh", pytest.param("rolling_coin", marks=pytest.mark.slow)],
+)
 @pytest.mark.parametrize("off", [1e-3, 1e-6, 0.0])
 def test_kernels_project_as_matrices_do(name, off):
     """On the constraints to rounding, and as close to the start of the projection as in plain mode."""

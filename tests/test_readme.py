@@ -11,10 +11,12 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def run(page: str) -> dict:
-    """All blocks in one namespace, as a reader pastes them one after another; the names they leave."""
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), flags=re.DOTALL)
-    assert len(blocks) >= 3
+def run(page: str, section: str = "", least: int = 3) -> dict:
+    """All blocks of a page or section in one namespace, as a reader pastes them one after another; the names they leave."""
+    text = (ROOT / page).read_text()
+    text = re.split(r"\n## ", text.partition(f"## {section}\n")[2])[0] if section else text
+    blocks = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    assert len(blocks) >= least
     names: dict = {}
     # A reader has jax's own settings, not the strict ones of the tests.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
@@ -40,3 +42,22 @@ def test_examples_of_the_page_on_systems_run():
     s, lower = names["angles"], names["lower"]
     assert abs(lower @ jnp.stack([jnp.cos(s[1]), jnp.sin(s[1])])) < 1e-12 < 1 < np.linalg.norm(lower)
     np.testing.assert_allclose(names["fit"].values, [0.5, 2.0, 0.8], rtol=1e-8)  # bob, cart, length
+
+
+@pytest.mark.slow
+def test_examples_of_the_section_on_events_run():
+    names = run("docs/simulation.md", "Events", 2)
+    events = names["motion"].events
+    assert list(events.name[:2]) == ["lane: touch", ""]
+    np.testing.assert_allclose(events.time[0], np.sqrt(0.8 / 9.81), rtol=1e-9)
+    # Rolling keeps 5/7 of the velocity.
+    np.testing.assert_allclose(names["motion"].q[-1, 0], 2 * (events.time[0] + 5 / 7 * (2 - events.time[0])), rtol=1e-7)
+    assert np.isfinite(names["slope"]) and names["slope"] != 0
+
+
+@pytest.mark.slow
+def test_examples_of_the_page_on_hands_run():
+    names = run("docs/hands.md")
+    assert names["closure"].closed and names["closure"].margin > 0.1
+    assert bool(names["held"].success) and abs(names["margin"] - 0.5) < 1e-6
+    assert bool(names["measure"].is_manipulable)

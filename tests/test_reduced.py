@@ -17,10 +17,11 @@ from jaxdyn.dynamics.quantities import bias_force, forward_dynamics, mass_matrix
 from jaxdyn.forces.elements import JointDamping
 from jaxdyn.model import robots
 from jaxdyn.model.tree import configuration_rate
-from jaxdyn.reduction.minimal import as_basis, independent_velocities, reduced_dynamics, tangent_basis
+from jaxdyn.reduction.bases import as_basis, independent_velocities, tangent_basis
+from jaxdyn.reduction.minimal import reduced_dynamics
 from jaxdyn.simulation.methods import Baumgarte, Reduced
-from jaxdyn.simulation.run import RESULTS as SIMULATION
 from jaxdyn.simulation.run import simulate
+from jaxdyn.simulation.solution import RESULTS as SIMULATION
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 
@@ -257,6 +258,7 @@ def test_bad_arguments():
         jax.jit(lambda q: tangent_basis(twice, q))(q)
 
 
+@pytest.mark.slow
 def test_derivatives_at_rest_and_float32():
     """Second derivatives of the reduced equations at rest are finite; float32 keeps its type."""
     scene, (q, v) = scenes.spherical_pendulum(), scenes.spherical_pendulum.start()

@@ -31,9 +31,9 @@ from jaxdyn.reports.references import (
     windows,
 )
 from jaxdyn.reports.timing import interleaved
-from jaxdyn.simulation.methods import chosen_method
 from jaxdyn.simulation.solvers import RK4
 from jaxdyn.simulation.solvers.choice import checked_method
+from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import Scene
 
 MOMENTS = np.array([1.0, 2.0, 3.0])

@@ -69,7 +69,7 @@ def test_a_bad_lane_leaves_the_others_alone():
     np.testing.assert_allclose(found[::2], alone, rtol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["projected", "reduced"])
+@pytest.mark.parametrize("method", ["projected", pytest.param("reduced", marks=pytest.mark.slow)])
 def test_derivatives_of_constrained_motions(method):
     """Of a rolling disk, in what it starts with and in its mass, forward and reverse."""
     scene, start = jd.scenes.rolling_disk(), jd.scenes.rolling_disk.start()

@@ -19,8 +19,6 @@ FEW = {
     "allegro_right_hand.urdf": False,
     "solo12.urdf": True,
     "anymal.urdf": True,
-    "g1_29dof_rev_1_0.urdf": True,
-    "talos_reduced.urdf": True,
 }
 # ur3.urdf is a xacro file without links, which Pinocchio refuses too; the links of these two have no mass, so that some of
 # their joints move no inertia and M is singular.

@@ -1,7 +1,5 @@
 """`simulate`: order with retraction, balances, derivatives, batches, failures, refusals, an independent trajectory."""
 
-import sys
-
 import diffrax
 import equinox as eqx
 import jax
@@ -20,7 +18,9 @@ from jaxdyn.dynamics.quantities import forward_dynamics, kinetic_energy, potenti
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.tree import integrate, neutral
-from jaxdyn.simulation.run import RESULTS, simulate
+from jaxdyn.simulation import integration
+from jaxdyn.simulation.run import simulate
+from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.simulation.solvers import RK4, ExplicitSteps, LieGroup, ProjectedSolver
 from jaxdyn.systems.scene import Scene
 
@@ -105,13 +105,12 @@ def test_projected_solver_steps_on_the_manifold_and_evaluates_the_first_stage_an
 def test_only_models_with_quaternions_are_retracted(pendulum, leg, monkeypatch):
     """Nothing to retract, nothing compiled."""
     wrapped = []
-    module = sys.modules["jaxdyn.simulation.run"]  # as an attribute of the package it is the function
 
     def made(solver, project, *more, **fields):
         wrapped.extend([] if project is None else [project])
         return ExplicitSteps(solver, project, *more, **fields)
 
-    monkeypatch.setattr(module, "ExplicitSteps", made)
+    monkeypatch.setattr(integration, "ExplicitSteps", made)
     for model, size in ((pendulum, 0), (leg, 1)):
         q0, v0 = neutral(model), jnp.zeros(model.nv)
         jax.make_jaxpr(lambda q, v, model=model: simulate(model, q, v, [0.0, 1.0], stepsize=0.1).q)(q0, v0)
@@ -308,6 +307,7 @@ def swing(pendulum, z, **options):
     return jnp.sum(out.q) + 2 * jnp.sum(out.v)
 
 
+@pytest.mark.slow
 def test_modes_and_second_order(pendulum):
     """jvp = vjp, adaptive steps at rest too; the Hessian is symmetric and the derivative of the gradient."""
     point = np.array([1.2, 0.7, -0.5, 0.1, 0.05, 0.3])
@@ -531,7 +531,7 @@ def test_quaternions_near_unit_length_are_normalised(leg):
 @pytest.mark.parametrize(
     "wrapped", [LieGroup(diffrax.Tsit5()), diffrax.HalfSolver(diffrax.Tsit5())], ids=["Lie", "half"]
 )
-@pytest.mark.parametrize("name", ["free_body", "rolling_coin"])
+@pytest.mark.parametrize("name", ["free_body", pytest.param("rolling_coin", marks=pytest.mark.slow)])
 def test_methods_that_wrap_an_explicit_one(wrapped, name):
     """In local coordinates, and with errors by halved steps: the motion is that of Dopri8, with and without constraints."""
     found = getattr(scenes, name)

@@ -149,6 +149,7 @@ def test_near_a_singularity_it_is_damped_and_says_so():
     assert float(jnp.abs(jnp.diff(masses)).max()) < 0.1 * float(jnp.abs(masses).max())
 
 
+@pytest.mark.slow
 def test_batch_gradient_and_float32():
     def felt(model, q):
         return jnp.sum(jd.workspace_dynamics(model, "tip", q, V, rows=(0, 1, 2)).mass_matrix)

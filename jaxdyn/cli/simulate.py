@@ -22,6 +22,7 @@ from jaxdyn.identify import SampledTorque
 from jaxdyn.identify.excitation import FourierTorque, random_torque
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.tree import Model, integrate, neutral
+from jaxdyn.pictures import save_html, shapes, view
 from jaxdyn.simulation.run import Solution, simulate
 from jaxdyn.systems.scene import Scene
 
@@ -36,6 +37,7 @@ examples:
   jaxdyn simulate panda.urdf --q0 panda_joint4=-2 panda_joint6=1.5 --torque gravity --damping 1
   jaxdyn simulate panda.urdf --batch 256 --torque gravity+random --torque-size 2 --seed 1 --out motions.npz
   jaxdyn simulate panda.urdf --torque log.csv --out replay.csv
+  jaxdyn simulate panda.urdf --torque gravity+random --view
 
 torques (--torque):
   zero             none: the robot falls
@@ -112,12 +114,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     files.add_argument(
         "--plot", metavar="FILE", help="draw positions, velocities and torques to FILE.png, .pdf or .svg"
     )
+    files.add_argument(
+        "--html", metavar="FILE", help="write the motion as a page FILE.html that plays in a browser, offline too"
+    )
+    files.add_argument("--view", action="store_true", help="show the motion in the browser, until Ctrl-C")
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, print a summary, write the files; 1 if a motion could not be computed to its end."""
     out = output_path(args.out, (".csv", ".npz"), "--out")
     plot = output_path(args.plot, (".png", ".pdf", ".svg"), "--plot")
+    page = output_path(args.html, (".html",), "--html")
     if args.batch < 1:
         raise ValueError(f"--batch is {args.batch}; give at least 1")
     if args.dt is not None and not args.dt > 0:
@@ -151,6 +158,13 @@ def run(args: argparse.Namespace) -> int:
 
         motion_figure(model, ts, solution.q, solution.v, tau).savefig(plot)
         print(f"Wrote {plot}.")
+    if page is not None or args.view:
+        solids, moving = shapes(args.urdf), eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
+        if page is not None:
+            save_html(page, scene, moving, shapes=solids)
+            print(f"Wrote {page}.")
+        if args.view:
+            view(scene, moving, shapes=solids, block=True)
     if not done.all():
         reached = np.asarray(solution.stats["time_reached"])[~done]
         print(f"{np.sum(~done)} of {args.batch} motions stopped early, the first at t = {reached.min():.6g} s; "

@@ -88,7 +88,7 @@ def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
             g.compare("lt", quotient, 0.0), g.function("floor", quotient), g.function("ceil", quotient), kind
         )
         return g.sub(d[0], g.mul(whole, d[1]))
-    return 0.0  # floor, ceil, round, sign
+    return 0.0  # floor, ceil, round, sign, stop_gradient
 
 
 _PARTIAL: dict[str, Callable[..., Any]] = {

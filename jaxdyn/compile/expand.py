@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
+from jaxdyn.compile import matrices
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bound, computed, of_nothing
 from jaxdyn.compile.graph import Graph, Number, as_objects, objects
@@ -248,20 +249,7 @@ class _Expansion:
         )
         if a.dtype.kind != "O" and b.dtype.kind != "O":
             return [np.asarray(a @ b.transpose(0, 2, 1), out.dtype).reshape(out.shape)]
-        entries, add, mul = [], self.graph.add, self.graph.mul
-        zero = 0.0 if out.dtype.kind == "f" else 0
-        for rows, columns in zip(a.tolist(), b.tolist(), strict=True):
-            # Known zeros are most of it: they are looked for once.
-            kept = [[(k, y) for k, y in enumerate(column) if type(y) is Number or y != 0] for column in columns]
-            for row in rows:
-                for column in kept:
-                    total = zero
-                    for k, y in column:
-                        x = row[k]
-                        if type(x) is Number or x != 0:
-                            total = add(total, mul(x, y))
-                    entries.append(total)
-        return [objects(entries, out.shape)]
+        return [objects(matrices.product(self.graph, a, b, 0.0 if out.dtype.kind == "f" else 0), out.shape)]
 
     def _scatter(self, params, args, eqn):
         operand, indices, updates = args
@@ -336,24 +324,8 @@ class _Expansion:
         return [x.ravel() for x in self.graph.replay(inner, shaped)[1]]
 
     def _cholesky(self, params, args, eqn):
-        matrices = as_objects(args[0]).reshape(-1, *args[0].shape[-2:])
-        return [np.stack([self._factor(x) for x in matrices]).reshape(args[0].shape)]
-
-    def _factor(self, matrix):
-        g, n = self.graph, matrix.shape[0]
-        lower = np.full((n, n), 0.0, object)
-        inverse = []
-        for j in range(n):
-            for i in range(j, n):
-                entry = matrix[i, j]
-                for k in range(j):
-                    entry = g.sub(entry, g.mul(lower[i, k], lower[j, k]))
-                if i == j:
-                    lower[j, j] = g.function("sqrt", entry)
-                    inverse.append(g.div(1.0, lower[j, j]))
-                else:
-                    lower[i, j] = g.mul(entry, inverse[j])
-        return lower
+        given = as_objects(args[0]).reshape(-1, *args[0].shape[-2:])
+        return [np.stack([matrices.cholesky(self.graph, x) for x in given]).reshape(args[0].shape)]
 
     def _triangular_solve(self, params, args, eqn):
         a, b = (as_objects(x) for x in args)
@@ -363,20 +335,9 @@ class _Expansion:
         if not params["left_side"]:  # x a = b is a^T x^T = b^T
             a, b, lower = np.swapaxes(a, -1, -2), np.swapaxes(b, -1, -2), not lower
         pairs = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
-        found = np.stack([self._solved(x, y, lower, params["unit_diagonal"]) for x, y in pairs]).reshape(b.shape)
+        found = [matrices.triangular_solve(self.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
+        found = np.stack(found).reshape(b.shape)
         return [found if params["left_side"] else np.swapaxes(found, -1, -2)]
-
-    def _solved(self, a, b, lower: bool, unit: bool):
-        g, n = self.graph, a.shape[0]
-        rows: list = [None] * n
-        for i in range(n) if lower else reversed(range(n)):
-            row = b[i].tolist()
-            for k in range(i) if lower else range(i + 1, n):
-                if type(a[i, k]) is Number or a[i, k] != 0:
-                    row = [g.sub(x, g.mul(a[i, k], y)) for x, y in zip(row, rows[k], strict=True)]
-            inverse = 1.0 if unit else g.div(1.0, a[i, i])
-            rows[i] = [g.mul(x, inverse) for x in row]
-        return objects([x for row in rows for x in row], b.shape)
 
 
 _INNER = {
@@ -387,7 +348,6 @@ _INNER = {
 _OTHER: dict[str, Callable] = {
     "copy": _Expansion._same,
     "copy_p": _Expansion._same,
-    "stop_gradient": _Expansion._same,
     "optimization_barrier": _Expansion._same,
     "pvary": _Expansion._same,
     "convert_element_type": _Expansion._convert,
@@ -410,7 +370,7 @@ _OTHER: dict[str, Callable] = {
 }
 
 # Maxima and minima are of integers too.
-_OF_FLOATS = {*numbers.FUNCTIONS, *numbers.FUNCTIONS_OF_TWO} - {"max", "min"}
+_OF_FLOATS = {*numbers.FUNCTIONS, *numbers.FUNCTIONS_OF_TWO} - {"max", "min", "stop_gradient"}
 
 
 def _constant(x) -> np.ndarray:

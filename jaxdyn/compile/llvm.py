@@ -134,6 +134,8 @@ class Emitter:
             return self.put(f"xor {of} {args[0]}, {self.constant(1 if kind == 'b1' else -1, kind)}")
         if op == "select":
             return self.put(f"select {self.type('b1')} {args[0]}, {of} {args[2]}, {of} {args[1]}")
+        if op == "stop_gradient":
+            return args[0]
         if op == "convert":
             return self.convert(args[0], given, kind)
         if op == "is_finite":

@@ -1,5 +1,6 @@
 """Putting a scene on its constraints: `assemble` from a rough guess."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import along, compiled, compute, implicit, is_concrete, is_staged, run
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import RESULTS, Outcome, correction, right_inverse, whitened_rows
+from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, openness, row_limits
 from jaxdyn.dynamics.quantities import mass_matrix
@@ -28,12 +30,16 @@ _STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
 
 
 class Assembly(Outcome):
-    """State on the constraints: `q` (nq,), `v` (nv,), largest `residual` (2,) left in |phi| and |A v - b|, `result`."""
+    """State on the constraints: `q` (nq,), `v` (nv,), largest `residual` (2,) left in |phi| and |A v - b|, `result`.
+
+    `guesses`: how many starts were tried; 1 says that the given one led there.
+    """
 
     q: Float[Array, " nq"]
     v: Float[Array, " nv"]
     residual: Float[Array, "2"]
     result: Any
+    guesses: int = eqx.field(static=True, default=1)
 
 
 def assemble(
@@ -42,6 +48,8 @@ def assemble(
     v: Float[Array, " nv"] | None = None,
     t=0.0,
     *,
+    hold: Mapping[str, Any] | None = None,
+    guesses: int = 16,
     rank_tol: float | None = None,
     throw: bool | None = None,
 ) -> Assembly:
@@ -50,22 +58,43 @@ def assemble(
     q minimises |q - guess| in the metric M(guess) among the configurations on the constraints (a local minimum, by
     repeated linearisation, then Newton steps to rounding); v is the guess plus the least change in the metric M(q).
 
-    **Arguments:** `q` (nq,), `v` (nv,) (None: at rest), guesses; `t`, s; `rank_tol` as in `constrained_dynamics`;
-    `throw`: raise when it fails, by default if all inputs are concrete.
+    **Arguments:**
+
+    - `q` (nq,), `v` (nv,) (None: at rest): the guess. `t`, s.
+    - `hold`: values of joints by name, as in `lock_joint`, that the configuration is to have; velocities are not held.
+    - `guesses`: how many configurations to start from, where all inputs are concrete. The first is the given one; the others,
+      tried only where it fails, lie around it at random (the same ones in every call), farther and farther away, by up to pi
+      (rad, or lengths of the mechanism).
+    - `rank_tol` as in `constrained_dynamics`.
+    - `throw`: raise when it fails, by default if all inputs are concrete.
 
     **Returns:** `Assembly`. Derivatives, of any order, with respect to the guess and the scene's numbers are those of the
     minimum, by the implicit function theorem.
 
-    **Raises:** ValueError that names the constraints that stay open and by how much, if it fails and `throw`.
+    **Raises:** ValueError that names the constraints that stay open and by how much, if it fails and `throw`; for joints in
+    `hold` that do not exist, and for less than one guess.
+
+    ```python
+    state = jd.assemble(jd.scenes.four_bar(), jnp.zeros(3), hold={"crank": 0.5})
+    ```
     """
     scene = as_scene(scene)
+    if isinstance(guesses, bool) or not isinstance(guesses, int) or guesses < 1:
+        raise ValueError(f"guesses is {guesses!r}; give how many configurations to start from, at least 1")
     v = or_zeros(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
-    concrete = is_concrete(scene, q, v, t)
-    found = _assemble(scene, q, v, t, rank_tol)
-    if concrete and (throw is None or throw) and not bool(found.result == RESULTS.successful):
-        left = open_constraints(scene, found.q, found.v, t, _closed_to(q.dtype))
-        raise ValueError(f"not assembled: {left}; give a better guess")
+    held = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
+    layout(held)  # refuses joints that do not exist
+    concrete = is_concrete(held, q, v, t)
+    found = _assemble(held, q, v, t, rank_tol, scene if hold else None)
+    if concrete and not bool(found.success):
+        found = _from_elsewhere(
+            found, guesses, lambda q: _assemble(held, q, v, t, rank_tol, scene if hold else None), held, q
+        )
+    if concrete and (throw is None or throw) and not bool(found.success):
+        left = open_constraints(held, found.q, found.v, t, _closed_to(q.dtype))
+        tried = f" (nor are they from {guesses - 1} configurations around it)" if guesses > 1 else ""
+        raise ValueError(f"not assembled: {left}{tried}; give a better guess")
     if throw and not concrete:
         found = found.result.error_if(found, found.result != RESULTS.successful)
     return found
@@ -76,16 +105,40 @@ def _closed_to(dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.7
 
 
+def _from_elsewhere(found: Assembly, guesses: int, assembled: Callable, scene: Scene, q) -> Assembly:
+    """The first success from configurations around q, or what was found at first."""
+    sizes, _ = coordinate_sizes(scene.system, q.dtype)
+    chance = np.random.default_rng(0)
+    for tried in range(1, guesses):
+        far = np.pi * tried / (guesses - 1)
+        step = jnp.asarray(chance.uniform(-far, far, scene.nv), q.dtype) * sizes
+        other = assembled(displace(scene.system, q, step))
+        if bool(other.success):
+            return Assembly(other.q, other.v, other.residual, other.result, tried + 1)
+    return found
+
+
 @compiled
-def _assemble(scene, q, v, t, rank_tol):
-    if holonomic_rows(layout(scene)).size:
-        q = _closed(Scene(scene.system, scene.constraints), q, t, rank_tol)
+def _assemble(held, q, v, t, rank_tol, scene):
+    """The scene `held` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
+    if holonomic_rows(layout(held)).size:
+        q = _closed(Scene(held.system, held.constraints), q, t, rank_tol)
+    limit, good = _closed_to(q.dtype), jnp.asarray(True)
+    if scene is not None:
+        good = openness(held, q, _with_velocity(held, q, v, t, rank_tol), t, limit) <= 1.0
+    scene = held if scene is None else scene
+    v = _with_velocity(scene, q, v, t, rank_tol)
+    residual = _sizes(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
+    good = good & (openness(scene, q, v, t, limit) <= 1.0)
+    return Assembly(q, v, residual, RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled))  # pyright: ignore[reportArgumentType]
+
+
+def _with_velocity(scene, q, v, t, rank_tol):
+    """v with A v = b by the least change."""
     B = correction(scene, q, t, rank_tol, holonomic=False)
     for _ in range(2):
         v = v - _product(B, velocity_residual(scene, q, v, t))
-    residual = _sizes(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
-    good = openness(scene, q, v, t, _closed_to(q.dtype)) <= 1.0
-    return Assembly(q, v, residual, RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled))  # pyright: ignore[reportArgumentType]
+    return v
 
 
 def _closed(scene, q, t, rank_tol):

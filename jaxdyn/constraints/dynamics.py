@@ -18,12 +18,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxdyn.compile import is_rank_safe, partition_traced, repair_flagged, run
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
-from jaxdyn.constraints.frames import Pair, relative_poses
 from jaxdyn.constraints.rank import checked_tolerance, eps_of, least_pivot, pseudo_inverse, quality_of, tolerance
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import check_state, or_zeros
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_factored
 from jaxdyn.systems.scene import Scene, as_scene, checked_force
@@ -58,6 +57,15 @@ class RESULTS(optimistix.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     inconsistent_start = "The initial state is not on the constraints."
     open_constraints = "The constraints opened, and the projection could not close them."
     contact_lost = "A contact pulled or left its friction cone."
+    joint_limit_passed = "A joint passed one of its position limits."
+    too_many_events = "Events followed each other without end, or there were more than max_events."
+    painleve_paradox = (
+        "Friction and normal force of a sliding contact left no forces, or more than one (Painleve's paradox)."
+    )
+    no_contact_mode = "No mode of the contacts was found that agrees with their forces."
+    no_single_contact = (
+        "Surfaces that roll do not touch in one point any more: their relative curvature is not positive."
+    )
 
 
 # Of optimistix the message of this one is empty, which prints as nothing.
@@ -299,43 +307,6 @@ def _solve_delassus(delassus, wanted, nv: int):
     # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
     fine = jnp.min(pivots) > (10 * nv * eps_of(delassus)) ** 0.5 * jnp.max(pivots)
     return solve_factored(factor, wanted), fine
-
-
-def constraint_forces(
-    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t=0.0
-) -> dict[str, Float[Array, " nv"]]:
-    """Generalised force A_i^T lam_i (nv,) of each constraint on the system, by name; N m or N."""
-    scene = as_scene(scene)
-    A = constraint_jacobian(scene, q, t)
-    multipliers = _checked_multipliers(multipliers, A.shape[0], A.dtype)
-    return {p.name: _product(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
-
-
-def constraint_wrenches(
-    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"]
-) -> dict[str, Float[Array, "6"]]:
-    """Wrench (f, tau) of each constraint between two frames on its body B, at the origin and in the axes of its frame A.
-
-    N and N m, by name. The wrench on body A is the negative of it. A loop has its frames A and B as given; for a rolling
-    contact A is on the surface and B on the body that rolls, for a contact of a grasp A is on the object and B on the finger.
-    """
-    scene, found = as_scene(scene), {}
-    (q,) = check_state(scene.system, q=q)
-    places = layout(scene)
-    multipliers = _checked_multipliers(multipliers, places[-1].end if places else 0, q.dtype)
-    for constraint, place in zip(scene.constraints, places, strict=True):
-        if isinstance(constraint, Pair):
-            rotation, position = relative_poses([constraint], scene.system, q)
-            found[place.name] = constraint.wrench(rotation[0], position[0], multipliers[place.start : place.end])
-    return found
-
-
-def _checked_multipliers(multipliers, count: int, dtype) -> Array:
-    multipliers = as_array(multipliers, "multipliers", dtype)
-    if multipliers.shape != (count,):
-        hint = batch_hint(multipliers, (1,))
-        raise ValueError(f"multipliers has shape {multipliers.shape}, expected {(count,)}, one per row{hint}")
-    return multipliers
 
 
 def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None) -> Projections:

@@ -68,6 +68,10 @@ class Pair(Constraint):
         """Frames A and B, each a body or frame (None: the world) and a pose (4, 4) in it."""
         raise NotImplementedError
 
+    def declared(self, system) -> "Pair":
+        """The constraint as it was given to the system, where its rows are known by a number alone."""
+        return self
+
     def apart(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Array | None:
         """Residual (nh,) of the holonomic part, or None without one."""
         return None
@@ -75,6 +79,10 @@ class Pair(Constraint):
     def sliding(self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]) -> Array | None:
         """Residual (np,) of the nonholonomic part, linear in U, or None without one."""
         return None
+
+    def at(self, system, q: Float[Array, " nq"]) -> "Pair":
+        """The constraint with what it reads from the system and from q itself, beside the poses of its frames."""
+        return self
 
     def likeness(self) -> tuple:
         """Members of one class with equal likeness differ in numbers alone, and are one batch."""
@@ -112,6 +120,7 @@ class Pair(Constraint):
 
 
 def _positions_of(members: tuple[Pair, ...], system, q) -> list:
+    members = tuple(member.at(system, q) for member in members)
     rotation, position = relative_poses(members, system, q)
     found: list = [None] * len(members)
     for index, build, leaves in _batches(members):
@@ -125,6 +134,7 @@ def _positions_of(members: tuple[Pair, ...], system, q) -> list:
 
 
 def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
+    members = tuple(member.at(system, q) for member in members)
     frames, n = _both_frames(members, system, q, v), len(members)
     rotation, position, across = _seen_from_a(frames)
     inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
@@ -166,6 +176,29 @@ def relative_poses(members, system, q):
     return _seen_from_a(_both_frames(members, system, q))[:2]
 
 
+def relative_motions(members, system, q, v):
+    """`relative_poses`, and the twists (n, 6) of frame B against frame A, at the origin and in the axes of A."""
+    frames, n = _both_frames(members, system, q, v), len(members)
+    rotation, position, across = _seen_from_a(frames)
+    assert frames.twist is not None
+    inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
+    by_a, by_b = inverse(frames.pose[:n]), inverse(frames.pose[:n].at[:, :3, 3].add(-across))
+    twist_a, twist_b = frames.twist[:n, :, None], frames.twist[n:, :, None]
+    return rotation, position, (_product(by_b, twist_b) - _product(by_a, twist_a))[..., 0]
+
+
+def each(members: Sequence[Pair], function, *rows) -> list:
+    """function(member, row of each of `rows`) for every constraint, those that differ in numbers alone as one batch."""
+    found: list = [None] * len(members)
+    for index, build, leaves in _batches(members):
+        values = jax.vmap(lambda leaves, *at, build=build: function(build(leaves), *at))(
+            leaves, *(take(x, index) for x in rows)
+        )
+        for k, i in enumerate(index):
+            found[i] = jax.tree.map(lambda x, k=k: x[k], values)
+    return found
+
+
 def _batches(members: Sequence[Pair]):
     """Members that differ in numbers alone: their indices, a function that makes one of them of its numbers, all numbers."""
     sets: dict = {}
@@ -177,7 +210,7 @@ def _batches(members: Sequence[Pair]):
         yield np.array(places), lambda leaves, structure=structure: jax.tree.unflatten(structure, leaves), leaves
 
 
-def _displaced(R, p, twist):
+def displaced(R, p, twist):
     """Pose of frame B after it has moved along a small twist, seen from frame A: exp(twist) up to second order.
 
     Only first and second derivatives at twist = 0 are taken, and these are exact.
@@ -192,7 +225,7 @@ def _directions(pair: Pair, R, p) -> Float[Array, "r 6"]:
     """Rows D (r, 6): the rates of the residuals are D U."""
     zero = jnp.zeros((6,), p.dtype)
     held = jax.eval_shape(pair.apart, R, p)
-    parts = [] if held is None else [jax.jacfwd(lambda twist: pair.apart(*_displaced(R, p, twist)))(zero)]
+    parts = [] if held is None else [jax.jacfwd(lambda twist: pair.apart(*displaced(R, p, twist)))(zero)]
     if jax.eval_shape(pair.sliding, R, p, zero) is not None:
         parts.append(jax.jacfwd(lambda U: pair.sliding(R, p, U))(zero))
     return jnp.concatenate(parts)
@@ -206,9 +239,9 @@ def _rates(pair: Pair, R, p, U, bend):
     if jax.eval_shape(pair.apart, R, p) is not None:
 
         def moved(twist):
-            return pair.apart(*_displaced(R, p, twist))
+            return pair.apart(*displaced(R, p, twist))
 
         parts.append(jax.jvp(lambda twist: jax.jvp(moved, (twist,), (U,))[1], (zero,), (U,))[1])
     if jax.eval_shape(pair.sliding, R, p, U) is not None:
-        parts.append(jax.jvp(lambda twist: pair.sliding(*_displaced(R, p, twist), U), (zero,), (U,))[1])
+        parts.append(jax.jvp(lambda twist: pair.sliding(*displaced(R, p, twist), U), (zero,), (U,))[1])
     return D, -(_product(D, bend) + jnp.concatenate(parts)), _product(D, U)

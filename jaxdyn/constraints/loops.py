@@ -299,7 +299,12 @@ def lock_joint(joint: str, value=0.0, *, name: str | None = None) -> JointLock:
 
 
 def model_couplings(model: Model) -> tuple[Gear, ...]:
-    """The couplings that a model records (mimic joints of a file, `add_coupling`) as constraints of a scene."""
+    """The couplings that a model records (mimic joints of a file, `add_coupling`) as constraints of a scene, one `gear` each.
+
+    ```python
+    scene = jd.Scene(model, jd.model_couplings(model))
+    ```
+    """
     names = model.joint_names
     return tuple(
         gear(names[joint], names[source], *(model.coupling_values[i]))  # pyright: ignore[reportOptionalSubscript]

@@ -25,7 +25,7 @@ from jaxdyn.lie.so3 import _product, cross
 from jaxdyn.model.arguments import pose_leaf
 
 
-class _Contact(NamedTuple):
+class TouchingPoint(NamedTuple):
     """A point of contact: where (3,), normal (3,), gap (), directions without slip (n, 3); in the surface's frame."""
 
     point: Array
@@ -34,7 +34,7 @@ class _Contact(NamedTuple):
     directions: Array
 
 
-class _Touching(Pair):
+class Touching(Pair):
     """A body that touches a surface. Subclasses say where, and in which directions it cannot slip."""
 
     name: eqx.AbstractVar[str]
@@ -50,9 +50,14 @@ class _Touching(Pair):
         """Frame A on the surface, frame B on the body."""
         return (self.surface_body, self.surface), (self.body, self.pose)
 
-    def _touch(self, R, p) -> _Contact:
+    def touching(self, R, p) -> TouchingPoint:
         """The contact for the pose of the body's frame seen from the surface's."""
         raise NotImplementedError
+
+    def contact_point(self, R, p) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Point of contact (m) and normal from the surface to the body, (3,) each, in frame A; `R`, `p` as in `wrench`."""
+        touch = self.touching(R, p)
+        return touch.point, touch.normal
 
     def sizes(self, system, dtype):
         """The height, and the rows without slip and spin."""
@@ -72,11 +77,11 @@ class _Touching(Pair):
 
     def apart(self, R, p):
         """Gap between body and surface, (1,), m; None when the height is not constrained."""
-        return self._touch(R, p).gap[None] if self.contact else None
+        return self.touching(R, p).gap[None] if self.contact else None
 
     def sliding(self, R, p, U):
         """Velocities of slipping (m/s), and of spinning (rad/s) where it is resisted."""
-        touch = self._touch(R, p)
+        touch = self.touching(R, p)
         if not self.count:
             return jnp.sum(touch.normal * U[3:])[None] if self.spin else None
         found = _product(touch.directions, U[:3] + cross(U[3:], touch.point))
@@ -87,7 +92,7 @@ def _unit(i, like):
     return jnp.asarray([float(i == k) for k in range(3)], like.dtype)
 
 
-def _unit_or(vector, fallback):
+def unit_or(vector, fallback):
     """The unit vector along `vector`, or `fallback` (a constant) where it vanishes; no NaN in derivatives."""
     square = jnp.sum(vector * vector)
     safe = square > float(jnp.finfo(vector.dtype).eps) ** 2
@@ -95,7 +100,7 @@ def _unit_or(vector, fallback):
     return jnp.where(safe, vector / length, fallback)
 
 
-def _tangents(normal):
+def tangents(normal):
     """Two unit vectors (2, 3) that make a right-handed frame with the normal; smooth but for a jump at normal z = 0.
 
     The rows that a jump turns span the same plane, so accelerations do not see it.
@@ -110,7 +115,7 @@ def _tangents(normal):
     return jnp.stack([one, jnp.stack([b, sign + y * y * a, -y])])
 
 
-class RollingWheel(_Touching):
+class RollingWheel(Touching):
     """A wheel or disk that rolls on a plane; made by `jd.rolling_wheel`."""
 
     name: str = eqx.field(static=True)
@@ -123,14 +128,14 @@ class RollingWheel(_Touching):
     spin: bool = eqx.field(static=True)
     count: int = eqx.field(static=True)
 
-    def _touch(self, R, p):
+    def touching(self, R, p):
         axis, normal = R[:, 2], _unit(2, p)
         # Down the wheel's plane; for a wheel that lies flat there is no lowest point and any direction serves.
-        down = _unit_or(axis[2] * axis - normal, -R[:, 0])
+        down = unit_or(axis[2] * axis - normal, -R[:, 0])
         point = p + self.radius.astype(p.dtype) * down
-        forward = _unit_or(cross(axis, normal), R[:, 1])
+        forward = unit_or(cross(axis, normal), R[:, 1])
         directions = jnp.stack([forward, cross(normal, forward)])[: self.count]
-        return _Contact(point, normal, point[2], directions)
+        return TouchingPoint(point, normal, point[2], directions)
 
 
 def rolling_wheel(
@@ -174,7 +179,7 @@ def rolling_wheel(
     )
 
 
-class KnifeEdge(_Touching):
+class KnifeEdge(Touching):
     """A blade that slides along itself on a plane; made by `jd.knife_edge`."""
 
     name: str = eqx.field(static=True)
@@ -186,9 +191,9 @@ class KnifeEdge(_Touching):
     spin: bool = eqx.field(static=True, default=False)
     count: int = eqx.field(static=True, default=1)
 
-    def _touch(self, R, p):
+    def touching(self, R, p):
         normal = _unit(2, p)
-        return _Contact(p, normal, p[2], _unit_or(cross(normal, R[:, 0]), R[:, 1])[None])
+        return TouchingPoint(p, normal, p[2], unit_or(cross(normal, R[:, 0]), R[:, 1])[None])
 
 
 def knife_edge(
@@ -212,7 +217,7 @@ def knife_edge(
     )
 
 
-class RollingSphere(_Touching):
+class RollingSphere(Touching):
     """A sphere that rolls on a plane, a sphere or a cylinder; made by `jd.rolling_sphere`."""
 
     name: str = eqx.field(static=True)
@@ -232,7 +237,7 @@ class RollingSphere(_Touching):
         """Which rows there are, and on what."""
         return self.on, self.inside, self.contact, self.spin
 
-    def _touch(self, R, p):
+    def touching(self, R, p):
         radius = self.radius.astype(p.dtype)
         if self.on == "plane":
             normal, gap = _unit(2, p), p[2] - radius
@@ -240,12 +245,12 @@ class RollingSphere(_Touching):
         else:
             reach = self.surface_radius.astype(p.dtype)  # pyright: ignore[reportOptionalMemberAccess]
             away = p if self.on == "sphere" else p * jnp.asarray([1.0, 1.0, 0.0], p.dtype)
-            outward = _unit_or(away, _unit(0, p))
+            outward = unit_or(away, _unit(0, p))
             distance = jnp.sum(outward * away)
             gap = reach - distance - radius if self.inside else distance - reach - radius
             normal = -outward if self.inside else outward
-            directions = _tangents(normal)
-        return _Contact(p - radius * normal, normal, gap, directions[: self.count])
+            directions = tangents(normal)
+        return TouchingPoint(p - radius * normal, normal, gap, directions[: self.count])
 
 
 def rolling_sphere(

@@ -18,6 +18,9 @@ from jaxdyn.contact.optimal import optimal_forces as optimal_forces
 from jaxdyn.contact.qp import RESULTS as RESULTS
 from jaxdyn.contact.qp import QPSolution as QPSolution
 from jaxdyn.contact.qp import solve_qp as solve_qp
+from jaxdyn.contact.rolling import RollingContact as RollingContact
+from jaxdyn.contact.rolling import rolling_contact as rolling_contact
+from jaxdyn.contact.rolling_model import RollingModel as RollingModel
 from jaxdyn.contact.surfaces import Cylinder as Cylinder
 from jaxdyn.contact.surfaces import Ellipsoid as Ellipsoid
 from jaxdyn.contact.surfaces import Parametrised as Parametrised

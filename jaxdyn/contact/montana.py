@@ -145,8 +145,8 @@ def _montana(surface_o, surface_f, eta) -> ContactKinematics:
 
     seen = _product(turn, _product(o.curvature, turn))
     relative = f.curvature + seen
-    strict = _is_positive(relative)
-    flexibility = _inverse(relative, strict)
+    strict = is_positive(relative)
+    flexibility = inverse_2x2(relative, strict)
     # Columns (vx, vy, vz, wx, wy, wz) of (-wy, wx) and of (vx, vy).
     rolled = jnp.asarray(np.array([[0, 0, 0, 0, -1, 0], [0, 0, 0, 1, 0, 0]]), eta.dtype)
     slid = jnp.asarray(np.array([[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]), eta.dtype)
@@ -158,7 +158,11 @@ def _montana(surface_o, surface_f, eta) -> ContactKinematics:
         + _product(o.torsion, along_o)
     )
     forward = jnp.concatenate(
-        [_product(_inverse(o.metric, o.regular), along_o), _product(_inverse(f.metric, f.regular), along_f), spun[None]]
+        [
+            _product(inverse_2x2(o.metric, o.regular), along_o),
+            _product(inverse_2x2(f.metric, f.regular), along_f),
+            spun[None],
+        ]
     )
     return ContactKinematics(
         J_c=J_c,
@@ -172,14 +176,14 @@ def _montana(surface_o, surface_f, eta) -> ContactKinematics:
     )
 
 
-def _is_positive(matrix) -> Any:
+def is_positive(matrix) -> Any:
     """Whether a symmetric (2, 2) matrix is positive definite beyond rounding."""
     trace, size = matrix[0, 0] + matrix[1, 1], jnp.sum(matrix * matrix)
     determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
     return (trace > 0) & (determinant > 1e2 * float(jnp.finfo(matrix.dtype).eps) * size)
 
 
-def _inverse(matrix, fine):
+def inverse_2x2(matrix, fine):
     """Inverse (2, 2) in closed form, finite where it is not `fine`."""
     a, b, c, d = matrix[0, 0], matrix[0, 1], matrix[1, 0], matrix[1, 1]
     determinant = a * d - b * c

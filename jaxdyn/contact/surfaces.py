@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import compiled, is_concrete
+from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.lie.so3 import _product, cross
 from jaxdyn.systems.scene import as_pytree
@@ -38,6 +39,34 @@ class Surface(eqx.Module):
         """How far alpha is from where the chart ends, in its own units; infinite for a chart without end."""
         return jnp.full((), jnp.inf, alpha.dtype)
 
+    # Where a contact is on the surface, while it rolls: numbers without a place at which they end. For a surface whose chart
+    # covers all of it these are (u, v). On ellipsoids they are a unit vector, about which a chart is made anew everywhere.
+
+    @property
+    def place_size(self) -> int:
+        """Number of numbers that say where on the surface."""
+        return 2
+
+    def place_of(self, alpha: Float[Array, "2"]) -> Float[Array, " n"]:
+        """The numbers of the point with coordinates alpha."""
+        return alpha
+
+    def coordinates_at(self, place: Float[Array, " n"]) -> Float[Array, "2"]:
+        """alpha (2,) of a place."""
+        return place
+
+    def moved(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
+        """The place at `step` in a chart about `place`, oriented as f is."""
+        return place + step
+
+    def point_at(self, place: Float[Array, " n"]) -> Float[Array, "3"]:
+        """Point of the surface, m, in the body's axes."""
+        return self.point(place)
+
+    def toward(self, point: Float[Array, "3"]) -> Float[Array, " n"] | None:
+        """A place about where the surface is next to a point of the body, m; None where that is not known."""
+        return None
+
 
 class Plane(Surface):
     """The plane z = 0 of the body, f = (u, v, 0); outward is +z."""
@@ -45,6 +74,10 @@ class Plane(Surface):
     def point(self, alpha):
         """(u, v, 0), m."""
         return jnp.concatenate([alpha, jnp.zeros_like(alpha[:1])])
+
+    def toward(self, point):
+        """The place below the point."""
+        return point[:2]
 
 
 # Rows of the rotation that turns the axes of a chart into those of the body: its poles are then on z, x, or y.
@@ -77,9 +110,7 @@ class Ellipsoid(Surface):
 
     def point(self, alpha):
         """f(u, v), m."""
-        u, v = jnp.unstack(alpha)
-        unit = jnp.stack([jnp.cos(u) * jnp.cos(v), -jnp.cos(u) * jnp.sin(v), jnp.sin(u)])
-        return self.semi_axes * unit[np.argsort(_POLES[self.poles])]
+        return self.point_at(self.place_of(alpha))
 
     def chart_margin(self, alpha):
         """Angle between u and the end of the chart, rad."""
@@ -87,8 +118,35 @@ class Ellipsoid(Surface):
 
     def coordinates(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
         """alpha (2,) of a point of the surface (of any point: of that on its ray in the stretched space)."""
-        x, y, z = jnp.unstack((point / self.semi_axes)[np.array(_POLES[self.poles])])
+        x, y, z = jnp.unstack((point / self.semi_axes.astype(point.dtype))[np.array(_POLES[self.poles])])
         return jnp.stack([jnp.arctan2(z, jnp.sqrt(x * x + y * y)), jnp.arctan2(-y, x)])
+
+    @property
+    def place_size(self):
+        """3, of a unit vector."""
+        return 3
+
+    def place_of(self, alpha):
+        """The unit vector n (3,) with f = (a, b, c) n."""
+        u, v = jnp.unstack(alpha)
+        unit = jnp.stack([jnp.cos(u) * jnp.cos(v), -jnp.cos(u) * jnp.sin(v), jnp.sin(u)])
+        return unit[np.argsort(_POLES[self.poles])]
+
+    def coordinates_at(self, place):
+        """alpha (2,) of a place."""
+        return self.coordinates(self.point_at(place))
+
+    def moved(self, place, step):
+        """The unit vector at `step` in the plane that touches the unit sphere there."""
+        return unit_or(place + _product(step, tangents(place)), place)
+
+    def point_at(self, place):
+        """(a, b, c) n, m."""
+        return self.semi_axes.astype(place.dtype) * place
+
+    def toward(self, point):
+        """The unit vector to the point in the stretched space; any one to the centre."""
+        return unit_or(point / self.semi_axes.astype(point.dtype), jnp.asarray([1.0, 0.0, 0.0], point.dtype))
 
 
 class Sphere(Ellipsoid):
@@ -126,7 +184,14 @@ class Cylinder(Surface):
     def point(self, alpha):
         """(R cos u, R sin u, v), m."""
         u, v = jnp.unstack(alpha)
-        return jnp.stack([self.radius * jnp.cos(u), self.radius * jnp.sin(u), v])
+        radius = self.radius.astype(alpha.dtype)
+        return jnp.stack([radius * jnp.cos(u), radius * jnp.sin(u), v])
+
+    def toward(self, point):
+        """The place at the angle and the height of the point."""
+        x, y, z = jnp.unstack(point)
+        on_axis = (x == 0) & (y == 0)
+        return jnp.stack([jnp.arctan2(y, jnp.where(on_axis, jnp.ones_like(x), x)), z])
 
 
 class Parametrised(Surface):

@@ -1,7 +1,8 @@
 """Control laws: Modules called as `law(q, v, t) -> tau`, with gains and targets as leaves.
 
 `gains` checks gains, `errors` writes what a law controls as rows of constraints, `motion` holds the laws of free motion,
-`constrained` those of motion and force on constraints, and `feet` and `legs` are for robots whose base has no motor.
+`constrained` those of motion and force on constraints, `grasping` that of an object in a hand, and `feet` and `legs` are for
+robots whose base has no motor.
 
 Sources: EQUATIONS sections 8 to 10.
 """
@@ -10,6 +11,7 @@ from jaxdyn.control.constrained import GaugeInvariant as GaugeInvariant
 from jaxdyn.control.constrained import HybridForce as HybridForce
 from jaxdyn.control.feet import Foot as Foot
 from jaxdyn.control.feet import foot as foot
+from jaxdyn.control.grasping import GraspForce as GraspForce
 from jaxdyn.control.legs import missing_wrench as missing_wrench
 from jaxdyn.control.motion import CartesianStiffness as CartesianStiffness
 from jaxdyn.control.motion import ComputedTorque as ComputedTorque

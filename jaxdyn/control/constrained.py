@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
 from jaxdyn.constraints.dynamics import projections
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
-from jaxdyn.control.errors import RateError, TaskError, as_target, least_acceleration, wanted_rows
+from jaxdyn.control.errors import RateError, TaskError, as_target, least_acceleration, row_rank, wanted_rows
 from jaxdyn.control.gains import gain, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
@@ -143,7 +143,7 @@ class HybridForce(_ForceLoop):
         t = jnp.asarray(t, q.dtype)
         A = constraint_jacobian(self.scene, q, t)
         both, _ = self._rows(q, v, t)
-        return _rank(both) == _rank(A) + both.shape[0] - A.shape[0]
+        return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
 
     def __call__(self, q, v, t=0.0, state=None, multipliers=None) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N."""
@@ -277,7 +277,3 @@ def _indices(actuated: Any, nv: int) -> tuple[int, ...]:
 
 def _count(scene: Scene) -> int:
     return layout(scene)[-1].end
-
-
-def _rank(matrix: Float[Array, "m n"]) -> Array:
-    return jnp.round(jnp.sum(pseudo_inverse(matrix, tolerance(None, matrix), True) * matrix.T))

@@ -143,3 +143,8 @@ def least_acceleration(system, q, t, A, wanted, start) -> Float[Array, " nv"]:
     Y = metric.whiten(A.T)
     missing = wanted - _product(A, start)
     return start + metric.unwhiten(_product(pseudo_inverse(Y, tolerance(None, Y)).T, missing))
+
+
+def row_rank(matrix: Float[Array, "m n"]) -> Array:
+    """Number of independent rows, ()."""
+    return jnp.round(jnp.sum(pseudo_inverse(matrix, tolerance(None, matrix), True) * matrix.T))

@@ -58,7 +58,7 @@ class Foot(eqx.Module):
         """The constraint that keeps the foot where it is at q (nq,).
 
         For a point its rows' multipliers are the force f of a hard finger. A flat foot is welded; its wrench is that of
-        `jaxdyn.constraints.dynamics.constraint_wrenches`.
+        `jd.constraint_wrenches`.
         """
         local = self.pose if self.is_flat else self.pose.at[:3, :3].set(jnp.eye(3, dtype=self.pose.dtype))
         joint = "weld" if self.is_flat else "point"

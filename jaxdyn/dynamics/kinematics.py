@@ -249,8 +249,8 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
     **Raises:** ValueError for an unknown name (near names are listed) or a q that does not fit.
     """
     (q,) = check_shapes(model, q=q)
-    body, offset = _named_frame(model, name)
-    return offset if body < 0 else run(_pose_in_body, (_kinematic(model), offset), q, static=(body,))
+    body, offset = named_frame(model, name)
+    return offset if body < 0 else run(_pose_in_body, (kinematic_part(model), offset), q, static=(body,))
 
 
 def _pose_in_body(body: int, tree, q):
@@ -272,16 +272,16 @@ def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Fl
     Source: Murray, Li & Sastry (1994), eq. 3.55; EQUATIONS section 2.
     """
     (q,) = check_shapes(model, q=q)
-    body, offset = _named_frame(model, frame)
+    body, offset = named_frame(model, frame)
     if body < 0:
         return jnp.zeros((6, model.nv), model.home.dtype)
-    return run(_body_jacobian, (_kinematic(model), offset), q, static=(body,))
+    return run(_body_jacobian, (kinematic_part(model), offset), q, static=(body,))
 
 
 def _body_jacobian(body: int, tree, q):
     model, offset = tree
     frame = tree_frame(model, q)
-    return _body_twist_columns(model, frame, body, offset, frame.subspace).T
+    return twist_columns(model, frame, body, offset, frame.subspace).T
 
 
 def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -297,10 +297,10 @@ def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) ->
     Source: Murray, Li & Sastry (1994), eq. 3.54.
     """
     (q,) = check_shapes(model, q=q)
-    body, _ = _named_frame(model, frame)
+    body, _ = named_frame(model, frame)
     if body < 0:
         return jnp.zeros((6, model.nv), model.home.dtype)
-    return run(_spatial_jacobian, _kinematic(model), q, static=(body,))
+    return run(_spatial_jacobian, kinematic_part(model), q, static=(body,))
 
 
 def _spatial_jacobian(body: int, model: Model, q):
@@ -325,20 +325,20 @@ def jacobian_dot_v(
     **Raises:** ValueError for an unknown name or shapes that do not fit.
     """
     q, v = check_shapes(model, q=q, v=v)
-    body, offset = _named_frame(model, frame)
+    body, offset = named_frame(model, frame)
     if body < 0:
         return jnp.zeros((6,), model.home.dtype)
-    return run(_jacobian_dot_v, (_kinematic(model), offset), q, v, static=(body,))
+    return run(_jacobian_dot_v, (kinematic_part(model), offset), q, v, static=(body,))
 
 
 def _jacobian_dot_v(body: int, tree, q, v):
     model, offset = tree
     frame = tree_frame(model, q)
     rate = subspace_rate(model, frame, body_twists(model, frame, v)) * v[:, None]
-    return jnp.sum(_body_twist_columns(model, frame, body, offset, rate), axis=0)
+    return jnp.sum(twist_columns(model, frame, body, offset, rate), axis=0)
 
 
-def _kinematic(model: Model) -> Model:
+def kinematic_part(model: Model) -> Model:
     """The model as kinematics read it, so that programs do not depend on its other numbers."""
     if all(x is None for x in (model.gravity, model.armature)):
         return model
@@ -358,7 +358,7 @@ def _groups(topology: Topology) -> list[tuple[str, np.ndarray]]:
     return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]
 
 
-def _named_frame(model: Model, name: str | None) -> tuple[int, Float[Array, "4 4"]]:
+def named_frame(model: Model, name: str | None) -> tuple[int, Float[Array, "4 4"]]:
     """Body that carries a frame (-1: the world) and the frame's pose in it."""
     if name is None:
         return -1, jnp.eye(4, dtype=model.home.dtype)
@@ -372,7 +372,7 @@ def _moving(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array,
     return jnp.where(moves[:, None], rows, jnp.zeros_like(rows))
 
 
-def _body_twist_columns(model: Model, tree: TreeFrame, body: int, offset: Array, rows: Array) -> Float[Array, "nv 6"]:
+def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Array, rows: Array) -> Float[Array, "nv 6"]:
     """Twists of the tree frame (one per coordinate) seen from a frame that stands at `offset` in a body."""
     if body < 0:
         return jnp.zeros_like(rows)

@@ -21,9 +21,9 @@ from jaxdyn.compile import along, implicit, native, run
 from jaxdyn.dynamics import recursions
 from jaxdyn.dynamics import scans as looped
 from jaxdyn.dynamics import world_frame as matrix_form
-from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, sum_to_coordinates, take, tree_frame
+from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import check_shapes, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.system import System, symbols
@@ -42,7 +42,7 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[A
     if isinstance(model, System):
         return _of_system(model, "mass_matrix", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
-    return _by_recursion(recursions.crba, matrix_form.mass_matrix, model, q)
+    return by_recursion(recursions.crba, matrix_form.mass_matrix, model, q)
 
 
 def coriolis_matrix(
@@ -62,7 +62,7 @@ def coriolis_matrix(
     if isinstance(model, System):
         return _of_system(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
-    return _by_recursion(matrix_form.coriolis_matrix, matrix_form.coriolis_matrix, model, q, v)
+    return by_recursion(matrix_form.coriolis_matrix, matrix_form.coriolis_matrix, model, q, v)
 
 
 def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nv"]:
@@ -77,7 +77,7 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         return jnp.zeros((model.nv,), model.home.dtype)
-    return _by_recursion(recursions.gravity_force, matrix_form.gravity_force, model, q)
+    return by_recursion(recursions.gravity_force, matrix_form.gravity_force, model, q)
 
 
 def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"]:
@@ -90,7 +90,7 @@ def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " 
     if isinstance(model, System):
         return _of_system(model, "bias_force", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
-    return _by_recursion(recursions.bias_force, _bias_force, model, q, v)
+    return by_recursion(recursions.bias_force, _bias_force, model, q, v)
 
 
 def inverse_dynamics(
@@ -115,7 +115,7 @@ def inverse_dynamics(
         q, v, a, t, _ = check_state(model, q=q, v=v, a=a, t=t, external=external)
         return _of_system(model, "inverse_dynamics", q, v, a, t)
     q, v, a, external = check_shapes(model, q=q, v=v, a=a, external=external)
-    tau = _by_recursion(recursions.rnea, _inverse_dynamics, model, q, v, a)
+    tau = by_recursion(recursions.rnea, _inverse_dynamics, model, q, v, a)
     return tau if external is None else tau - generalized_force(model, q, external)
 
 
@@ -173,7 +173,7 @@ MAX_BODIES = 128
 _MAX_BODIES_IN_MATRICES = 16
 
 
-def _by_recursion(recursion, matrices, model: Model, *args):
+def by_recursion(recursion, matrices, model: Model, *args):
     """recursion(model, *args) as a kernel, else by products of matrices."""
     if model.nb > MAX_BODIES or model.nb == 0:
         return matrices(model, *args)
@@ -226,7 +226,7 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
     **Returns:** (nv,), N m or N; it stands on the right, with tau.
     """
     q, external = check_shapes(model, q=q, external=external)
-    return _by_recursion(matrix_form.generalized_force, matrix_form.generalized_force, model, q, external)
+    return by_recursion(matrix_form.generalized_force, matrix_form.generalized_force, model, q, external)
 
 
 def kinetic_energy(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, ""]:
@@ -239,7 +239,7 @@ def kinetic_energy(model: Model | System, q: Float[Array, " nq"], v: Float[Array
     if isinstance(model, System):
         return _of_system(model, "kinetic_energy", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
-    return _by_recursion(_kinetic_energy, _kinetic_energy, model, q, v)
+    return by_recursion(_kinetic_energy, _kinetic_energy, model, q, v)
 
 
 def _kinetic_energy(model: Model, q, v):
@@ -264,72 +264,13 @@ def potential_energy(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Fl
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         return jnp.zeros((), model.home.dtype)
-    return _by_recursion(_potential_energy, _potential_energy, model, q)
+    return by_recursion(_potential_energy, _potential_energy, model, q)
 
 
 def _potential_energy(model: Model, q):
-    mass, first, origin, shift = _first_moments(model, tree_frame(model, q))
+    mass, first, origin, shift = first_moments(model, tree_frame(model, q))
     gravity: Any = model.gravity
     return -jnp.sum(gravity * (jnp.sum(mass) * origin + jnp.sum(first + mass[:, None] * shift, axis=0)))
-
-
-def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
-    """Centre of mass of all bodies, c = sum of m_i c_i / sum of m_i.
-
-    **Arguments:** `q` (nq,).
-
-    **Returns:** (3,), world position, m. NaN when no moving body has mass.
-    """
-    (q,) = check_shapes(model, q=q)
-    return _by_recursion(_center_of_mass, _center_of_mass, model, q)
-
-
-def _center_of_mass(model: Model, q):
-    mass, first, origin, shift = _first_moments(model, tree_frame(model, q))
-    return origin + jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
-
-
-def centroidal_momentum(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "6"]:
-    """Momentum of the whole mechanism about its centre of mass, in world axes.
-
-    (l, k) = (sum of m_i cdot_i, sum of (c_i - c) x m_i cdot_i + I_i omega_i), c the common centre of mass. Without
-    contact and joint torques on the world, k is constant and dl/dt = m g.
-
-    **Arguments:** `q` (nq,); `v` (nv,).
-
-    **Returns:** (6,), linear (kg m/s) then angular (kg m^2/s). Rotors (armature) are left out. NaN when no body has
-    mass.
-
-    Source: Orin, Goswami & Lee (2013), eq. 21.
-    """
-    q, v = check_shapes(model, q=q, v=v)
-    return _by_recursion(_centroidal_momentum, _centroidal_momentum, model, q, v)
-
-
-def _centroidal_momentum(model: Model, q, v):
-    frame = tree_frame(model, q)
-    momenta = jax.vmap(momentum)(tree_inertias(model, frame), body_twists(model, frame, v))
-    return jnp.sum(_about_center(model, frame, momenta), axis=0)
-
-
-def centroidal_momentum_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Array, "6 nv"]:
-    """Centroidal momentum matrix A(q): `centroidal_momentum(model, q, v)` = A v.
-
-    **Arguments:** `q` (nq,).
-
-    **Returns:** (6, nv), rows linear then angular, about the centre of mass in world axes.
-
-    Source: Orin, Goswami & Lee (2013), eq. 22.
-    """
-    (q,) = check_shapes(model, q=q)
-    return _by_recursion(_centroidal_momentum_matrix, _centroidal_momentum_matrix, model, q)
-
-
-def _centroidal_momentum_matrix(model: Model, q):
-    frame = tree_frame(model, q)
-    composite = sum_to_coordinates(model, tree_inertias(model, frame))
-    momenta = jax.vmap(momentum)(composite, frame.subspace)
-    return _about_center(model, frame, momenta, model.topology.dof_body).T
 
 
 def torque_regressor(
@@ -347,7 +288,7 @@ def torque_regressor(
     Source: Atkeson, An & Hollerbach (1986).
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
-    return _by_recursion(matrix_form.torque_regressor, matrix_form.torque_regressor, model, q, v, a)
+    return by_recursion(matrix_form.torque_regressor, matrix_form.torque_regressor, model, q, v, a)
 
 
 def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
@@ -363,7 +304,7 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     """
     (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "mass_matrix_derivative")
-    return _by_recursion(matrix_form.mass_matrix_derivative, matrix_form.mass_matrix_derivative, model, q)
+    return by_recursion(matrix_form.mass_matrix_derivative, matrix_form.mass_matrix_derivative, model, q)
 
 
 def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv nv"]:
@@ -405,7 +346,7 @@ def _check_coordinates(model: Model, name: str) -> None:
         )
 
 
-def _first_moments(model: Model, frame: TreeFrame):
+def first_moments(model: Model, frame: TreeFrame):
     """Masses (nb,), first moments (nb, 3) in the tree frames, world position (3,) of the first tree's origin, and shifts.
 
     A shift (3,) is the place of a body's tree frame relative to the first one: zero, not a difference of far
@@ -415,13 +356,3 @@ def _first_moments(model: Model, frame: TreeFrame):
     rotated = _product(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
     origin = frame.origin[0] if model.nb else jnp.zeros((3,), mass.dtype)
     return mass, rotated + mass[:, None] * frame.pose[:, :3, 3], origin, frame.origin - origin[None]
-
-
-def _about_center(model: Model, frame: TreeFrame, momenta: Array, bodies=None) -> Array:
-    """Momenta (n, 6) taken in tree frames, of the given bodies, moved to the centre of mass."""
-    mass, first, _, shift = _first_moments(model, frame)
-    center = jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
-    lever = shift - center[None]
-    lever = lever if bodies is None else take(lever, bodies)
-    angular = momenta[:, 3:] + jax.vmap(cross)(lever, momenta[:, :3])
-    return jnp.concatenate([momenta[:, :3], angular], axis=1)

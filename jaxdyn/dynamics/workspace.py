@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import compiled
-from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
+from jaxdyn.dynamics.frame_motion import frame_jacobian
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import check_shapes
@@ -94,12 +94,10 @@ def workspace_dynamics(
         raise ValueError(
             f"rows is {rows}; give different components 0 to 5 of the twist, at most nv = {model.nv} of them"
         )
-    if axes not in ("body", "world"):
-        raise ValueError(f"axes is {axes!r}; choose from body, world")
     limit = float(jnp.finfo(q.dtype).eps) ** 0.4 if least is None else least
     if not 0 < limit < 1:
         raise ValueError(f"least is {least}; give a number between 0 and 1, or None")
-    frame_pose(model, q, frame)  # refuses unknown names
+    frame_jacobian(model, q, frame, axes=axes)  # refuses unknown names
     return _workspace(model, _Choice(frame, axes, rows, limit), q, v)
 
 
@@ -113,11 +111,7 @@ class _Choice(eqx.Module):
 @compiled
 def _workspace(model: Model, choice: _Choice, q, v) -> WorkspaceDynamics:
     def velocity_map(q):
-        J = body_jacobian(model, q, choice.frame)
-        if choice.axes == "world":
-            turn = frame_pose(model, q, choice.frame)[:3, :3]
-            J = jnp.concatenate([_product(turn, J[:3]), _product(turn, J[3:])])
-        return J[np.array(choice.rows)]
+        return frame_jacobian(model, q, choice.frame, axes=choice.axes)[np.array(choice.rows)]
 
     J, J_rate = jax.jvp(velocity_map, (q,), (configuration_rate(model, q, v),))
     factor = mass_factor(mass_matrix(model, q))

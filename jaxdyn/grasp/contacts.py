@@ -115,6 +115,39 @@ def contact(
     )
 
 
+def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
+    """Contacts of named fingertips at points of the object, from its points and inward normals.
+
+    **Arguments:** `places`: by the name of a finger's body or frame, whose origin touches, (point (3,), normal (3,)) on the
+    object, in its frame: m, and the direction into the object. `kind`: as of `contact`.
+
+    **Returns:** one `Contact` each; z of its frame is the normal, x and y any directions across.
+
+    **Raises:** ValueError for no places, points and normals that are not (3,), and normals of length zero.
+
+    ```python
+    jd.grasp.point_contacts({"tip1": ((0.03, 0, 0), (-1, 0, 0)), "tip2": ((-0.03, 0, 0), (1, 0, 0))})
+    ```
+    """
+    if not isinstance(places, dict) or not places:
+        raise ValueError(f"places is {places!r}; give {{finger: (point, normal)}}")
+    found = []
+    for finger, place in places.items():
+        if not isinstance(place, (tuple, list)) or [np.shape(x) for x in place] != [(3,), (3,)]:
+            raise ValueError(f"places[{finger!r}] is {place!r}; give (point (3,), normal (3,))")
+        point, normal = (np.asarray(x, float) for x in place)
+        length = np.linalg.norm(normal)
+        if not (np.isfinite(length) and length > 0):
+            raise ValueError(f"places[{finger!r}]: normal is {normal.tolist()}; give a direction into the object")
+        normal = normal / length
+        across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+        across = across / np.linalg.norm(across)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = np.stack([across, np.cross(normal, across), normal], 1), point
+        found.append(contact(kind, finger, pose))
+    return found
+
+
 def on_object(constraint: Constraint, name: str) -> Constraint:
     """The constraint as a contact of the object `name`.
 

@@ -5,6 +5,9 @@ With J_h square and regular, X = J_h^-1 G^T gives the joint velocities thetadot 
     M~ = N^T M N = M_o + X^T M_f X,        C~ = N^T (C N + M Ndot) = C_o + X^T (C_f X + M_f Xdot),
     N~ = N^T g = N_o + X^T N_f,            F = N^T tau = tau_o + G J_h^-T tau_f,
     M~ Vdot + C~ V + N~ = F,               lam = J_h^-T (tau_f - M_f thetadd - C_f thetadot - N_f).
+
+With any J_h the same holds for nu = (w, u) and N = [[J_h^+ G^T H, K], [H, 0]] (`jaxdyn.grasp.motions`), and the multipliers
+of the full equations M a + C v + g = tau + A^T lam are  lam = (A^T)^+ (M a + C v + g - tau).
 """
 
 from typing import Any
@@ -12,7 +15,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
@@ -22,31 +24,38 @@ from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp, check_grasp
+from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
-from jaxdyn.reduction.minimal import least_quality
+from jaxdyn.reduction.bases import least_quality
 from jaxdyn.systems.system import velocity_to_rate
 
 
 class ObjectDynamics(Outcome):
-    """M~ Vdot + C~ V + N~ = F of a grasped object, its solution and the contact forces.
+    """M~ nudot + C~ nu + N~ = F of a grasped object, its solution and the contact forces.
 
-    - `mass_matrix`, `coriolis_matrix` (no, no); `gravity_force`, `force` (no,): M~, C~, N~, F, wrenches in the object's
-      frame for a free body. M~ is symmetric, dM~/dt - 2 C~ skew.
-    - `rate` (no,): Vdot. `velocity`, `acceleration` (nv,): of all joints, thetadot = X V among them.
+    nu (nr,) is the object's velocity V with `object_dynamics`, and (w, u) with `hand_dynamics`.
+
+    - `mass_matrix`, `coriolis_matrix` (nr, nr); `gravity_force`, `force` (nr,): M~, C~, N~, F; wrenches in the object's
+      frame for the velocity of a free body. M~ is symmetric, dM~/dt - 2 C~ skew.
+    - `input_map` (nr, nh): of the joints' torques, F = input_map tau_f + what acts on the object: G J_h^-T with V.
+    - `rate` (nr,): nudot. `velocity`, `acceleration` (nv,): of all joints, v = N nu and its rate.
     - `contact_forces` (nc,): on the object, along the contacts' components, N and N m.
-    - `result`: one of `jd.RESULTS`; `singular_basis` where the hand Jacobian is singular.
+    - `basis` (nv, nr): N.
+    - `result`: one of `jd.RESULTS`; `singular_basis` where the hand Jacobian is singular, or of another rank than `motions`.
     - `layout`: name and place of each contact's rows.
     """
 
-    mass_matrix: Float[Array, "no no"]
-    coriolis_matrix: Float[Array, "no no"]
-    gravity_force: Float[Array, " no"]
-    force: Float[Array, " no"]
-    rate: Float[Array, " no"]
+    mass_matrix: Float[Array, "nr nr"]
+    coriolis_matrix: Float[Array, "nr nr"]
+    gravity_force: Float[Array, " nr"]
+    force: Float[Array, " nr"]
+    input_map: Float[Array, "nr nh"]
+    rate: Float[Array, " nr"]
     velocity: Float[Array, " nv"]
     acceleration: Float[Array, " nv"]
     contact_forces: Float[Array, " nc"]
+    basis: Float[Array, "nv nr"]
     result: Any
     layout: tuple[Layout, ...] = eqx.field(static=True)
 
@@ -68,7 +77,7 @@ def object_dynamics(
     **Returns:** `ObjectDynamics`.
 
     **Raises:** ValueError for shapes that do not fit, and for contacts with another number of rows than the hand has
-    joints, so that J_h is not square: use `constrained_dynamics` then.
+    joints, so that J_h is not square: use `hand_dynamics` then.
 
     Source: Murray, Li & Sastry (1994), eqs 6.21-6.25; EQUATIONS section 10 and errata E35-E37.
     """
@@ -80,7 +89,7 @@ def object_dynamics(
     if count != joints:
         raise ValueError(
             f"the contacts have {count} rows and the hand {joints} joints, so the hand Jacobian is not square; use "
-            "jd.constrained_dynamics(grasp, q, v, tau), or choose other contacts"
+            "jd.grasp.hand_dynamics(grasp, q, nu, tau), or choose other contacts"
         )
     if V.shape != (len(grasp.object_velocities),):
         raise ValueError(
@@ -90,10 +99,67 @@ def object_dynamics(
     return _solve(grasp, q, V, tau, t)
 
 
+def hand_dynamics(
+    grasp: Grasp,
+    q: Float[Array, " nq"],
+    nu: Float[Array, " nr"],
+    tau: Float[Array, " nv"] | None = None,
+    t=0.0,
+    *,
+    motions: HandMotions | None = None,
+) -> ObjectDynamics:
+    """Equations of motion of any hand, redundant or not able to follow every motion of its object.
+
+    Formulation: minimal velocities nu = (w, u), w of the object velocities V = H w that the fingers can follow, u of the
+    internal motions of the hand; thetadot = J_h^+ G^T H w + K u with the pseudo-inverse J_h^+ and K a basis of ker J_h. No
+    chart is laid on the object's configuration, nor any quantity damped. Where J_h is square and regular it is
+    `object_dynamics`, and nu = V.
+
+    Contact forces that fingers take up in their structure, which no torque changes, are found from the object's equation
+    too; where rows depend on each other, the forces of least norm, as in `jd.constrained_dynamics`.
+
+    **Arguments:**
+
+    - `q` (nq,), on the contacts; `nu` (nw + nk,): (w, u).
+    - `tau` (nv,), of the fingers' joints and on the object, N m or N (None: zero); `t`, s. The grasp's forces are added.
+    - `motions`: references of H and K, `hand_motions` of a place nearby; by default of q itself. Along a motion keep them,
+      so that nu means the same: dM~/dt - 2 C~ is skew for H and K continued from fixed references.
+
+    **Returns:** `ObjectDynamics`, in nu.
+
+    **Raises:** ValueError for shapes that do not fit, and as `hand_motions` does.
+
+    ```python
+    motions = jd.grasp.hand_motions(grasp, q)
+    found = jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions)
+    found.acceleration, found.contact_forces
+    ```
+
+    Source: Murray, Li & Sastry (1994), eqs 6.21-6.25 and the paragraphs on redundant and nonmanipulable grasps of section
+    6.3; EQUATIONS section 10.
+    """
+    check_grasp(grasp)
+    tau = or_zeros(tau, grasp.nv)
+    q, tau, t = check_state(grasp.system, q=q, tau=tau, t=t)
+    motions = hand_motions(grasp, q, t) if motions is None else motions
+    nh, no = len(grasp.hand_velocities), len(grasp.object_velocities)
+    if motions.object.shape[0] != no or motions.internal.shape[0] != nh:
+        raise ValueError(
+            f"motions has rows for {motions.object.shape[0]} velocities of an object and {motions.internal.shape[0]} joints, "
+            f"the grasp has {no} and {nh}; take jd.grasp.hand_motions(grasp, q)"
+        )
+    nu = as_array(nu, "nu", q.dtype)
+    if nu.shape != (motions.size(grasp),):
+        raise ValueError(
+            f"nu has shape {nu.shape}, expected {(motions.size(grasp),)}: {motions.object.shape[1]} velocities of the object and "
+            f"{motions.internal.shape[1]} of the hand{batch_hint(nu, (1,))}"
+        )
+    return _solve_motions(grasp, motions, q, nu, tau, t)
+
+
 @compiled
 def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
-    hands, objects = (np.array(x, int) for x in (grasp.hand_velocities, grasp.object_velocities))
-    system = grasp.system
+    hands, objects = velocity_rows(grasp)
     A, push = jax.linearize(lambda q, t: constraint_jacobian(grasp, q, t), q, t)
     Jh = -A[:, hands]
     inverse = pseudo_inverse(Jh, tolerance(None, Jh))
@@ -102,21 +168,39 @@ def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     N = N.at[hands].set(X)
     v = _product(N, V)
     # From J_h X = G^T: J_h Xdot = Gdot^T - J_hdot X, which is Adot N.
-    Xdot = _product(inverse, _product(push(velocity_to_rate(system, q, v), jnp.ones_like(t)), N))
+    Xdot = _product(inverse, _product(push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)), N))
     Ndot = jnp.zeros_like(N).at[hands].set(Xdot)
+    whole = jnp.round(jnp.sum(inverse * Jh.T)) == hands.size
+    condition = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
+    serves = whole & (condition * least_quality(q.dtype) < 1)
+    return _solved(grasp, q, V, tau, t, N, Ndot, serves, lambda left: -_product(inverse.T, left[hands]))
 
+
+@compiled
+def _solve_motions(grasp: Grasp, motions: HandMotions, q, nu, tau, t) -> ObjectDynamics:
+    place, push = jax.linearize(lambda q, t: motions.at(grasp, q, t), q, t)
+    v = _product(place.N, nu)
+    Ndot = push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)).N
+    serves = place.quality > least_quality(q.dtype)
+    A = constraint_jacobian(grasp, q, t)
+    inverse = pseudo_inverse(A, tolerance(None, A))
+    return _solved(grasp, q, nu, tau, t, place.N, Ndot, serves, lambda left: _product(inverse.T, left))
+
+
+def _solved(grasp: Grasp, q, nu, tau, t, N, Ndot, serves, multipliers) -> ObjectDynamics:
+    """The equations in nu, v = N nu, and their solution; `multipliers` of A^T lam = M a + C v + g - tau (nv,)."""
+    system, v = grasp.system, _product(N, nu)
     M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)
     gravity, force = gravity_force(system, q, t), applied(grasp, q, v, tau, t)
     mass = _product(N.T, _product(M, N))
     coriolis = _product(N.T, _product(C, N) + _product(M, Ndot))
     held, driven = _product(N.T, gravity), _product(N.T, force)
     factor = jnp.linalg.cholesky(mass)
-    rate = cho_solve((factor, True), driven - _product(coriolis, V) - held)
-    a = _product(N, rate) + _product(Ndot, V)
-    lam = _product(inverse.T, (force - _product(M, a) - _product(C, v) - gravity)[hands])
+    rate = cho_solve((factor, True), driven - _product(coriolis, nu) - held)
+    a = _product(N, rate) + _product(Ndot, nu)
+    lam = multipliers(_product(M, a) + _product(C, v) + gravity - force)
 
     result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
-    whole = jnp.round(jnp.sum(inverse * Jh.T)) == hands.size
-    condition = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
-    result = RESULTS.where(whole & (condition * least_quality(q.dtype) < 1), result, RESULTS.singular_basis)
-    return ObjectDynamics(mass, coriolis, held, driven, rate, v, a, lam, result, layout(grasp))
+    result = RESULTS.where(serves, result, RESULTS.singular_basis)
+    push = N[velocity_rows(grasp)[0]].T
+    return ObjectDynamics(mass, coriolis, held, driven, push, rate, v, a, lam, N, result, layout(grasp))

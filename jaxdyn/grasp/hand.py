@@ -7,12 +7,14 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.inertia import spatial_inertia
 from jaxdyn.model.joining import joined
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
@@ -37,9 +39,9 @@ class Grasp(Scene):
       constraints of the library.
     - `forces`, `cones`: as of a `Scene`. Without cones contacts are two-sided: they pull as well as press.
 
-    **Raises:** ValueError for models that do not fit together, an object that is no single body of its own, an empty
-    list of contacts, contacts with bodies or frames that the models do not have, contacts that prescribe a slip, and cones
-    that do not fit their contacts.
+    **Raises:** ValueError for models that do not fit together, an object that is no single body of its own, or whose inertia
+    is not positive definite, an empty list of contacts, contacts with bodies or frames that the models do not have, contacts
+    that prescribe a slip, and cones that do not fit their contacts.
 
     Source: Murray, Li & Sastry (1994), sections 5.5 and 6.3; EQUATIONS section 10.
     """
@@ -138,3 +140,11 @@ def _check_object(model: Model, name: str) -> None:
         raise ValueError(f"object {name!r} is part of a tree of bodies; give it a joint to the world and no children")
     if top.nb == 1:
         raise ValueError(f"there are no fingers beside the object {name!r}; pass their models")
+    if is_concrete(model.inertias):
+        moved = {"free": range(6), "planar": (0, 1, 5)}.get(top.kinds[body], ())
+        matrix = np.asarray(spatial_inertia(model.inertias[body]), float)[np.ix_(moved, moved)]
+        if len(moved) and not (least := np.linalg.eigvalsh(matrix)[0]) > 0:
+            raise ValueError(
+                f"inertia of the object {name!r} is not positive definite: the least eigenvalue of its spatial inertia is "
+                f"{least:.3g}; give it a mass and an inertia about every axis, as of jd.inertia.box(mass, size)"
+            )

@@ -1,6 +1,7 @@
 """Logs as files: CSV or NPZ with named columns t, q1.., v1.., a1.., tau1.. (or q_<joint name> ...)."""
 
 import csv
+import re
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import as_path
 
 _SIGNALS = ("q", "v", "a", "tau")
+_NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit behind a column's name
 
 
 def read_log(path, *, joint_names=None) -> Log:
@@ -16,7 +18,7 @@ def read_log(path, *, joint_names=None) -> Log:
     Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1,
     ...` torques. The numbers may be replaced by joint names: `q_shoulder, tau_shoulder`. In an NPZ archive each column
     is an array (n,), or a signal is one array (n, columns) named `q`, `v`, `a`, `tau`. Columns of other names are
-    ignored.
+    ignored, and so is a unit in brackets behind a name of a CSV file, `q_shoulder [rad]`; numbers are taken in SI units.
 
     **Arguments:** `path`; `joint_names`: order of the joints in the result for columns with joint names (a model's
     `joint_names`); columns of other joints are left out. Without it the order of the file's tau columns.
@@ -69,7 +71,7 @@ def write_log(path, log: Log) -> None:
 def _read_csv(path) -> dict[str, np.ndarray]:
     with path.open(newline="") as file:
         reader = csv.reader(file)
-        header = [name.strip().lstrip("\ufeff") for name in next(reader, [])]
+        header = [_NOTE.sub("", name.strip().lstrip("\ufeff")) for name in next(reader, [])]
         if not header:
             raise ValueError(f"{path}: the file is empty; the first line names the columns t, q1, ..., tau1, ...")
         repeated = sorted({name for name in header if header.count(name) > 1})

@@ -157,6 +157,12 @@ def sphere(mass: float, radius: float) -> np.ndarray:
     return _centred(mass, np.full(3, 0.4 * mass * radius**2))
 
 
+def ellipsoid(mass: float, semi_axes) -> np.ndarray:
+    """Inertial parameters (10,) of a solid ellipsoid about its centre; `semi_axes` (3,) along x, y, z in m."""
+    squares = np.asarray(semi_axes, float) ** 2
+    return _centred(mass, 0.2 * mass * (squares.sum() - squares))
+
+
 def cylinder(mass: float, radius: float, length: float) -> np.ndarray:
     """Uniform solid cylinder along z about its centre; a disk for length 0."""
     across = mass * (3 * radius**2 + length**2) / 12

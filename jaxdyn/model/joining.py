@@ -39,6 +39,7 @@ def join(left: Any, right: Any, *, prefix: Any = ("", ""), pose: Any = None, nam
     for argument, model in (("left", left), ("right", right)):
         if not isinstance(model, Model):
             raise ValueError(f"{argument} is a {type(model).__name__}; pass a Model")
+        _check_plain(model)
     prefixes = ("", prefix) if isinstance(prefix, str) else prefix
     if not isinstance(prefixes, (tuple, list)) or len(prefixes) != 2 or not all(isinstance(x, str) for x in prefixes):
         raise ValueError(f"prefix is {prefix!r}; give a string for the right model, or one for each")
@@ -47,6 +48,12 @@ def join(left: Any, right: Any, *, prefix: Any = ("", ""), pose: Any = None, nam
     return _side_by_side(
         [first, second if pose is None else _moved(second, pose)], whole, "pass prefix=", by_name=False
     )
+
+
+def _check_plain(model: Model) -> None:
+    """Refuse a model whose q holds more than the coordinates of its joints."""
+    if model.nq > model.topology.nq:
+        raise ValueError(f"model {model.name!r} is a {type(model).__name__}; join models before contacts are added")
 
 
 def renamed(model: Model, prefix: str) -> Model:
@@ -78,6 +85,11 @@ def joined(models: Sequence[Model], name: str) -> Model:
 
 
 def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -> Model:
+    for model in models:
+        if model.nq > model.topology.nq:
+            raise ValueError(
+                f"model {model.name!r} is a {type(model).__name__}; join the models that it is made of first"
+            )
     tops = [model.topology for model in models]
     for what in ("joint_names", "frame_names"):
         names = [n for top in tops for n in getattr(top, what)]

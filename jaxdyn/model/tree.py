@@ -9,7 +9,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import is_concrete, is_expanding
 from jaxdyn.model.arguments import as_array, check_shapes
@@ -208,9 +208,24 @@ class Model(eqx.Module):
         """
         return _replace(self, leaves)
 
+    def followed(self, q: Float[Array, " nq"], joints: Array) -> Float[Array, " nq"]:
+        """The configuration next to q whose joints have the coordinates `joints`: all that there is to q, in a `Model`.
+
+        A subclass may keep numbers behind the joints' coordinates that are functions of these and known near q alone.
+        """
+        return joints
+
+    def followed_rate(self, q: Float[Array, " nq"], v: Float[Array, " nv"], rate: Array) -> Float[Array, " nq"]:
+        """dq/dt (nq,) where the joints' coordinates have the given rate."""
+        return rate
+
+    def follows(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
+        """Whether q is where `followed` leaves it and may go on from there; True for a `Model`."""
+        return jnp.asarray(True)
+
 
 def _replace(model: Model, leaves: dict) -> Model:
-    names = [field.name for field in dataclasses.fields(model) if field.name != "topology"]
+    names = [field.name for field in dataclasses.fields(Model) if field.name != "topology"]
     sizes = {"gravity": (3,), "armature": (model.nv,), "damping": (model.nv,), "friction": (model.nv,)}
     if model.topology.couplings == ():
         names.remove("coupling_values")
@@ -293,7 +308,7 @@ def integrate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], dt=1
     """
     q, v = check_shapes(model, q=q, v=v)
     dt = as_array(dt, "dt", q.dtype)
-    return _per_joint(model.topology, joint_integrate, q, (v * dt, False))
+    return model.followed(q, _per_joint(model.topology, joint_integrate, q, (v * dt, False)))
 
 
 def difference(model: Model, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -> Float[Array, " nv"]:
@@ -308,6 +323,11 @@ def difference(model: Model, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -
 def configuration_rate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nq"]:
     """dq/dt (nq,) for the body velocity v (nv,): the kinematic map qdot = H(q) v."""
     q, v = check_shapes(model, q=q, v=v)
+    return model.followed_rate(q, v, joint_rates(model, q, v))
+
+
+def joint_rates(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Array:
+    """Rates of the joints' coordinates in q for the body velocity v (nv,)."""
     return _per_joint(model.topology, joint_rate, q, (v, False))
 
 
@@ -321,7 +341,7 @@ def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
         quat = qj[-4:] / jnp.sqrt(jnp.sum(qj[-4:] ** 2))
         return quat if kind == "spherical" else jnp.concatenate([qj[:3], quat])
 
-    return _per_joint(model.topology, unit, q)
+    return model.followed(q, _per_joint(model.topology, unit, q))
 
 
 def random_configuration(model: Model, key: Array) -> Float[Array, " nq"]:
@@ -355,15 +375,17 @@ def body_index(model: Model, name: str | None) -> int:
 
 
 def frame_index(model: Model, name: str) -> int:
-    """Index of a frame by name.
+    """Index of a frame by name; where no frame has the name of a joint, that stands for the frame of the body that it moves.
 
     **Raises:** ValueError when there is no frame of that name; names that look alike are listed.
     """
     import difflib
 
+    moved = dict(zip(model.joint_names, model.body_names, strict=True)).get(name)
     try:
-        return model.frame_names.index(name)
+        return model.frame_names.index(name if name in model.frame_names or moved is None else moved)
     except ValueError:
-        near = difflib.get_close_matches(str(name), model.frame_names, n=5, cutoff=0.4)
+        names = (*model.frame_names, *model.joint_names)
+        near = difflib.get_close_matches(str(name), names, n=5, cutoff=0.4)
         hint = f"did you mean {', '.join(near)}?" if near else f"frames are {', '.join(model.frame_names[:10])} ..."
         raise ValueError(f"frame {name!r} is not in model {model.name!r}; {hint}") from None

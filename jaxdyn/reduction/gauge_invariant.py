@@ -28,7 +28,7 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import batch_hint, check_state, or_zeros
-from jaxdyn.reduction.minimal import freedoms, orthonormal, split_directions
+from jaxdyn.reduction.bases import freedoms, orthonormal, split_directions
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 

@@ -15,14 +15,8 @@ from jaxdyn.constraints.dynamics import tolerance
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
-from jaxdyn.reduction.minimal import (
-    Independent,
-    Orthonormal,
-    as_basis,
-    constraint_jacobian_compiled,
-    reduce,
-    tangent_basis,
-)
+from jaxdyn.reduction.bases import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, tangent_basis
+from jaxdyn.reduction.minimal import reduce
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import velocity_to_rate

@@ -11,9 +11,10 @@ import numpy as np
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared
 from jaxdyn.reports.records import Record
 from jaxdyn.reports.timing import interleaved
-from jaxdyn.simulation.methods import Method, Reduced, chosen_method
-from jaxdyn.simulation.run import RESULTS
+from jaxdyn.simulation.methods import Method, Reduced
+from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.simulation.solvers.explicit import passes_last_stage_on
+from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import Scene
 
 

@@ -111,7 +111,7 @@ def figure(title: str, known: Known, records: Sequence[Record]) -> Any:
         return None
     drawn, axes = new_figure(4.3 * len(panels), 4.4, 1, len(panels))
     for ax, (error, cost, label) in zip(axes[0], panels, strict=True):
-        _panel(ax, records, error, cost)
+        panel(ax, records, error, cost)
         ax.set(xscale="log", yscale="log", ylabel=label)
         ax.set_xlabel("energy error (J)" if error == "energy_error" else "error")
         if error == "error_path":
@@ -136,7 +136,8 @@ def _svg(drawn, salt: str) -> str:
     return text.getvalue()[text.getvalue().index("<svg") :]
 
 
-def _panel(ax, records, error: str, cost: str) -> None:
+def panel(ax, records, error: str, cost: str) -> None:
+    """Draw `cost` against `error` of records, a line for each ladder, and a halo around those on the front."""
     smallest = 1e-16  # a logarithmic axis has no zero
     for i, label in enumerate(dict.fromkeys(r.label for r in records)):
         ladder = [r for r in records if r.label == label and None not in (getattr(r, error), getattr(r, cost))]

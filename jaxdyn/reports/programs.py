@@ -16,9 +16,9 @@ from jaxdyn.lie.so3 import quat_to_matrix
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.cases import Case
 from jaxdyn.reports.references import Reference
-from jaxdyn.simulation.methods import chosen_method
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers import RK4, Rodas5P
+from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import Scene
 
 # By name; those in FIXED run with fixed steps.

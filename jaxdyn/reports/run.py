@@ -16,7 +16,7 @@ from jaxdyn.reports.plotting import new_figure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared, prepare
 from jaxdyn.reports.records import Known, Record, Report
 from jaxdyn.reports.timing import commit, machine
-from jaxdyn.simulation.methods import chosen_method
+from jaxdyn.simulation.start import chosen_method
 
 # Contestants of others for a scene, a dtype and starts (q, v, ts); see `Contestant`.
 Peers = Callable[[Prepared, str, tuple], Sequence[Contestant]]

@@ -37,6 +37,7 @@ from jaxdyn.scenes.rolling import knife_edge_on_incline as knife_edge_on_incline
 from jaxdyn.scenes.rolling import rolling_coin as rolling_coin
 from jaxdyn.scenes.rolling import rolling_disk as rolling_disk
 from jaxdyn.scenes.rolling import suslov as suslov
+from jaxdyn.scenes.rolling_hands import hand_rolling_egg as hand_rolling_egg
 from jaxdyn.scenes.spatial_linkages import bennett as bennett
 from jaxdyn.scenes.vehicles import bicycle as bicycle
 from jaxdyn.scenes.vehicles import car as car

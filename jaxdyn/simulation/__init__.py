@@ -1,5 +1,5 @@
 """Motions: `run` is `jd.simulate`, `methods` how a scene becomes an ordinary differential equation, `solvers/` the methods of
-diffrax and of our own, `variational` steps for long motions, `time_scales` how stiff a scene is.
+diffrax and of our own, `hybrid/` motions with events, `variational` steps for long motions, `time_scales` how stiff a scene is.
 
 Imports `reduction`, `constraints` and what is below them; the only room that integrates.
 """

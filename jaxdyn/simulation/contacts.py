@@ -50,15 +50,15 @@ def allowances(scene: Scene, multipliers: Float[Array, " nc"]) -> Float[Array, "
 
 
 class Loss(NamedTuple):
-    """Whether and when a contact was lost, and which: its index among those with a cone, -1 for none."""
+    """Whether and when an allowance fell below zero, and which entry, -1 for none."""
 
     happened: Bool[Array, ""]
     time: Float[Array, ""]
-    contact: Int[Array, ""]
+    entry: Int[Array, ""]
 
 
 def first_loss(rows: Float[Array, "nt k"], reached, ts, within) -> Loss:
-    """The first loss of a contact, from the `allowances` at the save points and at the event that ended a step.
+    """The first allowance that is used up, from those at the save points and at the event that ended a step.
 
     `within` is None, or whether there was such an event, its time and the allowances (k,) there.
     """
@@ -72,7 +72,7 @@ def first_loss(rows: Float[Array, "nt k"], reached, ts, within) -> Loss:
         located = Loss(happened, time, jnp.argmin(margins).astype(jnp.int32))
         earlier = happened & ~(found.happened & (found.time <= time))
         found = jax.tree.map(lambda a, b: jnp.where(earlier, a, b), located, found)
-    return found._replace(contact=jnp.where(found.happened, found.contact, -1))
+    return found._replace(entry=jnp.where(found.happened, found.entry, -1))
 
 
 def event(allowance, basis, start, dtype) -> diffrax.Event:

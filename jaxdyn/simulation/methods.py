@@ -1,4 +1,4 @@
-"""How a scene becomes an ordinary differential equation: the methods of `simulate`, and the check of a start.
+"""How a scene becomes an ordinary differential equation: the methods of `simulate`.
 
 A method says what the state y of the equation is, how it changes, and what is done to it after a step:
 
@@ -14,12 +14,9 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.assembly import open_constraints, start_evidence
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
@@ -27,7 +24,7 @@ from jaxdyn.constraints.rank import checked_tolerance
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.reduction.minimal import (
+from jaxdyn.reduction.bases import (
     Basis,
     Given,
     Orthonormal,
@@ -35,14 +32,14 @@ from jaxdyn.reduction.minimal import (
     least_quality,
     minimal_velocity,
     moving,
-    solve_reduced,
     tangent_basis,
 )
+from jaxdyn.reduction.minimal import solve_reduced
 from jaxdyn.simulation import variational
 from jaxdyn.simulation.solvers import Stepper
 from jaxdyn.simulation.solvers.choice import is_fixed
 from jaxdyn.systems.scene import Scene, as_pytree
-from jaxdyn.systems.system import has_quaternions, rate_to_velocity, retract, velocity_to_rate
+from jaxdyn.systems.system import rate_to_velocity, retract, retracts, velocity_to_rate
 
 
 class Method(eqx.Module):
@@ -87,7 +84,7 @@ class Method(eqx.Module):
 
     def corrects(self, scene: Scene) -> bool:
         """Whether `stepped` and `corrected` change a state."""
-        return self.projects or has_quaternions(scene.system)
+        return self.projects or retracts(scene.system)
 
     def corrected(self, scene: Scene, y, t) -> dict[str, Array]:
         """The state put back between steps, where it is saved."""
@@ -276,7 +273,7 @@ class Reduced(Method):
 
     def corrects(self, scene):
         """Where there are holonomic rows, quaternions, or a reference to be renewed."""
-        return bool(holonomic_rows(layout(scene)).size or self.jumping or has_quaternions(scene.system))
+        return bool(holonomic_rows(layout(scene)).size or self.jumping or retracts(scene.system))
 
     def stepped(self, scene, y, t, error):
         """q on the holonomic constraints, its error without the part normal to them; nu stays."""
@@ -364,39 +361,6 @@ class Variational(Multipliers):
         return y | {"q": q, "v": v}
 
 
-METHODS: dict[str, type[Method]] = {
-    kind.name: kind for kind in (Multipliers, Projected, Reduced, Baumgarte, Variational)
-}
-
-
-def chosen_method(scene: Scene, method: str | Method) -> Method:
-    """How to integrate: "auto" is "projected" for a scene with constraints and "free" for one without.
-
-    "projected" is the rule because it serves where the others fail: dependent rows, and places where rows lose rank on
-    the way, and needs no choice of velocities.
-
-    **Raises:** ValueError for a method that does not fit the scene.
-    """
-    if not scene.constraints:
-        if method in ("auto", "free") or isinstance(method, Free):
-            return Free()
-        if method == "variational" or isinstance(method, Variational):
-            return Variational() if isinstance(method, str) else method
-        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free', or 'variational'")
-    if method == "auto":
-        return Projected()
-    if isinstance(method, Method) and not isinstance(method, Free):
-        chosen = method
-    elif isinstance(method, str) and method in METHODS:
-        chosen = METHODS[method]()
-    else:
-        names = ", ".join(map(repr, METHODS))
-        raise ValueError(
-            f"method is {method!r}; a scene with constraints takes 'auto' or {names}, or e.g. jd.Reduced(...)"
-        )
-    return chosen.fitted(scene, None) if isinstance(chosen, Reduced) else chosen
-
-
 def _error_of_place(scene: Scene, q, error) -> Array:
     """Estimated error of q as a displacement (nv,)."""
     return rate_to_velocity(scene.system, retract(scene.system, q), error["q"])
@@ -420,39 +384,3 @@ def start_limit(dtype) -> float:
 def consistent(scene: Scene, q, v, t):
     """Whether a state is on the constraints but for rounding."""
     return openness(scene, q, v, t, start_limit(q.dtype)) <= 1.0
-
-
-def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
-    """The method for a start with concrete numbers, which must be on the constraints and have some freedom.
-
-    **Raises:** ValueError that names the constraints and by how much they are violated, and the fix; for a basis that
-    does not serve at the start.
-    """
-    limit = start_limit(q.dtype)
-    found, ratio, rank = start_evidence(scene, q, v, np.asarray(t, q.dtype), limit)
-    if not ratio <= 1:
-        raise ValueError(
-            f"q0, v0 are not on the constraints: {open_constraints(scene, q, v, t, limit)} (position residual "
-            f"{float(found[0]):.3g}, velocity residual {float(found[1]):.3g}); start from "
-            "state = jd.assemble(scene, q0, v0), with state.q and state.v"
-        )
-    if rank == scene.nv:
-        names = ", ".join(repr(place.name) for place in layout(scene))
-        raise ValueError(
-            f"the constraints {names} remove all freedom: {rank} independent rows for nv = {scene.nv}; "
-            "leave one out, or free a joint"
-        )
-    if not isinstance(method, Reduced):
-        return method
-    # Inside a jit, jax would trace operations on known numbers too.
-    with jax.ensure_compile_time_eval():
-        q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
-        method = method.fitted(scene, scene.nv - rank)
-        if method.basis is not None and not bool(_serves_at(scene, method.basis, q, t)):
-            raise ValueError(f"the basis does not serve at q0: {method.basis.advice(scene, q, t)}")
-    return method
-
-
-@eqx.filter_jit
-def _serves_at(scene, basis, q, t):
-    return serves(basis.at(scene, q, t).quality)

@@ -12,6 +12,8 @@ from jaxdyn.constraints.dynamics import Outcome
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.model.printed import solution_lines
 from jaxdyn.simulation.controls import at_start
+from jaxdyn.simulation.export import as_xarray, write_csv, write_npz
+from jaxdyn.simulation.limits import joint_of
 from jaxdyn.simulation.solvers.choice import for_stiff, known_stiffness, unwrapped
 from jaxdyn.systems.scene import Scene
 
@@ -44,8 +46,14 @@ ADVICE = {
     "contradictory_rows": "remove a constraint, or change one that moves with time, so that some motion satisfies all of them",
     "open_constraints": "take smaller steps (stepsize, or rtol and atol), or look for constraints that contradict each other "
     "on the way",
+    "no_single_contact": "take surfaces that are more convex where they come to touch, or other starts",
     "contact_lost": "grip harder (jd.contact.optimal_forces finds forces within the cones, jd.grasp.internal_forces what "
     "squeezes), or pass contacts='report' to go on with two-sided contacts",
+    "joint_limit_passed": "change the start or the control, or pass limits='report' to go on, or None",
+    "too_many_events": "raise max_events (now {max_events}); where events accumulate (a body that rocks to rest, friction that "
+    "chatters) there is no more motion of rigid bodies behind that time: give friction a smoothing, or end before",
+    "painleve_paradox": "rigid bodies have no answer here: lower the friction, or give the contact some compliance",
+    "no_contact_mode": "lower the friction, or look for contacts that press against each other",
 }
 
 
@@ -62,6 +70,9 @@ class Solution(Outcome):
       `control_state`, rows of the controller's state, a pytree; `poses`, one array (nt, 4, 4) by name for each frame asked for
       as "pose:<frame>"; `contact_forces` (nt, m) and `contact_margins` (nt,), by the names of the contacts that have a cone,
       along the columns of `jd.contact.wrench_basis`, N and N m.
+    - `events`, of a scene with friction that sticks or contacts that open: an `Events` with `time`, `index` and `name`, else
+      None. Its `contact_forces` (nt, 3) are the two components of friction and the normal force, N.
+    - With `limits`, `stats["passed_limit"]` is the entry of q that was the first to pass one of its limits, or -1.
     - Of a scene with cones `stats["lost_contact"]` is the contact that ended the run, an index among those with a cone, or -1.
     """
 
@@ -81,10 +92,46 @@ class Solution(Outcome):
     poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
     contact_forces: dict[str, Float[Array, "nt m"]] = eqx.field(default_factory=dict)
     contact_margins: dict[str, Float[Array, " nt"]] = eqx.field(default_factory=dict)
+    events: Any = None
     solver: str = eqx.field(static=True, default="")
 
     def __str__(self) -> str:
         return solution_lines(self)
+
+    def to_csv(self, path, scene) -> None:
+        """Write the motion as CSV: one row a save point, columns with names and units, every number at full precision.
+
+        Columns are `t [s]`, then of each signal that there is: `q_JOINT [rad]`, `v_...`, `a_...` (acceleration), `tau_...`
+        (torque), `multipliers_CONSTRAINT.1`, `energy [J]`, ... Where a joint has several numbers, all are counted, and the
+        brackets name them too: `q1 [base.x; m]`. A batch has a first column `rollout`. Poses are left out.
+        A motion with `torque` (`outputs=("torque",)`) is a log that `jaxdyn identify` and `jaxdyn simulate --torque` read.
+
+        **Arguments:** `path`, a file .csv; `scene`: the scene or model that was simulated, which has the names.
+
+        **Raises:** ValueError for another kind of file and for a scene that is not that of the solution.
+        """
+        write_csv(self, path, scene)
+
+    def to_npz(self, path, scene) -> None:
+        """Write the motion as an archive of NumPy: arrays `t`, `q`, `v`, `a`, `tau`, `multipliers`, `energy`, `pose_FRAME`, ...
+
+        Shapes are those of the solution, batched or not. `names` and `units` are JSON texts, by array: `json.loads(str(file
+        ["names"]))["q"]`. With `torque` it is a log, as `to_csv` says.
+
+        **Arguments:** `path`, a file .npz; `scene` as in `to_csv`.
+
+        **Raises:** ValueError as `to_csv` does.
+        """
+        write_npz(self, path, scene)
+
+    def to_xarray(self, scene) -> Any:
+        """The motion as an `xarray.Dataset` over `t` (s), with names as coordinates and units as attributes.
+
+        **Arguments:** `scene` as in `to_csv`.
+
+        **Raises:** ValueError for a scene that is not that of the solution. ImportError without xarray.
+        """
+        return as_xarray(self, scene)
 
 
 def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
@@ -105,6 +152,8 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     if name == "contact_lost":
         contact = coned_contacts(scene)[int(solution.stats["lost_contact"])].name
         advice = f"the contact is {contact!r}; {advice}"
+    if name == "joint_limit_passed":
+        advice = f"the joint is {joint_of(scene.system, int(solution.stats['passed_limit']))!r}; {advice}"
     raise RuntimeError(
         f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: {advice}. "
         "With throw=False, what was reached is returned."

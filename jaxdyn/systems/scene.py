@@ -122,6 +122,13 @@ class Scene(eqx.Module):
             total = value if total is None else total + value
         return total
 
+    def limited(self, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """tau (nv,) as the scene's `EffortLimits` let it through."""
+        for force in self.forces:
+            cut = getattr(force, "limited", None)
+            tau = tau if cut is None else cut(self.system, tau)
+        return tau
+
 
 def as_scene(scene: Any) -> Scene:
     """A scene as it is, and a system as the scene without constraints and forces."""

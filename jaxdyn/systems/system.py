@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import is_known, run
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import batch_hint
-from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, normalize
+from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, joint_rates, normalize
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import as_pytree
 from jaxdyn.systems.start import check_mass_matrix
@@ -206,7 +206,9 @@ def rate_to_velocity(system, q: Float[Array, " nq"], rate: Float[Array, " nq"]) 
     """Velocity v (nv,) of any system whose dq/dt is `rate` (nq,), tangent to its manifold."""
     if not isinstance(system, Model):
         return rate
-    (v,) = jax.linear_transpose(lambda v: configuration_rate(system, q, v), jnp.zeros(system.nv, rate.dtype))(rate)
+    # What follows the joints says nothing that they do not say.
+    rate = rate[: system.topology.nq]
+    (v,) = jax.linear_transpose(lambda v: joint_rates(system, q, v), jnp.zeros(system.nv, rate.dtype))(rate)
     if not has_quaternions(system):
         return v
     # H^T H is 1 but for angular velocities, where unit quaternions move at half the rate: 1/4.
@@ -228,13 +230,23 @@ def displacement(system, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -> Fl
 
 
 def has_quaternions(system) -> bool:
-    """Whether q holds numbers that must stay on a unit sphere."""
+    """Whether q holds quaternions, which must stay on a unit sphere."""
     return isinstance(system, Model) and any(kind in ("spherical", "free") for kind in system.topology.kinds)
 
 
+def has_followers(system) -> bool:
+    """Whether q holds numbers behind the joints' coordinates that are functions of these (see `Model.followed`)."""
+    return isinstance(system, Model) and system.nq > system.topology.nq
+
+
+def retracts(system) -> bool:
+    """Whether `retract` changes anything."""
+    return has_quaternions(system) or has_followers(system)
+
+
 def retract(system, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
-    """q with unit quaternions, of any system."""
-    return normalize(system, q) if has_quaternions(system) else q
+    """q with unit quaternions, and with what follows the joints where it belongs, of any system."""
+    return normalize(system, q) if retracts(system) else q
 
 
 def symbols(derivative: Float[Array, "n n n"]) -> Float[Array, "n n n"]:

@@ -176,7 +176,7 @@ def drive(
         after, kept, found = _advanced(plan, how, args, limits, lane, is_active(lane))
         if history is not None:
             history = reverse.written(history, lane.y, lane.t, lane.t_next, kept)
-        return after, *_save(plan, ts, lane, after, kept, found, saved, rows), history
+        return after, *save(plan, ts, lane, after, kept, found, saved, rows), history
 
     def unfinished(carry):
         return any_in_batch(is_active(carry[0]))
@@ -250,7 +250,7 @@ def _accepted(plan: Plan, how, args, limits: _Limits, lane: _Lane, active, step:
     return lane, kept
 
 
-def _save(plan: Plan, ts, before: _Lane, after: _Lane, kept, step: Step, saved, rows):
+def save(plan: Plan, ts, before: Any, after: Any, kept, step: Step, saved, rows):
     """How many save points have been passed, and their rows."""
     count = ts.shape[0] - 1
 

@@ -13,6 +13,7 @@ from jaxdyn.lie.so3 import _product
 from jaxdyn.model.joints import SCREW_KINDS, joint_integrate, joint_rate
 from jaxdyn.model.tree import Model, Topology, _per_joint
 from jaxdyn.simulation.solvers.wrapped import Wrapped
+from jaxdyn.systems.system import has_followers
 
 
 class LieGroup(Wrapped):
@@ -35,7 +36,12 @@ class LieGroup(Wrapped):
     topology: Topology | None = eqx.field(static=True, default=None)
 
     def fitted(self, system) -> diffrax.AbstractSolver:
-        """The method for a system."""
+        """The method for a system. **Raises:** ValueError for one whose q holds more than the coordinates of joints."""
+        if has_followers(system):
+            raise ValueError(
+                f"solver is LieGroup and the system a {type(system).__name__}, whose contacts have no local coordinates; "
+                "pass the wrapped method itself"
+            )
         flat = not isinstance(system, Model) or all(kind in SCREW_KINDS for kind in system.topology.kinds)
         return self.solver if flat else LieGroup(self.solver, system.topology)
 

@@ -1,0 +1,70 @@
+"""What constraints do to a system: the generalised force and the wrench of each one, from the multipliers."""
+
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.base import constraint_jacobian, layout
+from jaxdyn.constraints.frames import Pair, relative_poses
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint, check_state
+from jaxdyn.systems.scene import Scene, as_scene
+
+
+def constraint_forces(
+    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t=0.0
+) -> dict[str, Float[Array, " nv"]]:
+    """Generalised force A_i^T lam_i of each constraint on the system, by name.
+
+    **Arguments:** `q` (nq,); `multipliers` (nc,), those of `constrained_dynamics` or of the output "multipliers" of `simulate`.
+
+    **Returns:** a dictionary of arrays (nv,), N m or N.
+
+    **Raises:** ValueError for shapes that do not fit.
+
+    Source: EQUATIONS section 7, M a + h = tau + A^T lam.
+
+    ```python
+    found = jd.constrained_dynamics(scene, q, v)
+    pushes = jd.constraint_forces(scene, q, found.multipliers)
+    ```
+    """
+    scene = as_scene(scene)
+    A = constraint_jacobian(scene, q, t)
+    multipliers = _checked_multipliers(multipliers, A.shape[0], A.dtype)
+    return {p.name: _product(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
+
+
+def constraint_wrenches(
+    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"]
+) -> dict[str, Float[Array, "6"]]:
+    """Wrench (f, tau) of each constraint between two frames on its body B, at the origin and in the axes of its frame A.
+
+    The wrench on body A is the negative of it. A loop has its frames A and B as given; for a rolling
+    contact A is on the surface and B on the body that rolls, for a contact of a grasp A is on the object and B on the finger.
+    Constraints that are not between two frames have no entry.
+
+    **Arguments:** `q` (nq,); `multipliers` (nc,), as in `constraint_forces`.
+
+    **Returns:** a dictionary of arrays (6,), N and N m, by the constraints' names.
+
+    **Raises:** ValueError for shapes that do not fit.
+
+    Source: EQUATIONS sections 3 (wrenches) and 7.
+    """
+    scene, found = as_scene(scene), {}
+    (q,) = check_state(scene.system, q=q)
+    places = layout(scene)
+    multipliers = _checked_multipliers(multipliers, places[-1].end if places else 0, q.dtype)
+    for constraint, place in zip(scene.constraints, places, strict=True):
+        if isinstance(constraint, Pair):
+            constraint = constraint.at(scene.system, q)
+            rotation, position = relative_poses([constraint], scene.system, q)
+            found[place.name] = constraint.wrench(rotation[0], position[0], multipliers[place.start : place.end])
+    return found
+
+
+def _checked_multipliers(multipliers, count: int, dtype) -> Array:
+    multipliers = as_array(multipliers, "multipliers", dtype)
+    if multipliers.shape != (count,):
+        hint = batch_hint(multipliers, (1,))
+        raise ValueError(f"multipliers has shape {multipliers.shape}, expected {(count,)}, one per row{hint}")
+    return multipliers

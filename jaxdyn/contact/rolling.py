@@ -1,0 +1,208 @@
+"""Two surfaces that touch and roll: the rows of a contact at a place that the configuration holds (see `rolling_model`)."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.frames import Pair, displaced
+from jaxdyn.constraints.rolling import Touching, TouchingPoint, tangents
+from jaxdyn.contact.surfaces import Surface, check_surface
+from jaxdyn.contact.touching import Patch, Steps, newton_steps, patch_at
+from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.model.arguments import pose_leaf
+
+
+class RollingContact(Touching):
+    """Two surfaces that touch and roll; made by `jd.rolling_contact`. Body A carries `shape_a`, body B `shape_b`."""
+
+    name: str = eqx.field(static=True)
+    body: str | None = eqx.field(static=True)
+    surface_body: str | None = eqx.field(static=True)
+    pose: Float[Array, "4 4"]
+    surface: Float[Array, "4 4"]
+    shape_a: Surface
+    shape_b: Surface
+    contact: bool = eqx.field(static=True)
+    spin: bool = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+    places: tuple[Array, Array] | None = None
+    about: tuple[Patch, Patch] | None = None
+
+    @property
+    def place_size(self) -> int:
+        """Number of numbers that its places take in q."""
+        return self.shape_a.place_size + self.shape_b.place_size
+
+    def put(self, place: Float[Array, " n"]) -> "RollingContact":
+        """The contact at a place, the numbers for A before those for B."""
+        size = self.shape_a.place_size
+        return dataclasses.replace(self, places=(place[:size], place[size:]), about=None)
+
+    def likeness(self):
+        """Which rows there are, and on what kinds of surfaces."""
+        return self.contact, self.spin, self.count, jax.tree.structure((self.shape_a, self.shape_b))
+
+    def touching(self, R, p):
+        """The points next to each other, by one step of Newton's method from the places."""
+        a, b = self.patches()
+        steps = newton_steps(a, b, R, p)
+        point = _product(R, b.at(steps.on_b)) + p
+        # For surfaces that touch, the gap along the normal of the place has the first and second derivatives of the gap.
+        gap = jnp.sum(a.normal * (point - a.at(steps.on_a)))
+        normal = a.normal_at(steps.on_a)
+        return TouchingPoint(point, normal, gap, tangents(normal)[: self.count])
+
+    def patches(self) -> tuple[Patch, Patch]:
+        """Both surfaces about their places."""
+        if self.about is not None:
+            return self.about
+        place_a, place_b = self.placed()
+        return patch_at(self.shape_a, place_a), patch_at(self.shape_b, place_b)
+
+    def prepared(self) -> "RollingContact":
+        """The same with the surfaces about their places computed."""
+        return dataclasses.replace(self, about=self.patches())
+
+    def steps(self, R, p) -> Steps:
+        """Steps on both surfaces toward the points next to each other."""
+        return newton_steps(*self.patches(), R, p)
+
+    def followed(self, R, p, count: int) -> Float[Array, " n"]:
+        """The place after some steps of Newton's method."""
+        contact = self
+        for _ in range(count):
+            steps = contact.steps(R, p)
+            contact = contact.put(contact.stepped(steps.on_a, steps.on_b))
+        return jnp.concatenate(contact.placed())
+
+    def stepped(self, on_a, on_b) -> Float[Array, " n"]:
+        """The place at steps on both surfaces."""
+        place_a, place_b = self.placed()
+        return jnp.concatenate([self.shape_a.moved(place_a, on_a), self.shape_b.moved(place_b, on_b)])
+
+    def place_rate(self, R, p, U) -> Float[Array, " n"]:
+        """Rate of the place for a twist U of B against A."""
+        patches = self.patches()
+
+        def along(twist):
+            steps = newton_steps(*patches, *displaced(R, p, twist))
+            return steps.on_a, steps.on_b
+
+        on, rate = jax.jvp(along, (jnp.zeros_like(U),), (U,))
+        return jax.jvp(self.stepped, on, rate)[1]
+
+    def coordinates(self, R, p) -> Float[Array, "5"]:
+        """Contact coordinates (u_a, v_a, u_b, v_b, psi) of the place in the charts of the surfaces."""
+        from_charts = []
+        for shape, place in zip((self.shape_a, self.shape_b), self.placed(), strict=True):
+            alpha = shape.coordinates_at(place)
+            along = jax.jacfwd(shape.point)(alpha)[:, 0]
+            from_charts.append((alpha, along / jnp.sqrt(jnp.sum(along * along))))
+        (alpha_a, x_a), (alpha_b, x_b) = from_charts
+        normal, seen = self.patches()[0].normal, _product(R, x_b)
+        # R_psi = [cos psi, -sin psi; -sin psi, -cos psi], its first column x_b in the axes x, y of A.
+        y_a = cross(normal, x_a)
+        psi = jnp.arctan2(-jnp.sum(seen * y_a), jnp.sum(seen * x_a))
+        return jnp.concatenate([alpha_a, alpha_b, psi[None]])
+
+    def placed(self) -> tuple[Array, Array]:
+        """Places on A and on B. **Raises:** ValueError for a contact that has not been put at one."""
+        if self.places is None:
+            raise ValueError(
+                f"rolling contact {self.name!r} is not part of a system that knows its places; give it to "
+                "jd.RollingModel(model, [contact]) and take the constraints of that"
+            )
+        return self.places
+
+
+class Rolling(Pair):
+    """The rows of one contact of a `RollingModel`; see `RollingModel.rows`."""
+
+    name: str = eqx.field(static=True)
+    index: int = eqx.field(static=True)
+    body: str | None = eqx.field(static=True)
+    surface_body: str | None = eqx.field(static=True)
+    contact: bool = eqx.field(static=True)
+    spin: bool = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+    def at(self, system, q):
+        """The contact at its place in q."""
+        contact = self._of(system)
+        return contact.put(q[system.place_slices[self.index]]).prepared()
+
+    def declared(self, system):
+        """The contact of the system."""
+        return self._of(system)
+
+    def sizes(self, system, dtype):
+        """As of the contact."""
+        return self._of(system).sizes(system, dtype)
+
+    def wrench_components(self):
+        """As of the contact: normal force, those that do not slip, and the torque that does not spin."""
+        return Touching.wrench_components(self)  # pyright: ignore[reportArgumentType]
+
+    def _of(self, system) -> RollingContact:
+        contacts = getattr(system, "contacts", ())
+        if not self.index < len(contacts) or contacts[self.index].name != self.name:
+            raise ValueError(
+                f"rolling contact {self.name!r} is none of the system; take the rows of the RollingModel that is simulated"
+            )
+        return contacts[self.index]
+
+
+def rolling_contact(
+    body_a: str | None,
+    surface_a,
+    body_b: str | None,
+    surface_b,
+    *,
+    pose_a=None,
+    pose_b=None,
+    spin: bool = False,
+    slip: bool = False,
+    contact: bool = True,
+    name: str | None = None,
+) -> RollingContact:
+    """Two smooth surfaces that touch in one point and roll on each other, for a `RollingModel`.
+
+    Rows: the gap (a positive multiplier presses B off A), the two slips, and with `spin` the turning about the normal.
+
+    **Arguments:**
+
+    - `body_a`, `body_b`: bodies or frames that carry the surfaces; None for the world.
+    - `surface_a`, `surface_b`: `jd.contact.Sphere`, `Plane`, `Cylinder`, `Ellipsoid`, or `Parametrised` for any other smooth
+      surface, whose chart should hold wherever the contact goes; outward normals as the surfaces say. One may be concave, as
+      long as the relative curvature is positive.
+    - `pose_a`, `pose_b`: of the surface's frame in its body: None, (4, 4), (3,) or (xyz, rpy).
+    - `spin`: whether the contact resists spinning about the normal too, as a soft finger. `slip`: whether it slides without
+      friction. `contact`: whether the gap is a row.
+    - `name`: for errors and reports.
+
+    **Raises:** ValueError for what is no surface, a bad pose, or no rows at all; when used, for unknown bodies.
+
+    Source: Montana (1988); Murray, Li & Sastry (1994), section 5.6; EQUATIONS section 8.
+    """
+    name = f"{body_b or 'world'} on {body_a or 'world'}" if name is None else name
+    for surface in (surface_a, surface_b):
+        check_surface(surface)
+    if slip and not (spin or contact):
+        raise ValueError(
+            f"{name!r}: slip is True and contact and spin are False, which leaves no rows; set contact=True"
+        )
+    return RollingContact(
+        name=name,
+        body=body_b,
+        surface_body=body_a,
+        pose=pose_leaf(pose_b, f"{name!r}: pose_b"),
+        surface=pose_leaf(pose_a, f"{name!r}: pose_a"),
+        shape_a=surface_a,
+        shape_b=surface_b,
+        contact=bool(contact),
+        spin=bool(spin),
+        count=0 if slip else 2,
+    )

@@ -1,0 +1,241 @@
+"""Surfaces that roll on each other: where they touch is part of the configuration, and the rows are those of a contact.
+
+A `RollingModel` is a `Model` whose q goes on behind the joints' coordinates with the places of its contacts on both surfaces.
+They have no inertia and no velocities of their own: where the surfaces are next to each other is a function of the joints'
+coordinates, and the places say which of its values. Their rates are those of Montana's equations, for any velocity; steps and
+projections take them along by Newton's method. So v, M, h and tau are those of the model.
+
+Source: Montana (1988); Murray, Li & Sastry (1994), section 5.6; EQUATIONS section 8.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import is_known, run
+from jaxdyn.constraints.frames import each, relative_motions, relative_poses
+from jaxdyn.constraints.loops import check_bodies
+from jaxdyn.contact.rolling import Rolling, RollingContact
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, check_shapes
+from jaxdyn.model.tree import Model
+
+# Newton steps where the joints have moved by a step of an integration.
+_STEPS_MOVED = 2
+# Of the search for a place, from a start found in so many turns between the surfaces.
+_STEPS_SEARCHED, _TURNS = 30, 8
+
+
+class RollingModel(Model):
+    """A `Model` with surfaces that roll on each other. q = (joints' coordinates, places of the contacts), v as of the model.
+
+    **Arguments:** `model`: a `Model`; `contacts`: a list of `jd.rolling_contact(...)`.
+
+    The places are numbers without a chart that ends: a unit vector (3) on a sphere or an ellipsoid, (u, v) on a plane, a
+    cylinder and a `Parametrised` surface. `place` finds them, `contact_coordinates` gives them in the surfaces' charts. Functions
+    of a `Model` take it as it is; `jd.neutral` and `jd.random_configuration` give the joints' coordinates alone.
+
+    **Raises:** ValueError for what is no model or no list of rolling contacts, equal names and unknown bodies.
+
+    ```python
+    tip, ball = jd.contact.Sphere(0.02), jd.contact.Ellipsoid([0.1, 0.1, 0.12])
+    system = jd.RollingModel(model, [jd.rolling_contact("tip", tip, "ball", ball)])
+    scene = jd.Scene(system, system.rows)
+    q0 = system.place(joints)
+    ```
+    """
+
+    contacts: tuple[RollingContact, ...] = ()
+
+    def __init__(self, model: Any = None, contacts: Sequence = (), **fields):
+        if fields:  # of `dataclasses.replace`, with fields that have been looked at
+            for name, value in fields.items():
+                setattr(self, name, value)
+            self.contacts = tuple(contacts)
+            return
+        if not isinstance(model, Model) or isinstance(model, RollingModel):
+            raise ValueError(f"model is a {type(model).__name__}; pass a Model, the bodies that carry the surfaces")
+        if not isinstance(contacts, (tuple, list)) or not all(isinstance(one, RollingContact) for one in contacts):
+            raise ValueError(f"contacts is {contacts!r}; pass a list of jd.rolling_contact(...)")
+        for field in dataclasses.fields(Model):
+            setattr(self, field.name, getattr(model, field.name))
+        names = [one.name for one in contacts]
+        if len(set(names)) < len(names):
+            raise ValueError(f"contacts have the names {names}; give each its own (name=)")
+        for one in contacts:
+            check_bodies(one.name, model, (one.body, one.surface_body))
+        self.contacts = tuple(contacts)
+
+    def replace(self, **leaves) -> "RollingModel":
+        """A copy with some leaves of the model replaced; the contacts stay."""
+        model = Model(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Model)})
+        return RollingModel(model.replace(**leaves), self.contacts)
+
+    @property
+    def nq(self) -> int:
+        """Number of configuration coordinates, places included."""
+        return self.topology.nq + sum(contact.place_size for contact in self.contacts)
+
+    @property
+    def place_slices(self) -> tuple[slice, ...]:
+        """Where the place of each contact stands in q."""
+        ends = np.cumsum([self.topology.nq] + [contact.place_size for contact in self.contacts]).tolist()
+        return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
+
+    @property
+    def rows(self) -> tuple[Rolling, ...]:
+        """The constraints of its contacts, for a `Scene` or a `Grasp` with this model."""
+        fields = "name", "body", "surface_body", "contact", "spin", "count"
+        return tuple(
+            Rolling(index=i, **{field: getattr(one, field) for field in fields}) for i, one in enumerate(self.contacts)
+        )
+
+    def placed(self, q: Float[Array, " nq"]) -> tuple[RollingContact, ...]:
+        """The contacts at their places in q."""
+        return tuple(one.put(q[at]) for one, at in zip(self.contacts, self.place_slices, strict=True))
+
+    def place(self, joints: Any, near: Any = None) -> Float[Array, " nq"]:
+        """q (nq,) for the coordinates of the joints: with the places where the surfaces are next to each other.
+
+        **Arguments:**
+
+        - `joints` (model nq,): as of the model. The surfaces need not touch: `jd.assemble` closes the gaps.
+        - `near`: coordinates to begin the search from, a row (u_a, v_a, u_b, v_b) for each contact, in the charts of its
+          surfaces (a fifth number, psi, is not read). By default from the directions of the bodies' frames to each other,
+          which a `Parametrised` surface does not know: there it is needed.
+
+        **Raises:** ValueError for wrong shapes, and, on concrete numbers, where no such place is found, and for surfaces that do
+        not touch in one point from outside there (a bowl too deep, two planes).
+        """
+        joints = as_array(joints, "joints", self.home.dtype)
+        if joints.shape != (self.topology.nq,):
+            raise ValueError(
+                f"joints has shape {joints.shape}, expected {(self.topology.nq,)}, those of model {self.name!r}"
+            )
+        count = len(self.contacts)
+        if near is not None:
+            near = as_array(near, "near", joints.dtype)
+            if near.ndim != 2 or near.shape[0] != count or near.shape[1] not in (4, 5):
+                raise ValueError(
+                    f"near has shape {near.shape}, expected {(count, 4)}, (u_a, v_a, u_b, v_b) of each contact"
+                )
+        q = _searched(self, joints, near)
+        _check_places(self, q, "joints", "give near=, coordinates next to the contact")
+        return q
+
+    def contact_coordinates(self, q: Float[Array, " nq"]) -> Float[Array, "n 5"]:
+        """eta = (u_a, v_a, u_b, v_b, psi) of each contact, in the charts of its surfaces: what `jd.contact.montana` takes.
+
+        psi is the angle (rad) between the Gauss frames of these charts: R_AB = [cos psi, -sin psi; -sin psi, -cos psi] in the
+        tangent plane.
+        """
+        (q,) = check_shapes(self, q=q)
+        contacts = self.placed(q)
+        return jnp.stack(each(contacts, RollingContact.coordinates, *relative_poses(contacts, self, q)))
+
+    def check_start(self, q, v, t) -> None:
+        """Refuse places at which a motion cannot start.
+
+        **Raises:** ValueError, on concrete numbers, that names the contact, as `place` does.
+        """
+        _check_places(self, q, "q0", "take system.place(q0[: system.topology.nq])")
+
+    def follows(self, q):
+        """Whether all surfaces are next to each other at their places, in one point each."""
+        strict, left = _closeness(self, q)
+        return jnp.all(strict & (left <= float(jnp.finfo(q.dtype).eps) ** 0.4))
+
+    def followed(self, q, joints):
+        """q with the places where the surfaces are next to each other for other coordinates of the joints."""
+        if not self.contacts:
+            return joints
+        return run(_followed, self, q, joints, otherwise=_followed)
+
+    def followed_rate(self, q, v, rate):
+        """dq/dt, with the rates of the places."""
+        if not self.contacts:
+            return rate
+        return jnp.concatenate([rate, run(_place_rates, self, q, v, otherwise=_place_rates)])
+
+
+def _followed(system: RollingModel, q, joints):
+    contacts = system.placed(q)
+    poses = relative_poses(contacts, system, joints)
+    return jnp.concatenate([joints, *each(contacts, lambda one, R, p: one.followed(R, p, _STEPS_MOVED), *poses)])
+
+
+def _place_rates(system: RollingModel, q, v):
+    contacts = system.placed(q)
+    return jnp.concatenate(each(contacts, RollingContact.place_rate, *relative_motions(contacts, system, q, v)))
+
+
+@eqx.filter_jit
+def _closeness(system: RollingModel, q):
+    """Of each contact, whether it is in one point, and how far its place is off (m, rad)."""
+    contacts = system.placed(q)
+    steps = each(contacts, RollingContact.steps, *relative_poses(contacts, system, q))
+    return jnp.stack([step.is_strict for step in steps]), jnp.stack([step.left for step in steps])
+
+
+def _check_places(system: RollingModel, q, what: str, fix: str) -> None:
+    if not is_known(system, q):
+        return
+    with jax.ensure_compile_time_eval():
+        strict, left = map(np.asarray, _closeness(system, jnp.asarray(q)))
+    for contact, is_strict, off in zip(system.contacts, strict, left, strict=True):
+        if not is_strict:
+            raise ValueError(
+                f"{what}: the surfaces of contact {contact.name!r} do not touch in one point from outside (their relative "
+                f"curvature is not positive, or their normals do not face each other); choose more convex ones, or {fix}"
+            )
+        if not off <= float(np.finfo(q.dtype).eps) ** 0.4:
+            raise ValueError(
+                f"{what}: the place of contact {contact.name!r} is {off:.3g} (m or rad) from where its surfaces are next to "
+                f"each other; {fix}"
+            )
+
+
+@eqx.filter_jit
+def _searched(system: RollingModel, joints, near):
+    rotations, positions = relative_poses(system.contacts, system, joints)
+    found = []
+    for i, contact in enumerate(system.contacts):
+        R, p = rotations[i], positions[i]
+        start = _between(contact, R, p) if near is None else _given(contact, near[i])
+
+        def improved(_, place, contact=contact, R=R, p=p):
+            return contact.put(place).followed(R, p, 1)
+
+        found.append(lax.fori_loop(0, _STEPS_SEARCHED, improved, start))
+    return jnp.concatenate([joints, *found])
+
+
+def _given(contact: RollingContact, alpha):
+    return jnp.concatenate([contact.shape_a.place_of(alpha[:2]), contact.shape_b.place_of(alpha[2:4])])
+
+
+def _between(contact: RollingContact, R, p):
+    """Places on the two surfaces toward each other, found in turns."""
+    a, b = contact.shape_a, contact.shape_b
+    point = p
+    for _ in range(_TURNS):
+        place_a = a.toward(point)
+        if place_a is None:
+            break
+        place_b = b.toward(_product(R.T, a.point_at(place_a) - p))
+        if place_b is None:
+            break
+        point = _product(R, b.point_at(place_b)) + p
+    else:
+        return jnp.concatenate([place_a, place_b])
+    raise ValueError(
+        f"contact {contact.name!r} has a surface given by its parametrisation alone; give near=, coordinates next to the contact"
+    )

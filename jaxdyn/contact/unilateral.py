@@ -1,0 +1,213 @@
+"""Forces that stick, slip and let go: dry friction, and contacts that hold on one side.
+
+They are listed among the forces of a scene. `jd.simulate` follows the modes of each of them from event to event
+(`jaxdyn.simulation.hybrid`); as functions of a state alone they have no value, because at rest the force depends on what it
+has to hold.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.base import Constraint, Pfaffian
+from jaxdyn.constraints.rolling import RollingSphere
+from jaxdyn.model.arguments import as_array, pose_leaf
+from jaxdyn.systems.scene import Scene, as_pytree
+
+
+class WithModes(eqx.Module):
+    """A force that has modes: sticking or slipping, closed or open."""
+
+    name: eqx.AbstractVar[str]
+
+    def __call__(self, system, q, v, t):
+        """There is no force without a mode. **Raises:** ValueError."""
+        raise ValueError(
+            f"{type(self).__name__} {self.name!r} has modes, which jd.simulate follows; for a force that is a function of the "
+            "state take jd.CoulombFriction, and for contacts that are held on both sides constraints (jd.rolling_sphere)"
+        )
+
+
+class DryFriction(WithModes):
+    """Coulomb friction that sticks and slips: |f| <= mu_s N at rest, f = -mu N w/|w| while it slides with w.
+
+    N is a number, a function, or the size of the multiplier of one of the scene's constraints, of which the friction is then a
+    part: both are found from the same equations.
+
+    **Arguments:**
+
+    - `coefficient`: mu of sliding. `static`: mu_s of rest; None for the same.
+    - `normal`: N, in N: a number, a function normal(system, q, v, t) -> (), or the name of a constraint with one row, or of a
+      contact (its normal force).
+    - `along`: what slides: the index of a velocity, a function A(q, t) -> (nv,) or (2, nv) with w = A v, or a constraint with
+      one or two rows on the velocity, as `jd.Pfaffian(A, b)` for a belt that moves.
+    - `smoothing`: v_s, m/s: instead of modes, f = -mu N tanh(|w|/v_s) w/|w|. It never sticks, it creeps, at the velocity
+      v_s artanh(load/(mu N)) under a load below mu N; while it slides the force is within 1 % above 2.65 v_s.
+    - `name`: of its events.
+
+    **Raises:** ValueError for coefficients that are negative or a static one below the other, an index that is none, a
+    constraint that holds positions, and smoothing that is not positive.
+
+    Source: EQUATIONS section 11 and erratum E42.
+
+    ```python
+    scene = jd.Scene(system, forces=[jd.DryFriction(0.3, normal=9.81, along=0, static=0.4)])
+    ```
+    """
+
+    coefficient: Float[Array, "..."]
+    static: Float[Array, "..."]
+    normal: Any
+    constraint: str | None = eqx.field(static=True)
+    along: Constraint
+    smoothing: Float[Array, "..."] | None
+    name: str = eqx.field(static=True)
+
+    def __init__(self, coefficient, normal, along: Any = 0, *, static=None, smoothing=None, name: str = "friction"):
+        self.name = _checked_name(name, "DryFriction")
+        self.coefficient, self.static = _coefficients(coefficient, static, f"DryFriction {name!r}")
+        self.constraint = normal if isinstance(normal, str) else None
+        if isinstance(normal, str):
+            self.normal = None
+        elif callable(normal):
+            self.normal = as_pytree(normal, f"DryFriction {name!r}: normal")
+        else:
+            self.normal = jnp.asarray(as_array(normal, f"DryFriction {name!r}: normal"), float)
+        if isinstance(along, bool) or not (callable(along) or isinstance(along, (int, Constraint))):
+            raise ValueError(
+                f"DryFriction {name!r}: along is {along!r}; give an index of v, a function A(q, t) -> (nv,), or a constraint"
+            )
+        if isinstance(along, int):
+            if along < 0:
+                raise ValueError(f"DryFriction {name!r}: along is {along}; give an index of v, 0 or more")
+            self.along = _Coordinate(index=along, name=name)
+        else:
+            self.along = along if isinstance(along, Constraint) else Pfaffian(along, name=name)
+        self.smoothing = _positive(smoothing, f"DryFriction {name!r}: smoothing")
+
+
+class UnilateralContact(WithModes):
+    """A contact that pushes and does not pull, with Coulomb friction: open, or closed and sticking or slipping.
+
+    It closes by an impact without rebound: p is the least impulse, in the metric of the mass matrix, that keeps the bodies
+    from each other, and it lies in the friction cone. It opens where its normal force would have to pull.
+
+    **Arguments:**
+
+    - `contact`: a constraint with a gap and up to two rows without slip: `jd.rolling_sphere(...)`, `jd.rolling_wheel(...)`; or
+      see `ground_contact`. The gap is positive where the contact is open.
+    - `friction`: mu while it slides; `static`: mu at rest, None for the same.
+    - `name`: of its events; by default that of the constraint.
+
+    **Raises:** ValueError for what is no contact, and bad coefficients.
+    """
+
+    contact: Constraint
+    coefficient: Float[Array, "..."]
+    static: Float[Array, "..."]
+    name: str = eqx.field(static=True)
+
+    def __init__(self, contact: Any, friction=0.0, *, static=None, name: str | None = None):
+        if not (isinstance(contact, Constraint) and contact.wrench_components() is not None):
+            raise ValueError(
+                f"UnilateralContact: contact is {contact!r}; give a constraint with a gap, as jd.rolling_sphere(...), or take "
+                "jd.ground_contact(body, point, friction=0.5)"
+            )
+        self.contact = contact
+        self.name = _checked_name(contact.name if name is None else name, "UnilateralContact")
+        self.coefficient, self.static = _coefficients(friction, static, f"UnilateralContact {self.name!r}")
+
+
+def ground_contact(
+    body: str,
+    point=None,
+    friction=0.0,
+    *,
+    static=None,
+    radius=0.0,
+    plane=None,
+    plane_body=None,
+    name: str | None = None,
+) -> UnilateralContact:
+    """Contact of a point of a body, or a sphere on it, with the ground, which holds on one side.
+
+    **Arguments:**
+
+    - `body`: body or frame; `point` (3,) in it, None for its origin, m; `radius` of a sphere about the point, m, 0 for none.
+    - `friction`, `static`: see `UnilateralContact`.
+    - `plane`: pose of the ground in `plane_body` (None: the world), z its normal; by default the plane z = 0.
+
+    **Raises:** ValueError for a bad pose, radius or coefficient; when used, for unknown bodies.
+
+    ```python
+    feet = [jd.ground_contact(name, friction=0.7) for name in ("left_foot", "right_foot")]
+    solution = jd.simulate(jd.Scene(robot, forces=feet), q0, v0, ts)
+    ```
+    """
+    name = f"{body} on the ground" if name is None else name
+    size = jnp.asarray(as_array(radius, f"ground_contact {name!r}: radius"), float)
+    if size.shape != () or not (isinstance(size, Tracer) or 0 <= float(size) < np.inf):
+        raise ValueError(f"ground_contact {name!r}: radius is {radius}; give one number (m), 0 for a point")
+    touching = RollingSphere(
+        name=name,
+        body=body,
+        surface_body=plane_body,
+        pose=pose_leaf(point, f"ground_contact {name!r}: point"),
+        surface=pose_leaf(plane, f"ground_contact {name!r}: plane"),
+        radius=size,
+        surface_radius=None,
+        on="plane",
+        inside=False,
+        contact=True,
+        spin=False,
+    )
+    return UnilateralContact(touching, friction, static=static, name=name)
+
+
+def has_modes(scene: Scene) -> bool:
+    """Whether a scene lists forces that have modes."""
+    return any(isinstance(force, WithModes) for force in scene.forces)
+
+
+class _Coordinate(Constraint):
+    """One of the velocities."""
+
+    index: int = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    def slip(self, system, q, v, t):
+        if self.index >= v.shape[0]:
+            raise ValueError(f"DryFriction {self.name!r}: along is {self.index}, but the system has nv = {v.shape[0]}")
+        return v[self.index : self.index + 1]
+
+
+def _checked_name(name: Any, owner: str) -> str:
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{owner}: name is {name!r}; give a non-empty string")
+    return name
+
+
+def _coefficients(sliding: Any, static: Any, owner: str):
+    """Both as leaves."""
+    both = [
+        jnp.asarray(as_array(x, f"{owner}: coefficient"), float)
+        for x in (sliding, sliding if static is None else static)
+    ]
+    if not any(isinstance(x, Tracer) for x in both):
+        mu, mu_s = (np.asarray(x) for x in both)
+        if not (np.isfinite(mu).all() and (mu >= 0).all() and np.isfinite(mu_s).all() and (mu_s >= mu).all()):
+            raise ValueError(f"{owner}: coefficients are {mu} sliding and {mu_s} at rest; give 0 <= sliding <= static")
+    return both
+
+
+def _positive(value: Any, what: str):
+    if value is None:
+        return None
+    found = jnp.asarray(as_array(value, what), float)
+    if not isinstance(found, Tracer) and not (np.asarray(found) > 0).all():
+        raise ValueError(f"{what} is {value}; give a positive velocity (m/s), or None for friction that sticks")
+    return found

@@ -1,0 +1,120 @@
+"""Velocity and acceleration of a frame as a user measures them: of its origin, in world axes."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import run
+from jaxdyn.dynamics.kinematics import (
+    body_jacobian,
+    body_twists,
+    kinematic_part,
+    named_frame,
+    subspace_rate,
+    tree_frame,
+    twist_columns,
+)
+from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.tree import Model
+
+
+def frame_jacobian(
+    model: Model, q: Float[Array, " nq"], frame: str | None, *, axes: str = "world"
+) -> Float[Array, "6 nv"]:
+    """Jacobian of a named frame at its own origin, in the axes of the world or in its own.
+
+    **Arguments:** `q` (nq,); `frame`, one of `model.frame_names` or of `model.joint_names` (None: the world, J = 0);
+    `axes`: "world", so that J v is `frame_velocity`, or "body", which is `body_jacobian`.
+
+    **Returns:** (6, nv): linear then angular velocity, m/s and rad/s per unit of v. Its transpose maps a wrench (f, tau) at
+    the frame's origin, in those axes, to generalised forces.
+
+    **Raises:** ValueError for an unknown frame, other axes, or a q that does not fit.
+
+    Source: EQUATIONS section 2; the body Jacobian with both parts rotated into the world.
+    """
+    if axes == "body":
+        return body_jacobian(model, q, frame)
+    if axes != "world":
+        raise ValueError(f"axes is {axes!r}; choose from world, body")
+    (q,) = check_shapes(model, q=q)
+    body, offset = named_frame(model, frame)
+    if body < 0:
+        return jnp.zeros((6, model.nv), model.home.dtype)
+    return run(_jacobian, (kinematic_part(model), offset), q, static=(body,))
+
+
+def _jacobian(body: int, tree, q):
+    model, offset = tree
+    frame = tree_frame(model, q)
+    columns = twist_columns(model, frame, body, offset, frame.subspace)
+    turn = _product(frame.pose[body], offset)[:3, :3]
+    return jnp.concatenate([_product(turn, columns[:, :3].T), _product(turn, columns[:, 3:].T)])
+
+
+def frame_velocity(
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], frame: str | None
+) -> Float[Array, "6"]:
+    """Velocity of a frame's origin and angular velocity of the frame, in world axes.
+
+    **Arguments:** `q` (nq,); `v` (nv,); `frame`, one of `model.frame_names` or of `model.joint_names` (None: the world).
+
+    **Returns:** (6,), linear (m/s) then angular (rad/s).
+
+    **Raises:** ValueError for an unknown frame or shapes that do not fit.
+
+    Source: Murray, Li & Sastry (1994), section 2.4.2; EQUATIONS section 1.
+    """
+    q, v = check_shapes(model, q=q, v=v)
+    body, offset = named_frame(model, frame)
+    if body < 0:
+        return jnp.zeros((6,), model.home.dtype)
+    return run(_velocity, (kinematic_part(model), offset), q, v, static=(body,))
+
+
+def _velocity(body: int, tree, q, v):
+    model, offset = tree
+    frame = tree_frame(model, q)
+    twist, lever = body_twists(model, frame, v)[body], _product(frame.pose[body], offset)[:3, 3]
+    return jnp.concatenate([twist[:3] + cross(twist[3:], lever), twist[3:]])
+
+
+def frame_acceleration(
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"], frame: str | None
+) -> Float[Array, "6"]:
+    """Acceleration of a frame's origin and angular acceleration of the frame, in world axes: the rate of `frame_velocity`.
+
+    With the body twist V_b = (v_b, w_b) and the frame's rotation R: R (dv_b/dt + w_b x v_b) and R dw_b/dt. Gravity does not
+    enter: a body in free fall has the linear part g, an accelerometer measures R^T (this - g).
+
+    **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,), the rate of v, as `forward_dynamics` or the output "acceleration" of
+    `simulate` gives it; `frame`, one of `model.frame_names` or of `model.joint_names` (None: the world).
+
+    **Returns:** (6,), linear (m/s^2) then angular (rad/s^2).
+
+    **Raises:** ValueError for an unknown frame or shapes that do not fit.
+
+    Source: EQUATIONS section 2, the rate of R v_b.
+
+    ```python
+    hand = jd.frame_acceleration(model, q, v, jd.forward_dynamics(model, q, v, tau), "hand")
+    ```
+    """
+    q, v, a = check_shapes(model, q=q, v=v, a=a)
+    body, offset = named_frame(model, frame)
+    if body < 0:
+        return jnp.zeros((6,), model.home.dtype)
+    return run(_acceleration, (kinematic_part(model), offset), q, v, a, static=(body,))
+
+
+def _acceleration(body: int, tree, q, v, a):
+    model, offset = tree
+    frame = tree_frame(model, q)
+    twists = body_twists(model, frame, v)
+    rows = frame.subspace * a[:, None] + subspace_rate(model, frame, twists) * v[:, None]
+    # The tree's axes are the world's, and its origin is fixed: rates of the twist taken there.
+    rate = jnp.sum(twist_columns(model, frame, body, offset, rows), axis=0)
+    twist = jnp.sum(twist_columns(model, frame, body, offset, frame.subspace * v[:, None]), axis=0)
+    turn = _product(frame.pose[body], offset)[:3, :3]
+    linear = rate[:3] + cross(twist[3:], twist[:3])
+    return jnp.concatenate([_product(turn, linear[:, None])[:, 0], _product(turn, rate[3:, None])[:, 0]])

@@ -1,0 +1,125 @@
+"""Limits of joints: stops that push back, and the largest effort that actuators give."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jaxdyn.model.arguments import as_array
+from jaxdyn.model.tree import Model
+
+
+class JointStops(eqx.Module):
+    """Stops at the position limits of the model's joints, as springs with dampers that push and never pull.
+
+    Beyond a limit by x, with the velocity x' outwards, tau = -max(k x + d x', 0); else none. A joint that is driven against its
+    stop with tau comes to rest tau/k beyond it. The rate sqrt(k/M) has to be followed by the steps; with d = 2 sqrt(k M) the
+    stop does not throw the joint back.
+
+    **Arguments:** `stiffness` k (N m/rad or N/m) and `damping` d (N m s/rad or N s/m), numbers; `joints`, names of joints of one
+    coordinate, or None for all of those that have a finite limit.
+
+    **Raises:** ValueError for numbers that are not positive; (when called) for a system without joints, unknown joints, and
+    named ones that have no limit or several coordinates.
+
+    ```python
+    scene = jd.Scene(robot, forces=[jd.JointStops(1e4, 50.0)])
+    ```
+    """
+
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    joints: tuple[str, ...] | None = eqx.field(static=True)
+
+    def __init__(self, stiffness: Any = 1e4, damping: Any = 0.0, joints: Any = None):
+        self.stiffness = _number(stiffness, "JointStops: stiffness", least=0.0, strict=True)
+        self.damping = _number(damping, "JointStops: damping", least=0.0, strict=False)
+        self.joints = (joints,) if isinstance(joints, str) else joints if joints is None else tuple(joints)
+
+    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+        places = self._places(system)
+        at_q, at_v = (np.array(x, int) for x in zip(*places, strict=True)) if places else (np.zeros(0, int),) * 2
+        place, rate = q[at_q], v[at_v]
+        k, d = self.stiffness.astype(q.dtype), self.damping.astype(q.dtype)
+        total = jnp.zeros_like(v)
+        for limit, sign in ((system.lower, -1.0), (system.upper, 1.0)):
+            edge = jnp.asarray(limit, q.dtype)[at_q]
+            bounded = jnp.isfinite(edge)
+            beyond = sign * (place - jnp.where(bounded, edge, jnp.zeros_like(edge)))  # keeps inf out of the gradient
+            push = jnp.where(bounded & (beyond > 0), jnp.maximum(k * beyond + d * sign * rate, 0.0), 0.0)
+            total = total.at[at_v].add(-sign * push)
+        return total
+
+    def _places(self, system) -> list[tuple[int, int]]:
+        """Where the joints stand in q and v."""
+        if not isinstance(system, Model):
+            raise ValueError(f"JointStops: a {type(system).__name__} has no joints with limits; it takes a Model")
+        top = system.topology
+        names = top.joint_names if self.joints is None else self.joints
+        missing = [name for name in names if name not in top.joint_names]
+        if missing:
+            raise ValueError(
+                f"JointStops: joints {missing} are not in model {system.name!r}; it has {list(top.joint_names)}"
+            )
+        found = []
+        for name in names:
+            i = top.joint_names.index(name)
+            at_q, at_v = top.q_slices[i], top.v_slices[i]
+            if at_q.stop - at_q.start == 1 and at_v.stop - at_v.start == 1:
+                found.append((at_q.start, at_v.start))
+            elif self.joints is not None:
+                raise ValueError(
+                    f"JointStops: joint {name!r} is {top.kinds[i]!r}; stops are for joints of one coordinate"
+                )
+        return found
+
+
+class EffortLimits(eqx.Module):
+    """The efforts of a control, or of `jd.stepper`, cut off at the limits of the actuators: -limit <= tau <= limit.
+
+    It acts on tau, not on the scene's other forces; as a force it is zero.
+
+    **Arguments:** `limit` (N m or N), a number or one per velocity coordinate; None takes the model's `effort_limit`. Infinite
+    ones do not cut.
+
+    **Raises:** ValueError for limits that are negative; (when used) for a wrong shape, or a system without limits.
+    """
+
+    limit: Float[Array, "..."] | None
+
+    def __init__(self, limit: Any = None):
+        self.limit = None if limit is None else jnp.asarray(as_array(limit, "EffortLimits: limit"), float)
+        if self.limit is not None and not isinstance(self.limit, Tracer) and not (np.asarray(self.limit) >= 0).all():
+            raise ValueError(
+                f"EffortLimits: limit is {limit}; give limits that are not negative, or None for the model's"
+            )
+
+    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+        return jnp.zeros_like(v)
+
+    def limited(self, system: Any, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """tau cut off."""
+        limit: Any = getattr(system, "effort_limit", None) if self.limit is None else self.limit
+        if limit is None:
+            raise ValueError(f"EffortLimits: a {type(system).__name__} has no effort_limit; give the limit")
+        if jnp.shape(limit) not in ((), tau.shape):
+            raise ValueError(
+                f"EffortLimits: limit has shape {jnp.shape(limit)}, expected a number or {tau.shape} = (nv,)"
+            )
+        limit = jnp.broadcast_to(jnp.asarray(limit, tau.dtype), tau.shape)
+        return jnp.clip(tau, -limit, limit)
+
+
+def _number(value: Any, what: str, least: float, strict: bool):
+    found = jnp.asarray(as_array(value, what), float)
+    fine = isinstance(found, Tracer) or (
+        found.shape == () and np.isfinite(found) and (found > least if strict else found >= least)
+    )
+    if not fine:
+        raise ValueError(
+            f"{what} is {value}; give one {'positive number' if strict else 'number that is not negative'}"
+        )
+    return found

@@ -1,0 +1,266 @@
+"""Contact forces of a hand: those that exert a wanted wrench on the object, internal ones, and the torques that they take.
+
+The forces lam with G lam = F are  lam = G^+ F + E c:  the columns of E span the internal forces, ker G. At rest the joints
+exert them with tau = J_h^T lam, so that tau . thetadot = lam . J_h thetadot = lam . G^T V = F . V for motions on the contacts.
+
+Source: Murray, Li & Sastry (1994), sections 5.3, 5.5 and 6.3; EQUATIONS section 10.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import compiled, is_known
+from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
+from jaxdyn.constraints.dynamics import applied
+from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.contact.closure import ForceClosure
+from jaxdyn.contact.closure import force_closure as _closure
+from jaxdyn.contact.forces import ConedContact, coned_contacts
+from jaxdyn.contact.kinds import components
+from jaxdyn.contact.optimal import optimal_forces
+from jaxdyn.contact.qp import RESULTS
+from jaxdyn.dynamics.quantities import gravity_force
+from jaxdyn.grasp.contacts import Contact
+from jaxdyn.grasp.hand import Grasp, check_grasp, grasp_map, hand_jacobian
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint, check_state
+from jaxdyn.reduction.bases import orthonormal, split_directions
+
+
+class HandForces(eqx.Module):
+    """Contact forces within their cones, and the torques of the joints that exert them at rest; of `hold`.
+
+    - `contact_forces` (nc,): on the object, in the order of the grasp's rows, N and N m.
+    - `torques` (nh,): J_h^T times them, of the joints in the order of `grasp.hand_velocities`, without the weight of the
+      fingers; N m or N.
+    - `result`: one of `jaxdyn.contact.RESULTS`; `infeasible` where no forces in the cones exert the wrench.
+    - `layout`: name and place of each contact's rows.
+    """
+
+    contact_forces: Float[Array, " nc"]
+    torques: Float[Array, " nh"]
+    result: Any
+    layout: tuple[Layout, ...] = eqx.field(static=True)
+
+    @property
+    def success(self):
+        """Whether `result` is successful."""
+        return self.result == RESULTS.successful
+
+    def by_contact(self) -> dict[str, Array]:
+        """Forces of each contact on the object, by its name."""
+        return {place.name: self.contact_forces[..., place.start : place.end] for place in self.layout}
+
+
+def internal_force_basis(
+    grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0, *, reference: Float[Array, "nc ni"] | None = None
+) -> Float[Array, "nc ni"]:
+    """Orthonormal basis E (nc, ni) of the internal forces: G E = 0.
+
+    **Arguments:**
+
+    - `q` (nq,); `t`, s.
+    - `reference` (nc, ni): a basis of a place nearby, of which this is the smooth continuation, E = P R T^-1 with
+      P = 1 - G^+ G and T the Cholesky factor of R^T P R. By default a basis of this place, arbitrary and constant under
+      differentiation; where q is traced it has as many columns as for a G of full rank.
+
+    **Raises:** ValueError for a reference of another shape.
+
+    Source: Murray, Li & Sastry (1994), definition 5.4; EQUATIONS section 10.
+    """
+    G = grasp_map(grasp, q, t)
+    inverse = pseudo_inverse(G, tolerance(None, G))
+    if reference is None:
+        known = is_known(grasp, q, t)
+        rank = int(jnp.round(jnp.sum(inverse * G.T))) if known else min(G.shape)
+        return split_directions(jnp.eye(G.shape[1], dtype=G.dtype) - _product(inverse, G))[:, rank:]
+    reference = jnp.asarray(as_array(reference, "reference", G.dtype))
+    if reference.ndim != 2 or reference.shape[0] != G.shape[1]:
+        raise ValueError(
+            f"reference has shape {reference.shape}, expected ({G.shape[1]}, ni); take internal_force_basis(grasp, q)"
+        )
+    return orthonormal(reference - _product(inverse, _product(G, reference)))[0] if reference.shape[1] else reference
+
+
+def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
+    """Contact forces that press with 1 N along every normal, (nc,).
+
+    **Raises:** ValueError for a constraint of the grasp that has no normal force.
+    """
+    check_grasp(grasp)
+    found = np.zeros(layout(grasp)[-1].end)
+    for constraint, place in zip(grasp.constraints, layout(grasp), strict=True):
+        order = constraint.wrench_components()
+        if order is None:
+            raise ValueError(f"constraint {place.name!r} is a {type(constraint).__name__} without a normal force")
+        if isinstance(constraint, Contact):
+            normal = components(constraint.kind, constraint.in_plane, place.name).index(2)
+        else:
+            normal = {1: 0, 2: 1}.get(len(order), 2)
+        found[place.start + order[normal]] = 1.0
+    return found
+
+
+def forces_for_wrench(
+    grasp: Grasp, q: Float[Array, " nq"], wrench: Float[Array, " no"], preload: Any = 0.0, t: Any = 0.0
+) -> Float[Array, " nc"]:
+    """Contact forces lam = G^+ F + (1 - G^+ G) lam_0 that exert the wrench F on the object, with a chosen internal force.
+
+    **Arguments:**
+
+    - `wrench` F (no,): on the object, in its own axes for a free body; N and N m. Of a wrench that the contacts cannot
+      exert the nearest one.
+    - `preload` lam_0: a number (N), with which every contact presses, or forces (nc,), of either the internal part.
+      Pressing is internal by itself where the normals balance, as those of an antipodal grasp.
+
+    **Raises:** ValueError for shapes that do not fit, and for a number with constraints that have no normal force.
+
+    Cones are not looked at: `hold` finds forces within them.
+
+    Source: Murray, Li & Sastry (1994), section 6.3, eq. 6.25; EQUATIONS section 10.
+    """
+    G = grasp_map(grasp, q, t)
+    wrench = as_array(wrench, "wrench", G.dtype)
+    if wrench.shape != G.shape[:1]:
+        raise ValueError(f"wrench has shape {wrench.shape}, expected {G.shape[:1]}{batch_hint(wrench, (1,))}")
+    return split_forces(G, wrench, as_preload(grasp, preload, G.dtype))
+
+
+def split_forces(G: Float[Array, "no nc"], wrench, preload) -> Float[Array, " nc"]:
+    """G^+ F + (1 - G^+ G) lam_0."""
+    return preload + _product(pseudo_inverse(G, tolerance(None, G)), wrench - _product(G, preload))
+
+
+def as_preload(grasp: Grasp, preload: Any, dtype) -> Float[Array, " nc"]:
+    """Contact forces (nc,) from a number, with which contacts press, or from forces. **Raises:** ValueError."""
+    preload, count = as_array(preload, "preload", dtype), layout(grasp)[-1].end
+    if preload.ndim == 0:
+        if is_known(preload) and float(preload) == 0:
+            return jnp.zeros((count,), dtype)
+        return preload * jnp.asarray(normal_forces(grasp), dtype)
+    if preload.shape != (count,):
+        raise ValueError(
+            f"preload has shape {preload.shape}; give a number (N), or ({count},), one per row of the grasp"
+            f"{batch_hint(preload, (1,))}"
+        )
+    return preload
+
+
+def hold(
+    grasp: Grasp,
+    q: Float[Array, " nq"],
+    wrench: Float[Array, " no"] | None = None,
+    *,
+    cones: Any = None,
+    preload: Any = 0.0,
+    t: Any = 0.0,
+) -> HandForces:
+    """Least contact forces within their cones that exert a wrench on the object, and the torques for them at rest.
+
+    A second-order cone program (`jd.contact.optimal_forces`): batched by `jax.vmap`, and differentiable in q, the
+    grasp's leaves, coefficients of friction and the wrench.
+
+    **Arguments:**
+
+    - `q` (nq,), on the contacts; `t`, s.
+    - `wrench` (no,): to be exerted by the contacts, N and N m. By default what holds the object still: the opposite of its
+      weight and of the grasp's forces on it.
+    - `cones`: as in `jd.grasp.contact_forces`, by default those of the grasp; every contact has to have one.
+    - `preload`: N, least margin of every contact from its cone.
+
+    **Returns:** `HandForces`.
+
+    **Raises:** ValueError for shapes that do not fit and for contacts without a cone.
+
+    ```python
+    found = jd.grasp.hold(grasp, q, preload=0.5)
+    found.torques, found.by_contact()
+    ```
+
+    Source: Murray, Li & Sastry (1994), section 5.3; Boyd & Wegbreit (2007).
+    """
+    check_grasp(grasp)
+    q, t = check_state(grasp.system, q=q, t=t)
+    contacts = _every_cone(grasp, cones)
+    if wrench is not None:
+        wrench = jnp.asarray(as_array(wrench, "wrench", q.dtype))
+        if wrench.shape != (len(grasp.object_velocities),):
+            raise ValueError(
+                f"wrench has shape {wrench.shape}, expected {(len(grasp.object_velocities),)}{batch_hint(wrench, (1,))}"
+            )
+    A, weight = _static(grasp, q, t)
+    order = np.concatenate([contact.rows for contact in contacts])
+    wrench = weight if wrench is None else wrench
+    G = A[:, np.array(grasp.object_velocities, int)].T
+    found = optimal_forces(G[:, order], wrench, [contact.cone for contact in contacts], preload=preload)
+    forces = jnp.zeros((A.shape[0],), A.dtype).at[order].set(found.x)
+    torques = -_product(A[:, np.array(grasp.hand_velocities, int)].T, forces)
+    return HandForces(forces, torques, found.result, layout(grasp))
+
+
+@compiled
+def _static(grasp: Grasp, q, t):
+    """The rows, and what holds the object still."""
+    still = jnp.zeros((grasp.nv,), q.dtype)
+    force = gravity_force(grasp.system, q, t) - applied(grasp, q, still, still, t)
+    return constraint_jacobian(grasp, q, t), force[np.array(grasp.object_velocities, int)]
+
+
+def force_closure(
+    grasp: Grasp, q: Float[Array, " nq"], *, cones: Any = None, t: Any = 0.0, required: bool = False
+) -> ForceClosure:
+    """Whether the contacts of the grasp can resist every wrench on the object; see `jd.contact.force_closure`.
+
+    **Arguments:** `q` (nq,), known numbers; `cones` as in `hold`. `required`: refuse a grasp without force closure.
+
+    **Returns:** `ForceClosure`, its forces in the order of the grasp's rows.
+
+    **Raises:** ValueError for contacts without a cone and, where it is `required`, for a grasp without force closure, with a
+    wrench that it cannot resist.
+
+    Source: Murray, Li & Sastry (1994), proposition 5.3.
+    """
+    check_grasp(grasp)
+    contacts = _every_cone(grasp, cones)
+    order = np.concatenate([contact.rows for contact in contacts])
+    found = _closure(grasp_map(grasp, q, t)[:, order], [contact.cone for contact in contacts])
+    if required and not found.closed:
+        raise ValueError(
+            f"the contacts {[contact.name for contact in contacts]} on {grasp.object!r} have no force closure: the wrench "
+            f"{np.round(found.direction, 6).tolist()} on the object cannot be resisted; add contacts or friction, or place them "
+            "elsewhere"
+        )
+    forces = np.zeros(order.size)
+    forces[order] = found.forces
+    return ForceClosure(found.closed, found.margin, forces, found.direction, found.rank)
+
+
+def joint_torques(grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Any = 0.0) -> Float[Array, " nh"]:
+    """J_h^T lam (nh,): torques of the joints that exert the contact forces lam (nc,) at rest, without the fingers' weight.
+
+    Source: Murray, Li & Sastry (1994), eq. 5.31; EQUATIONS section 10.
+    """
+    Jh = hand_jacobian(grasp, q, t)
+    lam = as_array(lam, "lam", Jh.dtype)
+    if lam.shape != Jh.shape[:1]:
+        raise ValueError(f"lam has shape {lam.shape}, expected {Jh.shape[:1]}{batch_hint(lam, (1,))}")
+    return _product(Jh.T, lam)
+
+
+def _every_cone(grasp: Grasp, cones) -> tuple[ConedContact, ...]:
+    """The contacts with their cones. **Raises:** ValueError where there is one without."""
+    names = [place.name for place in layout(grasp)]
+    if cones is None and grasp.cones is None:
+        raise ValueError(
+            f"the contacts {names} have no cones; give cones, as in jd.contact.friction_cone('hard-finger', mu=0.8), here "
+            "or to the Grasp"
+        )
+    found = coned_contacts(grasp, cones)
+    missing = [name for name in names if name not in {contact.name for contact in found}]
+    if missing:
+        raise ValueError(f"contacts {missing} have no cone; give one for every contact of {names}")
+    return found

@@ -1,0 +1,128 @@
+"""How well a hand moves its object, and how hard it pushes it: ellipsoids of object velocities and of wrenches.
+
+Joint velocities thetadot = X w, X = J_h^+ G^T H, are the shortest ones that give the object the velocity V = H w. Those with
+|thetadot| <= 1 give the velocities of an ellipsoid whose semi-axes are 1 / sigma_i(X); torques with |tau| <= 1 give the
+wrenches X^T tau of one with the semi-axes sigma_i(X) in the same directions: the same principal directions are fast and weak.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxdyn.compile import compiled, is_concrete
+from jaxdyn.constraints.base import constraint_jacobian
+from jaxdyn.grasp.hand import Grasp, check_grasp
+from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, check_state
+from jaxdyn.reduction.bases import least_quality, orthonormal
+
+
+class Manipulability(eqx.Module):
+    """Ellipsoids of the object's velocities and of wrenches on it, and what they say in one number.
+
+    Angular velocities count `length` times, so that all is in m/s and N per unit of joint velocity and torque.
+
+    - `velocity_axes` (nw,): semi-axes of the ellipsoid of object velocities for |thetadot| <= 1, longest first; infinite
+      for a motion of the object that the fingers need not follow. `force_axes` (nw,): their inverses, of the
+      ellipsoid of wrenches for |tau| <= 1.
+    - `directions` (no, nw): twists of the object along them, of unit length as they are counted; constants.
+    - `sigma_min` (): least velocity axis. `isotropy` (): least over largest, 1 for a sphere. `volume` (): product of the velocity
+      axes, Yoshikawa's measure.
+    - `grasp_axes` (no,): semi-axes of the wrenches G lam for |lam| <= 1, the singular values of G, longest first.
+      `grasp_isotropy` (): least over largest.
+    - `is_manipulable` (): whether the fingers can follow every velocity of the object.
+    """
+
+    velocity_axes: Float[Array, " nw"]
+    force_axes: Float[Array, " nw"]
+    directions: Float[Array, "no nw"]
+    sigma_min: Float[Array, ""]
+    isotropy: Float[Array, ""]
+    volume: Float[Array, ""]
+    grasp_axes: Float[Array, " no"]
+    grasp_isotropy: Float[Array, ""]
+    is_manipulable: Bool[Array, ""]
+
+
+def manipulability(
+    grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0, *, length: Any = 1.0, motions: HandMotions | None = None
+) -> Manipulability:
+    """Velocity and force ellipsoids of the object in the hand (see `Manipulability`).
+
+    First derivatives of the axes are right; where two are equal, of a mean of both. Second ones and those of the directions
+    are not given.
+
+    **Arguments:**
+
+    - `q` (nq,), on the contacts; `t`, s.
+    - `length` (): m, positive: 1 rad/s about an axis of a planar or free object counts as `length` m/s, so that axes can be
+      compared; its size, say. Without it the measure depends on the unit of length.
+    - `motions`: as in `hand_dynamics`; to be given where q is traced and J_h is not of full rank.
+
+    **Returns:** `Manipulability`.
+
+    **Raises:** ValueError for a length that is not positive, for shapes that do not fit, and for a hand whose object cannot
+    move at all.
+
+    Source: Yoshikawa (1985); Murray, Li & Sastry (1994), sections 5.5 and 5.6 (definition 5.6 of manipulable grasps).
+    """
+    check_grasp(grasp)
+    q, t = check_state(grasp.system, q=q, t=t)
+    length = as_array(length, "length", q.dtype)
+    if length.shape != () or (is_concrete(length) and not 0 < float(length) < float("inf")):
+        raise ValueError(f"length is {length}; give one positive number (m)")
+    motions = hand_motions(grasp, q, t) if motions is None else motions
+    if not motions.object.shape[1]:
+        raise ValueError(
+            f"the fingers cannot follow any velocity of {grasp.object!r} here, so there is nothing to measure"
+        )
+    return _measured(grasp, motions, q, length, t)
+
+
+@compiled
+def _measured(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability:
+    hands, objects = velocity_rows(grasp)
+    N = motions.at(grasp, q, t).N[:, : motions.object.shape[1]]
+    scale = _scale(grasp, length)
+    H = scale[:, None] * N[objects]
+    along, _, factor = orthonormal(H)
+    # thetadot for the columns of `along`: N_hands times T^-T of H = along T^T.
+    X = jnp.linalg.solve(factor, N[hands].T).T
+    force_axes, vectors = _axes(X)
+    force_axes, vectors = force_axes[::-1], vectors[:, ::-1]
+    some = force_axes > least_quality(q.dtype) ** 1.5 * force_axes[-1]
+    velocity_axes = jnp.where(some, 1 / jnp.where(some, force_axes, jnp.ones_like(force_axes)), jnp.inf)
+    G = constraint_jacobian(grasp, q, t)[:, objects].T / scale[:, None]
+    wrenches = _axes(G.T)[0]
+    return Manipulability(
+        velocity_axes=velocity_axes,
+        force_axes=force_axes,
+        directions=lax.stop_gradient(_product(along, vectors) / scale[:, None]),
+        sigma_min=velocity_axes[-1],
+        isotropy=force_axes[0] / force_axes[-1],
+        volume=jnp.prod(velocity_axes),
+        grasp_axes=wrenches,
+        grasp_isotropy=wrenches[-1] / wrenches[0],
+        is_manipulable=jnp.asarray(motions.object.shape[1] == objects.size),
+    )
+
+
+def _axes(X: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
+    """Singular values of X, largest first, and the right vectors, constants: |X v_i| has the right first derivative."""
+    vectors = lax.stop_gradient(jnp.linalg.svd(lax.stop_gradient(X))[2]).T
+    square = jnp.sum(_product(X, vectors) ** 2, 0)
+    some = square > 0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, square, jnp.ones_like(square))), jnp.zeros_like(square)), vectors
+
+
+def _scale(grasp: Grasp, length) -> Float[Array, " no"]:
+    """What a unit of each velocity of the object counts."""
+    top = grasp.system.topology
+    kind = top.kinds[top.body_names.index(grasp.object)]
+    one = jnp.ones_like(length)
+    turns = {"free": (0, 0, 0, 1, 1, 1), "planar": (0, 0, 1)}.get(kind, (0,) * len(grasp.object_velocities))
+    return jnp.stack([length if turn else one for turn in turns])

@@ -1,0 +1,160 @@
+"""What a hand can do with its object: object velocities that the fingers follow, and internal motions of the hand.
+
+The contacts ask for J_h thetadot = G^T V. With a hand Jacobian of any shape and rank the velocities that satisfy this are
+
+    V = H w,    thetadot = J_h^+ G^T H w + K u,
+
+where the columns of H span the object velocities V with G^T V in the range of J_h, all of them where the grasp is
+manipulable, and those of K the kernel of J_h: motions of redundant fingers that leave their tips where they are.
+
+Source: Murray, Li & Sastry (1994), section 6.3 (redundant hands by an internal motion beside the object's, hands that are not
+manipulable by a basis of the motions that they allow); EQUATIONS section 10.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import compiled, is_known
+from jaxdyn.constraints.base import constraint_jacobian, layout
+from jaxdyn.constraints.rank import eps_of, pseudo_inverse, tolerance
+from jaxdyn.grasp.hand import Grasp, check_grasp
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_state
+from jaxdyn.reduction.bases import Basis, Parametrization, orthonormal, split_directions
+
+
+class HandMotions(Basis):
+    """The basis N of velocities nu = (w, u) of a grasp, from references at one place; made by `hand_motions`.
+
+    - `object` (no, nw): reference R_o of H = P R_o T^-1, with P = 1 - B^+ B, B = (1 - J_h J_h^+) G^T, and T the Cholesky
+      factor of R_o^T P R_o. With nw = no it is H itself, the same at every place.
+    - `internal` (nh, nk): reference R_i of K, in the same way of 1 - J_h^+ J_h.
+
+    H and K are as smooth as J_h and G wherever their ranks are constant: no signs or pivots are chosen on the way. It is a
+    basis for `jd.reduced_dynamics` and, around the place of its references, for `jd.Reduced`.
+    """
+
+    object: Float[Array, "no nw"]
+    internal: Float[Array, "nh nk"]
+
+    def size(self, scene):
+        """nw + nk."""
+        return self.object.shape[1] + self.internal.shape[1]
+
+    def at(self, scene, q, t):
+        """N (nv, nw + nk): H in the rows of the object, (J_h^+ G^T H, K) in those of the joints."""
+        hands, objects = velocity_rows(scene)
+        A = constraint_jacobian(scene, q, t)
+        Jh, seen = -A[:, hands], A[:, objects]
+        rank = hands.size - self.internal.shape[1]
+        inverse = pseudo_inverse(Jh, tolerance(None, Jh), rank < min(Jh.shape))
+        H, pivot, fits = self._object(A, Jh, seen, inverse)
+        N = jnp.zeros((scene.nv, self.size(scene)), A.dtype)
+        N = N.at[objects, : H.shape[1]].set(H)
+        N = N.at[hands, : H.shape[1]].set(_product(inverse, _product(seen, H)))
+        if self.internal.shape[1]:
+            reference = self.internal.astype(A.dtype)
+            K, least, _ = orthonormal(reference - _product(inverse, _product(Jh, reference)))
+            N = N.at[hands, H.shape[1] :].set(K)
+            pivot = jnp.minimum(pivot, least)
+        fits = fits & (jnp.round(jnp.sum(inverse * Jh.T)) == rank)
+        size = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
+        size = jnp.where(size > 0, size, jnp.ones_like(size))
+        good = fits & jnp.isfinite(pivot)
+        return Parametrization(N, jnp.zeros((scene.nv,), A.dtype), jnp.where(good, pivot / size, jnp.zeros_like(size)))
+
+    def _object(self, A, Jh, seen, inverse):
+        """H, its least pivot, and whether it has as many columns as the object has velocities to follow."""
+        reference = self.object.astype(A.dtype)
+        lost = seen - _product(Jh, _product(inverse, seen))
+        if reference.shape[0] == reference.shape[1]:
+            whole = jnp.max(jnp.abs(lost), initial=0.0) <= _negligible(A) * jnp.max(jnp.abs(A))
+            return reference, jnp.ones((), A.dtype), whole
+        across = pseudo_inverse(lost, tolerance(None, lost), True)
+        fits = jnp.round(jnp.sum(across * lost.T)) == reference.shape[0] - reference.shape[1]
+        if not reference.shape[1]:
+            return reference, jnp.ones((), A.dtype), fits
+        H, pivot, _ = orthonormal(reference - _product(across, _product(lost, reference)))
+        return H, pivot, fits
+
+    def advice(self, scene, q, t):
+        """The basis of this place."""
+        return "take jd.grasp.hand_motions(grasp, q) for it"
+
+
+def hand_motions(
+    grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0, *, sizes: tuple[int, int] | None = None
+) -> HandMotions:
+    """Bases of the object velocities that the fingers can follow and of the hand's internal motions, at q.
+
+    With units of V and thetadot taken as they are (m/s beside rad/s), the columns are orthonormal. Where the grasp is
+    manipulable H = 1, so that w is the object's velocity V. Which basis it is is arbitrary otherwise; it is constant under
+    differentiation and continued smoothly to other places by `HandMotions`.
+
+    **Arguments:**
+
+    - `q` (nq,), on the contacts; `t`, s.
+    - `sizes`: (nw, nk), numbers of columns of H and K. By default those of the ranks at q where q is known; where it is
+      traced those of a J_h of full rank.
+
+    **Returns:** `HandMotions`: `.object` (no, nw), `.internal` (nh, nk).
+
+    **Raises:** ValueError where neither the object nor the hand can move, and for sizes that are not possible.
+
+    ```python
+    motions = jd.grasp.hand_motions(grasp, q)
+    found = jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions)
+    ```
+
+    Source: Murray, Li & Sastry (1994), section 6.3; EQUATIONS section 10.
+    """
+    check_grasp(grasp)
+    q, t = check_state(grasp.system, q=q, t=t)
+    nh, no = len(grasp.hand_velocities), len(grasp.object_velocities)
+    on_object, on_hand, ranks = _projections(grasp, q, t)
+    count = layout(grasp)[-1].end
+    if sizes is None:
+        if is_known(grasp, q, t):
+            sizes = no - int(ranks[0]), nh - int(ranks[1])
+        else:
+            rank = min(count, nh)
+            sizes = max(no - (count - rank), 0), nh - rank
+    nw, nk = sizes
+    if not (0 <= nw <= no and 0 <= nk <= nh):
+        raise ValueError(f"sizes is {sizes}; give (nw, nk) with nw from 0 to {no} and nk from 0 to {nh}")
+    if nw + nk == 0:
+        raise ValueError(
+            f"the contacts leave neither the object {grasp.object!r} nor the hand any motion here; take contacts with fewer "
+            "rows, or give sizes=(nw, nk) where q is traced"
+        )
+    whole = jnp.eye(no, dtype=q.dtype) if nw == no else split_directions(on_object)[:, no - nw :]
+    return HandMotions(whole, split_directions(on_hand)[:, nh - nk :])
+
+
+def velocity_rows(grasp: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Indices in v of the joints' velocities and of the object's."""
+    return np.array(grasp.hand_velocities, int), np.array(grasp.object_velocities, int)
+
+
+@compiled
+def _projections(grasp: Grasp, q, t):
+    """1 - B^+ B and 1 - J_h^+ J_h, and the ranks of B and J_h."""
+    hands, objects = velocity_rows(grasp)
+    A = constraint_jacobian(grasp, q, t)
+    Jh, seen = -A[:, hands], A[:, objects]
+    inverse = pseudo_inverse(Jh, tolerance(None, Jh), True)
+    lost = seen - _product(Jh, _product(inverse, seen))
+    # Rounding is not a direction that the fingers cannot follow.
+    lost = jnp.where(jnp.abs(lost) <= _negligible(A) * jnp.max(jnp.abs(A)), jnp.zeros_like(lost), lost)
+    across = pseudo_inverse(lost, tolerance(None, lost), True)
+    on_object = jnp.eye(objects.size, dtype=A.dtype) - _product(across, lost)
+    on_hand = jnp.eye(hands.size, dtype=A.dtype) - _product(inverse, Jh)
+    return on_object, on_hand, (jnp.round(jnp.sum(across * lost.T)), jnp.round(jnp.sum(inverse * Jh.T)))
+
+
+def _negligible(like) -> float:
+    """Relative size of an entry that is rounding."""
+    return eps_of(like) ** 0.6

@@ -1,0 +1,208 @@
+"""Drawings and animations with matplotlib: no browser, no display and no meshes needed."""
+
+import os
+import shutil
+from typing import Any
+
+import numpy as np
+
+from jaxdyn.model.arguments import as_path
+from jaxdyn.pictures.inferred import place_of
+from jaxdyn.pictures.motion import Motion, forces, joint_axes, marks, motion_of
+from jaxdyn.pictures.solids import simplified
+from jaxdyn.pictures.stage import AXIS, FORCE, LOOP, TORQUE, Stage, all_solids, color_of, stage_of
+
+_MOST_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
+_LIGHT = np.array([0.4, -0.5, 0.77])
+
+
+def draw(scene, q, ax=None, *, shapes=None) -> Any:
+    """Draw a mechanism at a configuration: its bodies, joints with their axes, loops and contacts.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` or `Model`.
+    - `q` (nq,): the configuration.
+    - `ax`: matplotlib axes of projection "3d" to draw into; None makes a figure of its own.
+    - `shapes`: solids to show, of `jd.shapes(path)`; None draws rods between joints and solids of the bodies' inertias.
+
+    **Returns:** the axes, in m, axes of the world; `ax.figure.savefig(path)` writes the picture. Blue lines are axes
+    of joints, orange circles loops and contacts, dashed lines distances.
+
+    **Raises:** ValueError for a system without bodies, a q that does not fit, and axes that are not 3D. ImportError without
+    matplotlib.
+
+    ```python
+    jd.draw(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0]).figure.savefig("four_bar.png")
+    ```
+    """
+    motion = motion_of(scene, q)
+    picture = _Picture(motion, shapes, ax)
+    picture.show(0)
+    return picture.ax
+
+
+def animate(scene, solution, path: str | os.PathLike, *, fps: int = 25, speed: float = 1.0, shapes=None) -> None:
+    """Write a motion as an animated picture: GIF (by pillow, which matplotlib brings) or MP4 (by ffmpeg, where installed).
+
+    **Arguments:** `scene`; `solution`, what `jd.simulate` returned, batched or not (at most four motions are drawn); `path`, a
+    file .gif or .mp4; `fps`, pictures a second; `speed`, seconds of motion a second; `shapes` as in `draw`.
+
+    **Raises:** ValueError for another kind of file, MP4 without ffmpeg, numbers that are not positive, systems
+    without bodies. ImportError without matplotlib.
+
+    ```python
+    scene = jd.scenes.four_bar()
+    turn = jd.simulate(scene, *jd.scenes.four_bar.start(), jnp.linspace(0.0, 2.0, 51))
+    jd.animate(scene, turn, "four_bar.gif")
+    ```
+    """
+    path = as_path(path)
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise ValueError(f"path is {str(path)!r}; write to a file .gif or .mp4")
+    if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
+        raise ValueError(f"path is {str(path)!r}, but there is no ffmpeg; install it, or write a .gif")
+    if not (fps > 0 and speed > 0):
+        raise ValueError(f"fps is {fps}, speed is {speed}; give positive numbers")
+    if not path.parent.is_dir():
+        raise ValueError(f"path is {str(path)!r}: there is no directory {path.parent}")
+    _matplotlib()
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    duration = float(np.ptp(np.asarray(solution.ts))) if hasattr(solution, "ts") else 0.0
+    motion = motion_of(scene, solution, rows=max(2, round(duration / speed * fps) + 1), most=4)
+    picture = _Picture(motion, shapes, None)
+    writer = (PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter)(fps=fps)
+    figure = picture.ax.figure
+    # A margin that fits one picture need not fit the next: the layout is settled once.
+    figure.set_layout_engine("none")
+    with writer.saving(figure, str(path), dpi=80):
+        for k in range(len(motion.ts)):
+            picture.show(k)
+            picture.ax.set_title(f"{motion.ts[k]:.2f} s", fontsize=9, color="0.3")
+            writer.grab_frame()
+
+
+def _matplotlib() -> None:
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise ImportError("drawings need matplotlib: pip install jaxdyn[plot]") from error
+
+
+class _Picture:
+    """A mechanism in 3D axes, which can be shown at each row of its motion."""
+
+    def __init__(self, motion: Motion, shapes, ax):
+        _matplotlib()
+        self.motion = motion
+        parts = all_solids(motion, shapes)
+        self.stage = stage_of(motion, parts)
+        self.ax = _axes(ax)
+        model = motion.scene.system
+        self.solids = []
+        for shape in parts:
+            vertices, faces = simplified(*shape.triangles(), _MOST_VERTICES)
+            self.solids.append((shape.frame, vertices, faces, np.array(color_of(shape, model)), shape.opacity))
+        self.axes, self.marks, self.forces = joint_axes(motion), marks(motion), forces(motion)
+        self.drawn: list = []
+        _set_stage(self.ax, self.stage)
+
+    def show(self, row: int) -> None:
+        """Draw one row in the place of what was there."""
+        from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+        for artist in self.drawn:
+            artist.remove()
+        self.drawn = []
+        ax, size, model = self.ax, self.stage.size, self.motion.scene.system
+        corners, colors = [], []
+        for n in range(len(self.motion.q)):
+            ghost = 0.3 if n else 1.0
+            for frame, vertices, faces, color, opacity in self.solids:
+                pose = place_of(model, self.motion.poses[n, row], frame)
+                sides = (vertices @ pose[:3, :3].T + pose[:3, 3])[faces]
+                normals = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])
+                lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+                light = 0.78 + 0.24 * (normals / np.where(lengths > 0, lengths, 1.0)) @ _LIGHT
+                corners.append(sides)
+                shaded = np.clip(light[:, None] * color, 0, 1)
+                colors.append(np.concatenate([shaded, np.full((len(faces), 1), opacity * ghost)], axis=1))
+        if corners:
+            # One collection for all: depth is then sorted by triangles and not by bodies.
+            shades = np.concatenate(colors)
+            # Edges in the colour of their face close the seams that smoothing leaves between faces.
+            faces = Poly3DCollection(np.concatenate(corners), facecolors=shades, edgecolors=shades, linewidths=0.3)
+            self.drawn.append(ax.add_collection3d(faces))
+        self._lines(row, 0.06 * size)
+        self._arrows(row, 0.25 * size)
+
+    def _lines(self, row: int, length: float) -> None:
+        for _, _, place, axis in self.axes:
+            if axis is not None:
+                ends = np.stack([place[0, row] - length * axis[0, row], place[0, row] + length * axis[0, row]])
+                self.drawn += self.ax.plot(*ends.T, color=AXIS, linewidth=1.1, alpha=0.8)
+        for mark in self.marks:
+            ends = np.stack([mark.a[0, row], mark.b[0, row]])
+            style: dict = dict(linestyle="--", linewidth=1.2) if mark.kind == "distance" else dict(linestyle="none")
+            self.drawn += self.ax.plot(
+                *ends.T, color=LOOP, marker="o", markersize=6, markerfacecolor="none", zorder=10, **style
+            )
+
+    def _arrows(self, row: int, length: float) -> None:
+        for force, scale in scaled(self.forces, length):
+            at, vector = force.places[0, row], force.vectors[0, row] * scale
+            color = FORCE if force.kind == "force" else TORQUE
+            self.drawn.append(self.ax.quiver(*at, *vector, color=color, linewidth=1.6, arrow_length_ratio=0.2))
+
+
+def scaled(found, length: float):
+    """Each force with the factor (m/N or m/(N m)) that gives the largest of its kind the length (m)."""
+    for kind in ("force", "torque"):
+        members = [force for force in found if force.kind == kind]
+        largest = max((float(np.linalg.norm(force.vectors, axis=-1).max()) for force in members), default=0.0)
+        yield from ((force, length / largest) for force in members)
+
+
+def _axes(ax) -> Any:
+    if ax is None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(5.2, 4.6), dpi=110, layout="constrained")
+        FigureCanvasAgg(figure)
+        return figure.add_subplot(projection="3d")
+    if getattr(ax, "name", "") != "3d":
+        raise ValueError(
+            f"ax is {type(ax).__name__}; give axes of projection '3d': figure.add_subplot(projection='3d')"
+        )
+    return ax
+
+
+def _set_stage(ax, stage: Stage) -> None:
+    """Equal scales, the ground as a grid, and the view."""
+    extent = np.maximum(stage.high - stage.low, 0.12 * stage.size)
+    low, high = stage.centre - 0.53 * extent, stage.centre + 0.53 * extent
+    axis = int(np.argmax(np.abs(stage.up)))
+    if stage.up[axis] > 0:
+        low[axis] = min(low[axis], stage.ground)
+    else:
+        high[axis] = max(high[axis], -stage.ground)
+    # matplotlib's angles are about the axis that it calls vertical, the other two in cyclic order.
+    vertical = "xyz"[axis]
+    a, b = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+    elevation = np.rad2deg(np.arcsin(np.clip(stage.eye @ np.eye(3)[axis], -1, 1)))
+    azimuth = np.rad2deg(np.arctan2(stage.eye @ b, stage.eye @ a))
+    roll = 0.0 if stage.up[axis] > 0 else 180.0
+    ax.view_init(elevation, azimuth, roll, vertical_axis=vertical)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    ax.set_box_aspect(high - low, zoom=1.1)  # after the vertical axis is set, by which matplotlib turns the numbers
+    for pane in (ax.xaxis, ax.yaxis, ax.zaxis):
+        pane.set_pane_color((1.0, 1.0, 1.0, 0.0))
+    for name, length in zip("xyz", high - low, strict=True):
+        if length < 0.25 * (high - low).max():  # numbers along a short axis would lie on top of each other
+            getattr(ax, f"set_{name}ticks")([])
+            continue
+        getattr(ax, f"set_{name}label")(f"{name} (m)", fontsize=8)
+        ax.tick_params(axis=name, labelsize=7)
+        ax.locator_params(axis=name, nbins=5)

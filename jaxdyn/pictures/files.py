@@ -1,0 +1,201 @@
+"""The solids that URDF, MJCF and SDF files show, each on the frame that the loaders of `jaxdyn.io` give its link.
+
+URDF and SDF: the elements <visual>. MJCF: the geoms of groups 0 to 2, which MuJoCo shows, but planes and height fields.
+A file that is missing or cannot be read is named in a warning; the body then gets the solid of its inertia.
+"""
+
+import os
+import pathlib
+import warnings
+from typing import Any
+
+import numpy as np
+
+from jaxdyn.io.loaded import NotTakenWarning
+from jaxdyn.io.mjcf_file import compiled, library, named, pose_of
+from jaxdyn.io.sdf_frames import SdfFile
+from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import as_path
+from jaxdyn.pictures.meshes import MeshError, find_mesh, read_mesh
+from jaxdyn.pictures.solids import Shape, Shapes
+
+_MJCF_KINDS = {2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}  # mjtGeom
+_SHOWN_GROUPS = 3
+_DEFAULT_GREY = (0.5, 0.5, 0.5, 1.0)  # of a geom without a colour
+
+
+def shapes(path: str | os.PathLike) -> Shapes:
+    """The solids that a URDF, MJCF or SDF file shows, for `jd.view`, `jd.save_html` and `jd.draw`.
+
+    A model holds no geometry; what is drawn is read from the file again and kept beside it. Meshes are STL, DAE, OBJ, PLY or
+    GLB files, looked for at the path that the file gives, `package://` and `model://` in the folders above the file and
+    in those of ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and GZ_SIM_RESOURCE_PATH.
+
+    **Arguments:** `path`, the file; its root element tells the format.
+
+    **Returns:** `Shapes`, a tuple of `Shape`s, with `.missing`: in words, what could not be drawn.
+
+    **Warns:** `NotTakenWarning` naming meshes that are missing or cannot be read.
+
+    **Raises:** ValueError with file and line for a file that cannot be read and for another format. ImportError without
+    mujoco (MJCF); without trimesh, which viser brings, meshes are named in the warning.
+
+    ```python
+    solids = jd.shapes("robot.urdf")
+    jd.save_html("robot.html", model, solution, shapes=solids)
+    ```
+    """
+    file = XmlFile(path, "robot")
+    readers = {"robot": _urdf, "mujoco": _mjcf, "sdf": _sdf}
+    if file.root.tag not in readers:
+        raise file.fault(file.root, f"the root element is <{file.root.tag}>; expected <robot>, <mujoco> or <sdf>")
+    found = readers[file.root.tag](file)
+    if found.missing:
+        warnings.warn(f"{path}: not drawn from the file: {'; '.join(found.missing)}", NotTakenWarning, stacklevel=2)
+    return found
+
+
+class _Meshes:
+    """Meshes of one file, each read once; those that are missing are collected."""
+
+    def __init__(self, path: str):
+        self.folder = pathlib.Path(as_path(path)).resolve().parent
+        self.missing: list[str] = []
+        self._read: dict[str, list[tuple]] = {}
+
+    def shapes(self, frame, uri: str, scale, pose, color, opacity) -> list[Shape]:
+        """Solids of a mesh; none where it is missing. The colour of the file that holds the mesh comes last."""
+        if uri not in self._read:
+            try:
+                self._read[uri] = read_mesh(find_mesh(uri, self.folder))
+            except MeshError as error:
+                self._read[uri] = []
+                self.missing.append(f"mesh {uri!r} ({error})")
+        size = tuple(float(x) for x in scale)
+        return [
+            Shape(frame, "mesh", size, pose, color or own, opacity, vertices, faces)
+            for vertices, faces, own in self._read[uri]
+        ]
+
+
+def _urdf(file: XmlFile) -> Shapes:
+    meshes, found = _Meshes(file.path), []
+    materials = {element.get("name"): rgba for element in file.root.iter("material") if (rgba := _rgba(file, element))}
+    for link in file.root.findall("link"):
+        frame = file.name(link, "the robot")
+        for visual in link.findall("visual"):
+            what = f"<visual> of link {frame!r}"
+            origin = visual.find("origin")
+            pose = np.eye(4)
+            if origin is not None:
+                xyz, rpy = (_attribute(file, origin, key, 3, what, np.zeros(3)) for key in ("xyz", "rpy"))
+                pose = f64.pose_matrix((xyz, rpy), what)
+            material = visual.find("material")
+            rgba = None if material is None else _rgba(file, material) or materials.get(material.get("name"))
+            color, opacity = (None, 1.0) if rgba is None else (rgba[:3], rgba[3])
+            geometry = visual.find("geometry")
+            for part in () if geometry is None else geometry:
+                get = lambda key, count, part=part, what=what: _attribute(file, part, key, count, what)  # noqa: E731
+                if part.tag == "box":
+                    found.append(Shape(frame, "box", tuple(get("size", 3)), pose, color, opacity))
+                elif part.tag == "sphere":
+                    found.append(Shape(frame, "ellipsoid", (float(get("radius", 1)[0]),) * 3, pose, color, opacity))
+                elif part.tag in ("cylinder", "capsule"):
+                    size = float(get("radius", 1)[0]), float(get("length", 1)[0])
+                    found.append(Shape(frame, part.tag, size, pose, color, opacity))
+                elif part.tag == "mesh":
+                    scale = _attribute(file, part, "scale", 3, what, np.ones(3))
+                    found += meshes.shapes(frame, part.get("filename") or "", scale, pose, color, opacity)
+                else:
+                    meshes.missing.append(f"<{part.tag}> of link {frame!r}")
+    return Shapes(found, meshes.missing)
+
+
+def _rgba(file: XmlFile, material) -> tuple[float, ...] | None:
+    color = material.find("color")
+    return None if color is None else tuple(_attribute(file, color, "rgba", 4, "a material").tolist())
+
+
+def _attribute(file: XmlFile, element, key: str, count: int, what: str, default: Any = None) -> np.ndarray:
+    text = (element.get(key) or "").strip()
+    if not text and default is not None:
+        return default
+    try:
+        values = np.array([float(part) for part in text.split()])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count or not np.isfinite(values).all():
+        raise file.fault(element, f"{key} of <{element.tag}> in {what} is {text!r}; give {count} finite numbers")
+    return values
+
+
+def _sdf(file: XmlFile) -> Shapes:
+    scene, found = SdfFile(file.path), []
+    meshes = _Meshes(file.path)
+    for frame, (link, _) in scene.links.items():
+        for visual in link.findall("visual"):
+            what = f"<visual> of link {frame!r}"
+            pose = scene.raw_pose(visual, what)
+            diffuse = visual.find("material/diffuse")
+            rgba = None if diffuse is None else scene.numbers(diffuse, (3, 4), what).tolist()
+            opacity = 1.0 - scene.number(visual, "transparency", 0.0, what)
+            color = None if rgba is None else tuple(rgba[:3])
+            geometry = visual.find("geometry")
+            for part in () if geometry is None else geometry:
+                number = lambda tag, default, part=part, what=what: scene.number(part, tag, default, what)  # noqa: E731
+                options = (pose, color, opacity)
+                if part.tag == "box":
+                    size = part.find("size")
+                    edges = np.ones(3) if size is None else scene.numbers(size, 3, what)
+                    found.append(Shape(frame, "box", tuple(edges), *options))
+                elif part.tag == "sphere":
+                    found.append(Shape(frame, "ellipsoid", (number("radius", 1.0),) * 3, *options))
+                elif part.tag in ("cylinder", "capsule"):
+                    found.append(Shape(frame, part.tag, (number("radius", 0.5), number("length", 1.0)), *options))
+                elif part.tag == "ellipsoid":
+                    radii = part.find("radii")
+                    found.append(Shape(frame, "ellipsoid", tuple(scene.numbers(radii, 3, what)), *options))
+                elif part.tag == "mesh":
+                    factors = part.find("scale")
+                    scale = np.ones(3) if factors is None else scene.numbers(factors, 3, what)
+                    found += meshes.shapes(frame, scene.word(part, "uri"), scale, *options)
+                elif part.tag not in ("empty", "plane"):
+                    meshes.missing.append(f"<{part.tag}> of link {frame!r}")
+    return Shapes(found, meshes.missing)
+
+
+def _mjcf(file: XmlFile) -> Shapes:
+    mujoco = library()
+    m, gone = compiled(mujoco, file.path)
+    bodies = named(mujoco, m, file.path).bodies
+    found = []
+    for g in range(m.ngeom):
+        kind = _MJCF_KINDS.get(int(m.geom_type[g]))
+        if kind is None or m.geom_group[g] >= _SHOWN_GROUPS:
+            continue
+        size = tuple(float(x) for x in m.geom_size[g])
+        # What `compiled` puts in the place of a missing mesh is a point of no size.
+        if gone and kind == "sphere" and size[0] == 1e-3:
+            continue
+        material = int(m.geom_matid[g])
+        rgba = tuple(float(x) for x in (m.mat_rgba[material] if material >= 0 else m.geom_rgba[g]))
+        if rgba[3] == 0:
+            continue
+        color = None if material < 0 and np.allclose(rgba, _DEFAULT_GREY) else rgba[:3]
+        pose = pose_of(m.geom_pos[g], m.geom_quat[g])
+        vertices = faces = None
+        if kind == "sphere":
+            kind, size = "ellipsoid", (size[0],) * 3
+        elif kind in ("capsule", "cylinder"):
+            size = size[0], 2 * size[1]
+        elif kind == "box":
+            size = tuple(2 * x for x in size)
+        elif kind == "mesh":
+            mesh, size = int(m.geom_dataid[g]), (1.0, 1.0, 1.0)
+            start, count = m.mesh_vertadr[mesh], m.mesh_vertnum[mesh]
+            vertices = np.asarray(m.mesh_vert[start : start + count], float)
+            start, count = m.mesh_faceadr[mesh], m.mesh_facenum[mesh]
+            faces = np.asarray(m.mesh_face[start : start + count], int)
+        found.append(Shape(bodies[m.geom_bodyid[g]], kind, size, pose, color, rgba[3], vertices, faces))
+    return Shapes(found, gone)

@@ -1,0 +1,220 @@
+"""Solids for bodies that have none: rods between joints, and solids of the same inertia.
+
+The inertia of a body about its centre of mass has principal moments I1 <= I2 <= I3, which a uniform solid of the same
+mass m reproduces: the box with edges x^2 = 6 (I2 + I3 - I1) / m, the ellipsoid with half axes a^2 = 5 (I2 + I3 - I1) / 2m,
+and, where two moments are equal, a cylinder with r^2 = 2 Ia / m, L^2 = 12 It / m - 3 r^2 for the moments Ia about its axis
+and It across. A body that moves in a plane is drawn as a disk with its moment about z, the only one that its motion has.
+Where such a solid would hide the rods of its body, a small ball marks the centre of mass instead.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from jaxdyn.constraints.frames import Pair
+from jaxdyn.constraints.loops import Distance, Loop
+from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
+from jaxdyn.contact.rolling import RollingContact
+from jaxdyn.contact.surfaces import Cylinder, Ellipsoid
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.joints import joint_neutral
+from jaxdyn.model.tree import Model, frame_index
+from jaxdyn.pictures.solids import Shape, Shapes, rod
+from jaxdyn.systems.scene import Scene
+
+_EQUAL = 1e-3  # moments that differ by less, relatively, are taken as equal
+_THIN = 0.012  # radius of rods, as a share of the mechanism's size
+_BULKY = (1.2, 0.5)  # longest and middle edge of a solid beside the rods of its body, as shares of the longest of these
+_SHARE = 0.3  # the same for bodies without rods, as a share of the mechanism's size
+
+
+def completed(scene: Scene, shapes: Shapes) -> Shapes:
+    """The solids given, and inferred ones for bodies with mass that have none. Also for all that rolls."""
+    model = scene.system
+    carried = {model.topology.frame_bodies[frame_index(model, name)] for name in shapes.frames()}
+    found = list(shapes)
+    size = extent(scene)
+    thin = _THIN * size
+    rolling, wheeled = _rolling(scene, carried)
+    found += rolling
+    bare = [i for i in range(model.nb) if i not in carried]
+    points = _joints_on(scene)
+    whole = not shapes
+    for i in bare:
+        # Rods complete a drawing that is made of inertias; between the parts of a file they would be in the way.
+        rods = _rods(model, i, points[i], thin) if whole else []
+        solid = _of_inertia(model, i, thin, i in wheeled)
+        longest = max((rod.size[1] for rod in rods), default=_SHARE * size if whole and model.nb > 3 else 0.0)
+        longest *= model.nb > 1  # one body alone is its solid
+        found += rods + [_or_mark(shape, longest, thin) for shape in solid]
+    return Shapes(found, shapes.missing)
+
+
+def extent(scene: Scene) -> float:
+    """Size of the mechanism at its neutral configuration, m: the diagonal of its joints, ends of loops and masses."""
+    model = scene.system
+    poses = home_poses(model)
+    points = [np.zeros(3)] if (np.array(model.topology.parents) == -1).all() and model.nb > 1 else []
+    for i in range(model.nb):
+        mass, com, moment = f64.about_com(np.asarray(model.inertias[i], float))
+        points += [poses[i, :3, 3], poses[i, :3, :3] @ com + poses[i, :3, 3]]
+        if mass > 0:
+            reach = np.sqrt(np.abs(np.trace(moment)) / mass)
+            points += [points[-1] + reach * sign for sign in np.array([[1, 1, 1], [-1, -1, -1]]) / np.sqrt(3)]
+    for body, pose in _ends(scene):
+        points.append((place_of(model, poses, body) @ pose)[:3, 3])
+    size = float(np.linalg.norm(np.ptp(np.array(points), axis=0))) if points else 0.0
+    return size if size > 0 else 1.0
+
+
+def home_poses(model: Model) -> np.ndarray:
+    """Poses (nb, 4, 4) of all bodies in the world where every joint is neutral."""
+    poses = np.zeros((model.nb, 4, 4))
+    home, screws = np.asarray(model.home, float), np.asarray(model.screws, float)
+    for i, (parent, kind) in enumerate(zip(model.topology.parents, model.topology.kinds, strict=True)):
+        here = home[i] @ f64.joint_pose(kind, screws[i], joint_neutral(kind))
+        poses[i] = here if parent < 0 else poses[parent] @ here
+    return poses
+
+
+def place_of(model: Model, poses: np.ndarray, frame: str | None) -> np.ndarray:
+    """Poses (..., 4, 4) of a frame (None: the world) where the bodies stand at `poses` (..., nb, 4, 4)."""
+    if frame is None:
+        return np.broadcast_to(np.eye(4), (*poses.shape[:-3], 4, 4))
+    index = frame_index(model, frame)
+    body, offset = model.topology.frame_bodies[index], np.asarray(model.frame_poses[index], float)
+    if body < 0:
+        return np.broadcast_to(offset, (*poses.shape[:-3], 4, 4))
+    return poses[..., body, :, :] @ offset
+
+
+def pairs(scene: Scene) -> list[Pair]:
+    """The constraints between two frames, as they were declared: they know where their frames are."""
+    return [one.declared(scene.system) for one in scene.constraints if isinstance(one, Pair)]
+
+
+def _ends(scene: Scene) -> list[tuple[str | None, np.ndarray]]:
+    return [(body, np.asarray(pose, float)) for pair in pairs(scene) for body, pose in pair.ends()]
+
+
+def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
+    """Points (3,) of each body, in its frame, where something holds it: its own joint, those it carries, loops."""
+    model = scene.system
+    points: dict[int, list[np.ndarray]] = {i: [] for i in range(-1, model.nb)}
+    home = np.asarray(model.home, float)
+    for i, parent in enumerate(model.topology.parents):
+        if model.topology.kinds[i] != "free":
+            points[i].insert(0, np.zeros(3))
+            points[parent].append(home[i, :3, 3])
+    for constraint in pairs(scene):
+        # Of a contact frame A lies on a surface, which no rod leads to.
+        for body, pose in constraint.ends() if isinstance(constraint, Loop | Distance) else constraint.ends()[1:]:
+            if body is not None:
+                index = frame_index(model, body)
+                offset = np.asarray(model.frame_poses[index], float) @ np.asarray(pose, float)
+                points[model.topology.frame_bodies[index]].append(offset[:3, 3])
+    return points
+
+
+def _rods(model: Model, i: int, points: list[np.ndarray], thin: float) -> list[Shape]:
+    """From a body's own joint to all that it carries, and to its centre of mass where it carries nothing."""
+    name = model.body_names[i]
+    mass, com, _ = f64.about_com(np.asarray(model.inertias[i], float))
+    start = points[0] if points else com
+    # A rod ends where the next body begins, at the place of that joint at rest.
+    ends = points[1:] if len(points) > 1 or not mass else [com]
+    return [rod(name, start, end, thin, source="inertia") for end in ends if np.linalg.norm(end - start) > 2 * thin]
+
+
+def _or_mark(solid: Shape, longest: float, thin: float) -> Shape:
+    """The solid, or a ball at its centre where it is bulky beside a rod of the length `longest`."""
+    edges = np.sort(np.ptp(solid.triangles()[0] @ solid.pose[:3, :3], axis=0))
+    if longest and (edges[2] > _BULKY[0] * longest or edges[1] > _BULKY[1] * longest):
+        return dataclasses.replace(solid, kind="ellipsoid", size=(2.5 * thin,) * 3)
+    return solid
+
+
+def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
+    """A uniform solid with a body's mass, centre of mass and inertia."""
+    parameters = np.asarray(model.inertias[i], float)
+    mass, com, moment = f64.about_com(parameters)
+    name = model.body_names[i]
+    if mass <= 0 or rolls:
+        return []
+    pose = np.eye(4)
+    pose[:3, 3] = com
+    least = 1.2 * thin
+    if model.topology.kinds[i] == "planar":
+        radius = float(np.sqrt(max(2 * moment[2, 2] / mass, 0.0)))
+        return [Shape(name, "cylinder", (max(radius, least), 2 * least), pose, source="inertia")]
+    moments, axes = np.linalg.eigh(moment)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    pose[:3, :3] = axes
+    options: dict = dict(source="inertia")
+    if moments[2] <= mass * least**2:
+        return [Shape(name, "ellipsoid", (2 * thin,) * 3, pose, **options)]
+    equal = [abs(moments[a] - moments[b]) <= _EQUAL * moments[2] for a, b in ((0, 1), (1, 2))]
+    if all(equal):
+        radius = float(np.sqrt(2.5 * moments.mean() / mass))
+        return [Shape(name, "ellipsoid", (radius,) * 3, pose, **options)]
+    if any(equal):
+        axis = 2 if equal[0] else 0
+        across = moments[0] if axis == 2 else moments[2]
+        radius = np.sqrt(max(2 * moments[axis] / mass, 0.0))
+        length = np.sqrt(max(12 * across / mass - 3 * radius**2, 0.0))
+        if length > 0 or radius > least:
+            turned = np.roll(axes, 2 - axis, axis=1)
+            pose[:3, :3] = turned
+            size = (max(float(radius), least), max(float(length), least))
+            return [Shape(name, "cylinder", size, pose, **options)]
+    edges = np.sqrt(np.maximum(6 * (moments.sum() - 2 * moments) / mass, 0.0))
+    return [Shape(name, "box", tuple(float(x) for x in np.maximum(edges, 2 * least)), pose, **options)]
+
+
+def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
+    """Wheels and balls of rolling constraints, and the bodies whose centre of mass lies in one of them."""
+    model, found, bodies = scene.system, [], set()
+    for constraint in pairs(scene):
+        if isinstance(constraint, RollingContact):
+            found += _surfaces(model, constraint, carried)
+            bodies |= {model.topology.frame_bodies[frame_index(model, shape.frame)] for shape in found if shape.frame}
+            continue
+        if not isinstance(constraint, RollingWheel | RollingSphere):
+            continue
+        index = frame_index(model, constraint.body)
+        body = model.topology.frame_bodies[index]
+        if body in carried:
+            continue
+        pose, radius = np.asarray(constraint.pose, float), float(constraint.radius)
+        if isinstance(constraint, RollingWheel):
+            found.append(Shape(constraint.body, "cylinder", (radius, 0.12 * radius), pose, source="constraint"))
+        else:
+            found.append(Shape(constraint.body, "ellipsoid", (radius,) * 3, pose, source="constraint"))
+        centre = (np.asarray(model.frame_poses[index], float) @ pose)[:3, 3]
+        if body >= 0 and np.linalg.norm(f64.about_com(np.asarray(model.inertias[body], float))[1] - centre) < radius:
+            bodies.add(body)
+        reach = getattr(constraint, "surface_radius", None)
+        if reach is not None and not constraint.inside and constraint.surface_body is not None:  # pyright: ignore[reportAttributeAccessIssue]
+            surface = np.asarray(constraint.surface, float)
+            kind, size = ("ellipsoid", (float(reach),) * 3)
+            if constraint.on == "cylinder":  # pyright: ignore[reportAttributeAccessIssue]
+                kind, size = "cylinder", (float(reach), 4 * float(reach))
+            found.append(Shape(constraint.surface_body, kind, size, surface, source="constraint"))
+    return found, bodies
+
+
+def _surfaces(model: Model, contact: RollingContact, carried: set[int]) -> list[Shape]:
+    """The balls, ellipsoids and cylinders of two surfaces that roll on each other, one for each body."""
+    found = []
+    for (frame, pose), shape in zip(contact.ends(), (contact.shape_a, contact.shape_b), strict=True):
+        if frame is not None and model.topology.frame_bodies[frame_index(model, frame)] in carried:
+            continue
+        if isinstance(shape, Ellipsoid):
+            kind, size = "ellipsoid", tuple(float(x) for x in shape.semi_axes)
+        elif isinstance(shape, Cylinder):
+            kind, size = "cylinder", (float(shape.radius), 4 * float(shape.radius))
+        else:
+            continue
+        found.append(Shape(frame, kind, size, np.asarray(pose, float), source="constraint"))
+    return found

@@ -1,0 +1,226 @@
+"""What moves in a picture: poses of bodies over time, ends of loops, places and sizes of forces. Plain numpy arrays."""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.constraints.base import layout
+from jaxdyn.constraints.frames import Pair
+from jaxdyn.constraints.loops import Distance, Loop
+from jaxdyn.dynamics.kinematics import forward_kinematics
+from jaxdyn.grasp.contacts import Contact
+from jaxdyn.model.arguments import as_array
+from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.tree import Model
+from jaxdyn.pictures.inferred import place_of
+from jaxdyn.simulation.solution import Solution
+from jaxdyn.systems.scene import Scene, as_scene
+
+
+class Motion(NamedTuple):
+    """Motions of one scene. Rows that were not reached repeat the last one that was.
+
+    - `ts` (nt,), s; `q` (n, nt, nq); `poses` (n, nt, nb, 4, 4), of the bodies in the world.
+    - `multipliers` (n, nt, nc) and `torque` (n, nt, nv), None where the solution has none.
+    """
+
+    scene: Scene
+    ts: np.ndarray
+    q: np.ndarray
+    poses: np.ndarray
+    multipliers: np.ndarray | None
+    torque: np.ndarray | None
+
+
+class Force(NamedTuple):
+    """Arrows of one constraint or joint: places (n, nt, 3), m, and vectors (n, nt, 3), N (or N m of a torque)."""
+
+    name: str
+    kind: str  # "force" or "torque"
+    places: np.ndarray
+    vectors: np.ndarray
+
+
+class Mark(NamedTuple):
+    """Where a constraint holds: points (n, nt, 3) on its two bodies, and the axis (n, nt, 3) of a loop's joint or normal."""
+
+    name: str
+    kind: str  # "loop", "distance" or "contact"
+    a: np.ndarray
+    b: np.ndarray
+    axis: np.ndarray
+
+
+def drawable(scene: Any) -> Scene:
+    """The scene of a model. **Raises:** ValueError for systems without bodies."""
+    scene = as_scene(scene)
+    if not isinstance(scene.system, Model):
+        raise ValueError(
+            f"the system is a {type(scene.system).__name__}, which has no bodies to draw; a Model has (jd.ModelBuilder, "
+            "jd.load_urdf, ...). Its coordinates over time: jd.plot.states(scene, solution)"
+        )
+    return scene
+
+
+@functools.lru_cache(maxsize=32)
+def _kinematics(structure):
+    """One compiled function for models that differ in numbers alone."""
+    del structure
+    return jax.jit(lambda model, qs: jax.vmap(lambda q: forward_kinematics(model, q))(qs))
+
+
+def poses_of(model: Model, qs) -> np.ndarray:
+    """Poses (n, nb, 4, 4) of the bodies at configurations (n, nq)."""
+    qs = as_array(qs, "q", model.home.dtype)
+    return np.asarray(_kinematics(model.topology)(model, qs), float)
+
+
+def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | None = None) -> Motion:
+    """A solution, batched or not, or a configuration (nq,), as a motion of at most `rows` rows and `most` trajectories.
+
+    **Raises:** ValueError for systems without bodies, and for arrays that do not fit the scene.
+    """
+    scene = drawable(scene)
+    model = scene.system
+    if not isinstance(solution, Solution):
+        q = np.asarray(as_array(solution, "q", model.home.dtype), float)
+        if q.shape != (model.nq,):
+            raise ValueError(
+                f"solution has shape {q.shape}; give what jd.simulate returns, or one configuration ({model.nq},) = (nq,)"
+            )
+        return Motion(scene, np.zeros(1), q[None, None], poses_of(model, q[None])[None], None, None)
+    q = np.asarray(solution.q, float)
+    if q.ndim < 2 or q.shape[-1] != model.nq:
+        raise ValueError(
+            f"solution.q has shape {q.shape}, expected (..., nt, {model.nq}); is the scene that of the solution?"
+        )
+    nt = q.shape[-2]
+    q = q.reshape(-1, nt, model.nq)
+    ts = np.asarray(solution.ts, float).reshape(-1, nt)
+    if (ts != ts[0]).any():
+        raise ValueError(
+            "solution.ts differs from motion to motion; save all of them at the same times to show them together"
+        )
+    extras: list[Any] = [solution.multipliers, solution.torque]
+    if most is not None and len(q) > most:
+        chosen = np.unique(np.linspace(0, len(q) - 1, most).round().astype(int))
+    else:
+        chosen = np.arange(len(q))
+    kept = np.arange(nt)
+    if rows is not None and nt > rows:
+        # Evenly in time: save points may be anywhere.
+        kept = np.unique(np.abs(ts[:1] - np.linspace(ts[0, 0], ts[0, -1], rows)[:, None]).argmin(1))
+    q = q[chosen][:, kept]
+    reached = np.logical_and.reduce(np.isfinite(q), axis=-1)
+    if not reached[:, 0].all():
+        raise ValueError("solution.q is not finite at the start; there is nothing to show")
+    last = np.maximum.accumulate(np.where(reached, np.arange(q.shape[1]), 0), axis=1)[..., None]
+    q = np.take_along_axis(q, last, 1)
+    for k, values in enumerate(extras):
+        if values is not None:
+            values = np.asarray(values, float).reshape(-1, nt, values.shape[-1])[chosen][:, kept]
+            extras[k] = np.take_along_axis(values, last, 1)
+    poses = poses_of(model, q.reshape(-1, model.nq)).reshape(*q.shape[:2], model.nb, 4, 4)
+    return Motion(scene, ts[0, kept], q, poses, *extras)
+
+
+def _ends(motion: Motion, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (n, nt, 4, 4) of the frames A and B of a constraint."""
+    model = motion.scene.system
+    ends = pair.declared(model).ends()
+    return tuple(place_of(model, motion.poses, body) @ np.asarray(pose, float) for body, pose in ends)  # pyright: ignore[reportReturnType]
+
+
+def _seen_from_a(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    turned = np.swapaxes(a[..., :3, :3], -1, -2)
+    return turned @ b[..., :3, :3], (turned @ (b[..., :3, 3:] - a[..., :3, 3:]))[..., 0]
+
+
+def marks(motion: Motion) -> list[Mark]:
+    """Where the constraints between bodies hold."""
+    found = []
+    for constraint in motion.scene.constraints:
+        if not isinstance(constraint, Pair):
+            continue
+        a, b = _ends(motion, constraint)
+        if isinstance(constraint, Loop | Distance):
+            kind = "distance" if isinstance(constraint, Distance) else "loop"
+            found.append(Mark(constraint.name, kind, a[..., :3, 3], b[..., :3, 3], a[..., :3, 2]))
+            continue
+        point, normal = _contact(motion, constraint, a, b)
+        found.append(Mark(constraint.name, "contact", point, point, normal))
+    return found
+
+
+def _contact(motion: Motion, constraint: Pair, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Point (n, nt, 3) and normal (n, nt, 3) of a contact in the world."""
+    model = motion.scene.system
+    if not hasattr(constraint.declared(model), "contact_point"):
+        return a[..., :3, 3], a[..., :3, 2]
+
+    def touch(R, p, q):
+        at: Any = constraint.at(model, q)
+        return at.contact_point(R, p)
+
+    R, p, q = _rows(motion, a, b)
+    point, normal = (np.asarray(x, float).reshape(a.shape[0], a.shape[1], 3) for x in jax.vmap(touch)(R, p, q))
+    turn = a[..., :3, :3]
+    return (turn @ point[..., None])[..., 0] + a[..., :3, 3], (turn @ normal[..., None])[..., 0]
+
+
+def _rows(motion: Motion, a: np.ndarray, b: np.ndarray) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Rotations and positions of frame B seen from A, and configurations, of all rows of all trajectories."""
+    R, p = _seen_from_a(a, b)
+    return tuple(jnp.asarray(x.reshape(-1, *x.shape[2:])) for x in (R, p, motion.q))  # pyright: ignore[reportReturnType]
+
+
+def forces(motion: Motion) -> list[Force]:
+    """Arrows of the constraint forces that the solution has, on frame B (a grasp: on the object), and of its joint torques."""
+    found = []
+    if motion.multipliers is not None:
+        for constraint, place in zip(motion.scene.constraints, layout(motion.scene), strict=True):
+            if not isinstance(constraint, Pair):
+                continue
+            a, b = _ends(motion, constraint)
+            R, p, q = _rows(motion, a, b)
+            lam = jnp.asarray(motion.multipliers[..., place.start : place.end].reshape(len(p), -1))
+            wrench = np.asarray(_wrenches(motion.scene.system, constraint, R, p, q, lam), float)
+            wrench = wrench[:, :3].reshape(*a.shape[:2], 3)
+            vectors = (a[..., :3, :3] @ wrench[..., None])[..., 0] * (-1.0 if isinstance(constraint, Contact) else 1.0)
+            at = b[..., :3, 3] if isinstance(constraint, Loop | Distance) else _contact(motion, constraint, a, b)[0]
+            found.append(Force(place.name, "force", at, vectors))
+    if motion.torque is not None:
+        model = motion.scene.system
+        top = model.topology
+        for i, kind in enumerate(top.kinds):
+            if kind not in SCREW_KINDS:
+                continue
+            screw = np.asarray(model.screws[i], float)
+            axis = screw[:3] if kind == "prismatic" else screw[3:]
+            direction = motion.poses[:, :, i, :3, :3] @ axis
+            size = motion.torque[:, :, top.v_slices[i]]
+            word = "force" if kind == "prismatic" else "torque"
+            found.append(Force(top.joint_names[i], word, motion.poses[:, :, i, :3, 3], direction * size))
+    return [force for force in found if np.abs(force.vectors).max(initial=0.0) > 0]
+
+
+@eqx.filter_jit
+def _wrenches(model: Model, constraint: Pair, R, p, q, lam):
+    return jax.vmap(lambda R, p, q, lam: constraint.at(model, q).wrench(R, p, lam))(R, p, q, lam)
+
+
+def joint_axes(motion: Motion) -> list[tuple[str, str, np.ndarray, np.ndarray | None]]:
+    """Name, kind, place (n, nt, 3) and axis (n, nt, 3) (None without one) of each joint."""
+    model, found = motion.scene.system, []
+    for i, (name, kind) in enumerate(zip(model.joint_names, model.topology.kinds, strict=True)):
+        axis = None
+        if kind in SCREW_KINDS or kind == "planar":
+            screw = np.asarray(model.screws[i], float)
+            local = np.eye(3)[2] if kind == "planar" else screw[:3] if kind == "prismatic" else screw[3:]
+            axis = motion.poses[:, :, i, :3, :3] @ local
+        found.append((name, kind, motion.poses[:, :, i, :3, 3], axis))
+    return found

@@ -1,0 +1,342 @@
+"""Pages for a browser by viser: served on this machine (`view`), or as one file that opens offline (`save_html`)."""
+
+import contextlib
+import html
+import io
+import itertools
+import logging
+import os
+import socket
+import sys
+import threading
+import time
+import webbrowser
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxdyn.model.arguments import as_path
+from jaxdyn.model.float64 import quaternion
+from jaxdyn.pictures.drawing import scaled
+from jaxdyn.pictures.inferred import place_of
+from jaxdyn.pictures.motion import Motion, forces, marks, motion_of
+from jaxdyn.pictures.solids import Shapes, by_frame, joined, sharpened, simplified
+from jaxdyn.pictures.stage import FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
+
+MOST_BYTES = 2_000_000  # of a file
+_HOST = "127.0.0.1"
+_FIELD_OF_VIEW = np.deg2rad(40.0)
+_GHOSTS = 7  # motions of a batch beside the first
+_GHOST_OPACITY = 0.25
+# Vertices of all meshes and rows of the motion, of a page that is served, and of a file until it is small enough.
+_SERVED = (60_000, 2_000)
+_FILED = ((24_000, 300), (12_000, 200), (5_000, 120), (2_000, 60), (500, 30))
+_PICTURES = 30  # a second
+
+
+def view(
+    scene, solution, *, shapes=None, port: int | None = None, browser: bool = True, block: bool | None = None
+) -> "Viewer":
+    """Show a motion in the browser: a page on this machine with a slider over time and a button to play.
+
+    The first motion of a batch is solid; up to seven more, evenly from the batch, stand beside it as ghosts. Red arrows are
+    forces of constraints and contacts, where the solution has `multipliers` (`outputs=("multipliers",)`), green ones
+    joint torques, where it has `torque`; the largest of each kind is a quarter of the mechanism long.
+
+    **Arguments:**
+
+    - `scene`: a `Scene` or `Model`; `solution`: what `jd.simulate` returned for it, batched or not, or one configuration (nq,).
+    - `shapes`: solids to show, of `jd.shapes(path)`; None draws rods between joints and solids of the bodies' inertias.
+    - `port`: of the page; None takes a free one. The page is served to this machine alone (127.0.0.1).
+    - `browser`: whether to open a browser; without a display the address is printed alone.
+    - `block`: whether to wait until Ctrl-C; by default in scripts, and not in a notebook or a prompt.
+
+    **Returns:** `Viewer`, with `.url`, `.stop()` and, in a notebook, the motion in the cell.
+
+    **Raises:** ValueError for a port in use, systems without bodies, arrays that do not fit the scene. ImportError without viser.
+    """
+    motion = motion_of(scene, solution, rows=_SERVED[1], most=1 + _GHOSTS)
+    parts = all_solids(motion, shapes)
+    viewer = Viewer(motion, parts, _free_port(port))
+    print(f"Showing the motion at {viewer.url}")
+    if browser and not _open(viewer.url):
+        print(
+            "No browser could be opened here; open that address in one, or write a file: jd.save_html(path, scene, solution)"
+        )
+    if (not _interactive()) if block is None else block:
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                time.sleep(3600)
+        viewer.stop()
+    return viewer
+
+
+def save_html(path: str | os.PathLike, scene, solution, *, shapes=None) -> None:
+    """Write a motion as one HTML file under 2 MB that needs nothing else: no network, no Python.
+
+    It plays in the browser as the page of `view` does. Meshes are simplified, and rows and trajectories left out, until it is
+    small enough: at most 300 rows, 30 a second, and eight motions of a batch.
+
+    **Arguments:** `path`, a file .html; `scene`, `solution`, `shapes` as in `view`.
+
+    **Raises:** ValueError as `view` does, and for a path that does not end in .html. ImportError without viser.
+
+    ```python
+    scene = jd.scenes.four_bar()
+    turn = jd.simulate(scene, *jd.scenes.four_bar.start(), jnp.linspace(0.0, 2.0, 51), outputs=("multipliers",))
+    jd.save_html("four_bar.html", scene, turn)
+    ```
+    """
+    path = as_path(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"path is {str(path)!r}; write to a file .html")
+    if not path.parent.is_dir():
+        raise ValueError(f"path is {str(path)!r}: there is no directory {path.parent}")
+    motion = motion_of(scene, solution, most=1 + _GHOSTS)
+    path.write_text(_document(motion, all_solids(motion, shapes)), encoding="utf-8")
+
+
+class Viewer:
+    """A page that is served until `.stop()`; made by `jd.view`. In a notebook it shows the motion in its cell.
+
+    - `url`: its address.
+    """
+
+    def __init__(self, motion: Motion, parts: Shapes, port: int):
+        self._motion, self._parts = motion, parts
+        self._server = _server(port)
+        self._content = _Content(self._server, motion, parts, _SERVED[0])
+        self._stopped = threading.Event()
+        self.url = f"http://{_HOST}:{self._server.get_port()}"
+        if len(motion.ts) > 1:
+            self._add_controls()
+
+    def stop(self) -> None:
+        """Close the page."""
+        if not self._stopped.is_set():
+            self._stopped.set()
+            _stop(self._server)
+
+    def _repr_html_(self) -> str:
+        return framed(_document(self._motion, self._parts))
+
+    def _add_controls(self) -> None:
+        gui, ts = self._server.gui, self._motion.ts
+        step = max(float(np.ptp(ts)) / 1000, 1e-6)
+        slider = gui.add_slider("time (s)", float(ts[0]), float(ts[-1]), step, float(ts[0]))
+        play = gui.add_button("Play / pause")
+        speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0)
+        playing = threading.Event()
+
+        @slider.on_update
+        def _(_event) -> None:
+            self._content.show(int(np.abs(ts - slider.value).argmin()))
+
+        @play.on_click
+        def _(_event) -> None:
+            playing.clear() if playing.is_set() else playing.set()
+
+        def run() -> None:
+            while not self._stopped.wait(1.0 / _PICTURES):
+                if playing.is_set():
+                    now = slider.value + speed.value / _PICTURES
+                    slider.value = float(ts[0]) if now > ts[-1] else float(now)
+
+        threading.Thread(target=run, daemon=True).start()
+
+
+def framed(document: str, height: int = 480) -> str:
+    """A page within another, as notebooks show it."""
+    return f'<iframe srcdoc="{html.escape(document)}" width="100%" height="{height}" style="border:0"></iframe>'
+
+
+def _document(motion: Motion, parts: Shapes) -> str:
+    """The page as one file, made coarser until it is small enough."""
+    text = ""
+    for vertices, rows in _FILED:
+        with _recorded() as server:
+            kept = _rows(motion.ts, min(rows, 1 + int(np.ptp(motion.ts) * _PICTURES)))
+            content = _Content(server, motion, parts, vertices)
+            serializer = server.get_scene_serializer()
+            for before, row in itertools.pairwise(kept):
+                serializer.insert_sleep(float(motion.ts[row] - motion.ts[before]))
+                content.show(int(row))
+            text = serializer.as_html()
+        if len(text) <= MOST_BYTES:
+            return text
+    raise ValueError(
+        f"the page takes {len(text) / 1e6:.1f} MB, more than {MOST_BYTES / 1e6:g} MB; show fewer motions: jax.tree.map(lambda x: "
+        "x[:2], solution)"
+    )
+
+
+def _rows(ts: np.ndarray, most: int) -> np.ndarray:
+    """Rows evenly in time."""
+    wanted = np.linspace(ts[0], ts[-1], max(most, 2) if len(ts) > 1 else 1)
+    return np.unique(np.abs(ts - wanted[:, None]).argmin(1))
+
+
+class _Content:
+    """What is on a page: the stage and the mechanism, which can be shown at each row of its motion."""
+
+    def __init__(self, server, motion: Motion, parts: Shapes, vertices: int):
+        self.motion, self.scene = motion, server.scene
+        stage = stage_of(motion, parts)
+        self.size = stage.size
+        _set_stage(server, stage)
+        self.bodies: list[tuple[int, str | None, Any]] = []
+        meshes = list(_meshes(motion, parts, vertices))
+        for n in range(len(motion.q)):
+            self._add_bodies(n, meshes)
+        self.marks = [(mark, self._ball(k)) for k, mark in enumerate(marks(motion))]
+        self.forces = list(scaled(forces(motion), 0.25 * self.size))
+        self.arrows = None
+        if self.forces:
+            colors = np.array([rgb(FORCE if force.kind == "force" else TORQUE) for force, _ in self.forces])
+            self.arrows = self.scene.add_arrows(
+                "/forces",
+                self._arrows(0),
+                (255 * colors).astype(np.uint8),
+                shaft_radius=0.006 * self.size,
+                head_radius=0.014 * self.size,
+                head_length=0.035 * self.size,
+            )
+        self.show(0)
+
+    def _add_bodies(self, n: int, meshes) -> None:
+        groups = {}
+        for k, (frame, color, opacity, vertices, faces) in enumerate(meshes):
+            if n and frame is None:
+                continue  # what stands in the world is there once
+            if frame not in groups:
+                groups[frame] = f"/motion{n}/{frame or 'world'}"
+                self.bodies.append((n, frame, self.scene.add_frame(groups[frame], show_axes=False)))
+            opacity = opacity * (_GHOST_OPACITY if n else 1.0)
+            self.scene.add_mesh_simple(
+                f"{groups[frame]}/solid{k}",
+                vertices,
+                faces,
+                color=tuple(round(255 * x) for x in color),
+                opacity=None if opacity == 1.0 else opacity,
+                side="double",
+                cast_shadow=not n,
+            )
+
+    def _ball(self, k: int) -> Any:
+        color = tuple(round(255 * x) for x in rgb(LOOP))
+        return self.scene.add_icosphere(f"/constraints/{k}", 0.012 * self.size, color, subdivisions=2)
+
+    def _arrows(self, row: int) -> np.ndarray:
+        ends = [(f.places[0, row], f.places[0, row] + scale * f.vectors[0, row]) for f, scale in self.forces]
+        return np.array(ends, np.float32)
+
+    def show(self, row: int) -> None:
+        """Move everything to a row of the motion."""
+        model = self.motion.scene.system
+        for n, frame, handle in self.bodies:
+            pose = place_of(model, self.motion.poses[n, row], frame)
+            handle.wxyz, handle.position = quaternion(pose[:3, :3]), pose[:3, 3]
+        for mark, handle in self.marks:
+            handle.position = mark.a[0, row]
+        if self.arrows is not None:
+            self.arrows.points = self._arrows(row)
+
+
+def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:
+    """Frame, colour, opacity, vertices and faces of the solids, one mesh for each frame and colour."""
+    groups = []
+    for frame, _, opacity, members in by_frame(parts):
+        parts_of = [shape.triangles() for shape in members]
+        groups.append((frame, color_of(members[0], motion.scene.system), opacity, parts_of))
+    total = sum(len(vertices) for *_, found in groups for vertices, _ in found)
+    share = min(1.0, most / max(total, 1))
+    for frame, color, opacity, found in groups:
+        small = [simplified(v, f, max(24, int(share * len(v)))) if share < 1 else (v, f) for v, f in found]
+        vertices, faces = sharpened(*joined(mesh for mesh in small if len(mesh[1])))
+        yield frame, color, opacity, vertices.astype(np.float32), faces.astype(np.uint32)
+
+
+def _set_stage(server, stage: Stage) -> None:
+    scene = server.scene
+    scene.set_up_direction(tuple(stage.up.tolist()))
+    axis = int(np.argmax(np.abs(stage.up)))
+    cell = 10.0 ** np.floor(np.log10(stage.size / 2))
+    cell = cell / 2 if stage.size / cell < 5 else cell
+    centre = np.where(np.abs(stage.up) > 0, stage.ground * stage.up, np.round(stage.centre / cell) * cell)
+    width = 2 * cell * np.ceil(2.5 * stage.size / cell)
+    scene.add_grid(
+        "/ground",
+        width,
+        width,
+        plane=("yz", "xz", "xy")[axis],
+        cell_size=cell,
+        section_size=5 * cell,
+        cell_color=(214, 218, 224),
+        section_color=(176, 184, 194),
+        plane_color=(246, 247, 249),
+        plane_opacity=1.0,
+        shadow_opacity=0.25,
+        fade_distance=8 * stage.size,
+        position=tuple((centre - 1e-4 * stage.size * stage.up).tolist()),
+    )
+    camera = server.initial_camera
+    distance = 0.54 * stage.size / np.tan(_FIELD_OF_VIEW / 2)
+    camera.fov = float(_FIELD_OF_VIEW)
+    camera.near, camera.far = float(0.01 * stage.size), float(100 * stage.size)
+    camera.look_at = stage.centre
+    camera.position = stage.centre + distance * stage.eye
+
+
+def _server(port: int) -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise ImportError("the viewer needs viser: pip install jaxdyn[view]") from error
+    # Of probes that connect and leave without a word (a browser's, a test's) nobody wants to know.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    with contextlib.redirect_stdout(io.StringIO()):  # a banner
+        return viser.ViserServer(host=_HOST, port=port, label="jaxdyn", verbose=False)
+
+
+def _stop(server) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+@contextlib.contextmanager
+def _recorded() -> Iterator[Any]:
+    """A server to record a page with; viser has no other way to one."""
+    server = _server(_free_port(None))
+    try:
+        yield server
+    finally:
+        _stop(server)
+
+
+def _free_port(port: int | None) -> int:
+    """The port if nothing uses it, or any free one. **Raises:** ValueError for one in use or out of range."""
+    if port is not None and not (isinstance(port, int) and 0 < port < 65536):
+        raise ValueError(f"port is {port!r}; give a number from 1 to 65535, or None for a free one")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((_HOST, port or 0))
+        except OSError as error:
+            raise ValueError(
+                f"port {port} cannot be used ({error.strerror}); give another one, or None for a free one"
+            ) from error
+        return probe.getsockname()[1]
+
+
+def _open(url: str) -> bool:
+    """Open a browser; False where there is none. Browsers for terminals are not wanted."""
+    if sys.platform.startswith("linux") and not any(
+        os.environ.get(x) for x in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+    ):
+        return False
+    return webbrowser.open(url)
+
+
+def _interactive() -> bool:
+    return hasattr(sys, "ps1") or "ipykernel" in sys.modules

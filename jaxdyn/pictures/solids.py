@@ -1,0 +1,215 @@
+"""What is drawn of a mechanism: boxes, balls, cylinders and meshes, each on a frame of the model, as triangles."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+
+_SIDES = 24  # of a circle
+
+# What each number of `size` means (m).
+SIZES = {
+    "box": "edges (x, y, z)",
+    "ellipsoid": "half axes (x, y, z)",
+    "cylinder": "radius, length along z",
+    "capsule": "radius, length along z between the centres of its caps",
+    "mesh": "factors (x, y, z) on the vertices",
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Shape:
+    """One solid, fixed to a frame of a model.
+
+    - `frame`: a body or frame by name, None for the world; `pose` (4, 4) of the solid in it (m).
+    - `kind`: "box", "ellipsoid" (a ball has three equal half axes), "cylinder", "capsule" or "mesh"; `size` as in
+      `jaxdyn.pictures.solids.SIZES` (m).
+    - `color` (3,) from 0 to 1, None for one that is chosen by the body; `opacity` from 0 to 1.
+    - `vertices` (n, 3) and `faces` (m, 3) of a mesh, before they are scaled by `size`.
+    - `source`: "file", "constraint" or "inertia": where the solid comes from.
+    """
+
+    frame: str | None
+    kind: str
+    size: tuple[float, ...]
+    pose: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))
+    color: tuple[float, ...] | None = None
+    opacity: float = 1.0
+    vertices: np.ndarray | None = None
+    faces: np.ndarray | None = None
+    source: str = "file"
+
+    def triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (n, 3) in the frame's axes (m), and faces (m, 3) as indices, counter-clockwise from outside."""
+        if self.kind == "mesh":
+            assert self.vertices is not None and self.faces is not None
+            vertices, faces = self.vertices * np.asarray(self.size), self.faces
+            if np.prod(self.size) < 0:  # a mirror turns triangles over
+                faces = faces[:, ::-1]
+        else:
+            vertices, faces = _SOLIDS[self.kind](self.size)
+        return vertices @ self.pose[:3, :3].T + self.pose[:3, 3], faces
+
+
+class Shapes(tuple[Shape, ...]):
+    """Solids to draw, and in words what of the file could not be drawn (`missing`).
+
+    Made by `jd.shapes`, or from any `Shape`s: `Shapes([Shape("tip", "box", (0.1, 0.1, 0.2))])`.
+    """
+
+    missing: tuple[str, ...]
+
+    def __new__(cls, items=(), missing=()):
+        """A tuple with a note."""
+        made = super().__new__(cls, items)
+        made.missing = tuple(missing)
+        return made
+
+    def frames(self) -> set[str]:
+        """Names of the frames that carry a solid."""
+        return {shape.frame for shape in self if shape.frame is not None}
+
+
+def rod(frame: str | None, start, end, radius: float, **options) -> Shape:
+    """A capsule from a point to another, both (3,) in the frame."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    length = float(np.linalg.norm(end - start))
+    return Shape(frame, "capsule", (radius, length), along((start + end) / 2, end - start), **options)
+
+
+def along(place, direction) -> np.ndarray:
+    """Pose (4, 4) at a place with z along a direction; z as it is for a direction of no length."""
+    pose, length = np.eye(4), np.linalg.norm(direction)
+    pose[:3, 3] = place
+    if length > 0:
+        z = np.asarray(direction, float) / length
+        helper = np.eye(3)[np.argmin(np.abs(z))]
+        x = np.cross(helper, z) / np.linalg.norm(np.cross(helper, z))
+        pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    return pose
+
+
+def _box(size) -> tuple[np.ndarray, np.ndarray]:
+    # Each side has vertices of its own, so that edges stay sharp where normals are averaged at vertices.
+    corners, faces = [], []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            one, other = np.roll(np.eye(3), axis, axis=1)[1:] if sign > 0 else np.roll(np.eye(3), axis, axis=1)[:0:-1]
+            middle = sign * np.roll(np.eye(3), axis, axis=1)[0]
+            k = len(corners)
+            corners += [middle - one - other, middle + one - other, middle + one + other, middle - one + other]
+            faces += [[k, k + 1, k + 2], [k, k + 2, k + 3]]
+    return np.array(corners) * np.asarray(size) / 2, np.array(faces)
+
+
+def _turned(radii, heights, smooth: bool) -> tuple[np.ndarray, np.ndarray]:
+    """A profile (radius and height at each ring) turned about z. Rings of radius zero are its ends."""
+    angles = np.linspace(0, 2 * np.pi, _SIDES, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(_SIDES)], axis=1)
+    rings = [circle * r + [0, 0, h] for r, h in zip(radii, heights, strict=True)]
+    vertices, faces = [], []
+    step = np.arange(_SIDES)
+    following = (step + 1) % _SIDES
+    count = 0
+    for low, high in itertools.pairwise(rings):
+        if smooth and vertices:
+            first, new = count - _SIDES, [high]
+        else:
+            first, new = count, [low, high]
+        vertices += new
+        count += _SIDES * len(new)
+        a, b = first + step, first + following
+        faces += [np.stack([a, b, b + _SIDES], 1), np.stack([a, b + _SIDES, a + _SIDES], 1)]
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _cylinder(size) -> tuple[np.ndarray, np.ndarray]:
+    radius, length = size
+    return _turned([0.0, radius, radius, 0.0], np.array([-1, -1, 1, 1]) * length / 2, smooth=False)
+
+
+def _capsule(size) -> tuple[np.ndarray, np.ndarray]:
+    radius, length = size
+    up = np.linspace(0, np.pi / 2, 6)
+    radii = np.concatenate([np.cos(up)[::-1], np.cos(up)]) * radius
+    heights = np.concatenate([-np.sin(up)[::-1] * radius - length / 2, np.sin(up) * radius + length / 2])
+    return _turned(radii, heights, smooth=True)
+
+
+def _ellipsoid(size) -> tuple[np.ndarray, np.ndarray]:
+    up = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1)
+    vertices, faces = _turned(np.cos(up), np.sin(up), smooth=True)
+    return vertices * np.asarray(size), faces
+
+
+_SOLIDS = {"box": _box, "cylinder": _cylinder, "capsule": _capsule, "ellipsoid": _ellipsoid}
+
+
+def simplified(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh of at most about `most` vertices: those within a cell of a grid become one, flat triangles are left out.
+
+    The grid is made coarser until the mesh is small enough; a mesh that is small already stays as it is.
+
+    Source: Rossignac and Borrel (1993), Multi-resolution 3D approximations for rendering complex scenes.
+    """
+    low, extent = vertices.min(0), np.ptp(vertices, axis=0).max()
+    cells = int(np.sqrt(most) * 1.5) + 2  # a surface in a cube of n cells an edge fills some n^2 of them
+    while len(vertices) > most and cells > 2 and extent > 0:
+        place = np.floor((vertices - low) / extent * cells).astype(int) @ (1, cells + 1, (cells + 1) ** 2)
+        _, index, count = np.unique(place, return_inverse=True, return_counts=True)
+        if len(count) <= most:
+            centres = np.stack([np.bincount(index, vertices[:, k]) for k in range(3)], axis=1) / count[:, None]
+            turned = index[faces]
+            keep = np.all(turned != np.roll(turned, 1, axis=1), axis=1)
+            return centres, turned[keep]
+        cells = int(cells * 0.8)
+    return vertices, faces
+
+
+def sharpened(vertices: np.ndarray, faces: np.ndarray, angle: float = 0.6) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh whose vertices are doubled at edges, so that averaged normals leave these sharp.
+
+    The corners of the triangles at a vertex share it where their normals are within `angle` (rad) of one another.
+    """
+    _, first, merged = np.unique(vertices.round(7), axis=0, return_index=True, return_inverse=True)
+    corners = merged.ravel()[faces]
+    sides = vertices[faces]
+    normals = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])
+    sizes = np.linalg.norm(normals, axis=1)
+    corners, normals = corners[sizes > 0], normals[sizes > 0] / sizes[sizes > 0, None]
+    owners: dict[int, list[tuple[np.ndarray, int]]] = {}
+    places: list[int] = []
+    found = np.zeros_like(corners)
+    least = np.cos(angle)
+    for f, (corner, normal) in enumerate(zip(corners.tolist(), normals, strict=True)):
+        for k, vertex in enumerate(corner):
+            known = owners.setdefault(vertex, [])
+            for other, index in known:
+                if other @ normal > least:
+                    found[f, k] = index
+                    break
+            else:
+                known.append((normal, len(places)))
+                found[f, k] = len(places)
+                places.append(int(first[vertex]))
+    return vertices[places], found
+
+
+def by_frame(shapes: Shapes) -> Iterator[tuple[str | None, tuple | None, float, list[Shape]]]:
+    """The solids in groups of one frame, colour and opacity."""
+    groups: dict[tuple, list[Shape]] = {}
+    for shape in shapes:
+        groups.setdefault((shape.frame, shape.color, shape.opacity), []).append(shape)
+    for (frame, color, opacity), members in groups.items():
+        yield frame, color, opacity, members
+
+
+def joined(parts) -> tuple[np.ndarray, np.ndarray]:
+    """Several meshes as one."""
+    vertices, faces, count = [], [], 0
+    for points, triangles in parts:
+        vertices.append(points)
+        faces.append(triangles + count)
+        count += len(points)
+    return np.concatenate(vertices), np.concatenate(faces)

@@ -1,0 +1,141 @@
+"""The stage of a picture: what is up, where the ground is, from where one looks, and in which colours."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdyn.constraints.loops import Distance, Loop
+from jaxdyn.pictures.inferred import completed, pairs, place_of
+from jaxdyn.pictures.motion import Motion
+from jaxdyn.pictures.solids import Shape, Shapes
+from jaxdyn.reports.plotting import BLUE, GREEN, ORANGE
+
+# Bodies without a colour of their own take these in turn: muted, so that arrows and marks stand out.
+_BODIES = ("#8fa9c4", "#d9b382", "#93b8a1", "#c79c94", "#a9a3c2", "#b9b8a0")
+FORCE, TORQUE, LOOP, AXIS = "#c8201e", GREEN, ORANGE, BLUE
+
+
+class Stage(NamedTuple):
+    """What surrounds the mechanism, in world axes and m.
+
+    - `low`, `high` (3,): corners of the space that the motion takes; `centre` (3,), `size`, its middle and diagonal.
+    - `up` (3,): against gravity; `ground`: height of the ground along it.
+    - `eye` (3,): unit vector from the centre towards whoever looks.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    centre: np.ndarray
+    size: float
+    up: np.ndarray
+    ground: float
+    eye: np.ndarray
+
+
+def all_solids(motion: Motion, shapes) -> Shapes:
+    """The solids given (None: none; a path: those of the file), completed by inferred ones.
+
+    **Raises:** ValueError for what holds no shapes, and for shapes on frames that the model does not have.
+    """
+    if shapes is None:
+        shapes = Shapes()
+    elif not isinstance(shapes, tuple | list) or not all(isinstance(item, Shape) for item in shapes):
+        raise ValueError(f"shapes is {shapes!r}; give jd.shapes(path), a list of jaxdyn.pictures.Shape, or None")
+    shapes = shapes if isinstance(shapes, Shapes) else Shapes(shapes)
+    model = motion.scene.system
+    unknown = sorted(shapes.frames() - set(model.frame_names))
+    if unknown:
+        raise ValueError(
+            f"shapes are on frames {', '.join(unknown[:5])}, which model {model.name!r} does not have; are they of another file?"
+        )
+    return completed(motion.scene, shapes)
+
+
+def stage_of(motion: Motion, shapes: Shapes) -> Stage:
+    """The stage for a motion and its solids."""
+    model = motion.scene.system
+    points = [motion.poses[:, ::, :, :3, 3].reshape(-1, 3)]
+    rows = motion._replace(poses=motion.poses[:, :: max(1, motion.poses.shape[1] // 40)])
+    for shape in shapes:
+        vertices, _ = shape.triangles()
+        low, high = vertices.min(0), vertices.max(0)
+        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        if shape.kind == "ellipsoid" and len(set(shape.size)) == 1:
+            # The corners of a ball's box turn with it and reach below the ground on which it rolls.
+            here = place_of(model, rows.poses, shape.frame)
+            centre = (here @ shape.pose)[..., :3, 3].reshape(-1, 3)
+            points += [centre + sign * shape.size[0] for sign in (-1.0, 1.0)]
+            continue
+        if shape.kind == "cylinder":
+            corners = vertices
+        here = place_of(model, rows.poses, shape.frame)
+        points.append((corners @ np.swapaxes(here[..., :3, :3], -1, -2) + here[..., None, :3, 3]).reshape(-1, 3))
+    every = np.concatenate(points)
+    low, high = every.min(0), every.max(0)
+    size = max(float(np.linalg.norm(high - low)), 1e-3)
+    up = _up(model)
+    ground = _ground(motion, float((every @ up).min()), up, size)
+    return Stage(low, high, (low + high) / 2, size, up, ground, _eye(motion, high - low, up))
+
+
+def _up(model) -> np.ndarray:
+    gravity = None if model.gravity is None else np.asarray(model.gravity, float)
+    if gravity is None or not gravity.any():
+        return np.array([0.0, 0.0, 1.0])
+    # The nearest axis: a slope is drawn as a slope.
+    axis = int(np.argmax(np.abs(gravity)))
+    return -np.sign(gravity[axis]) * np.eye(3)[axis]
+
+
+def _ground(motion: Motion, lowest: float, up: np.ndarray, size: float) -> float:
+    heights = []
+    for constraint in pairs(motion.scene):
+        if isinstance(constraint, Loop | Distance):
+            continue
+        (surface, pose), _ = constraint.ends()
+        if surface is None and np.asarray(pose, float)[:3, 2] @ up > 0.9:
+            heights.append(float(np.asarray(pose, float)[:3, 3] @ up))
+    if heights and min(heights) <= lowest + 0.05 * size:
+        return min(heights)
+    return 0.0 if -0.02 * size <= lowest <= 0.15 * size else lowest
+
+
+def _eye(motion: Motion, extent: np.ndarray, up: np.ndarray) -> np.ndarray:
+    joints = motion.poses[:, :, :, :3, 3].reshape(-1, 3)
+    spread = np.ptp(joints, axis=0)
+    flat = int(np.argmin(spread))
+    widest = max(spread.max(), 1e-9)
+    across = np.eye(3)[flat]
+    if len(joints) > 2 and spread[flat] < 0.02 * widest and np.sort(spread)[1] > 0.1 * widest:
+        if abs(across @ up) < 0.5:
+            # A mechanism in a vertical plane is seen from its front, from a little above.
+            side = np.cross(up, across)
+            return _unit(-across * (1.0 if flat == 1 else -1.0) + 0.35 * side + 0.3 * up)
+        if not (motion.scene.constraints and extent @ np.abs(up) > 0.2 * widest):
+            return _unit(0.35 * _sideways(up)[1] + 1.1 * up)
+    one, other = _sideways(up)
+    return _unit(one + 0.75 * other + 0.55 * up)
+
+
+def _sideways(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Horizontal directions: x and -y where z is up."""
+    axis = int(np.argmax(np.abs(up)))
+    one = np.eye(3)[(axis + 1) % 3]
+    return one, -np.cross(up, one)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+def color_of(shape: Shape, model) -> tuple[float, float, float]:
+    """Colour (3,) from 0 to 1 of a solid: its own, or that of its body."""
+    if shape.color is not None:
+        return tuple(float(x) for x in shape.color[:3])  # pyright: ignore[reportReturnType]
+    index = -1 if shape.frame is None else model.topology.frame_bodies[model.frame_names.index(shape.frame)]
+    return (0.7, 0.7, 0.7) if index < 0 else rgb(_BODIES[index % len(_BODIES)])
+
+
+def rgb(code: str) -> tuple[float, float, float]:
+    """Colour (3,) from 0 to 1 of a code #rrggbb."""
+    return tuple(int(code[k : k + 2], 16) / 255 for k in (1, 3, 5))  # pyright: ignore[reportReturnType]

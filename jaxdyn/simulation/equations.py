@@ -1,0 +1,164 @@
+"""The differential equation of a run: rates of the state, what is done after a step, what is watched on the way.
+
+Functions of a run hold no arrays: what is traced of scene, control and method goes through `args`.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+
+from jaxdyn.compile import is_expanding, is_rank_safe, partition_traced
+from jaxdyn.simulation import contacts as unilateral
+from jaxdyn.simulation import controls
+from jaxdyn.simulation import limits as joint_limits
+from jaxdyn.simulation.methods import Method
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import retract, velocity_to_rate
+
+
+class Equations(NamedTuple):
+    """What diffrax and our own loops integrate.
+
+    - `args`: what is traced. `derivative(t, y, args)`, and its two parts for solvers that split it.
+    - `torque(args, y, q, v, t)` of the control and `effort`, which is that plus the scene's forces, (nv,) or None.
+    - `project(t, y, error, args)` after a step; `quality` of the method's basis; `begin`, `advance` for steps of its own.
+    - `allowances(args, y, q, v, t)` of contacts and joints that can end the run; `least_allowance(t, y, args)`, or None
+      where nothing can.
+    """
+
+    args: tuple | None
+    torque: Callable
+    effort: Callable
+    derivative: Callable
+    explicit_part: Callable
+    implicit_part: Callable
+    project: Callable
+    quality: Callable
+    begin: Callable
+    advance: Callable
+    allowances: Callable
+    least_allowance: Callable | None
+
+
+def power(force, v):
+    """Of a force (nv,) or None."""
+    return jnp.zeros((), v.dtype) if force is None else jnp.sum(v * force)
+
+
+def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...], options: dict) -> Equations:
+    """The equations of a run; `added`: names of what the control adds to the state."""
+    system = scene.system
+    # diffrax compiles its arguments, which hides their values. What is known stays in closures, the rest is `args`:
+    # flat, because its continuous adjoint takes no empty tuples.
+    unknown, known = partition_traced((scene, control, method))
+    args = tuple(unknown) or None
+
+    def given(args):
+        """The scene, the control and the method."""
+        return known(args or ())
+
+    def torque(args, y, q, v, t):
+        """Of the control, or None when there is none."""
+        scene, control, method = given(args)
+
+        def multipliers(tau):
+            force = scene.applied_force(q, v, t)
+            return method.multipliers(scene, q, v, t, tau if force is None else tau + force)
+
+        tau = controls.torque(control, scene, y, q, v, t, multipliers)
+        return None if tau is None else scene.limited(tau)
+
+    def effort(args, y, q, v, t):
+        """Tau plus the scene's forces, or None when there are none."""
+        force, tau = given(args)[0].applied_force(q, v, t), torque(args, y, q, v, t)
+        return force if tau is None else tau if force is None else tau + force
+
+    def of_control(args, y, q, v, t, force):
+        """Rates of what the control adds to the state."""
+        scene, control, method = given(args)
+        return controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
+
+    # Traced once for all the places where diffrax and differentiation call it, and once for each way in which it is traced.
+    @functools.partial(jax.jit, static_argnums=0)
+    def traced(way, t, y, args):
+        scene, _, method = given(args)
+        rates, force, v = method.evaluated(scene, y, t, functools.partial(effort, args, y))
+        if added:
+            rates = rates | of_control(args, y, retract(system, y["q"]), v, t, force)
+        return rates | {"work": power(force, v)} if "work" in y else rates
+
+    def derivative(t, y, args):
+        return traced((is_expanding(), is_rank_safe()), t, y, args)
+
+    @jax.jit
+    def explicit_part(t, y, args):
+        """All rates but those of `implicit_part`."""
+        scene, _, method = given(args)
+        q, v = method.place(scene, y, t)
+        rates = method.rates(scene, y, q, v, t, torque(args, y, q, v, t)) | {"q": jnp.zeros_like(y["q"])}
+        force = effort(args, y, q, v, t) if added or "work" in y else None
+        rates = rates | of_control(args, y, q, v, t, force)
+        return rates | {"work": power(force, v)} if "work" in y else rates
+
+    @jax.jit
+    def implicit_part(t, y, args):
+        """dq/dt = H v, and what the scene's forces add to the rates of velocity, on which they act linearly."""
+        scene, _, method = given(args)
+        q, v = method.place(scene, y, t)
+        rates = jax.tree.map(jnp.zeros_like, y)
+        force = scene.applied_force(q, v, t)
+        if force is not None:
+            by_force = {name: y[name] for name in y if name not in ("work", *added)}
+            _, pushed = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
+            rates = rates | pushed
+        return rates | {"q": velocity_to_rate(scene.system, q, v)}
+
+    def project(t, y, error, args):
+        scene, _, method = given(args)
+        y, error = method.stepped(scene, y, t, error)
+        # A step that will be rejected may be too long to be projected, so failing here does not end the run.
+        y = method.continued(scene, y, t)
+        if controls.HELD in y:
+            y = y | {controls.HELD: controls.sampled(given(args)[1], y[controls.HELD], *method.place(scene, y, t), t)}
+        return y, error, diffrax.RESULTS.successful
+
+    def quality(t, y, args, **_):
+        scene, _, method = given(args)
+        return method.quality(scene, y, t)
+
+    def begin(t, y, args):
+        scene, _, method = given(args)
+        return method.begin(scene, y, t)
+
+    by_contacts = unilateral.can_end(scene, options["contacts"])
+
+    def allowances(args, y, q, v, t):
+        """How far the contacts are from being lost, and the joints from their limits."""
+        scene, _, method = given(args)
+        found = []
+        if by_contacts:
+            found.append(unilateral.allowances(scene, method.multipliers(scene, q, v, t, effort(args, y, q, v, t))))
+        if options["limits"] == "stop":
+            found.append(joint_limits.limit_margins(scene.system, q))
+        return jnp.concatenate(found)
+
+    @jax.jit
+    def least_allowance(t, y, args):
+        scene, _, method = given(args)
+        q, v = method.place(scene, y, t)
+        return jnp.min(allowances(args, y, q, v, t))
+
+    @jax.jit
+    def advance(t0, t1, y, args, carried):
+        scene, _, method = given(args)
+        return method.advance(scene, y, t0, t1, carried, functools.partial(effort, args, y))
+
+    watched = by_contacts or options["limits"] == "stop"
+    return Equations(
+        args, torque, effort, derivative, explicit_part, implicit_part, project, quality, begin, advance, allowances,
+        least_allowance if watched else None,
+    )  # fmt: skip

@@ -1,0 +1,142 @@
+"""Solutions as files and tables: CSV and NPZ that `jd.identify` reads as logs, and xarray datasets."""
+
+import csv
+import json
+import os
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdyn.constraints.base import layout
+from jaxdyn.model.arguments import as_path
+from jaxdyn.model.columns import columns_of
+from jaxdyn.systems.scene import Scene, as_scene
+
+
+class Signal(NamedTuple):
+    """One array of a solution: values (..., nt, columns) or (..., nt), the names of its columns (none of a single one), units."""
+
+    key: str
+    values: np.ndarray
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+def signals(solution: Any, scene: Any) -> list[Signal]:
+    """All arrays of a solution that have one row for each save point, with names and units.
+
+    **Raises:** ValueError when the scene is not that of the solution.
+    """
+    scene = as_scene(scene)
+    if np.shape(solution.q)[-1:] != (scene.nq,) or np.shape(solution.v)[-1:] != (scene.nv,):
+        raise ValueError(
+            f"solution has q {np.shape(solution.q)} and v {np.shape(solution.v)}, the scene nq = {scene.nq} and nv = "
+            f"{scene.nv}; pass the scene that was simulated"
+        )
+    names = columns_of(scene.system)
+    rows = _row_names(scene)
+    both = ("position", "velocity")
+    found = [
+        ("q", solution.q, names.q, names.q_units),
+        ("v", solution.v, names.v, names.v_units),
+        ("a", solution.acceleration, names.v, names.a_units),
+        ("tau", solution.torque, names.v, names.force_units),
+        ("multipliers", solution.multipliers, rows, ("",) * len(rows)),
+        ("constraint_residual", solution.constraint_residual, both, ("", "")),
+        ("energy", solution.energy, (), ("J",)),
+        ("power", solution.power, (), ("W",)),
+        ("work", solution.work, (), ("J",)),
+    ]
+    for name, values in solution.contact_forces.items():
+        parts = tuple(str(k + 1) for k in range(np.shape(values)[-1]))
+        found.append((f"contact_force_{name}", values, parts, ("",) * len(parts)))
+    found += [(f"contact_margin_{name}", values, (), ("",)) for name, values in solution.contact_margins.items()]
+    return [Signal(key, np.asarray(x), tuple(n), tuple(u)) for key, x, n, u in found if x is not None]
+
+
+def _row_names(scene: Scene) -> tuple[str, ...]:
+    return tuple(
+        f"{place.name}.{k - place.start + 1}" for place in layout(scene) for k in range(place.start, place.end)
+    )
+
+
+def times(solution: Any) -> np.ndarray:
+    """Save points (nt,). **Raises:** ValueError where those of a batch differ."""
+    ts = np.asarray(solution.ts)
+    ts = ts.reshape(-1, ts.shape[-1])
+    if (ts != ts[0]).any():
+        raise ValueError("solution.ts differs from motion to motion; write each of them on its own")
+    return ts[0]
+
+
+def write_csv(solution: Any, path: str | os.PathLike, scene: Any) -> None:
+    """See `Solution.to_csv`."""
+    path = _checked(path, ".csv")
+    found, ts = signals(solution, scene), times(solution)
+    # What reads logs takes joint names where each joint has one number, and else counts.
+    named = found[0].names == found[1].names
+    header, arrays = ["t [s]"], []
+    for signal in found:
+        parts = signal.names or ("",)
+        arrays.append(signal.values.reshape(-1, len(ts), len(parts)))
+        for k, (name, unit) in enumerate(zip(parts, signal.units, strict=True)):
+            if signal.key in ("q", "v", "a", "tau"):
+                label, note = (f"{signal.key}_{name}", unit) if named else (f"{signal.key}{k + 1}", f"{name}; {unit}")
+            else:
+                label, note = f"{signal.key}_{name}" if name else signal.key, unit
+            header.append(f"{label} [{note}]" if note else label)
+    table = np.concatenate(arrays, axis=2)
+    batched = np.ndim(solution.q) > 2
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow((["rollout"] if batched else []) + header)
+        for n, motion in enumerate(table):
+            first = [str(n + 1)] if batched else []
+            writer.writerows(first + [repr(float(x)) for x in (t, *row)] for t, row in zip(ts, motion, strict=True))
+
+
+def write_npz(solution: Any, path: str | os.PathLike, scene: Any) -> None:
+    """See `Solution.to_npz`."""
+    path = _checked(path, ".npz")
+    arrays: dict[str, np.ndarray] = {"t": times(solution)}
+    units: dict[str, Any] = {"t": "s"}
+    names: dict[str, list] = {}
+    for signal in signals(solution, scene):
+        arrays[signal.key] = signal.values
+        units[signal.key] = list(signal.units) if signal.names else signal.units[0]
+        names[signal.key] = list(signal.names)
+    arrays |= {f"pose_{name}": np.asarray(pose) for name, pose in solution.poses.items()}
+    texts = {"names": np.array(json.dumps(names)), "units": np.array(json.dumps(units))}
+    np.savez_compressed(path, **arrays, **texts)  # pyright: ignore[reportArgumentType]
+
+
+def as_xarray(solution: Any, scene: Any) -> Any:
+    """See `Solution.to_xarray`."""
+    try:
+        import xarray  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError("Solution.to_xarray needs xarray: pip install xarray") from error
+    batch = tuple(f"batch{k}" for k in range(np.ndim(solution.q) - 2)) if np.ndim(solution.q) > 3 else ("rollout",)
+    batch = batch if np.ndim(solution.q) > 2 else ()
+    axes = {"q": "coordinate", "v": "velocity", "a": "velocity", "tau": "velocity", "multipliers": "row"}
+    variables: dict[str, tuple] = {}
+    coordinates: dict[str, tuple] = {"t": ("t", times(solution), {"units": "s"})}
+    for signal in signals(solution, scene):
+        if not signal.names:
+            variables[signal.key] = ((*batch, "t"), signal.values, {"units": signal.units[0]})
+            continue
+        axis = axes.get(signal.key, signal.key)
+        coordinates[axis] = (axis, list(signal.names))
+        variables[signal.key] = ((*batch, "t", axis), signal.values, {"units": list(signal.units)})
+    for name, pose in solution.poses.items():
+        variables[f"pose_{name}"] = ((*batch, "t", "pose_row", "pose_column"), np.asarray(pose), {"units": "m"})
+    return xarray.Dataset(variables, coordinates)
+
+
+def _checked(path, suffix: str):
+    path = as_path(path)
+    if path.suffix.lower() != suffix:
+        raise ValueError(f"path is {str(path)!r}; write to a file {suffix}")
+    if not path.parent.is_dir():
+        raise ValueError(f"path is {str(path)!r}: there is no directory {path.parent}")
+    return path

@@ -1,0 +1,251 @@
+"""Dynamics within a mode: constraints, contacts that are closed, friction that sticks, and friction that slides in proportion to
+multipliers.
+
+With Y = U^-1 A^T, M = U U^T, for the active rows A a = gamma, and sliding friction -Z N of which the normal forces N = S lam
+are multipliers themselves,
+
+    M a + h = tau + A^T lam - Z N,    (A M^-1 A^T) lam - (A M^-1 Z) S lam = gamma - A M^-1 (tau - h).
+
+The first matrix is symmetric; the second term makes the equations for N lose their positive pivots where friction is strong:
+Painleve's paradox, where forces of rigid bodies do not exist or are not unique.
+
+Rows that depend on each other (a box on two corners that stick) have multipliers near those of least norm.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxdyn.constraints.base import Rows, position_residual, rows
+from jaxdyn.dynamics.quantities import bias_force, mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.simulation.hybrid.modes import Elements, Mode, extended, force_at
+from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_factored
+from jaxdyn.systems.scene import Scene
+
+
+class Place(NamedTuple):
+    """What is known of a state before its mode: rows, mass matrix, and the sliding velocities (n, 2)."""
+
+    row: Rows
+    metric: MassFactor
+    Y: Array
+    slip: Array
+
+
+class Pushed(NamedTuple):
+    """What constraints and friction do: multipliers (count,), normal forces (n,), friction that holds (n, 2), what they add to
+    the velocity's rate (nv,), and the pivots (n,) of the equations for normal forces: one without friction."""
+
+    multipliers: Array
+    normal: Array
+    holding: Array
+    change: Array
+    pivots: Array
+
+
+def place_at(scene: Scene, elements: Elements, q, v, t) -> Place:
+    """Of the scene as it is, with its elements."""
+    row = rows(extended(scene), q, v, t)
+    metric = mass_factor(mass_matrix(scene.system, q, t))
+    return Place(row, metric, metric.whiten(row.A.T), by_element(elements, row.velocity))
+
+
+def by_element(elements: Elements, rowwise) -> Array:
+    """Entries of the rows that slip, (n, 2), zero where there are none."""
+    zero = jnp.zeros((), rowwise.dtype)
+    return jnp.stack(
+        [
+            jnp.stack([rowwise[one.tangent[k]] if k < len(one.tangent) else zero for k in range(2)])
+            for one in elements.each
+        ]
+    )
+
+
+def normal_given(scene: Scene, element, q, v, t):
+    """N of a friction whose normal force is given."""
+    normal: Any = force_at(scene, element).normal
+    value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
+    if jnp.shape(value) != ():
+        raise ValueError(f"friction {element.name!r}: normal gives shape {jnp.shape(value)}; expected one number, ()")
+    return jnp.asarray(value, q.dtype)
+
+
+def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
+    """Unit vectors (n, 2) of sliding; shorter ones for friction that is smooth.
+
+    They go on smoothly through w = 0 to w < 0, as the events that end a mode there are looked for from both sides: w/|w| with
+    the sign that `reference` (n, 2) has, which for one row is constant.
+    """
+    found = []
+    for i, one in enumerate(elements.each):
+        w, s = slip[i], reference[i]
+        least = 100 * float(jnp.finfo(w.dtype).eps)
+        square = jnp.sum(w * w)
+        moves = square > least**2
+        length = jnp.sqrt(jnp.where(moves, square, jnp.ones_like(square)))
+        if one.smooth:
+            speed = force_at(scene, one).smoothing.astype(w.dtype)
+            found.append(w * jnp.where(moves, jnp.tanh(length / speed) / length, 1 / speed))
+        elif len(one.tangent) < 2:
+            found.append(s)
+        else:
+            forward = jnp.where(jnp.sum(s * w) < 0, -1.0, 1.0).astype(w.dtype)
+            found.append(jnp.where(moves, forward * w / length, s))
+    return jnp.stack(found)
+
+
+def slides(elements: Elements, mode: Mode) -> list:
+    """Whether each element slides, ()."""
+    free = [jnp.ones((), bool) if one.smooth else ~mode.stick[i] for i, one in enumerate(elements.each)]
+    return [mode.closed[i] & free[i] for i in range(len(elements.each))]
+
+
+def push(scene: Scene, elements: Elements, mode: Mode, place: Place, along, wanted) -> Pushed:
+    """Forces that give the active rows the rates `wanted` (count,); impulses that give them velocities."""
+    dtype = wanted.dtype
+    active = elements.active(mode).astype(dtype)
+    sliding = slides(elements, mode)
+    Z = [
+        jnp.where(sliding[i], force_at(scene, elements.each[i]).coefficient.astype(dtype), 0.0)
+        * _product(along[i, : len(elements.each[i].tangent)], place.row.A[jnp.asarray(elements.each[i].tangent)])
+        for i in elements.coupled
+    ]
+    count = len(Z)
+    pushes = place.metric.whiten(jnp.stack(Z).T) if count else jnp.zeros((scene.nv, 0), dtype)
+    right = jnp.concatenate([wanted[:, None], _product(place.Y.T, pushes)], 1) * active[:, None]
+    found = solve_rows(place.Y * active[None], active, right)
+    base, by_normal = found[:, 0], found[:, 1:]
+    sign = mode.signs(dtype)
+    at = [elements.each[i].normal for i in elements.coupled]
+    normal = jnp.zeros((0,), dtype)
+    pivots = [jnp.ones((), dtype)] * len(elements.each)
+    if count:
+        pick = jnp.stack([sign[i] for i in elements.coupled])
+        K = jnp.eye(count, dtype=dtype) - pick[:, None] * by_normal[jnp.asarray(at)]
+        normal, own = _eliminated(K, pick * base[jnp.asarray(at)])
+        for i, pivot in zip(elements.coupled, own, strict=True):
+            pivots[i] = jnp.where(sliding[i], pivot, jnp.ones_like(pivot))
+    lam = (base + _product(by_normal, normal)) * active
+    change = place.metric.unwhiten(_product(place.Y, lam) - _product(pushes, normal))
+    zero = jnp.zeros((), dtype)
+    each = [sign[i] * lam[one.normal] if one.normal >= 0 else zero for i, one in enumerate(elements.each)]
+    return Pushed(lam, jnp.stack(each), by_element(elements, lam), change, jnp.stack(pivots))
+
+
+def solve_rows(Y, active, right):
+    """x with Y^T Y x = right on the active rows, zero elsewhere; near the least norm where rows depend on each other.
+
+    Two steps of the proximal method x <- x + (G + eps)^-1 (right - G x), of rows scaled to unit length.
+    """
+    square, eps = jnp.sum(Y * Y, 0), float(jnp.finfo(Y.dtype).eps)
+    # What is left of a row by rounding, as of one across the plane of a plane model, is none.
+    is_row = square > eps**1.5 * jnp.max(square)
+    scale = jnp.where(is_row, 1 / jnp.sqrt(jnp.where(is_row, square, jnp.ones_like(square))), 0.0)
+    Y = Y * scale[None]
+    shift = eps**0.5
+    count = Y.shape[1]
+    factor = cholesky(_product(Y.T, Y) + jnp.diag(1.0 - active + shift * jnp.ones((count,), Y.dtype)))
+    right = right * scale[:, None]
+    x = solve_factored(factor, right)
+    for _ in range(2):
+        x = x + solve_factored(factor, (right - _product(Y.T, _product(Y, x))) * active[:, None])
+    return x * (scale * active)[:, None]
+
+
+def _eliminated(K, right):
+    """x with K x = right, and the pivots in turn."""
+    n, pivots = K.shape[0], []
+    matrix = [K[i] for i in range(n)]
+    values = [right[i] for i in range(n)]
+    for i in range(n):
+        pivot = matrix[i][i]
+        pivots.append(pivot)
+        pivot = jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
+        for j in range(i + 1, n):
+            share = matrix[j][i] / pivot
+            matrix[j] = matrix[j] - share * matrix[i]
+            values[j] = values[j] - share * values[i]
+    found: list[Any] = [None] * n
+    for i in reversed(range(n)):
+        rest = values[i]
+        for j in range(i + 1, n):
+            rest = rest - matrix[i][j] * found[j]
+        pivot = matrix[i][i]
+        found[i] = rest / jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
+    return jnp.stack(found), pivots
+
+
+class Motion(NamedTuple):
+    """Accelerations (nv,), what pushes, normal forces (n,) with those that are given, and rates of the rows (count,) with the
+    size of what cancels in them."""
+
+    acceleration: Array
+    pushed: Pushed
+    normal: Array
+    rates: Array
+    sizes: Array
+
+
+def motion_at(scene: Scene, elements: Elements, mode: Mode, place: Place, reference, effort, q, v, t) -> Motion:
+    """Accelerations in a mode; `effort` (nv,) is tau and the forces without modes, or None."""
+    along = directions(scene, elements, place.slip, reference)
+    force = jnp.zeros_like(v) if effort is None else effort
+    sliding = slides(elements, mode)
+    given = {}
+    for i, one in enumerate(elements.each):
+        if one.normal < 0:
+            given[i] = normal_given(scene, one, q, v, t)
+            level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(v.dtype) * given[i], 0.0)
+            force = force - level * _product(along[i, : len(one.tangent)], place.row.A[jnp.asarray(one.tangent)])
+    free = place.metric.whiten(force - bias_force(scene.system, q, v, t))
+    wanted = place.row.gamma - _product(place.Y.T, free)
+    pushed = push(scene, elements, mode, place, along, wanted)
+    acceleration = place.metric.unwhiten(free) + pushed.change
+    normal = jnp.stack([given.get(i, pushed.normal[i]) for i in range(len(elements.each))])
+    parts = place.row.A * acceleration[None]
+    sizes = jnp.sum(jnp.abs(parts), 1) + jnp.abs(place.row.gamma)
+    return Motion(acceleration, pushed, normal, jnp.sum(parts, 1) - place.row.gamma, sizes)
+
+
+def gaps(scene: Scene, elements: Elements, q, t) -> Array:
+    """Of the elements that open, (n,); zero of others."""
+    whole = extended(scene)
+    held = position_residual(whole, q, t)
+    # Contacts have one row each among the residuals, behind those of the scene's own constraints.
+    at, found = held.shape[0] - sum(one.opens for one in elements.each), []
+    for one in elements.each:
+        found.append(held[at] if one.opens else jnp.zeros((), q.dtype))
+        at += one.opens
+    return jnp.stack(found)
+
+
+def jumped(scene: Scene, elements: Elements, mode: Mode, place: Place, along, v) -> tuple[Array, Pushed]:
+    """The velocity after impulses that end the motion of the active rows, and these."""
+    pushed = push(scene, elements, mode, place, along, -place.row.velocity)
+    return v + pushed.change, pushed
+
+
+def conditions(scene: Scene, elements: Elements, mode: Mode, place: Place, motion: Motion, reference, q, t) -> Array:
+    """What a mode keeps positive, (n, CHANNELS): 1 where it asks for nothing."""
+    gap, found = gaps(scene, elements, q, t), []
+    one_ = jnp.ones((), q.dtype)
+    for i, one in enumerate(elements.each):
+        normal = one_
+        if one.opens:
+            normal = jnp.where(mode.closed[i], motion.normal[i], gap[i])
+        elif one.normal >= 0:
+            normal = motion.normal[i]
+        friction, pivot = one_, one_
+        if one.tangent and not one.smooth:
+            hold = motion.pushed.holding[i]
+            square = jnp.sum(hold * hold)
+            size = jnp.sqrt(jnp.where(square > 0, square, one_)) * (square > 0).astype(q.dtype)
+            margin = force_at(scene, one).static.astype(q.dtype) * motion.normal[i] - size
+            friction = jnp.where(mode.stick[i], margin, jnp.sum(reference[i] * place.slip[i]))
+            friction = jnp.where(mode.closed[i], friction, one_)
+        if one.tangent:
+            pivot = motion.pushed.pivots[i]
+        found.append(jnp.stack([normal, friction, pivot]))
+    return jnp.stack(found)

@@ -1,0 +1,186 @@
+"""The functions of a motion with modes, of a scene whose unknown numbers are arguments: vector field, projection, conditions and
+transitions, on states with the entries q, v and `slip`, the directions (n, 2) in which elements slide.
+
+Directions are constants of a step (`jumping`), renewed where it ends.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from jaxdyn.compile import run
+from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
+from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.simulation.hybrid.dynamics import (
+    Place,
+    by_element,
+    conditions,
+    directions,
+    gaps,
+    jumped,
+    motion_at,
+    place_at,
+    solve_rows,
+)
+from jaxdyn.simulation.hybrid.machine import Laws
+from jaxdyn.simulation.hybrid.modes import Elements, Mode, extended, force_at
+from jaxdyn.simulation.hybrid.transitions import Judged, Jumped, aligned, at_once, changed_mode
+from jaxdyn.simulation.solvers.explicit import Plan
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_to_rate
+
+_ROUNDS = 2
+
+
+def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
+    """`given(unknown)` -> (scene, effort(q, v, t)), of the numbers that are arguments; `y0`, a state."""
+
+    def at(args, t, y):
+        unknown, mode = args
+        scene, effort = given(unknown)
+        q, v = retract(scene.system, y["q"]), y["v"]
+        place = place_at(scene, elements, q, v, t)
+        return scene, mode, q, v, place, motion_at(scene, elements, mode, place, y["slip"], effort(q, v, t), q, v, t)
+
+    @jax.jit
+    def field(t, y, args):
+        scene, _, q, v, _, motion = at(args, t, y)
+        return {"q": velocity_to_rate(scene.system, q, v), "v": motion.acceleration, "slip": jnp.zeros_like(y["slip"])}
+
+    def project(t, y, error, args):
+        unknown, mode = args
+        return *put_back(given(unknown)[0], elements, mode, t, y, error), diffrax.RESULTS.successful
+
+    plan = Plan(type(solver), field, project, ("slip",), False, *_shape_of(y0))
+
+    def judge(args, t, y):
+        y = plan.structure(y)
+        scene, mode, q, v, place, motion = at(args, t, y)
+        found = _judged(scene, elements, mode, place, motion, y["slip"], q, v, t)
+        return found.conditions, found.levels
+
+    def judge_all(unknown, mode, slip, t, q, v):
+        scene, _, q, v, place, motion = at((unknown, mode), t, {"q": q, "v": v, "slip": slip})
+        return _judged(scene, elements, mode, place, motion, slip, q, v, t)
+
+    def jump(unknown, mode, slip, t, q, v):
+        return _jumped(given(unknown)[0], elements, mode, slip, t, q, v)
+
+    def transit(unknown, t, y, mode, slip, hit):
+        y = plan.structure(y)
+        q, v = y["q"], y["v"]
+        scene = given(unknown)[0]
+
+        def judge_in(mode, slip, v):
+            return run(judge_all, unknown, mode, slip, t, q, v)
+
+        def jump_in(mode, slip):
+            return run(jump, unknown, mode, slip, t, q, v)
+
+        mode, slip, begins = at_once(elements, mode, slip, judge_in(mode, slip, v), hit)
+        cones = jnp.stack([force_at(scene, one).static.astype(v.dtype) for one in elements.each])
+        return changed_mode(elements, cones, mode, slip, begins, v, jump_in, judge_in)
+
+    def land(unknown, mode, slip, t, y):
+        y = plan.structure(y)
+        found = run(jump, unknown, mode, slip, t, y["q"], y["v"])
+        return ravel_pytree(y | {"v": found.v})[0]
+
+    def slip_of(y):
+        return plan.structure(y)["slip"]
+
+    def placed(y, v, slip):
+        return ravel_pytree(plan.structure(y) | {"v": v, "slip": slip})[0]
+
+    return Laws(plan, elements, judge, transit, land, solver.error_order(None), slip_of, placed)
+
+
+def _shape_of(y0):
+    leaves, tree = jax.tree.flatten(y0)
+    return tree, tuple(x.shape for x in leaves)
+
+
+def put_back(scene: Scene, elements: Elements, mode: Mode, t, y, error):
+    """q and v by the least change onto the rows that act, and the error (or None) without its part normal to them."""
+    whole, dtype = extended(scene), y["v"].dtype
+    q, v = retract(scene.system, y["q"]), y["v"]
+    place = place_at(scene, elements, q, v, t)
+    held = holonomic_rows(layout(whole))
+    active = elements.active(mode).astype(dtype)
+    holds = jnp.zeros((elements.count,), dtype).at[held].set(1.0) * active
+
+    def change(wanted, which):
+        """The least velocities that change the rows by `wanted`."""
+        lam = solve_rows(place.Y * which[None], which, (wanted * which)[:, None])[:, 0]
+        return place.metric.unwhiten(_product(place.Y, lam))
+
+    tangent = None
+    if error is not None:
+        e = rate_to_velocity(scene.system, q, error["q"])
+        e = e - change(_product(place.row.A, e), holds)
+        tangent = error | {
+            "q": velocity_to_rate(scene.system, q, e),
+            "v": error["v"] - change(_product(place.row.A, error["v"]), active),
+        }
+    blank = jnp.zeros((elements.count,), dtype)
+    if held.size:
+        for _ in range(_ROUNDS):
+            q = displace(scene.system, q, -change(blank.at[held].set(position_residual(whole, q, t)), holds))
+    for _ in range(_ROUNDS):
+        v = v - change(velocity_residual(whole, q, v, t), active)
+    slip = by_element(elements, velocity_residual(whole, q, v, t))
+    return y | {"q": q, "v": v, "slip": aligned(slip, y["slip"])}, tangent
+
+
+def _jumped(scene: Scene, elements: Elements, mode: Mode, slip, t, q, v) -> Jumped:
+    place = place_at(scene, elements, q, v, t)
+    after, pushed = jumped(scene, elements, mode, place, directions(scene, elements, jnp.zeros_like(slip), slip), v)
+    rates = _product(place.row.A, after - v) + place.row.velocity
+    gap = jnp.stack([rates[one.normal] if one.opens else jnp.zeros((), v.dtype) for one in elements.each])
+    M = mass_matrix(scene.system, q, t)
+    size = jnp.max(jnp.abs(_product(M, v))) + jnp.max(jnp.abs(M)) + jnp.max(jnp.abs(pushed.multipliers))
+    return Jumped(after, pushed.normal, pushed.holding, by_element(elements, rates), gap, size)
+
+
+def _judged(scene: Scene, elements: Elements, mode: Mode, place: Place, motion, slip, q, v, t) -> Judged:
+    dtype, eps = v.dtype, float(jnp.finfo(v.dtype).eps)
+    values = conditions(scene, elements, mode, place, motion, slip, q, t)
+    speeds = jnp.sum(jnp.abs(place.row.A) * jnp.abs(v)[None], 1)
+    zero = jnp.zeros((), dtype)
+    reach = 1 + jnp.max(jnp.abs(q))
+    force = jnp.sum(jnp.abs(motion.normal)) + jnp.sum(jnp.abs(motion.pushed.holding))
+    levels, slip_size, rate_size = [], [], []
+    for i, one in enumerate(elements.each):
+        tangent = [speeds[k] for k in one.tangent] or [zero]
+        speed = jnp.max(jnp.stack(tangent))
+        rates = [motion.sizes[k] for k in (*one.tangent, *((one.normal,) if one.opens else ()))]
+        slip_size.append(1 + speed + (speeds[one.normal] if one.opens else zero))
+        rate_size.append(jnp.max(jnp.stack(rates or [zero])))
+        normal = jnp.where(mode.closed[i], 10 * force, reach)
+        friction = jnp.where(mode.stick[i], 10 * force, speed)
+        levels.append(jnp.stack([100 * eps * normal, 100 * eps * friction, jnp.full((), eps, dtype)]))
+    cone = jnp.stack(
+        [force_at(scene, one).static.astype(dtype) * motion.normal[i] for i, one in enumerate(elements.each)]
+    )
+    gap_rates = [(place.row.velocity[one.normal], motion.rates[one.normal]) if one.opens else (zero, zero)
+                 for one in elements.each]  # fmt: skip
+    return Judged(
+        values,
+        jnp.stack(levels),
+        motion.normal,
+        motion.pushed.holding,
+        cone,
+        place.slip,
+        by_element(elements, motion.rates),
+        jnp.stack(slip_size),
+        jnp.stack(rate_size),
+        gaps(scene, elements, q, t),
+        jnp.stack([a for a, _ in gap_rates]),
+        jnp.stack([b for _, b in gap_rates]),
+        reach,
+    )

@@ -1,0 +1,283 @@
+"""The steps of a motion with modes: one attempt in every turn of a loop, by which each lane of a batch goes its own way.
+
+A step that ends where a condition of the mode is violated is taken again, shorter, until its end is the event: the root is
+bracketed by the steps before and behind it, and approached by the secant rule of Illinois. So the state at the event is that of
+a step of full order, and not of an interpolation. Conditions are looked at in the middle and at the end of every step: what
+is violated and mended between is not seen.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jaxdyn.compile import any_in_batch, recompute_unless, run
+from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
+from jaxdyn.simulation.hybrid.transitions import Change
+from jaxdyn.simulation.solvers.driver import save
+from jaxdyn.simulation.solvers.explicit import Plan, bent_output, step_in_turn, whole_step
+
+_SAFETY, _LEAST, _MOST, _AFTER_EVENT = 0.9, 0.2, 10.0, 0.3
+_SIMULTANEOUS, _REAL = 1e-9, 1e-6  # of the size of a condition in the step
+FINE, SHORT, PARADOX, NO_MODE, CROWDED = range(5)
+
+
+class Records(NamedTuple):
+    """What happened: a row for each event, of which the last one is for what is not kept. `name`: an index among
+    `Elements.names`; `trigger`: the condition that fell to zero, -1 for what came with another event. Modes and directions of the
+    impact and of what follows."""
+
+    time: Array
+    name: Array
+    trigger: Array
+    impact: Mode
+    impact_slip: Array
+    mode: Mode
+    slip: Array
+
+
+class Lane(NamedTuple):
+    """Where a motion is, what it tries next, and the bracket of an event, in lengths of the step."""
+
+    t: Array
+    y: Array
+    length: Array
+    usual: Array
+    mode: Mode
+    conditions: Array
+    locating: Array
+    low: Array
+    high: Array
+    value_low: Array
+    value_high: Array
+    side: Array
+    tries: Array
+    scale: Array
+    taken: Array
+    kept: Array
+    code: Array
+    count: Array
+
+
+class Laws(NamedTuple):
+    """The functions of a motion: `plan` of its steps, `judge(args, t, y)` -> conditions and their levels (n, CHANNELS), of flat
+    states; `transit(unknown, t, y, mode, slip, hit)` -> `Change`; `land(unknown, mode, slip, t, y)`, the state after
+    an impact; `order` of the error estimate; `slip(y)` (n, 2) of a flat
+    state, and `placed(y, v, slip)`, the flat state with these."""
+
+    plan: Plan
+    elements: Elements
+    judge: Any
+    transit: Any
+    land: Any
+    order: float
+    slip: Any
+    placed: Any
+
+
+def attempt(laws: Laws, args, t0, t1, y, rtol, atol):
+    """A step, the size of its error, and the conditions and levels at its end and in its middle."""
+    rate = laws.plan.field_of(args, t0, y) if laws.plan.passes_rate_on else jnp.zeros_like(y)
+    return _looked_at(laws, args, t0, t1, y, whole_step(laws.plan, args, t0, t1, y, rate), rtol, atol)
+
+
+def attempt_in_turn(laws: Laws, args, t0, t1, y, rtol, atol):
+    """The same, one stage after the other."""
+    rate = laws.plan.field_of(args, t0, y) if laws.plan.passes_rate_on else jnp.zeros_like(y)
+    return _looked_at(laws, args, t0, t1, y, step_in_turn(laws.plan, args, t0, t1, y, rate), rtol, atol)
+
+
+def _looked_at(laws: Laws, args, t0, t1, y, step, rtol, atol):
+    scaled = step.error / (atol + rtol * jnp.maximum(jnp.abs(y), jnp.abs(step.projected)))
+    size = jnp.sqrt(jnp.mean(scaled * scaled))
+    middle = (t0 + t1) / 2
+    between = bent_output(laws.plan, None, middle, t0, t1, y, step.raw, step.stages, step.shift)
+    return step, size, laws.judge(args, t1, step.projected), laws.judge(args, middle, between)
+
+
+def _attempted(laws: Laws, *given):
+    kernel: Any = partial(run, attempt, *given, static=(laws,), calls=True, served=True)
+    found, served = kernel(otherwise=lambda *_: None)
+    again = partial(attempt_in_turn, laws)
+    return again(*given) if found is None else recompute_unless(served, again, found, given)
+
+
+def blank(elements: Elements, dtype, most: int) -> Records:
+    """Before anything happened."""
+    n, none = len(elements.each), jnp.zeros((most + 1,), jnp.int32)
+    flags = jnp.zeros((most + 1, n), bool)
+    mode = Mode(flags, flags, flags)
+    slip = jnp.zeros((most + 1, n, 2), dtype)
+    return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, mode, slip, mode, slip)
+
+
+def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, max_steps: int, most: int):
+    """Rows of the state at ts[1:], the lane at its end, the records, and the change by which it began.
+
+    `y0` (m,), flat; `mode`, `slip` (n, 2): a first guess. `most`: events.
+    """
+    start, end, count = ts[0], ts[-1], ts.shape[0] - 1
+    eps, dtype, n = float(jnp.finfo(ts.dtype).eps), y0.dtype, len(laws.elements.each)
+    none, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    hit = jnp.zeros((n, CHANNELS), bool)
+    begun: Change = laws.transit(unknown, start, y0, mode, slip, hit)
+    y = laws.placed(y0, begun.v, begun.slip)
+    conditions, _ = run(judged, (unknown, begun.mode), start, y, static=(laws,))
+    code = jnp.where(begun.paradox, PARADOX, jnp.where(begun.found, FINE, NO_MODE)).astype(jnp.int32)
+    zero = jnp.zeros((), ts.dtype)
+    first = 1e-4 * (end - start)
+    lane = Lane(
+        start, y, first, first, begun.mode, conditions, no, zero, zero, zero, zero, none, none,
+        jnp.ones_like(conditions), none, none, code, none,
+    )  # fmt: skip
+    rows = jnp.broadcast_to(jnp.full_like(y, jnp.inf), (count, y.size))
+
+    def is_active(lane: Lane):
+        return (lane.t < end) & (lane.code == FINE) & (lane.taken < max_steps)
+
+    def body(carry):
+        lane, saved, rows, records = carry
+        active = is_active(lane)
+        t1 = jnp.where(active, jnp.minimum(lane.t + lane.length, end), lane.t)
+        args = unknown, lane.mode
+        found = _attempted(laws, args, lane.t, t1, lane.y, rtol, atol)
+        after, kept, hit = _decided(laws, lane, t1, end, found, eps)
+        after = jax.tree.map(lambda a, b: jnp.where(active, a, b), after, lane)
+        kept, hit = kept & active, hit & active & kept
+        saved, rows = save(laws.plan, ts, lane, after, kept, found[0], saved, rows)
+        happens = hit.any()
+        after, records = lax.cond(
+            any_in_batch(happens),
+            lambda after, records: _crossed(laws, unknown, after, records, hit, happens, most),
+            lambda after, records: (after, records),
+            after,
+            records,
+        )
+        return after, saved, rows, records
+
+    carry = lane, none, rows, blank(laws.elements, dtype, most)
+    lane, _, rows, records = lax.while_loop(lambda carry: any_in_batch(is_active(carry[0])), body, carry)
+    return rows, lane, records, begun
+
+
+def judged(laws: Laws, args, t, y):
+    """Conditions and levels."""
+    return laws.judge(args, t, y)
+
+
+def _decided(laws: Laws, lane: Lane, t1, end, found, eps: float) -> tuple[Lane, Array, Array]:
+    """The lane after an attempt, whether the step is kept, and which conditions ended it."""
+    step, size, (values, levels), (between, levels_between) = found
+    length = t1 - lane.t
+    good = size < 1
+    factor = _SAFETY * (1 / size) ** (1 / laws.order)
+    factor = jnp.where(jnp.isnan(factor), _LEAST, factor)
+    factor = jnp.clip(factor, jnp.where(good, 1.0, _LEAST), jnp.where(good, _MOST, _SAFETY)).astype(length.dtype)
+
+    violated = (values < -levels).any()
+    # In the middle alone: the step is halved first.
+    inside = good & ~lane.locating & (between < -levels_between).any()
+    violated = violated | inside
+    at = jnp.where(inside, between, values)
+    high = jnp.where(inside, length / 2, length)
+    level = jnp.maximum(levels, float(jnp.finfo(values.dtype).tiny))
+    scale = jnp.where(lane.locating, lane.scale, jnp.maximum(jnp.maximum(jnp.abs(lane.conditions), jnp.abs(at)), level))
+    value = jnp.min(at / scale)
+    first_value = jnp.min(lane.conditions / scale)
+
+    begins = good & violated & ~lane.locating
+    low = jnp.where(begins, 0.0, lane.low)
+    value_low = jnp.where(begins, first_value, lane.value_low)
+    # What was a root is near zero and does not guide the secant.
+    behind, before = good & violated, good & ~violated & lane.locating
+    low = jnp.where(before, high, low)
+    value_low = jnp.where(before, value, value_low)
+    high_ = jnp.where(behind, high, lane.high)
+    value_high = jnp.where(behind, value, lane.value_high)
+    side = jnp.where(behind, 1, jnp.where(before, -1, lane.side)).astype(jnp.int32)
+    again = lane.locating & (side == lane.side)
+    value_low = jnp.where(again & behind, value_low / 2, value_low)
+    value_high = jnp.where(again & before, value_high / 2, value_high)
+
+    locating = (lane.locating & good) | begins
+    near = jnp.abs(value) <= 64 * eps
+    narrow = (high_ - low) <= 4 * eps * jnp.maximum(jnp.abs(t1), lane.usual)
+    located = locating & (near | narrow) & ~inside
+    kept = good & ((~violated & ~lane.locating) | located)
+    # What the middle of a step showed may have been an error of the dense output.
+    real = located & (value <= _REAL)
+    hit = real & ((values <= _SIMULTANEOUS * scale) & (scale > 4 * level) | (values / scale <= value))
+
+    guided = (value_low > 64 * eps) & (value_high < 0) & (lane.tries < 30)
+    slope = jnp.where(guided, value_high - value_low, 1.0)
+    secant = jnp.where(guided, high_ - value_high * (high_ - low) / slope, (low + high_) / 2)
+    secant = jnp.clip(secant, low, high_)
+    usual = jnp.where(lane.locating, lane.usual, jnp.where(good & ~violated, length * factor, length))
+    usual = jnp.where(good, usual, length * factor)
+    next_length = jnp.where(locating, secant, usual)
+    next_length = jnp.where(located, _AFTER_EVENT * usual, next_length)
+    least = 4 * eps * jnp.maximum(jnp.abs(lane.t), eps)
+    short = ~good & (next_length < least)
+    pivot = jnp.min(lane.conditions[:, 2]) < 0.05  # friction that leaves no forces grows without bound before
+    code = jnp.where(short, jnp.where(pivot, PARADOX, SHORT), lane.code).astype(jnp.int32)
+    # Steps end on the run's end, or well before it.
+    t = jnp.where(kept, t1, lane.t)
+    ends = ~locating & (t + next_length > end - 1e-3 * next_length)
+    next_length = jnp.where(ends & (t < end), end - t, next_length)
+    one = jnp.ones((), jnp.int32)
+    return (
+        Lane(
+            t, jnp.where(kept, step.projected, lane.y), next_length, usual, lane.mode,
+            jnp.where(kept, values, lane.conditions), locating & ~located, low, high_, value_low, value_high, side,
+            jnp.where(locating & ~located, lane.tries + one, 0), scale, lane.taken + one, lane.kept + kept.astype(jnp.int32),
+            code, lane.count,
+        ),
+        kept,
+        hit,
+    )  # fmt: skip
+
+
+def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, most: int):
+    """The lane in the mode behind an event, and the records with it."""
+    elements = laws.elements
+    change: Change = laws.transit(unknown, lane.t, lane.y, lane.mode, laws.slip(lane.y), hit)
+    before, mode = lane.mode, change.mode
+    y = laws.placed(lane.y, change.v, change.slip)
+    conditions, _ = run(judged, (unknown, mode), lane.t, y, static=(laws,))
+    opened = hit.any(1)
+    kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, 4))
+    # A contact that is hit may let go at once.
+    hits = (mode.closed | hit[:, 0]) & ~before.closed
+    kind = jnp.where(hits, 0, jnp.where(before.closed & ~mode.closed, 1, kind))
+    differs = (mode.closed != before.closed) | (mode.stick != before.stick) | (mode.negative != before.negative)
+    told = happens & (opened | differs)
+    lost = hit[:, 2].any()  # of pivots: no mode follows
+    leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32)
+    rows, count = records, lane.count
+    order = [(i, True) for i in range(len(elements.each))] + [(i, False) for i in range(len(elements.each))]
+    for i, by_trigger in order:
+        # First the one whose condition it was, which carries the impact; then what came with it.
+        mine = told[i] & ((leading // CHANNELS == i) == by_trigger)
+        place = jnp.where(mine & (count < most), count, most)
+        row = Records(
+            lane.t,
+            (i * len(KINDS) + kind[i]).astype(jnp.int32),
+            jnp.where(by_trigger, leading, -1).astype(jnp.int32),
+            jax.tree.map(lambda a, b, by=by_trigger: a if by else b, change.impact, mode),
+            change.impact_slip if by_trigger else change.slip,
+            mode,
+            change.slip,
+        )
+        rows = jax.tree.map(lambda all_, one, at=place: all_.at[at].set(one), rows, row)
+        count = count + mine.astype(jnp.int32)
+    crowded = count > most
+    code = jnp.where(change.found, FINE, NO_MODE)
+    code = jnp.where(crowded, CROWDED, code)
+    code = jnp.where(change.paradox | lost, PARADOX, code)
+    after = lane._replace(
+        y=y, mode=mode, conditions=conditions, count=jnp.minimum(count, most), code=code.astype(jnp.int32)
+    )
+    return jax.tree.map(lambda a, b: jnp.where(happens, a, b), (after, rows), (lane, records))

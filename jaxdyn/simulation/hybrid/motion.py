@@ -1,0 +1,203 @@
+"""A motion with modes from its start to its save points: what `jd.simulate` calls for a scene with such forces."""
+
+from functools import partial
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxdyn.compile import partition_traced, run
+from jaxdyn.constraints.base import velocity_residual
+from jaxdyn.constraints.dynamics import RESULTS
+from jaxdyn.dynamics.kinematics import frame_pose
+from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.model.tree import Model, neutral
+from jaxdyn.simulation.controls import Controller, Sampled
+from jaxdyn.simulation.hybrid import machine
+from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, place_at, slides
+from jaxdyn.simulation.hybrid.events import Events
+from jaxdyn.simulation.hybrid.laws import laws_of, put_back
+from jaxdyn.simulation.hybrid.modes import Mode, elements_of, extended, force_at
+from jaxdyn.simulation.hybrid.replay import Hybrid
+from jaxdyn.simulation.hybrid.transitions import length
+from jaxdyn.simulation.methods import consistent
+from jaxdyn.simulation.solution import Solution
+from jaxdyn.simulation.solvers.choice import label, unwrapped
+from jaxdyn.systems.scene import Scene, check_callback, checked_force
+from jaxdyn.systems.system import retract
+
+OUTPUTS = ("energy", "acceleration", "multipliers", "contact_forces", "torque")
+_CODES = {
+    machine.SHORT: "dt_min_reached",
+    machine.PARADOX: "painleve_paradox",
+    machine.NO_MODE: "no_contact_mode",
+    machine.CROWDED: "too_many_events",
+}
+
+
+def check_options(control, stepsize, solver, adjoint, outputs) -> None:
+    """Refuse what motions with modes do not do.
+
+    **Raises:** ValueError.
+    """
+    what = "the scene has forces with modes (jd.DryFriction, jd.UnilateralContact)"
+    if isinstance(control, (Controller, Sampled)):
+        raise ValueError(f"control is a {type(control).__name__}, and {what}; give a function control(q, v, t)")
+    if stepsize is not None:
+        raise ValueError(f"stepsize is {stepsize!r}, and {what}, whose events end steps; leave it out")
+    if not isinstance(solver, diffrax.AbstractERK) or isinstance(unwrapped(solver), diffrax.AbstractWrappedSolver):
+        raise ValueError(f"solver is {label(solver)}, and {what}; take an explicit one, as diffrax.Dopri8() or Tsit5()")
+    if not isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
+        raise ValueError(f"adjoint is {type(adjoint).__name__}, and {what}; leave it out, for reverse mode")
+    for name in outputs:
+        if name not in OUTPUTS and not name.startswith("pose:"):
+            raise ValueError(f"outputs has {name!r}, and {what}; choose from {', '.join(OUTPUTS)} and 'pose:<frame>'")
+
+
+def check_count(most: Any) -> None:
+    """**Raises:** ValueError for anything but a positive number of events."""
+    if isinstance(most, bool) or not isinstance(most, (int, np.integer)) or most < 1:
+        raise ValueError(f"max_events is {most!r}; pass a positive integer, such as 64")
+
+
+def motion(scene: Scene, control, numbers, options) -> Solution:
+    """The solution; `numbers` are q0, v0, ts, rtol, atol, and a stepsize that is not used."""
+    q0, v0, ts, rtol, atol, _ = numbers
+    system, elements, outputs = scene.system, elements_of(scene), options["outputs"]
+    eps, dtype = float(jnp.finfo(q0.dtype).eps), q0.dtype
+    unknown, known = partition_traced((scene, control))
+    unknown = tuple(unknown)
+    bare = extended(scene).forces
+
+    def given(unknown):
+        scene, control = known(unknown)
+        whole = extended(scene)
+
+        def effort(q, v, t):
+            force = whole.applied_force(q, v, t)
+            if control is None:
+                return force
+            tau = whole.limited(checked_force(control(q, v, t), q, scene.nv, "control"))
+            return tau if force is None else tau + force
+
+        return scene, effort
+
+    for i, force in enumerate(bare):
+        check_callback(force, f"forces[{i}]", "force(system, q, v, t)", q0, v0, ts[0], first=(system,))
+    in_order = jnp.isfinite(ts).all() & (ts[1:] > ts[:-1]).all()
+    given_times, ts = ts, jnp.where(in_order, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
+    q0 = retract(system, q0)
+    finite_start = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
+    fine = jnp.isfinite(rtol) & (rtol >= 0) & jnp.isfinite(atol) & (atol >= 0)
+    rtol, atol = (jnp.maximum(jnp.where(fine, x, 1e-3), 10 * eps).astype(dtype) for x in (rtol, atol))
+    good = finite_start & in_order & fine
+    harmless = neutral(system).astype(dtype) if isinstance(system, Model) else jnp.zeros_like(q0)
+    q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
+
+    mode, slip, held = _guess(scene, elements, q0, v0, ts[0])
+    own = Scene(system, scene.constraints)
+    if scene.constraints:
+        held = held & consistent(own, q0, v0, ts[0])
+    y0 = {"q": q0, "v": v0, "slip": slip}
+    laws = laws_of(given, elements, options["solver"], y0)
+    most = options["max_events"]
+    hybrid = Hybrid(laws, mode, rtol, atol, options["max_steps"], most)
+    rows, times, facts = hybrid(y0, unknown, ts)
+    lane, records, begun = facts
+    # A save point at an event shows what was before.
+    passed = jnp.sum(records.time[None, :most] < ts[:, None], 1)
+    modes = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:most]])[passed], begun.mode, records.mode)
+    first = {"q": q0, "v": v0, "slip": begun.slip}
+    y = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rows)
+    reached = good & jnp.isfinite(y["q"]).all(1) & jnp.isfinite(y["v"]).all(1)
+    y = jax.tree.map(lambda rows, one: jnp.where(_along(reached, rows), rows, one[None]), y, first)
+
+    def report(unknown, row):
+        y, mode, t = row
+        scene_, effort = given(unknown)
+        system, control = scene_.system, known(unknown)[1]
+        q, v, values = y["q"], y["v"], {}
+        if "energy" in outputs:
+            values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
+        if "torque" in outputs:
+            tau = jnp.zeros_like(v) if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
+            values["torque"] = scene_.limited(tau)
+        if {"acceleration", "multipliers", "contact_forces"} & set(outputs):
+            place = place_at(scene_, elements, q, v, t)
+            found = motion_at(scene_, elements, mode, place, y["slip"], effort(q, v, t), q, v, t)
+            if "acceleration" in outputs:
+                values["acceleration"] = found.acceleration
+            if "multipliers" in outputs:
+                values["multipliers"] = found.pushed.multipliers[: elements.own]
+            if "contact_forces" in outputs:
+                values["contact_forces"] = _forces(scene_, elements, mode, place, found, y["slip"])
+        frames = [name.removeprefix("pose:") for name in outputs if name.startswith("pose:")]
+        return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
+
+    def closed(unknown, row):
+        y, mode, t = row
+        return put_back(given(unknown)[0], elements, mode, t, y, None)[0]
+
+    later = lax.map(partial(run, closed, unknown), jax.tree.map(lambda x: x[1:], (y, modes, ts)))
+    y = jax.tree.map(lambda a, b: jnp.concatenate([a[:1], b]), y, later)
+    values = lax.map(partial(run, report, unknown), (y, modes, ts))
+
+    def or_nan(rows):
+        return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
+
+    codes: Any = RESULTS
+    result: Any = codes.where(lane.t < ts[-1], codes.max_steps_reached, codes.successful)
+    for code, name in _CODES.items():
+        result = RESULTS.where(lane.code == code, getattr(RESULTS, name), result)
+    result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
+    for fits, name in (
+        (held, "inconsistent_start"),
+        (finite_start, "nonfinite_start"),
+        (fine, "bad_tolerance"),
+        (in_order, "unordered_times"),
+    ):
+        result = RESULTS.where(fits, result, getattr(RESULTS, name))
+    stats = {
+        "num_steps": lane.taken,
+        "num_accepted_steps": lane.kept,
+        "num_rejected_steps": lane.taken - lane.kept,
+        "time_reached": jnp.where(good, lane.t, ts[0]),
+    }
+    happened = Events(times, records.name[:most], elements.names)
+    solver = label(options["solver"])
+    shown = {"q": y["q"], "v": y["v"], **values}
+    return Solution(
+        ts=given_times, result=result, stats=stats, events=happened, solver=solver, **jax.tree.map(or_nan, shown)
+    )
+
+
+def _along(mask, rows):
+    """The mask (nt,) shaped so that it applies to the rows (nt, ...)."""
+    return mask.reshape(-1, *[1] * (rows.ndim - 1))
+
+
+def _guess(scene: Scene, elements, q, v, t):
+    """The mode of a start as far as its place and velocity tell, directions of sliding, and whether no contact is pressed in."""
+    small = float(jnp.finfo(q.dtype).eps) ** 0.6
+    gap, reach = gaps(scene, elements, q, t), 1 + jnp.max(jnp.abs(q))
+    slip = by_element(elements, velocity_residual(extended(scene), q, v, t))
+    speed, unit = length(slip)
+    opens = jnp.asarray(elements.opening)
+    mode = Mode(~opens | (gap <= small * reach), speed <= small * (1 + jnp.max(jnp.abs(v))), jnp.zeros(gap.shape, bool))
+    smooth = jnp.asarray(np.array([one.smooth for one in elements.each]))
+    limit = float(jnp.finfo(q.dtype).eps) ** 0.4
+    held = (~opens | (gap >= -limit * reach)).all()
+    return mode._replace(stick=mode.stick & ~smooth), lax.stop_gradient(unit), held
+
+
+def _forces(scene: Scene, elements, mode: Mode, place, found, slip) -> dict:
+    """Friction along the rows (2,), what holds or what brakes, and normal force, by the names of the elements: (3,)."""
+    along, sliding, forces = directions(scene, elements, place.slip, slip), slides(elements, mode), {}
+    for i, one in enumerate(elements.each):
+        level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(slip.dtype) * found.normal[i], 0.0)
+        normal = jnp.where(mode.closed[i], found.normal[i], 0.0)
+        forces[one.name] = jnp.append(found.pushed.holding[i] - level * along[i], normal)
+    return forces

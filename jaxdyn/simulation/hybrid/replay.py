@@ -1,0 +1,136 @@
+"""The way from the start to the save points, and reverse mode through its events.
+
+Backwards the motion is taken again in pieces, from each save point or event to the next, within the modes that are known by then.
+Each piece is differentiated as motions without events are. At an event the condition e of the mode falls to zero, so its time
+follows what moves e at that moment,
+
+    dt = -de / (de/dt),
+
+the state is taken to that time by its rate before the event, goes through the impact, and begins the next piece there. That is
+what saltation matrices say.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix
+from jax import lax
+from jax.flatten_util import ravel_pytree
+
+from jaxdyn.compile import run
+from jaxdyn.simulation.hybrid import machine
+from jaxdyn.simulation.hybrid.machine import Laws, Records
+from jaxdyn.simulation.hybrid.modes import Mode
+from jaxdyn.simulation.solvers import driver
+from jaxdyn.simulation.solvers.differentiable import ROOM
+from jaxdyn.simulation.solvers.driver import Drive
+
+
+class Hybrid(eqx.Module):
+    """How a motion is made: hybrid(y0, unknown, ts) -> rows of the state at ts[1:]; times of events; lane, records and start.
+
+    Reverse mode reaches y0, `unknown` and ts, through rows and times of events.
+    """
+
+    laws: Laws = eqx.field(static=True)
+    mode: Mode
+    rtol: Any
+    atol: Any
+    max_steps: int = eqx.field(static=True)
+    most: int = eqx.field(static=True)
+
+    def __call__(self, y0, unknown, ts):
+        return _driven((y0, unknown, ts), lax.stop_gradient(self))
+
+    def found(self, moving):
+        """What a call returns."""
+        y0, unknown, ts = moving
+        flat, _ = ravel_pytree(y0)
+        rows, lane, records, begun = machine.drive(
+            self.laws, unknown, ts, flat, self.mode, y0["slip"], self.rtol, self.atol, self.max_steps, self.most
+        )
+        return jax.vmap(self.laws.plan.structure)(rows), records.time[: self.most], (lane, records, begun)
+
+
+@eqx.filter_custom_vjp
+def _driven(moving, how: Hybrid):
+    return how.found(moving)
+
+
+@_driven.def_fwd
+def _(perturbed, moving, how: Hybrid):
+    found = how.found(moving)
+    return found, found[2]
+
+
+@_driven.def_bwd
+def _(facts, gradients, perturbed, moving, how: Hybrid):
+    y0, _, ts = moving
+    count = ts.shape[0] - 1
+    rows, times, _ = gradients
+    rows = jax.tree.map(lambda y, g: jnp.zeros((count, *y.shape), y.dtype) if g is None else g, y0, rows)
+    times = jnp.zeros((how.most,), ts.dtype) if times is None else times
+    times = jnp.where(facts[1].name[: how.most] < 0, jnp.zeros_like(times), times)  # of events that there were not
+    free, fixed = eqx.partition(moving, perturbed)
+    _, pull = jax.vjp(lambda free: _replayed(how, eqx.combine(free, fixed), *facts), free)
+    return pull((rows, times))[0]
+
+
+def _replayed(how: Hybrid, moving, lane, records, begun):
+    """Rows at ts[1:] and times of events, taken again in the modes that are known."""
+    laws, (y0, unknown, ts) = how.laws, moving
+    saves, most = ts.shape[0] - 1, how.most
+    happened = records.name[:most] >= 0
+    known_times = jnp.concatenate([ts[1:], jnp.where(happened, records.time[:most], jnp.inf)])
+    is_event = jnp.arange(saves + most) >= saves
+    order = jnp.lexsort((is_event, lax.stop_gradient(known_times)))  # a save point at an event is before it
+    norm = driver.Adaptive(laws.order, optimistix.rms_norm)
+    room = min(how.max_steps, ROOM)
+    end = lax.stop_gradient(lane.t)
+
+    def piece(carry, at):
+        t, y, mode = carry
+        event, place = is_event[at], jnp.clip(at - saves, 0, most - 1)
+        record = jax.tree.map(lambda x: x[place], records)
+        until = jnp.where(event, lax.stop_gradient(record.time), ts[1:][jnp.clip(at, 0, saves - 1)])
+        known = ~event | (record.name >= 0)
+        moves = known & (until > t) & (until <= end)
+        until = jnp.where(moves, until, t)
+        drive = Drive(laws.plan, norm, how.rtol, how.atol, None, how.max_steps, room)
+        found, _, _ = drive(laws.plan.structure(y), (unknown, mode), jnp.stack([t, until]))
+        here = jnp.where(moves, ravel_pytree(jax.tree.map(lambda x: x[0], found))[0], y)
+        landed = _crossed(laws, unknown, mode, record, t, until, here)
+        crosses = event & known
+        t, y = (jnp.where(crosses, a, b) for a, b in zip(landed, (until, here), strict=True))
+        mode = jax.tree.map(lambda a, b: jnp.where(crosses, a, b), record.mode, mode)
+        return (t, y, mode), (t, here)
+
+    y = _with_slip(laws, laws.land(unknown, begun.impact, begun.impact_slip, ts[0], ravel_pytree(y0)[0]), begun.slip)
+    _, (times, rows) = lax.scan(jax.checkpoint(piece), (ts[0], y, begun.mode), order)
+    back = jnp.argsort(order)
+    return jax.vmap(laws.plan.structure)(rows[back[:saves]]), times[back[saves:]]
+
+
+def _crossed(laws: Laws, unknown, mode: Mode, record: Records, t, known_time, y):
+    """Time and state behind an event; y is the state at the time that is known."""
+    hit, which = record.trigger >= 0, jnp.maximum(record.trigger, 0)
+
+    def condition(t, y):
+        return run(machine.judged, (unknown, mode), t, y, static=(laws,))[0].reshape(-1)[which]
+
+    rate = lax.stop_gradient(laws.plan.field_of((unknown, mode), known_time, y))
+    still = lax.stop_gradient((known_time, y))
+    _, slope = jax.jvp(condition, still, (jnp.ones_like(known_time), rate))
+    value = condition(known_time, y)
+    moves = hit & (slope != 0)
+    late = (value - lax.stop_gradient(value)) / lax.stop_gradient(jnp.where(moves, slope, jnp.ones_like(slope)))
+    late = jnp.where(moves, late, jnp.zeros_like(late))
+    time = jnp.where(hit, known_time - late, t)
+    y = laws.land(unknown, record.impact, record.impact_slip, time, y - late * rate)
+    return time, _with_slip(laws, y, record.slip)
+
+
+def _with_slip(laws: Laws, y, slip):
+    return laws.placed(y, laws.plan.structure(y)["v"], lax.stop_gradient(slip))

@@ -1,0 +1,96 @@
+"""The way from a start to the save points: which solver takes the steps, by our own loop or by diffrax's, and how that ended."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+
+from jaxdyn.simulation import contacts as unilateral
+from jaxdyn.simulation import controls
+from jaxdyn.simulation.methods import Reduced, serves
+from jaxdyn.simulation.solution import RESULTS, from_diffrax
+from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver, driver
+from jaxdyn.simulation.solvers.choice import is_fixed, progress_meter, stepping
+from jaxdyn.simulation.solvers.differentiable import ROOM, run, run_adaptively
+from jaxdyn.simulation.solvers.driver import Drive
+from jaxdyn.simulation.solvers.explicit import Plan
+from jaxdyn.simulation.solvers.first_step import Adaptive
+from jaxdyn.simulation.solvers.fixed_steps import Watched, too_coarse
+
+
+def integrate(term, project, quality, allowance, method, y0, ts, args, steps, options):
+    """Rows of the state at ts[1:], how it ended, counts, the time it came to, and the state there if an event may end it."""
+    adjoint = options["adjoint"]
+    solver: Any
+    solver, controller, dt0 = stepping(options["solver"], term, ts, *steps)
+    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which integrates another vector field
+    # Of a method that wraps an explicit one, diffrax says that it is one.
+    explicit = isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
+    jumping = (*method.jumping, *({controls.HELD} & set(y0)))
+    if explicit and not continuous:
+        solver = ExplicitSteps(solver, project, jumping, method.projects, field=term.vector_field)
+    elif project:
+        solver = ProjectedSolver(solver, project, jumping, method.projects)
+    if continuous and isinstance(controller, Watched):
+        controller = diffrax.ConstantStepSize()  # backwards the state is another one
+    event = None
+    # Near a singular basis steps become short; a long one may pass it, which the sign shows.
+    watched = isinstance(method, Reduced) and not continuous
+    basis = (lambda t, y, args, **_: _signed(quality(t, y, args))) if watched else None
+    if allowance and not continuous:
+        event = unilateral.event(allowance, basis, basis and basis(ts[0], y0, args), ts.dtype)
+    elif basis:
+        event = diffrax.Event(basis)
+    how = {
+        "term": term,
+        "solver": solver,
+        "controller": controller,
+        "event": event,
+        "adjoint": adjoint,
+        "max_steps": options["max_steps"],
+        "progress": progress_meter(options["progress"]),
+        "dt0": dt0,
+    }
+    sums = None
+    if explicit and not continuous and not allowance and _is_driven(controller, adjoint, options):
+        stepper: Any = solver
+        plan = stepper.plan(y0)
+        if watched:
+            plan = plan._replace(quality=lambda t, y, args: _signed(quality(t, y, args)))
+        rows, facts, sums = _drive(plan, stepper, controller, steps, options)(y0, args, ts)
+    elif is_fixed(steps[-1]):
+        rows, facts, solved = run((y0, args, ts), **how)
+        sums = solved.controller_state[2:] if isinstance(controller, Watched) else None
+    else:
+        rows, facts = run_adaptively((y0, args, ts), how, options["limit_is_given"])
+    result, stats, reached, *last = facts
+    result = from_diffrax(result)
+    if is_fixed(steps[-1]):
+        if sums is not None:
+            coarse = (result == RESULTS.successful) & too_coarse(sums)
+            result = RESULTS.where(coarse, RESULTS.coarse_steps, result)
+        # diffrax is at the end of the step that could not be solved; what is known ends where it began.
+        began = ts[0] + (stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
+        reached = jnp.where(result == RESULTS.nonlinear_divergence, began, reached)
+    return rows, result, stats, reached, last[0] if last else None
+
+
+def _is_driven(controller, adjoint, options) -> bool:
+    """Whether steps are made by a loop of our own: explicit ones, of a control that we know, with nothing shown on the way."""
+    known = type(controller) in (Adaptive, Watched)
+    return known and isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) and not options["progress"]
+
+
+def _drive(plan: Plan, solver: ExplicitSteps, controller, steps, options) -> Drive:
+    """How the run is made by a loop of our own."""
+    order, most = solver.error_order(None), options["max_steps"]
+    if isinstance(controller, Adaptive):
+        room = most if options["limit_is_given"] else min(most, ROOM)
+        how = driver.Adaptive(order, controller.norm)
+        return Drive(plan, how, controller.rtol, controller.atol, None, most, room)
+    return Drive(plan, driver.Fixed(solver.order(None), order), None, None, steps[-1], most, most)
+
+
+def _signed(quality):
+    """The quality of a basis, of which a change of sign ends the run: zero where it no longer serves."""
+    return jnp.where(serves(quality), quality, jnp.zeros_like(quality))

@@ -1,0 +1,169 @@
+"""One run from its start to its solution: the start judged, the way integrated, the end judged, the outputs computed."""
+
+import functools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.model.tree import Model, neutral
+from jaxdyn.simulation import contacts as unilateral
+from jaxdyn.simulation import controls
+from jaxdyn.simulation.equations import equations
+from jaxdyn.simulation.integration import integrate
+from jaxdyn.simulation.methods import Method, consistent, serves, start_limit
+from jaxdyn.simulation.outputs import at_save_point
+from jaxdyn.simulation.solution import RESULTS, Solution
+from jaxdyn.simulation.solvers import LieGroup, Stepper
+from jaxdyn.simulation.solvers.choice import (
+    is_fixed,
+    is_split,
+    label,
+)
+from jaxdyn.simulation.solvers.differentiable import COUNTS
+from jaxdyn.simulation.solvers.inputs import (
+    most_turned,
+    turning,
+    usable_steps,
+)
+from jaxdyn.systems.scene import Scene, check_callback
+from jaxdyn.systems.system import displace, has_followers, retract
+
+
+def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
+    """The run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
+    q0, v0, ts, *steps = numbers
+    system, outputs = scene.system, options["outputs"]
+    q0 = retract(system, q0)
+    in_order = jnp.isfinite(ts).all() & (ts[1:] > ts[:-1]).all()
+    given_times, ts = ts, jnp.where(in_order, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
+    finite_start = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
+    steps, fine_steps, fine_tolerances = usable_steps(steps, ts)
+    good = finite_start & in_order & fine_steps & fine_tolerances
+    # A bad lane of a batch takes a harmless start, so that it does not make the others wait.
+    harmless = jnp.zeros_like(q0)
+    if isinstance(system, Model):
+        harmless = (
+            harmless.at[system.topology.nq :].set(1.0).at[: system.topology.nq].set(neutral(system).astype(q0.dtype))
+        )
+    q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
+    held = jnp.asarray(True)
+    if scene.constraints:
+        held = consistent(scene, q0, v0, ts[0])
+        if method.projects:
+            given_start = q0, v0
+            q0, v0 = method.onto_constraints(scene, q0, v0, ts[0])
+            # Residuals of a small mechanism are small numbers of metres: how far it moves onto the constraints tells more.
+            ways = [
+                jnp.max(jnp.abs(x - y)) / (1 + jnp.max(jnp.abs(x))) for x, y in zip(given_start, (q0, v0), strict=True)
+            ]
+            held = held & (jnp.maximum(*ways) <= 10 * start_limit(q0.dtype))
+    # Refuses callbacks that do not fit before diffrax meets them.
+    for i, force in enumerate(scene.forces):
+        check_callback(force, f"forces[{i}]", "force(system, q, v, t)", q0, v0, ts[0], first=(system,))
+    controls.check_control(scene, control, q0, v0, ts[0])
+    states = controls.started(control, q0, v0, ts[0])
+    added = tuple(states)  # names alone, as functions of a run hold no arrays
+    eqs = equations(scene, control, method, added, options)
+    eqx.filter_eval_shape(eqs.effort, eqs.args, states, q0, v0, ts[0])
+    y0 = method.start(scene, q0, v0, ts[0]) | states
+    first = method.quality(scene, y0, ts[0])
+    y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
+    solver = options["solver"]
+    if isinstance(solver, Stepper):
+        solver = Stepper(eqs.begin, eqs.advance, functools.partial(displace, system))
+    elif isinstance(solver, LieGroup):
+        solver = solver.fitted(system)
+    # Of what a projection does, local coordinates leave nothing to be done about quaternions.
+    corrects = method.projects or bool(method.jumping) if isinstance(solver, LieGroup) else method.corrects(scene)
+    corrects = corrects or controls.HELD in added
+    term = diffrax.ODETerm(eqs.derivative)
+    if is_split(solver):
+        term = diffrax.MultiTerm(diffrax.ODETerm(eqs.explicit_part), diffrax.ODETerm(eqs.implicit_part))
+    options = options | {"solver": solver}
+    corrector = eqs.project if corrects else None
+    rows, result, counts, time_reached, last = integrate(
+        term, corrector, eqs.quality, eqs.least_allowance, method, y0, ts, eqs.args, steps, options
+    )
+
+    y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, rows)
+    finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]
+    reached = good & jnp.stack(finite).all(0)
+    y = jax.tree.map(lambda rows, start: jnp.where(_along(reached, rows), rows, start[None]), y, y0)
+    work = y.pop("work", None)
+
+    def place(row):
+        y, t = row
+        return method.place(scene, method.corrected(scene, y, t), t)
+
+    # One after the other, by the kernels that have put the start on the constraints.
+    q, v = lax.map(place, (y, ts))
+    lost = None
+    if eqs.least_allowance is not None:
+        margins, within = lax.map(lambda row: eqs.allowances(eqs.args, *row), (y, q, v, ts)), None
+        if last is not None:
+            there = eqs.allowances(eqs.args, last, *method.place(scene, last, time_reached), time_reached)
+            within = (result == RESULTS.event_occurred, time_reached, there)
+        lost = unilateral.first_loss(margins, reached, ts, within)
+        reached = reached & ~(lost.happened & (ts > lost.time))
+        time_reached = jnp.where(lost.happened, lost.time, time_reached)
+        by_contacts = unilateral.can_end(scene, options["contacts"])
+        count = len(coned_contacts(scene)) if by_contacts else 0
+        at_limit = lost.happened & (lost.entry >= count)
+        result = RESULTS.where(lost.happened & ~at_limit, RESULTS.contact_lost, result)
+        result = RESULTS.where(at_limit, RESULTS.joint_limit_passed, result)
+    result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
+    if has_followers(system):
+        follows = jnp.cumsum(~lax.map(system.follows, q)) == 0
+        result = RESULTS.where(follows.all(), result, RESULTS.no_single_contact)
+        reached = reached & follows
+        time_reached = jnp.where(follows.all(), time_reached, jnp.max(jnp.where(reached, ts, ts[0])))
+    ended = (result == RESULTS.successful) | (result == RESULTS.coarse_steps)
+    result = RESULTS.where(ended & ~reached.all(), RESULTS.nonfinite_state, result)
+    # Fixed steps go on from what is not finite: all that is known is the last state before it that was kept.
+    kept = jnp.max(jnp.where(reached, ts, ts[0]))
+    time_reached = jnp.where(result == RESULTS.nonfinite_state, kept, time_reached)
+    if method.projects and scene.constraints:
+        closed = lax.map(lambda row: consistent(scene, *row), (q, v, ts))
+        result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
+    elif scene.constraints:
+        met = lax.map(lambda row: method.satisfies(scene, *row[1:], eqs.effort(eqs.args, *row)), (y, q, v, ts))  # pyright: ignore[reportCallIssue]
+        result = RESULTS.where((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows, result)
+    if first is not None:
+        result = RESULTS.where(serves(first), result, RESULTS.singular_basis)
+    result = RESULTS.where(held, result, RESULTS.inconsistent_start)
+    angles = turning(system)
+    if angles.size and not is_fixed(steps[-1]):
+        coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
+        result = RESULTS.where(coarse, RESULTS.coarse_start, result)
+    for fine, code in (
+        (finite_start, RESULTS.nonfinite_start),
+        (fine_tolerances, RESULTS.bad_tolerance),
+        (fine_steps, RESULTS.bad_stepsize),
+        (in_order, RESULTS.unordered_times),
+    ):
+        result = RESULTS.where(fine, result, code)
+
+    def or_nan(rows):
+        return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
+
+    of_control = {name: y[name] for name in added}
+    computed = jax.vmap(functools.partial(at_save_point, scene, control, method, eqs, outputs))(q, v, ts, of_control)
+    rows = {"q": q, "v": v} | computed | ({} if work is None else {"work": work})
+    whole = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
+    result = RESULTS.where((result == RESULTS.successful) & ~whole, RESULTS.nonfinite_state, result)
+    stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
+    stats["time_reached"] = jnp.where(good, time_reached, ts[0])
+    if lost is not None and unilateral.can_end(scene, options["contacts"]):
+        stats["lost_contact"] = jnp.where(at_limit, -1, lost.entry)
+    if lost is not None and options["limits"] == "stop":
+        stats["passed_limit"] = jnp.where(at_limit, (lost.entry - count) % q.shape[1], -1).astype(jnp.int32)
+    return Solution(ts=given_times, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
+
+
+def _along(mask, rows):
+    """The mask (nt,) shaped so that it applies to the rows (nt, ...)."""
+    return mask.reshape(-1, *[1] * (rows.ndim - 1))

@@ -1,0 +1,89 @@
+"""Which method a run takes, and whether its start serves."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.constraints.assembly import open_constraints, start_evidence
+from jaxdyn.constraints.base import layout
+from jaxdyn.simulation.methods import (
+    Baumgarte,
+    Free,
+    Method,
+    Multipliers,
+    Projected,
+    Reduced,
+    Variational,
+    serves,
+    start_limit,
+)
+from jaxdyn.systems.scene import Scene
+
+METHODS: dict[str, type[Method]] = {
+    kind.name: kind for kind in (Multipliers, Projected, Reduced, Baumgarte, Variational)
+}
+
+
+def chosen_method(scene: Scene, method: str | Method) -> Method:
+    """How to integrate: "auto" is "projected" for a scene with constraints and "free" for one without.
+
+    "projected" is the rule because it serves where the others fail: dependent rows, and places where rows lose rank on
+    the way, and needs no choice of velocities.
+
+    **Raises:** ValueError for a method that does not fit the scene.
+    """
+    if not scene.constraints:
+        if method in ("auto", "free") or isinstance(method, Free):
+            return Free()
+        if method == "variational" or isinstance(method, Variational):
+            return Variational() if isinstance(method, str) else method
+        raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free', or 'variational'")
+    if method == "auto":
+        return Projected()
+    if isinstance(method, Method) and not isinstance(method, Free):
+        chosen = method
+    elif isinstance(method, str) and method in METHODS:
+        chosen = METHODS[method]()
+    else:
+        names = ", ".join(map(repr, METHODS))
+        raise ValueError(
+            f"method is {method!r}; a scene with constraints takes 'auto' or {names}, or e.g. jd.Reduced(...)"
+        )
+    return chosen.fitted(scene, None) if isinstance(chosen, Reduced) else chosen
+
+
+def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
+    """The method for a start with concrete numbers, which must be on the constraints and have some freedom.
+
+    **Raises:** ValueError that names the constraints and by how much they are violated, and the fix; for a basis that
+    does not serve at the start.
+    """
+    limit = start_limit(q.dtype)
+    found, ratio, rank = start_evidence(scene, q, v, np.asarray(t, q.dtype), limit)
+    if not ratio <= 1:
+        raise ValueError(
+            f"q0, v0 are not on the constraints: {open_constraints(scene, q, v, t, limit)} (position residual "
+            f"{float(found[0]):.3g}, velocity residual {float(found[1]):.3g}); start from "
+            "state = jd.assemble(scene, q0, v0), with state.q and state.v"
+        )
+    if rank == scene.nv:
+        names = ", ".join(repr(place.name) for place in layout(scene))
+        raise ValueError(
+            f"the constraints {names} remove all freedom: {rank} independent rows for nv = {scene.nv}; "
+            "leave one out, or free a joint"
+        )
+    if not isinstance(method, Reduced):
+        return method
+    # Inside a jit, jax would trace operations on known numbers too.
+    with jax.ensure_compile_time_eval():
+        q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
+        method = method.fitted(scene, scene.nv - rank)
+        if method.basis is not None and not bool(_serves_at(scene, method.basis, q, t)):
+            raise ValueError(f"the basis does not serve at q0: {method.basis.advice(scene, q, t)}")
+    return method
+
+
+@eqx.filter_jit
+def _serves_at(scene, basis, q, t):
+    return serves(basis.at(scene, q, t).quality)

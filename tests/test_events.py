@@ -1,0 +1,370 @@
+"""Motions with events: friction that sticks and slips, contacts that open and close, against closed forms."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import jaxdyn as jd
+
+G, MU, MU_S, LOAD, RATE = 9.81, 0.3, 0.5, 6.0, 2.0
+PLANE = ((0, 0, 0), (-np.pi / 2, 0, 0))  # z of the ground along y of the world
+
+
+def load(q, v, t):
+    return jnp.stack([LOAD * jnp.sin(RATE * t)])
+
+
+def block(mu=MU, static=MU_S, normal=G, **options):
+    system = jd.scenes.sliding_block().system
+    return jd.Scene(system, forces=(jd.DryFriction(mu, normal, 0, static=static, **options),))
+
+
+def block_velocity(start, speed, sign):
+    """Of the block of one kilogram while it slides in a direction."""
+
+    def at(t):
+        return speed + LOAD / RATE * (np.cos(RATE * start) - np.cos(RATE * t)) - sign * MU * G * (t - start)
+
+    return at
+
+
+TS = jnp.linspace(0.0, 4.0, 41)
+TIGHT: Any = {"rtol": 1e-11, "atol": 1e-11}
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    return jd.simulate(block(), [0.0], [2.0], TS, control=load, outputs=("acceleration", "contact_forces"), **TIGHT)
+
+
+def test_block_turns_sticks_and_slips_at_the_times_of_the_closed_form(shaken):
+    first, back = block_velocity(0.0, 2.0, 1), None
+    turns = brentq(first, 1.5, 3.0, xtol=1e-15)
+    back = block_velocity(turns, 0.0, -1)
+    sticks = brentq(back, turns + 0.5, 3.6, xtol=1e-15)
+    slips = brentq(lambda t: LOAD * np.sin(RATE * t) - MU_S * G, sticks, 3.9, xtol=1e-15)
+    assert list(shaken.events.name[:4]) == ["friction: turn", "friction: stick", "friction: slip", ""]
+    np.testing.assert_allclose(shaken.events.time[:3], [turns, sticks, slips], rtol=0, atol=1e-10)
+    assert int(shaken.events.count) == 3 and np.isnan(shaken.events.time[3:]).all()
+    again = block_velocity(slips, 0.0, 1)
+    at = np.asarray(TS)
+    want = np.select([at < turns, at < sticks, at < slips], [first(at), back(at), 0 * at], again(at))
+    np.testing.assert_allclose(shaken.v[:, 0], want, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(shaken.events.times("friction: slip"), [slips], atol=1e-10)
+
+
+def test_friction_balances_at_rest_and_lies_on_the_cone_while_it_slides(shaken):
+    force, at_rest = shaken.contact_forces["friction"], np.asarray(shaken.v[:, 0] == 0)
+    assert at_rest.sum() >= 2
+    np.testing.assert_allclose(shaken.acceleration[:, 0], LOAD * np.sin(RATE * TS) + force[:, 0], atol=1e-11)
+    np.testing.assert_allclose(force[at_rest, 0], -LOAD * np.sin(RATE * TS[at_rest]), atol=1e-11)
+    np.testing.assert_allclose(force[~at_rest, 0], -MU * G * np.sign(shaken.v[~at_rest, 0]), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_each_lane_of_a_batch_has_its_own_events(shaken):
+    speeds = jnp.asarray([2.0, 0.5, -1.0])
+    batch = jax.jit(jax.vmap(lambda v: jd.simulate(block(), jnp.zeros(1), v[None], TS, control=load, **TIGHT)))(speeds)
+    assert batch.success.all()
+    np.testing.assert_allclose(batch.events.time[0], shaken.events.time, atol=1e-12)
+    assert len(set(np.asarray(batch.events.time[:, 0]).round(6))) == 3
+    for i, speed in enumerate(speeds[1:], 1):
+        alone = jd.simulate(block(), jnp.zeros(1), speed[None], TS, control=load, **TIGHT)
+        np.testing.assert_allclose(batch.q[i], alone.q, atol=1e-10)
+        assert list(batch.events.name[i]) == list(alone.events.name)
+
+
+def bowling(mu=0.12, radius=0.10795):
+    ball = jd.scenes.bowling_ball().system
+    return jd.Scene(ball, forces=(jd.ground_contact("ball", None, mu, radius=radius, name="lane"),))
+
+
+@pytest.mark.slow
+def test_bowling_ball_rolls_when_the_closed_form_says():
+    """Problem 5.4: the friction is that of the contact's own normal force."""
+    r, m, inertia, g, mu = 0.10795, 6.35, 0.0296, 9.8, 0.12
+    ts = jnp.linspace(0.0, 4.0, 5)
+    motion = jd.simulate(bowling(), *jd.scenes.bowling_ball.start(), ts, rtol=1e-10, atol=1e-10)
+    up, v, w = np.array([0, 0, 1.0]), np.array([8.0, 0, 0]), np.array([-8 * np.pi, 0, 0])
+    slip = v + np.cross(w, -r * up)
+    rolling = r / (inertia + m * r * r) * np.cross(inertia * w + m * r * np.cross(up, v), up)
+    begins = (v - rolling) @ slip / (np.linalg.norm(slip) * mu * g)
+    assert list(motion.events.name[:2]) == ["lane: stick", ""]
+    assert abs(motion.events.time[0] - begins) < 1e-8
+    turned = jax.vmap(jd.so3.quat_to_matrix)(motion.q[-1:, 3:])[0]
+    np.testing.assert_allclose(turned @ motion.v[-1, :3], rolling, atol=1e-8)
+    along = (v * begins - mu * g * slip / np.linalg.norm(slip) * begins**2 / 2) + rolling * (4 - begins)
+    np.testing.assert_allclose(motion.q[-1, :3], along + r * up, atol=1e-8)
+
+
+def box(mu=0.4, size=(0.4, 0.2), mass=2.0):
+    (a, h), (m,) = size, (mass,)
+    builder = jd.ModelBuilder("box", gravity=(0.0, -G, 0.0))
+    builder.add_body("box", None, "planar", (m, (0, 0, 0), (0.1, 0.1, m * (a * a + h * h) / 12)))
+    corners = {"left": (-a / 2, -h / 2, 0), "right": (a / 2, -h / 2, 0)}
+    feet = [jd.ground_contact("box", at, mu, plane=PLANE, name=name) for name, at in corners.items()]
+    return jd.Scene(builder.build(), forces=feet)
+
+
+@pytest.fixture(scope="module")
+def fallen():
+    """The box by its start, on one compiled program."""
+    times = jnp.linspace(0.0, 1.0, 101)
+
+    def motion(q0, v0, mu=0.4, ts=times):
+        return jd.simulate(box(mu), q0, v0, ts, outputs=("energy", "contact_forces"), throw=False, **TIGHT)
+
+    return motion
+
+
+@pytest.mark.slow
+def test_box_that_lands_flat_stops_and_slides(fallen):
+    """m v_y is taken by the ground; the impulse of friction is up to mu times that, and slows it from 2 m/s."""
+    motion, m, mu = fallen([0.0, 0.5, 0.0], [2.0, 0.0, 0.0]), 2.0, 0.4
+    touch = np.sqrt(2 * 0.4 / G)
+    after = 2.0 - mu * G * touch
+    rest = touch + after / (mu * G)
+    assert motion.success
+    assert list(motion.events.name[:5]) == ["left: touch", "right: touch", "left: stick", "right: stick", ""]
+    np.testing.assert_allclose(motion.events.time[:4], [touch, touch, rest, rest], atol=1e-10)
+    np.testing.assert_allclose(motion.q[-1], [2 * touch + after**2 / (2 * mu * G), 0.1, 0], atol=1e-9)
+    flying = motion.ts < touch
+    np.testing.assert_allclose(motion.energy[flying], m * (G * 0.5 + 2.0), rtol=1e-11)
+    landed = (motion.ts > touch) & (motion.ts < rest)
+    v = after - mu * G * (motion.ts[landed] - touch)
+    np.testing.assert_allclose(motion.energy[landed], m * G * 0.1 + m * v**2 / 2, rtol=1e-10)
+    for name in ("left", "right"):
+        np.testing.assert_allclose(motion.contact_forces[name][-1, 2], m * G / 2, rtol=1e-7)  # shared by least norm
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mu", [0.4, 0.8])
+def test_box_on_a_corner_is_hit_as_linear_and_angular_momentum_say(fallen, mu):
+    """The impulse would have to lie at a slope of 0.61 to hold the corner: with less friction than that it slides."""
+    angle, m, (a, h) = 0.3, 2.0, (0.4, 0.2)
+    moment = m * (a * a + h * h) / 12
+    corner = np.array([-a / 2 * np.cos(angle) + h / 2 * np.sin(angle), -a / 2 * np.sin(angle) - h / 2 * np.cos(angle)])
+    touch = np.sqrt(2 * (0.5 + corner[1]) / G)
+    ts = jnp.concatenate([jnp.linspace(0, touch, 50), touch + 1e-12 + jnp.linspace(0, 0.7, 51)])
+    motion = fallen([0.0, 0.5, angle], [0.0, 0.0, 0.0], mu, ts)
+    assert motion.events.name[0] == "left: touch" and abs(motion.events.time[0] - touch) < 1e-10
+    speed = G * touch
+    x, y = corner
+    # Velocities of the corner by impulses along the ground and up.
+    yields = np.array([[1 / m + y * y / moment, -x * y / moment], [-x * y / moment, 1 / m + x * x / moment]])
+    impulse = np.linalg.solve(yields, [0, speed])
+    assert (impulse[0] <= mu * impulse[1]) == (mu == 0.8)
+    if mu == 0.4:
+        impulse = np.array([mu, 1.0]) * speed / (yields[1] @ [mu, 1.0])
+    turn = (x * impulse[1] - y * impulse[0]) / moment
+    i = 50
+    np.testing.assert_allclose(motion.v[i, 2], turn, atol=1e-9)
+    after = impulse / m - np.array([0, speed])
+    lost = m * speed**2 / 2 - (moment * turn**2 + m * after @ after) / 2
+    np.testing.assert_allclose(motion.energy[0] - motion.energy[i], lost, rtol=1e-9)
+    assert (np.diff(motion.energy) < 1e-9).all()
+
+
+@pytest.mark.slow
+def test_contact_lets_go_where_it_would_pull():
+    """A bead that slides without friction down a sphere of one metre leaves it at cos(theta) = 2/3."""
+    builder = jd.ModelBuilder("bead", gravity=(0.0, 0.0, -G))
+    builder.add_body("bead", None, "free", (1.0, (0, 0, 0), (1e-2, 1e-2, 1e-2)))
+    touching = jd.rolling_sphere("bead", None, 0.1, on="sphere", surface_radius=0.9, slip=True, name="bead")
+    scene = jd.Scene(builder.build(), forces=(jd.UnilateralContact(touching),))
+    start = 0.1
+    q0 = [np.sin(start), 0.0, np.cos(start), 1.0, 0.0, 0.0, 0.0]
+    motion = jd.simulate(scene, q0, jnp.zeros(6), jnp.linspace(0.0, 1.5, 151), rtol=1e-10, atol=1e-10)
+    assert list(motion.events.name[:2]) == ["bead: release", ""]
+    leaves = float(motion.events.time[0])
+    i = int(np.argmax(motion.ts > leaves))
+    back = motion.ts[i] - leaves
+    height = motion.q[i, 2] - motion.v[i, 2] * back - G * back**2 / 2
+    assert abs(height - 2 / 3 * np.cos(start)) < 1e-8
+
+
+def rod(mu, angle, speed, end=0.3):
+    """A slender rod of one metre and one kilogram whose end slides on the ground, not turning."""
+    builder = jd.ModelBuilder("rod", gravity=(0.0, -G, 0.0))
+    builder.add_body("rod", None, "planar", (1.0, (0, 0, 0), (0.0, 1 / 12, 1 / 12)))
+    tip = jd.ground_contact("rod", (-0.5, 0, 0), mu, plane=PLANE, name="tip")
+    v0 = [speed * np.cos(angle), -speed * np.sin(angle), 0.0]
+    q0 = [0.0, 0.5 * np.sin(angle), angle]
+    return jd.simulate(jd.Scene(builder.build(), forces=[tip]), q0, v0, jnp.linspace(0, end, 4), throw=False)
+
+
+@pytest.mark.parametrize(("mu", "speed", "paradox"), [(0.3, -1.0, False), (2.0, -1.0, True), (2.0, 1.0, False)])
+def test_painleves_rod_has_a_code(mu, speed, paradox):
+    """No force serves where 1 + 3 cos^2 + 3 mu sin cos sign(v) < 0."""
+    s, c = np.sin(1.0), np.cos(1.0)
+    assert (1 + 3 * c * c + 3 * mu * s * c * np.sign(speed) < 0) == paradox
+    motion = rod(mu, 1.0, speed)
+    assert (motion.result == jd.RESULTS.painleve_paradox) == paradox
+    assert bool(motion.success) != paradox
+
+
+@pytest.mark.slow
+def test_rocking_to_rest_ends_with_a_code():
+    """A slender box that rocks hits the ground ever sooner: infinitely many times before it rests."""
+    scene = box(mu=2.0, size=(0.2, 0.6))
+    angle = 0.15
+    lean = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    at = -lean @ np.array([-0.1, -0.3])
+    motion = jd.simulate(scene, [*at, angle], jnp.zeros(3), jnp.linspace(0, 5.0, 6), max_events=40, throw=False)
+    assert motion.result == jd.RESULTS.too_many_events
+    times = np.asarray(motion.events.time)
+    assert (np.diff(times) >= 0).all()
+    with pytest.raises(RuntimeError, match="max_events"):
+        jd.simulate(scene, [*at, angle], jnp.zeros(3), jnp.linspace(0, 5.0, 6), max_events=40)
+
+
+def differences(f, at, steps):
+    """Central differences of fourth order."""
+    return np.array([(8 * (f(at + s) - f(at - s)) - (f(at + 2 * s) - f(at - 2 * s))) / (12 * s.sum()) for s in steps])
+
+
+@pytest.mark.slow
+def test_gradients_go_through_events():
+    """Turn, stick and slip: of rows and times of events, in coefficients, normal force and start."""
+    ts = jnp.linspace(0.0, 4.0, 5)
+
+    def found(p):
+        scene = block(p[0], p[1], p[2])
+        motion = jd.simulate(scene, jnp.zeros(1), p[3:], ts, control=load, rtol=1e-13, atol=1e-13, max_events=4)
+        return jnp.concatenate([motion.q[:, 0], motion.v[:, 0], motion.events.time[:3]])
+
+    at = jnp.asarray([MU, MU_S, G, 2.0])
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=13))
+    values = jax.jit(lambda p: found(p) @ weights)
+    gradients = jax.jit(jax.vmap(jax.grad(lambda p: found(p) @ weights)))(jnp.stack([at, at * 1.01]))
+    want = differences(values, at, 3e-4 * jnp.eye(4))
+    np.testing.assert_allclose(gradients[0], want, rtol=1e-8, atol=1e-7)  # of the differences
+    # The time of the last event is where the load comes to what holds: LOAD cos(RATE t) RATE dt = G d mu_s.
+    time = np.pi / RATE + np.arcsin(MU_S * G / LOAD) / RATE
+    moves = jax.jit(jax.grad(lambda p: found(p)[-1]))(at)
+    np.testing.assert_allclose(moves, np.array([0, G, MU_S, 0]) / (LOAD * RATE * np.cos(RATE * time)) * -1, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_gradients_go_through_an_impact():
+    """Of the box that lands on a corner while it turns: start and friction."""
+    ts = jnp.linspace(0.0, 0.35, 3)
+
+    def found(p):
+        q0, v0 = jnp.stack([0 * p[1], p[1], p[2]]), jnp.stack([p[3], 0 * p[3], 0 * p[3]])
+        motion = jd.simulate(box(p[0]), q0, v0, ts, rtol=1e-12, atol=1e-12, max_events=6)
+        return jnp.concatenate([motion.q.ravel(), motion.v.ravel(), motion.events.time[:2]])
+
+    at = jnp.asarray([0.4, 0.5, 0.3, 0.7])
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=20))
+    values = jax.jit(lambda p: found(p) @ weights)
+    gradient = jax.jit(jax.grad(lambda p: found(p) @ weights))(at)
+    np.testing.assert_allclose(gradient, differences(values, at, 1e-4 * jnp.eye(4)), atol=1e-6)  # of the differences
+
+
+def test_friction_in_proportion_to_a_multiplier_of_both_sides():
+    """A bead on a rough hoop without gravity: N = m v^2/R either way, so v = v0/(1 + mu v0 t/R)."""
+    system = jd.LagrangianSystem(lambda q, v, t, p: 0.5 * jnp.sum(v * v) - p["g"] * q[1], 2, parameters={"g": 0.0})
+    hoop = jd.Holonomic(lambda q, t: jnp.sqrt(q @ q) - 1.0, name="hoop")
+    along = jd.Pfaffian(lambda q, t: jnp.stack([-q[1], q[0]]) / jnp.sqrt(q @ q), name="along")
+    ts = jnp.linspace(0.0, 2.0, 5)
+    for inward in (1.0, -1.0):  # the multiplier's sign is a matter of how the constraint is written
+        rows = hoop if inward > 0 else jd.Holonomic(lambda q, t: 1.0 - jnp.sqrt(q @ q), name="hoop")
+        scene = jd.Scene(system, (rows,), (jd.DryFriction(0.3, "hoop", along),))
+        motion = jd.simulate(scene, [1.0, 0.0], [0.0, 2.0], ts, rtol=1e-11, atol=1e-11, outputs=("multipliers",))
+        speed = jnp.sqrt(jnp.sum(motion.v**2, 1))
+        np.testing.assert_allclose(speed, 2 / (1 + 0.3 * 2 * ts), rtol=1e-9)
+        np.testing.assert_allclose(motion.multipliers[:, 0], -inward * speed**2, rtol=1e-9)
+        assert int(motion.events.count) == 0
+
+
+def test_smooth_friction_creeps_as_it_says():
+    """Under a load below mu N: v_s artanh(load/(mu N)); while it slides the force is tanh(|w|/v_s) of mu N."""
+    scene, speed = block(smoothing=0.01), 0.01 * np.arctanh(0.5)
+    half = 0.5 * MU * G
+    motion = jd.simulate(
+        scene, [0.0], [1.0], [0.0, 0.1, 2.0], control=lambda q, v, t: jnp.full(1, half), outputs=("contact_forces",)
+    )
+    np.testing.assert_allclose(motion.v[-1, 0], speed, rtol=1e-7)
+    forces = motion.contact_forces["friction"][:, 0]
+    np.testing.assert_allclose(forces[:2], -MU * G * np.tanh(motion.v[:2, 0] / 0.01), rtol=1e-10)
+    np.testing.assert_allclose(forces[-1], -half, rtol=1e-6)
+
+
+def test_belt_drags_a_block_along_until_the_spring_is_stronger():
+    """It sticks to the belt while k x < mu_s N: to the time x_s/v_belt, and slips there."""
+    k, belt = 2.0, 0.5
+    along = jd.Pfaffian(lambda q, t: jnp.ones(1), lambda q, t: belt, name="belt")
+    friction = jd.DryFriction(0.2, 1.0, along, static=0.4, name="belt")
+    spring = jd.JointSpring(k, rest=jnp.zeros(1))
+    scene = jd.Scene(jd.scenes.sliding_block().system, forces=(friction, spring))
+    motion = jd.simulate(scene, [0.0], [belt], jnp.linspace(0.0, 1.5, 4), **TIGHT)
+    slips = 0.4 / k / belt
+    w = np.sqrt(k)
+    # From there a harmonic motion about 0.2/k, until its velocity is the belt's again.
+    assert motion.events.name[0] == "belt: slip"
+    np.testing.assert_allclose(motion.events.time[0], slips, atol=1e-10)
+    t = np.asarray(motion.ts[motion.ts > slips]) - slips
+    x = 0.1 + 0.1 * np.cos(w * t) + belt / w * np.sin(w * t)
+    stuck = motion.events.time[1] - slips if int(motion.events.count) > 1 else np.inf
+    np.testing.assert_allclose(motion.q[motion.ts > slips, 0][t < stuck], x[t < stuck], atol=1e-9)
+
+
+def test_float32_finds_the_same_events():
+    with jax.enable_x64(False):
+        scene = jd.Scene(jd.scenes.sliding_block().system, forces=(jd.DryFriction(MU, G, 0, static=MU_S),))
+        motion = jd.simulate(scene, [0.0], [2.0], jnp.linspace(0.0, 4.0, 5), control=load, rtol=1e-5, atol=1e-5)
+        assert motion.q.dtype == jnp.float32 and motion.success
+        assert list(motion.events.name[:4]) == ["friction: turn", "friction: stick", "friction: slip", ""]
+        np.testing.assert_allclose(motion.events.time[:3], [2.135119, 3.427974, 3.620121], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: jd.DryFriction(-0.1, 1.0), "0 <= sliding"),
+        (lambda: jd.DryFriction(0.5, 1.0, static=0.4), "static"),
+        (lambda: jd.DryFriction(0.5, 1.0, -1), "along"),
+        (lambda: jd.DryFriction(0.5, 1.0, smoothing=0.0), "smoothing"),
+        (lambda: jd.UnilateralContact("lane"), "ground_contact"),
+        (lambda: jd.ground_contact("ball", radius=-1.0), "radius"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=0.1), "stepsize"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, solver=jd.Rodas5P()), "solver"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, adjoint="forward"), "adjoint"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, outputs=("work",)), "outputs"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, max_events=0), "max_events"),
+        (lambda: jd.simulate(block(normal="rail"), [0.0], [1.0], TS), "rail"),
+        (lambda: jd.constrained_dynamics(block(), jnp.zeros(1), jnp.zeros(1)), "CoulombFriction"),
+    ],
+)
+def test_what_does_not_fit_is_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_start_pressed_into_the_ground_is_refused():
+    motion = jd.simulate(box(), [0.0, 0.05, 0.0], jnp.zeros(3), [0.0, 1.0], throw=False)
+    assert motion.result == jd.RESULTS.inconsistent_start
+
+
+@pytest.mark.slow
+def test_boxes_that_tumble_lose_energy_and_stay_above_the_ground():
+    """64 of them at once, each with events of its own, equal to one alone."""
+    rng, ts = np.random.default_rng(0), jnp.linspace(0.0, 1.0, 6)
+    q0 = jnp.asarray(np.c_[np.zeros(64), 0.45 + 0.1 * rng.random(64), rng.uniform(-0.5, 0.5, 64)])
+    v0, mu = jnp.asarray(rng.normal(size=(64, 3))), jnp.asarray(rng.uniform(0.1, 0.6, 64))
+
+    def motion(mu, q0, v0):
+        return jd.simulate(box(mu), q0, v0, ts, outputs=("energy",), **TIGHT)
+
+    batch = jax.jit(jax.vmap(motion))(mu, q0, v0)
+    assert batch.success.all() and int(batch.events.count.min()) >= 1
+    assert np.diff(batch.energy, axis=1).max() < 1e-6  # of 20 J, by the dense output between steps
+    angle = batch.q[..., 2]
+    bottom = batch.q[..., 1] - 0.2 * jnp.abs(jnp.sin(angle)) - 0.1 * jnp.cos(angle)
+    assert bottom.min() > -1e-8  # of the dense output
+    np.testing.assert_allclose(batch.q[7], motion(mu[7], q0[7], v0[7]).q, atol=1e-9)

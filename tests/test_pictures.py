@@ -1,0 +1,429 @@
+"""Pictures: solids of files and of inertias, drawings, pages for a browser."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+from jaxdyn.io import NotTakenWarning
+from jaxdyn.model import float64 as f64
+from jaxdyn.pictures import inferred, motion
+from jaxdyn.pictures.solids import SIZES, Shape, Shapes, joined, sharpened, simplified
+
+WITH_BODIES = [name for name in jd.scenes.names() if isinstance(getattr(jd.scenes, name)().system, jd.Model)]
+
+
+def volume(vertices, faces) -> float:
+    """Volume by the divergence theorem: positive where triangles run counter-clockwise from outside."""
+    return float(np.einsum("ni,ni->", vertices[faces[:, 0]], np.cross(*(vertices[faces[:, k]] for k in (1, 2)))) / 6)
+
+
+def inertia_of(vertices, faces, mass: float) -> np.ndarray:
+    """Inertia (3, 3) about the origin of a uniform solid of triangles: sums over its tetrahedra from the origin."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    six = np.einsum("ni,ni->n", a, np.cross(b, c))
+    total = a + b + c
+    second = sum(np.einsum("n,ni,nj->ij", six, x, x) for x in (a, b, c, total)) / 120
+    second = second * mass / (six.sum() / 6)
+    return np.trace(second) * np.eye(3) - second
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "exact"),
+    [
+        ("box", (0.1, 0.2, 0.3), 0.006),
+        ("ellipsoid", (0.1, 0.2, 0.3), 4 / 3 * np.pi * 0.006),
+        ("cylinder", (0.2, 0.5), np.pi * 0.04 * 0.5),
+        ("capsule", (0.2, 0.5), np.pi * 0.04 * 0.5 + 4 / 3 * np.pi * 0.008),
+    ],
+)
+def test_triangles_of_solids_enclose_their_volume(kind, size, exact):
+    pose = f64.pose_matrix(((0.3, -0.2, 0.1), (0.3, 0.2, 0.5)), "pose")
+    assert kind in SIZES
+    vertices, faces = Shape("body", kind, size, pose).triangles()
+    # Polygons of 24 sides lie inside of their circles: 1.1 % of the area, 3 % of a ball.
+    assert volume(vertices, faces) == pytest.approx(exact, rel=1e-12 if kind == "box" else 0.04)
+    mirrored = Shape("body", "mesh", (1.0, -1.0, 1.0), pose, vertices=vertices, faces=faces)
+    assert volume(*mirrored.triangles()) > 0
+    again = sharpened(*joined([(vertices, faces)]))
+    assert volume(*again) == pytest.approx(volume(vertices, faces), rel=1e-12)
+
+
+def test_simplified_meshes_are_small_and_close():
+    vertices, faces = Shape("b", "ellipsoid", (1.0, 0.8, 0.6)).triangles()
+    few, triangles = simplified(vertices, faces, 100)
+    assert len(few) <= 100 < len(vertices)
+    assert np.abs(np.ptp(few, axis=0) / np.ptp(vertices, axis=0) - 1).max() < 0.15
+    assert volume(few, triangles) == pytest.approx(volume(vertices, faces), rel=0.2)
+    assert simplified(vertices, faces, 10_000)[0] is vertices
+
+
+@pytest.mark.parametrize("moments", [(0.01, 0.02, 0.025), (0.02, 0.02, 0.03), (0.02, 0.02, 0.005), (0.02, 0.02, 0.02)])
+def test_solids_of_inertia_have_that_inertia(moments):
+    turn = f64.rotation_from_rpy((0.3, -0.4, 0.9))
+    com, mass = np.array([0.1, 0.05, -0.02]), 2.0
+    inertia = (mass, com, turn @ np.diag(moments) @ turn.T)
+    model = jd.ModelBuilder("one").add_body("body", joint="spherical", inertia=inertia).build()
+    (solid,) = [shape for shape in inferred.completed(jd.Scene(model), Shapes()) if shape.kind != "capsule"]
+    vertices, faces = solid.triangles()
+    found = inertia_of(vertices - com, faces, mass)
+    # Round solids are polygons of 24 sides.
+    np.testing.assert_allclose(found, inertia[2], atol=(1e-12 if solid.kind == "box" else 0.03) * max(moments))
+
+
+@pytest.mark.parametrize("name", WITH_BODIES)
+def test_every_scene_of_bodies_has_solids_and_a_stage(name):
+    """Without kinematics compiled: solids are on frames of the model, finite and right side out."""
+    scene = getattr(jd.scenes, name)()
+    shapes = inferred.completed(scene, Shapes())
+    assert shapes and shapes.frames() <= set(scene.system.frame_names)
+    for shape in shapes:
+        assert volume(*shape.triangles()) > 0
+
+
+URDF = """<robot name="arm">
+  <material name="red"><color rgba="0.8 0.1 0.1 1"/></material>
+  <link name="base"><visual><geometry><cylinder radius="0.1" length="0.2"/></geometry></visual></link>
+  <link name="upper">
+    <inertial><origin xyz="0 0 0.25"/><mass value="1"/>
+      <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.001"/></inertial>
+    <visual><origin xyz="0 0 0.25" rpy="0 0 0.3"/><geometry><box size="0.1 0.1 0.5"/></geometry>
+      <material name="red"/></visual>
+    <visual><geometry><mesh filename="package://arm/part.obj" scale="2 2 2"/></geometry></visual>
+  </link>
+  <link name="tip"><visual><geometry><sphere radius="0.06"/></geometry></visual></link>
+  <link name="lower">
+    <inertial><origin xyz="0 0 0.2"/><mass value="1"/>
+      <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.001"/></inertial>
+    <visual><geometry><mesh filename="gone.stl"/></geometry></visual>
+  </link>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+    <limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.5"/>
+    <axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="end" type="fixed"><parent link="lower"/><child link="tip"/><origin xyz="0 0 0.4"/></joint>
+</robot>"""
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.fixture(scope="module")
+def urdf(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("share") / "arm"
+    folder.mkdir()
+    (folder / "part.obj").write_text(OBJ)
+    (folder / "arm.urdf").write_text(URDF)
+    return folder / "arm.urdf"
+
+
+@pytest.fixture(scope="module")
+def solids(urdf) -> Shapes:
+    with pytest.warns(NotTakenWarning, match=r"gone\.stl.*no such file"):
+        return jd.shapes(urdf)
+
+
+def test_solids_of_urdf(urdf, solids):
+    pytest.importorskip("trimesh")
+    assert [(shape.frame, shape.kind) for shape in solids] == [
+        ("base", "cylinder"), ("upper", "box"), ("upper", "mesh"), ("tip", "ellipsoid")
+    ]  # fmt: skip
+    assert solids.missing == ("mesh 'gone.stl' (no such file)",)
+    box, mesh = solids[1], solids[2]
+    assert box.color == (0.8, 0.1, 0.1)
+    assert volume(*box.triangles()) == pytest.approx(0.005, rel=1e-12)
+    assert volume(*mesh.triangles()) == pytest.approx(8 / 6, rel=1e-12)  # twice as large as in its file
+    np.testing.assert_allclose(box.pose[:3, :3], f64.rotation_from_rpy((0, 0, 0.3)))
+    # The lower arm has the tip's ball; nothing of inertia is added to bodies that have a solid.
+    model = jd.load_urdf(urdf)
+    assert {shape.source for shape in inferred.completed(jd.Scene(model), solids)} == {"file"}
+    whole = inferred.completed(jd.Scene(model), Shapes([box]))
+    assert [shape.frame for shape in whole if shape.source == "inertia"] == ["lower"]
+
+
+def test_solids_of_mjcf(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    path = tmp_path / "robot.xml"
+    path.write_text("""<mujoco><asset><material name="blue" rgba="0 0 1 1"/>
+      <mesh name="part" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/><mesh name="lost" file="lost.stl"/></asset><worldbody>
+      <geom type="plane" size="1 1 1"/><geom type="box" size="0.1 0.2 0.3" pos="0 0 1"/>
+      <body name="arm" pos="0 0 1"><joint axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.05" material="blue"/>
+        <geom type="mesh" mesh="part" pos="0.1 0.2 0.3"/><geom type="mesh" mesh="lost" mass="0"/>
+        <geom type="sphere" size="0.3" group="3"/></body></worldbody></mujoco>""")
+    with pytest.warns(NotTakenWarning, match=r"lost\.stl"):
+        solids = jd.shapes(path)
+    assert [(shape.frame, shape.kind) for shape in solids] == [(None, "box"), ("arm", "capsule"), ("arm", "mesh")]
+    assert volume(*solids[0].triangles()) == pytest.approx(8 * 0.006, rel=1e-12)
+    assert solids[1].color == (0.0, 0.0, 1.0) and solids[0].color is None
+    # mujoco moves a mesh to its centre and turns it to its axes of inertia, and the geom with it.
+    vertices = solids[2].triangles()[0]
+    np.testing.assert_allclose(vertices.min(0), (0.1, 0.2, 0.3), atol=1e-6)  # of float32
+    assert mujoco is not None
+
+
+def test_solids_of_sdf(tmp_path):
+    path = tmp_path / "robot.sdf"
+    path.write_text("""<sdf version='1.7'><model name='m'><link name='a'>
+      <visual name='v'><pose>0 0 1 0 0 0</pose><geometry><box><size>1 2 3</size></box></geometry>
+        <material><diffuse>0.2 0.3 0.4 1</diffuse></material><transparency>0.5</transparency></visual>
+      <visual name='w'><geometry><sphere><radius>0.5</radius></sphere></geometry></visual>
+      <visual name='x'><geometry><cylinder><radius>0.5</radius><length>2</length></cylinder></geometry></visual>
+      <visual name='y'><geometry><mesh><uri>model://m/no.dae</uri></mesh></geometry></visual></link></model></sdf>""")
+    with pytest.warns(NotTakenWarning, match=r"model://m/no\.dae"):
+        solids = jd.shapes(path)
+    assert [shape.kind for shape in solids] == ["box", "ellipsoid", "cylinder"]
+    assert solids[0].color == (0.2, 0.3, 0.4) and solids[0].opacity == 0.5
+    np.testing.assert_allclose(solids[0].triangles()[0].max(0), (0.5, 1.0, 2.5))
+    assert solids[2].size == (0.5, 2.0)
+
+
+def test_shapes_refuse_what_they_cannot_read(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(
+        "<robot name='r'><link name='a'><visual><geometry>\n<box size='1 2'/></geometry></visual></link></robot>"
+    )
+    with pytest.raises(ValueError, match=r"robot\.urdf:2: size of <box> .* is '1 2'; give 3"):
+        jd.shapes(path)
+    path.write_text("<html/>")
+    with pytest.raises(ValueError, match="expected <robot>, <mujoco> or <sdf>"):
+        jd.shapes(path)
+    path.write_bytes(b"solid")
+    (tmp_path / "broken.stl").write_bytes(b"no mesh")
+    path.write_text(
+        "<robot name='r'><link name='a'><visual><geometry><mesh filename='broken.stl'/></geometry></visual></link></robot>"
+    )
+    with pytest.warns(NotTakenWarning, match=r"broken\.stl"):
+        assert jd.shapes(path) == ()
+
+
+def solution_of(scene, qs, ts, **outputs) -> jd.Solution:
+    """A solution made by hand, of one motion: what is drawn does not ask how a motion was found."""
+    qs = jnp.asarray(qs)
+    rates = jnp.zeros((len(qs), scene.nv))
+    return jd.Solution(jnp.asarray(ts, float), qs, rates, jd.RESULTS.successful, {}, **outputs)
+
+
+def batch_of(*solutions) -> jd.Solution:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *solutions)
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """A four-bar linkage, two motions of nine rows, with numbers for the forces of its loop and its joint torques."""
+    scene = jd.scenes.four_bar()
+    q, _ = jd.scenes.four_bar.start()
+    rng = np.random.default_rng(0)
+    qs = np.asarray(q) + 0.3 * np.sin(np.linspace(0, 3, 9))[None, :, None] * np.array([[[1.0, 0.5, -1]], [[0.5, 1, 1]]])
+    forces = jnp.asarray(rng.normal(size=(2, 9, 2)))
+    torque = jnp.asarray(rng.normal(size=(2, 9, 3)))
+    ts = np.linspace(0.0, 0.4, 9)
+    return scene, batch_of(*(solution_of(scene, qs[k], ts, multipliers=forces[k], torque=torque[k]) for k in range(2)))
+
+
+def test_marks_and_forces_of_a_loop(turning):
+    """The wrench of the multipliers does the work lam^T A dq along any displacement dq."""
+    scene, solution = turning
+    moved = motion.motion_of(scene, solution)
+    (mark,) = motion.marks(moved)
+    force, *torques = motion.forces(moved)
+    assert mark.kind == "loop" and force.kind == "force"
+    assert force.places.shape == force.vectors.shape == (2, 9, 3)
+    np.testing.assert_array_equal(force.places, mark.b)
+    rows = np.asarray(jd.constraint_jacobian(scene, solution.q[0, 0]))
+    dq = 1e-6 * np.random.default_rng(0).normal(size=scene.nv)
+    found = []
+    for sign in (1.0, -1.0):
+        poses = motion.poses_of(scene.system, (np.asarray(solution.q[0, 0]) + sign * dq)[None])
+        places = [
+            inferred.place_of(scene.system, poses, body) @ np.asarray(pose)
+            for body, pose in scene.constraints[0].ends()
+        ]
+        found.append(places[1][0, :3, 3] - places[0][0, :3, 3])
+    work = force.vectors[0, 0] @ (found[0] - found[1]) / 2
+    # A central difference over a step of 1e-6; the start closes the loop to rounding.
+    assert work == pytest.approx(float(np.asarray(solution.multipliers[0, 0]) @ rows @ dq), rel=1e-6)
+    # Torques are along the joints' axes, which are across the plane.
+    assert [torque.name for torque in torques] == list(scene.system.joint_names)
+    sizes = np.stack([torque.vectors[..., 2] for torque in torques], axis=-1)
+    np.testing.assert_allclose(sizes, solution.torque, atol=1e-12)
+
+
+def test_force_of_a_wheel_is_at_its_contact_and_as_newton_has_it():
+    scene = jd.scenes.rolling_coin()
+    q, v = jd.scenes.rolling_coin.start()
+    found = jd.constrained_dynamics(scene, q, v)
+    solution = solution_of(scene, q[None], [0.0], multipliers=found.multipliers[None])
+    moved = motion.motion_of(scene, solution)
+    (force,), (mark,) = motion.forces(moved), motion.marks(moved)
+    assert mark.kind == "contact"
+    np.testing.assert_allclose(force.places[..., 2], 0.0, atol=1e-12)  # on the ground
+    np.testing.assert_allclose(mark.axis[0, 0], [0, 0, 1.0], atol=1e-12)
+    # The ground is all that touches the coin: the force that its motion asks for.
+    asked = np.asarray(jd.inverse_dynamics(scene.system, q, v, found.acceleration))[:3]
+    np.testing.assert_allclose(force.vectors[0, 0], moved.poses[0, 0, 0, :3, :3] @ asked, atol=1e-10)
+
+
+def test_draw_and_animate(turning, solids, urdf, tmp_path):
+    pytest.importorskip("matplotlib")
+    scene, solution = turning
+    axes = jd.draw(scene, solution.q[0, 0])
+    assert axes.name == "3d" and axes.get_xlabel() == "x (m)"
+    axes.figure.savefig(tmp_path / "one.png")
+    assert (tmp_path / "one.png").stat().st_size > 5_000
+    jd.animate(scene, solution, tmp_path / "turn.gif", fps=10)
+    from PIL import Image
+
+    with Image.open(tmp_path / "turn.gif") as picture:
+        assert picture.n_frames == 5  # of 0.4 s
+    jd.draw(jd.load_urdf(urdf), jnp.asarray([0.3, -0.2]), axes, shapes=solids)
+
+
+def test_draw_refuses(turning, tmp_path):
+    scene, solution = turning
+    with pytest.raises(ValueError, match=r"LagrangianSystem, which has no bodies.*jd\.plot\.states"):
+        jd.draw(jd.scenes.pendulum(), jnp.zeros(1))
+    with pytest.raises(ValueError, match=r"shape \(2,\).*\(3,\) = \(nq,\)"):
+        jd.draw(scene, jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"\.gif or \.mp4"):
+        jd.animate(scene, solution, tmp_path / "turn.avi")
+    with pytest.raises(ValueError, match="on frames elsewhere, which model"):
+        jd.draw(scene, solution.q[0, 0], shapes=[Shape("elsewhere", "box", (1.0, 1.0, 1.0))])
+    with pytest.raises(ValueError, match="give jd"):
+        jd.draw(scene, solution.q[0, 0], shapes="robot.urdf")
+    with pytest.raises(ValueError, match="projection '3d'"):
+        from matplotlib.figure import Figure
+
+        jd.draw(scene, solution.q[0, 0], Figure().add_subplot())
+    if shutil.which("ffmpeg") is None:
+        with pytest.raises(ValueError, match="there is no ffmpeg; install it"):
+            jd.animate(scene, solution, tmp_path / "turn.mp4")
+    other = jd.scenes.slider_crank() if scene.nq != 3 else jd.scenes.windows()
+    with pytest.raises(ValueError, match="is the scene that of the solution"):
+        motion.motion_of(other, solution)
+
+
+def test_rows_that_were_not_reached_repeat_the_last():
+    model = jd.ModelBuilder("rod").add_body("rod", axis=(0, 1, 0), inertia=(1.0, (0, 0, -0.5), (0.1, 0.1, 0.1))).build()
+    qs = np.linspace(0.0, 1.0, 6)[:, None]
+    solution, ts = solution_of(model, qs, np.linspace(0.0, 1.0, 6)), np.linspace(0.0, 1.0, 6)
+    broken = qs.copy()
+    broken[3:] = np.nan
+    moved = motion.motion_of(model, solution_of(model, broken, ts))
+    np.testing.assert_array_equal(moved.q[0, 3:], np.broadcast_to(qs[2], (3, 1)))
+    np.testing.assert_allclose(moved.poses[0, 1, 0], jd.forward_kinematics(model, solution.q[1])[0], atol=1e-15)
+    np.testing.assert_allclose(motion.motion_of(model, solution, rows=3).ts, (0.0, 0.4, 1.0), atol=1e-12)
+    with pytest.raises(ValueError, match="not finite at the start"):
+        motion.motion_of(model, solution_of(model, np.full((6, 1), np.nan), ts))
+    with pytest.raises(ValueError, match="differs from motion to motion"):
+        motion.motion_of(model, batch_of(solution, solution_of(model, qs, 2 * ts)))
+
+
+@pytest.fixture(scope="module")
+def page(turning, tmp_path_factory) -> Path:
+    pytest.importorskip("viser")
+    path = tmp_path_factory.mktemp("page") / "turn.html"
+    jd.save_html(path, *turning)
+    return path
+
+
+def messages_of(path: Path) -> list[tuple[float, dict]]:
+    """What a page holds: times and messages of its recording."""
+    import base64
+    import re
+
+    import msgspec
+    import zstandard
+
+    (data,) = re.findall(r'window\.__VISER_EMBED_DATA__="([^"]*)"', path.read_text(encoding="utf-8"))
+    raw = base64.b64decode(data)
+    inner = zstandard.ZstdDecompressor().decompress(raw[8:], max_output_size=int.from_bytes(raw[:8], "little"))
+    size = int.from_bytes(inner[:8], "little")
+    return msgspec.msgpack.decode(inner[8 : 8 + size])["messages"]
+
+
+def test_page_is_one_small_file_with_the_whole_motion(page, turning, capsys):
+    scene, solution = turning
+    assert 300_000 < page.stat().st_size <= 2_000_000
+    text = page.read_text(encoding="utf-8")
+    assert "<script src=" not in text and '<link rel="stylesheet" href="http' not in text
+    messages = messages_of(page)
+    assert messages[-1][0] == pytest.approx(0.4)  # s
+    # Positions of a body over time are those of the kinematics, of the solid motion and of the ghost.
+    for n in (0, 1):
+        name = f"/motion{n}/{scene.system.body_names[-1]}"
+        found = [(t, m["position"]) for t, m in messages if m["type"] == "SetPositionMessage" and m["name"] == name]
+        last = jd.forward_kinematics(scene.system, solution.q[n, -1])[-1]
+        np.testing.assert_allclose(found[-1][1], last[:3, 3], atol=1e-12)
+    kinds = {m["type"] for _, m in messages}
+    assert {"MeshMessage", "ArrowMessage", "GridMessage", "SetCameraPositionMessage"} <= kinds
+    assert capsys.readouterr().out == ""
+
+
+def test_page_refuses(turning, tmp_path):
+    scene, solution = turning
+    with pytest.raises(ValueError, match=r"write to a file \.html"):
+        jd.save_html(tmp_path / "turn.txt", scene, solution)
+    with pytest.raises(ValueError, match="there is no directory"):
+        jd.save_html(tmp_path / "no" / "turn.html", scene, solution)
+    with pytest.raises(ValueError, match="LagrangianSystem, which has no bodies"):
+        jd.save_html(tmp_path / "turn.html", jd.scenes.pendulum(), jnp.zeros(1))
+    with pytest.raises(ValueError, match="port is 70000; give a number"):
+        jd.view(scene, solution, port=70000)
+
+
+def test_view_serves_a_page_on_this_machine(turning, monkeypatch, capsys):
+    pytest.importorskip("viser")
+    import re
+    import urllib.request
+
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    scene, solution = turning
+    viewer = jd.view(scene, solution, block=False)
+    try:
+        port = int(re.fullmatch(r"http://127\.0\.0\.1:(\d+)", viewer.url)[1])
+        with urllib.request.urlopen(viewer.url) as answer:
+            assert b"<html" in answer.read()
+        said = capsys.readouterr().out
+        assert viewer.url in said and "save_html" in said and "viser" not in said
+        with pytest.raises(ValueError, match=f"port {port} cannot be used"):
+            jd.view(scene, solution, port=port, block=False)
+        assert viewer._repr_html_().startswith("<iframe srcdoc=")
+    finally:
+        viewer.stop()
+        viewer.stop()
+    jd.view(scene, solution.q[0, 0], block=False, browser=False).stop()  # one configuration
+
+
+def test_page_of_one_configuration_in_float32(tmp_path):
+    pytest.importorskip("viser")
+    box = jd.inertia.box(1.0, (0.1, 0.2, 0.3))
+    model = jd.ModelBuilder("box", dtype=jnp.float32).add_body("box", joint="spherical", inertia=box).build()
+    jd.save_html(tmp_path / "one.html", model, jd.neutral(model))
+    assert messages_of(tmp_path / "one.html")[-1][0] == 0.0
+
+
+@pytest.mark.slow
+def test_page_shows_the_mechanism_in_a_browser(page, tmp_path):
+    """A screenshot by Chromium: the page is not empty, and the linkage's colours are in its middle."""
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium on this machine")
+    from PIL import Image
+
+    flags = (
+        "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
+        "--disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=800,600 --virtual-time-budget=15000"
+    )
+    picture = tmp_path / "page.png"
+    own = [f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={picture}"]
+    subprocess.run([browser, *flags.split(), *own, page.as_uri()], timeout=170, capture_output=True, check=True)
+    middle = np.asarray(Image.open(picture).convert("RGB"), float)[150:520, 100:700]
+    # Bodies are coloured, the ground and its grid are grey.
+    coloured = np.ptp(middle, axis=2) > 25
+    assert 0.005 < coloured.mean() < 0.5

@@ -1,0 +1,379 @@
+"""Surfaces that roll on each other: against the equations of Montana and of Lagrange, and spheres in closed form."""
+
+import re
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import quick
+
+import jaxdyn as jd
+from jaxdyn import scenes, se3
+from jaxdyn.constraints.base import rows
+from jaxdyn.contact import Cylinder, Ellipsoid, Parametrised, Plane, Sphere, montana, relative_pose
+from jaxdyn.model import inertia
+
+
+def bump(alpha):
+    """A surface with a chart that is not orthogonal, convex where it is used."""
+    u, v = alpha
+    return jnp.stack([u + 0.2 * v, v, -0.5 * u * u - v * v + 0.3 * u * v])
+
+
+def bowl(alpha):
+    """A bowl that the small egg fits into."""
+    return jnp.stack([alpha[0], alpha[1], alpha[0] ** 2 + 0.5 * alpha[1] ** 2])
+
+
+EGG, TIP = Ellipsoid([0.1, 0.2, 0.15]), Ellipsoid([0.03, 0.02, 0.05], poles="x")
+PAIRS = {
+    "ellipsoid on ellipsoid": (EGG, TIP),
+    "ellipsoid on plane": (Plane(), TIP),
+    "ellipsoid on cylinder": (Cylinder(0.2), TIP),
+    "plane on ellipsoid": (TIP, Plane()),
+    "ellipsoid on a parametrised surface": (Parametrised(bump), TIP),
+    "ellipsoid in a shallow bowl": (Parametrised(bowl), TIP),
+}
+ETA = jnp.array([0.3, 0.2, -0.5, 0.4, 0.7])
+POSE_A = se3.exp(jnp.array([0.1, -0.2, 0.05, 0.3, 0.2, -0.4]))
+POSE_B = se3.exp(jnp.array([-0.03, 0.02, 0.04, -0.5, 0.1, 0.6]))
+STONE = (0.4, (0.01, -0.02, 0.005), (0.002, 0.003, 0.0025))
+
+
+def quaternion(R):
+    w = 0.5 * jnp.sqrt(1 + jnp.trace(R))
+    return jnp.stack([w, *(jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))])
+
+
+def joints_of(pose):
+    return jnp.concatenate([pose[:3, 3], quaternion(pose[:3, :3])])
+
+
+def two_bodies(surface_a, surface_b, **options):
+    """Two free bodies whose surfaces touch."""
+    builder = jd.ModelBuilder("two stones", gravity=(0.0, 0.0, -9.81))
+    builder.add_body("object", None, "free", (1.5, (0.02, 0.0, 0.01), (0.02, 0.03, 0.025)))
+    builder.add_body("tip", None, "free", STONE)
+    touch = jd.rolling_contact("object", surface_a, "tip", surface_b, pose_a=POSE_A, pose_b=POSE_B, **options)
+    system = jd.RollingModel(builder.build(), [touch])
+    return jd.Scene(system, system.rows)
+
+
+def one_body(surface_a, surface_b, **options):
+    """A body on a surface that stands still."""
+    builder = jd.ModelBuilder("a stone", gravity=(0.5, 0.2, -9.81))
+    builder.add_body("stone", None, "free", STONE)
+    system = jd.RollingModel(builder.build(), [jd.rolling_contact(None, surface_a, "stone", surface_b, **options)])
+    return jd.Scene(system, system.rows)
+
+
+TWIST = jnp.array([0.2, -0.1, 0.3, 0.5, 0.4, -0.6])
+
+
+# The others differ in the surfaces alone.
+FAST = ("ellipsoid on plane",)
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in PAIRS]
+)
+def test_rows_and_rates_are_montanas(name):
+    """Contact coordinates, their rates and the rows of a soft finger, at a place that was set up by g_of."""
+    a, b = PAIRS[name]
+    scene = two_bodies(a, b, spin=True)
+    system = scene.system
+    found = montana(a, b, ETA)
+    object_pose = se3.exp(jnp.array([0.3, -0.2, 0.5, 0.2, -0.3, 0.1]))
+    tip_pose = object_pose @ POSE_A @ relative_pose(a, b, ETA) @ se3.inverse(POSE_B)
+    joints = jnp.concatenate([joints_of(object_pose), joints_of(tip_pose)])
+    # A search from nearby comes to the place.
+    q = system.place(joints, near=ETA[None, :4] + 0.05)
+    # V_c: twist of L_f against L_o; the object moves too, so that both sides are seen.
+    V_c = jnp.array([0.02, -0.03, 0.0, 0.7, -0.4, 0.5])
+    to_tip = POSE_B @ found.finger.pose
+    tip_twist = se3.Ad_apply(to_tip, V_c) + se3.Ad_apply(se3.inverse(tip_pose) @ object_pose, TWIST)
+    v = jnp.concatenate([TWIST, tip_twist])
+
+    @quick
+    def compute(q, v):
+        rate = jd.configuration_rate(system, q, v)
+        eta, eta_rate = jax.jvp(system.contact_coordinates, (q,), (rate,))
+        A, A_rate = jax.jvp(lambda q: jd.constraint_jacobian(scene, q), (q,), (rate,))
+        return eta[0], eta_rate[0], A, A_rate @ v, rows(scene, q, v, 0.0)
+
+    eta, eta_rate, A, A_rate_v, row = compute(q, v)
+    np.testing.assert_allclose(eta, ETA, atol=1e-11)
+    np.testing.assert_allclose(eta_rate, found.forward @ V_c, atol=1e-10, rtol=1e-10)
+    np.testing.assert_allclose(row.A, A, atol=1e-13)
+    # A a = gamma is A v = const differentiated.
+    np.testing.assert_allclose(row.gamma, -A_rate_v, atol=1e-9 * float(jnp.abs(A_rate_v).max()))
+    # The gap opens against the tip's outward normal; slips are those of V_c in any two directions; then the spin, about
+    # the object's outward normal, which is the tip's inward one.
+    np.testing.assert_allclose(A @ v, [0.0, *(A @ v)[1:3], -V_c[5]], atol=1e-12)
+    np.testing.assert_allclose(np.hypot(*(A @ v)[1:3]), np.hypot(*V_c[:2]), rtol=1e-11)
+    rolling = jnp.concatenate([TWIST, tip_twist - se3.Ad_apply(to_tip, V_c.at[3:5].set(0.0))])
+    np.testing.assert_allclose(A @ rolling, 0.0, atol=1e-12)
+
+
+CLOSED = {
+    "plane": (Plane(), {"on": "plane"}, jnp.array([0.3, -0.2, 0.1])),
+    "sphere": (Sphere(0.3), {"on": "sphere", "surface_radius": 0.3}, 0.4 * jnp.array([0.6, -0.48, 0.64])),
+    "cylinder": (Cylinder(0.3), {"on": "cylinder", "surface_radius": 0.3}, jnp.array([0.24, -0.32, 0.2])),
+}
+
+
+@pytest.mark.parametrize(
+    ("on", "spin"),
+    [("plane", True), *(pytest.param(on, True, marks=pytest.mark.slow) for on in ("sphere", "cylinder"))],
+)
+def test_a_ball_has_the_rows_in_closed_form(on, spin):
+    surface, options, center = CLOSED[on]
+    general = one_body(surface, Sphere(0.1), spin=spin)
+    closed = jd.Scene(
+        one_body(surface, Sphere(0.1)).system, (jd.rolling_sphere("stone", None, 0.1, spin=spin, **options),)
+    )
+    joints = jnp.concatenate([center, jnp.array([0.5, -0.5, 0.1, 0.7])])
+    q, v = general.system.place(joints), jnp.array([0.2, -0.1, 0.3, 0.5, 0.4, -0.6])
+    one, other = (quick(lambda q, v, scene=scene: rows(scene, q, v, 0.0))(q, v) for scene in (general, closed))
+    for name in ("A", "gamma", "velocity"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-12)
+    # Where the ball is next to the surface, its own point and that of the surface.
+    _, place = jnp.split(q, [7])
+    R = jd.frame_pose(general.system, q, "stone")[:3, :3]
+    inward = {"plane": jnp.array([0.0, 0.0, -1.0]), "sphere": -center / 0.4, "cylinder": jnp.array([-0.6, 0.8, 0.0])}[
+        on
+    ]
+    np.testing.assert_allclose(R @ place[-3:], inward, atol=1e-12)
+    want = {"plane": center[:2], "sphere": center / 0.4, "cylinder": jnp.array([np.arctan2(-0.32, 0.24), 0.2])}[on]
+    np.testing.assert_allclose(place[:-3], want, atol=1e-12)
+
+
+def touching(a, b, eta, V_c, **options):
+    """A stone that touches a surface at contact coordinates eta and moves by V_c: scene, q, v."""
+    scene = one_body(a, b, **options)
+    q = scene.system.place(joints_of(relative_pose(a, b, eta)), near=eta[None])
+    return scene, q, se3.Ad_apply(montana(a, b, eta).finger.pose, V_c)
+
+
+def spatial_mass():
+    return np.asarray(
+        inertia.spatial_inertia(jd.ModelBuilder("m").add_body("b", None, "free", STONE).build().inertias[0])
+    )
+
+
+@pytest.mark.slow
+def test_sliding_is_lagranges_equations_in_contact_coordinates():
+    """L(eta, etadot) with V_of = J_F etadot: five coordinates, against the row of the gap on SE(3)."""
+    V_c = jnp.array([0.2, 0.1, 0.0, 0.7, -0.4, 0.5])
+    scene, q, v = touching(EGG, TIP, ETA, V_c, slip=True)
+    M, mass, com, fall = spatial_mass(), STONE[0], jnp.asarray(STONE[1]), jnp.asarray(scene.system.gravity)
+
+    def metric(eta):
+        J = montana(EGG, TIP, eta).J_F
+        return J.T @ M @ J
+
+    def potential(eta):
+        pose = relative_pose(EGG, TIP, eta)
+        return -mass * fall @ (pose[:3, :3] @ com + pose[:3, 3])
+
+    @quick
+    def both(q, v, eta):
+        rates = montana(EGG, TIP, eta).forward @ V_c
+        eta_rate2 = jd.forward_dynamics(jd.MetricSystem(metric, 5, potential=potential), eta, rates, jnp.zeros(5))
+        J, J_rate = jax.jvp(lambda eta: montana(EGG, TIP, eta).J_F, (eta,), (rates,))
+        return jd.constrained_dynamics(scene, q, v).acceleration, J @ eta_rate2 + J_rate @ rates, J @ rates
+
+    acceleration, lagrange, twist = both(q, v, ETA)
+    np.testing.assert_allclose(twist, v, atol=1e-13)
+    np.testing.assert_allclose(acceleration, lagrange, atol=1e-10 * float(jnp.abs(lagrange).max()))
+
+
+@pytest.mark.slow
+def test_rolling_is_newton_eulers_equations_in_the_rates_of_rolling():
+    """M V' - ad_V^T M V = G + A^T lam with V = J_F B (wx, wy): two rates and four forces, by one system of equations."""
+    w = jnp.array([0.7, -0.4])
+    scene, q, v = touching(EGG, TIP, ETA, jnp.array([0.0, 0.0, 0.0, *w, 0.0]), spin=True)
+    M, found = spatial_mass(), montana(EGG, TIP, ETA)
+
+    def to_twist(eta):
+        at = montana(EGG, TIP, eta)
+        return at.J_F @ at.rolling
+
+    J, J_rate = quick(lambda eta: jax.jvp(to_twist, (eta,), (found.rolling @ w,)))(ETA)
+    A = (np.asarray(se3.Ad(se3.inverse(found.finger.pose))))[[0, 1, 2, 5]]
+    fall, com = found.g_of[:3, :3].T @ scene.system.gravity * STONE[0], jnp.asarray(STONE[1])
+    weight = jnp.concatenate([fall, jnp.cross(com, fall)])
+    turning = -se3.ad(v).T @ (M @ v)
+    solved = np.linalg.solve(np.concatenate([M @ J, -A.T], 1), weight - turning - M @ (J_rate @ w))
+    got = quick(lambda q, v: jd.constrained_dynamics(scene, q, v))(q, v)
+    want = J @ solved[:2] + J_rate @ w
+    np.testing.assert_allclose(got.acceleration, want, atol=1e-10 * float(jnp.abs(want).max()))
+    rows_of = jd.constraint_jacobian(scene, q)
+    np.testing.assert_allclose(rows_of.T @ got.multipliers, A.T @ solved[2:], atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("radius", "ranks"), [(0.1, (2, 3, 5)), (0.3, (2, 2))])
+def test_rolling_reaches_all_contact_coordinates_unless_radii_are_equal(radius, ranks):
+    """Murray, Li & Sastry (1994), section 7.4: equal spheres roll as mirror images, which can be integrated."""
+    scene = one_body(Sphere(0.3), Sphere(radius), spin=True)
+    center = (0.3 + radius) * jnp.array([0.6, -0.48, 0.64])
+    q = scene.system.place(jnp.concatenate([center, jnp.array([0.5, -0.5, 0.1, 0.7])]))
+    assert jd.involutive(scene, q).ranks == ranks
+
+
+def egg_on_plane(axes):
+    """An egg that rolls on a plane, its centre of mass in the middle."""
+    builder = jd.ModelBuilder("egg", gravity=(0.0, 0.0, -9.81))
+    builder.add_body("egg", None, "free", inertia.ellipsoid(1.0, (0.3, 0.2, 0.25)))
+    system = jd.RollingModel(builder.build(), [jd.rolling_contact(None, Plane(), "egg", Ellipsoid(axes))])
+    return jd.Scene(system, system.rows)
+
+
+AXES, OMEGA = jnp.array([0.3, 0.2, 0.25]), jnp.array([4.0, 6.0, 0.5])
+
+
+def egg_start(scene, omega, height=AXES[2]):
+    """The egg on the pole of its chart, where it rolls without slip."""
+    q = scene.system.place(jnp.concatenate([jnp.zeros(2), height[None], jnp.array([1.0, 0.0, 0.0, 0.0])]))
+    return q, jnp.concatenate([jnp.stack([height * omega[1], -height * omega[0], 0.0 * height]), omega])
+
+
+@pytest.mark.slow
+def test_an_egg_keeps_its_energy_and_both_methods_agree():
+    scene = egg_on_plane(AXES)
+    q, v = egg_start(scene, OMEGA)
+    ts, ends = jnp.linspace(0.0, 5.0, 26), []
+    for method in ("projected", "reduced"):
+        found = jd.simulate(
+            scene, q, v, ts, method=method, rtol=1e-11, atol=1e-11, outputs=("energy", "constraint_residual")
+        )
+        assert float(found.constraint_residual.max()) < 1e-13
+        np.testing.assert_allclose(found.energy, found.energy[0], rtol=1e-9)
+        ends.append(found.q)
+    # It has turned over, past the poles of every chart.
+    places = np.asarray(ends[0][:, 9:])
+    assert (np.ptp(places, axis=0) > 1.5).all()
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), 1.0, atol=1e-14)
+    # Errors of some 1e-11 a step, of motions that part from each other in 5 s.
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+    # The places are where the surfaces touch, and eta gives the pose back.
+    for row in ends[0][::5]:
+        pose = relative_pose(Plane(), Ellipsoid(AXES), scene.system.contact_coordinates(row)[0])
+        np.testing.assert_allclose(pose, jd.frame_pose(scene.system, row, "egg"), atol=1e-11)
+
+
+@pytest.mark.slow
+def test_a_hand_rolls_an_egg_and_stays_in_touch():
+    scene, (q, v) = scenes.hand_rolling_egg(gravity=0.0), scenes.hand_rolling_egg.start()
+    outputs = ("energy", "constraint_residual", "contact_forces")
+    found = jd.simulate(scene, q, v, jnp.linspace(0.0, 5.0, 26), outputs=outputs, contacts="report")
+    assert found.contact_forces is not None and set(found.contact_forces) == {"finger1", "finger2", "finger3"}
+    assert float(found.constraint_residual.max()) < 1e-11
+    # Tolerances of 1e-8 of coordinates of the order of 1; the energy is some 4e-4 J.
+    np.testing.assert_allclose(found.energy, found.energy[0], atol=1e-9)
+    eta = jax.vmap(scene.system.contact_coordinates)(found.q)
+    assert (np.abs(eta[-1, :, :4] - eta[0, :, :4]).max(1) > 0.1).all()
+    # 9 rows on 15 velocities; the object's six are left.
+    assert jd.grasp.hand_jacobian(scene, q).shape == (9, 9)
+
+
+@pytest.mark.slow
+def test_motions_are_batched_and_have_derivatives_in_states_and_shapes():
+    def end(axes, omega):
+        scene = egg_on_plane(axes)
+        options = {"stepsize": 0.02, "solver": diffrax.Dopri5(), "adjoint": "reverse"}
+        found = jd.simulate(scene, *egg_start(scene, omega, axes[2]), jnp.array([0.0, 0.1, 0.2]), **options)
+        return jnp.sum(found.q[-1] ** 2)
+
+    step = 1e-4
+    axes, omegas = step * jnp.eye(3, 3), step * jnp.eye(3)
+    value, slopes = quick(jax.value_and_grad(end, (0, 1)))(AXES, OMEGA)
+    steps = jnp.concatenate([-2 * axes, -axes, axes, 2 * axes])
+    none = jnp.zeros_like(steps)
+    ends = quick(jax.vmap(end))(
+        AXES + jnp.concatenate([steps, none]), OMEGA + jnp.concatenate([none, steps * omegas[0, 0] / step])
+    )
+    low2, low, high, high2 = jnp.moveaxis(ends.reshape(2, 4, 3), 1, 0)
+    differences = (low2 - 8 * low + 8 * high - high2) / (12 * step)
+    # Differences of fourth order of numbers that are known to 1e-13.
+    np.testing.assert_allclose(slopes, differences, atol=1e-7)
+    np.testing.assert_allclose(value, end(AXES, OMEGA), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_valley_that_becomes_too_narrow_ends_the_motion():
+    def narrowing(a):
+        return jnp.stack([a[0], a[1], 0.5 * a[0] ** 2 + 12.0 * a[0] ** 4 + 0.5 * a[1] ** 2])
+
+    scene = one_body(Parametrised(narrowing), Sphere(0.3))
+    q = scene.system.place(jnp.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]), near=[[0.0, 0.0, -0.5, 0.0]])
+    v = jnp.array([1.2, 0.0, 0.0, 0.0, 4.0, 0.0])
+    for options in ({}, {"stepsize": 0.005}):
+        found = jd.simulate(scene, q, v, jnp.linspace(0.0, 0.5, 51), throw=False, max_steps=2000, **options)
+        assert found.result == jd.RESULTS.no_single_contact, found.result
+        assert 0 < float(found.stats["time_reached"]) < 0.5 and np.isnan(found.q[-1]).all()
+
+
+@pytest.mark.slow
+def test_the_page_on_constraints_runs():
+    page = (Path(__file__).resolve().parent.parent / "docs/constraints.md").read_text(encoding="utf-8")
+    block = re.search(r"## Rolling of surfaces.*?```python\n(.*?)```", page, flags=re.DOTALL)
+    assert block is not None
+    names: dict = {}
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        exec(compile(block[1], "constraints.md", "exec"), names)
+    assert float(names["motion"].constraint_residual.max()) < 1e-11 and names["eta"].shape == (1, 5)
+
+
+BALL = jnp.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0])
+
+
+def placed_on(f, **options):
+    return one_body(Parametrised(f), Sphere(0.3)).system.place(BALL, **options)
+
+
+def simulated(change):
+    scene = one_body(Plane(), Sphere(0.3))
+    q = change(scene.system)
+    return jd.simulate(scene, q, jnp.zeros(6), jnp.array([0.0, 0.1]))
+
+
+BAD = [
+    (lambda: jd.rolling_contact(None, Plane(), "stone", Sphere(-0.1)), "radius is -0.1"),
+    (lambda: jd.rolling_contact(None, "plane", "stone", Sphere(0.1)), "surface is a str"),
+    (lambda: jd.rolling_contact(None, Plane(), "ball", Sphere(0.1), slip=True, contact=False), "leaves no rows"),
+    (lambda: jd.RollingModel(one_body(Plane(), Sphere(0.3)).system, []), "model is a RollingModel"),
+    (lambda: jd.RollingModel(scenes.sphere_arm().system, ["ball"]), "contacts is"),
+    (
+        lambda: jd.RollingModel(scenes.sphere_arm().system, [jd.rolling_contact(None, Plane(), "stone", Sphere(0.1))]),
+        "frame 'stone' is not in model",
+    ),
+    (lambda: placed_on(lambda a: jnp.stack([a[0], a[1], 5 * a @ a]), near=[[0, 0, 0, 0]]), "curvature is not positive"),
+    (lambda: placed_on(lambda a: jnp.stack([a[0], a[1], jnp.sqrt(a @ a)]), near=[[0, 0, 0, 0]]), "do not touch in one"),
+    (lambda: placed_on(bump), "give near="),
+    (lambda: placed_on(bump, near=[0.0, 0.0]), "near has shape"),
+    (lambda: one_body(Plane(), Sphere(0.3)).system.place(BALL[:3]), "joints has shape"),
+    (lambda: simulated(lambda system: system.place(BALL + 0.05 * jnp.eye(7)[2])), "open by 0.05"),
+    (lambda: simulated(lambda system: system.place(BALL).at[7].set(0.5)), "is 0.5 .m or rad. from where"),
+    (lambda: simulated(lambda system: BALL), "q0 has shape"),
+    (
+        lambda: jd.constraint_jacobian(
+            jd.Scene(scenes.sphere_arm().system, one_body(Plane(), Sphere(0.3)).system.rows), jnp.zeros(6)
+        ),
+        "none of the system",
+    ),
+    (
+        lambda: jd.join(one_body(Plane(), Sphere(0.3)).system, scenes.sphere_arm().system, prefix=("a", "b")),
+        "is a RollingModel",
+    ),
+]
+
+
+@pytest.mark.parametrize("call, match", BAD)
+def test_bad_input_is_refused(call, match):
+    with pytest.raises(ValueError, match=match):
+        call()

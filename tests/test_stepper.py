@@ -1,0 +1,116 @@
+"""One step at a time, joint stops and limits of effort."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+
+DT, TAU = 0.01, jnp.asarray([3.0, -1.0])
+
+
+def arm():
+    builder, rod = jd.ModelBuilder("arm"), (1.0, (0.0, 0.0, -0.5), (0.1, 0.1, 0.01))
+    builder.add_body(
+        "upper", None, "revolute", rod, axis=(0, 1, 0), joint_name="1", lower=-0.5, upper=0.5, effort_limit=2.0
+    )
+    builder.add_body(
+        "lower", "upper", "continuous", rod, axis=(0, 1, 0), joint_name="2", pose=((0, 0, -1.0), (0, 0, 0))
+    )
+    return builder.build()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    drive = jd.Drive(5.0, 0.5, 0.2, joints=("2",))
+    return jd.Scene(arm(), forces=(jd.JointStops(2e3, 20.0), jd.CoulombFriction(0.3, 0.05), drive, jd.EffortLimits()))
+
+
+def run(scene, start, taus, **options):
+    step = jd.stepper(scene, DT, **options)
+
+    def advance(state, tau):
+        state = step(state, tau)
+        return state, state
+
+    return jax.lax.scan(advance, start, taus)[1]
+
+
+START = jnp.asarray([0.45, 0.1]), jnp.asarray([1.0, -2.0])
+
+
+def test_steps_are_those_of_simulate(scene):
+    """With friction, a stop that is hit, a drive, and an effort above its limit."""
+    q, v = jax.jit(lambda taus: run(scene, START, taus, substeps=2))(jnp.broadcast_to(TAU, (30, 2)))
+    ts = DT * jnp.arange(31.0)
+    motion = jd.simulate(scene, *START, ts, control=lambda q, v, t: TAU, stepsize=DT / 2, outputs=("torque",))
+    np.testing.assert_allclose(q, motion.q[1:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(v, motion.v[1:], rtol=0, atol=1e-11)
+    np.testing.assert_array_equal(motion.torque, jnp.broadcast_to(jnp.asarray([2.0, -1.0]), (31, 2)))
+    assert motion.q[:, 0].max() > 0.5, "the stop is hit"
+
+
+@pytest.mark.slow
+def test_batches_and_gradients_of_steps(scene):
+    """Of a batch, through a scan, kept or computed again; against differences."""
+    taus = 1.5 * jnp.sin(jnp.arange(40.0)).reshape(20, 2)
+
+    def loss(scale, remat):
+        q, v = run(scene, START, scale * taus, remat=remat)
+        return jnp.sum(q[-1] ** 2) + jnp.sum(v[-1] * q[-1])
+
+    gradient = jax.jit(jax.vmap(jax.grad(lambda s: loss(s, True))))(jnp.asarray([0.5, 1.0]))
+    kept = jax.jit(jax.grad(lambda s: loss(s, False)))(1.0)
+    np.testing.assert_allclose(gradient[1], kept, rtol=1e-12)
+    value = jax.jit(lambda s: loss(s, True))
+    np.testing.assert_allclose(gradient[0], (value(0.5 + 1e-5) - value(0.5 - 1e-5)) / 2e-5, rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_constraints_are_closed_after_every_step():
+    scene = jd.scenes.four_bar()
+    q, v = jd.scenes.four_bar.start()
+    states = run(scene, (q, v), jnp.zeros((20, scene.nv)))
+    motion = jd.simulate(scene, q, v, DT * jnp.arange(21.0), stepsize=DT)
+    np.testing.assert_allclose(states[0], motion.q[1:], atol=1e-12)
+    np.testing.assert_allclose(states[1], motion.v[1:], atol=1e-11)
+
+
+def test_stop_holds_a_joint_and_never_pulls():
+    """Rest is tau/k beyond the limit; leaving, the damper does not hold it back."""
+    model, stops = arm(), jd.JointStops(2e3, 20.0)
+    q = jnp.asarray([0.51, 3.0])
+    np.testing.assert_allclose(stops(model, q, jnp.zeros(2), 0.0), [-20.0, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(stops(model, -q, jnp.asarray([-0.1, 0]), 0.0), [22.0, 0.0], rtol=1e-12)
+    np.testing.assert_array_equal(stops(model, q, jnp.asarray([-2.0, 0]), 0.0), [0.0, 0.0])
+    np.testing.assert_array_equal(stops(model, jnp.asarray([0.49, 0.0]), jnp.ones(2), 0.0), [0.0, 0.0])
+    slopes = jax.jacfwd(lambda q: stops(model, q, jnp.zeros(2), 0.0))(q)
+    np.testing.assert_allclose(slopes, [[-2e3, 0], [0, 0]])
+
+
+def test_limits_cut_the_control_and_nothing_else():
+    limits, tau = jd.EffortLimits([1.0, jnp.inf]), jnp.asarray([-3.0, 50.0])
+    scene = jd.Scene(arm(), forces=(limits,))
+    np.testing.assert_array_equal(scene.limited(tau), [-1.0, 50.0])
+    np.testing.assert_array_equal(jax.jacfwd(scene.limited)(tau), [[0, 0], [0, 1]])
+    np.testing.assert_array_equal(scene.applied_force(jnp.zeros(2), jnp.ones(2)), [0, 0])
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: jd.stepper(arm(), 0.0), "dt"),
+        (lambda: jd.stepper(arm(), 0.1, substeps=0), "substeps"),
+        (lambda: jd.stepper(jd.Scene(arm(), forces=(jd.DryFriction(0.1, 1.0),)), 0.1), "CoulombFriction"),
+        (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(3), jnp.zeros(2)), TAU), "q has shape"),
+        (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(2), jnp.zeros(2)), jnp.zeros(3)), "tau"),
+        (lambda: jd.JointStops(-1.0), "stiffness"),
+        (lambda: jd.JointStops(joints="9")(arm(), jnp.zeros(2), jnp.zeros(2), 0.0), "9"),
+        (lambda: jd.EffortLimits(-1.0), "negative"),
+        (lambda: jd.EffortLimits([1.0]).limited(arm(), jnp.zeros(2)), "shape"),
+    ],
+)
+def test_what_does_not_fit_is_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
