@@ -59,6 +59,7 @@ USERS = {
     | FILES_AND_PLOTS,  # a dependency of jax, so always there; not when jaxdyn is imported
     "yourdfpy": FILES_AND_PLOTS,
     "mujoco": FILES_AND_PLOTS,
+    "robot_descriptions": {"io"},
     "trimesh": {"pictures"},
     "viser": {"pictures"},
     "xarray": {"simulation"},

@@ -97,7 +97,7 @@ class ModelBuilder:
           into the one that carries it; its frame stays reachable by name. Inertia fixed to the world has no effect.
         - `inertia`: None (massless), the ten numbers (10,) about the body frame's origin, or (mass, centre of mass
           (3,), rotational inertia (3, 3) or principal moments (3,) about it); kg, m, kg m^2, in the body frame.
-        - `joint_name`: `name` + "_joint" when None. Siblings stand in the model in the order of their joint names.
+        - `joint_name`: `name` + "_joint" when None. Siblings stand in the order of these. Of a fixed body it names the frame too.
         - `pose`: of the body frame in the parent's at the joint's zero: None (identity), (4, 4), (3,) or (xyz, rpy).
         - `axis`: direction (3,) of a revolute, continuous, prismatic or helical joint in the body frame, of any
           length but zero. A planar joint moves in the x-y plane of its body frame at home.
@@ -206,6 +206,7 @@ class ModelBuilder:
             frame_names=tuple(body.name for body in moving) + tuple(name for _, name, _ in others),
             frame_bodies=tuple(range(len(moving))) + tuple(body for body, _, _ in others),
             couplings=tuple(sorted(couplings)),
+            fixed_joints=tuple((self._bodies[name].joint_name, name) for name in sorted(fixed)),
         )
         screws = np.array([body.screw for body in moving]).reshape(-1, 6)
         leaves = {key: _stacked(moving, key, size, 0.0) for key, size in _JOINT_LEAVES.items()}

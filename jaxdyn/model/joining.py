@@ -62,7 +62,9 @@ def renamed(model: Model, prefix: str) -> Model:
     names = {
         what: tuple(prefix + own for own in getattr(top, what)) for what in ("body_names", "joint_names", "frame_names")
     }
-    return dataclasses.replace(model, topology=dataclasses.replace(top, **names)) if prefix else model
+    fixed = tuple((prefix + joint, prefix + link) for joint, link in top.fixed_joints)
+    whole = dataclasses.replace(top, **names, fixed_joints=fixed)
+    return dataclasses.replace(model, topology=whole) if prefix else model
 
 
 def _moved(model: Model, pose) -> Model:
@@ -136,6 +138,7 @@ def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -
         frame_names=tuple(bodies[i] for i in order) + tuple(frame for _, frame, _ in others),
         frame_bodies=tuple(range(len(order))) + tuple(body for body, *_ in others),
         couplings=tuple(pair for pair, *_ in couplings),
+        fixed_joints=tuple(pair for top in tops for pair in top.fixed_joints),
     )
     along = {size: _coordinates(kinds, order, size) for size in ("nq", "nv")}
     index = dict.fromkeys(("home", "screws", "inertias"), order)
