@@ -206,7 +206,6 @@ class ModelBuilder:
             frame_names=tuple(body.name for body in moving) + tuple(name for _, name, _ in others),
             frame_bodies=tuple(range(len(moving))) + tuple(body for body, _, _ in others),
             couplings=tuple(sorted(couplings)),
-            fixed_joints=tuple((self._bodies[name].joint_name, name) for name in sorted(fixed)),
         )
         screws = np.array([body.screw for body in moving]).reshape(-1, 6)
         leaves = {key: _stacked(moving, key, size, 0.0) for key, size in _JOINT_LEAVES.items()}
@@ -218,7 +217,8 @@ class ModelBuilder:
         stored: dict[str, Any] = {
             key: None if value is None else jnp.asarray(value, self._dtype) for key, value in leaves.items()
         }
-        return Model(**stored, topology=topology)
+        held = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
+        return Model(**stored, topology=topology, fixed_joints=held)
 
     def _check_new(self, name, parent) -> None:
         if not isinstance(name, str) or not name:

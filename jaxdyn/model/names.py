@@ -24,7 +24,7 @@ def frame_index(model: Any, name: str) -> int:
 
     **Raises:** ValueError when there is no frame of that name; names that look alike are listed.
     """
-    carried = dict(model.topology.fixed_joints) | dict(zip(model.joint_names, model.body_names, strict=True))
+    carried = dict(model.fixed_joints) | dict(zip(model.joint_names, model.body_names, strict=True))
     try:
         return model.frame_names.index(name if name in model.frame_names else carried.get(name, name))
     except ValueError:
@@ -38,7 +38,7 @@ def joint_index(model: Any, name: str) -> int:
     """
     if name in model.joint_names:
         return model.joint_names.index(name)
-    if name in dict(model.topology.fixed_joints):
+    if name in dict(model.fixed_joints):
         raise ValueError(f"joint {name!r} of model {model.name!r} is fixed: it has no coordinates")
     near = difflib.get_close_matches(str(name), model.joint_names, n=5, cutoff=0.4)
     hint = f"did you mean {', '.join(near)}?" if near else f"joints are {', '.join(model.joint_names[:10])}"

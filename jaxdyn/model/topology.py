@@ -26,7 +26,6 @@ class Topology:
     frame_names: tuple[str, ...]
     frame_bodies: tuple[int, ...]
     couplings: tuple[tuple[int, int], ...] = ()  # (joint, source): the joint is to follow the source
-    fixed_joints: tuple[tuple[str, str], ...] = ()  # (joint, the frame of the link that it carries)
 
     @cached_property
     def _key(self):

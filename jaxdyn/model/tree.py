@@ -44,6 +44,7 @@ class Model(eqx.Module):
     - `lower`, `upper` (nq,) position limits (infinite where there are none); `velocity_limit`, `effort_limit` (nv,).
     - `coupling_values` (nc, 2): multiplier and offset (m or rad) of each coupling q[joint] = multiplier q[source] + offset in
       `topology.couplings`, or None when there are none. They are data for a scene's constraints; the joints stay free here.
+    - `fixed_joints`: (joint, frame) for each joint that holds a link fast: its name stands for the link's frame. Static.
     """
 
     home: Float[Array, "nb 4 4"]
@@ -60,6 +61,7 @@ class Model(eqx.Module):
     effort_limit: Float[Array, " nv"]
     topology: Topology = eqx.field(static=True)
     coupling_values: Float[Array, "nc 2"] | None = None
+    fixed_joints: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
 
     def __str__(self) -> str:
         return tree_of(self)
@@ -187,7 +189,7 @@ def _payload(inertia: Any, dtype) -> Array:
 
 
 def _replace(model: Model, leaves: dict) -> Model:
-    names = [field.name for field in dataclasses.fields(Model) if field.name != "topology"]
+    names = [field.name for field in dataclasses.fields(Model) if field.name not in ("topology", "fixed_joints")]
     sizes = {"gravity": (3,), "armature": (model.nv,), "damping": (model.nv,), "friction": (model.nv,)}
     if model.topology.couplings == ():
         names.remove("coupling_values")
@@ -202,7 +204,8 @@ def _replace(model: Model, leaves: dict) -> Model:
         if np.shape(value) != want:
             raise ValueError(f"replace: {name} has shape {np.shape(value)}, expected {want}")
         leaves[name] = jnp.asarray(value, model.home.dtype) if not isinstance(value, jax.Array) else value
-    return Model(**{name: leaves.get(name, getattr(model, name)) for name in names}, topology=model.topology)
+    leaves = {name: leaves.get(name, getattr(model, name)) for name in names}
+    return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints)
 
 
 def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
@@ -294,7 +297,7 @@ def joint_rates(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) ->
 
 
 def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
-    """Put q back on the manifold: unit quaternions, other coordinates unchanged."""
+    """q (nq,) back on the manifold: unit quaternions, other coordinates unchanged."""
     (q,) = check_shapes(model, q=q)
 
     def unit(kind, qj):
