@@ -8,10 +8,14 @@ import jax
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def run(page: str, section: str = "", least: int = 3) -> dict:
-    """All blocks of a page or section in one namespace, as a reader pastes them one after another; the names they leave."""
+def run(page: str, section: str = "", least: int = 3, head: bool = False) -> dict:
+    """All blocks of a page or section in one namespace, as a reader pastes them one after another; the names they leave.
+
+    With `head` the blocks above the page's first section come first.
+    """
     text = (ROOT / page).read_text()
-    text = re.split(r"\n## ", text.partition(f"## {section}\n")[2])[0] if section else text
+    first = re.split(r"\n## ", text)[0] if head else ""
+    text = first + re.split(r"\n## ", text.partition(f"## {section}\n")[2])[0] if section else text
     blocks = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     assert len(blocks) >= least
     names: dict = {}

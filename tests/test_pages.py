@@ -67,3 +67,45 @@ def test_examples_of_the_page_on_pictures_run(tmp_path, monkeypatch):
     assert {"four_bar.png", "four_bar.gif", "four_bar.html", "motion.csv"} <= {path.name for path in tmp_path.iterdir()}
     assert names["address"].startswith("http://127.0.0.1")
     np.testing.assert_array_equal(names["log"].q, names["recorded"].q)
+
+
+def recipe(section: str, least: int = 2) -> dict:
+    return run("docs/recipes.md", section, least, head=True)
+
+
+def test_recipe_environment_step():
+    names = recipe("Environment step")
+    assert names["after"] > names["before"] + 5
+
+
+@pytest.mark.slow
+def test_recipe_geometry():
+    np.testing.assert_allclose(recipe("Optimising a geometry")["lengths"], [0.32, 0.95, 0.75], rtol=1e-9)
+
+
+def test_recipe_operational_space():
+    names = recipe("Operational space")
+    # The circle starts with 0.2 m/s, the arm at rest: the error rises and then decays as its gains say.
+    assert names["missed"].max() < 5e-3 and names["missed"][-1] < 1e-6
+    assert np.linalg.eigvalsh(names["mass_at_the_tip"]).min() > 0.1
+
+
+@pytest.mark.slow
+def test_recipe_parallel_robot():
+    names = recipe("A parallel robot from code")
+    assert names["freedom"] == 2
+    assert np.abs(names["held"].acceleration).max() < 1e-10
+    assert np.abs(names["fall"].constraint_residual).max() < 1e-10
+    # The motor's bearing transmits the motor's torque about its axis.
+    np.testing.assert_allclose(names["bearing"][5], names["torques"][0], rtol=1e-10)
+
+
+def test_recipe_sampled_controller():
+    names = recipe("A sampled controller")
+    assert names["left"].max() < 1e-3 and np.isfinite(names["regulated"].torque).all()
+
+
+def test_recipe_payloads():
+    names = recipe("Monte Carlo of payloads")
+    assert np.isfinite(names["sags"]).all() and 0.01 < names["quantiles"][1] < 0.1
+    assert np.corrcoef(names["masses"], names["sags"])[0, 1] > 0.95  # what weighs more sags more

@@ -113,7 +113,9 @@ def from_log_cholesky(theta: Float[Array, "10"]) -> Float[Array, "10"]:
 
 
 def to_log_cholesky(parameters: Float[Array, "10"]) -> Float[Array, "10"]:
-    """Ten unconstrained numbers (10,) of ten inertial parameters (10,): the inverse of `from_log_cholesky`. NaN when the parameters are not strictly feasible (see `is_feasible`)."""
+    """Ten unconstrained numbers (10,) of ten inertial parameters (10,): the inverse of `from_log_cholesky`. NaN when the parameters are not strictly
+    feasible (see `is_feasible`).
+    """
     matrix = pseudo_inertia(parameters)
     # U U^T with U upper triangular is the Cholesky factorisation of the matrix with rows and columns reversed.
     upper = jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
@@ -147,7 +149,7 @@ def nearest_feasible(parameters, *, floor: float = 1e-6) -> np.ndarray:
 
 
 def box(mass: float, size) -> np.ndarray:
-    """Inertial parameters (10,) of a uniform box with edges `size` (3,) along x, y, z (m) about its centre (EQUATIONS section 1)."""
+    """Inertial parameters (10,) of a uniform box with edges `size` (3,) (m) about its centre (EQUATIONS section 1)."""
     x, y, z = np.asarray(size, float)
     return _centred(mass, mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y]))
 
