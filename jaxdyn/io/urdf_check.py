@@ -1,6 +1,7 @@
 """What a URDF file must hold to be read: names, references and numbers, each fault with its line."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -25,11 +26,8 @@ _PARENTS = ("link", "joint", "inertial")  # what holds each of the parts above a
 
 def check_elements(file: XmlFile, path) -> tuple[list, dict[str, str]]:
     """The link and joint elements, once names, references and numbers are found in order; file:line of each."""
-    root = file.root
-
-    def fault(element, text) -> ValueError:
-        return ValueError(f"{path}:{element.line}: {text}")
-
+    root: Any = file.root
+    fault = file.fault
     if root.tag != "robot":
         raise fault(root, f"the root element is <{root.tag}>, expected <robot>; this is not a URDF file")
     elements = [element for element in root if element.tag in ("link", "joint")]

@@ -106,5 +106,6 @@ def _vector(element, key: str, default: str) -> np.ndarray:
 
 def _numbers(element) -> dict[str, float]:
     """The numbers that the attributes of an element give."""
-    known = () if element is None else NUMBERS[element.tag]
-    return {key: float(element.get(key)) for key in known if element.get(key) is not None}
+    if element is None:
+        return {}
+    return {key: float(element.get(key)) for key in NUMBERS[element.tag] if element.get(key) is not None}

@@ -113,8 +113,9 @@ def from_log_cholesky(theta: Float[Array, "10"]) -> Float[Array, "10"]:
 
 
 def to_log_cholesky(parameters: Float[Array, "10"]) -> Float[Array, "10"]:
-    """Ten unconstrained numbers (10,) of ten inertial parameters (10,): the inverse of `from_log_cholesky`. NaN when the parameters are not strictly
-    feasible (see `is_feasible`).
+    """Ten unconstrained numbers (10,) of ten inertial parameters (10,): the inverse of `from_log_cholesky`.
+
+    NaN when the parameters are not strictly feasible (see `is_feasible`).
     """
     matrix = pseudo_inertia(parameters)
     # U U^T with U upper triangular is the Cholesky factorisation of the matrix with rows and columns reversed.
