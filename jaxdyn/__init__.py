@@ -23,6 +23,8 @@ from jaxdyn.constraints.dynamics import RESULTS as RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics as constrained_dynamics
 from jaxdyn.constraints.dynamics import projections as projections
 from jaxdyn.constraints.dynamics import second_fundamental_form as second_fundamental_form
+from jaxdyn.constraints.mobility import degrees_of_freedom as degrees_of_freedom
+from jaxdyn.constraints.reactions import body_wrenches as body_wrenches
 from jaxdyn.constraints.reactions import constraint_forces as constraint_forces
 from jaxdyn.constraints.reactions import constraint_wrenches as constraint_wrenches
 from jaxdyn.contact import RollingModel as RollingModel
@@ -39,6 +41,7 @@ from jaxdyn.dynamics.centroidal import com_jacobian as com_jacobian
 from jaxdyn.dynamics.frame_motion import frame_acceleration as frame_acceleration
 from jaxdyn.dynamics.frame_motion import frame_jacobian as frame_jacobian
 from jaxdyn.dynamics.frame_motion import frame_velocity as frame_velocity
+from jaxdyn.dynamics.joint_wrenches import joint_wrench as joint_wrench
 from jaxdyn.dynamics.kinematics import body_jacobian as body_jacobian
 from jaxdyn.dynamics.kinematics import forward_kinematics as forward_kinematics
 from jaxdyn.dynamics.kinematics import frame_pose as frame_pose
@@ -80,11 +83,14 @@ from jaxdyn.io import LoadedScene as LoadedScene
 from jaxdyn.io import NotTakenWarning as NotTakenWarning
 from jaxdyn.io import Start as Start
 from jaxdyn.io import UnitsWarning as UnitsWarning
+from jaxdyn.io import load as load
 from jaxdyn.io import load_mjcf as load_mjcf
 from jaxdyn.io import load_sdf as load_sdf
 from jaxdyn.io import load_urdf as load_urdf
+from jaxdyn.io import read_log as read_log
 from jaxdyn.io import save_urdf as save_urdf
 from jaxdyn.io import urdf_inertia_report as urdf_inertia_report
+from jaxdyn.io import write_log as write_log
 from jaxdyn.lie import se2 as se2
 from jaxdyn.lie import se3 as se3
 from jaxdyn.lie import so3 as so3
@@ -94,8 +100,8 @@ from jaxdyn.model.builder import ModelBuilder as ModelBuilder
 from jaxdyn.model.builder import inertia_report as inertia_report
 from jaxdyn.model.builder import repair_inertias as repair_inertias
 from jaxdyn.model.joining import join as join
+from jaxdyn.model.topology import Topology as Topology
 from jaxdyn.model.tree import Model as Model
-from jaxdyn.model.tree import Topology as Topology
 from jaxdyn.model.tree import configuration_rate as configuration_rate
 from jaxdyn.model.tree import difference as difference
 from jaxdyn.model.tree import integrate as integrate

@@ -57,8 +57,8 @@ USERS = {
     "matplotlib": FILES_AND_PLOTS,
     "scipy": {"contact", "identify"}
     | FILES_AND_PLOTS,  # a dependency of jax, so always there; not when jaxdyn is imported
-    "yourdfpy": FILES_AND_PLOTS,
     "mujoco": FILES_AND_PLOTS,
+    "robot_descriptions": {"io"},
     "trimesh": {"pictures"},
     "viser": {"pictures"},
     "xarray": {"simulation"},
@@ -205,7 +205,7 @@ def test_import_is_light_and_leaves_jax_unconfigured():
     program = """
 import sys
 import jaxdyn
-heavy = {"matplotlib", "mujoco", "scipy", "trimesh", "viser", "xarray", "yourdfpy"} & sys.modules.keys()
+heavy = {"matplotlib", "mujoco", "scipy", "trimesh", "viser", "xarray"} & sys.modules.keys()
 assert not heavy, f"importing jaxdyn imports {heavy}"
 import jax
 try:

@@ -1,28 +1,9 @@
 """The examples of the README and of the page on systems run as they are printed."""
 
-import re
-from pathlib import Path
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-ROOT = Path(__file__).resolve().parent.parent
-
-
-def run(page: str, section: str = "", least: int = 3) -> dict:
-    """All blocks of a page or section in one namespace, as a reader pastes them one after another; the names they leave."""
-    text = (ROOT / page).read_text()
-    text = re.split(r"\n## ", text.partition(f"## {section}\n")[2])[0] if section else text
-    blocks = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
-    assert len(blocks) >= least
-    names: dict = {}
-    # A reader has jax's own settings, not the strict ones of the tests.
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        for block in blocks:
-            exec(compile(block, page, "exec"), names)
-    return names
+from pages import run
 
 
 def test_examples_of_the_readme_run():

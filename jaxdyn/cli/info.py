@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxdyn.cli.common import UNITS, add_model_options, load_model, output_path, short, table
 from jaxdyn.io import save_urdf, urdf_inertia_report
+from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.builder import inertia_report, repair_inertias
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
@@ -144,11 +145,8 @@ def _listed(names: list[str]) -> str:
 
 def _unused(path: str) -> str:
     """What the file holds that the model does not, counted by element."""
-    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
-
-    root = etree.parse(path, etree.XMLParser(recover=True, remove_comments=True, remove_pis=True)).getroot()
     counts: collections.Counter[str] = collections.Counter()
-    for element in root:
+    for element in XmlFile(path, "URDF").root:
         if element.tag not in ("link", "joint"):
             counts[element.tag] += 1
             continue

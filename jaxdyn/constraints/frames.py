@@ -24,20 +24,26 @@ from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import Carried, carried, take
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.tree import Model, frame_index
+from jaxdyn.model.names import frame_index
+from jaxdyn.model.tree import Model
 
 
 def frames_on(model: Model, q, bodies: Sequence[str | None], poses, v=None) -> Carried:
     """Frames at the given poses (4, 4) in bodies or named frames (None: the world); with v, their twists too."""
-    offsets = jnp.stack([pose.astype(q.dtype) for pose in poses])
-    places = []
+    places, offsets = places_on(model, bodies, poses, q.dtype)
+    found = carried(model, q, places, v)
+    return found._replace(pose=_product(found.pose, offsets))
+
+
+def places_on(model: Model, bodies: Sequence[str | None], poses, dtype) -> tuple[list[int], Float[Array, "n 4 4"]]:
+    """The bodies (-1: the world) that carry frames at given poses (4, 4) in bodies or named frames, and the poses in these."""
+    offsets, places = jnp.stack([pose.astype(dtype) for pose in poses]), []
     for k, body in enumerate(bodies):
         index = None if body is None else frame_index(model, body)
         places.append(-1 if index is None else model.topology.frame_bodies[index])
         if index is not None and body not in model.body_names:
-            offsets = offsets.at[k].set(_product(model.frame_poses[index].astype(q.dtype), offsets[k]))
-    found = carried(model, q, places, v)
-    return found._replace(pose=_product(found.pose, offsets))
+            offsets = offsets.at[k].set(_product(model.frame_poses[index].astype(dtype), offsets[k]))
+    return places, offsets
 
 
 def _both_frames(members, system, q, v=None) -> Carried:

@@ -1,11 +1,13 @@
 """What constraints do to a system: the generalised force and the wrench of each one, from the multipliers."""
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import constraint_jacobian, layout
-from jaxdyn.constraints.frames import Pair, relative_poses
+from jaxdyn.constraints.frames import Pair, places_on, relative_poses
+from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state
+from jaxdyn.model.arguments import as_array, batch_hint, check_shapes, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 
 
@@ -60,6 +62,44 @@ def constraint_wrenches(
             rotation, position = relative_poses([constraint], scene.system, q)
             found[place.name] = constraint.wrench(rotation[0], position[0], multipliers[place.start : place.end])
     return found
+
+
+def body_wrenches(scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"]) -> Float[Array, "nb 6"]:
+    """Wrench (f, tau) of all constraints between two frames ON each body, at its frame's origin and in its axes.
+
+    They are the `external` of `joint_wrench`, `inverse_dynamics` and `generalized_force`, whose result for them is A^T lam of
+    these constraints. Gears and locked joints act through the joints, and functions of the user on coordinates: they
+    have no wrench here.
+
+    **Arguments:** `scene` of a `Model`; `q` (nq,); `multipliers` (nc,), as in `constraint_forces`.
+
+    **Returns:** (nb, 6), N and N m, in the order of `model.body_names`.
+
+    **Raises:** ValueError for shapes that do not fit, and for a system without bodies.
+
+    Source: EQUATIONS sections 3 (wrenches) and 7.
+
+    ```python
+    found = jd.constrained_dynamics(scene, q, v)
+    pull = jd.body_wrenches(scene, q, found.multipliers)
+    bearings = jd.joint_wrench(scene.system, q, v, found.acceleration, external=pull)
+    ```
+    """
+    scene = as_scene(scene)
+    (q,) = check_shapes(scene.system, q=q)
+    found = constraint_wrenches(scene, q, multipliers)
+    total = jnp.zeros((scene.system.nb, 6), q.dtype)
+    for constraint, place in zip(scene.constraints, layout(scene), strict=True):
+        if not isinstance(constraint, Pair):
+            continue
+        constraint, wrench = constraint.at(scene.system, q), found[place.name]
+        rotation, position = relative_poses([constraint], scene.system, q)
+        at_b = se3.AdT_apply(se3.from_parts(rotation[0], position[0]), wrench)
+        ends = constraint.ends()
+        bodies, poses = places_on(scene.system, [body for body, _ in ends], [pose for _, pose in ends], q.dtype)
+        for body, pose, pull in zip(bodies, poses, (-wrench, at_b), strict=True):
+            total = total if body < 0 else total.at[body].add(se3.Ad_inv_T_apply(pose, pull))
+    return total
 
 
 def _checked_multipliers(multipliers, count: int, dtype) -> Array:

@@ -15,7 +15,8 @@ from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array
-from jaxdyn.model.tree import Model, frame_index
+from jaxdyn.model.names import frame_index
+from jaxdyn.model.tree import Model
 
 _FLAT = ("rigid", "surface")
 

@@ -24,7 +24,8 @@ from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
-from jaxdyn.model.tree import Model, Topology, frame_index, geometry
+from jaxdyn.model.names import frame_index
+from jaxdyn.model.tree import Model, Topology, geometry
 
 
 class TreeFrame(NamedTuple):

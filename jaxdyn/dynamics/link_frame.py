@@ -20,7 +20,8 @@ from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.inertia import spatial_inertia
-from jaxdyn.model.tree import Model, frame_index
+from jaxdyn.model.names import frame_index
+from jaxdyn.model.tree import Model
 
 
 class NewtonEulerMatrices(eqx.Module):

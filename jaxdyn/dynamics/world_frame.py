@@ -201,11 +201,21 @@ def _accelerations(model, frame, twists, v, a) -> Float[Array, "nb 6"]:
     return accelerations - jnp.concatenate([model.gravity, jnp.zeros_like(model.gravity)])[None]
 
 
-def _inverse_dynamics(model, frame, inertias, v, a, external) -> Float[Array, " nv"]:
+def joint_wrenches(model: Model, frame: TreeFrame, v, a, external) -> Float[Array, "nb 6"]:
+    """Wrench through each joint, in the tree frame: the sum of what moves the bodies that it carries."""
+    wrenches = _body_wrenches(model, frame, tree_inertias(model, frame), v, a, external)
+    return _product(jnp.asarray(model.topology.ancestors.T, wrenches.dtype), wrenches)
+
+
+def _body_wrenches(model, frame, inertias, v, a, external) -> Float[Array, "nb 6"]:
+    """What the joints of each body exert on it together: its rate of momentum less its weight and the external wrench."""
     twists = body_twists(model, frame, v)
     wrenches = jax.vmap(_inertial_wrench)(inertias, twists, _accelerations(model, frame, twists, v, a))
-    if external is not None:
-        wrenches = wrenches - jax.vmap(se3.Ad_inv_T_apply)(frame.pose, external)
+    return wrenches if external is None else wrenches - jax.vmap(se3.Ad_inv_T_apply)(frame.pose, external)
+
+
+def _inverse_dynamics(model, frame, inertias, v, a, external) -> Float[Array, " nv"]:
+    wrenches = _body_wrenches(model, frame, inertias, v, a, external)
     tau = jnp.sum(frame.subspace * sum_to_coordinates(model, wrenches), axis=1)
     return tau if a is None or model.armature is None else tau + model.armature * a
 

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, take
 from jaxdyn.model.arguments import batch_hint
-from jaxdyn.model.tree import Model, difference, frame_index, neutral
+from jaxdyn.model.names import frame_index
+from jaxdyn.model.tree import Model, difference, neutral
 
 
 class _Places(NamedTuple):

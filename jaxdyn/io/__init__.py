@@ -1,10 +1,13 @@
 """Reading and writing mechanisms. File libraries are imported here alone, and only when a file is read."""
 
+from jaxdyn.io.load import load as load
 from jaxdyn.io.loaded import Actuators as Actuators
 from jaxdyn.io.loaded import LoadedScene as LoadedScene
 from jaxdyn.io.loaded import NotTakenWarning as NotTakenWarning
 from jaxdyn.io.loaded import Start as Start
 from jaxdyn.io.loaded import UnitsWarning as UnitsWarning
+from jaxdyn.io.logs import read_log as read_log
+from jaxdyn.io.logs import write_log as write_log
 from jaxdyn.io.mjcf import load_mjcf as load_mjcf
 from jaxdyn.io.sdf import load_sdf as load_sdf
 from jaxdyn.io.urdf import load_urdf as load_urdf

@@ -12,7 +12,7 @@ _SIGNALS = ("q", "v", "a", "tau")
 _NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit behind a column's name
 
 
-def read_log(path, *, joint_names=None) -> Log:
+def read_log(path, *, joint_names=None, rollout: int | None = None) -> Log:
     """Read a log from a CSV file with one header line, or from an NPZ archive.
 
     Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1,
@@ -21,7 +21,8 @@ def read_log(path, *, joint_names=None) -> Log:
     ignored, and so is a unit in brackets behind a name of a CSV file, `q_shoulder [rad]`; numbers are taken in SI units.
 
     **Arguments:** `path`; `joint_names`: order of the joints in the result for columns with joint names (a model's
-    `joint_names`); columns of other joints are left out. Without it the order of the file's tau columns.
+    `joint_names`); columns of other joints are left out. Without it the order of the file's tau columns. `rollout`: which
+    motion of a file that holds several, as `Solution.to_csv` and `to_npz` write them of a batch; the first is 1.
 
     **Returns:** `jd.identify.Log`; v and a are None when the file has none. Make them with `jd.identify.from_raw`.
 
@@ -34,11 +35,30 @@ def read_log(path, *, joint_names=None) -> Log:
         raise ValueError(f"{path}: log files are .csv or .npz, not {path.suffix!r}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such log file")
-    columns = readers[path.suffix.lower()](path)
+    columns = _one_motion(readers[path.suffix.lower()](path), rollout, path)
     try:
         return _assemble(columns, None if joint_names is None else tuple(joint_names))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _one_motion(columns: dict[str, np.ndarray], rollout: int | None, path) -> dict[str, np.ndarray]:
+    """The columns of one motion of a file with a column `rollout`, or with signals (rollouts, n, columns)."""
+    numbers = columns.pop("rollout", None)
+    stacked = {name: len(columns[name]) for name in _SIGNALS if name in columns}
+    known = sorted(set(np.asarray(numbers, int).tolist())) if numbers is not None else []
+    known = known or list(range(1, 1 + max(stacked.values(), default=1)))
+    if rollout is None and len(known) > 1:
+        raise ValueError(f"{path}: the file holds {len(known)} motions; choose one, as rollout={known[0]}")
+    chosen = known[0] if rollout is None else rollout
+    if chosen not in known:
+        raise ValueError(f"{path}: rollout is {rollout!r}; the motions of the file are {known[0]} to {known[-1]}")
+    if numbers is not None:
+        return {name: values[numbers == chosen] for name, values in columns.items()}
+    for name in stacked:
+        value = columns.pop(name)[chosen - 1]
+        columns.update({f"{name}{i + 1}": value[:, i] for i in range(value.shape[1])})
+    return columns
 
 
 def write_log(path, log: Log) -> None:
@@ -106,9 +126,9 @@ def _read_npz(path) -> dict[str, np.ndarray]:
         for name in archive.files:
             value = archive[name]
             if name in _SIGNALS:
-                if value.ndim != 2:
+                if value.ndim not in (2, 3):
                     raise ValueError(f"{path}: {name} has shape {value.shape}, expected (n, columns)")
-                columns.update({f"{name}{i + 1}": value[:, i] for i in range(value.shape[1])})
+                columns[name] = value if value.ndim == 3 else value[None]
             else:
                 columns[name] = value
     return columns
@@ -120,7 +140,8 @@ def _assemble(columns: dict[str, np.ndarray], joint_names) -> Log:
     found = {signal: _signal_columns(columns, signal) for signal in _SIGNALS}
     for signal in ("q", "tau"):
         if not found[signal]:
-            raise ValueError(f"missing columns {signal}1, {signal}2, ...; the file has {', '.join(columns)}")
+            hint = "" if signal == "q" else ' (of simulate: outputs=("torque",))'
+            raise ValueError(f"missing columns {signal}1, {signal}2, ...{hint}; the file has {', '.join(columns)}")
     labels = list(found["tau"])
     by_number = all(label.isdecimal() for label in labels)
     if not by_number:

@@ -8,7 +8,8 @@ from jaxdyn.constraints.loops import gear, lock_joint, loop
 from jaxdyn.io.loaded import Actuators, listed
 from jaxdyn.io.mjcf_file import HINGE, SLIDE, Compiled, pose_of
 from jaxdyn.io.tendons import PolynomialCoupling, TendonForce
-from jaxdyn.model.tree import Model, body_index
+from jaxdyn.model.names import body_index
+from jaxdyn.model.tree import Model
 
 _CONNECT, _WELD, _JOINT, _TENDON = range(4)  # mjtEq
 _ON_JOINT, _IN_PARENT, _ON_TENDON, _AT_SITE = 0, 1, 3, 4  # mjtTrn

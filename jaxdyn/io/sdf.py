@@ -17,7 +17,8 @@ from jaxdyn.io.urdf import ROOT_JOINT, _turn_from_z
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
-from jaxdyn.model.tree import Model, body_index
+from jaxdyn.model.names import body_index
+from jaxdyn.model.tree import Model
 
 _KINDS = dict(revolute="revolute", continuous="revolute", revolute2="revolute", universal="revolute")
 _KINDS |= dict(prismatic="prismatic", screw="helical", ball="spherical")

@@ -1,11 +1,9 @@
 """Reading URDF files.
 
-A file is read strictly first: XML, structure, references and numbers, each fault with its line. yourdfpy then turns the
-links and joints into typed objects (it fills gaps with defaults and mends broken XML without a word, which is why it is
-not asked first). Meshes and all that is only seen are never looked at.
+A file is read strictly: XML, structure, references and numbers, each fault with its line (`urdf_check`); `urdf_parts` makes
+numbers of it. Meshes and all that is only seen are never looked at.
 """
 
-import io
 import os
 import warnings
 from collections.abc import Iterable, Mapping
@@ -13,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.io.urdf_check import JOINTS, NUMBERS, REQUIRED, check_elements
+from jaxdyn.io.urdf_check import JOINTS
+from jaxdyn.io.urdf_parts import Inertial, Joint, read_parts
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import as_path
 from jaxdyn.model.builder import GRAVITY, ModelBuilder, inertia_problems, unknown
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model
@@ -28,12 +26,11 @@ _Z = np.array([0.0, 0.0, 1.0])
 
 class _Description(NamedTuple):
     name: str
-    links: dict[str, Any]
-    joints: dict[str, Any]  # by name, in the file's order
+    links: dict[str, Inertial | None]
+    joints: dict[str, Joint]  # by name, in the file's order
+    places: dict[str, str]  # "joint NAME" and "link NAME" -> file:line
     children: dict[str, list[str]]  # link -> names of the joints it carries
     root: str
-    armature: dict[str, float]
-    places: dict[str, str]  # "joint NAME" and "link NAME" -> file:line
 
 
 def load_urdf(
@@ -67,7 +64,7 @@ def load_urdf(
     **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, links that are not a tree,
     an unknown joint type, a bad number, a part that is given twice, a declared entity, a negative mass, a negative limit of
     velocity or effort, a zero axis; for names in `lock` that are not movable joints;
-    for a joint that moves no inertia. ImportError without yourdfpy.
+    for a joint that moves no inertia.
 
     **Warns:** UserWarning naming the links with a negative moment of inertia.
     """
@@ -121,7 +118,7 @@ def urdf_inertia_report(path: str | os.PathLike) -> list[tuple[str, str]]:
     moved = {joint.child for joint in urdf.joints.values() if joint.type != "fixed"}
     report = []
     for name, link in urdf.links.items():
-        if link.inertial is None:
+        if link is None:
             report += [(name, "massless: no <inertial>")] if name in moved else []
             continue
         report += [(name, problem) for problem in inertia_problems(_inertia(urdf, name))]
@@ -130,9 +127,9 @@ def urdf_inertia_report(path: str | os.PathLike) -> list[tuple[str, str]]:
 
 def _warn_of_inertias(urdf: _Description) -> None:
     for name, link in urdf.links.items():
-        if link.inertial is None or link.inertial.inertia is None:
+        if link is None or link.inertia is None:
             continue
-        moments = np.linalg.eigvalsh(link.inertial.inertia)
+        moments = np.linalg.eigvalsh(link.inertia)
         if moments[0] < -1e-9 * np.abs(moments).max():
             warnings.warn(
                 f"{urdf.places[f'link {name}']}: link {name!r}: a principal moment of inertia is negative "
@@ -141,10 +138,9 @@ def _warn_of_inertias(urdf: _Description) -> None:
             )
 
 
-def _add_joint(builder: ModelBuilder, joint, inertia, urdf: _Description, held: dict[str, np.ndarray]) -> None:
+def _add_joint(builder: ModelBuilder, joint: Joint, inertia, urdf: _Description, held: dict[str, np.ndarray]) -> None:
     kind, name = JOINTS[joint.type], joint.child
-    pose = np.eye(4) if joint.origin is None else joint.origin
-    parent, axis, turn = joint.parent, _Z, np.eye(4)
+    pose, parent, axis, turn = joint.origin, joint.parent, _Z, np.eye(4)
     if kind in SCREW_KINDS or kind == "planar":
         axis = f64.unit(joint.axis, f"joint {joint.name!r}: axis")
     if kind == "planar":
@@ -153,7 +149,7 @@ def _add_joint(builder: ModelBuilder, joint, inertia, urdf: _Description, held: 
         screw = np.concatenate([axis, np.zeros(3)] if kind == "prismatic" else [np.zeros(3), axis])
         pose = pose @ turn @ f64.joint_pose(kind, screw, held[joint.name]) @ f64.inverse(turn)
         kind, axis, turn = "fixed", _Z, np.eye(4)
-    leaves = {} if kind == "fixed" else _leaves(joint, kind, urdf.armature.get(joint.name))
+    leaves = {} if kind == "fixed" else _leaves(joint, kind)
     if not np.array_equal(turn, np.eye(4)):
         carrier = f"{name}_plane"
         builder.add_body(carrier, parent, kind, joint_name=joint.name, pose=pose @ turn, **leaves)
@@ -162,17 +158,13 @@ def _add_joint(builder: ModelBuilder, joint, inertia, urdf: _Description, held: 
     builder.add_body(name, parent, kind, inertia, joint_name=joint.name, pose=pose, axis=axis, **leaves)
 
 
-def _leaves(joint, kind: str, armature: float | None) -> dict[str, Any]:
-    leaves: dict[str, Any] = {"armature": armature}
-    if joint.dynamics is not None:
-        for key in ("damping", "friction"):
-            value = getattr(joint.dynamics, key)
-            leaves[key] = None if value is None else float(value)
+def _leaves(joint: Joint, kind: str) -> dict[str, Any]:
+    leaves: dict[str, Any] = {key: joint.dynamics.get(key) for key in ("armature", "damping", "friction")}
     if joint.limit is not None:
-        leaves |= {"velocity_limit": joint.limit.velocity, "effort_limit": joint.limit.effort}
+        leaves |= {"velocity_limit": joint.limit.get("velocity"), "effort_limit": joint.limit.get("effort")}
         if kind in ("revolute", "prismatic"):
             # The format's default for a bound that is left out is zero.
-            leaves |= {"lower": joint.limit.lower or 0.0, "upper": joint.limit.upper or 0.0}
+            leaves |= {key: joint.limit.get(key, 0.0) for key in ("lower", "upper")}
         for key in ("velocity_limit", "effort_limit", "lower", "upper"):
             if leaves.get(key) is not None and abs(leaves[key]) >= NO_LIMIT:
                 leaves[key] = np.copysign(np.inf, leaves[key])
@@ -180,7 +172,7 @@ def _leaves(joint, kind: str, armature: float | None) -> dict[str, Any]:
 
 
 def _inertia(urdf: _Description, link: str) -> np.ndarray:
-    inertial = urdf.links[link].inertial
+    inertial = urdf.links[link]
     if inertial is None:
         return np.zeros(10)
     # A missing <mass> or <inertia> inside <inertial> is none at all.
@@ -258,56 +250,11 @@ def _settle(couplings: dict, kinds: dict[str, str], held: dict[str, np.ndarray],
 
 
 def _read(path) -> _Description:
-    etree, yourdfpy = _libraries()
-    try:
-        data = as_path(path).read_bytes()
-    except OSError as error:
-        raise ValueError(f"URDF file {str(path)!r} cannot be read ({error.strerror}); check the path") from error
-    # Undeclared namespace prefixes are common and harmless; all other faults that the parser can mend are errors.
-    parser = etree.XMLParser(
-        recover=True, remove_comments=True, remove_pis=True, resolve_entities=False, no_network=True
-    )
-    try:
-        root = etree.fromstring(data, parser)
-    except etree.XMLSyntaxError:
-        root = None
-    for entry in parser.error_log:
-        if entry.domain_name != "NAMESPACE":
-            raise ValueError(f"{path}:{entry.line}: malformed XML: {entry.message}")
-    if root is None:
-        raise ValueError(f"{path}:1: malformed XML: there is no element in the file")
-    for declared in () if (dtd := root.getroottree().docinfo.internalDTD) is None else dtd.iterentities():
-        line = data[: max(data.find(b"<!ENTITY"), 0)].count(b"\n") + 1
-        raise ValueError(
-            f"{path}:{line}: the file declares the entity {declared.name!r}, which is refused, as entities can expand without "
-            "bound; write its text where it is used"
-        )
-    elements, places = check_elements(root, path)
-    kept = etree.Element("robot", name=root.get("name"))
-    for element in elements:
-        copy = etree.SubElement(kept, element.tag, dict(element.attrib))
-        copy.extend(part for part in element if part.tag in (*NUMBERS, *REQUIRED, "inertial"))
-    robot = yourdfpy.URDF.load(io.BytesIO(etree.tostring(kept)), build_scene_graph=False, load_meshes=False).robot
-    armature = {
-        joint.get("name"): float(dynamics.get("armature"))
-        for joint in kept.findall("joint")
-        if (dynamics := joint.find("dynamics")) is not None and dynamics.get("armature") is not None
-    }
-    links = {link.name: link for link in robot.links}
-    joints = {joint.name: joint for joint in robot.joints}
-    children: dict[str, list[str]] = {name: [] for name in links}
-    for joint in joints.values():
+    parts = read_parts(path)
+    children: dict[str, list[str]] = {name: [] for name in parts.links}
+    for joint in parts.joints.values():
         children[joint.parent].append(joint.name)
-    return _Description(robot.name, links, joints, children, _root(joints, links, places, path), armature, places)
-
-
-def _libraries():
-    try:
-        import yourdfpy
-        from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]  # a requirement of yourdfpy
-    except ImportError as error:
-        raise ImportError("reading URDF files needs yourdfpy: pip install jaxdyn[urdf]") from error
-    return etree, yourdfpy
+    return _Description(*parts, children, _root(parts.joints, parts.links, parts.places, path))
 
 
 def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str], path) -> str:

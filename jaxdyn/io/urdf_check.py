@@ -1,6 +1,11 @@
 """What a URDF file must hold to be read: names, references and numbers, each fault with its line."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
+
+from jaxdyn.io.xml_lines import XmlFile
 
 JOINTS = {"floating": "free", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar", "fixed")}}
 # Attributes that must hold so many finite numbers where they are given. The model needs no others.
@@ -15,21 +20,20 @@ NUMBERS = {
 }
 REQUIRED = {"mass": ("value",), "inertia": tuple(NUMBERS["inertia"]), "parent": ("link",), "child": ("link",)}
 REQUIRED["mimic"] = ("joint",)
+_READ = {*NUMBERS, *REQUIRED, "inertial"}
 _PARENTS = ("link", "joint", "inertial")  # what holds each of the parts above at most once
 
 
-def check_elements(root, path) -> tuple[list, dict[str, str]]:
+def check_elements(file: XmlFile, path) -> tuple[list, dict[str, str]]:
     """The link and joint elements, once names, references and numbers are found in order; file:line of each."""
-
-    def fault(element, text) -> ValueError:
-        return ValueError(f"{path}:{element.sourceline}: {text}")
-
+    root: Any = file.root
+    fault = file.fault
     if root.tag != "robot":
         raise fault(root, f"the root element is <{root.tag}>, expected <robot>; this is not a URDF file")
     elements = [element for element in root if element.tag in ("link", "joint")]
     if not elements or not root.get("name"):
         missing = "name" if elements else "<link>"
-        hint = "; expand this xacro file first: xacro IN > OUT" if "xacro" in root.nsmap else ""
+        hint = "; expand this xacro file first: xacro IN > OUT" if "xmlns:xacro" in root.attrib else ""
         raise fault(root, f"the robot has no {missing}{hint}")
     places: dict[str, str] = {}
     for element in elements:
@@ -38,11 +42,9 @@ def check_elements(root, path) -> tuple[list, dict[str, str]]:
             raise fault(element, f"a <{tag}> has no name")
         if f"{tag} {name}" in places:
             raise fault(element, f"the {tag} name {name!r} is taken at {places[f'{tag} {name}']}; rename one")
-        places[f"{tag} {name}"] = f"{path}:{element.sourceline}"
-        for part in element.iter(*NUMBERS, *REQUIRED, "inertial"):
-            if part.getparent().tag in ("visual", "collision"):
-                continue
-            _check_once(part, f"{tag} {name!r}", fault)
+        places[f"{tag} {name}"] = f"{path}:{element.line}"
+        for parent, part in _parts(element):
+            _check_once(parent, part, f"{tag} {name!r}", fault)
             for key in REQUIRED.get(part.tag, ()):
                 if part.get(key) is None:
                     raise fault(part, f"<{part.tag}> of {tag} {name!r} has no {key}")
@@ -72,10 +74,18 @@ def check_elements(root, path) -> tuple[list, dict[str, str]]:
     return elements, places
 
 
-def _check_once(part, what: str, fault) -> None:
-    first = part.getparent().find(part.tag)
-    if part.getparent().tag in _PARENTS and first is not part:
-        raise fault(part, f"a second <{part.tag}> of {what}, the first is on line {first.sourceline}; keep one")
+def _parts(element) -> Iterator[tuple]:
+    """What is read below an element, each with its parent, in the file's order; what is only seen is left out."""
+    for part in element:
+        if element.tag not in ("visual", "collision") and part.tag in _READ:
+            yield element, part
+        yield from _parts(part)
+
+
+def _check_once(parent, part, what: str, fault) -> None:
+    first = parent.find(part.tag)
+    if parent.tag in _PARENTS and first is not part:
+        raise fault(part, f"a second <{part.tag}> of {what}, the first is on line {first.line}; keep one")
 
 
 def _are_numbers(text: str, count: int) -> bool:

@@ -54,7 +54,11 @@ class XmlFile:
         try:
             parser.Parse(data, True)
         except expat.ExpatError as error:
-            raise ValueError(f"{self.path}:{error.lineno}: malformed XML: {expat.ErrorString(error.code)}") from error
+            lines = data.splitlines()
+            text = lines[error.lineno - 1].decode(errors="replace").strip() if error.lineno <= len(lines) else ""
+            shown = f" at {text[:80]!r}" if text else ""
+            reason = f"malformed XML: {expat.ErrorString(error.code)}{shown}"
+            raise ValueError(f"{self.path}:{error.lineno}: {reason}") from error
         self.root = builder.close()
 
     def fault(self, element, text: str) -> ValueError:

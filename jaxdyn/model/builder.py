@@ -97,7 +97,7 @@ class ModelBuilder:
           into the one that carries it; its frame stays reachable by name. Inertia fixed to the world has no effect.
         - `inertia`: None (massless), the ten numbers (10,) about the body frame's origin, or (mass, centre of mass
           (3,), rotational inertia (3, 3) or principal moments (3,) about it); kg, m, kg m^2, in the body frame.
-        - `joint_name`: `name` + "_joint" when None. Siblings stand in the model in the order of their joint names.
+        - `joint_name`: `name` + "_joint" when None. Siblings stand in the order of these. Of a fixed body it names the frame too.
         - `pose`: of the body frame in the parent's at the joint's zero: None (identity), (4, 4), (3,) or (xyz, rpy).
         - `axis`: direction (3,) of a revolute, continuous, prismatic or helical joint in the body frame, of any
           length but zero. A planar joint moves in the x-y plane of its body frame at home.
@@ -217,7 +217,8 @@ class ModelBuilder:
         stored: dict[str, Any] = {
             key: None if value is None else jnp.asarray(value, self._dtype) for key, value in leaves.items()
         }
-        return Model(**stored, topology=topology)
+        held = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
+        return Model(**stored, topology=topology, fixed_joints=held)
 
     def _check_new(self, name, parent) -> None:
         if not isinstance(name, str) or not name:

@@ -55,7 +55,7 @@ def mass_com_inertia(parameters: Float[Array, "10"]):
 
 
 def transform_inertia(pose: Float[Array, "4 4"], parameters: Float[Array, "10"]) -> Float[Array, "10"]:
-    """The ten numbers in frame a of a body whose numbers in frame b are given; `pose` T_ab maps b coordinates to a.
+    """The ten numbers (10,) in frame a of a body whose numbers in frame b are given; `pose` T_ab (4, 4) maps b coordinates to a.
 
     No mass is divided by, so massless bodies are allowed and gradients stay finite.
     """
@@ -113,7 +113,10 @@ def from_log_cholesky(theta: Float[Array, "10"]) -> Float[Array, "10"]:
 
 
 def to_log_cholesky(parameters: Float[Array, "10"]) -> Float[Array, "10"]:
-    """Inverse of `from_log_cholesky`. NaN when the parameters are not strictly feasible (see `is_feasible`)."""
+    """Ten unconstrained numbers (10,) of ten inertial parameters (10,): the inverse of `from_log_cholesky`.
+
+    NaN when the parameters are not strictly feasible (see `is_feasible`).
+    """
     matrix = pseudo_inertia(parameters)
     # U U^T with U upper triangular is the Cholesky factorisation of the matrix with rows and columns reversed.
     upper = jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
@@ -147,13 +150,13 @@ def nearest_feasible(parameters, *, floor: float = 1e-6) -> np.ndarray:
 
 
 def box(mass: float, size) -> np.ndarray:
-    """Uniform box with edges `size` (3,) along x, y, z, about its centre (EQUATIONS section 1)."""
+    """Inertial parameters (10,) of a uniform box with edges `size` (3,) (m) about its centre (EQUATIONS section 1)."""
     x, y, z = np.asarray(size, float)
     return _centred(mass, mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y]))
 
 
 def sphere(mass: float, radius: float) -> np.ndarray:
-    """Uniform solid ball about its centre."""
+    """Inertial parameters (10,) of a uniform solid ball about its centre; kg, m."""
     return _centred(mass, np.full(3, 0.4 * mass * radius**2))
 
 
@@ -164,20 +167,20 @@ def ellipsoid(mass: float, semi_axes) -> np.ndarray:
 
 
 def cylinder(mass: float, radius: float, length: float) -> np.ndarray:
-    """Uniform solid cylinder along z about its centre; a disk for length 0."""
+    """Inertial parameters (10,) of a uniform solid cylinder along z about its centre, a disk for length 0; kg, m."""
     across = mass * (3 * radius**2 + length**2) / 12
     return _centred(mass, np.array([across, across, 0.5 * mass * radius**2]))
 
 
 def rod(mass: float, length: float, axis: str = "x") -> np.ndarray:
-    """Uniform thin rod along an axis about its centre."""
+    """Inertial parameters (10,) of a uniform thin rod along an axis, "x", "y" or "z", about its centre; kg, m."""
     moments = np.full(3, mass * length**2 / 12)
     moments["xyz".index(axis)] = 0.0
     return _centred(mass, moments)
 
 
 def point_mass(mass: float, position=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """Point mass at a position (3,) in the body frame."""
+    """Inertial parameters (10,) of a point mass (kg) at a position (3,) in the body frame (m)."""
     position = np.asarray(position, float)
     return displaced(_centred(mass, np.zeros(3)), position)
 

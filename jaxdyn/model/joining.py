@@ -62,7 +62,9 @@ def renamed(model: Model, prefix: str) -> Model:
     names = {
         what: tuple(prefix + own for own in getattr(top, what)) for what in ("body_names", "joint_names", "frame_names")
     }
-    return dataclasses.replace(model, topology=dataclasses.replace(top, **names)) if prefix else model
+    fixed = tuple((prefix + joint, prefix + link) for joint, link in model.fixed_joints)
+    whole = dataclasses.replace(top, **names)
+    return dataclasses.replace(model, topology=whole, fixed_joints=fixed) if prefix else model
 
 
 def _moved(model: Model, pose) -> Model:
@@ -147,7 +149,8 @@ def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -
     leaves["frame_poses"] = jnp.concatenate([unit, *(poses[i][None] for *_, i in others)])
     values = [models[k].coupling_values[row] for _, k, row in couplings]  # pyright: ignore[reportOptionalSubscript]
     leaves["coupling_values"] = jnp.stack(values) if values else None
-    return Model(**leaves, gravity=_common_gravity(models), topology=topology)
+    fixed = tuple(pair for model in models for pair in model.fixed_joints)
+    return Model(**leaves, gravity=_common_gravity(models), topology=topology, fixed_joints=fixed)
 
 
 def _coordinates(kinds, order, size: str) -> np.ndarray:

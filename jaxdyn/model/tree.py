@@ -1,8 +1,8 @@
-"""The mechanism: a static tree of bodies (`Topology`) and the array leaves that give it numbers (`Model`)."""
+"""The mechanism: the array leaves that give numbers to a static tree of bodies (`Model`), and moves on its manifold."""
 
 import dataclasses
-import itertools
-from functools import cached_property
+from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import is_concrete, is_expanding
-from jaxdyn.model.arguments import as_array, check_shapes
+from jaxdyn.model.arguments import as_array, batch_hint, check_shapes
+from jaxdyn.model.inertia import inertial_parameters, transform_inertia
 from jaxdyn.model.joints import (
     KINDS,
     joint_difference,
@@ -20,113 +21,10 @@ from jaxdyn.model.joints import (
     joint_neutral,
     joint_random,
     joint_rate,
-    screw_mask,
 )
+from jaxdyn.model.names import columns_in_v, frame_index, place_in
 from jaxdyn.model.printed import tree_of
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Topology:
-    """Everything about a mechanism that decides what is compiled: who hangs on whom, and by which kind of joint.
-
-    Bodies are listed so that a parent comes before its children (`parents[i] < i`; -1 is the world). Body i is moved by
-    joint i. Two topologies with the same tree, kinds and names are equal, so models that differ in numbers alone share
-    compiled code.
-    """
-
-    name: str
-    parents: tuple[int, ...]
-    kinds: tuple[str, ...]
-    body_names: tuple[str, ...]
-    joint_names: tuple[str, ...]
-    frame_names: tuple[str, ...]
-    frame_bodies: tuple[int, ...]
-    couplings: tuple[tuple[int, int], ...] = ()  # (joint, source): the joint is to follow the source
-
-    @cached_property
-    def _key(self):
-        return tuple(getattr(self, field.name) for field in dataclasses.fields(self))
-
-    @cached_property
-    def _hash(self):
-        return hash(self._key)
-
-    def __hash__(self):
-        return self._hash
-
-    def __eq__(self, other):
-        return self is other or (isinstance(other, Topology) and self._key == other._key)
-
-    @property
-    def nb(self) -> int:
-        """Number of bodies."""
-        return len(self.parents)
-
-    @cached_property
-    def nq(self) -> int:
-        """Number of configuration coordinates."""
-        return sum(KINDS[kind].nq for kind in self.kinds)
-
-    @cached_property
-    def nv(self) -> int:
-        """Number of velocity coordinates (degrees of freedom)."""
-        return sum(KINDS[kind].nv for kind in self.kinds)
-
-    @cached_property
-    def q_slices(self) -> tuple[slice, ...]:
-        """Where each joint's coordinates stand in q."""
-        ends = np.cumsum([0] + [KINDS[kind].nq for kind in self.kinds]).tolist()
-        return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
-
-    @cached_property
-    def v_slices(self) -> tuple[slice, ...]:
-        """Where each joint's coordinates stand in v."""
-        ends = np.cumsum([0] + [KINDS[kind].nv for kind in self.kinds]).tolist()
-        return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
-
-    @cached_property
-    def screw_mask(self) -> np.ndarray:
-        """(nb, 6) of bool: the screw entries that each joint's kind reads."""
-        return np.array([screw_mask(kind) for kind in self.kinds], bool).reshape(-1, 6)
-
-    @cached_property
-    def dof_body(self) -> np.ndarray:
-        """(nv,): the body that each velocity coordinate moves first."""
-        return np.repeat(np.arange(self.nb), [KINDS[kind].nv for kind in self.kinds])
-
-    @cached_property
-    def ancestors(self) -> np.ndarray:
-        """(nb, nb) of bool: [i, j] is true when body j is body i or an ancestor of it. The world-frame G = (I - Gamma)^-1."""
-        mask = np.eye(self.nb, dtype=bool)
-        for i, parent in enumerate(self.parents):
-            if parent >= 0:
-                mask[i] |= mask[parent]
-        return mask
-
-    @cached_property
-    def dof_ancestors(self) -> np.ndarray:
-        """(nb, nv) of bool: [i, j] is true when velocity coordinate j moves body i."""
-        return self.ancestors[:, self.dof_body]
-
-    @cached_property
-    def depths(self) -> np.ndarray:
-        """(nb,): number of joints between the world and each body, at least 1."""
-        return self.ancestors.sum(1)
-
-    @cached_property
-    def roots(self) -> np.ndarray:
-        """(nb,): the root body of the tree that each body belongs to."""
-        return np.argmax(self.ancestors, axis=1) if self.nb else np.zeros(0, int)
-
-    @cached_property
-    def jumps(self) -> tuple[np.ndarray, ...]:
-        """Pointer-jumping tables: the 2^k-th ancestor of each body (nb means the world), k = 0 .. ceil(log2(depth)) - 1."""
-        jump = np.array([p if p >= 0 else self.nb for p in self.parents] + [self.nb])
-        tables = []
-        while self.nb and (jump[:-1] != self.nb).any():
-            tables.append(jump[:-1])
-            jump = jump[jump]
-        return tuple(tables)
+from jaxdyn.model.topology import Topology as Topology
 
 
 class Model(eqx.Module):
@@ -146,6 +44,7 @@ class Model(eqx.Module):
     - `lower`, `upper` (nq,) position limits (infinite where there are none); `velocity_limit`, `effort_limit` (nv,).
     - `coupling_values` (nc, 2): multiplier and offset (m or rad) of each coupling q[joint] = multiplier q[source] + offset in
       `topology.couplings`, or None when there are none. They are data for a scene's constraints; the joints stay free here.
+    - `fixed_joints`: (joint, frame) for each joint that holds a link fast: its name stands for the link's frame. Static.
     """
 
     home: Float[Array, "nb 4 4"]
@@ -162,6 +61,7 @@ class Model(eqx.Module):
     effort_limit: Float[Array, " nv"]
     topology: Topology = eqx.field(static=True)
     coupling_values: Float[Array, "nc 2"] | None = None
+    fixed_joints: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
 
     def __str__(self) -> str:
         return tree_of(self)
@@ -208,6 +108,56 @@ class Model(eqx.Module):
         """
         return _replace(self, leaves)
 
+    def q_index(self, joint: str) -> int | slice:
+        """Where a joint's coordinates stand in q: an index of a joint with one number, else a slice.
+
+        `q[model.q_index("elbow")]` reads them, `q.at[model.q_index("elbow")].set(0.5)` sets them.
+
+        **Raises:** ValueError for a name that is no moving joint; near names are listed.
+        """
+        return place_in(self.topology.q_slices, self, joint)
+
+    def v_index(self, joint: str) -> int | slice:
+        """Where a joint's numbers stand in v, tau and every array (nv,), as `q_index` says it for q."""
+        return place_in(self.topology.v_slices, self, joint)
+
+    def selection_matrix(self, joints: Iterable[str] | None = None) -> Float[Array, "nv nu"]:
+        """S (nv, nu) of zeros and ones: tau = S u for the forces u (nu,) of actuated joints, S^T v are their velocities.
+
+        **Arguments:** `joints`, names in the order of u; None: all but free ones, which carry floating bases.
+
+        **Raises:** ValueError for names that are no moving joints, or that are given twice.
+        """
+        if joints is None:
+            named = zip(self.joint_names, self.topology.kinds, strict=True)
+            joints = [name for name, kind in named if kind != "free"]
+        return jnp.asarray(np.eye(self.nv)[:, columns_in_v(self, joints)], self.home.dtype)
+
+    def with_payload(self, frame: str, inertia: Any) -> "Model":
+        """The model carrying a body at a frame: its inertia is added to that of the body with the frame.
+
+        **Arguments:** `frame`, one of `model.frame_names` or of `model.joint_names`; `inertia`, in the frame's axes: the ten
+        numbers (10,) about its origin, or (mass, centre of mass (3,), rotational inertia (3, 3) about it); kg, m, kg m^2.
+        They may be traced: a batch of payloads is a `jax.vmap` over them.
+
+        **Raises:** ValueError for an unknown frame, one fixed to the world, and for an inertia of other shapes.
+
+        Source: Steiner's theorem, `jd.inertia.transform_inertia`.
+
+        ```python
+        heavier = model.with_payload("hand", (2.0, (0.0, 0.0, 0.1), jnp.diag(jnp.array([0.01, 0.01, 0.01]))))
+        batch = jax.vmap(lambda ten: jd.gravity_force(model.with_payload("hand", ten), q))(tens)
+        ```
+        """
+        index, dtype = frame_index(self, frame), self.home.dtype
+        body = self.topology.frame_bodies[index]
+        if body < 0:
+            raise ValueError(
+                f"frame {frame!r} is fixed to the world: a payload there has no effect; name a moving frame"
+            )
+        added = transform_inertia(self.frame_poses[index], _payload(inertia, dtype))
+        return self.replace(inertias=self.inertias.at[body].add(added))
+
     def followed(self, q: Float[Array, " nq"], joints: Array) -> Float[Array, " nq"]:
         """The configuration next to q whose joints have the coordinates `joints`: all that there is to q, in a `Model`.
 
@@ -224,8 +174,22 @@ class Model(eqx.Module):
         return jnp.asarray(True)
 
 
+def _payload(inertia: Any, dtype) -> Array:
+    """Ten numbers of what a user gave as an inertia, traced or not."""
+    ask = "give the ten numbers (10,), or (mass, centre of mass (3,), rotational inertia (3, 3) about it)"
+    if isinstance(inertia, (tuple, list)) and len(inertia) == 3:
+        parts = [as_array(part, "inertia", dtype) for part in inertia]
+        if [part.shape for part in parts] != [(), (3,), (3, 3)]:
+            raise ValueError(f"inertia has parts of shapes {[part.shape for part in parts]}; {ask}")
+        return inertial_parameters(*parts)
+    ten = as_array(inertia, "inertia", dtype)
+    if ten.shape != (10,):
+        raise ValueError(f"inertia has shape {ten.shape}; {ask}{batch_hint(ten, (10,))}")
+    return ten
+
+
 def _replace(model: Model, leaves: dict) -> Model:
-    names = [field.name for field in dataclasses.fields(Model) if field.name != "topology"]
+    names = [field.name for field in dataclasses.fields(Model) if field.name not in ("topology", "fixed_joints")]
     sizes = {"gravity": (3,), "armature": (model.nv,), "damping": (model.nv,), "friction": (model.nv,)}
     if model.topology.couplings == ():
         names.remove("coupling_values")
@@ -240,7 +204,8 @@ def _replace(model: Model, leaves: dict) -> Model:
         if np.shape(value) != want:
             raise ValueError(f"replace: {name} has shape {np.shape(value)}, expected {want}")
         leaves[name] = jnp.asarray(value, model.home.dtype) if not isinstance(value, jax.Array) else value
-    return Model(**{name: leaves.get(name, getattr(model, name)) for name in names}, topology=model.topology)
+    leaves = {name: leaves.get(name, getattr(model, name)) for name in names}
+    return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints)
 
 
 def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
@@ -332,7 +297,7 @@ def joint_rates(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) ->
 
 
 def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
-    """Put q back on the manifold: unit quaternions, other coordinates unchanged."""
+    """q (nq,) back on the manifold: unit quaternions, other coordinates unchanged."""
     (q,) = check_shapes(model, q=q)
 
     def unit(kind, qj):
@@ -360,32 +325,3 @@ def random_configuration(model: Model, key: Array) -> Float[Array, " nq"]:
         high = jnp.where(jnp.isfinite(high), high, jnp.asarray(reach, high.dtype))
         parts.append(joint_random(kind, keys[i], low, high, model.home.dtype))
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), model.home.dtype)
-
-
-def body_index(model: Model, name: str | None) -> int:
-    """Index of a body by name; None means the world, -1.
-
-    **Raises:** ValueError for a name that is neither a body nor a frame merged into one; the near names are listed.
-    """
-    if name is None:
-        return -1
-    if name in model.body_names:
-        return model.body_names.index(name)
-    return model.topology.frame_bodies[frame_index(model, name)]
-
-
-def frame_index(model: Model, name: str) -> int:
-    """Index of a frame by name; where no frame has the name of a joint, that stands for the frame of the body that it moves.
-
-    **Raises:** ValueError when there is no frame of that name; names that look alike are listed.
-    """
-    import difflib
-
-    moved = dict(zip(model.joint_names, model.body_names, strict=True)).get(name)
-    try:
-        return model.frame_names.index(name if name in model.frame_names or moved is None else moved)
-    except ValueError:
-        names = (*model.frame_names, *model.joint_names)
-        near = difflib.get_close_matches(str(name), names, n=5, cutoff=0.4)
-        hint = f"did you mean {', '.join(near)}?" if near else f"frames are {', '.join(model.frame_names[:10])} ..."
-        raise ValueError(f"frame {name!r} is not in model {model.name!r}; {hint}") from None

@@ -18,7 +18,8 @@ from jaxdyn.contact.rolling import RollingContact
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.joints import joint_neutral
-from jaxdyn.model.tree import Model, frame_index
+from jaxdyn.model.names import frame_index
+from jaxdyn.model.tree import Model
 from jaxdyn.pictures.solids import Shape, Shapes, rod
 from jaxdyn.systems.scene import Scene
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxdyn.constraints.assembly import residuals
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
-from jaxdyn.model.tree import Model, frame_index
+from jaxdyn.model.names import frame_index
+from jaxdyn.model.tree import Model
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.equations import Equations, power

@@ -1,0 +1,48 @@
+"""How many ways a constrained mechanism can move."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxdyn.compile import is_concrete
+from jaxdyn.constraints.base import constraint_jacobian, layout
+from jaxdyn.constraints.rank import checked_tolerance, pseudo_inverse, tolerance
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_state
+from jaxdyn.systems.scene import as_scene
+
+
+def degrees_of_freedom(
+    scene: Any, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None
+) -> int | Int[Array, ""]:
+    """Degrees of freedom at a configuration: nv minus the rank of the constraints' rows A(q, t).
+
+    Dependent rows count once, so overconstrained linkages have the freedom that they have. It is the freedom of velocities at
+    this q: it is larger in singular positions, and rolling takes from it without taking configurations away. Rows of
+    loops that are dependent only where the loops are closed need a q of `jd.assemble`. Rows are compared after each has been
+    scaled to length 1.
+
+    **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `t`, s; `rank_tol`: singular values below `rank_tol` times the
+    largest count as zero, by default eps^(4/7), 1e-9 in float64.
+
+    **Returns:** an int for numbers that are known, an array () of integers for traced ones.
+
+    **Raises:** ValueError for shapes that do not fit, or a `rank_tol` outside (0, 1).
+
+    Source: EQUATIONS section 7; the rank is the trace of A A^+.
+
+    ```python
+    freedom = jd.degrees_of_freedom(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0])  # 1
+    ```
+    """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
+    rank_tol = checked_tolerance(rank_tol)
+    if not layout(scene):
+        return scene.nv
+    A = constraint_jacobian(scene, q, t)
+    size = jnp.sqrt(jnp.sum(A * A, axis=1, keepdims=True))
+    A = A / jnp.where(size > 0, size, jnp.ones_like(size))
+    rank = jnp.round(jnp.trace(_product(A, pseudo_inverse(A, tolerance(rank_tol, A), True)))).astype(jnp.int32)
+    return scene.nv - int(rank) if is_concrete(rank) else scene.nv - rank

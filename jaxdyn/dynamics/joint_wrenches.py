@@ -1,0 +1,73 @@
+"""What joints transmit: the wrench through each joint of a tree in motion."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import run
+from jaxdyn.dynamics.kinematics import tree_frame
+from jaxdyn.dynamics.quantities import MAX_BODIES
+from jaxdyn.dynamics.world_frame import joint_wrenches
+from jaxdyn.lie import se3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.names import joint_index
+from jaxdyn.model.tree import Model
+
+
+def joint_wrench(
+    model: Model,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    a: Float[Array, " nv"],
+    joint: str | None = None,
+    *,
+    external: Float[Array, "nb 6"] | None = None,
+    axes: str = "body",
+) -> Float[Array, "*nb 6"]:
+    """Wrench that a joint transmits in a motion: (f, tau) of what carries the body ON the body, drive included.
+
+    F_i = sum over the bodies j that joint i carries of (the rate of momentum of j - its weight - external_j). Its part along
+    the joint's freedoms is the joint's force: S_i^T F_i = tau_i - armature a_i, with tau of `inverse_dynamics`; the rest is
+    what the bearing holds. Rotors are left out of it.
+
+    **Arguments:**
+
+    - `q` (nq,), `v` (nv,), `a` (nv,): the motion; a as `forward_dynamics` or `constrained_dynamics` gives it.
+    - `joint`: name of a moving joint; None: all of them.
+    - `external` (nb, 6): other wrenches (f, tau) ON each body, at its frame's origin and in its axes (N, N m). Those of closed
+      loops are `jd.body_wrenches(scene, q, multipliers)`.
+    - `axes`: "body", of the frame of the body that the joint moves, or "world"; at that frame's origin in either case.
+
+    **Returns:** (6,), or (nb, 6) for all joints in the order of `model.joint_names`; N, N m.
+
+    **Raises:** ValueError for an unknown joint, other axes, shapes that do not fit.
+
+    Source: EQUATIONS section 4, the backward recursion of Newton and Euler; `data.f` of Pinocchio after `rnea` for body axes.
+
+    ```python
+    weight = jd.joint_wrench(model, q, still, still, model.joint_names[0])  # what the base bears at rest
+    ```
+    """
+    if axes not in ("body", "world"):
+        raise ValueError(f"axes is {axes!r}; choose from body, world")
+    q, v, a, external = check_shapes(model, q=q, v=v, a=a, external=external)
+    index = None if joint is None else joint_index(model, joint)
+    if model.nb == 0:
+        return jnp.zeros((0, 6), q.dtype)
+    function = _in_world if axes == "world" else _in_bodies
+    given = (q, v, a) if external is None else (q, v, a, external)
+    found = function(model, *given) if model.nb > MAX_BODIES else run(function, model, *given)
+    return found if index is None else found[index]
+
+
+def _in_bodies(model: Model, q, v, a, external=None):
+    frame = tree_frame(model, q)
+    return jax.vmap(se3.AdT_apply)(frame.pose, joint_wrenches(model, frame, v, a, external))
+
+
+def _in_world(model: Model, q, v, a, external=None):
+    frame = tree_frame(model, q)
+    found = jax.vmap(se3.AdT_apply)(frame.pose, joint_wrenches(model, frame, v, a, external))
+    turn = frame.pose[:, :3, :3]
+    return jnp.concatenate([_product(turn, found[:, :3, None]), _product(turn, found[:, 3:, None])], 1)[..., 0]

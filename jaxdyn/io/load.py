@@ -1,0 +1,132 @@
+"""One call for every format: the scene of a file, or of a robot that the package robot_descriptions knows by name."""
+
+import contextlib
+import difflib
+import importlib
+import os
+import pathlib
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.constraints.loops import model_couplings
+from jaxdyn.forces.elements import CoulombFriction, JointDamping
+from jaxdyn.io.loaded import LoadedScene, Start
+from jaxdyn.io.mjcf import load_mjcf
+from jaxdyn.io.sdf import load_sdf
+from jaxdyn.io.urdf import load_urdf
+from jaxdyn.model.arguments import as_path
+from jaxdyn.model.tree import Model, neutral
+
+_BY_SUFFIX = {".urdf": "urdf", ".sdf": "sdf", ".world": "sdf", ".mjcf": "mjcf"}
+_BY_ROOT = {"robot": "urdf", "sdf": "sdf", "gazebo": "sdf", "mujoco": "mjcf", "mujocoinclude": "mjcf"}
+
+
+def load(source: str | os.PathLike, *, floating_base: bool | None = None, dtype=None) -> LoadedScene:
+    """The scene of a URDF, MJCF or SDF file, or of a robot by its name in the package robot_descriptions.
+
+    All formats give a `LoadedScene`, with the `Model` in `.system`. That of a URDF has the file's mimicked joints as
+    couplings, its joint damping and dry friction (smoothed at 0.01 rad/s) as forces, and the start "reference", q = 0.
+    `load_urdf`, which returns the `Model` alone, has more options, and so have `load_mjcf` and `load_sdf`.
+
+    **Arguments:**
+
+    - `source`: a path; or a name such as "go2_description" or "go2_mj_description", whose file robot_descriptions has in its
+      cache. What it does not have there it fetches by git, once, if there is a network.
+    - `floating_base`: whether the root moves freely. None: as the format has it: fixed in a URDF, free in SDF. MJCF says so
+      itself.
+    - `dtype`: as for `ModelBuilder`.
+
+    **Returns:** `LoadedScene`.
+
+    **Raises:** ValueError for a file that does not exist or is of no known format, an unknown name (near ones are listed), a
+    robot that could not be fetched, `floating_base` with MJCF; and as the loader of the format does. ImportError
+    without the package that reads the format.
+
+    ```python
+    scene = jd.load("robot.urdf")  # or jd.load("go2_mj_description")
+    q = jd.neutral(scene.system)
+    ```
+    """
+    path = as_path(source, "source")
+    if not path.suffix and not path.exists():
+        path = described(str(source))
+    kind = format_of(path)
+    if kind == "mjcf":
+        if floating_base is not None:
+            raise ValueError(
+                f"floating_base is {floating_base}, but {path} is MJCF, which says so by <freejoint>; leave it out"
+            )
+        return load_mjcf(path, dtype=dtype)
+    if kind == "sdf":
+        return load_sdf(path, floating_base=floating_base is not False, dtype=dtype)
+    return scene_of_urdf(load_urdf(path, floating_base=bool(floating_base), mimic="couple", dtype=dtype))
+
+
+def scene_of_urdf(model: Model) -> LoadedScene:
+    """The scene of a model that was read from a URDF: couplings, damping and friction of its joints, q = 0 as a start."""
+    forces: list = []
+    for leaf, force in ((model.damping, JointDamping), (model.friction, CoulombFriction)):
+        if leaf is not None and np.any(np.asarray(leaf) != 0):
+            forces.append(force(leaf))
+    starts = {"reference": Start(neutral(model), jnp.zeros((model.nv,), model.home.dtype))}
+    return LoadedScene(model, model_couplings(model), forces, starts=starts)
+
+
+def format_of(path: pathlib.Path) -> str:
+    """ "urdf", "mjcf" or "sdf", by the suffix, and of .xml files by the name of the root element.
+
+    **Raises:** ValueError for a file that cannot be read, and for other suffixes and elements.
+    """
+    kind = _BY_SUFFIX.get(path.suffix.lower())
+    if kind is None and path.suffix.lower() == ".xml":
+        kind = _BY_ROOT.get(_root_element(path))
+    if kind is None:
+        raise ValueError(
+            f"{path}: not a file of a known format; give .urdf, .sdf, .world, .mjcf, or .xml with one of them"
+        )
+    return kind
+
+
+def _root_element(path: pathlib.Path) -> str:
+    import xml.etree.ElementTree as ET
+
+    try:
+        with path.open("rb") as file, contextlib.suppress(ET.ParseError):
+            # Nothing is read beyond the first element: no entity can expand.
+            for _, element in ET.iterparse(file, events=("start",)):
+                return element.tag
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read ({error.strerror}); check the path") from error
+    return ""
+
+
+def described(name: str) -> pathlib.Path:
+    """The file of a robot that robot_descriptions knows.
+
+    **Raises:** ValueError for an unknown name, a robot without a file that is read here, and one that cannot be fetched;
+    ImportError without the package.
+    """
+    try:
+        import robot_descriptions
+    except ImportError as error:
+        raise ImportError(
+            f"{name!r} is no file; as a name of a robot it needs the package robot_descriptions: "
+            "pip install jaxdyn[robots]"
+        ) from error
+    known = robot_descriptions.DESCRIPTIONS
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=5, cutoff=0.5)
+        hint = f"did you mean {', '.join(near)}?" if near else "names end in _description or _mj_description"
+        raise ValueError(f"{name!r} is neither a file nor a robot of robot_descriptions; {hint}")
+    try:
+        module = importlib.import_module(f"robot_descriptions.{name}")
+    except Exception as error:  # of git, the network or the disk
+        reason = (str(error).strip() or type(error).__name__).splitlines()[-1]
+        raise ValueError(
+            f"{name!r} is not in the cache of robot_descriptions and could not be fetched: {reason}"
+        ) from error
+    for attribute in ("URDF_PATH", "MJCF_PATH"):
+        if (path := getattr(module, attribute, None)) is not None:
+            return pathlib.Path(path)
+    raise ValueError(f"{name!r} has neither a URDF nor an MJCF file; robots in xacro have to be expanded first")

@@ -1,0 +1,111 @@
+"""Links and joints of a URDF file as numbers, with the defaults that the format sets for what is left out."""
+
+import os
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdyn.io.urdf_check import NUMBERS, check_elements
+from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import float64 as f64
+
+_MOMENTS = np.array([["ixx", "ixy", "ixz"], ["ixy", "iyy", "iyz"], ["ixz", "iyz", "izz"]])
+
+
+class Inertial(NamedTuple):
+    """Mass (kg), inertia (3, 3) (kg m^2) and the pose (4, 4) of its axes in the link; None where the file gives none."""
+
+    mass: float | None
+    inertia: np.ndarray | None
+    origin: np.ndarray | None
+
+
+class Mimic(NamedTuple):
+    """The joint that is followed: q = multiplier q[joint] + offset."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+class Joint(NamedTuple):
+    """A joint: `origin` (4, 4) of the child in the parent; `limit` and `dynamics` hold the numbers that the file gives."""
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    origin: np.ndarray
+    axis: np.ndarray
+    limit: dict[str, float] | None
+    dynamics: dict[str, float]
+    mimic: Mimic | None
+
+
+class Parts(NamedTuple):
+    """What a file holds: the robot's name, links and joints by name in the file's order, and file:line of each."""
+
+    name: str
+    links: dict[str, Inertial | None]
+    joints: dict[str, Joint]
+    places: dict[str, str]  # "joint NAME" and "link NAME" -> file:line
+
+
+def read_parts(path: str | os.PathLike) -> Parts:
+    """The links and joints of a file.
+
+    **Raises:** ValueError with file and line, for a file that cannot be read and all that `check_elements` refuses.
+    """
+    file = XmlFile(path, "URDF")
+    elements, places = check_elements(file, path)
+    links = {part.get("name"): _inertial(part.find("inertial")) for part in elements if part.tag == "link"}
+    joints = {part.get("name"): _joint(part) for part in elements if part.tag == "joint"}
+    return Parts(file.root.get("name") or "", links, joints, places)
+
+
+def _inertial(element) -> Inertial | None:
+    if element is None:
+        return None
+    mass, inertia = element.find("mass"), element.find("inertia")
+    matrix = None if inertia is None else np.array([[float(inertia.get(key)) for key in row] for row in _MOMENTS])
+    return Inertial(None if mass is None else float(mass.get("value")), matrix, _origin(element))
+
+
+def _joint(element) -> Joint:
+    axis, limit, mimic = (element.find(tag) for tag in ("axis", "limit", "mimic"))
+    origin = _origin(element)
+    return Joint(
+        element.get("name"),
+        element.get("type"),
+        element.find("parent").get("link"),
+        element.find("child").get("link"),
+        np.eye(4) if origin is None else origin,
+        _vector(axis, "xyz", "1 0 0"),
+        None if limit is None else _numbers(limit),
+        _numbers(element.find("dynamics")),
+        None if mimic is None else Mimic(mimic.get("joint"), *(float(mimic.get(*d)) for d in _MIMIC)),
+    )
+
+
+_MIMIC = (("multiplier", "1"), ("offset", "0"))
+
+
+def _origin(element) -> np.ndarray | None:
+    found = element.find("origin")
+    if found is None:
+        return None
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = f64.rotation_from_rpy(_vector(found, "rpy", "0 0 0")), _vector(found, "xyz", "0 0 0")
+    return pose
+
+
+def _vector(element, key: str, default: str) -> np.ndarray:
+    text = default if element is None else element.get(key, default)
+    return np.array([float(part) for part in text.split()])
+
+
+def _numbers(element) -> dict[str, float]:
+    """The numbers that the attributes of an element give."""
+    if element is None:
+        return {}
+    return {key: float(element.get(key)) for key in NUMBERS[element.tag] if element.get(key) is not None}

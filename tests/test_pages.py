@@ -1,0 +1,111 @@
+"""The documents: links lead somewhere, exports are described, examples run as they are printed."""
+
+import inspect
+import re
+from urllib.parse import unquote
+
+import numpy as np
+import pytest
+from pages import ROOT, anchors, links, pages, run
+
+import jaxdyn as jd
+
+
+def test_links_of_all_pages_lead_somewhere():
+    wrong = []
+    for page in pages():
+        for target in links(page.read_text()):
+            if re.match(r"[a-z]+:", target):
+                continue
+            path, _, anchor = unquote(target).partition("#")
+            other = (page.parent / path).resolve() if path else page
+            if not other.exists():
+                wrong.append(f"{page.relative_to(ROOT)}: {target}")
+            elif anchor and other.suffix == ".md" and anchor not in anchors(other.read_text()):
+                wrong.append(f"{page.relative_to(ROOT)}: {target} (no such heading)")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_page_is_in_the_menu_of_the_site():
+    text = (ROOT / "mkdocs.yml").read_text()
+    missing = [page.name for page in (ROOT / "docs").glob("*.md") if f": {page.name}" not in text]
+    assert not missing, missing
+
+
+# Rooms of the package, which Python leaves in its namespace, are none of these.
+GROUPS = "contact control geometry grasp identify inertia plot robots scenes se2 se3 so3 solvers".split()
+
+
+def exports() -> dict[str, object]:
+    """All that users call, by the name that they write: the names of jaxdyn, and those of its groups."""
+    found = {f"jd.{name}": x for name, x in vars(jd).items() if not name.startswith("_") and not inspect.ismodule(x)}
+    for group in GROUPS:
+        for name, x in vars(getattr(jd, group)).items():
+            if not name.startswith("_") and getattr(x, "__module__", "").startswith("jaxdyn"):
+                found[f"jd.{group}.{name}"] = x
+    return found
+
+
+def test_every_export_is_described():
+    """A docstring of its own, and the shape of what is an array among the arguments."""
+    wrong = []
+    for name, value in exports().items():
+        text = inspect.getdoc(value) or ""
+        if not text or (inspect.isclass(value) and not vars(value).get("__doc__")):
+            wrong.append(f"{name}: no docstring")
+        elif inspect.isfunction(value):
+            arrays = [p for p in inspect.signature(value).parameters.values() if "Float" in str(p.annotation)]
+            if arrays and not re.search(r"\((n\w*|\d)?,? ?[\w* ,]*\)", text):
+                wrong.append(f"{name}: no shape of {arrays[0].name}")
+    assert len(exports()) > 300 and not wrong, "\n".join(wrong)
+
+
+def test_examples_of_the_page_on_pictures_run(tmp_path, monkeypatch):
+    pytest.importorskip("viser", reason="viser is not installed")
+    monkeypatch.chdir(tmp_path)
+    names = run("docs/pictures.md")
+    assert {"four_bar.png", "four_bar.gif", "four_bar.html", "motion.csv"} <= {path.name for path in tmp_path.iterdir()}
+    assert names["address"].startswith("http://127.0.0.1")
+    np.testing.assert_array_equal(names["log"].q, names["recorded"].q)
+
+
+def recipe(section: str, least: int = 2) -> dict:
+    return run("docs/recipes.md", section, least, head=True)
+
+
+def test_recipe_environment_step():
+    names = recipe("Environment step")
+    assert names["after"] > names["before"] + 5
+
+
+@pytest.mark.slow
+def test_recipe_geometry():
+    np.testing.assert_allclose(recipe("Optimising a geometry")["lengths"], [0.32, 0.95, 0.75], rtol=1e-9)
+
+
+def test_recipe_operational_space():
+    names = recipe("Operational space")
+    # The circle starts with 0.2 m/s, the arm at rest: the error rises and then decays as its gains say.
+    assert names["missed"].max() < 5e-3 and names["missed"][-1] < 1e-6
+    assert np.linalg.eigvalsh(names["mass_at_the_tip"]).min() > 0.1
+
+
+@pytest.mark.slow
+def test_recipe_parallel_robot():
+    names = recipe("A parallel robot from code")
+    assert names["freedom"] == 2
+    assert np.abs(names["held"].acceleration).max() < 1e-10
+    assert np.abs(names["fall"].constraint_residual).max() < 1e-10
+    # The motor's bearing transmits the motor's torque about its axis.
+    np.testing.assert_allclose(names["bearing"][5], names["torques"][0], rtol=1e-10)
+
+
+def test_recipe_sampled_controller():
+    names = recipe("A sampled controller")
+    assert names["left"].max() < 1e-3 and np.isfinite(names["regulated"].torque).all()
+
+
+def test_recipe_payloads():
+    names = recipe("Monte Carlo of payloads")
+    assert np.isfinite(names["sags"]).all() and 0.01 < names["quantiles"][1] < 0.1
+    assert np.corrcoef(names["masses"], names["sags"])[0, 1] > 0.95  # what weighs more sags more
