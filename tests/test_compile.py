@@ -1,6 +1,7 @@
 """Native kernels: what their programs hold, each operation against JAX, derivatives, batches, modes, threads and files."""
 
 import ast
+import concurrent.futures
 import contextlib
 import logging
 import os
@@ -970,11 +971,36 @@ def test_without_jit_kernels_are_still_compiled():
         np.testing.assert_allclose(x, y, rtol=1e-13)
 
 
+def test_kernels_that_are_not_called_are_not_compiled():
+    """The two branches of a condition, of which one is taken: one has code, and the other gets it at its first call."""
+    double, triple = native(lambda x: 2.0 * x + jnp.sin(x)), native(lambda x: 3.0 * x + jnp.sin(x))
+    run = jax.jit(lambda flag, x: jax.lax.cond(flag, double, triple, x))
+    x, before = jnp.arange(3.0), set(target._kernels)
+    assert_same(run(True, x), 2 * x + jnp.sin(x))
+    new = [target._kernels[number] for number in target._kernels if number not in before]
+    assert sorted(made.code is None for made in new) == [False, True]
+    assert_same(run(False, x), 3 * x + jnp.sin(x))
+    assert all(made.code is not None and made.program is None for made in new)
+
+
+def test_threads_that_call_a_kernel_for_the_first_time_share_its_code(monkeypatch):
+    """All wait for the one that compiles it, while other threads of Python go on."""
+    made, code = [], target.Code
+    monkeypatch.setattr(target, "Code", lambda *args: made.append(args) or code(*args))
+    run = jax.jit(native(lambda x: jnp.cos(x) * 5.4321)).lower(jnp.ones(3)).compile()
+    assert not made
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda k: run(jnp.full(3, float(k))), range(8)))
+    assert len(made) == 1
+    for k, x in enumerate(found):
+        assert_same(x, jnp.cos(jnp.full(3, float(k))) * 5.4321)
+
+
 def test_a_kernel_that_is_missing_is_said():
     """A program whose kernels this process does not have, as after it was stored by another one."""
     x = jnp.ones(3)
     run = jax.jit(native(lambda x: jnp.sin(x) * 2.345678)).lower(x).compile()
-    number = next(reversed(target._held))
+    number = next(reversed(target._kernels))
     slot = next(entry for entry in target._table if entry.hash == number)
     slot.hash = 1  # nobody's
     try:
@@ -1115,7 +1141,10 @@ def test_a_second_process_compiles_no_kernel(tmp_path):
 
 
 def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
-    """Ctrl-C while a kernel is built, or its file written: the next call builds it, and no file is left behind."""
+    """Ctrl-C while a kernel is built, or its file written: the next call builds it, and no file is left behind.
+
+    A kernel is built when XLA calls it, which cannot pass an interruption on: it ends with an error.
+    """
 
     def interrupted(*_):
         raise KeyboardInterrupt
@@ -1124,10 +1153,11 @@ def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
         return jnp.sin(x) * 7.654321
 
     for place, name in ((objects, "_optimize"), (target, "kernel_ir"), (kernel, "expand")):
-        with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt):
+        with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt, jax.errors.JaxRuntimeError):
             patched.setattr(place, name, interrupted)
             jax.jit(native(lambda x: function(x)))(jnp.ones(3))
-        assert not target._lock.locked() and not backend.is_expanding()
+        with target._lock:
+            assert not backend.is_expanding()
     assert_same(jax.jit(native(lambda x: function(x)))(jnp.ones(3)), function(jnp.ones(3)))
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(os, "replace", interrupted)

@@ -9,7 +9,6 @@ it: `void called(ptr ..., ptr ...)` with the arrays of its inputs, then of its o
 sample is such an array: it is passed on without a copy.
 """
 
-import hashlib
 from collections.abc import Callable, Sequence
 
 from jaxdyn.compile.llvm import Emitter
@@ -133,18 +132,11 @@ def _write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
 
 def symbol_of(called: Program, width: int) -> str:
     """The name by which kernels call a subprogram: equal names have equal code."""
-    return f"jaxdyn_{hashlib.sha256(subprogram_ir(called, width).encode()).hexdigest()[:32]}"
+    return f"jaxdyn_{called.digest[:32]}_{width}"
 
 
 def subprogram_ir(called: Program, width: int) -> str:
     """The text of a subprogram, the function `called`."""
-    key = ("text", width)
-    if key not in called.derived:
-        called.derived[key] = _subprogram_ir(called, width)
-    return called.derived[key]
-
-
-def _subprogram_ir(called: Program, width: int) -> str:
     if called.subprograms:
         raise AssertionError("a subprogram that calls others, which `expand` does not make")
     e = Emitter(width)

@@ -4,6 +4,9 @@
 ; was written for, and runs it: on this thread where there are few samples, else in chunks that the threads of XLA's own pool and this
 ; one claim in turn. This thread waits only for chunks that others have begun, so a busy pool cannot block it.
 ;
+; A kernel that is called for the first time has no machine code yet: `prepare`, a function of Python's, makes it, and stores its
+; address in the table. Kernels that are never called, as of branches that are not taken, cost nothing.
+;
 ; Names in braces are filled in by target.py. A table entry is { hash, kernel, chunk, least, buffers, sizes }: `chunk` samples are
 ; claimed at a time, fewer than `least` stay on one thread, and sizes[i] is the number of entries per sample of buffer i, or less than
 ; zero (minus one, less the number of entries) for an argument that is the same for all samples.
@@ -13,6 +16,7 @@ declare void @free(ptr)
 declare {RELAX_TYPE}
 
 @missing = private constant [{MISSING_BYTES} x i8] c"{MISSING}\00"
+@failed = private constant [{FAILED_BYTES} x i8] c"{FAILED}\00"
 @misfit = private constant [{MISFIT_BYTES} x i8] c"{MISFIT}\00"
 
 %Entry = type { i64, ptr, i64, i64, i64, ptr }
@@ -332,7 +336,19 @@ not.found:
   ret ptr %error.missing
 found:
   %kernel.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 1
-  %kernel = load ptr, ptr %kernel.at
+  %ready = load atomic ptr, ptr %kernel.at acquire, align 8
+  %is.ready = icmp ne ptr %ready, null
+  br i1 %is.ready, label %go, label %first.call
+first.call:
+  %prepare = inttoptr i64 {PREPARE} to ptr
+  %made = call ptr %prepare(i64 %hash)
+  %is.made = icmp ne ptr %made, null
+  br i1 %is.made, label %go, label %not.made
+not.made:
+  %error.failed = call ptr @failure(ptr %api, ptr @failed, i32 13)
+  ret ptr %error.failed
+go:
+  %kernel = phi ptr [ %ready, %found ], [ %made, %first.call ]
   %chunk.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 2
   %chunk = load i64, ptr %chunk.at
   %least.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 3

@@ -43,6 +43,11 @@ class PseudoInverse:
         self.name = "pseudo_inverse"
 
     @property
+    def digest(self) -> str:
+        """As of a `Program`."""
+        return f"pseudo_inverse {self.rows} {self.columns} {self.dtype} {self.tolerance!r}"
+
+    @property
     def cost(self) -> int:
         """Operations of some eight sweeps."""
         n, m = max(self.rows, self.columns), min(self.rows, self.columns)

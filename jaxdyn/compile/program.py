@@ -1,6 +1,7 @@
 """Programs of single numbers: operations in an order in which they can be computed, from arrays to arrays."""
 
 import functools
+import hashlib
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -75,6 +76,13 @@ class Program:
         """Number of operations that are carried out, without inputs and changes of sign."""
         own = sum(x.op not in ("input", "neg", "call", "part") for x in self.operations)
         return own + sum(self.subprograms[x.args[0].value].cost for x in self.operations if x.op == "call")
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """Of all that its code depends on: programs of equal digests do the same."""
+        lines = [f"{op} {kind} {args}" for op, kind, args in self.operations]
+        lines += [str(x) for x in (*self.inputs, *self.outputs, *self.results)] + [x.digest for x in self.subprograms]
+        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
     def counts(self) -> dict[str, int]:
         """Number of operations of each kind."""

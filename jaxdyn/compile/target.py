@@ -3,12 +3,14 @@
 import contextlib
 import ctypes
 import functools
+import hashlib
 import logging
 import re
 import threading
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,6 +27,7 @@ OPERATIONS_PER_CHUNK = 40_000
 ANNOUNCED_AFTER = 5.0  # seconds of compilation
 _VERSION = (0, 3)  # of XLA's FFI, whose structures `handler.ll` describes
 _MISSING = "jaxdyn: this program was compiled by another process, which had its kernel; trace it again here"
+_FAILED = "jaxdyn: a kernel could not be compiled; the error was logged"
 _MISFIT = "jaxdyn: a buffer of a kernel has another size than the kernel was written for"
 # What a waiting thread tells each kind of processor: pause, and yield.
 _RELAX = {"x86_64": "void @llvm.x86.sse2.pause()", "aarch64": "void @llvm.aarch64.hint(i32 1)"}
@@ -50,9 +53,10 @@ class _Entry(ctypes.Structure):
 
 _table = (_Entry * SLOTS)()
 _threads = ctypes.c_int64(1 << 30)
-_lock = threading.Lock()
+_lock = threading.RLock()
 _called: dict[str, Code] = {}  # subprograms, which other kernels call too
-_held: dict[int, tuple] = {}  # code and sizes by hash, for as long as the process may call them
+_kernels: dict[int, "_Kernel"] = {}  # by number, for as long as the process may call them
+_handler: list[Code] = []
 
 
 def set_threads(count: int | None) -> None:
@@ -78,11 +82,12 @@ def register() -> None:
     if architecture not in _RELAX:
         raise Unsupported(f"the processor is {architecture}, and kernels are written for {', '.join(_RELAX)}")
     text = resources.files("jaxdyn.compile").joinpath("handler.ll").read_text()
+    messages = {"MISSING": _MISSING, "FAILED": _FAILED, "MISFIT": _MISFIT}
     fields = {
         "TABLE": ctypes.addressof(_table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads),
-        "MAJOR": version[0], "MINOR": version[1], "RELAX": _RELAX[architecture],
-        "RELAX_TYPE": _RELAX[architecture].replace("i32 1", "i32"),
-        "MISSING": _MISSING, "MISSING_BYTES": len(_MISSING) + 1, "MISFIT": _MISFIT, "MISFIT_BYTES": len(_MISFIT) + 1,
+        "PREPARE": ctypes.cast(_PREPARE, ctypes.c_void_p).value, "MAJOR": version[0], "MINOR": version[1],
+        "RELAX": _RELAX[architecture], "RELAX_TYPE": _RELAX[architecture].replace("i32 1", "i32"),
+        **messages, **{f"{name}_BYTES": len(message) + 1 for name, message in messages.items()},
     }  # fmt: skip
     for name, value in fields.items():
         text = text.replace("{" + name + "}", str(value))
@@ -91,7 +96,7 @@ def register() -> None:
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
     jax.ffi.register_ffi_target(TARGET, new(code.address("handler"), None, None), platform="cpu", api_version=1)
-    _held[0] = (code,)
+    _handler.append(code)
 
 
 def _architecture() -> str:
@@ -116,23 +121,56 @@ def width_of(program, samples: int | None) -> int:
 
 
 def kernel(program, width: int, uniform: Sequence[bool]) -> int:
-    """The hash by which the handler finds the kernel of a program, which is compiled where it is not there yet."""
+    """The number by which the handler finds the kernel of a program, which is compiled when it is called for the first time."""
     uniform = tuple(uniform)
     key = ("kernel", width, uniform)
     with _lock:
         register()
         if key not in program.derived:
-            text = kernel_ir(program, width, uniform) if isinstance(program, Program) else program.ir(width, uniform)
-            with _announced(program):
-                is_shared = isinstance(program, Program) and calls_itself(program, width)
-                for called in (program,) if is_shared else program.subprograms:
-                    _publish(called, width)
-                code = Code(text)
-            number = int.from_bytes(code.key[:8], "little") >> 1 | 1
-            if number not in _held:
-                _enter(number, code, program, width, uniform)
+            content = f"{program.digest} {width} {uniform}"
+            number = int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "little") >> 1 | 1
+            if number not in _kernels:
+                _kernels[number] = _Kernel(number, program, width, uniform)
             program.derived[key] = number
         return program.derived[key]
+
+
+class _Kernel:
+    """A kernel of the table; its program until there is code."""
+
+    def __init__(self, number: int, program, width: int, uniform: tuple[bool, ...]):
+        if len(_kernels) > SLOTS // 2:
+            raise Unsupported(f"more than {SLOTS // 2} kernels in one process")
+        self.program: Any = program
+        self.width, self.uniform = width, uniform
+        self.code: Code | None = None
+        sizes = [-1 - array.size if same else array.size for array, same in zip(program.inputs, uniform, strict=True)]
+        sizes += [array.size for array in program.outputs]
+        self.sizes = (ctypes.c_int64 * len(sizes))(*sizes)
+        slot = number % SLOTS
+        while _table[slot].hash:
+            slot = (slot + 1) % SLOTS
+        self.entry = _table[slot]
+        chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.cost)))
+        self.entry.kernel, self.entry.chunk, self.entry.least = 0, chunk, 2 * chunk
+        self.entry.buffers, self.entry.sizes = len(sizes), ctypes.addressof(self.sizes)
+        self.entry.hash = number  # last: from here on it is found
+
+    def address(self) -> int:
+        """Of its code, which is made where there is none."""
+        if self.code is None:
+            program, width = self.program, self.width
+            with _announced(program):
+                if isinstance(program, Program):
+                    for called in (program,) if calls_itself(program, width) else program.subprograms:
+                        _publish(called, width)
+                    text = kernel_ir(program, width, self.uniform)
+                else:
+                    text = program.ir(width, self.uniform)
+                self.code = Code(text)
+            self.program = None
+            self.entry.kernel = self.code.address("kernel")
+        return self.entry.kernel
 
 
 def _publish(called: Program, width: int) -> None:
@@ -141,6 +179,19 @@ def _publish(called: Program, width: int) -> None:
     if symbol not in _called:
         _called[symbol] = Code(subprogram_ir(called, width))
         _called[symbol].publish("called", symbol)
+
+
+def _prepare(number: int) -> int:
+    """What the handler calls for a kernel without code: its address, or zero where there is none."""
+    try:
+        with _lock:
+            return _kernels[number].address()
+    except BaseException:  # an interruption too: there is no Python above this call that could be told
+        logger.exception("jaxdyn: a kernel could not be compiled")
+        return 0
+
+
+_PREPARE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint64)(_prepare)
 
 
 @contextlib.contextmanager
@@ -156,30 +207,15 @@ def _announced(program):
         timer.cancel()
 
 
-def _enter(number: int, code: Code, program, width: int, uniform: tuple[bool, ...]) -> None:
-    if len(_held) > SLOTS // 2:
-        raise Unsupported(f"more than {SLOTS // 2} kernels in one process")
-    sizes = [-1 - array.size if same else array.size for array, same in zip(program.inputs, uniform, strict=True)]
-    sizes += [array.size for array in program.outputs]
-    row = (ctypes.c_int64 * len(sizes))(*sizes)
-    slot = number % SLOTS
-    while _table[slot].hash:
-        slot = (slot + 1) % SLOTS
-    entry = _table[slot]
-    chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.cost)))
-    entry.kernel, entry.chunk, entry.least = code.address("kernel"), chunk, 2 * chunk
-    entry.buffers, entry.sizes = len(sizes), ctypes.addressof(row)
-    entry.hash = number  # last: from here on it is found
-    _held[number] = code, row
-
-
 def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     """The results of a program for one sample, by its kernel and without XLA; `arrays` as its inputs."""
     number = kernel(program, 1, [False] * len(program.inputs))
     given = [np.ascontiguousarray(x, array.dtype) for x, array in zip(arrays, program.inputs, strict=True)]
     results = [np.empty(array.shape, array.dtype) for array in program.outputs]
     data = (ctypes.c_void_p * (len(given) + len(results)))(*(x.ctypes.data for x in (*given, *results)))
-    _KERNEL(_held[number][0].address("kernel"))(data, 1, 0, 1)
+    with _lock:
+        address = _kernels[number].address()
+    _KERNEL(address)(data, 1, 0, 1)
     return results
 
 
