@@ -1,6 +1,6 @@
 """Moving pictures of scenes for the page docs/gallery.md: `python -m benchmarks.gallery [--out docs/gallery] [SCENE ...]`.
 
-Each scene of the page is simulated from its start and written as a GIF. The files are made, not kept in the repository; `make docs`
+Each scene of the page is simulated from its start and written as a GIF. The files are not kept in the repository: `make docs`
 makes those that are missing.
 """
 
@@ -41,7 +41,8 @@ def write(name: str, folder: Path) -> float:
     make = getattr(jd.scenes, name)
     scene, start, duration = make(), make.start(), SCENES[name]
     ts = jnp.linspace(0.0, duration, _FRAMES)
-    motion = jd.simulate(scene, start[0], start[1], ts)
+    # Fingers that only roll, under no torques, would soon pull: the picture shows the motion that the rows allow.
+    motion = jd.simulate(scene, start[0], start[1], ts, contacts="report")
     partial = folder / f"{name}.part.gif"
     jd.animate(scene, motion, partial, fps=15, speed=duration * 15 / _FRAMES)
     partial.replace(folder / f"{name}.gif")

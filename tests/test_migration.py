@@ -17,7 +17,8 @@ ARM = """<mujoco><option gravity="0 0 -9.81"/><worldbody>
   <body name="upper" pos="0 0 0.3"><joint name="a" axis="0 1 0"/><inertial pos="0 0 .2" mass="2" diaginertia=".03 .02 .01"/>
     <body name="lower" pos="0.1 0 0.4" euler="10 20 30"><joint name="b" axis="1 0 0"/>
       <inertial pos="0 .1 .2" mass="1.5" fullinertia=".02 .03 .025 .001 .002 .003"/>
-      <body name="hand" pos="0 0.05 0.35"><joint name="c" axis="0 0 1"/><inertial pos=".05 0 .1" mass=".7" diaginertia=".01 .02 .01"/>
+      <body name="hand" pos="0 0.05 0.35"><joint name="c" axis="0 0 1"/>
+        <inertial pos=".05 0 .1" mass=".7" diaginertia=".01 .02 .01"/>
 </body></body></body></worldbody></mujoco>"""
 
 
