@@ -202,11 +202,11 @@ def test_only_programs_switch_to_float64():
 
 
 def test_import_is_light_and_leaves_jax_unconfigured():
-    """In a fresh interpreter: no plotting or scipy, and no array made before the user chooses devices and dtype."""
+    """In a fresh interpreter: no plotting, optax or scipy, and no array made before the user chooses devices and dtype."""
     program = """
 import sys
 import jaxdyn
-heavy = {"matplotlib", "mujoco", "scipy", "trimesh", "viser", "xarray"} & sys.modules.keys()
+heavy = {"matplotlib", "mujoco", "optax", "scipy", "trimesh", "viser", "xarray"} & sys.modules.keys()
 assert not heavy, f"importing jaxdyn imports {heavy}"
 import jax
 try:

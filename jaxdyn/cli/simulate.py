@@ -19,6 +19,7 @@ from jaxdyn.cli.common import (
     vector,
 )
 from jaxdyn.constraints.assembly import assemble
+from jaxdyn.constraints.dynamics import RESULTS
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify import SampledTorque
 from jaxdyn.identify.excitation import FourierTorque, random_torque
@@ -176,8 +177,12 @@ def run(args: argparse.Namespace) -> int:
             view(scene, moving, shapes=solids, block=True)
     if not done.all():
         reached = np.asarray(solution.stats["time_reached"])[~done]
-        print(f"{np.sum(~done)} of {args.batch} motions stopped early, the first at t = {reached.min():.6g} s; "
-              "try a smaller --dt or --rtol, or a larger --max-steps")  # fmt: skip
+        first = int(np.flatnonzero(~done)[np.argmin(reached)])
+        reason = str(RESULTS[jax.tree.map(lambda x: x[first], solution.result)])
+        print(
+            f"{np.sum(~done)} of {args.batch} motions stopped early, the first at t = {reached.min():.6g} s: {reason}"
+        )
+        print("Try a smaller --dt or --rtol, or a larger --max-steps.")
     return int(not done.all())
 
 
