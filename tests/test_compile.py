@@ -793,10 +793,15 @@ def test_modes(monkeypatch):
     with jd.compilation("auto"):
         assert has_kernel()
     monkeypatch.setenv("JAXDYN_COMPILATION", "fast")
-    with pytest.raises(ValueError, match="environment's JAXDYN_COMPILATION is 'fast'; choose from 'auto', 'plain'"):
+    with pytest.raises(
+        ValueError, match="environment's JAXDYN_COMPILATION is 'fast'; choose from 'auto', 'general', 'plain'"
+    ):
         has_kernel()
     for wrong in ("native", ""):
-        with pytest.raises(ValueError, match=r"compilation: mode is .*'auto', 'plain'"), jd.compilation(wrong):
+        with (
+            pytest.raises(ValueError, match=r"compilation: mode is .*'auto', 'general', 'plain'"),
+            jd.compilation(wrong),
+        ):
             pass
 
 

@@ -42,6 +42,7 @@ def test_growth_of_known_distributions():
     assert_close(sizes[1], [1.0, 1.0, 1.0], 1e-12)
 
 
+@pytest.mark.slow
 def test_mixed_rows_count_the_holonomic_ones():
     """A knife edge and one integrable row in five coordinates: 3, 4, 4: of two rows one is holonomic."""
 

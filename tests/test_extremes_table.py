@@ -38,9 +38,10 @@ QUICK = {
     "turns": (BOTH, refused("coarse_start", ["float32"], "1e+03 turns", "1e+06 turns")),
     "planes": (("float32",), {}),
 }
+FAST = ("rates", "turns")
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in FAST)) for x in QUICK])
 def test_verdicts(name):
     dtypes, expected = QUICK[name]
     rows = CASES[name](dtypes, False)
@@ -152,6 +153,7 @@ def test_through_the_flat_position():
     assert found == {}
 
 
+@pytest.mark.slow
 def test_motion_passes_singular_positions_at_any_tolerance():
     """Where two branches of the constraints meet rounding must not choose one unseen, and steps must not creep up to it."""
     ts, tolerances = jnp.asarray([0.0, 0.5, 1.0]), 10.0 ** -jnp.linspace(8.0, 12.5, 32)

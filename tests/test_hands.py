@@ -121,6 +121,7 @@ def test_equations_of_any_hand_are_those_with_multipliers(hand):
         assert_close(pushed, found.force, 1e-11)
 
 
+@pytest.mark.slow
 def test_a_square_hand_is_its_own_object_dynamics():
     """With J_h square and regular nu is V, and both functions agree."""
     grasp, (q, v) = jd.scenes.hand_with_bar(), jd.scenes.hand_with_bar.start()
@@ -174,6 +175,7 @@ def test_forces_for_a_wrench():
     np.testing.assert_allclose(jd.grasp.joint_torques(grasp, q, at["lam"]), at["Jh"].T @ lam, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_hand_holds_its_ball_within_cones():
     """Least forces in the cones against weight, of a batch, with a gradient in mu; infeasible where friction is too small."""
     grasp, q, _, _ = gripped()

@@ -155,6 +155,7 @@ def test_linear_parameters_and_their_deviations_are_those_of_least_squares(oscil
     )
 
 
+@pytest.mark.slow
 def test_trajectories_with_noise_and_free_starts(oscillation):
     """The log's clock reaches the drive; starts that are fitted too take their noise out of the parameters."""
     log = oscillation

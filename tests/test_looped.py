@@ -71,7 +71,7 @@ def test_five_hundred_links(branching):
     assert_close(a, want, 1e-8)
 
 
-@pytest.mark.parametrize("links", [40, dynamics.MAX_BODIES + 1])
+@pytest.mark.parametrize("links", [pytest.param(40, marks=pytest.mark.slow), dynamics.MAX_BODIES + 1])
 @pytest.mark.parametrize("count", [1, 40])
 def test_long_chains(count, links):
     """With the most bodies of a kernel and more, against the matrix form; which way was taken."""

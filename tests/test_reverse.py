@@ -51,6 +51,7 @@ def test_derivatives_are_those_of_diffrax(options, monkeypatch):
         np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_without_kernels():
     options = {"stepsize": 0.05, "max_steps": 16}
     own = gradients("reverse", **options)

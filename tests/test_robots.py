@@ -17,7 +17,6 @@ FEW = {
     "ur5_robot.urdf": False,
     "kinova.urdf": False,
     "allegro_right_hand.urdf": False,
-    "solo12.urdf": True,
     "anymal.urdf": True,
 }
 # ur3.urdf is a xacro file without links, which Pinocchio refuses too; the links of these two have no mass, so that some of

@@ -10,11 +10,14 @@ Imports nothing of jaxdyn. Others import the names below, and no module of this 
 """
 
 from jaxdyn.compile.calls import compiled as compiled
+from jaxdyn.compile.calls import first_numbers as first_numbers
+from jaxdyn.compile.calls import specialized as specialized
 from jaxdyn.compile.flags import unless as unless
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
 from jaxdyn.compile.kernel import compute as compute
 from jaxdyn.compile.kernel import native as native
 from jaxdyn.compile.kernel import run as run
+from jaxdyn.compile.known import constant as constant
 from jaxdyn.compile.known import is_concrete as is_concrete
 from jaxdyn.compile.known import is_known as is_known
 from jaxdyn.compile.known import is_staged as is_staged

@@ -106,7 +106,9 @@ def compute(function: Callable, tree, *args, static: tuple = (), given: bool = F
     leaves = [x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) for x in leaves]
     if mode.current() != "plain" and target is not None:
         shapes = tuple((x.shape, x.dtype) for x in leaves)
-        found = _program(function, static, known, len(apart), structure, shapes, None, mode.MAX_OPERATIONS)
+        found = _program(
+            function, static, known, len(apart), structure, shapes, None, mode.MAX_OPERATIONS, False, False
+        )
         if not isinstance(found, str):
             try:
                 return jax.tree.unflatten(found[1], target.call(found[0], leaves))
@@ -131,7 +133,7 @@ def _name_of(function) -> str:
 
 
 @functools.lru_cache(maxsize=1024)
-def _program(function, static, known: Known, count: int, structure, shapes, tangent, most, calls=False, served=False):
+def _program(function, static, known: Known, count: int, structure, shapes, tangent, most, calls, served):
     """The program of a function and the structure of its results, or why there is none."""
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
     flat = _traced_once(function, static, known, count, structure)

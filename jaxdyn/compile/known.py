@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 
 
@@ -22,6 +23,11 @@ def is_staged() -> bool:
 def is_known(*trees) -> bool:
     """Whether no number is traced, nor would be when computed with."""
     return not is_staged() and is_concrete(*trees)
+
+
+def constant(tree):
+    """The tree without derivatives. Leaves that are known stay known, which an operation on them would hide within a trace."""
+    return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if isinstance(leaf, Tracer) else leaf, tree)
 
 
 class _Leaves:

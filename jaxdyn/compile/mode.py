@@ -1,4 +1,4 @@
-"""How functions are compiled: `compilation("auto")` by native kernels where they serve, `compilation("plain")` by JAX alone."""
+"""How functions are compiled: by native kernels where they serve, or, under `compilation("plain")`, by JAX alone."""
 
 import contextlib
 import contextvars
@@ -6,7 +6,7 @@ import logging
 import os
 
 logger = logging.getLogger("jaxdyn")
-MODES = ("auto", "plain")
+MODES = ("auto", "general", "plain")
 # LLVM takes some 50 microseconds an operation: three seconds.
 MAX_OPERATIONS = 60_000
 
@@ -30,8 +30,13 @@ def _checked(mode, what: str) -> str:
 def compilation(mode: str):
     """While functions are traced inside: how they become machine code.
 
-    **Arguments:** `mode`: "auto", native kernels on a CPU where a function is a program of single numbers, operations of JAX
-    elsewhere; "plain", operations of JAX everywhere, which compile and run slower and serve as a witness.
+    **Arguments:** `mode`:
+
+    - "auto": native kernels on a CPU where a function is a program of single numbers, operations of JAX elsewhere. `simulate` and
+      `assemble`, called outside of `jax.jit`, compile the numbers of the first scene of its shape in, whose zeros and ones
+      then cost nothing; all other scenes of that shape share a second program that takes their numbers as inputs.
+    - "general": the same with that second program for all of them.
+    - "plain": operations of JAX everywhere, which compile and run slower and serve as a witness.
 
     The mode counts when a function is traced: what `jax.jit` has compiled stays as it is. Without this context the environment
     variable JAXDYN_COMPILATION decides, and without that, "auto".

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import along, compiled, compute, implicit, is_concrete, is_staged, run
+from jaxdyn.compile import along, compute, constant, first_numbers, implicit, is_concrete, is_staged, run, specialized
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import RESULTS, Outcome, correction, right_inverse, whitened_rows
 from jaxdyn.constraints.loops import lock_joint
@@ -118,7 +118,7 @@ def _from_elsewhere(found: Assembly, guesses: int, assembled: Callable, scene: S
     return found
 
 
-@compiled
+@specialized
 def _assemble(held, q, v, t, rank_tol, scene):
     """The scene `held` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
     if holonomic_rows(layout(held)).size:
@@ -148,7 +148,7 @@ def _closed(scene, q, t, rank_tol):
         return _newton(scene, _nearest(scene, q, t, rank_tol), t, rank_tol)
 
     def differentiable(scene, q, t):
-        fixed, guess, frozen = lax.stop_gradient((scene, q, t))
+        fixed, guess, frozen = constant((scene, q, t))
         place = lax.stop_gradient(solve(fixed, guess, frozen))
         e = difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
         moved = displace(scene.system, q, _stationary(scene, q, t, e, rank_tol))
@@ -294,7 +294,9 @@ def _residuals_and_limits(scene, q, v, t, relative):
 
 def start_evidence(scene: Scene, q, v, t, relative: float) -> tuple[np.ndarray, float, int]:
     """Largest residuals (2,), `openness`, and the rank of the rows at a concrete state."""
-    bare, given = Scene(scene.system, scene.constraints), not is_staged()
+    bare = Scene(scene.system, scene.constraints)
+    first = None if is_staged() else first_numbers(bare)
+    bare, given = (bare, not is_staged()) if first is None else (first(()), False)
     _, Y = compute(whitened_rows, bare, q, t, given=given)
     sizes = np.linalg.svd(Y, compute_uv=False)
     rank = int(np.sum(sizes > tolerance(None, Y) * sizes[0])) if sizes.size else 0

@@ -109,7 +109,9 @@ def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
             points[parent].append(home[i, :3, 3])
     for constraint in pairs(scene):
         # Of a contact frame A lies on a surface, which no rod leads to.
-        for body, pose in constraint.ends() if isinstance(constraint, Loop | Distance) else constraint.ends()[1:]:
+        for body, pose in (
+            constraint.ends() if isinstance(constraint, Loop | Distance | RollingContact) else constraint.ends()[1:]
+        ):
             if body is not None:
                 index = frame_index(model, body)
                 offset = np.asarray(model.frame_poses[index], float) @ np.asarray(pose, float)

@@ -125,7 +125,7 @@ def as_xarray(solution: Any, scene: Any) -> Any:
         if not signal.names:
             variables[signal.key] = ((*batch, "t"), signal.values, {"units": signal.units[0]})
             continue
-        axis = axes.get(signal.key, signal.key)
+        axis = axes.get(signal.key, f"{signal.key}_entry")
         coordinates[axis] = (axis, list(signal.names))
         variables[signal.key] = ((*batch, "t", axis), signal.values, {"units": list(signal.units)})
     for name, pose in solution.poses.items():
