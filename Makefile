@@ -11,7 +11,7 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help venv demo test test-all lint types bench notebooks clean
+.PHONY: help venv demo test test-all lint types bench docs notebooks wheel clean
 
 help:  ## print the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
@@ -37,11 +37,18 @@ types: $(VENV)/.installed-dev  ## static types
 bench: $(VENV)/.installed-bench  ## dynamics against peers, into out/; the other benchmarks: benchmarks/README.md
 	$(BIN)/python -m benchmarks
 
+docs: $(VENV)/.installed-docs  ## the site, into out/site; pictures of the gallery that are missing are made first
+	$(BIN)/python -m benchmarks.gallery
+	$(BIN)/zensical build -f mkdocs.yml --strict
+
+wheel: $(VENV)/.installed-test  ## build the wheel, install it elsewhere and try it without the repository
+	$(BIN)/python -m benchmarks.wheel
+
 notebooks: $(VENV)/.installed-notebook  ## run the notebooks, into out/notebooks
 	$(BIN)/python -m nbconvert --to notebook --execute --output-dir out/notebooks notebooks/*.ipynb
 
 clean:  ## remove outputs and caches, keep .venv
-	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf out build dist docs/gallery .pytest_cache .ruff_cache .hypothesis
 	find jaxdyn tests $(wildcard benchmarks notebooks) -name __pycache__ -prune -exec rm -rf {} +
 
 # An interpreter without pip is what a failed set-up leaves behind, so it is removed.

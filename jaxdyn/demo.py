@@ -4,6 +4,7 @@ No file is needed: the arm is the KUKA iiwa of `jaxdyn.robots`. Two figures are 
 """
 
 import argparse
+import importlib.util
 import time
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,8 @@ def main(argv=None) -> dict[str, float]:
     parser.add_argument("--steps", type=int, default=120, help="iterations of the fit")
     parser.add_argument("--out", type=Path, default=Path("out"))
     options = parser.parse_args(argv)
+    if importlib.util.find_spec("matplotlib") is None:
+        parser.error("the demo draws figures, which need matplotlib: pip install jaxdyn[plot]")
     jax.config.update("jax_enable_x64", True)
     began = time.perf_counter()
     options.out.mkdir(parents=True, exist_ok=True)

@@ -51,6 +51,11 @@ def columns_of(path):
     return dict(zip(rows[0], np.array(rows[1:], float).T, strict=True))
 
 
+def arrays_of(path):
+    with np.load(path) as archive:
+        return dict(archive)
+
+
 def test_help_names_units_columns_and_examples(capsys):
     for command, words in {
         "info": ("rad", "kg", "--repair"),
@@ -138,7 +143,7 @@ def test_simulate_a_batch_with_seed_and_plot(arm, tmp_path, capsys):
     for name, seed in (("a.npz", 1), ("b.npz", 1), ("c.npz", 2)):
         plot = ["--plot", str(tmp_path / "motion.png")] if name == "a.npz" else []
         assert main([*args, "--seed", str(seed), "--out", str(tmp_path / name), *plot]) == 0
-    a, b, c = (np.load(tmp_path / name) for name in ("a.npz", "b.npz", "c.npz"))
+    a, b, c = (arrays_of(tmp_path / name) for name in ("a.npz", "b.npz", "c.npz"))
     assert a["q"].shape == (3, 11, 3)
     assert a["energy"].shape == (3, 11)
     np.testing.assert_array_equal(a["tau"], b["tau"])
@@ -301,3 +306,65 @@ def test_simulate_writes_a_page_that_plays(arm, tmp_path, capsys):
     assert main(args) == 0
     assert f"Wrote {page}." in capsys.readouterr().out
     assert 300_000 < page.stat().st_size <= 2_000_000
+
+
+LOOP = """<mujoco><compiler angle="radian"/><worldbody>
+  <body name="crank"><joint name="drive" axis="0 0 1" damping="0.01"/><inertial pos=".1 0 0" mass="1" diaginertia=".01 .01 .01"/>
+    <body name="coupler" pos=".2 0 0"><joint name="knee" axis="0 0 1"/><inertial pos=".2 0 0" mass="1" diaginertia=".01 .01 .01"/>
+  </body></body>
+  <body name="rocker" pos=".5 0 0"><joint name="swing" axis="0 0 1"/><inertial pos=".2 0 0" mass="1" diaginertia=".01 .01 .01"/>
+  <geom type="sphere" size=".01"/></body>
+</worldbody>
+<equality><connect body1="coupler" body2="rocker" anchor="{anchor} 0 0"/></equality>
+<actuator><motor name="motor" joint="drive"/></actuator>
+<keyframe><key name="open" qpos="0.3 0.6 1.4"/></keyframe></mujoco>"""
+
+
+@pytest.fixture
+def four_bar(tmp_path):
+    path = tmp_path / "four_bar.xml"
+    path.write_text(LOOP.replace("{anchor}", "0.5"))
+    return path
+
+
+def test_info_of_a_file_with_a_loop(four_bar, capsys):
+    assert main(["info", str(four_bar)]) == 0
+    text = capsys.readouterr().out
+    assert "3 moving bodies, 3 degrees of freedom" in text
+    assert "They close: jd.assemble finds a configuration from the reference." in text
+    assert "Degrees of freedom after constraints: 1 of 3 (2 in the singular position of the reference)" in text
+    assert "Actuators: motor" in text and "States that the file names: reference, open" in text
+    with pytest.warns(jd.NotTakenWarning):
+        scene = jd.load(four_bar)
+    line = next(line for line in text.splitlines() if scene.constraints[0].name in line)
+    gap = np.abs(scene.constraints[0].position(scene.system, scene.starts["open"].q, 0.0)).max()
+    assert f"{gap:.2g}" in line.split()
+    assert "Not taken from the file:" in text and "contact" in text
+    assert main(["info", str(four_bar), "--repair", "x.urdf"]) == 2
+    assert "only URDF files can be repaired" in capsys.readouterr().err
+    assert main(["info", str(four_bar), "--lock", "knee"]) == 2
+    assert "--lock: joints of MJCF files cannot be held" in capsys.readouterr().err
+
+
+def test_info_counts_couplings(panda, capsys):
+    assert main(["info", str(panda)]) == 0
+    text = capsys.readouterr().out
+    assert "Degrees of freedom after constraints: 8 of 9" in text and "gear" in text
+
+
+def test_simulate_a_file_with_a_loop(four_bar, tmp_path, capsys):
+    """From its keyframe, closed at the start, and closed to its end; a start that the file does not name is refused."""
+    out = tmp_path / "motion.npz"
+    args = ["simulate", str(four_bar), "--duration", "0.2", "--sample", "0.05", "--out", str(out)]
+    with pytest.warns(jd.NotTakenWarning):
+        assert main([*args, "--start", "open"]) == 0
+    text = capsys.readouterr().out
+    assert "loops closed at the start by moving joints by up to" in text
+    assert float(text.split("at most ")[1].split(" J")[0]) < 1e-7
+    with pytest.warns(jd.NotTakenWarning):
+        scene = jd.load(four_bar)
+    gaps = [np.abs(scene.constraints[0].position(scene.system, jnp.asarray(q), 0.0)).max() for q in arrays_of(out)["q"]]
+    assert max(gaps) < 1e-10
+    with pytest.warns(jd.NotTakenWarning):
+        assert main([*args, "--start", "home"]) == 2
+    assert "--start is 'home'; the file names reference, open" in capsys.readouterr().err

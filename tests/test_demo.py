@@ -1,9 +1,19 @@
 """The demo at a small size: it runs without files, writes its figures, and its numbers improve."""
 
+import importlib.util
+
 import jax
 import pytest
 
 from jaxdyn import demo
+
+
+def test_demo_without_matplotlib_says_so_before_the_work(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as stop:
+        demo.main(["--out", str(tmp_path / "out")])
+    assert stop.value.code == 2 and not (tmp_path / "out").exists()
+    assert "pip install jaxdyn[plot]" in capsys.readouterr().err
 
 
 @pytest.mark.slow

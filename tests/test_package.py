@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import jaxdyn
+from jaxdyn.compile.versions import warn_of_version
 
 PACKAGE = Path(jaxdyn.__file__).parent
 
@@ -201,11 +202,11 @@ def test_only_programs_switch_to_float64():
 
 
 def test_import_is_light_and_leaves_jax_unconfigured():
-    """In a fresh interpreter: no plotting or scipy, and no array made before the user chooses devices and dtype."""
+    """In a fresh interpreter: no plotting, optax or scipy, and no array made before the user chooses devices and dtype."""
     program = """
 import sys
 import jaxdyn
-heavy = {"matplotlib", "mujoco", "scipy", "trimesh", "viser", "xarray"} & sys.modules.keys()
+heavy = {"matplotlib", "mujoco", "optax", "scipy", "trimesh", "viser", "xarray"} & sys.modules.keys()
 assert not heavy, f"importing jaxdyn imports {heavy}"
 import jax
 try:
@@ -224,6 +225,15 @@ def test_excluded_jax_is_neither_installed_nor_allowed():
     pins = [line for line in project["dependencies"] if re.match(r"jax(lib)?[^a-z]", line)]
     assert len(pins) == 2
     assert all("!=0.10.2" in line for line in pins)
+
+
+def test_a_jax_newer_than_those_tested_gives_a_warning(recwarn):
+    warn_of_version()
+    assert not recwarn.list, "the installed jax is among those tested"
+    with pytest.warns(
+        UserWarning, match=r"tested with jax up to 0\.10, this is jax 0\.11\.0: .*pip install 'jax<0\.11'"
+    ):
+        warn_of_version((0, 11, 0))
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float64, 1e-14), (jnp.float32, 1e-5)])

@@ -9,13 +9,14 @@ import pytest
 from pages import ROOT, anchors, links, pages, run
 
 import jaxdyn as jd
+from benchmarks.gallery import SCENES
 
 
 def test_links_of_all_pages_lead_somewhere():
     wrong = []
     for page in pages():
         for target in links(page.read_text()):
-            if re.match(r"[a-z]+:", target):
+            if re.match(r"[a-z]+:", target) or target.startswith("gallery/"):  # the gallery's pictures are made
                 continue
             path, _, anchor = unquote(target).partition("#")
             other = (page.parent / path).resolve() if path else page
@@ -30,6 +31,22 @@ def test_every_page_is_in_the_menu_of_the_site():
     text = (ROOT / "mkdocs.yml").read_text()
     missing = [page.name for page in (ROOT / "docs").glob("*.md") if f": {page.name}" not in text]
     assert not missing, missing
+
+
+def test_gallery_shows_what_its_command_makes():
+    shown = re.findall(r"\(gallery/(\w+)\.gif\)", (ROOT / "docs" / "gallery.md").read_text())
+    assert shown == list(SCENES) and set(shown) <= set(jd.scenes.names())
+
+
+def test_reference_has_every_export():
+    """Each by its name, on one of the pages below docs/reference."""
+    listed = re.findall(
+        r"^::: jaxdyn\.(.*)$", "\n".join(p.read_text() for p in (ROOT / "docs/reference").glob("*.md")), re.M
+    )
+    named = {name.removeprefix("jd.") for name in exports()}
+    recursions = {"rnea", "crba", "aba", "mass_matrix_sqrt"}  # listed where they are written
+    missing = named - set(listed) - recursions
+    assert not missing and recursions <= {name.rpartition(".")[2] for name in listed}, sorted(missing)
 
 
 # Rooms of the package, which Python leaves in its namespace, are none of these.

@@ -1,4 +1,4 @@
-"""The examples of the README and of the page on systems run as they are printed."""
+"""The examples of the README and of pages beside it run as they are printed."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,8 +6,20 @@ import pytest
 from pages import run
 
 
-def test_examples_of_the_readme_run():
-    names = run("README.md")
+def test_example_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = run("README.md", least=1)
+    assert (tmp_path / "four_bar.png").stat().st_size > 10_000
+    # Save points stand between steps: the energy (84 J) is that of the dense output.
+    assert np.abs(names["motion"].constraint_residual).max() < 1e-10 and np.ptp(names["motion"].energy) < 1e-6 * 84
+    assert names["weights"].shape == (100, 3) and names["slopes"].shape == (100, 3, 3, 10)
+    # The weight is linear in the ten numbers of each body.
+    inertias = names["scene"].system.inertias
+    np.testing.assert_allclose(jnp.einsum("ncbk,bk->nc", names["slopes"], inertias), names["weights"], atol=1e-10)
+
+
+def test_examples_of_the_first_steps_run():
+    names = run("docs/start.md")
     assert np.abs(names["a"]).max() < 1e-10, "gravity compensation holds the arm still"
     assert names["accelerations"].shape == (1000, 7)
     assert np.isfinite(names["gradient"]).all()

@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command with the arguments given (those of the process by default) and return the exit status."""
     parser = argparse.ArgumentParser(
         prog="jaxdyn",
-        description="Rigid-body dynamics of robots: look at a URDF, simulate it, identify its inertias from a log; and "
+        description="Rigid-body dynamics of robots: look at a file, simulate it, identify its inertias from a log; and "
         "report error against run time.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -7,10 +7,13 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
-from jaxdyn.io import load_urdf
+from jaxdyn.io import LoadedScene, load_urdf
+from jaxdyn.io.load import described, format_of, load, scene_of_urdf
 from jaxdyn.model.arguments import as_path
+from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.text_table import short as short
 from jaxdyn.model.text_table import table as table
@@ -20,35 +23,66 @@ from jaxdyn.model.tree import Model
 UNITS = {"revolute": "rad", "continuous": "rad", "helical": "rad", "prismatic": "m"}
 
 
+FILE = "a URDF, MJCF or SDF file (expand xacro first), or a name of robot_descriptions such as go2_description"
+
+
 def add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Options that decide which mechanism a URDF file becomes."""
+    """Options that decide which mechanism a file becomes."""
     group = parser.add_argument_group("model")
     group.add_argument("--floating-base", action="store_true", help="let the root link move freely (6 more freedoms)")
+    group.add_argument("--fixed-base", action="store_true", help="fix the root links of an SDF file to the world")
     group.add_argument(
         "--lock",
         nargs="+",
         action="extend",
         default=[],
         metavar="JOINT[=VALUE]",
-        help="hold these joints, at neutral or at a value (rad, m)",
+        help="hold these joints of a URDF file, at neutral or at a value (rad, m)",
     )
     group.add_argument(
         "--gravity",
         nargs=3,
         type=float,
-        default=(0.0, 0.0, -9.81),
         metavar=("X", "Y", "Z"),
-        help="in axes of the root link, m/s^2 (default: 0 0 -9.81)",
+        help="m/s^2 (default: as the file says, of a URDF 0 0 -9.81 in axes of the root link)",
     )
 
 
 def load_model(path: str, args: argparse.Namespace) -> Model:
     """The model of a URDF file under the options of `add_model_options`."""
+    return _movable(_urdf(path, args, "ignore"), path)
+
+
+def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathlib.Path]:
+    """The scene of a file of any format, or of a robot by name, under the options of `add_model_options`; and its file."""
+    file = as_path(path, "file")
+    if not file.suffix and not file.exists():
+        file = described(path)
+    kind = format_of(file)
+    if args.floating_base and args.fixed_base:
+        raise ValueError("--floating-base and --fixed-base contradict each other; give one of them")
+    if kind == "urdf":
+        return scene_of_urdf(_movable(_urdf(str(file), args, "couple"), path)), file
+    if args.lock:
+        raise ValueError(f"--lock: joints of {kind.upper()} files cannot be held; change the file, or use a URDF")
+    given = False if args.fixed_base else True if args.floating_base else None
+    scene = load(file, floating_base=given)
+    _movable(scene.system, path)
+    if args.gravity is None:
+        return scene, file
+    return eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity))), file
+
+
+def _urdf(path: str, args: argparse.Namespace, mimic: str) -> Model:
     lock: dict[str, Any] = {}
     for item in args.lock:
         name, equals, text = item.partition("=")
         lock[name] = number(text, f"--lock {item}") if equals else None
-    model = load_urdf(path, floating_base=args.floating_base, lock=lock, gravity=tuple(args.gravity))
+    gravity = GRAVITY if args.gravity is None else tuple(args.gravity)
+    return load_urdf(path, floating_base=args.floating_base, lock=lock, mimic=mimic, gravity=gravity)
+
+
+def _movable(model: Model, path: str) -> Model:
     if model.nv == 0:
         raise ValueError(f"{path}: no joint is free to move; lock fewer joints or use --floating-base")
     return model

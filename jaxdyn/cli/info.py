@@ -1,21 +1,28 @@
-"""`jaxdyn info`: what a URDF file describes, and what is wrong with it."""
+"""`jaxdyn info`: what a file describes, what is wrong with it, and what of it is not taken."""
 
 import argparse
 import collections
+import contextlib
+import warnings
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.cli.common import UNITS, add_model_options, load_model, output_path, short, table
-from jaxdyn.io import save_urdf, urdf_inertia_report
+from jaxdyn.cli.common import FILE, UNITS, add_model_options, load_scene, output_path, short, table
+from jaxdyn.constraints.assembly import assemble
+from jaxdyn.constraints.mobility import degrees_of_freedom
+from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
+from jaxdyn.io.load import format_of
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.builder import inertia_report, repair_inertias
 from jaxdyn.model.joints import KINDS
-from jaxdyn.model.tree import Model
+from jaxdyn.model.tree import Model, integrate
 
-HELP = "bodies, joints, limits, frames and faulty inertias of a URDF file"
+HELP = "bodies, joints, limits, loops, frames and faulty inertias of a URDF, MJCF or SDF file"
 DESCRIPTION = """\
-Print what a URDF file describes: bodies with mass, joints with axes and limits in the order of q and v,
-frames, links whose inertia no solid body can have, and what the file holds that is not used.
+Print what a file describes: bodies with mass, joints with axes and limits in the order of q and v, loops and
+couplings with their gaps, degrees of freedom that these leave, frames, actuators, states that the file names,
+bodies whose inertia no solid can have, and what the file holds that is not taken.
 """
 EPILOG = """\
 examples:
@@ -23,6 +30,8 @@ examples:
   jaxdyn info panda.urdf --lock panda_finger_joint1 panda_finger_joint2=0.02
   jaxdyn info humanoid.urdf --floating-base
   jaxdyn info hand.urdf --repair hand_repaired.urdf
+  jaxdyn info cassie.sdf --fixed-base
+  jaxdyn info go2_description
 
 Links on fixed joints are merged into the body that carries them; they stay available as frames.
 Units: kg, m, rad, rad/s or m/s, N m or N, kg m^2.
@@ -31,24 +40,31 @@ Units: kg, m, rad, rad/s or m/s, N m or N, kg m^2.
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("urdf", help="the URDF file (expand xacro first; meshes are not read)")
+    parser.add_argument("file", help=FILE)
     add_model_options(parser)
     parser.add_argument(
         "--repair",
         metavar="OUT.urdf",
-        help="write the model with faulty inertias replaced by physical ones close to them (merged links stay merged)",
+        help="write a URDF with faulty inertias replaced by physical ones close to them (merged links stay merged)",
     )
 
 
 def run(args: argparse.Namespace) -> None:
     """Print the report, and write the repaired model if asked."""
     out = output_path(args.repair, (".urdf",), "--repair")
-    model = load_model(args.urdf, args)
-    link_problems = urdf_inertia_report(args.urdf)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotTakenWarning)  # what it names is printed below
+        scene, file = load_scene(args.file, args)
+    model, is_urdf = scene.system, format_of(file) == "urdf"
+    if out is not None and not is_urdf:
+        raise ValueError(f"--repair {args.repair}: only URDF files can be repaired; change the inertias in {file}")
     body_problems = inertia_report(model)
-    print(describe(model, args.urdf))
-    print(_problems(link_problems, body_problems))
-    print(_unused(args.urdf))
+    print(describe(model, args.file))
+    print(constraint_lines(scene))
+    print(_problems(urdf_inertia_report(file), body_problems) if is_urdf else _body_problems(body_problems))
+    print(
+        _unused(str(file)) if is_urdf else "\n".join(["\nNot taken from the file:", *(scene.not_taken or ["nothing"])])
+    )
     if out is not None:
         repaired = repair_inertias(model)
         save_urdf(repaired, out)
@@ -73,9 +89,51 @@ def describe(model: Model, source: str) -> str:
         "",
         _frames(model),
     ]
-    if model.coupling_values is not None:
-        lines.append(f"Couplings: {len(model.topology.couplings)}")
     return "\n".join(lines)
+
+
+def constraint_lines(scene: LoadedScene) -> str:
+    """Loops and couplings with their gaps at every state that the file names, the freedom that they leave; drives."""
+    lines, q = [""], scene.starts["reference"].q
+    if scene.constraints:
+        rows = []
+        for one in scene.constraints:
+            held, slips = one.sizes(scene.system, q.dtype)
+            gaps = [_gap(one, scene, start.q) for start in scene.starts.values()]
+            rows.append([one.name, type(one).__name__.lower(), str(held + slips), *gaps])
+        heads = ["constraint", "kind", "rows", *(f"gap at {name!r}" for name in list(scene.starts)[:4])]
+        lines += [
+            "Loops and couplings such as <mimic>, and how far each is open (m or rad)",
+            table(heads, [r[: len(heads)] for r in rows]),
+        ]
+        try:
+            q = assemble(scene, q).q
+            lines.append("They close: jd.assemble finds a configuration from the reference.")
+        except ValueError as error:
+            lines.append(f"They do not close from the reference: {error}.")
+    freedom, beside = degrees_of_freedom(scene, q), _freedom_beside(scene, q)
+    here = "" if beside == freedom else f" ({freedom} in the singular position of the reference)"
+    lines.append(f"Degrees of freedom after constraints: {beside} of {scene.nv}{here}")
+    if len(scene.starts) > 1:
+        lines.append(f"States that the file names: {', '.join(scene.starts)}")
+    if scene.actuators is not None:
+        lines.append(f"Actuators: {', '.join(scene.actuators.names)}")
+    return "\n".join(lines)
+
+
+def _freedom_beside(scene: LoadedScene, q) -> int:
+    """Degrees of freedom at the least of a few closed configurations around q: files like to put linkages flat."""
+    found, chance = [degrees_of_freedom(scene, q)], np.random.default_rng(0)
+    for _ in range(2 if scene.constraints else 0):
+        step = jnp.asarray(chance.uniform(-0.1, 0.1, scene.nv), q.dtype)
+        with contextlib.suppress(ValueError):  # not every configuration near by can be closed
+            found.append(degrees_of_freedom(scene, assemble(scene, integrate(scene.system, q, step), guesses=1).q))
+    return int(min(found))
+
+
+def _gap(constraint, scene: LoadedScene, q) -> str:
+    residual = constraint.position(scene.system, q, 0.0)
+    return "-" if residual is None else f"{float(np.abs(np.asarray(residual)).max(initial=0.0)):.2g}"
 
 
 def _joint_table(model: Model) -> str:
@@ -139,6 +197,13 @@ def _problems(links: list[tuple[str, str]], bodies: list[tuple[str, str]]) -> st
     return text
 
 
+def _body_problems(bodies: list[tuple[str, str]]) -> str:
+    if not bodies:
+        return "\nInertias: every body that moves has a physical inertia."
+    rows = table(("body", "problem"), bodies)
+    return f"\nInertia problems ({len(bodies)}); jd.repair_inertias(scene.system) gives physical ones\n{rows}"
+
+
 def _listed(names: list[str]) -> str:
     return f": {', '.join(names)}" if names else ""
 
@@ -150,8 +215,7 @@ def _unused(path: str) -> str:
         if element.tag not in ("link", "joint"):
             counts[element.tag] += 1
             continue
-        used = {"inertial", "origin", "parent", "child", "axis", "limit", "dynamics"}
+        used = {"inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic"}
         counts.update(part.tag for part in element if part.tag not in used)
     names = ", ".join(f"{count} <{tag}>" for tag, count in sorted(counts.items()))
-    follow = " Joints with <mimic> are free joints here." if counts["mimic"] else ""
-    return f"\nIn the file and not used: {names or 'nothing'}.{follow}"
+    return f"\nIn the file and not used: {names or 'nothing'}."

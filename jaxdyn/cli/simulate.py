@@ -1,4 +1,4 @@
-"""`jaxdyn simulate`: motions of a URDF robot under chosen torques, to a file and a picture."""
+"""`jaxdyn simulate`: motions of a robot under chosen torques, to a file and a picture."""
 
 import argparse
 import csv
@@ -10,26 +10,31 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.cli.common import (
+    FILE,
     Stopwatch,
     add_model_options,
-    load_model,
+    load_scene,
     output_path,
     per_coordinate,
     vector,
 )
+from jaxdyn.constraints.assembly import assemble
+from jaxdyn.constraints.dynamics import RESULTS
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify import SampledTorque
 from jaxdyn.identify.excitation import FourierTorque, random_torque
+from jaxdyn.io import LoadedScene
 from jaxdyn.io.logs import read_log
-from jaxdyn.model.tree import Model, integrate, neutral
+from jaxdyn.model.tree import Model, integrate
 from jaxdyn.pictures import save_html, shapes, view
 from jaxdyn.simulation.run import Solution, simulate
 from jaxdyn.systems.scene import Scene
 
-HELP = "simulate a URDF robot, one motion or a batch, and write or plot the motions"
+HELP = "simulate a robot of a URDF, MJCF or SDF file, one motion or a batch, and write, plot or show the motions"
 DESCRIPTION = """\
-Simulate the robot from a given state under chosen joint torques. Energy minus work is printed as a check
-of the integration: it has to be tiny.
+Simulate the robot from a given state under chosen joint torques. Loops and couplings of the file are closed at the
+start and stay closed; its springs, damping and friction act. Energy minus work is printed as a check of the
+integration: it has to be tiny.
 """
 EPILOG = """\
 examples:
@@ -38,6 +43,7 @@ examples:
   jaxdyn simulate panda.urdf --batch 256 --torque gravity+random --torque-size 2 --seed 1 --out motions.npz
   jaxdyn simulate panda.urdf --torque log.csv --out replay.csv
   jaxdyn simulate panda.urdf --torque gravity+random --view
+  jaxdyn simulate robot.xml --start home --duration 1 --html motion.html
 
 torques (--torque):
   zero             none: the robot falls
@@ -58,7 +64,7 @@ _KINDS = ("zero", "gravity", "random", "gravity+random")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("urdf", help="the URDF file")
+    parser.add_argument("file", help=FILE)
     add_model_options(parser)
     motion = parser.add_argument_group("motion")
     motion.add_argument(
@@ -67,9 +73,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion.add_argument(
         "--sample", type=float, default=0.01, metavar="S", help="time between output rows, s (default: 0.01)"
     )
-    motion.add_argument("--q0", nargs="+", metavar="Q", help="start: all of q, or JOINT=VALUE (default: zero; rad, m)")
+    motion.add_argument("--start", default="reference", metavar="NAME", help="a state that the file names (a keyframe)")
     motion.add_argument(
-        "--v0", nargs="+", metavar="V", help="start velocity, in the same way (default: zero; rad/s, m/s)"
+        "--q0", nargs="+", metavar="Q", help="start: all of q, or JOINT=VALUE to change some of it (rad, m)"
+    )
+    motion.add_argument(
+        "--v0", nargs="+", metavar="V", help="start velocity, in the same way (default: that of the start; rad/s, m/s)"
     )
     motion.add_argument("--batch", type=int, default=1, metavar="N", help="number of motions (default: 1)")
     motion.add_argument(
@@ -129,15 +138,16 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--batch is {args.batch}; give at least 1")
     if args.dt is not None and not args.dt > 0:
         raise ValueError(f"--dt is {args.dt}; give a positive step, s")
-    model = load_model(args.urdf, args)
-    control, q0, v0, duration = _excitation(model, args)
+    loaded, file = load_scene(args.file, args)
+    model = loaded.system
+    control, q0, v0, duration = _excitation(loaded, args)
     if args.duration is not None:
         duration = args.duration
     if not (duration > 0 and 0 < args.sample <= duration):
         raise ValueError(f"--duration is {duration} s, --sample {args.sample} s; give 0 < sample <= duration")
     ts = np.linspace(0.0, duration, round(duration / args.sample) + 1)
-    starts = _starts(model, q0, args)
-    scene = Scene(model, forces=_joint_forces(model, args))
+    scene = Scene(model, loaded.constraints, _forces(loaded, args))
+    starts, speeds = _starts(scene, q0, v0, args)
     steps = {"stepsize": args.dt} if args.dt is not None else {"rtol": args.rtol, "atol": args.rtol}
     if args.max_steps is not None:
         steps["max_steps"] = args.max_steps
@@ -145,9 +155,9 @@ def run(args: argparse.Namespace) -> int:
     watch = Stopwatch()
     carry = model if args.torque.startswith("gravity") else None
     steps["progress"] = args.progress
-    solution, tau = _simulate(scene, control, carry, starts, jnp.asarray(v0), ts, steps)
+    solution, tau = _simulate(scene, control, carry, starts, speeds, ts, steps)
     done = np.asarray(solution.success)
-    print(f"{args.urdf}: {args.batch} motion{'s' * (args.batch > 1)} of {duration:g} s, {len(ts)} rows each, in {watch} "
+    print(f"{args.file}: {args.batch} motion{'s' * (args.batch > 1)} of {duration:g} s, {len(ts)} rows each, in {watch} "
           "(compilation included)")  # fmt: skip
     _summarise(model, solution, done)
     if out is not None:
@@ -159,7 +169,7 @@ def run(args: argparse.Namespace) -> int:
         motion_figure(model, ts, solution.q, solution.v, tau).savefig(plot)
         print(f"Wrote {plot}.")
     if page is not None or args.view:
-        solids, moving = shapes(args.urdf), eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
+        solids, moving = shapes(file), eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
         if page is not None:
             save_html(page, scene, moving, shapes=solids)
             print(f"Wrote {page}.")
@@ -167,14 +177,21 @@ def run(args: argparse.Namespace) -> int:
             view(scene, moving, shapes=solids, block=True)
     if not done.all():
         reached = np.asarray(solution.stats["time_reached"])[~done]
-        print(f"{np.sum(~done)} of {args.batch} motions stopped early, the first at t = {reached.min():.6g} s; "
-              "try a smaller --dt or --rtol, or a larger --max-steps")  # fmt: skip
+        first = int(np.flatnonzero(~done)[np.argmin(reached)])
+        reason = str(RESULTS[jax.tree.map(lambda x: x[first], solution.result)])
+        print(
+            f"{np.sum(~done)} of {args.batch} motions stopped early, the first at t = {reached.min():.6g} s: {reason}"
+        )
+        print("Try a smaller --dt or --rtol, or a larger --max-steps.")
     return int(not done.all())
 
 
-def _excitation(model: Model, args):
+def _excitation(scene: LoadedScene, args):
     """Control (with a leading axis of motions in its leaves), start and duration."""
-    q0, v0, duration = np.asarray(neutral(model)), np.zeros(model.nv), 2.0
+    if args.start not in scene.starts:
+        raise ValueError(f"--start is {args.start!r}; the file names {', '.join(scene.starts)}")
+    model, start = scene.system, scene.starts[args.start]
+    q0, v0, duration = np.asarray(start.q), np.asarray(start.v), 2.0
     size = _torque_size(model, args)
     if args.torque in _KINDS:
         random = size if "random" in args.torque else 0 * size
@@ -206,41 +223,48 @@ def _torque_size(model: Model, args) -> jax.Array:
     return jnp.asarray(np.where(np.isfinite(limit) & (limit > 0), 0.01 * limit, 1.0))
 
 
-def _starts(model: Model, q0, args) -> jax.Array:
-    away = args.spread * jax.random.normal(jax.random.key(args.seed + 1), (args.batch, model.nv))
-    return jax.vmap(lambda step: integrate(model, jnp.asarray(q0), step))(away)
+def _starts(scene: Scene, q0, v0, args) -> tuple[jax.Array, jax.Array]:
+    """Positions (n, nq) and velocities (n, nv) at which the motions start, on the constraints."""
+    away = args.spread * jax.random.normal(jax.random.key(args.seed + 1), (args.batch, scene.nv))
+    starts = jax.vmap(lambda step: integrate(scene.system, jnp.asarray(q0), step))(away)
+    speeds = jnp.broadcast_to(jnp.asarray(v0), (args.batch, scene.nv))
+    if not scene.constraints:
+        return starts, speeds
+    closed = [assemble(scene, q, v) for q, v in zip(starts, speeds, strict=True)]
+    moved = max(float(jnp.abs(x.q - q).max()) for x, q in zip(closed, starts, strict=True))
+    if moved > 1e-9:
+        print(f"loops closed at the start by moving joints by up to {moved:.3g} (rad, m)")
+    return jnp.stack([x.q for x in closed]), jnp.stack([x.v for x in closed])
 
 
-def _joint_forces(model: Model, args) -> list:
-    forces = []
-    for option, leaf, force in (
-        ("damping", model.damping, JointDamping),
-        ("friction", model.friction, CoulombFriction),
-    ):
-        given = getattr(args, option)
-        values = leaf if given is None else per_coordinate(model, given, f"--{option}")
-        if values is not None and np.any(np.asarray(values) < 0):
-            raise ValueError(f"--{option} is {np.asarray(values).tolist()}; it must not be negative")
-        if values is not None and np.any(np.asarray(values) != 0):
-            forces.append(force(values))
+def _forces(scene: LoadedScene, args) -> list:
+    """The file's forces, its joints' damping and friction replaced where options say so."""
+    forces = list(scene.forces)
+    for option, force in (("damping", JointDamping), ("friction", CoulombFriction)):
+        if (given := getattr(args, option)) is None:
+            continue
+        values = per_coordinate(scene.system, given, f"--{option}")
+        if np.any(values < 0):
+            raise ValueError(f"--{option} is {values.tolist()}; it must not be negative")
+        forces = [one for one in forces if not isinstance(one, force)] + ([force(values)] if values.any() else [])
     return forces
 
 
-def _simulate(scene: Scene, control, carry: Model | None, starts, v0, ts, options) -> tuple[Solution, jax.Array]:
+def _simulate(scene: Scene, control, carry: Model | None, starts, speeds, ts, options) -> tuple[Solution, jax.Array]:
     """All motions and the torques at their rows, with a leading axis of motions."""
 
     # Model and options are closed over: known numbers make a faster program.
     @eqx.filter_jit
-    def batch(control, starts):
-        def one(control, q0):
+    def batch(control, starts, speeds):
+        def one(control, q0, v0):
             if carry is not None:
                 control = FourierTorque(control.cosine, control.sine, control.period, carry)
             solution = simulate(scene, q0, v0, ts, control=control, outputs=("energy", "work"), throw=False, **options)
             return solution, jax.vmap(control)(solution.q, solution.v, solution.ts)
 
-        return jax.vmap(one)(control, starts)
+        return jax.vmap(one)(control, starts, speeds)
 
-    return batch(control, starts)
+    return batch(control, starts, speeds)
 
 
 def _summarise(model: Model, solution: Solution, done: np.ndarray) -> None:

@@ -31,3 +31,6 @@ from jaxdyn.compile.repair import repair_flagged as repair_flagged
 from jaxdyn.compile.repair import run_repaired as run_repaired
 from jaxdyn.compile.rules import along as along
 from jaxdyn.compile.rules import implicit as implicit
+from jaxdyn.compile.versions import warn_of_version as _warn_of_version
+
+_warn_of_version()

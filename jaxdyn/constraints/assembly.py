@@ -75,7 +75,7 @@ def assemble(
     `hold` that do not exist, and for less than one guess.
 
     ```python
-    state = jd.assemble(jd.scenes.four_bar(), jnp.zeros(3), hold={"crank": 0.5})
+    state = jd.assemble(jd.scenes.four_bar(), jnp.zeros(3), hold={"1": 0.5})
     ```
     """
     scene = as_scene(scene)

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array
 
 METHODS = ("lbfgs", "adam")
@@ -141,7 +140,9 @@ def _line_search(evaluate: Callable, z, value, gradient, direction):
 
 
 @functools.lru_cache
-def _optimizer(method: str, steps: int, learning_rate: float) -> optax.GradientTransformation:
+def _optimizer(method: str, steps: int, learning_rate: float) -> Any:
+    import optax  # here, so that importing jaxdyn does not import it
+
     if method == "lbfgs":
         return optax.lbfgs(memory_size=30, linesearch=None)
     if method == "adam":

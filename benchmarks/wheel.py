@@ -1,0 +1,98 @@
+"""The wheel, installed elsewhere and tried without the repository: `python -m benchmarks.wheel [--keep DIR]`.
+
+Builds the wheel, installs it alone in a fresh environment, and runs there: an import, a URDF, a motion, the commands, and what
+asks for extras that are not installed. Prints how long importing takes beside importing jax, the best of five fresh processes
+each, in seconds of the processor, which do not count what else the machine does; more than LIMIT beyond jax is a failure.
+"""
+
+import argparse
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import venv
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+LIMIT = 1.0  # s
+
+SMOKE = """
+import pathlib, jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+import jaxdyn as jd
+
+assert "site-packages" in jd.__file__, jd.__file__
+model = jd.robots.iiwa()
+jd.save_urdf(model, "arm.urdf")
+scene = jd.load("arm.urdf")
+assert scene.system.joint_names == model.joint_names
+q = jnp.full(7, 0.3)
+a = jd.forward_dynamics(scene.system, q, q, q)
+assert abs(jd.inverse_dynamics(scene.system, q, q, a) - q).max() < 1e-10
+bar = jd.scenes.four_bar()
+motion = jd.simulate(bar, *jd.scenes.four_bar.start(), jnp.linspace(0.0, 0.5, 6), outputs=("constraint_residual",))
+assert motion.success and abs(motion.constraint_residual).max() < 1e-10
+try:
+    jd.draw(bar, motion.q[0])
+except ImportError as error:
+    assert "jaxdyn[plot]" in str(error), error
+else:
+    raise SystemExit("matplotlib is there, though the wheel does not ask for it")
+for name in ("go2_description", "robot.xml"):
+    try:
+        pathlib.Path("robot.xml").write_text("<mujoco/>")
+        jd.load(name)
+    except ImportError as error:
+        assert "pip install jaxdyn[" in str(error), error
+print("smoke test passed with jax", jax.__version__)
+"""
+
+
+def seconds_to_import(python: Path, name: str, folder: Path) -> float:
+    """Best of five fresh processes, s of the processor."""
+    found = []
+    for _ in range(5):
+        began = os.times()
+        subprocess.run([python, "-I", "-c", f"import {name}"], cwd=folder, check=True)
+        ended = os.times()
+        found.append(ended.children_user + ended.children_system - began.children_user - began.children_system)
+    return min(found)
+
+
+def main(argv=None) -> int:
+    """Build, install, try; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--keep", type=Path, help="make wheel and environment here and leave them")
+    options = parser.parse_args(argv)
+    with contextlib.ExitStack() as stack:
+        folder = (options.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))).resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+        subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, ROOT], check=True)
+        wheel = max(folder.glob("jaxdyn-*.whl"), key=os.path.getmtime)
+        print(f"built {wheel.name}, {wheel.stat().st_size / 1e3:.0f} kB")
+        venv.create(folder / "env", with_pip=True)
+        python = folder / "env" / ("Scripts" if os.name == "nt" else "bin") / "python"
+        began = time.perf_counter()
+        subprocess.run([python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", wheel], check=True)
+        print(f"installed in {time.perf_counter() - began:.0f} s")
+        subprocess.run([python, "-I", "-c", SMOKE], cwd=folder, check=True)
+        subprocess.run(
+            [python, "-I", "-m", "jaxdyn", "info", "arm.urdf"], cwd=folder, check=True, stdout=subprocess.DEVNULL
+        )
+        demo = subprocess.run([python, "-I", "-m", "jaxdyn.demo"], cwd=folder, capture_output=True, text=True)
+        if demo.returncode != 2 or "pip install jaxdyn[plot]" not in demo.stderr:
+            print(f"the demo without matplotlib: status {demo.returncode}, {demo.stderr[-300:]}")
+            return 1
+        jax, ours = (seconds_to_import(python, name, folder) for name in ("jax", "jaxdyn"))
+        print(
+            f"import jax: {jax:.2f} s, import jaxdyn: {ours:.2f} s, beyond jax {ours - jax:.2f} s (at most {LIMIT:g} s)"
+        )
+        return int(ours - jax > LIMIT)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
