@@ -28,7 +28,7 @@ FLOORS = (
     "contact reduction",
     "grasp simulation",
     "control identify scenes",
-    "io reports",
+    "io reports scale",
     "pictures",
     "cli demo",
     "__main__",
@@ -61,7 +61,8 @@ USERS = {
     "mujoco": FILES_AND_PLOTS,
     "trimesh": {"pictures"},
     "viser": {"pictures"},
-    "xarray": {"simulation"},
+    "xarray": {"simulation", "scale"},
+    "zarr": {"scale"},
 }
 LIGHT = {"equinox", "jax", "jaxtyping", "numpy"}
 
@@ -205,7 +206,7 @@ def test_import_is_light_and_leaves_jax_unconfigured():
     program = """
 import sys
 import jaxdyn
-heavy = {"matplotlib", "mujoco", "scipy", "trimesh", "viser", "xarray", "yourdfpy"} & sys.modules.keys()
+heavy = {"matplotlib", "mujoco", "scipy", "trimesh", "viser", "xarray", "yourdfpy", "zarr"} & sys.modules.keys()
 assert not heavy, f"importing jaxdyn imports {heavy}"
 import jax
 try:
