@@ -66,7 +66,7 @@ def pendulums(tmp_path_factory):
     out = tmp_path_factory.mktemp("scale") / "pendulums.zarr"
     starts = np.linspace(0.1, 1.0, 42).reshape(21, 2)
     lengths = np.linspace(0.5, 1.0, 21)
-    ts = jnp.linspace(0.0, 0.2, 3)
+    ts = np.linspace(0.0, 0.2, 3)
 
     def build(p):
         return jd.Scene(jd.scenes.double_pendulum().system, forces=(jd.JointDamping(jnp.stack([p["damping"]] * 2)),))

@@ -38,9 +38,9 @@ class Described(NamedTuple):
 
 
 def described_motion(
-    one: Callable, batch: Members, reductions: Mapping[str, Reduction], units: Mapping[str, str]
+    one: Callable, batch: Members, reductions: Mapping[str, Reduction], units: Mapping[str, str], ts: np.ndarray
 ) -> Described:
-    """Of `one(drawn, row) -> (solution, scene, parameters)`."""
+    """Of `one(drawn, row) -> (solution, scene, parameters)` with rows at the times ts (nt,)."""
     seen: dict[str, Any] = {}
 
     def rows(drawn: Any, row: Any) -> dict[str, Any]:
@@ -51,7 +51,7 @@ def described_motion(
         named = _parameters(parameters)
         stats = {name: solution.stats[name] for name in ("num_steps", "time_reached")}
         # What does not change from call to call, of whichever was the last.
-        seen.update(signals=[signal._replace(values=None) for signal in signals], poses=poses, ts=solution.ts)
+        seen.update(signals=[signal._replace(values=None) for signal in signals], poses=tuple(poses))
         found |= poses | named | stats
         return _with_quantities(found | {"result": code_of(solution.result)}, reductions)
 
@@ -71,7 +71,7 @@ def described_motion(
             unit = steps.get(name) or units.get(name.removeprefix("parameter_"))
             variables[name] = _variable(name, shapes, None, {"units": unit} if unit else {})
     variables["result"] = _codes(CODES)
-    axes["t"] = (np.asarray(seen["ts"]), {"units": "s"})
+    axes["t"] = (ts, {"units": "s"})
     return Described(rows, shapes, variables, CODES, axes)
 
 

@@ -12,6 +12,7 @@ from jaxdyn.scale.batch import Options, Run, whole
 from jaxdyn.scale.described import described_function, described_motion
 from jaxdyn.scale.members import digest, members
 from jaxdyn.simulation.run import simulate
+from jaxdyn.simulation.solvers.inputs import check_times
 from jaxdyn.systems.scene import Scene
 
 
@@ -98,7 +99,8 @@ def run(
     )
     ```
     """
-    ts = as_array(ts, "ts")
+    ts = np.asarray(as_array(ts, "ts"))
+    check_times(ts)
     for name in ("throw", "progress"):
         options.pop(name, None)
     builds = callable(scene) and jax.tree_util.all_leaves([scene])
@@ -126,14 +128,14 @@ def run(
     if not builds and not isinstance(scene, Scene):
         scene = Scene(scene)
     given = {
-        "ts": f"{np.asarray(ts)[0]:g} to {np.asarray(ts)[-1]:g} s, {len(ts)} points, {digest(np.asarray(ts))}",
+        "ts": f"{ts[0]:g} to {ts[-1]:g} s, {len(ts)} points, {digest(ts)}",
         "scene": "built by a function" if builds else scene_lines(scene),
         "outputs": list(options.get("outputs", ())),
     }
     shared = Options(
         out, reductions, rows, cost, process, devices, lanes, chunk, memory, compress, verify, progress, units or {}
     )
-    return whole(lambda reducing: described_motion(one, batch, reducing, shared.units), given, batch, shared)
+    return whole(lambda reducing: described_motion(one, batch, reducing, shared.units, ts), given, batch, shared)
 
 
 def evaluate(
