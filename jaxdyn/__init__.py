@@ -5,6 +5,7 @@ from jaxdyn import control as control
 from jaxdyn import geometry as geometry
 from jaxdyn import grasp as grasp
 from jaxdyn import identify as identify
+from jaxdyn import scale as scale
 from jaxdyn import scenes as scenes
 from jaxdyn.compile import compilation as compilation
 from jaxdyn.constraints import Holonomic as Holonomic

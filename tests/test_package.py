@@ -29,7 +29,7 @@ FLOORS = (
     "contact reduction",
     "grasp simulation",
     "control identify scenes",
-    "io reports",
+    "io reports scale",
     "pictures",
     "cli demo",
     "__main__",
@@ -62,7 +62,8 @@ USERS = {
     "robot_descriptions": {"io"},
     "trimesh": {"pictures"},
     "viser": {"pictures"},
-    "xarray": {"simulation"},
+    "xarray": {"simulation", "scale"},
+    "zarr": {"scale"},
 }
 LIGHT = {"equinox", "jax", "jaxtyping", "numpy"}
 
@@ -206,7 +207,7 @@ def test_import_is_light_and_leaves_jax_unconfigured():
     program = """
 import sys
 import jaxdyn
-heavy = {"matplotlib", "mujoco", "optax", "scipy", "trimesh", "viser", "xarray"} & sys.modules.keys()
+heavy = {"matplotlib", "mujoco", "optax", "scipy", "trimesh", "viser", "xarray", "zarr"} & sys.modules.keys()
 assert not heavy, f"importing jaxdyn imports {heavy}"
 import jax
 try:

@@ -1,4 +1,4 @@
-"""The command line: `jaxdyn info`, `jaxdyn simulate`, `jaxdyn identify` and `jaxdyn report`."""
+"""The command line: `jaxdyn info`, `jaxdyn simulate`, `jaxdyn sweep`, `jaxdyn identify` and `jaxdyn report`."""
 
 import argparse
 import sys
@@ -7,13 +7,14 @@ from collections.abc import Sequence
 import jax
 
 from jaxdyn import __version__
-from jaxdyn.cli import identify, info, report, simulate
+from jaxdyn.cli import identify, info, report, simulate, sweep
 
-COMMANDS = (info, simulate, identify, report)
+COMMANDS = (info, simulate, sweep, identify, report)
 _EPILOG = """\
 examples:
   jaxdyn info panda.urdf
   jaxdyn simulate panda.urdf --duration 2 --torque gravity --out motion.csv
+  jaxdyn sweep study.toml
   jaxdyn identify --urdf panda.urdf --log log.csv --out fitted.urdf
   jaxdyn report four_bar --out report
 
@@ -26,8 +27,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command with the arguments given (those of the process by default) and return the exit status."""
     parser = argparse.ArgumentParser(
         prog="jaxdyn",
-        description="Rigid-body dynamics of robots: look at a file, simulate it, identify its inertias from a log; and "
-        "report error against run time.",
+        description="Rigid-body dynamics of robots: look at a file, simulate it, alone and in studies of many rollouts, identify "
+        "its inertias from a log; and report error against run time.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -16,7 +16,7 @@ class NamedScene:
     def __init__(self, build: Callable, start: Callable):
         functools.update_wrapper(self, build)
         self._build = build
-        self._start = start
+        self.start_function = start  # whose signature says what a start depends on
 
     def __call__(self, **parameters) -> Scene:
         """The scene; parameters as in its documentation."""
@@ -24,7 +24,7 @@ class NamedScene:
 
     def start(self, **parameters):
         """Configuration (nq,) and velocity (nv,) of the reference motion, on the constraints."""
-        return self._start(**parameters)
+        return self.start_function(**parameters)
 
     def __repr__(self):
         return f"jaxdyn.scenes.{self.__name__}"  # pyright: ignore[reportAttributeAccessIssue]

@@ -17,7 +17,7 @@ class Signal(NamedTuple):
     """One array of a solution: values (..., nt, columns) or (..., nt), the names of its columns (none of a single one), units."""
 
     key: str
-    values: np.ndarray
+    values: Any
     names: tuple[str, ...]
     units: tuple[str, ...]
 
@@ -27,6 +27,11 @@ def signals(solution: Any, scene: Any) -> list[Signal]:
 
     **Raises:** ValueError when the scene is not that of the solution.
     """
+    return [one._replace(values=np.asarray(one.values)) for one in traced_signals(solution, scene)]
+
+
+def traced_signals(solution: Any, scene: Any) -> list[Signal]:
+    """`signals` whose values are those of the solution as they are, so that it may be traced."""
     scene = as_scene(scene)
     if np.shape(solution.q)[-1:] != (scene.nq,) or np.shape(solution.v)[-1:] != (scene.nv,):
         raise ValueError(
@@ -51,7 +56,7 @@ def signals(solution: Any, scene: Any) -> list[Signal]:
         parts = tuple(str(k + 1) for k in range(np.shape(values)[-1]))
         found.append((f"contact_force_{name}", values, parts, ("",) * len(parts)))
     found += [(f"contact_margin_{name}", values, (), ("",)) for name, values in solution.contact_margins.items()]
-    return [Signal(key, np.asarray(x), tuple(n), tuple(u)) for key, x, n, u in found if x is not None]
+    return [Signal(key, x, tuple(n), tuple(u)) for key, x, n, u in found if x is not None]
 
 
 def _row_names(scene: Scene) -> tuple[str, ...]:
@@ -110,6 +115,12 @@ def write_npz(solution: Any, path: str | os.PathLike, scene: Any) -> None:
     np.savez_compressed(path, **arrays, **texts)  # pyright: ignore[reportArgumentType]
 
 
+def dimensions(signal: Signal) -> tuple[str, ...]:
+    """Names of the axes of a signal behind those of a batch: time, and what its columns are."""
+    axes = {"q": "coordinate", "v": "velocity", "a": "velocity", "tau": "velocity", "multipliers": "row"}
+    return ("t", axes.get(signal.key, f"{signal.key}_part")) if signal.names else ("t",)
+
+
 def as_xarray(solution: Any, scene: Any) -> Any:
     """See `Solution.to_xarray`."""
     try:
@@ -118,16 +129,15 @@ def as_xarray(solution: Any, scene: Any) -> Any:
         raise ImportError("Solution.to_xarray needs xarray: pip install xarray") from error
     batch = tuple(f"batch{k}" for k in range(np.ndim(solution.q) - 2)) if np.ndim(solution.q) > 3 else ("rollout",)
     batch = batch if np.ndim(solution.q) > 2 else ()
-    axes = {"q": "coordinate", "v": "velocity", "a": "velocity", "tau": "velocity", "multipliers": "row"}
     variables: dict[str, tuple] = {}
     coordinates: dict[str, tuple] = {"t": ("t", times(solution), {"units": "s"})}
     for signal in signals(solution, scene):
         if not signal.names:
             variables[signal.key] = ((*batch, "t"), signal.values, {"units": signal.units[0]})
             continue
-        axis = axes.get(signal.key, f"{signal.key}_entry")
-        coordinates[axis] = (axis, list(signal.names))
-        variables[signal.key] = ((*batch, "t", axis), signal.values, {"units": list(signal.units)})
+        axes = dimensions(signal)
+        coordinates[axes[-1]] = (axes[-1], list(signal.names))
+        variables[signal.key] = ((*batch, *axes), signal.values, {"units": list(signal.units)})
     for name, pose in solution.poses.items():
         variables[f"pose_{name}"] = ((*batch, "t", "pose_row", "pose_column"), np.asarray(pose), {"units": "m"})
     return xarray.Dataset(variables, coordinates)

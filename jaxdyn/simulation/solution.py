@@ -4,6 +4,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -24,6 +25,15 @@ def from_diffrax(result) -> Any:
     for name, code in diffrax.RESULTS._name_to_item.items():
         found = RESULTS.where(result == code, getattr(RESULTS, name), found)
     return found
+
+
+# A number for each code, its place here, for arrays and files.
+CODES = tuple(RESULTS._name_to_item)
+
+
+def code_of(result: Any) -> Array:
+    """A result, traced or batched, as its place in `CODES` (uint8)."""
+    return jnp.argmax(jnp.stack([result == getattr(RESULTS, name) for name in CODES]), 0).astype(jnp.uint8)
 
 
 ADVICE = {

@@ -1,0 +1,199 @@
+"""Large batches through `jd.scale.run`: what storing costs, memory, resuming, two cores, rollouts of unequal cost.
+
+    python -m benchmarks.scale [store memory resume cores cost] [--samples 100000] [--full]
+
+- store: seconds of a run against those of its programs alone, an arm of seven joints, 400 steps of RK4, 11 rows each, in turns.
+- memory: peak of processes that run 1, 3 and 10 times as many rolling disks with 100 rows each (1e6 with --full, 9 GB on disk).
+- resume: a store of 1e5 (1e6 with --full) rolling disks with 99 % of its chunks: seconds from the start of a new process, imports
+  and compilation included, until the first new chunk is stored.
+- cores: the arm in processes that may use one core and two: seconds and efficiency, t1/(2 t2).
+- cost: four-bars whose springs are soft or stiff, adaptive steps: lane-steps that a batch waits for over steps that are needed,
+  and seconds, in the order of the numbers and by falling cost (`cost=`).
+"""
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxdyn as jd
+from jaxdyn.scale import batch, driver
+
+QUIET = {"progress": False}
+
+
+def arm(samples: int, out, **options):
+    """An arm of seven joints that falls from random states."""
+    model = jd.robots.iiwa()
+
+    def draw(key):
+        one, other = jax.random.split(key)
+        return {"q": jax.random.uniform(one, (7,), minval=-1.0, maxval=1.0), "v": jax.random.normal(other, (7,))}
+
+    ts = np.linspace(0.0, 0.4, 11)
+    options = {"stepsize": 1e-3, "samples": samples, "out": out} | QUIET | options
+    return jd.scale.run(model, lambda p: (p["q"], p["v"]), draw, ts, **options)
+
+
+def disks(samples: int, out, points: int = 100, **options):
+    """Rolling disks of random mass and radius."""
+
+    def draw(key):
+        mass, radius = jax.random.uniform(key, (2,), minval=0.3, maxval=0.7)
+        return {"mass": mass, "radius": radius}
+
+    def start(p):
+        one = jnp.ones_like(p["mass"])
+        return jnp.zeros(4), jnp.stack([2.0 * p["radius"], 0.0 * one, one, 2.0 * one])
+
+    ts = np.linspace(0.0, 1.0, points)
+    options = {"stepsize": 0.01, "samples": samples, "out": out} | QUIET | options
+    return jd.scale.run(lambda p: jd.scenes.rolling_disk(**p), start, draw, ts, **options)
+
+
+def four_bars(samples: int, out, **options):
+    """Four-bars with a spring at each joint, half of them soft and half stiff."""
+    q, v = jd.scenes.four_bar.start()
+
+    def draw(key):
+        one, other = jax.random.split(key)
+        high = jax.random.bernoulli(one)
+        return {"stiffness": jnp.where(high, 1e6, 1.0) * jax.random.uniform(other, (), minval=0.5, maxval=1.5)}
+
+    def build(p):
+        scene = jd.scenes.four_bar()
+        return jd.Scene(scene.system, scene.constraints, (jd.JointSpring(p["stiffness"] * jnp.ones(scene.nv), q),))
+
+    ts = np.linspace(0.0, 0.5, 3)
+    options = {"samples": samples, "out": out, "solver": diffrax.Dopri8()} | QUIET | options
+    return jd.scale.run(build, (np.asarray(q), np.asarray(v)), draw, ts, **options)
+
+
+def store(folder: Path, samples: int) -> None:
+    """Storing and the meter against computing alone."""
+    kept: dict = {}
+    drive = driver.drive
+
+    def noted(job, program, *rest):
+        kept.update(job=job, program=program)
+        return drive(job, program, *rest)
+
+    batch.driver.drive = noted
+    whole, alone = [], []
+    for k in range(3):
+        run = arm(samples, folder / f"store{k}.zarr", progress=True)
+        whole.append(run.seconds)
+        before = time.perf_counter()
+        for first in range(0, samples, run.chunk):
+            numbers = np.arange(first, min(first + run.chunk, samples))
+            driver.compute(kept["program"], numbers)
+        alone.append(time.perf_counter() - before)
+    batch.driver.drive = drive
+    print(
+        f"store: {samples} arms, chunks of {run.chunk}: {min(whole):.3g} s with the store, {min(alone):.3g} s without "
+        f"({samples / min(whole):.3g} rollouts/s); cost {100 * (min(whole) / min(alone) - 1):.1f} %"
+    )
+
+
+def child(function: str, *arguments, cores: int | None = None) -> tuple[float, int]:
+    """Seconds of the loop and peak memory (bytes) of a process that runs `function`."""
+    command = [sys.executable, "-m", "benchmarks.scale", "--child", function, *map(str, arguments)]
+
+    def pin() -> None:
+        if cores is not None:
+            os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+
+    done = subprocess.run(command, check=True, capture_output=True, text=True, preexec_fn=pin)
+    seconds, peak = done.stdout.split()[-2:]
+    return float(seconds), int(peak)
+
+
+def memory(folder: Path, samples: int) -> None:
+    """Peak memory against the number of rollouts."""
+    for count in (samples // 10, 3 * samples // 10, samples):
+        seconds, peak = child("disks", count, folder / f"memory{count}.zarr")
+        print(f"memory: {count} disks, 100 rows: peak {peak / 2**20:.0f} MiB, {seconds:.3g} s")
+
+
+def resume(folder: Path, samples: int) -> None:
+    """From the start of a process to the first new chunk, with 99 % done."""
+    out = folder / "resume.zarr"
+    run = disks(samples, out, points=11, chunk=max(1, samples // 100))
+    from jaxdyn.scale.store import Store
+
+    kept = Store(out)
+    last = kept.chunks - 1
+    kept.forget(last)
+    before = time.perf_counter()
+    command = [sys.executable, "-m", "benchmarks.scale", "--child", "resumed", str(samples), str(out)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    while not kept.is_done(last):
+        if process.poll() not in (None, 0):
+            raise RuntimeError("the resumed process failed")
+        time.sleep(0.005)
+    first = time.perf_counter() - before
+    process.communicate()
+    whole = time.perf_counter() - before
+    print(
+        f"resume: {run.samples} disks, 99 % done: {first:.3g} s to the first new chunk, {whole:.3g} s to the end with all "
+        "chunks looked through"
+    )
+
+
+def cores(folder: Path, samples: int) -> None:
+    """Strong scaling from one core to two."""
+    times = {n: child("arm", samples, folder / f"cores{n}.zarr", cores=n)[0] for n in (1, 2)}
+    print(f"cores: {samples} arms: {times[1]:.3g} s on one core, {times[2]:.3g} s on two; ", end="")
+    print(f"efficiency {times[1] / (2 * times[2]):.2f}")
+
+
+def cost(folder: Path, samples: int) -> None:
+    """Rollouts of unequal cost."""
+    lanes = 128
+    for name, by in (("by number", None), ("by cost", lambda p: p["stiffness"])):
+        run = four_bars(samples, folder / f"{name[3:]}.zarr", cost=by, lanes=lanes, chunk=lanes)
+        steps = np.asarray(run.dataset().num_steps)
+        own = lanes // len(jax.local_devices())
+        waited = steps.reshape(-1, own).max(1).sum() * own
+        print(
+            f"cost: {samples} four-bars {name}, {steps.min()} to {steps.max()} steps, {own} lanes: "
+            f"{waited / steps.sum():.2f} times the mean cost, {run.seconds:.3g} s"
+        )
+
+
+def main() -> None:
+    """Print the tables that were asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="*", default=["store", "memory", "resume", "cores", "cost"])
+    parser.add_argument("--samples", type=int, default=100_000)
+    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    if args.child:
+        name, samples, out = args.what
+        if name == "resumed":
+            run = disks(int(samples), out, points=11, chunk=max(1, int(samples) // 100))
+        else:
+            run = {"arm": arm, "disks": disks}[name](int(samples), out)
+        print(run.seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+        return
+    many = 1_000_000 if args.full else args.samples
+    sizes = {"store": args.samples, "memory": many, "resume": many, "cores": args.samples, "cost": 4096}
+    print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    for name in args.what:
+        with tempfile.TemporaryDirectory(dir="out" if Path("out").is_dir() else None) as folder:
+            globals()[name](Path(folder), sizes[name])
+
+
+if __name__ == "__main__":
+    main()

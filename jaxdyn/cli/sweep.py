@@ -1,0 +1,249 @@
+"""`jaxdyn sweep`: a study of many rollouts, described by a file, into a store that can be gone on with."""
+
+import argparse
+import importlib.util
+import inspect
+import pathlib
+import tomllib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn import scale, scenes
+from jaxdyn.cli.common import Stopwatch
+from jaxdyn.io import load_urdf
+from jaxdyn.model.arguments import as_path
+from jaxdyn.model.tree import integrate, neutral
+
+HELP = "simulate a study of many rollouts into a Zarr store, started again it goes on where it stopped"
+DESCRIPTION = """\
+Simulate many rollouts whose parameters are drawn as a file says. Finished chunks are kept: the same command started
+again after an interruption computes the rest, and several processes (Slurm, Kubernetes) share one study.
+"""
+EPILOG = """\
+examples:
+  jaxdyn sweep study.toml
+  jaxdyn sweep study.toml --samples 1000 --out trial.zarr
+  srun --ntasks=64 jaxdyn sweep study.toml
+
+study.toml:
+  scene = "rolling_disk"      a scene of jd.scenes, a file .urdf, or a file .py with functions
+                              scene(parameters) and states(parameters) -> (q0, v0)
+  out = "disks.zarr"          beside the study, unless it is a whole path
+  samples = 100000
+  seed = 0
+  duration = 1.0              s
+  points = 11                 rows of each rollout
+  outputs = ["energy"]        as in jd.simulate
+  rows = true                 false: codes and reductions alone; or a list of names
+  cost = "mass"               a parameter with which rollouts take longer
+
+  [parameters]                drawn for each rollout; arguments of a scene of jd.scenes and of its start;
+                              of a .urdf q0 and v0, displacements from neutral (size is nv)
+  mass = { uniform = [1.0, 3.0], units = "kg" }
+  radius = { normal = [0.5, 0.01], units = "m" }     mean, standard deviation
+  # damping = { log_uniform = [1e-3, 1.0], size = 2 }
+
+  [options]                   of jd.simulate: stepsize, rtol, atol, method, max_steps
+  stepsize = 0.01
+
+  [reductions]
+  energy = { mean = "energy" }
+  spread = { quantiles = "energy", low = 0.0, high = 10.0 }
+  # histogram = "energy" with low, high, bins; worst = "time_reached" with keep
+"""
+
+_DRAWS = {
+    "uniform": lambda key, a, b, shape: jax.random.uniform(key, shape, minval=a, maxval=b),
+    "normal": lambda key, a, b, shape: a + b * jax.random.normal(key, shape),
+    "log_uniform": lambda key, a, b, shape: jnp.exp(jax.random.uniform(key, shape, minval=np.log(a), maxval=np.log(b))),
+}
+_REDUCTIONS = {
+    "mean": scale.Mean,
+    "histogram": scale.Histogram,
+    "quantiles": scale.Quantiles,
+    "worst": scale.Worst,
+}
+_KEYS = {
+    "scene",
+    "out",
+    "samples",
+    "seed",
+    "duration",
+    "points",
+    "outputs",
+    "rows",
+    "cost",
+    "parameters",
+    "options",
+    "reductions",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("study", help="file .toml that describes the study, see below")
+    parser.add_argument("--out", metavar="DIR", help="store, in place of the study's")
+    parser.add_argument("--samples", type=int, metavar="N", help="rollouts, in place of the study's")
+    parser.add_argument("--seed", type=int, metavar="N", help="in place of the study's")
+    parser.add_argument("--process", type=int, nargs=2, metavar=("I", "N"), help="this is process I of N, from 0")
+    parser.add_argument("--devices", type=int, metavar="N", help="CPU devices to share rollouts among (default: 1)")
+    parser.add_argument("--chunk", type=int, metavar="N", help="rollouts stored at once (default: two seconds' work)")
+    parser.add_argument("--quiet", action="store_true", help="no meter")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study and print what became of it; 1 if a rollout failed."""
+    path = as_path(args.study, "study")
+    study = _read(path)
+    if args.devices is not None:
+        if args.devices < 1:
+            raise ValueError(f"--devices is {args.devices}; give at least 1")
+        jax.config.update("jax_num_cpu_devices", args.devices)
+    given = _required(study, path, "samples") if args.samples is None else args.samples
+    out = path.parent / _required(study, path, "out") if args.out is None else as_path(args.out, "--out")
+    parameters = study.get("parameters", {})
+    draw = drawing(parameters)
+    scene, states = _scene(_required(study, path, "scene"), path, tuple(parameters))
+    ts = np.linspace(0.0, float(_required(study, path, "duration")), int(study.get("points", 2)))
+    cost = study.get("cost")
+    if cost is not None and cost not in parameters:
+        raise ValueError(f"{path}: cost is {cost!r}; name one of the parameters {', '.join(parameters)}")
+    watch = Stopwatch()
+    found = scale.run(
+        scene,
+        states,
+        draw,
+        ts,
+        samples=given,
+        seed=study.get("seed", 0) if args.seed is None else args.seed,
+        out=out,
+        outputs=tuple(study.get("outputs", ())),
+        rows=study.get("rows", True),
+        reductions={name: _reduction(name, one) for name, one in study.get("reductions", {}).items()},
+        cost=None if cost is None else lambda p: jnp.sum(p[cost]),
+        units={name: one["units"] for name, one in parameters.items() if isinstance(one, dict) and "units" in one},
+        process=None if args.process is None else tuple(args.process),
+        chunk=args.chunk,
+        progress=not args.quiet,
+        **study.get("options", {}),
+    )
+    print(f"{found}\nin {watch}, compilation included.")
+    return int(not found.success)
+
+
+def drawing(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
+    """A function that draws the parameters of one rollout from its key; each has a key of its own, by the order of their names.
+
+    **Raises:** ValueError for what is neither a number nor a distribution.
+    """
+    drawn: dict[str, tuple[str, float, float, tuple[int, ...]]] = {}
+    known: dict[str, float] = {}
+    for name in sorted(parameters):
+        one = parameters[name]
+        if type(one) in (int, float):
+            known[name] = float(one)
+            continue
+        given: dict[str, Any] = one if isinstance(one, dict) else {}
+        kinds = [kind for kind in _DRAWS if kind in given]
+        ends = given[kinds[0]] if len(kinds) == 1 else None
+        if not (isinstance(ends, list) and len(ends) == 2 and all(isinstance(x, (int, float)) for x in ends)):
+            raise ValueError(f"parameter {name} is {one!r}; give a number, or one of {', '.join(_DRAWS)} = [a, b]")
+        if kinds[0] == "log_uniform" and not min(ends) > 0:
+            raise ValueError(f"parameter {name}: log_uniform = {ends}; give positive numbers")
+        drawn[name] = (kinds[0], float(ends[0]), float(ends[1]), (int(given["size"]),) if "size" in given else ())
+
+    def draw(key: Any) -> dict[str, Any]:
+        keys = jax.random.split(key, max(1, len(drawn)))
+        found = {
+            name: _DRAWS[kind](own, a, b, shape)
+            for own, (name, (kind, a, b, shape)) in zip(keys, drawn.items(), strict=False)
+        }
+        return found | {name: jnp.asarray(value) for name, value in known.items()}
+
+    return draw
+
+
+def _read(path: pathlib.Path) -> dict[str, Any]:
+    try:
+        study = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path} is no TOML: {error}") from error
+    if unknown := study.keys() - _KEYS:
+        raise ValueError(f"{path} has {', '.join(sorted(unknown))}; a study has {', '.join(sorted(_KEYS))}")
+    return study
+
+
+def _required(study: Mapping[str, Any], path: pathlib.Path, name: str) -> Any:
+    if name not in study:
+        raise ValueError(f"{path} has no {name}; see `jaxdyn sweep --help`")
+    return study[name]
+
+
+def _reduction(name: str, given: Any) -> scale.Reduction:
+    kinds = [kind for kind in _REDUCTIONS if isinstance(given, dict) and kind in given]
+    if len(kinds) != 1:
+        raise ValueError(f"reduction {name} is {given!r}; give one of {', '.join(_REDUCTIONS)} = NAME")
+    options = {key: value for key, value in given.items() if key != kinds[0]}
+    if "probabilities" in options:
+        options["probabilities"] = tuple(options["probabilities"])
+    try:
+        return _REDUCTIONS[kinds[0]](given[kinds[0]], **options)
+    except TypeError as error:
+        raise ValueError(f"reduction {name} is {given!r}: {error}") from error
+
+
+def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[Any, Any]:
+    """Functions of the parameters: the scene, and where it starts."""
+    file = path.parent / name
+    if file.suffix == ".py":
+        spec = importlib.util.spec_from_file_location(file.stem, file)
+        if spec is None or spec.loader is None or not file.is_file():
+            raise ValueError(f"{path}: scene is {name!r}, and there is no file {file}")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        missing = [part for part in ("scene", "states") if not callable(getattr(module, part, None))]
+        if missing:
+            raise ValueError(f"{file} has no function {' and '.join(missing)} of the parameters")
+        return module.scene, module.states
+    if file.suffix == ".urdf":
+        model = load_urdf(file)
+        if unknown := set(parameters) - {"q0", "v0"}:
+            raise ValueError(f"{path}: parameters of a .urdf are q0 and v0, not {', '.join(sorted(unknown))}")
+
+        def states(p: Mapping[str, Any]) -> tuple[Any, Any]:
+            still = jnp.zeros(model.nv)
+            return integrate(model, neutral(model), p.get("q0", still)), p.get("v0", still)
+
+        return model, states
+    if name not in scenes.names():
+        raise ValueError(f"{path}: scene is {name!r}; name one of {', '.join(scenes.names())}, or a file .py or .urdf")
+    named = getattr(scenes, name)
+    of_scene, of_start = (set(inspect.signature(part).parameters) for part in (named, named.start_function))
+    if unknown := set(parameters) - of_scene - of_start:
+        raise ValueError(
+            f"{path}: {name} has no parameter {', '.join(sorted(unknown))}; it has {', '.join(sorted(of_scene | of_start))}"
+        )
+
+    def known_numbers(error: Exception) -> ValueError:
+        return ValueError(
+            f"{path}: the scene {name!r} is built from known numbers, so that {', '.join(parameters)} cannot be drawn; write a "
+            f"file .py whose scene(parameters) puts them in with model.replace. {str(error).splitlines()[0]}"
+        )
+
+    def build(p: Mapping[str, Any]) -> Any:
+        try:
+            return named(**{key: value for key, value in p.items() if key in of_scene})
+        except (jax.errors.JAXTypeError, TypeError) as error:
+            raise known_numbers(error) from error
+
+    def start(p: Mapping[str, Any]) -> Any:
+        try:
+            return named.start(**{key: value for key, value in p.items() if key in of_start})
+        except (jax.errors.JAXTypeError, TypeError) as error:
+            raise known_numbers(error) from error
+
+    return build, start

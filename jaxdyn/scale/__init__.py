@@ -1,0 +1,20 @@
+"""From one core to a cluster: batches of any size, in blocks, on all devices, into a store that can be gone on with.
+
+`run` simulates (`jd.simulate` for each rollout), `evaluate` does the same for any function of one sample, `batch` is what they
+share. `members` says what each rollout is made of, `described` what a store says of its numbers, `program` compiles the
+function for all devices of a process, `driver` goes through the chunks, `store` keeps them (Zarr), `locks` says who writes,
+`reductions` keep what is wanted of many rollouts (`reducer`), `processes` tells processes apart. zarr and xarray, of the extra
+`scale`, are imported where a store is opened.
+"""
+
+from jaxdyn.scale.batch import Run as Run
+from jaxdyn.scale.members import member as member
+from jaxdyn.scale.processes import Process as Process
+from jaxdyn.scale.processes import initialize as initialize
+from jaxdyn.scale.reductions import Histogram as Histogram
+from jaxdyn.scale.reductions import Mean as Mean
+from jaxdyn.scale.reductions import Quantiles as Quantiles
+from jaxdyn.scale.reductions import Reduction as Reduction
+from jaxdyn.scale.reductions import Worst as Worst
+from jaxdyn.scale.run import evaluate as evaluate
+from jaxdyn.scale.run import run as run

@@ -1,0 +1,203 @@
+"""What `run` and `evaluate` share: from a function of one sample, described, to the result of a whole batch."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdyn.model.arguments import as_array, as_path
+from jaxdyn.scale import driver, program
+from jaxdyn.scale.described import Described, version
+from jaxdyn.scale.locks import Lock
+from jaxdyn.scale.members import Members, digest
+from jaxdyn.scale.processes import process_of
+from jaxdyn.scale.progress import Progress
+from jaxdyn.scale.reducer import Reducer
+from jaxdyn.scale.reductions import Arrays, checked_reductions, described
+from jaxdyn.scale.store import Store, full_disk, packages
+
+LISTED = 1000  # failures that a result lists
+PROGRAM = "program of a rollout (scene, control, solver, functions)"  # how a store names its hash
+LEFTOVER = 600.0  # s, after which a file that was not finished is nobody's, where there are several processes
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run gives back; the rows are in the store.
+
+    - `out`, its path; `samples`, rollouts in it; `chunk`, how many of them a chunk has.
+    - `codes`: how many rollouts ended with each result code, by its name. `failed`: the numbers of those that did not
+      succeed, the first 1000 in the order of the store.
+    - `reductions`: the arrays of each reduction, by its name and theirs.
+    - `computed`: rollouts computed by this process in this call; `seconds`, of the loop, without compilation. `repaired`: chunks
+      of before that were not whole and were computed again. `lanes`: rollouts at once; `program_bytes`: memory of their program
+      and its results, by XLA's account.
+    """
+
+    out: Path
+    samples: int
+    chunk: int
+    codes: dict[str, int]
+    failed: np.ndarray
+    reductions: dict[str, Arrays]
+    computed: int
+    seconds: float
+    repaired: tuple[int, ...]
+    lanes: int
+    program_bytes: int
+
+    @property
+    def success(self) -> bool:
+        """Whether every rollout succeeded."""
+        return set(self.codes) <= {"successful"}
+
+    def dataset(self) -> Any:
+        """The store as an `xarray.Dataset`, read as it is used."""
+        _, xarray = packages()
+        return xarray.open_zarr(self.out, chunks=None)
+
+    def __str__(self) -> str:
+        lines = [f"{self.out}: {self.samples} rollouts, {self.computed} of them computed in {self.seconds:.3g} s"]
+        lines += [f"{count:>10} {name}" for name, count in self.codes.items()]
+        if len(self.failed):
+            shown = ", ".join(map(str, self.failed[:10]))
+            lines.append(f"failed: {shown}{', ...' if len(self.failed) > 10 else ''}")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options that `run` and `evaluate` share, see `run`."""
+
+    out: Any
+    reductions: Any
+    rows: bool | Sequence[str]
+    cost: Any
+    process: Any
+    devices: Sequence[Any] | None
+    lanes: int | None
+    chunk: int | None
+    memory: int | None
+    compress: bool
+    verify: bool
+    progress: bool
+    units: Mapping[str, str]
+
+
+def whole(describe: Callable[[Any], Described], words: dict[str, Any], batch: Members, options: Options) -> Run:
+    """Compute a batch that `describe(reductions)` describes; `words` tell it from others, by argument."""
+    packages()
+    path = as_path(options.out, "out")
+    if not path.parent.is_dir():
+        raise ValueError(f"out is {str(path)!r}: there is no directory {path.parent}")
+    for name in ("lanes", "chunk", "memory"):
+        value = getattr(options, name)
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+            raise ValueError(f"{name} is {value!r}; give a whole number of at least 1, or None")
+    process = process_of(options.process)
+    devices = driver.local_devices(options.devices)
+    reductions = checked_reductions(options.reductions)
+    found = describe(reductions)
+    kept = _kept(found, options.rows)
+    order = _order(options.cost, batch)
+    reducer = Reducer(reductions, found.shapes, found.variables)
+    job = driver.Job(order, reducer, kept, found.codes, process)
+    description = (
+        version()
+        | {"platform": devices[0].platform, "float64": bool(jax.config.read("jax_enable_x64"))}
+        | batch.described()
+        | words
+        | {"order": None if order is None else digest(order), "rows stored": list(kept)}
+        | {"reductions": described(reductions), "compression": options.compress}
+    )
+    row_bytes = sum(_bytes(found.variables[name]) for name in kept)
+    with full_disk(path), Lock(path, process) as lock:
+        store = Store(path) if path.exists() else None
+        if store is not None:
+            store.check(description)
+            store.remove_leftovers(0.0 if process.count == 1 else LEFTOVER)
+        lanes = options.lanes or _lanes(devices, batch.count, process.count, row_bytes)
+        memory = options.memory
+        if memory is None and process.count > 1:  # which of them share this host is not known
+            memory = int(program.SHARE * program.available_memory(devices) / process.count)
+        compiled = program.Program(found.one, batch, devices, lanes, memory)
+        if store is None:
+            variables = [found.variables[name] for name in kept] + reducer.variables
+            variables = [replace(one, compressed=one.compressed or options.compress) for one in variables]
+            chunk = options.chunk or _chunk(job, compiled, row_bytes)
+            programs = {PROGRAM: program.fingerprint(found.one, batch), "lowered program": compiled.lowered}
+            store = Store.create(
+                path, variables, found.coordinates(order), description | programs, batch.count, min(chunk, batch.count)
+            )
+            store.check(description)  # another process may have been first
+        if store.description["lowered program"] != compiled.lowered:
+            # Of other lanes, devices or processors; what is computed for one member has to be the same.
+            store.check({PROGRAM: program.fingerprint(found.one, batch)})
+        meter = Progress(batch.count, store.finished, shown=options.progress)
+        repaired = driver.drive(job, compiled, store, lock, meter, options.verify)
+        meter.end()
+        results = driver.merge(job, store)
+        codes, failed = driver.codes_of(job, store, LISTED)
+    sizes = batch.count, store.chunk
+    return Run(
+        path,
+        *sizes,
+        codes,
+        failed,
+        results,
+        meter.computed,
+        meter.seconds,
+        tuple(repaired),
+        compiled.lanes,
+        compiled.bytes,
+    )
+
+
+def _chunk(job: driver.Job, compiled: program.Program, row_bytes: int) -> int:
+    count = compiled.members.count
+    first = job.numbers(slice(0, min(compiled.lanes, count)))
+    seconds = compiled.time(first, time.perf_counter)
+    return driver.chunk_size(seconds, compiled.lanes, row_bytes, count, job.process.count)
+
+
+def _kept(found: Described, rows: bool | Sequence[str]) -> tuple[str, ...]:
+    if isinstance(rows, bool):
+        return tuple(found.variables) if rows else ("result",)
+    unknown = [name for name in rows if name not in found.variables]
+    if unknown or isinstance(rows, str):
+        raise ValueError(f"rows is {rows!r}; name some of {', '.join(found.variables)}")
+    return tuple(dict.fromkeys([*rows, "result"]))
+
+
+def _order(cost: Any, batch: Members) -> np.ndarray | None:
+    """Numbers of the rollouts by falling cost."""
+    if cost is None:
+        return None
+    if callable(cost):
+
+        def of(given: Any) -> Any:
+            drawn, row = batch.one(given)
+            return cost(drawn if batch.draw is not None else row.get("parameters"))
+
+        many, step = jax.jit(jax.vmap(of)), 2**16
+        parts = [np.arange(k, min(k + step, batch.count)) for k in range(0, batch.count, step)]
+        costs = np.concatenate([np.asarray(many(batch.inputs(part))) for part in parts])
+    else:
+        costs = np.asarray(as_array(cost, "cost"))
+    if costs.shape != (batch.count,):
+        raise ValueError(f"cost has shape {costs.shape}; give one number for each of the {batch.count} rollouts")
+    return np.argsort(-costs, kind="stable")
+
+
+def _lanes(devices: Sequence[Any], count: int, processes: int, row_bytes: int) -> int:
+    """Rollouts at once: what devices like, but no more than a chunk may have of bytes, and enough chunks for each process."""
+    fair = -(-count // (driver.SHARES * processes))
+    return max(1, min(program.default_lanes(devices), driver.BYTES // max(row_bytes, 1), fair))
+
+
+def _bytes(variable: Any) -> int:
+    return int(np.prod(variable.shape, dtype=np.int64)) * np.dtype(variable.dtype).itemsize

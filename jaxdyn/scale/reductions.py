@@ -1,0 +1,233 @@
+"""What is kept of many rollouts without their rows: means, histograms, quantiles, the worst, and what users write.
+
+A reduction works on the values of one quantity, an array of each rollout. Those of a chunk become a partial result of a fixed
+shape, which is stored with the chunk; at the end the partial results are merged in the order of the chunks. So a run that was
+interrupted, or shared by several processes, gives the same bits as one that was not. Rollouts that failed are left out.
+"""
+
+import abc
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Arrays = dict[str, np.ndarray]
+
+
+class Reduction(abc.ABC):
+    """From the values of a quantity in all rollouts to a few arrays; write a subclass for your own.
+
+    `quantity` is the name of an array of a rollout ("q", "energy", ...), or a function of the dictionary of them, which is
+    traced: `lambda row: jnp.max(row["energy"])`. `parts` names the arrays of the result.
+    """
+
+    quantity: str | Callable[[Mapping[str, Any]], Any]
+    parts: tuple[str, ...]
+
+    @abc.abstractmethod
+    def partial(self, values: np.ndarray, numbers: np.ndarray) -> Arrays:
+        """Of the rollouts of one chunk that succeeded, values (n, ...) and their numbers (n,); n may be 0.
+
+        Arrays whose shapes and dtypes depend on the shape of one value alone.
+        """
+
+    @abc.abstractmethod
+    def merge(self, partials: Arrays) -> Arrays:
+        """The result, by `parts`, of the partial results of all chunks, each with a leading axis of chunks."""
+
+
+@dataclass(frozen=True)
+class Mean(Reduction):
+    """Mean and standard deviation (that of the sample, n - 1) of each entry, and the count of rollouts.
+
+    Partial sums of squares are about the chunk's own mean, and merged by the rule of Chan, Golub & LeVeque (1983), so that
+    nothing cancels. With no rollout the mean is NaN, with fewer than two the deviation.
+    """
+
+    quantity: str | Callable
+    parts = ("mean", "std", "count")
+
+    def partial(self, values: np.ndarray, numbers: np.ndarray) -> Arrays:
+        """Count, mean and sum of squared deviations."""
+        values = values.astype(np.float64)
+        mean = values.mean(0) if len(values) else np.zeros(values.shape[1:])
+        squares = ((values - mean) ** 2).sum(0)
+        return {"count": np.asarray(len(values)), "mean": np.asarray(mean), "squares": np.asarray(squares)}
+
+    def merge(self, partials: Arrays) -> Arrays:
+        """Chunk by chunk."""
+        count, mean = 0, np.zeros(partials["mean"].shape[1:])
+        squares = np.zeros_like(mean)
+        for n, one, apart in zip(partials["count"], partials["mean"], partials["squares"], strict=True):
+            if n == 0:
+                continue
+            total, shift = count + n, one - mean
+            mean = mean + shift * (n / total)
+            squares = squares + apart + shift**2 * (count * n / total)
+            count = total
+        mean = mean if count else np.full_like(mean, np.nan)
+        std = np.sqrt(squares / (count - 1)) if count > 1 else np.full_like(mean, np.nan)
+        return {"mean": np.asarray(mean), "std": np.asarray(std), "count": np.asarray(count)}
+
+
+@dataclass(frozen=True)
+class Histogram(Reduction):
+    """Counts of each entry of the quantity in `bins` equal bins from `low` to `high`.
+
+    The result "counts" (bins + 2, ...) has what lies below `low` in front and what does not lie below `high` behind, NaN too;
+    "edges" (bins + 1,).
+    """
+
+    quantity: str | Callable
+    low: float
+    high: float
+    bins: int = 100
+    parts = ("counts", "edges")
+
+    def __post_init__(self):
+        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high and self.bins >= 1):
+            raise ValueError(
+                f"low is {self.low}, high {self.high}, bins {self.bins}; give finite low < high and at least one bin"
+            )
+
+    @property
+    def edges(self) -> np.ndarray:
+        """Ends of the bins (bins + 1,)."""
+        return np.linspace(self.low, self.high, self.bins + 1)
+
+    def partial(self, values: np.ndarray, numbers: np.ndarray) -> Arrays:
+        """Counts of the chunk."""
+        flat = values.reshape(len(values), math.prod(values.shape[1:]))
+        places = np.searchsorted(self.edges, flat, side="right")
+        size, width = self.bins + 2, flat.shape[1]
+        counts = np.bincount((places * width + np.arange(width)).ravel(), minlength=size * width)
+        return {"counts": counts.reshape(size, *values.shape[1:])}
+
+    def merge(self, partials: Arrays) -> Arrays:
+        """Their sum."""
+        return {"counts": partials["counts"].sum(0), "edges": self.edges}
+
+
+@dataclass(frozen=True)
+class Quantiles(Histogram):
+    """Quantiles of each entry at the `probabilities`, from a histogram: wrong by at most the width of one bin.
+
+    The result "quantiles" (probabilities, ...) is NaN where one does not lie between `low` and `high`, and without rollouts.
+    """
+
+    probabilities: Sequence[float] = (0.05, 0.5, 0.95)
+    bins: int = 1000
+    parts = ("quantiles", "probabilities")
+
+    def __post_init__(self):
+        super().__post_init__()
+        given = np.asarray(self.probabilities, float)
+        if given.ndim != 1 or not ((given >= 0) & (given <= 1)).all():
+            raise ValueError(f"probabilities is {self.probabilities}; give numbers from 0 to 1")
+
+    def merge(self, partials: Arrays) -> Arrays:
+        """Linear within a bin."""
+        counts = partials["counts"].sum(0)
+        flat = counts.reshape(len(counts), math.prod(counts.shape[1:]))
+        probabilities = np.asarray(self.probabilities, float)
+        found = np.empty((len(probabilities), flat.shape[1]))
+        for k, column in enumerate(flat.T):
+            found[:, k] = self._of_entry(column, probabilities)
+        return {
+            "quantiles": found.reshape(len(probabilities), *counts.shape[1:]),
+            "probabilities": probabilities,
+        }
+
+    def _of_entry(self, counts: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
+        below, total = np.cumsum(counts), counts.sum()
+        if total == 0:
+            return np.full(len(probabilities), np.nan)
+        wanted = probabilities * total
+        # The first bin up to whose end lie that many, and at least one.
+        place = np.searchsorted(below, np.maximum(wanted, 1e-9 * total))
+        inside = (place > 0) & (place <= self.bins)
+        place = np.clip(place, 1, self.bins)
+        share = (wanted - below[place - 1]) / np.maximum(counts[place], 1)
+        found = self.edges[place - 1] + share * (self.high - self.low) / self.bins
+        return np.where(inside, found, np.nan)
+
+
+@dataclass(frozen=True)
+class Worst(Reduction):
+    """The `keep` rollouts with the largest (or smallest) values of a quantity that is one number, and those values.
+
+    The result has "value" (keep,), NaN where there are fewer rollouts, and "rollout" (keep,), their numbers, -1 there. Equal
+    values stand in the order of their numbers.
+    """
+
+    quantity: str | Callable
+    keep: int = 10
+    largest: bool = True
+    parts = ("value", "rollout")
+
+    def __post_init__(self):
+        if self.keep < 1:
+            raise ValueError(f"keep is {self.keep}; give at least 1")
+
+    def partial(self, values: np.ndarray, numbers: np.ndarray) -> Arrays:
+        """The worst of the chunk."""
+        if values.ndim != 1:
+            raise ValueError(
+                f"quantity of Worst has shape {values.shape[1:]} for each rollout; give a function that returns one number"
+            )
+        return self._worst(values.astype(np.float64), numbers)
+
+    def merge(self, partials: Arrays) -> Arrays:
+        """The worst of these."""
+        there = partials["rollout"] >= 0
+        return self._worst(partials["value"][there], partials["rollout"][there])
+
+    def _worst(self, values: np.ndarray, numbers: np.ndarray) -> Arrays:
+        order = np.lexsort((numbers, -values if self.largest else values))[: self.keep]
+        value, rollout = np.full(self.keep, np.nan), np.full(self.keep, -1, np.int64)
+        value[: len(order)], rollout[: len(order)] = values[order], numbers[order]
+        return {"value": value, "rollout": rollout}
+
+
+def checked_reductions(reductions: Any) -> dict[str, Reduction]:
+    """The reductions by name.
+
+    **Raises:** ValueError for what is no dictionary of reductions, and for names that are no identifiers.
+    """
+    if reductions is None:
+        return {}
+    if not isinstance(reductions, Mapping) or not all(isinstance(x, Reduction) for x in reductions.values()):
+        raise ValueError(
+            f'reductions is {reductions!r}; give a dictionary, such as {{"energy": jd.scale.Mean("energy")}}'
+        )
+    for name in reductions:
+        if not (isinstance(name, str) and name.isidentifier()):
+            raise ValueError(f"reductions has the name {name!r}; take letters, digits and _")
+    return dict(reductions)
+
+
+def quantities(reductions: Mapping[str, Reduction], rows: Mapping[str, Any]) -> dict[str, Any]:
+    """The quantity of each reduction in one rollout, traced.
+
+    **Raises:** ValueError for the name of no array of a rollout.
+    """
+    found = {}
+    for name, reduction in reductions.items():
+        if callable(reduction.quantity):
+            found[name] = reduction.quantity(rows)
+        elif reduction.quantity in rows:
+            found[name] = rows[reduction.quantity]
+        else:
+            raise ValueError(
+                f"reductions[{name!r}] is of {reduction.quantity!r}, which a rollout does not have; it has {', '.join(rows)}. "
+                "Ask for it in outputs, or give a function of them"
+            )
+    return found
+
+
+def described(reductions: Mapping[str, Reduction]) -> list[str]:
+    """A text for each reduction, the same in every process: without the addresses of functions."""
+    return [f"{name}: {re.sub(r' at 0x[0-9a-f]+', '', repr(one))}" for name, one in reductions.items()]

@@ -1,0 +1,297 @@
+"""The store: a Zarr group with one array for each number of a rollout, and the record of the chunks that are finished.
+
+    runs.zarr/            what xarray opens: rows with names and units, reductions, the description in the attributes
+      record/checksum     one row for each chunk, written when all of its arrays are: the chunk is finished
+      partial/            partial results of reductions, one row for each chunk
+
+Every chunk of every array is a file of its own that ends in a CRC-32C (Zarr's codec crc32c), and the record repeats those sums:
+a file that is missing, cut, changed, or of another run is told from the right one. Files are written under another name
+and renamed by Zarr, so that a process that is killed leaves whole files only.
+"""
+
+import contextlib
+import errno
+import os
+import shutil
+import time
+import uuid
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT = 1  # of the layout above
+MOST_BYTES = 2**27  # read at once
+FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+@dataclass(frozen=True)
+class Variable:
+    """An array of the store: name, axes, shape and dtype of one entry along its leading axis.
+
+    `leading` is "rollout", "chunk" (one entry for each chunk) or None (an array of the whole).
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: Any
+    dims: tuple[str, ...]
+    leading: str | None = "rollout"
+    attributes: dict[str, Any] = field(default_factory=dict)
+    compressed: bool = False
+
+
+def packages() -> tuple[Any, Any]:
+    """zarr and xarray.
+
+    **Raises:** ImportError that names the extra.
+    """
+    try:
+        import xarray
+        import zarr
+    except ImportError as error:
+        raise ImportError(f"jd.scale needs {error.name}: pip install 'jaxdyn[scale]'") from error
+    return zarr, xarray
+
+
+class Store:
+    """A store on disk, open to be written.
+
+    **Arguments:** `path`; `description`, what must be equal for a run to go on (see `check`).
+    """
+
+    def __init__(self, path: Path):
+        zarr, _ = packages()
+        self.path = path
+        self._zarr = zarr
+        with self._writing():
+            try:
+                self.group = zarr.open_group(path, mode="r+")
+                attributes = dict(self.group.attrs)
+            except (FileNotFoundError, NotADirectoryError):  # it is there, and is no group of Zarr
+                attributes = {}
+        if attributes.get("jaxdyn_store") != FORMAT:
+            found = attributes.get("jaxdyn_store", "nothing")
+            raise ValueError(
+                f"out is {str(path)!r}, whose format is {found} of jaxdyn and not {FORMAT}: it is of another version, or no "
+                "store of jd.scale; name another one"
+            )
+        self.description = attributes["description"]
+        self.count, self.chunk = attributes["rollouts"], attributes["chunk"]
+        self.chunks = -(-self.count // self.chunk)
+        self.names = tuple(attributes["arrays"])
+        self._arrays = {name: self.group[name] for name in self.names}
+        self._record = self.group["record/checksum"]
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        variables: Sequence[Variable],
+        coordinates: Mapping[str, tuple[Sequence[Any] | np.ndarray, dict[str, Any]]],
+        description: Mapping[str, Any],
+        count: int,
+        chunk: int,
+    ) -> "Store":
+        """A new store, made beside its place and moved there; where another process was first, that one's."""
+        zarr, _ = packages()
+        from zarr.codecs import Crc32cCodec, ZstdCodec
+
+        beside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
+        chunks = -(-count // chunk)
+        lengths = {"rollout": (count, chunk), "chunk": (chunks, 1)}
+        stored = [one for one in variables if one.leading is not None]
+        attributes = {
+            "jaxdyn_store": FORMAT,
+            "description": dict(description),
+            "rollouts": count,
+            "chunk": chunk,
+            "arrays": [one.name for one in stored],
+            "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        }
+        try:
+            with _quiet():
+                group = zarr.create_group(beside, attributes=attributes)
+                for one in variables:
+                    first = [lengths[one.leading]] if one.leading else []
+                    shape = tuple(size for size, _ in first) + one.shape
+                    codecs = [ZstdCodec(), Crc32cCodec()] if one.compressed else [Crc32cCodec()]
+                    group.create_array(
+                        one.name,
+                        shape=shape,
+                        chunks=tuple(max(1, part) for _, part in first) + tuple(max(1, n) for n in one.shape),
+                        dtype=one.dtype,
+                        compressors=codecs,
+                        fill_value=_empty(one.dtype),
+                        dimension_names=([one.leading] if one.leading else []) + list(one.dims),
+                        attributes=one.attributes,
+                    )
+                for name, (values, notes) in coordinates.items():
+                    array = np.asarray(values)
+                    texts = array.dtype.kind in "UO"
+                    place = group.create_array(
+                        name,
+                        shape=array.shape,
+                        dtype="string" if texts else array.dtype,
+                        dimension_names=(name,),
+                        attributes=notes,
+                    )
+                    place[...] = array
+                group.create_array(
+                    "record/checksum",
+                    shape=(chunks, len(stored)),
+                    chunks=(1, len(stored)),
+                    dtype="uint32",
+                    compressors=[Crc32cCodec()],
+                    fill_value=0,
+                    dimension_names=("chunk", "array"),
+                )
+                zarr.consolidate_metadata(beside)
+                try:
+                    beside.rename(path)
+                except OSError as error:
+                    if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                        raise
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+        return cls(path)
+
+    def check(self, description: Mapping[str, Any]) -> None:
+        """Refuse to go on with a store of something else.
+
+        **Raises:** ValueError that names the first part of the description that differs, with both values.
+        """
+        for name, value in description.items():
+            before = self.description.get(name)
+            if before != value:
+                raise ValueError(
+                    f"out is {str(self.path)!r}, a store of another {name}: there it is {_short(before)}, here {_short(value)}; "
+                    f"name another store, or give the {name} of that one"
+                )
+
+    def rows(self, chunk: int) -> slice:
+        """Places of the rollouts of a chunk."""
+        return slice(chunk * self.chunk, min((chunk + 1) * self.chunk, self.count))
+
+    def is_done(self, chunk: int) -> bool:
+        """Whether the chunk is recorded."""
+        return self._file("record/checksum", self._record, chunk).exists()
+
+    def done(self) -> list[int]:
+        """Recorded chunks, by the names of their files."""
+        folder = self._file("record/checksum", self._record, 0).parent.parent
+        names = os.listdir(folder) if folder.is_dir() else []
+        return sorted(int(name) for name in names if name.isdigit())
+
+    def finished(self) -> int:
+        """Rollouts of the recorded chunks."""
+        done = self.done()
+        last = self.count - (self.chunks - 1) * self.chunk
+        return len(done) * self.chunk - (self.chunk - last if self.chunks - 1 in done else 0)
+
+    def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write all arrays of a chunk, then its record.
+
+        **Raises:** OSError that says so where the disk is full; what was recorded before is kept.
+        """
+        with self._writing():
+            for name, array in self._arrays.items():
+                array[self._place(array, chunk)] = arrays[name]
+            self._record[chunk] = self._sums(chunk)
+
+    def parts(self, name: str) -> Iterator[tuple[int, np.ndarray]]:
+        """An array in parts of many chunks, each with the place at which it begins."""
+        array = self._arrays[name]
+        step = array.chunks[0] * max(1, MOST_BYTES // max(array.nbytes // max(array.shape[0], 1) * array.chunks[0], 1))
+        for start in range(0, array.shape[0], step):
+            yield start, np.asarray(array[start : start + step])
+
+    def is_whole(self, chunk: int) -> bool:
+        """Whether all files of a recorded chunk are those that were written, by their sums."""
+        try:
+            if not np.array_equal(np.asarray(self._record[chunk]), self._sums(chunk)):
+                return False
+            for array in self._arrays.values():
+                array[self._place(array, chunk)]
+        except (ValueError, OSError, RuntimeError):  # the codec's sum differs; a file is missing or cut
+            return False
+        return True
+
+    def forget(self, chunk: int) -> None:
+        """Take a chunk off the record, so that it is computed again."""
+        self._file("record/checksum", self._record, chunk).unlink(missing_ok=True)
+
+    def put(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Arrays of the whole: what reductions gave."""
+        with self._writing():
+            for name, value in arrays.items():
+                self.group[name][...] = value
+
+    def remove_leftovers(self, older: float) -> None:
+        """Files that a process was killed while writing, if they are older than so many seconds."""
+        for path in self.path.rglob("*.partial"):
+            with contextlib.suppress(FileNotFoundError):
+                if time.time() - path.stat().st_mtime >= older:
+                    path.unlink()
+
+    def _place(self, array: Any, chunk: int) -> slice:
+        return self.rows(chunk) if array.metadata.dimension_names[0] == "rollout" else slice(chunk, chunk + 1)
+
+    def _file(self, name: str, array: Any, chunk: int) -> Path:
+        return self.path / name / array.metadata.encode_chunk_key((chunk, *(0,) * (array.ndim - 1)))
+
+    def _sums(self, chunk: int) -> np.ndarray:
+        """The last four bytes of each array's file, which are its CRC-32C."""
+        found = []
+        for name, array in self._arrays.items():
+            with self._file(name, array, chunk).open("rb") as file:
+                file.seek(-4, os.SEEK_END)
+                found.append(int.from_bytes(file.read(4), "little"))
+        return np.asarray(found, np.uint32)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        # A chunk of zeros or NaN is a file too: by its files one knows that it was written.
+        with self._zarr.config.set({"array.write_empty_chunks": True}):
+            yield
+
+
+@contextlib.contextmanager
+def full_disk(path: Path) -> Iterator[None]:
+    """Say of what the disk is full.
+
+    **Raises:** OSError that names the store, in place of one that does not.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in FULL:
+            raise OSError(
+                error.errno,
+                f"out is {str(path)!r}, and its file system is full ({os.strerror(error.errno)}); chunks that were finished are "
+                "kept: make room and run again",
+            ) from error
+        raise
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Zarr's warning that consolidated metadata is no part of version 3 of its format; xarray reads it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Consolidated metadata")
+        yield
+
+
+def _empty(dtype: Any) -> Any:
+    kind = np.dtype(dtype)
+    if kind.kind == "f":
+        return np.nan
+    return {"b": False, "u": np.iinfo(kind).max if kind.kind == "u" else 0}.get(kind.kind, -1)
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 200 else f"{text[:100]} ... {text[-90:]}"

@@ -1,0 +1,729 @@
+"""Batches of any size into a store: rows, interruptions, processes, reductions, and how they say no."""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+from jaxdyn.scale import locks, program
+from jaxdyn.scale import store as stores
+from jaxdyn.scale.members import members
+from jaxdyn.scale.processes import Process, process_of
+
+zarr = pytest.importorskip("zarr", reason="zarr is not installed: the extra scale")
+xarray = pytest.importorskip("xarray", reason="xarray is not installed: the extra scale")
+
+QUIET = {"progress": False}
+
+
+def square(p):
+    """What most of these tests compute: next to nothing, so that they test all else."""
+    return {"y": jnp.stack([p["x"] ** 2, jnp.sin(p["x"])]), "z": 1.0 / p["x"]}
+
+
+def drawn(key):
+    return {"x": jax.random.uniform(key, (), minval=1.0, maxval=2.0)}
+
+
+def evaluated(out, samples=23, chunk=5, function=square, parameters=drawn, **options):
+    return jd.scale.evaluate(function, parameters, samples=samples, out=out, chunk=chunk, **QUIET | options)
+
+
+def files(path):
+    """All files of a store, but for the time of its making."""
+    found = {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    return {name: data for name, data in found.items() if not name.endswith("zarr.json")}
+
+
+def arrays(path):
+    with xarray.open_zarr(path, chunks=None) as table:
+        return {name: np.asarray(values) for name, values in table.variables.items()}
+
+
+def assert_equal(one, other):
+    """Bit for bit."""
+    assert one.keys() == other.keys()
+    for name, values in one.items():
+        assert values.dtype == other[name].dtype and values.tobytes() == other[name].tobytes(), name
+
+
+@pytest.fixture(scope="module")
+def pendulums(tmp_path_factory):
+    """A store of 21 double pendulums from given starts, and those starts."""
+    out = tmp_path_factory.mktemp("scale") / "pendulums.zarr"
+    starts = np.linspace(0.1, 1.0, 42).reshape(21, 2)
+    lengths = np.linspace(0.5, 1.0, 21)
+    ts = np.linspace(0.0, 0.2, 3)
+
+    def build(p):
+        return jd.Scene(jd.scenes.double_pendulum().system, forces=(jd.JointDamping(jnp.stack([p["damping"]] * 2)),))
+
+    def again():
+        return jd.scale.run(
+            build,
+            (starts, np.zeros(2)),
+            {"damping": lengths},
+            ts,
+            out=out,
+            chunk=8,
+            stepsize=0.01,
+            outputs=("energy",),
+            units={"damping": "N m s"},
+            **QUIET,
+        )
+
+    return again(), build, starts, lengths, ts, again
+
+
+def test_rows_are_those_of_simulate_with_names_and_units(pendulums):
+    run, build, starts, damping, ts, _ = pendulums
+    assert run.success and run.codes == {"successful": 21} and run.computed == 21
+
+    def one(q, c):
+        found = jd.simulate(build({"damping": c}), q, jnp.zeros(2), ts, stepsize=0.01, outputs=("energy",), throw=False)
+        return found.q, found.v, found.energy
+
+    q, v, energy = jax.jit(jax.vmap(one))(starts, damping)
+    table = run.dataset()
+    assert table.q.dims == ("rollout", "t", "coordinate") and table.energy.dims == ("rollout", "t")
+    assert table.energy.attrs["units"] == "J" and table.t.attrs["units"] == "s"
+    assert table.parameter_damping.attrs["units"] == "N m s"
+    model = jd.scenes.double_pendulum().system
+    if isinstance(model, jd.Model):
+        assert list(table.coordinate.values) == list(model.joint_names)
+    # The same program on other lanes: not one bit.
+    for name, values in (("q", q), ("v", v), ("energy", energy), ("parameter_damping", damping)):
+        assert np.asarray(table[name]).tobytes() == np.asarray(values).tobytes(), name
+    assert table.result.attrs["flag_meanings"].split()[0] == "successful"
+    assert np.ptp(np.asarray(table.q)) > 0.1
+
+
+def test_a_store_that_is_whole_is_only_looked_through(pendulums):
+    run, *_, again = pendulums
+    before = files(run.out)
+    same = again()
+    assert same.computed == 0 and same.codes == run.codes
+    assert files(run.out) == before
+
+
+def test_a_member_is_found_again(tmp_path):
+    run = evaluated(tmp_path / "a.zarr")
+    table = run.dataset()
+    assert float(jd.scale.member(drawn, 17)["x"]) == float(table.parameter_x[17])
+    assert float(jd.scale.member({"x": np.arange(3.0)}, 2)["x"]) == 2.0
+    np.testing.assert_array_equal(table.y[:, 0], table.parameter_x**2)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"chunk": 7}, {"lanes": 2}, {"devices": 1}, {"process": (1, 3)}, {"compress": True}, {"chunk": None}],
+    ids=str,
+)
+def test_rows_do_not_depend_on_how_they_are_computed(tmp_path, options):
+    want = arrays(evaluated(tmp_path / "a.zarr").out)
+    if "devices" in options:
+        options = {"devices": jax.local_devices()[: options["devices"]]}
+    assert_equal(arrays(evaluated(tmp_path / "b.zarr", **options).out), want)
+
+
+def test_motions_do_not_depend_on_devices_and_lanes(pendulums, tmp_path):
+    run, build, starts, damping, ts, _ = pendulums
+    one_device = jd.scale.run(
+        build,
+        (starts, np.zeros(2)),
+        {"damping": damping},
+        ts,
+        out=tmp_path / "b.zarr",
+        lanes=5,
+        devices=jax.local_devices()[:1],
+        stepsize=0.01,
+        outputs=("energy",),
+        **QUIET,
+    )
+    assert_equal(arrays(one_device.out), arrays(run.out))
+
+
+def test_a_program_has_no_communication(pendulums):
+    """Neither of devices nor of processes: nothing per step, nothing per batch."""
+    _, build, starts, damping, ts, _ = pendulums
+    batch = members({"q0": starts, "p": damping}, None, None, 0)
+
+    def one(_, row):
+        found = jd.simulate(build({"damping": row["p"]}), row["q0"], jnp.zeros(2), ts, stepsize=0.01, throw=False)
+        return {"q": found.q, "v": found.v}
+
+    compiled = program.Program(one, batch, jax.local_devices(), 8, None)
+    text = compiled.compiled.as_text()
+    assert "jaxdyn_kernel" in text
+    for collective in (
+        "all-reduce",
+        "all-gather",
+        "all-to-all",
+        "collective-permute",
+        "reduce-scatter",
+        "send",
+        "recv",
+    ):
+        assert f" {collective}(" not in text and f" {collective}-start(" not in text
+    assert len(jax.local_devices()) == 2 and compiled.bytes > 0
+
+
+# Interruptions
+
+SLOW = """
+import sys, time
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 2)
+import jax.numpy as jnp
+import jaxdyn as jd
+
+def drawn(key):
+    return jax.random.uniform(key, (), minval=0.1, maxval=0.9)
+
+def logistic(x):
+    return {"x": jax.lax.fori_loop(0, 300_000, lambda _, x: 3.9 * x * (1 - x), x)}
+
+found = jd.scale.evaluate(logistic, drawn, samples=160, lanes=4, chunk=4, out=sys.argv[1], progress=False,
+                          reductions={"x": jd.scale.Mean("x")})
+print(found.computed)
+"""
+
+
+def started(code, *args, **environment):
+    """A process of its own, with the machine code of the session's."""
+    env = os.environ | {"PYTHONPATH": str(Path(jd.__file__).parents[1]), "JAX_PLATFORMS": "cpu"} | environment
+    command = [sys.executable, "-c", textwrap.dedent(code), *map(str, args)]
+    return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ended(process, timeout=120.0):
+    out, error = process.communicate(timeout=timeout)
+    assert process.returncode == 0, error[-3000:]
+    return out
+
+
+def recorded(path):
+    folder = Path(path) / "record" / "checksum" / "c"
+    return len(list(folder.iterdir())) if folder.is_dir() else 0
+
+
+def killed_at(processes, path, chunks, which):
+    """Kill -9 once so many chunks are recorded."""
+    end = time.monotonic() + 60
+    while recorded(path) < chunks:
+        assert time.monotonic() < end, processes[0].stderr
+        assert all(process.poll() is None for process in processes), [p.communicate() for p in processes]
+        time.sleep(0.002)
+    for k in which:
+        processes[k].send_signal(signal.SIGKILL)
+        processes[k].communicate()
+
+
+def test_kill_9_and_resume(tmp_path):
+    """One process: what was recorded is kept, the rest is computed, and the whole is that of a run without interruption."""
+    out = tmp_path / "killed.zarr"
+    process = started(SLOW, out)
+    killed_at([process], out, 3, [0])
+    kept = recorded(out)
+    assert 3 <= kept < 40
+    assert list(tmp_path.glob("*.lock/process-0.json"))
+    (out / "x" / "c" / "7.0123.partial").write_bytes(b"cut")
+    before = {name: data for name, data in files(out).items() if name.startswith("record")}
+    # In this process: the lock of the dead one is taken over.
+    source: dict = {}
+    exec(SLOW.split("found =")[0].replace("jax.config.update(", "(lambda *_: None)("), source)
+    options = {"samples": 160, "lanes": 4, "chunk": 4, "reductions": {"x": jd.scale.Mean("x")}} | QUIET
+    resumed = jd.scale.evaluate(source["logistic"], source["drawn"], out=out, **options)
+    assert resumed.computed == 160 - 4 * kept
+    assert before.items() <= files(out).items()
+    whole = jd.scale.evaluate(source["logistic"], source["drawn"], out=tmp_path / "whole.zarr", **options)
+    assert files(out) == files(whole.out)
+    np.testing.assert_equal(resumed.reductions, whole.reductions)
+    assert not list(tmp_path.glob("*.lock"))
+
+
+DISKS = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 1)
+import jax.numpy as jnp
+import jaxdyn as jd
+
+def draw(key):
+    mass, radius = jax.random.uniform(key, (2,), minval=0.3, maxval=0.7)
+    return {"mass": mass, "radius": radius}
+
+def start(p):
+    one = jnp.ones_like(p["mass"])
+    return jnp.zeros(4), jnp.stack([2.0 * p["radius"], 0.0 * one, one, 2.0 * one])
+
+if len(sys.argv) > 3:
+    assert jd.scale.initialize().count == jax.process_count() == 2
+found = jd.scale.run(
+    lambda p: jd.scenes.rolling_disk(**p), start, draw, jnp.linspace(0.0, 1.0, 6), samples=int(sys.argv[2]),
+    out=sys.argv[1], lanes=1024, chunk=2048, stepsize=0.002, outputs=("energy",),
+    reductions={"energy": jd.scale.Mean("energy")}, progress=False)
+print(found.computed)
+"""
+
+
+def pair(out, samples, *args, **environment):
+    names = [{"JAXDYN_PROCESS": str(k), "JAXDYN_PROCESSES": "2"} for k in range(2)]
+    return [started(DISKS, out, samples, *args, **name | environment) for name in names]
+
+
+@pytest.mark.slow
+def test_two_processes_one_killed_then_both_then_resumed(tmp_path):
+    """100 000 rolling disks: the survivor does the work of the dead; two that are both killed are gone on with by two others."""
+    out, samples = tmp_path / "disks.zarr", 100_000
+    both = pair(out, samples)
+    killed_at(both, out, 4, [1])
+    at_death = recorded(out)
+    killed_at(both[:1], out, at_death + 4, [0])  # the survivor went on
+    assert recorded(out) < 49
+    both = pair(out, samples)
+    resumed = [int(ended(process)) for process in both]
+    assert sum(resumed) >= samples - 2048 * 48 and not list(tmp_path.glob("*.lock"))
+    ended(started(DISKS, tmp_path / "whole.zarr", samples))
+    assert files(out) == files(tmp_path / "whole.zarr")
+    table = xarray.open_zarr(out, chunks=None)
+    assert table.sizes["rollout"] == samples and not table.result.any()
+    # It rolls on a circle at constant speed: the energy is that of the start.
+    np.testing.assert_allclose(table.energy[:, -1], table.energy[:, 0], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_survivor_does_the_work_of_the_dead(tmp_path):
+    out, samples = tmp_path / "disks.zarr", 40_000
+    both = pair(out, samples)
+    killed_at(both, out, 3, [1])
+    ended(both[0])
+    assert recorded(out) == 20
+    ended(started(DISKS, tmp_path / "whole.zarr", samples))
+    assert files(out) == files(tmp_path / "whole.zarr")
+
+
+@pytest.mark.slow
+def test_processes_of_jax_distributed(tmp_path):
+    """The same between processes that `jd.scale.initialize` has brought together over loopback."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    code = DISKS.replace("initialize()", f"initialize('127.0.0.1:{port}', timeout=60)")
+    names = [{"JAXDYN_PROCESS": str(k), "JAXDYN_PROCESSES": "2"} for k in range(2)]
+    out = tmp_path / "disks.zarr"
+    both = [started(code, out, 20_000, "distributed", **name) for name in names]
+    counts = [int(ended(process)) for process in both]
+    assert sum(counts) >= 20_000
+    ended(started(DISKS, tmp_path / "whole.zarr", 20_000))
+    assert files(out) == files(tmp_path / "whole.zarr")
+
+
+def test_a_coordinator_that_never_answers_is_named():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with pytest.raises(
+        TimeoutError, match=f"coordinator is '127.0.0.1:{port}', and nobody answered there within 0.3 s"
+    ):
+        jd.scale.initialize(f"127.0.0.1:{port}", 2, 1, timeout=0.3)
+    with pytest.raises(ValueError, match="give all three"):
+        jd.scale.initialize("127.0.0.1:1", 2)
+    with pytest.raises(ValueError, match="give host:port"):
+        jd.scale.initialize("somewhere", 2, 1)
+
+
+def test_processes_are_those_that_launchers_say():
+    assert process_of(None, {}) == Process(0, 1)
+    assert process_of(None, {"SLURM_PROCID": "3", "SLURM_NTASKS": "8"}) == Process(3, 8)
+    assert process_of(None, {"JOB_COMPLETION_INDEX": "1", "JAXDYN_PROCESSES": "4"}) == Process(1, 4)
+    assert process_of((1, 2), {"SLURM_PROCID": "3", "SLURM_NTASKS": "8"}) == Process(1, 2)
+    for wrong in ((2, 2), (-1, 2), ("a", 2), 3):
+        with pytest.raises(ValueError, match="process is"):
+            process_of(wrong)
+    with pytest.raises(ValueError, match="SLURM_PROCID"):
+        process_of(None, {"SLURM_PROCID": "9", "SLURM_NTASKS": "8"})
+
+
+# Stores that are not what they should be
+
+
+def test_the_second_run_on_a_store_is_refused(tmp_path):
+    out = tmp_path / "a.zarr"
+    evaluated(out)
+    with locks.Lock(out, Process(0, 1)):
+        with pytest.raises(ValueError, match=rf"process {os.getpid()} of .* is writing.*wait for it"):
+            evaluated(out)
+        with pytest.raises(ValueError, match=r"number 0 of 1.*this is number 1 of 2"):
+            evaluated(out, process=(1, 2))
+    assert evaluated(out).computed == 0
+
+
+@pytest.mark.parametrize("host", ["here", "elsewhere"])
+def test_the_lock_of_a_dead_process_is_taken_over(tmp_path, host):
+    out = tmp_path / "a.zarr"
+    folder = tmp_path / "a.zarr.lock"
+    folder.mkdir()
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    name = socket.gethostname() if host == "here" else "another-host"
+    owner = {"host": name, "pid": gone.pid, "start": "1", "user": "u", "since": "", "index": 0, "count": 1}
+    (folder / "process-0.json").write_text(json.dumps(owner))
+    if host == "elsewhere":
+        with pytest.raises(ValueError, match="another-host"):
+            evaluated(out)
+        old = time.time() - 2 * locks.SILENT
+        os.utime(folder / "process-0.json", (old, old))
+    assert evaluated(out).computed == 23
+    assert not folder.exists()
+
+
+def test_chunks_of_others_are_left_to_them_while_they_live(tmp_path):
+    out = tmp_path / "a.zarr"
+    with locks.Lock(out, Process(0, 2)) as mine, locks.Lock(out, Process(1, 2)) as other:
+        other.me = other.me | {"pid": 1, "start": locks._start_of(1)}  # of a process that lives
+        (mine.directory / "process-1.json").write_text(json.dumps(other.me))
+        assert other.claim(3) and not mine.claim(3) and mine.claim(4) and mine.claim(4)
+        (mine.directory / "chunk-3.json").write_text(json.dumps(other.me | {"start": "another process of that number"}))
+        assert mine.claim(3)
+        mine.release(3)
+        mine.release(4)
+    assert not out.with_name("a.zarr.lock").exists()
+
+
+@pytest.mark.parametrize("damage", ["bit", "cut", "missing", "partial", "record"])
+def test_a_chunk_that_is_not_whole_is_computed_again(tmp_path, damage):
+    out = tmp_path / "a.zarr"
+    reductions = {"y": jd.scale.Mean("y")}
+    evaluated(out, reductions=reductions)
+    before = files(out)
+    name = {"partial": "partial/y_mean/c/2/0", "record": "record/checksum/c/2/0"}.get(damage, "y/c/2/0")
+    data = bytearray(before[name])
+    if damage == "missing":
+        (out / name).unlink()
+    else:
+        data[5] ^= 1
+        (out / name).write_bytes(data[:-9] if damage == "cut" else data)
+    assert files(out) != before
+    again = evaluated(out, reductions=reductions)
+    assert again.repaired == (2,) and again.computed == 5
+    assert files(out) == before
+    assert evaluated(out, reductions=reductions).repaired == ()
+
+
+def test_a_store_of_something_else_is_refused_with_what_differs(tmp_path, monkeypatch):
+    out = tmp_path / "a.zarr"
+    rows = {"x": np.linspace(1.0, 2.0, 23)}
+    evaluated(out, seed=3)
+
+    def refused(difference, **options):
+        with pytest.raises(ValueError, match=difference):
+            evaluated(out, **{"seed": 3} | options)
+
+    refused("of another seed: there it is 3, here 4", seed=4)
+    refused("of another samples: there it is 23, here 24", samples=24)
+    refused("of another rows stored", rows=["y"])
+    refused("of another reductions", reductions={"y": jd.scale.Mean("y")})
+    refused(
+        "of another program of a rollout", function=lambda p: {"y": jnp.stack([p["x"] ** 3, p["x"]]), "z": 1.0 / p["x"]}
+    )
+    refused("of another seed: there it is 3, here None", parameters=rows)
+    evaluated(tmp_path / "b.zarr", parameters=rows)
+    with pytest.raises(ValueError, match="of another values"):
+        evaluated(tmp_path / "b.zarr", parameters={"x": 2.0 * rows["x"]})
+    old = json.loads((out / "zarr.json").read_text())
+    old["attributes"]["description"]["version of jaxdyn"] = "0.0.9"
+    (out / "zarr.json").write_text(json.dumps(old))
+    refused("of another version of jaxdyn: there it is 0.0.9, here 0.1.0")
+    old["attributes"]["jaxdyn_store"] = 0
+    (out / "zarr.json").write_text(json.dumps(old))
+    refused("whose format is 0 of jaxdyn and not 1")
+    (tmp_path / "c.zarr").mkdir()
+    with pytest.raises(ValueError, match=r"no store of jd\.scale"):
+        evaluated(tmp_path / "c.zarr")
+
+
+def test_a_store_of_another_scene_or_other_times_is_refused(pendulums, tmp_path):
+    run, build, starts, damping, ts, _ = pendulums
+    out = tmp_path / "a.zarr"
+    shutil.copytree(run.out, out)
+    options = {"stepsize": 0.01, "outputs": ("energy",), "out": out} | QUIET
+    for scene, times, difference in (
+        (build, 2.0 * ts, "another ts"),
+        (lambda p: jd.Scene(build(p).system), ts, r"another program of a rollout \(scene"),
+    ):
+        with pytest.raises(ValueError, match=difference):
+            jd.scale.run(scene, (starts, np.zeros(2)), {"damping": damping}, times, **options)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=768k", "tmpfs", folder], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("no file system can be mounted here")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def heavy(p):
+    return {"y": jnp.full(2000, p["x"])}
+
+
+def test_a_full_disk_loses_nothing(small_disk, tmp_path):
+    """16 kB a rollout on a disk of 768 kB: it ends with an error that says so, and goes on elsewhere where there is room."""
+    out = small_disk / "a.zarr"
+    with pytest.raises(OSError, match=r"its file system is full .*chunks that were finished are kept") as caught:
+        evaluated(out, function=heavy, samples=80, chunk=4)
+    assert caught.value.errno == errno.ENOSPC
+    kept = recorded(out)
+    assert kept > 3 and not list(small_disk.rglob("*.partial"))
+    shutil.copytree(out, tmp_path / "roomy.zarr")
+    resumed = evaluated(tmp_path / "roomy.zarr", function=heavy, samples=80, chunk=4)
+    assert resumed.computed == 80 - 4 * kept and resumed.repaired == ()
+    whole = evaluated(tmp_path / "whole.zarr", function=heavy, samples=80, chunk=4)
+    assert files(resumed.out) == files(whole.out)
+
+
+def test_a_full_disk_is_told_wherever_it_is_met(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(stores.Store, "write", full)
+    with pytest.raises(OSError, match=r"a\.zarr', and its file system is full"):
+        evaluated(tmp_path / "a.zarr")
+    monkeypatch.undo()
+    assert evaluated(tmp_path / "a.zarr").computed == 23
+
+
+# Failures and reductions
+
+
+def test_failures_are_rows_with_codes(tmp_path):
+    speeds = np.ones((9, 2))
+    speeds[[2, 7]] = np.nan
+    run = jd.scale.run(
+        jd.scenes.double_pendulum(),
+        (np.zeros(2), speeds),
+        None,
+        jnp.linspace(0.0, 0.1, 3),
+        out=tmp_path / "a.zarr",
+        chunk=4,
+        stepsize=0.05,
+        reductions={"q": jd.scale.Mean("q")},
+        **QUIET,
+    )
+    assert run.codes == {"successful": 7, "nonfinite_start": 2} and not run.success
+    assert list(run.failed) == [2, 7] and "2 nonfinite_start" in str(run)
+    table = run.dataset()
+    code = int(table.result[2])
+    assert table.result.attrs["flag_meanings"].split()[code] == "nonfinite_start"
+    assert run.reductions["q"]["count"] == 7
+    good = np.asarray(table.q)[np.asarray(table.result) == 0]
+    np.testing.assert_allclose(run.reductions["q"]["mean"], good.mean(0), rtol=1e-14)
+    assert table.q_mean.dims == ("t", "coordinate")
+
+
+class Extent(jd.scale.Reduction):
+    """A user's own: least and largest."""
+
+    quantity = "z"
+    parts = ("least", "most")
+
+    def partial(self, values, numbers):
+        return {
+            "least": np.min(values, axis=0, initial=np.inf),
+            "most": np.max(values, axis=0, initial=-np.inf),
+        }
+
+    def merge(self, partials):
+        return {"least": partials["least"].min(0), "most": partials["most"].max(0)}
+
+
+def test_reductions_are_those_of_all_rows(tmp_path):
+    reductions = {
+        "y": jd.scale.Mean("y"),
+        "sine": jd.scale.Histogram(lambda row: row["y"][1], 0.85, 0.95, bins=7),
+        "z": jd.scale.Quantiles("z", 0.5, 1.0, bins=2000, probabilities=(0.1, 0.5, 0.9)),
+        "worst": jd.scale.Worst("z", keep=4),
+        "best": jd.scale.Worst(lambda row: row["z"], keep=500, largest=False),
+        "own": Extent(),
+    }
+    run = evaluated(tmp_path / "a.zarr", samples=433, chunk=64, reductions=reductions)
+    table, found = run.dataset(), run.reductions
+    y, z = np.asarray(table.y), np.asarray(table.z)
+    np.testing.assert_allclose(found["y"]["mean"], y.mean(0), rtol=1e-14)
+    np.testing.assert_allclose(found["y"]["std"], y.std(0, ddof=1), rtol=1e-13)
+    inner = np.histogram(y[:, 1], found["sine"]["edges"])[0]
+    inner[-1] -= (y[:, 1] == 0.95).sum()
+    np.testing.assert_array_equal(found["sine"]["counts"][1:-1], inner)
+    assert found["sine"]["counts"].sum() == 433
+    # A bin is 2.5e-4 wide; between neighbours of a sample of 433 lie 3e-3.
+    np.testing.assert_allclose(found["z"]["quantiles"], np.quantile(z, [0.1, 0.5, 0.9]), atol=5e-3)
+    order = np.argsort(-z, kind="stable")
+    np.testing.assert_array_equal(found["worst"]["rollout"], order[:4])
+    np.testing.assert_array_equal(found["worst"]["value"], z[order[:4]])
+    np.testing.assert_array_equal(found["best"]["value"][:433], np.sort(z))
+    assert (found["best"]["rollout"][433:] == -1).all() and np.isnan(found["best"]["value"][433:]).all()
+    assert (found["own"]["least"], found["own"]["most"]) == (z.min(), z.max())
+    for name, parts in found.items():
+        for part, value in parts.items():
+            np.testing.assert_array_equal(np.asarray(table[f"{name}_{part}"]), value)
+    # Without rows the same, and no rows.
+    bare = evaluated(tmp_path / "b.zarr", samples=433, chunk=64, reductions=reductions, rows=False)
+    np.testing.assert_equal(bare.reductions, found)
+    assert "y" not in bare.dataset() and bare.codes == run.codes
+
+
+def test_a_mean_of_large_numbers_does_not_cancel():
+    values = 1e8 + np.random.default_rng(0).normal(size=(1000, 2))
+    mean = jd.scale.Mean("y")
+    parts = [mean.partial(part, np.arange(len(part))) for part in (values[:0], values[:3], values[3:700], values[700:])]
+    found = mean.merge({name: np.stack([part[name] for part in parts]) for name in parts[0]})
+    np.testing.assert_allclose(found["mean"], values.mean(0), rtol=1e-14)
+    # The last bit of 1e8 is 1.5e-8, which is that of the deviations too; sums of squares as they are would lose all digits.
+    np.testing.assert_allclose(found["std"], values.std(0, ddof=1), rtol=1.5e-8)
+    none = mean.merge({name: part[None] for name, part in parts[0].items()})
+    assert none["count"] == 0 and np.isnan(none["mean"]).all() and np.isnan(none["std"]).all()
+
+
+def test_quantiles_outside_of_the_bins_are_not_made_up():
+    quantiles = jd.scale.Quantiles("y", 0.0, 1.0, probabilities=(0.0, 0.2, 0.5, 1.0))
+    part = quantiles.partial(np.array([-1.0, 0.25, 0.5, 0.75, 3.0]), np.arange(5))
+    found = quantiles.merge({"counts": part["counts"][None]})["quantiles"]
+    assert np.isnan(found[[0, 3]]).all() and abs(found[2] - 0.5) < 2e-3
+
+
+# Costs and memory
+
+
+def steps(p):
+    """Newton's method for a root, whose steps depend on the start."""
+
+    def body(state):
+        x, count = state
+        return x - (x * x - 2.0) / (2.0 * x), count + 1
+
+    x, count = jax.lax.while_loop(lambda s: jnp.abs(s[0] ** 2 - 2.0) > 1e-12, body, (p["x"], 0))
+    return {"root": x, "steps": count}
+
+
+@pytest.mark.parametrize("kind", ["function", "array"])
+def test_rollouts_of_equal_cost_stand_together(tmp_path, kind):
+    x = np.exp(np.random.default_rng(1).uniform(1.0, 40.0, 60))
+    cost = (lambda p: jnp.log(p["x"])) if kind == "function" else np.log(x)
+    options = {"function": steps, "parameters": {"x": x}, "samples": None, "chunk": 10, "lanes": 10}
+    plain = evaluated(tmp_path / "a.zarr", **options).dataset()
+    run = evaluated(tmp_path / "b.zarr", cost=cost, **options)
+    table = run.dataset()
+    assert (np.diff(table.steps) <= 0).all() and np.ptp(np.asarray(table.steps)) > 30
+    again = table.sortby("rollout")
+    for name in ("root", "steps", "parameter_x"):
+        np.testing.assert_array_equal(again[name], plain[name])
+    # What lanes wait for: the slowest of each ten.
+    waits = [np.asarray(t.steps).reshape(6, 10).max(1).sum() for t in (plain, table)]
+    assert waits[1] < 1.25 * np.asarray(table.steps).mean() * 6 < waits[0]
+    worst = evaluated(tmp_path / "c.zarr", cost=cost, reductions={"w": jd.scale.Worst("steps", 1)}, **options)
+    assert worst.reductions["w"]["rollout"][0] == np.argmax(np.asarray(plain.steps))
+
+
+def test_blocks_fit_the_memory(tmp_path):
+    free = evaluated(tmp_path / "a.zarr", function=heavy, samples=400, chunk=400, lanes=400)
+    tight = evaluated(tmp_path / "b.zarr", function=heavy, samples=400, chunk=400, lanes=400, memory=2**20)
+    assert free.lanes == 400 and free.program_bytes > 2**24
+    assert tight.lanes < 30 and tight.program_bytes <= 2**20
+    assert_equal(arrays(free.out), arrays(tight.out))
+    with pytest.raises(MemoryError, match=r"a program of 2 rollouts needs .* MiB, and .* are allowed"):
+        evaluated(tmp_path / "c.zarr", function=heavy, samples=400, memory=1000)
+    assert not (tmp_path / "c.zarr").exists()
+
+
+def test_free_memory_is_that_of_the_system():
+    assert 2**20 < program.available_memory(jax.local_devices()) < 2**50
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"samples": None}, "samples is None; say how many"),
+        (
+            {"parameters": {"x": np.ones(3), "w": np.ones(4)}, "samples": None},
+            r"parameters\['w'\] is of 4 .*'x'\] of 3|of 3",
+        ),
+        ({"parameters": {"x": np.ones(3)}, "samples": 5}, "is of 3 rollouts and samples of 5"),
+        ({"parameters": {"x": 1.0}, "samples": 5}, "is one number"),
+        ({"seed": -1}, "seed is -1"),
+        ({"samples": 0}, "of 0 rollouts"),
+        ({"rows": ["w"]}, "name some of parameter_x, y, z"),
+        ({"reductions": {"w": jd.scale.Mean("w")}}, "is of 'w', which a rollout does not have"),
+        ({"reductions": [jd.scale.Mean("y")]}, "give a dictionary"),
+        ({"reductions": {"w": jd.scale.Worst("y")}}, "give a function that returns one number"),
+        ({"cost": np.ones(3)}, r"cost has shape \(3,\)"),
+        ({"devices": []}, "give some of this process' own"),
+        ({"function": lambda p: p["x"]}, "return a dictionary"),
+        ({"function": lambda p: {"result": p["x"]}}, "take another name"),
+        ({"out": "/no/such/directory/a.zarr"}, "there is no directory /no/such/directory"),
+        ({"chunk": 0}, "chunk is 0"),
+        ({"lanes": -3}, "lanes is -3"),
+    ],
+    ids=lambda x: str(x)[:30],
+)
+def test_bad_input_is_refused(tmp_path, options, error):
+    with pytest.raises(ValueError, match=error):
+        evaluated(**{"out": tmp_path / "a.zarr"} | options)
+    assert not list(tmp_path.glob("a.zarr*"))
+
+
+def test_reductions_refuse():
+    for make in (
+        lambda: jd.scale.Histogram("y", 1.0, 1.0),
+        lambda: jd.scale.Quantiles("y", 0.0, 1.0, probabilities=(2.0,)),
+        lambda: jd.scale.Worst("y", keep=0),
+    ):
+        with pytest.raises(ValueError, match="give"):
+            make()
+
+
+def test_states_have_to_be_a_pair(tmp_path):
+    with pytest.raises(ValueError, match=r"states is .*give a pair"):
+        jd.scale.run(jd.scenes.pendulum(), np.zeros(1), None, np.linspace(0, 1, 3), out=tmp_path / "a", samples=3)
+
+
+def test_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(ImportError, match=r"jd.scale needs zarr: pip install 'jaxdyn\[scale\]'"):
+        evaluated(tmp_path / "a.zarr")
+
+
+def test_progress_has_rate_and_time_left(capsys):
+    from jaxdyn.scale.progress import Progress
+
+    done = iter([10, 30, 60, 100])
+    meter = Progress(100, lambda: next(done), every=0.0)
+    meter._start -= 10.0
+    meter.add(20, 1)
+    meter.add(30, 0)
+    meter.end()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].strip() == "30.0 %, 30 of 100 rollouts, 2/s, 35 s left, 1 failed"
+    assert lines[1].split(",")[2].strip() == "5/s" and "8 s left" in lines[1]
+    assert lines[2].startswith("100.0 %") and "left" not in lines[2]
