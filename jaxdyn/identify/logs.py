@@ -1,6 +1,7 @@
 """Logs: measured motion and torque, checked, and the signal preparation that makes one from raw samples."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -68,6 +69,23 @@ def split(log: Log, fraction: float = 0.7) -> tuple[Log, Log]:
     if not 0 < cut < len(log):
         raise ValueError(f"fraction={fraction} of {len(log)} samples leaves one part empty; take one between 0 and 1")
     return log[:cut], log[cut:]
+
+
+def as_logs(log, system=None, *, needs=("v", "a")) -> tuple[Log, ...]:
+    """One log or a sequence of logs as a tuple, each checked against the system unless that is None.
+
+    **Raises:** ValueError for something else, for an empty sequence, and as `check_log`, with the log's place in the sequence.
+    """
+    logs = (log,) if isinstance(log, Log) else tuple(log) if isinstance(log, Sequence) else ()
+    if not logs or not all(isinstance(one, Log) for one in logs):
+        raise ValueError(f"log is {type(log).__name__}; give a jd.identify.Log, or a sequence of at least one")
+    for place, one in enumerate(logs):
+        try:
+            if system is not None:
+                check_log(one, system, needs=needs)
+        except ValueError as error:
+            raise ValueError(f"log {place + 1} of {len(logs)}: {error}" if len(logs) > 1 else str(error)) from None
+    return logs
 
 
 def check_log(log: Log, system, *, needs=("v", "a")) -> None:
