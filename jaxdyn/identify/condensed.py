@@ -6,6 +6,7 @@ samples that are left out, and columns that are left out can then be chosen afte
 block is known without its samples.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -131,7 +132,7 @@ def block_slices(lengths: Sequence[int], total: int) -> list[tuple[int, slice]]:
     for which, length in enumerate(lengths):
         count = min(max(1, round(total * length / sum(lengths))), length)
         edges = np.linspace(0, length, count + 1).astype(int)
-        result += [(which, slice(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        result += [(which, slice(a, b)) for a, b in itertools.pairwise(edges)]
     return result
 
 

@@ -9,6 +9,7 @@
 Source: Dahl (1968), "A solid friction model"; Hamon, Gautier & Garrec (2010), load-dependent friction of geared joints.
 """
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 
 import equinox as eqx
@@ -142,7 +143,7 @@ class ExtraTorque(eqx.Module):
     def named(self) -> dict[str, list]:
         """Coefficients of each term: one list of nv numbers, or k of them."""
         edges = np.cumsum((0, *self.counts))
-        parts = [self.coefficients[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        parts = [self.coefficients[a:b] for a, b in itertools.pairwise(edges)]
         return {
             term.name: (part[0] if len(part) == 1 else part).tolist()
             for term, part in zip(self.terms, parts, strict=True)
