@@ -3,6 +3,7 @@
 from jaxdyn.identify.feasible import fit_torques as fit_torques
 from jaxdyn.identify.friction import TERMS as TERMS
 from jaxdyn.identify.friction import Friction as Friction
+from jaxdyn.identify.intervals import Intervals as Intervals
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import from_raw as from_raw
 from jaxdyn.identify.logs import split as split
@@ -20,4 +21,8 @@ from jaxdyn.identify.replay import rollout as rollout
 from jaxdyn.identify.replay import trajectory_error as trajectory_error
 from jaxdyn.identify.result import Fit as Fit
 from jaxdyn.identify.result import ParameterFit as ParameterFit
+from jaxdyn.identify.robot import RobotFit as RobotFit
+from jaxdyn.identify.robot import fit_robot as fit_robot
+from jaxdyn.identify.torque_terms import EXTRA as EXTRA
+from jaxdyn.identify.torque_terms import TorqueTerm as TorqueTerm
 from jaxdyn.identify.trajectory import fit_trajectory as fit_trajectory

@@ -69,7 +69,7 @@ class Blocks(NamedTuple):
         """One triangle for each torque, of the blocks chosen (an array of bool or of numbers; None: all)."""
         picked = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
         return [
-            np.linalg.qr(np.concatenate([self.triangles[block][joint] for block in picked]), mode="r")
+            np.asarray(np.linalg.qr(np.concatenate([self.triangles[block][joint] for block in picked]), mode="r"))
             for joint in range(self.nv)
         ]
 
@@ -121,7 +121,7 @@ class Blocks(NamedTuple):
 def condensed_rows(rows: np.ndarray, count: int) -> Condensed:
     """`Condensed` of rows [W, w] (m, p + 1) that stand for `count` torques."""
     p = rows.shape[1] - 1
-    triangle = np.linalg.qr(rows, mode="r")
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
     triangle = np.concatenate([triangle, np.zeros((max(p + 1 - len(triangle), 0), p + 1))])
     return Condensed(triangle[:p, :p], triangle[:p, p], float(triangle[p, p] ** 2), count)
 
@@ -163,7 +163,7 @@ def condense_blocks(
             for j in range(nv):
                 table = np.concatenate([W[:, j, :shared], own[:, j, :, j], more[:, j], tau[:, j, None]], axis=1)
                 before = found[j] if found[j].size else np.zeros((0, table.shape[1]))
-                found[j] = np.linalg.qr(np.concatenate([before, table]), mode="r")
+                found[j] = np.asarray(np.linalg.qr(np.concatenate([before, table]), mode="r"))
         triangles.append(found)
         samples.append(part.stop - part.start)
         owners.append(which)

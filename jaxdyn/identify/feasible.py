@@ -164,6 +164,9 @@ def make_problem(model: Model, condensed: Condensed, sizes, terms, v_s, inertia,
     return Problem(chart, *(jnp.asarray(x, dtype) for x in numbers)), point, float(sigma)
 
 
+_loss = eqx.filter_jit(torque_loss)
+
+
 class _Dual(eqx.Module):
     """Multipliers: of a body's pseudo-inertia being positive definite, in the frame where that is 1, and of terms >= 0."""
 
@@ -183,7 +186,7 @@ def newton(model: Model, problem: Problem, point: Coordinates, steps: int, toler
     prior = float(problem.prior)
     inequalities = point.s.shape[1] * int(positive_terms(problem.chart.terms).sum())
     least = 0.1 * tolerance / max(inequalities, 1)
-    gap = max(prior, float(torque_loss(point, problem)) / (4 * len(problem.chart.bodies) + max(inequalities, 1)))
+    gap = max(prior, float(_loss(point, problem)) / (4 * len(problem.chart.bodies) + max(inequalities, 1)))
     one = jnp.broadcast_to(jnp.eye(4, dtype=dtype), problem.chart.origin.shape)
     dual = _Dual(gap * one, jnp.full((point.s.size,), gap, dtype) / jnp.maximum(point.s.reshape(-1) ** 2, 1e-3))
     targets = gap, gap
@@ -235,8 +238,7 @@ def _newton_step(problem: Problem, point: Coordinates, dual: _Dual, weight, barr
     places = free_columns(nb, nv, chart.terms)[10 * nb :]
     rows = [problem.R[:, : 10 * nb] @ inertial, problem.R[:, places] * chart.scale.reshape(1, -1)]
     rows = jnp.concatenate(rows, axis=1)
-    basis = jax.vmap(_linear_factor)(jnp.eye(size, dtype=dtype))
-    basis = basis + jnp.swapaxes(basis, 1, 2)
+    basis = stretches(size, dtype)
     traces = jnp.trace(basis, axis1=1, axis2=2)
     # prior tr(P0^-1 P) is what remains of the divergence without its log det.
     slope = problem.prior * (jax.grad(chart.divergence)(point.theta) + traces[None]) - weight * traces[None]
@@ -286,6 +288,15 @@ def _length(*rates):
     """Longest step up to 1 that leaves a twentieth of everything that shrinks at these rates."""
     fastest = jnp.min(jnp.concatenate([rate.reshape(-1) for rate in rates]), initial=0)
     return jnp.minimum(1, -0.95 / jnp.minimum(fastest, -0.95))
+
+
+def stretches(size: int, dtype) -> Float[Array, "size 4 4"]:
+    """Derivatives of U U^T by the coordinates of a body, at the chart's origin.
+
+    Traces of their products are the curvature of the divergence along straight lines in x: tr(P^-1 dP P^-1 dP).
+    """
+    basis = jax.vmap(_linear_factor)(jnp.eye(size, dtype=dtype))
+    return basis + jnp.swapaxes(basis, 1, 2)
 
 
 def _linear_factor(step):
