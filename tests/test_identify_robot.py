@@ -113,7 +113,7 @@ def test_fits_of_several_logs_are_fits_of_all_their_rows(truth):
 
 def test_presliding_starts_anew_in_every_log():
     """It follows dz/dq = (sign v - z) / z0, from the side the motion starts on; a log does not know the one before."""
-    (_, (dahl,)) = split_terms("dahl")
+    (dahl,) = split_terms("dahl", 1)[1]
     q = np.concatenate([np.linspace(0, 0.01, 40), np.linspace(0.01, 0.004, 40)])[:, None]
     log = identify.Log(np.arange(80.0), q, np.gradient(q, axis=0), q, q)
     z = dahl(log, np.zeros_like(q), 1e-9)[:, 0, 0]
@@ -162,7 +162,7 @@ def test_terms_that_are_there_are_recovered(truth):
 
 def test_load_dependent_friction_follows_the_fitted_robot(truth):
     model = arm()
-    (_, (load,)) = split_terms("load")
+    (load,) = split_terms("load", 2)[1]
 
     def log(seed, noise=0.01):
         bare = motion(seed)
@@ -227,6 +227,7 @@ def test_bad_arguments_raise(truth):
     log = measured(model, motion(1), truth)
     for words, arguments in (
         (r"term 'stiction' is unknown; take some of viscous.*dahl", {"terms": "stiction"}),
+        (r"term 'dahl' is for torques \(2,\); there are 2", {"terms": (("dahl", (2,)),)}),
         ("each may be given once", {"terms": ("dahl", "dahl")}),
         ("v_s is 'fast'", {"v_s": "fast"}),
         ("v_s is -1.0", {"v_s": -1.0, "prior": 1.0}),

@@ -94,19 +94,23 @@ def fit_condensed(
     terms,
     weights: np.ndarray,
     *,
-    chosen=None,
+    rows: np.ndarray | None = None,
+    count: int | None = None,
     inertia: str = "full",
-    sigma: float | None = None,
     steps: int = 200,
     tolerance: float = 1e-6,
     callback=None,
 ) -> Estimate:
-    """Fit the blocks chosen (None: all); `sizes` as of `signal_sizes`, the other arguments as in `fit_torques`."""
-    rows, size = data.blocks.rows(weights, chosen), data.blocks.size
+    """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for.
+
+    `sizes` as of `signal_sizes`, the other arguments as in `fit_torques`.
+    """
+    rows, size = data.blocks.rows(weights) if rows is None else rows, data.blocks.size
+    count = data.blocks.count() if count is None else count
     places = data.places(setting.extra)
     kept = np.append(np.arange(data.basic), places)
-    rows, count = rows[:, [*places, *range(data.basic), size]], data.blocks.count(chosen)
-    sigma = noise_level(condensed_rows(rows, count)) if sigma is None else sigma
+    rows = rows[:, [*places, *range(data.basic), size]]
+    sigma = noise_level(condensed_rows(rows, count))
     units = data.units.reshape(-1)[places - data.basic]
     R, coefficients = eliminate(rows, len(places), np.sqrt(setting.prior) * sigma / units)
     condensed = condensed_rows(R, count)

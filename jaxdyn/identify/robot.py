@@ -1,6 +1,7 @@
 """A robot from one log or several: terms, prior and smoothing chosen by cross-validation, joints weighted by their noise."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -21,6 +22,8 @@ _BLOCKS = 20
 # Fits in which weights of the joints, and the torque that gears carry, are brought up to date.
 _ROUNDS = 3
 _V_S, _PRIOR = 0.01, 1.0
+# How close to the minimum of the loss a fit comes that only tells how good a setting is.
+_ROUGH = 1e-2
 
 
 class RobotFit(eqx.Module):
@@ -30,22 +33,24 @@ class RobotFit(eqx.Module):
     - `weights` (nv,): of each torque, one over the root mean square of its residual, of mean one; ones where not fitted.
     - `choice`: the setting (v_s, extra terms of which joints, prior) and what was tried; no trials where all was given.
     - `intervals`: standard deviations of all parameters and of the base parameters, each from the data or from the prior.
+    - `terms`: those of the fit, extra ones with the numbers of their torques, as `fit_robot` takes them.
     """
 
     fit: Fit
     weights: np.ndarray
     choice: Choice
     intervals: Intervals
+    terms: tuple
 
 
 def fit_robot(
     model: Model,
     log: Log | Sequence[Log],
-    terms="auto",
+    terms: Any = "auto",
     *,
     v_s: float | str = "auto",
     prior: float | str = "auto",
-    weights="auto",
+    weights: Any = "auto",
     inertia: str = "full",
     blocks: int = _BLOCKS,
     callback: Callable | None = None,
@@ -60,7 +65,8 @@ def fit_robot(
 
     - `model`: nominal model, where the fit starts. `log`: one log or several with v and a; they may differ in sampling, and
       nothing is filtered, differenced or remembered from one to the next.
-    - `terms`: names of `TERMS` and of `EXTRA`, and `TorqueTerm`s; or "auto": all of `TERMS`, and of `EXTRA` what helps, joint
+    - `terms`: names of `TERMS` and of `EXTRA`, and `TorqueTerm`s, or pairs of an extra term and the numbers of the torques that
+      have it; or "auto": all of `TERMS`, and of `EXTRA` what helps, joint
       by joint. Springs and pre-sliding need joints with one coordinate each.
     - `v_s`: smoothing velocity of Coulomb friction (rad/s, m/s), or "auto".
     - `prior`: its weight, or "auto". `weights` (nv,): one over the noise of each torque, None for ones, or "auto": one over the
@@ -80,7 +86,7 @@ def fit_robot(
     logs = as_logs(log, model)
     is_auto = isinstance(terms, str) and terms == "auto"
     candidates = [term for term in EXTRA.values() if model.nq == model.nv or term.name not in ("spring", "dahl")]
-    basic, extra = (TERMS, tuple(candidates)) if is_auto else split_terms(terms)
+    basic, extra, where = (TERMS, tuple(candidates), ()) if is_auto else split_terms(terms, model.nv)
     for name, value in (("v_s", v_s), ("prior", prior)):
         if isinstance(value, str) and value != "auto":
             raise ValueError(f'{name} is {value!r}; give a positive number or "auto"')
@@ -90,11 +96,8 @@ def fit_robot(
         raise ValueError(f"blocks is {blocks}; give at least 2")
     problem = _Problem(model, logs, basic, extra, inertia, blocks)
     fixed = None if isinstance(weights, str) and weights == "auto" else check_weights(weights, model.nv)
-    all_joints = tuple(range(model.nv))
     setting = Setting(
-        _V_S if isinstance(v_s, str) else float(v_s),
-        () if is_auto else tuple((term.name, all_joints) for term in extra),
-        _PRIOR if isinstance(prior, str) else float(prior),
+        _V_S if isinstance(v_s, str) else float(v_s), where, _PRIOR if isinstance(prior, str) else float(prior)
     )
     problem.refine(setting, fixed, rounds=2 if extra or fixed is None else 1)
     trials, by = (), "given"
@@ -110,7 +113,9 @@ def fit_robot(
     data = problem.data(setting.v_s)
     fit = problem.result(setting, estimate, data)
     found = intervals(model, data, setting, estimate, problem.weights, basic)
-    return RobotFit(fit, problem.weights, Choice(setting, trials, by), found)
+    used = dict(setting.extra)
+    chosen = (*basic, *((term, used[term.name]) for term in extra if term.name in used))
+    return RobotFit(fit, problem.weights, Choice(setting, trials, by), found, chosen)
 
 
 class _Problem:
@@ -123,6 +128,7 @@ class _Problem:
         self.loads = [np.zeros_like(np.asarray(log.tau, np.float64)) for log in logs]
         self.torque = float(sum(np.sum(np.asarray(log.tau, np.float64) ** 2) for log in logs))
         self._data: dict[float, Data] = {}
+        self._rows: dict[tuple, np.ndarray] = {}
 
     def data(self, v_s: float) -> Data:
         """Condensed logs for one v_s."""
@@ -130,30 +136,27 @@ class _Problem:
             self._data[v_s] = gather(self.model, self.logs, v_s, self.extra, self.loads, self.blocks)
         return self._data[v_s]
 
-    def fit(self, setting: Setting, chosen=None, tolerance=1e-6) -> Estimate:
-        """One fit."""
+    def fit(self, setting: Setting, **options) -> Estimate:
+        """One fit, of all blocks unless the options of `fit_condensed` say otherwise."""
+        data = self.data(setting.v_s)
         return fit_condensed(
-            self.model,
-            self.data(setting.v_s),
-            setting,
-            self.sizes,
-            self.basic,
-            self.weights,
-            chosen=chosen,
-            inertia=self.inertia,
-            tolerance=tolerance,
+            self.model, data, setting, self.sizes, self.basic, self.weights, inertia=self.inertia, **options
         )
 
     def left_out(self, setting: Setting, part: np.ndarray) -> np.ndarray:
         """Squared errors (nv,) on some blocks, of a fit to the others. No more digits than the choice needs."""
-        blocks = self.data(setting.v_s).blocks
+        blocks, key = self.data(setting.v_s).blocks, (setting.v_s, tuple(part.tolist()))
         rest = np.setdiff1d(np.arange(len(blocks)), part)
-        return blocks.squares(self.fit(setting, rest, tolerance=1e-2).x, part).sum(axis=0)
+        if key not in self._rows:
+            self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
+        found = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), tolerance=_ROUGH)
+        return blocks.squares(found.x, part).sum(axis=0)
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
         """Fit some times over; after each but the last, update weights and loads."""
         if fixed is not None:
             self.weights = fixed
+        self._rows = {}
         for left in reversed(range(rounds)):
             estimate = self.fit(setting)
             if not left:

@@ -10,7 +10,7 @@ Source: Dahl (1968), "A solid friction model"; Hamon, Gautier & Garrec (2010), l
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -94,26 +94,37 @@ EXTRA = {
 }
 
 
-def split_terms(terms: str | TorqueTerm | Iterable) -> tuple[tuple[str, ...], tuple[TorqueTerm, ...]]:
-    """Names of `TERMS`, and `TorqueTerm`s, from both and from names of `EXTRA` in any order.
+def split_terms(
+    terms, nv: int
+) -> tuple[tuple[str, ...], tuple[TorqueTerm, ...], tuple[tuple[str, tuple[int, ...]], ...]]:
+    """Names of `TERMS`; `TorqueTerm`s; and (name, numbers of the torques that have it) of these.
 
-    **Raises:** ValueError for an unknown or a repeated term.
+    `terms` are names of `TERMS` and of `EXTRA` and `TorqueTerm`s, in any order; or pairs of such an extra term and the numbers
+    of the torques that have it, instead of all.
+
+    **Raises:** ValueError for an unknown or a repeated term, and for numbers that are none of a torque.
     """
     given = (terms,) if isinstance(terms, str | TorqueTerm) else tuple(terms)
-    basic = tuple(term for term in given if term in TERMS)
-    extra = []
-    for term in given:
-        if isinstance(term, TorqueTerm):
-            extra.append(term)
-        elif term not in TERMS:
-            if term not in EXTRA:
-                known = ", ".join((*TERMS, *EXTRA))
-                raise ValueError(f"term {term!r} is unknown; take some of {known}, or a jd.identify.TorqueTerm")
-            extra.append(EXTRA[term])
+    basic = tuple(term for term in given if isinstance(term, str) and term in TERMS)
+    extra, where = [], []
+    for item in given:
+        if isinstance(item, str) and item in TERMS:
+            continue
+        term, joints = item if isinstance(item, tuple) else (item, range(nv))
+        if isinstance(term, str) and term in EXTRA:
+            term = EXTRA[term]
+        if not isinstance(term, TorqueTerm):
+            known = ", ".join((*TERMS, *EXTRA))
+            raise ValueError(f"term {term!r} is unknown; take some of {known}, or a jd.identify.TorqueTerm")
+        joints = tuple(sorted({int(joint) for joint in joints}))
+        if not joints or not 0 <= joints[0] <= joints[-1] < nv:
+            raise ValueError(f"term {term.name!r} is for torques {joints}; there are {nv}, from 0 to {nv - 1}")
+        extra.append(term)
+        where.append((term.name, joints))
     names = [*basic, *(term.name for term in extra)]
     if len(set(names)) < len(names):
         raise ValueError(f"terms are {', '.join(names)}; each may be given once")
-    return check_terms(basic, 1.0), tuple(extra)
+    return check_terms(basic, 1.0), tuple(extra), tuple(where)
 
 
 def term_columns(terms: Sequence[TorqueTerm], log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
