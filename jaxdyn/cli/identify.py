@@ -191,6 +191,7 @@ def run(args: argparse.Namespace) -> None:
         outcome=_outcome(final),
         is_refit=not test_paths,
         warnings=[],
+        choice=judge.choice if isinstance(judge, RobotFit) else None,
     )
     findings.warnings.extend(_warnings(findings, args))
     print(judged_table(findings))

@@ -5,6 +5,7 @@ import numpy as np
 from jaxdyn.cli.common import coordinate_labels, short, table
 from jaxdyn.identify import TERMS, LeastSquares, RobotFit, nominal_parameters
 from jaxdyn.identify.regression import free_columns
+from jaxdyn.identify.selection import Choice
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.identification import Findings, total_percent
 
@@ -40,7 +41,7 @@ def tables(findings: Findings) -> str:
         parts.append("Base parameters: URDF, fitted, standard deviation for independent errors\n" + table(header, rows))
         return "\n".join(parts)
     if isinstance(result, RobotFit):
-        parts += [_choice_text(result, model), _robot_base_table(result, model)]
+        parts += [_choice_text(findings.choice or result.choice, model), _robot_base_table(result, model)]
     parts.append(_mass_table(findings))
     return "\n".join(parts)
 
@@ -68,11 +69,11 @@ def _joint_table(findings: Findings) -> str:
     return f"Joints: errors on {first.name}, friction and rotor inertia\n" + table(header, rows)
 
 
-def _choice_text(result: RobotFit, model: Model) -> str:
-    setting, labels = result.choice.setting, coordinate_labels(model)[0]
+def _choice_text(choice: Choice, model: Model) -> str:
+    setting, labels = choice.setting, coordinate_labels(model)[0]
     extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
-    how = f", chosen over {len(result.choice.trials)} settings, each judged on {result.choice.by} left out in turn"
-    return f"v_s {setting.v_s:g}, prior {setting.prior:g}, extra terms: {extra}{how if result.choice.trials else ''}"
+    how = f", chosen over {len(choice.trials)} settings, each judged on {choice.by} left out in turn"
+    return f"v_s {setting.v_s:g}, prior {setting.prior:g}, extra terms: {extra}{how if choice.trials else ''}"
 
 
 def _robot_base_table(result: RobotFit, model: Model) -> str:

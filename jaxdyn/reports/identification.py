@@ -17,6 +17,7 @@ from jaxdyn.identify import (
     torque_error,
 )
 from jaxdyn.identify.regression import free_columns
+from jaxdyn.identify.selection import Choice
 from jaxdyn.model.tree import Model
 
 
@@ -50,7 +51,7 @@ class Findings(NamedTuple):
 
     `result`: what is written, fitted to all training logs. `tests`: logs, or parts of logs, that were not fitted, under the fit
     that is to be judged; `train`: what that fit was made from; `final`: all training logs under `result`. `is_refit`: whether
-    `result` is another fit than the one judged.
+    `result` is another fit than the one judged. `choice`: how its setting was chosen, on `train`; None for other fits.
     """
 
     model: Model
@@ -61,6 +62,7 @@ class Findings(NamedTuple):
     outcome: str
     is_refit: bool
     warnings: list[str]
+    choice: Choice | None = None
 
     @property
     def fit(self) -> Fit | LeastSquares:
@@ -125,21 +127,21 @@ def content(findings: Findings, settings: dict[str, Any]) -> dict[str, Any]:
         rows = zip(names, nominal.tolist(), fitted.tolist(), strict=True)
         found["parameters"] = {name: {"nominal": x0, "fitted": x} for name, x0, x in rows}
     if isinstance(result, RobotFit):
-        _add_robot(found, result, model)
+        _add_robot(found, result, findings.choice or result.choice, model)
     return found
 
 
-def _add_robot(found: dict[str, Any], result: RobotFit, model: Model) -> None:
-    setting, extra = result.choice.setting, result.fit.extra
+def _add_robot(found: dict[str, Any], result: RobotFit, choice: Choice, model: Model) -> None:
+    setting, extra = choice.setting, result.fit.extra
     spreads = result.intervals
     found["chosen"] = {
         "v_s": setting.v_s,
         "prior": setting.prior,
         "extra_terms": {name: [model_joint(model, j) for j in joints] for name, joints in setting.extra},
-        "by": result.choice.by,
+        "by": choice.by,
         "trials": [
             {"v_s": t.setting.v_s, "prior": t.setting.prior, "extra_terms": dict(t.setting.extra), "percent": t.percent}
-            for t in result.choice.trials
+            for t in choice.trials
         ],
     }
     found["extra_terms"] = {} if extra is None else extra.named

@@ -91,7 +91,8 @@ def _spectrum(one: Judged, labels: Sequence[str]) -> Any:
 def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
     result = findings.result
     assert isinstance(result, RobotFit)
-    setting, trials, base = result.choice.setting, result.choice.trials, result.intervals.base
+    choice = findings.choice or result.choice
+    setting, trials, base = choice.setting, choice.trials, result.intervals.base
     extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
     parts = [
         "<h2>What was chosen</h2>",
@@ -108,7 +109,7 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
             for t in sorted(trials, key=lambda t: t.score)
         ]
         parts += [
-            f"<p class='note'>{len(trials)} settings, each judged on {escaped(result.choice.by)} left out in turn.</p>",
+            f"<p class='note'>{len(trials)} settings, each judged on {escaped(choice.by)} left out in turn.</p>",
             "<details><summary>all of them, best first</summary>",
             html_table(("error (%)", "v_s", "prior", "extra terms"), cells) + "</details>",
         ]
@@ -138,7 +139,7 @@ def _interval_figure(result: RobotFit) -> Any:
     ratio = result.intervals.factor * base.std[shown] / np.abs(base.values[shown])
     order = np.argsort(ratio)
     colours = np.where(np.array(base.sources)[shown][order] == "data", BLUE, GREY)
-    figure, axes = new_figure(11, 2.8)
+    figure, axes = new_figure(11.0, 2.8)
     ax = axes[0, 0]
     ax.bar(np.arange(len(order)), ratio[order], color=colours.tolist())
     ax.axhline(1, color=RED, linewidth=0.8)
