@@ -9,6 +9,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.cli import main
+from jaxdyn.identify.logs import as_measured
 from jaxdyn.io.logs import read_log, write_log
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
@@ -180,6 +181,10 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, c
     offset = 10 * fitted.nb + fitted.nv * jd.identify.TERMS.index("offset")
     x[offset : offset + fitted.nv] = report["friction"]["offset"]
     rows = jd.identify.regressor(fitted, log.q, log.v, log.a)
+    # Friction counts as the log's low-pass leaves it.
+    column = np.tanh(log.v / 0.01)
+    place = 10 * fitted.nb + fitted.nv * jd.identify.TERMS.index("coulomb") + np.arange(7)
+    rows[:, np.arange(7), place] = as_measured(log, column)
     # A URDF holds the inertia about the centre of mass, so some digits of small moments are lost on the way.
     np.testing.assert_allclose(
         jd.identify.torque_error(rows @ x, log.tau), report["torque_error"]["final_percent"], rtol=1e-6

@@ -8,6 +8,7 @@ import pytest
 
 from jaxdyn import identify, inertia
 from jaxdyn.identify.condensed import block_slices, condensed_rows
+from jaxdyn.identify.logs import as_measured
 from jaxdyn.identify.one_fit import eliminate
 from jaxdyn.identify.regression import condense, condense_model
 from jaxdyn.identify.selection import folds, helped
@@ -174,6 +175,22 @@ def test_load_dependent_friction_follows_the_fitted_robot(truth):
     fit = identify.fit_robot(model, log(1), (*identify.TERMS, "load"), v_s=0.01, prior=1.0)
     np.testing.assert_allclose(fit.fit.extra.coefficients, 0.1, atol=3e-3)
     assert fit.fit.error(log(2, noise=0.0)) < 0.2
+
+
+def test_friction_goes_through_the_filter_of_the_log(truth):
+    """Raw samples of an arm with Coulomb friction, low-passed: a jump of the torque is then a slope, and so is the column's."""
+    model = arm()
+    raw = measured(model, motion(1, 12001, 24.0), truth)
+    log = identify.from_raw(raw.t, raw.q, raw.tau, cutoff=8.0, trim=200, every=4)
+    assert log.cutoff == log[10:].cutoff == 8.0 and raw.cutoff is None
+    fit = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, weights=None).fit
+    plain = identify.fit_torques(model, log, v_s=0.01)
+    assert fit.error(log) < 0.2 * plain.error(log)
+    np.testing.assert_allclose(fit.friction.coulomb, truth[22:24], rtol=0.01)
+    # Smooth signals pass as they are, and a log without a filter leaves every column alone.
+    np.testing.assert_allclose(as_measured(log, log.v)[50:-50], log.v[50:-50], atol=2e-3)
+    column = np.tanh(raw.v / 0.01)
+    assert as_measured(raw, column) is column
 
 
 def test_choice_by_cross_validation(truth):

@@ -138,7 +138,7 @@ def block_slices(lengths: Sequence[int], total: int) -> list[tuple[int, slice]]:
 
 def condense_blocks(
     logs: Sequence[Log],
-    rows: Callable[[Log], np.ndarray],
+    rows: Callable[[int, slice], np.ndarray],
     shared: int,
     *,
     extra: Sequence[np.ndarray] = (),
@@ -146,9 +146,9 @@ def condense_blocks(
 ) -> Blocks:
     """Condense logs, block by block.
 
-    **Arguments:** `logs`; `rows(log)`, the regressor (n, nv, s + k nv) of some samples, whose terms are diagonal blocks;
-    `shared`, its number s of columns before the terms; `extra`: for each log, more terms (n, nv, k'); `blocks`: about how
-    many, over all logs.
+    **Arguments:** `logs`; `rows(which, piece)`, the regressor (n, nv, s + k nv) of some samples of a log, whose terms are
+    diagonal blocks; `shared`, its number s of columns before the terms; `extra`: for each log, more terms (n, nv, k');
+    `blocks`: about how many, over all logs.
     """
     triangles, samples, owners = [], [], []
     for which, part in block_slices([len(log) for log in logs], blocks):
@@ -157,7 +157,7 @@ def condense_blocks(
         for start in range(part.start, part.stop, _SAMPLES):
             piece = slice(start, min(start + _SAMPLES, part.stop))
             log = logs[which][piece]
-            W, tau = rows(log), np.asarray(log.tau, np.float64)
+            W, tau = rows(which, piece), np.asarray(log.tau, np.float64)
             own = W[:, :, shared:].reshape(len(log), nv, -1, nv)
             more = np.zeros((len(log), nv, 0)) if not len(extra) else extra[which][piece]
             for j in range(nv):

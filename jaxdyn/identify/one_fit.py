@@ -13,9 +13,9 @@ import numpy as np
 from jaxdyn.identify.chart import Chart, Coordinates
 from jaxdyn.identify.condensed import Blocks, condensed_rows
 from jaxdyn.identify.feasible import make_problem, newton
-from jaxdyn.identify.logs import Log, root_mean_square
+from jaxdyn.identify.logs import Log, as_measured, root_mean_square
 from jaxdyn.identify.regression import condense_model, noise_level
-from jaxdyn.identify.torque_terms import TorqueTerm
+from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_column
 from jaxdyn.model.tree import Model
 
 # A coefficient's unit is what makes this share of the joint's torque.
@@ -72,7 +72,8 @@ def gather(
     model: Model, logs: Sequence[Log], v_s: float, extra: Sequence[TorqueTerm], loads: Sequence[np.ndarray], blocks: int
 ) -> Data:
     """Condense logs with the columns of extra terms; `loads` (n, nv) of each log is the torque of the rigid bodies."""
-    parts = [[term(log, load, v_s) for term in extra] for log, load in zip(logs, loads, strict=True)]
+    parts = [[as_measured(log, term(log, load, v_s)) for term in extra] for log, load in zip(logs, loads, strict=True)]
+    coulomb = [as_measured(log, coulomb_column(log, v_s)) for log in logs]
     counts = {term.name: part.shape[2] for term, part in zip(extra, parts[0], strict=True)}
     columns = [
         np.concatenate([np.zeros((len(log), log.nv, 0)), *part], axis=2) for log, part in zip(logs, parts, strict=True)
@@ -82,7 +83,7 @@ def gather(
     size = root_mean_square(joined.reshape(len(joined), -1)).reshape(joined.shape[1:]).T
     torque = np.where(torque > 0, torque, torque.max(initial=0) or 1.0)
     units = np.where(size > 0, _UNIT * torque / np.where(size > 0, size, 1), 0.0)
-    data = condense_model(model, logs, v_s=v_s, extra=columns, blocks=blocks)
+    data = condense_model(model, logs, v_s=v_s, coulomb=coulomb, extra=columns, blocks=blocks)
     return Data(data, 10 * model.nb + 4 * model.nv, counts, units)
 
 

@@ -89,12 +89,29 @@ def condense(model: Model, log: Log | Sequence[Log], *, v_s=0.01, weights=None) 
 
 
 def condense_model(
-    model: Model, logs: Sequence[Log], *, v_s=0.01, extra: Sequence[np.ndarray] = (), blocks: int = 1
+    model: Model,
+    logs: Sequence[Log],
+    *,
+    v_s=0.01,
+    coulomb: Sequence[np.ndarray] | None = None,
+    extra: Sequence[np.ndarray] = (),
+    blocks: int = 1,
 ) -> Blocks:
-    """`condense_blocks` of the regressor with all terms, and of `extra` terms (n, nv, k) for each log."""
-    return condense_blocks(
-        logs, lambda log: regressor(model, log.q, log.v, log.a, v_s=v_s), 10 * model.nb, extra=extra, blocks=blocks
-    )
+    """`condense_blocks` of the regressor with all terms.
+
+    `coulomb`: for each log, columns (n, nv) of Coulomb friction instead of tanh(v / v_s); `extra`: more terms (n, nv, k).
+    """
+    start = 10 * model.nb + model.nv * TERMS.index("coulomb")
+
+    def rows(which, piece):
+        log = logs[which][piece]
+        W = regressor(model, log.q, log.v, log.a, v_s=v_s)
+        if coulomb is not None:
+            joints = np.arange(model.nv)
+            W[:, joints, start + joints] = coulomb[which][piece]
+        return W
+
+    return condense_blocks(logs, rows, 10 * model.nb, extra=extra, blocks=blocks)
 
 
 class BaseParameters(eqx.Module):

@@ -200,4 +200,5 @@ class _Problem:
             terms=(*self.basic, *(term.name for term in terms)),
             sigma=estimate.sigma,
             extra=extra,
+            as_measured=True,
         )

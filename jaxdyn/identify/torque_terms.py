@@ -16,7 +16,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.identify.friction import TERMS, check_terms
-from jaxdyn.identify.logs import Log
+from jaxdyn.identify.logs import Log, as_measured
 
 # The way in which pre-sliding friction turns round (rad, m).
 PRESLIDING = 0.003
@@ -47,8 +47,13 @@ class TorqueTerm(eqx.Module):
         return value
 
 
+def coulomb_column(log: Log, v_s: float) -> np.ndarray:
+    """tanh(v / v_s), (n, nv)."""
+    return np.tanh(np.asarray(log.v, np.float64) / v_s)
+
+
 def _load(log, load, v_s):
-    return np.abs(load) * np.tanh(np.asarray(log.v) / v_s)
+    return np.abs(load) * coulomb_column(log, v_s)
 
 
 def _asymmetric(log, load, v_s):
@@ -148,7 +153,8 @@ class ExtraTorque(eqx.Module):
 
     def torque(self, log: Log, load: np.ndarray) -> np.ndarray:
         """Torque (n, nv) of all terms along a log, with the rigid bodies' torque `load` (n, nv) (N m, N)."""
-        return np.einsum("ijk,kj->ij", term_columns(self.terms, log, load, self.v_s), self.coefficients)
+        columns = as_measured(log, term_columns(self.terms, log, load, self.v_s))
+        return np.einsum("ijk,kj->ij", columns, self.coefficients)
 
     @property
     def named(self) -> dict[str, list]:
