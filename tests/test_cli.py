@@ -370,6 +370,7 @@ def test_identify_by_trajectory_from_a_log_taken_as_filtered(arm, tmp_path, caps
         ),
         (["identify", "--urdf", "ARM", "--log", "GOOD"], "too few"),
         (["identify", "--urdf", "ARM", "--log", "GOOD", "GOOD"], "given twice"),
+        (["identify", "--urdf", "ARM", "--log", "GOOD", "--rename", "m1"], "as motor1=shoulder"),
         (["identify", "--urdf", "ARM", "--log", "GOOD", "--test-log", "GOOD"], "a log that is fitted tells no error"),
         (["identify", "--urdf", "ARM", "--log", "GOOD", "--terms", "auto", "dahl"], "auto stands alone"),
         (["identify", "--urdf", "ARM", "--log", "GOOD", "--v-s", "fast"], "--v-s: 'fast' is no finite number"),

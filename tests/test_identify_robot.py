@@ -12,6 +12,8 @@ from jaxdyn.identify.logs import as_measured
 from jaxdyn.identify.one_fit import eliminate
 from jaxdyn.identify.regression import condense, condense_model
 from jaxdyn.identify.selection import folds, helped
+from jaxdyn.identify.spectra import motion_band, vibration
+from jaxdyn.identify.suspicions import suspicions
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
 from jaxdyn.model.builder import ModelBuilder
 
@@ -332,3 +334,61 @@ def test_one_log_condenses_as_before(truth):
     one, two = condense(model, log), condensed_rows(blocks.rows(np.ones(2)), blocks.count())
     np.testing.assert_allclose(one.R.T @ one.R, two.R.T @ two.R, atol=1e-10)
     assert one.rows == two.rows == 600
+
+
+# --- what looks wrong -------------------------------------------------------------------------------------------------
+
+
+def test_suspicions(truth):
+    model, names = arm(), ("a", "b")
+    good = measured(model, motion(1), truth)
+    assert suspicions(model, good, names) == []
+
+    def changed(**signals):
+        values = {name: getattr(good, name) for name in ("t", "q", "v", "a", "tau")} | signals
+        return suspicions(model, identify.Log(**values), names)
+
+    (line,) = changed(tau=good.tau / 150)
+    assert line.startswith("torques of a, b are about 1/") and "gear ratios" in line
+    (line,) = changed(tau=1000 * good.tau)
+    assert "N mm" in line
+    assert any("are they in degrees" in line for line in changed(q=np.rad2deg(good.q)))
+    still = changed(v=good.v * [1, 0], a=good.a * [1, 0])
+    assert any(line.startswith("b stand still") for line in still)
+
+
+def test_vibration_is_told_from_friction():
+    """A residual at the motion's own frequencies is none; one at 15 Hz is, and the edge is ten times the motion's band."""
+    t = np.linspace(0, 10, 2001)[:, None]
+    log = identify.Log(
+        t[:, 0], np.sin(2 * np.pi * t), 2 * np.pi * np.cos(2 * np.pi * t), -40 * np.sin(2 * np.pi * t), t
+    )
+    slow, fast = np.sin(4 * np.pi * t), np.sin(30 * np.pi * t)
+    assert motion_band(log) == pytest.approx(1.0, abs=0.21)  # the window's width is two tenths of a hertz
+    share, edge = vibration(log, slow + fast)
+    assert share == pytest.approx(0.5, abs=1e-3) and edge == 10 * motion_band(log)
+    assert vibration(log, slow)[0] < 1e-6
+    still = identify.Log(t[:, 0], 0 * t, 0 * t, 0 * t, t)
+    assert motion_band(still) == 0.0 and vibration(still, fast) == (0.0, 0.0)
+
+
+# --- payloads ---------------------------------------------------------------------------------------------------------
+
+
+def test_payload_is_what_loaded_logs_differ_by(truth):
+    """A wrong nominal robot, friction and noise: mass, centre and inertia come back within their intervals."""
+    model, nominal = arm(), arm(0.2, 3)
+    held = np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
+    x = truth.copy()
+    x[10:20] += held
+    unloaded = [measured(model, motion(seed), truth, noise=0.02, seed=seed) for seed in (1, 2)]
+    loaded = measured(model, motion(3), x, noise=0.02, seed=3)
+    found = identify.fit_payload(nominal, unloaded, loaded, terms=identify.TERMS, v_s=0.01, prior=1.0)
+    assert found.body == "b" and found.error < 0.5 * found.without
+    # A planar arm shows m x, m z and the inertia about its axis alone, and not the mass without them.
+    seen = [1, 3, 6]
+    assert np.all(np.abs(found.inertia - held)[seen] <= found.factor * found.std[seen] + 1e-3)
+    assert np.abs(found.inertia - held)[seen].max() < 0.03
+    assert inertia.is_feasible(found.inertia)
+    with pytest.raises(ValueError, match=r"body is 'hand'; the bodies are a, b"):
+        identify.fit_payload(nominal, unloaded, loaded, "hand")

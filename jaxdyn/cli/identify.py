@@ -13,6 +13,7 @@ from jaxdyn.cli.common import Stopwatch, add_model_options, coordinate_labels, l
 from jaxdyn.cli.identify_tables import judged_table, tables
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.identify.spectra import vibration
+from jaxdyn.identify.suspicions import suspicions
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
 from jaxdyn.io.logs import read_log
@@ -85,6 +86,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--test-log", nargs="+", action="extend", default=[], metavar="FILE", help="logs that only tell the error"
+    )
+    parser.add_argument(
+        "--rename",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE_NAME=JOINT",
+        help="joints whose columns have other names in the logs",
     )
     add_model_options(parser)
     parser.add_argument("--repair", action="store_true", help="replace inertias no body can have before fitting")
@@ -267,6 +276,14 @@ def _paths(args) -> tuple[list[str], list[str]]:
     return list(args.log), list(args.test_log)
 
 
+def _renaming(items: list[str]) -> dict[str, str]:
+    pairs = [item.partition("=") for item in items]
+    bad = [item for item, (theirs, sign, ours) in zip(items, pairs, strict=True) if not (theirs and sign and ours)]
+    if bad:
+        raise ValueError(f"--rename {bad[0]}: give the name in the log and the joint's, as motor1=shoulder")
+    return {theirs: ours for theirs, _, ours in pairs}
+
+
 def _names(paths: list[str]) -> list[str]:
     """Names of files, with their folders where two would be the same."""
     names = [pathlib.Path(path).name for path in paths]
@@ -275,7 +292,7 @@ def _names(paths: list[str]) -> list[str]:
 
 def _log(model: Model, path: str, args) -> Log:
     """The log of a file, filtered unless it has been."""
-    raw = read_log(path, joint_names=model.joint_names)
+    raw = read_log(path, joint_names=model.joint_names, rename=_renaming(args.rename))
     if raw.q.shape[1] != model.nq or raw.nv != model.nv:
         raise ValueError(
             f"{path}: the log has {raw.q.shape[1]} columns of q and {raw.nv} of tau, the model has {model.nq} and "
@@ -368,7 +385,9 @@ def _judged(model: Model, result, names: list[str], logs: list[Log]) -> list[Jud
 
 def _warnings(findings: Findings, args) -> list[str]:
     lines = []
-    for one in (*findings.train, *findings.tests):
+    labels, _ = coordinate_labels(findings.model)
+    for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
+        lines += [f"{one.name}: {line}" for line in suspicions(findings.model, one.log, labels)]
         share, edge = vibration(one.log, one.predicted - np.asarray(one.log.tau))
         if share > _VIBRATES and (args.filtered or edge < args.cutoff):
             lines.append(

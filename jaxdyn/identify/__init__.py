@@ -8,6 +8,8 @@ from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import from_raw as from_raw
 from jaxdyn.identify.logs import split as split
 from jaxdyn.identify.parameters import fit_parameters as fit_parameters
+from jaxdyn.identify.payload import Payload as Payload
+from jaxdyn.identify.payload import fit_payload as fit_payload
 from jaxdyn.identify.regression import BaseParameters as BaseParameters
 from jaxdyn.identify.regression import LeastSquares as LeastSquares
 from jaxdyn.identify.regression import base_parameters as base_parameters

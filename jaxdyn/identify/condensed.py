@@ -6,6 +6,7 @@ samples that are left out, and columns that are left out can then be chosen afte
 block is known without its samples.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -31,7 +32,8 @@ class Condensed(NamedTuple):
     rows: int
 
 
-class Blocks(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Blocks:
     """Regressor and torques of logs, condensed for each block of samples and each torque.
 
     - `triangles`: for each block a list of nv upper-trapezoidal matrices (m, s + k + 1): columns shared by all torques, the

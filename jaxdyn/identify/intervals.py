@@ -69,18 +69,11 @@ def intervals(model: Model, data: Data, setting: Setting, estimate: Estimate, we
     blocks, sigma = data.blocks, estimate.sigma
     slopes = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
     grams = np.einsum("pi,bpq,qj->bij", jacobian, blocks.grams(weights), jacobian, optimize=True) / sigma**2
-    groups = np.array_split(np.arange(len(blocks)), max(2, len(blocks) // _TOGETHER))
+    groups = block_groups(len(blocks))
     slopes, grams = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (slopes, grams))
-    H = grams.sum(axis=0) + curvature
-    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-    scaled = lambda matrix: matrix * unit[:, None] * unit[None, :]  # noqa: E731
-    moves = np.stack(
-        [unit * (_inverse(scaled(H - gram)) @ (unit * slope)) for gram, slope in zip(grams, slopes, strict=True)]
-    )
+    moves, inverse = jackknife(grams, slopes, curvature)
     count = len(groups)
-    moves = jacobian @ (moves - moves.mean(axis=0)).T * np.sqrt((count - 1) / count)
-    inverse = _inverse(scaled(H)) * unit[:, None] * unit[None, :]
-    pulled = jacobian @ inverse @ _root(curvature) * np.sqrt(max(setting.prior, 1.0))
+    moves, pulled = jacobian @ moves, jacobian @ inverse @ _root(curvature) * np.sqrt(max(setting.prior, 1.0))
 
     nb, nv = model.nb, model.nv
     names = list(parameter_names(model))
@@ -97,7 +90,27 @@ def intervals(model: Model, data: Data, setting: Setting, estimate: Estimate, we
     known = base.matrix @ fitted[columns].astype(float) != 0
     a, b = base.matrix @ moves[columns], base.matrix @ pulled[columns]
     spread = _spread(base.names, base.values(estimate.x[columns]), a, b, known)
-    return Intervals(parameters, spread, base, a @ a.T + b @ b.T, _student(count - 1))
+    return Intervals(parameters, spread, base, a @ a.T + b @ b.T, student(count - 1))
+
+
+def block_groups(count: int) -> list[np.ndarray]:
+    """Numbers of the blocks that are left out together."""
+    return np.array_split(np.arange(count), max(2, count // _TOGETHER))
+
+
+def jackknife(grams: np.ndarray, slopes: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A root (n, groups) of the covariance of a minimum, each group of samples left out in turn, and the inverse Hessian (n, n).
+
+    `grams` (groups, n, n) and `slopes` (groups, n) are the groups' curvatures and slopes there, `curvature` (n, n) what stays.
+    """
+    H = grams.sum(axis=0) + curvature
+    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    scale = unit[:, None] * unit[None, :]
+    moves = np.stack(
+        [unit * (_inverse((H - gram) * scale) @ (unit * slope)) for gram, slope in zip(grams, slopes, strict=True)]
+    )
+    count = len(grams)
+    return (moves - moves.mean(axis=0)).T * np.sqrt((count - 1) / count), _inverse(H * scale) * scale
 
 
 def _spread(names, values, moves, pulled, fitted) -> Spread:
@@ -154,7 +167,8 @@ def _joints(model: Model) -> list[str]:
     return [name.rpartition(".")[0] for name in parameter_names(model)[start : start + model.nv]]
 
 
-def _student(freedoms: int) -> float:
+def student(freedoms: int) -> float:
+    """Half of a 95 % interval in standard deviations, by Student's t with so many degrees of freedom."""
     from scipy.stats import t
 
     return float(t.ppf(0.975, freedoms))
