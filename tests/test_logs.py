@@ -123,6 +123,11 @@ BAD_FILES = {
     "nan": ("t,q1,tau1\n0,0,0\n1,nan,0\n", "q is nan at row 1, column 1"),
     "backwards": ("t,q1,tau1\n0,0,0\n-1,0,0\n", "time does not increase at row 1"),
     "header only": ("t,q1,tau1\n", "no samples"),
+    "no header": (
+        "0.0,-0.000000,1.0\n1,2,3\n",
+        "line 1 is 0.0, -0.000000, 1.0, ...: numbers, no header; the first line names",
+    ),
+    "decimal commas": ("t;q1;tau1\n0;0;0\n1;0,5;0\n", "column q1: '0,5' is no number; write decimal points"),
 }
 
 
@@ -133,6 +138,29 @@ def test_bad_files_raise(tmp_path, case):
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"bad\.csv: .*{message}"):
         read_log(path)
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_separators(tmp_path, separator):
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "\n".join(separator.join(row) for row in (("t", "q1", "tau1"), ("0", "0.5", "1"), ("1", "0.25", "2")))
+    )
+    log = read_log(path)
+    np.testing.assert_array_equal(log.q[:, 0], [0.5, 0.25])
+    np.testing.assert_array_equal(log.tau[:, 0], [1, 2])
+
+
+def test_joints_of_other_names(signals, tmp_path):
+    """The message offers the mapping, and the mapping does it."""
+    path = tmp_path / "log.csv"
+    write_log(path, identify.Log(**signals, joint_names=("m1", "m2")))
+    with pytest.raises(ValueError, match=r"missing columns q_shoulder.*rename them: m1=shoulder m2=elbow"):
+        read_log(path, joint_names=("shoulder", "elbow"))
+    log = read_log(path, joint_names=("shoulder", "elbow"), rename={"m1": "shoulder", "m2": "elbow"})
+    np.testing.assert_array_equal(log.tau, signals["tau"])
+    with pytest.raises(ValueError, match="rename: no column is of joint m3"):
+        read_log(path, rename={"m3": "wrist"})
 
 
 def test_unreadable_files_raise(tmp_path, signals):

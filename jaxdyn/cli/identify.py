@@ -1,54 +1,63 @@
-"""`jaxdyn identify`: inertias and friction of a URDF robot from a recorded log."""
+"""`jaxdyn identify`: inertias and friction of a URDF robot from recorded logs."""
 
 import argparse
 import json
 import math
 import pathlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxdyn import __version__, identify
-from jaxdyn.cli.common import (
-    Stopwatch,
-    add_model_options,
-    coordinate_labels,
-    load_model,
-    output_path,
-    short,
-    table,
-)
-from jaxdyn.identify import Fit, LeastSquares, Log
+from jaxdyn.cli.common import Stopwatch, add_model_options, coordinate_labels, load_model, number, output_path
+from jaxdyn.cli.identify_tables import judged_table, tables
+from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
+from jaxdyn.identify.spectra import vibration
+from jaxdyn.identify.suspicions import suspicions
 from jaxdyn.io import save_urdf
+from jaxdyn.io.files import write_text
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.builder import inertia_report, repair_inertias
 from jaxdyn.model.tree import Model
+from jaxdyn.reports.identification import Findings, Judged, content
 
 # Of the simulation in a trajectory fit (s).
 _LONGEST_STEP = 0.0025
-HELP = "identify inertias, friction and rotor inertias from a log of positions and torques"
+# Share of the residual's power far above the motion from which on it is worth a warning.
+_VIBRATES = 0.3
+HELP = "identify inertias, friction and rotor inertias from logs of positions and torques"
 DESCRIPTION = """\
-Identify link inertias, joint friction and rotor inertias from a recorded log of joint positions and torques.
-The first part of the log is fitted, the rest is held out to tell how good the fit is.
+Identify link inertias, joint friction and rotor inertias from recorded logs of joint positions and torques.
+How good the fit is, is told on logs kept apart (--test-log); without them the last part of every log is held out first, and the
+robot that is written is fitted to everything.
 """
 EPILOG = """\
 examples:
   jaxdyn identify --urdf panda.urdf --log log.csv --out fitted.urdf
+  jaxdyn identify --urdf arm.urdf --log A.csv B.csv --test-log C.csv --out fitted.urdf --report fit.json --html fit.html
   jaxdyn identify --urdf panda.urdf --log log.csv --lock panda_finger_joint1 panda_finger_joint2 --plot fit.png
   jaxdyn identify --urdf panda.urdf --log log.csv --method least-squares --report base_parameters.json
 
-log (--log FILE.csv, one header line, or FILE.npz):
+logs (--log FILE.csv ..., --test-log FILE.csv ..., one header line, or FILE.npz):
   t                time, s, increasing; jitter is allowed
   q1, q2, ...      joint positions, rad or m, in the order that `jaxdyn info` lists
   tau1, tau2, ...  joint torques, N m or N: motor torques seen at the joint, friction not compensated
   v1.., a1..       velocities and accelerations; only used if the log is filtered already (below)
   Joint names may stand for numbers, in any order: q_panda_joint1, tau_panda_joint1, ...
+  Logs may differ in sampling and length; each is filtered and differentiated by itself.
 
 filtering:
   A raw log (no columns a1..) is put on a uniform grid, low-passed without delay at --cutoff, and differentiated:
   v and a are made from q. Choose the cut-off some 5 to 10 times above the fastest motion; 8 Hz suits exciting
-  motions of arms. A log with columns a1.. is taken as filtered and used as it is. With --filtered so is one
-  without them, and v and a that are missing are made by differences.
+  motions of arms, and a warning says when what a fit leaves over lies far above the motion. A log with columns a1.. is
+  taken as filtered and used as it is. With --filtered so is one without them, and v and a that are missing are made by
+  differences.
+
+terms (--terms), beside the links:
+  viscous v + coulomb tanh(v / v_s) + offset + armature a (rotor inertia), and
+  load |tau_rigid| tanh(v / v_s); dahl, pre-sliding; asymmetric |v|; quadratic v |v|; spring sin q, cos q.
+  "auto" takes the first four, and of the others what lowers the error on parts of the training logs that are left out in
+  turn, joint by joint. --v-s auto and --prior auto are chosen the same way. The test logs are never looked at.
 
 methods (--method):
   feasible         convex fit of the torques over all physically possible bodies; the URDF written is sound (default)
@@ -57,10 +66,12 @@ methods (--method):
 
 output:
   --out            URDF with the fitted inertias, damping, friction and armature (rotor inertia, an attribute of
-                   <dynamics>). Base parameters are what the log tells; where it leaves a choice between links, the
-                   URDF stays close to the file given.
+                   <dynamics>), fitted to all of the training logs. Base parameters are what the logs tell; where they leave a
+                   choice between links, the URDF stays close to the file given. Offsets and the other terms have no place
+                   in a URDF; they are in the report.
   --report         everything in numbers as JSON (default: beside --out, with the ending .json)
-  The error is 100 |predicted - measured| / |measured| of the torques, over all joints and samples.
+  --html           the same as a page with plots, in one file
+  The error is 100 |predicted - measured| / |measured| of the torques, over all samples, and all joints or each.
 """
 METHODS = ("feasible", "least-squares", "trajectory")
 
@@ -70,33 +81,58 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--urdf", required=True, help="the robot; its geometry is taken as right, its inertias as a guess"
     )
-    parser.add_argument("--log", required=True, help="the recorded log, FILE.csv or FILE.npz")
+    parser.add_argument(
+        "--log", required=True, nargs="+", action="extend", metavar="FILE", help="recorded logs to fit, .csv or .npz"
+    )
+    parser.add_argument(
+        "--test-log", nargs="+", action="extend", default=[], metavar="FILE", help="logs that only tell the error"
+    )
+    parser.add_argument(
+        "--rename",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE_NAME=JOINT",
+        help="joints whose columns have other names in the logs",
+    )
     add_model_options(parser)
     parser.add_argument("--repair", action="store_true", help="replace inertias no body can have before fitting")
     data = parser.add_argument_group("data")
     data.add_argument(
-        "--train", type=float, default=0.7, metavar="SHARE", help="share of the log to fit (default: 0.7)"
+        "--train",
+        type=float,
+        default=0.7,
+        metavar="SHARE",
+        help="without --test-log: share of every log that is fitted to tell the error on the rest (default: 0.7)",
     )
     data.add_argument("--cutoff", type=float, default=8.0, metavar="HZ", help="of the low-pass filter (default: 8 Hz)")
     data.add_argument(
         "--every", type=int, metavar="N", help="keep each Nth filtered sample (default: 15 per cut-off period)"
     )
     data.add_argument("--trim", type=int, metavar="N", help="samples to drop at each end (default: 25 times --every)")
-    data.add_argument("--filtered", action="store_true", help="the log is filtered already")
+    data.add_argument("--filtered", action="store_true", help="the logs are filtered already")
     fit = parser.add_argument_group("fit")
     fit.add_argument("--method", choices=METHODS, default="feasible", help="see below (default: feasible)")
     fit.add_argument(
         "--terms",
         nargs="*",
-        choices=identify.TERMS,
-        default=identify.TERMS,
-        help="fitted beside the inertias: viscous v + coulomb tanh(v / v_s) + offset + armature a (default: all four)",
+        choices=("auto", *TERMS, *EXTRA),
+        help="see below (default: auto; the first four with other methods than feasible)",
     )
     fit.add_argument(
-        "--v-s", type=float, default=0.01, metavar="V", help="v_s of Coulomb friction, rad/s (default: 0.01)"
+        "--v-s",
+        default="auto",
+        metavar="V",
+        help="v_s of Coulomb friction, rad/s, or auto (default: auto; 0.01 with other methods than feasible)",
     )
     fit.add_argument(
-        "--prior", type=float, default=1.0, help="weight of staying close to the URDF's bodies (default: 1)"
+        "--prior", default="auto", metavar="W", help="weight of staying close to the URDF's bodies, or auto (default)"
+    )
+    fit.add_argument(
+        "--weights",
+        choices=("auto", "none"),
+        default="auto",
+        help="of the joints: auto, one over the error each is left with; none, all the same (default: auto)",
     )
     fit.add_argument(
         "--horizon", type=float, default=0.25, metavar="S", help="length of the simulated pieces, s (default: 0.25)"
@@ -107,57 +143,162 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     files = parser.add_argument_group("output")
     files.add_argument("--out", metavar="FILE.urdf", help="write the fitted robot")
     files.add_argument("--report", metavar="FILE.json", help="write parameters and errors")
+    files.add_argument("--html", metavar="FILE.html", help="write a page with tables and plots")
     files.add_argument("--plot", metavar="FILE", help="draw measured and predicted torques to FILE.png, .pdf or .svg")
-    files.add_argument("--progress", action="store_true", help="print the loss while fitting")
+    files.add_argument("--progress", action="store_true", help="print what is tried, and the loss, while fitting")
+
+
+class _Options(NamedTuple):
+    """How a fit is to be made; what is "auto" is chosen by the fit."""
+
+    method: str
+    terms: str | tuple[str, ...]
+    v_s: float | str
+    prior: float | str
+    weights: str | None
 
 
 def run(args: argparse.Namespace) -> None:
     """Fit, print the errors and the parameters, write the files."""
     out = output_path(args.out, (".urdf",), "--out")
-    report = output_path(args.report, (".json",), "--report")
+    json_path = output_path(args.report, (".json",), "--report")
+    html = output_path(args.html, (".html",), "--html")
     plot = output_path(args.plot, (".png", ".pdf", ".svg"), "--plot")
+    options = _options(args)
     if out is not None and args.method == "least-squares":
         raise ValueError("--out: least squares gives combinations of parameters and no bodies, so there is no URDF to "
                          "write; take --method feasible, or --report FILE.json")  # fmt: skip
-    report = out.with_suffix(".json") if report is None and out is not None else report
+    json_path = out.with_suffix(".json") if json_path is None and out is not None else json_path
+    train_paths, test_paths = _paths(args)
+    if args.method == "trajectory" and len(train_paths) > 1:
+        raise ValueError("--log: --method trajectory fits one log; take --method feasible for several")
     model = load_model(args.urdf, args)
     if args.repair:
         print(f"repaired inertias: {', '.join(dict(inertia_report(model))) or 'none needed it'}")
         model = repair_inertias(model)
-    log = _log(model, args)
-    train, test = identify.split(log, args.train)
+    logs = [_log(model, path, args) for path in train_paths]
+    names = _names(train_paths + test_paths)
 
     watch = Stopwatch()
-    result = _fit(model, train, args)
+    if test_paths:
+        final = judge = _fit(model, logs, options, args)
+        tests = [_log(model, path, args) for path in test_paths]
+        test_names, trained = names[len(logs) :], logs
+    else:
+        trained, tests = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
+        test_names = [f"{name} (last {100 * (1 - args.train):.3g} %)" for name in names]
+        judge = _fit(model, trained, options, args)
+        # What was chosen on the training part stays; the numbers are those of everything.
+        final = _fit(model, logs, _settled(options, judge), args)
     seconds = str(watch)
-    print(f"{args.method} fit of {model.name!r}, {model.nv} joints: {_outcome(result)}, in {seconds}")
-    errors = _errors(model, result, train, test)
-    print(_error_text(errors, train, test))
-    print(_joint_table(model, result, test))
-    print(_mass_table(model, result) if isinstance(result, Fit) else _base_table(result))
-    if out is not None and isinstance(result, Fit):
-        save_urdf(result.model, out)
+    findings = Findings(
+        model=model,
+        result=final,
+        tests=_judged(model, judge, test_names, tests),
+        train=_judged(model, judge, names[: len(logs)], trained),
+        final=_judged(model, final, names[: len(logs)], logs),
+        outcome=_outcome(final),
+        is_refit=not test_paths,
+        warnings=[],
+        choice=judge.choice if isinstance(judge, RobotFit) else None,
+    )
+    findings.warnings.extend(_warnings(findings, args))
+    print(judged_table(findings))
+    print(f"{args.method} fit of {model.name!r}, {model.nv} joints: {findings.outcome}, in {seconds}")
+    for line in findings.warnings:
+        print(f"warning: {line}")
+    print(tables(findings))
+    if out is not None and not isinstance(final, LeastSquares):
+        save_urdf((final.fit if isinstance(final, RobotFit) else final).model, out)
         print(f"Wrote {out}.")
-    if report is not None:
-        report.write_text(json.dumps(_report(model, result, errors, train, test, args), indent=2) + "\n")
-        print(f"Wrote {report}.")
+    if json_path is not None:
+        write_text(json_path, json.dumps(content(findings, _asked(args)), indent=2) + "\n")
+        print(f"Wrote {json_path}.")
+    if html is not None:
+        from jaxdyn.reports.identification_page import page
+
+        labels, units = coordinate_labels(model)
+        write_text(html, page(findings, labels, units, f"jaxdyn identify: {model.name}"))
+        print(f"Wrote {html}.")
     if plot is not None:
         from jaxdyn.reports.plotting import torque_figure
 
         labels, units = coordinate_labels(model)
-        torque_figure(test, result.torques(test), labels, units).savefig(plot)
+        first = findings.tests[0]
+        torque_figure(first.log, first.predicted, labels, units, title=first.name).savefig(plot)
         print(f"Wrote {plot}.")
 
 
-def _log(model: Model, args) -> Log:
-    """The log of the file, filtered unless it has been."""
-    raw = read_log(args.log, joint_names=model.joint_names)
+def _asked(args) -> dict[str, Any]:
+    return {
+        "jaxdyn": __version__,
+        "urdf": str(pathlib.Path(args.urdf)),
+        "logs": [str(pathlib.Path(path)) for path in args.log],
+        "method": args.method,
+        "cutoff_hz": None if args.filtered else args.cutoff,
+    }
+
+
+def _options(args) -> _Options:
+    simple = args.method != "feasible"
+    terms = args.terms
+    if terms is None or terms == ["auto"]:
+        terms = TERMS if simple else "auto"
+    elif "auto" in terms:
+        raise ValueError(f"--terms {' '.join(terms)}: auto stands alone; it chooses the terms")
+    elif simple and set(terms) & set(EXTRA):
+        raise ValueError(f"--terms {' '.join(terms)}: --method {args.method} takes {', '.join(TERMS)}; the others need "
+                         "--method feasible")  # fmt: skip
+    v_s = args.v_s if args.v_s == "auto" else number(args.v_s, "--v-s")
+    prior = args.prior if args.prior == "auto" else number(args.prior, "--prior")
+    if simple:
+        v_s, prior = 0.01 if v_s == "auto" else v_s, 1.0 if prior == "auto" else prior
+    weights = "auto" if args.weights == "auto" else None
+    return _Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, weights)
+
+
+def _settled(options: _Options, result) -> _Options:
+    """The options with what a fit chose in place of "auto"."""
+    if not isinstance(result, RobotFit):
+        return options
+    setting = result.choice.setting
+    return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior)
+
+
+def _paths(args) -> tuple[list[str], list[str]]:
+    seen: dict[pathlib.Path, str] = {}
+    for path in [*args.log, *args.test_log]:
+        place = pathlib.Path(path).resolve()
+        if place in seen:
+            where = "--test-log: a log that is fitted tells no error" if path in args.test_log else "--log"
+            raise ValueError(f"{where}: {path} is given twice")
+        seen[place] = path
+    return list(args.log), list(args.test_log)
+
+
+def _renaming(items: list[str]) -> dict[str, str]:
+    pairs = [item.partition("=") for item in items]
+    bad = [item for item, (theirs, sign, ours) in zip(items, pairs, strict=True) if not (theirs and sign and ours)]
+    if bad:
+        raise ValueError(f"--rename {bad[0]}: give the name in the log and the joint's, as motor1=shoulder")
+    return {theirs: ours for theirs, _, ours in pairs}
+
+
+def _names(paths: list[str]) -> list[str]:
+    """Names of files, with their folders where two would be the same."""
+    names = [pathlib.Path(path).name for path in paths]
+    return [path if names.count(name) > 1 else name for path, name in zip(paths, names, strict=True)]
+
+
+def _log(model: Model, path: str, args) -> Log:
+    """The log of a file, filtered unless it has been."""
+    raw = read_log(path, joint_names=model.joint_names, rename=_renaming(args.rename))
     if raw.q.shape[1] != model.nq or raw.nv != model.nv:
         raise ValueError(
-            f"{args.log}: the log has {raw.q.shape[1]} columns of q and {raw.nv} of tau, the model has {model.nq} and "
+            f"{path}: the log has {raw.q.shape[1]} columns of q and {raw.nv} of tau, the model has {model.nq} and "
             f"{model.nv} (joints {', '.join(model.joint_names)}); hold joints that were not logged with --lock"
         )
-    span = f"{args.log}: {len(raw)} samples, {float(raw.t[-1] - raw.t[0]):.4g} s"
+    span = f"{path}: {len(raw)} samples, {float(raw.t[-1] - raw.t[0]):.4g} s"
     if len(raw) < 2:
         raise ValueError(f"{span}; a log needs more than one sample")
     if raw.a is not None and raw.v is not None:
@@ -175,33 +316,50 @@ def _log(model: Model, args) -> Log:
     trim = 25 * every if args.trim is None else args.trim
     if every < 1 or trim < 0:
         raise ValueError(f"--every is {every}, --trim is {trim}; give --every of at least 1 and --trim of at least 0")
-    log = identify.from_raw(
-        raw.t, raw.q, raw.tau, cutoff=args.cutoff, trim=trim, every=every, joint_names=raw.joint_names
-    )
+    try:
+        log = identify.from_raw(
+            raw.t, raw.q, raw.tau, cutoff=args.cutoff, trim=trim, every=every, joint_names=raw.joint_names
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     print(f"{span} at {rate:.4g} Hz; low-passed at {args.cutoff:g} Hz, {trim} samples dropped at each end, "
           f"each {every}th kept: {len(log)}")  # fmt: skip
     return log
 
 
-def _fit(model: Model, train: Log, args) -> Fit | LeastSquares:
-    if args.method == "least-squares":
-        return identify.least_squares(model, train, args.terms, v_s=args.v_s)
-
+def _fit(model: Model, logs: list[Log], options: _Options, args) -> RobotFit | Fit | LeastSquares:
     def show(step, loss, _):
         if args.progress:
             print(f"  step {step}: loss {loss:.8g}", flush=True)
 
-    fit = identify.fit_torques(model, train, args.terms, v_s=args.v_s, prior=args.prior, callback=show)
-    if args.method == "feasible":
-        return fit
-    dt = float(np.median(np.diff(np.asarray(train.t))))
-    horizon = min(max(1, round(args.horizon / dt)), len(train) - 1)
+    def tell(trial):
+        if args.progress:
+            extra = ", ".join(f"{name} {list(joints)}" for name, joints in trial.setting.extra)
+            print(f"  left out: {trial.percent:.3f} % with v_s {trial.setting.v_s:g}, prior {trial.setting.prior:g}, "
+                  f"terms {extra or 'none more'}", flush=True)  # fmt: skip
+
+    if options.method == "least-squares":
+        return identify.least_squares(model, logs, options.terms, v_s=float(options.v_s))
+    if options.method == "feasible":
+        return identify.fit_robot(
+            model,
+            logs,
+            options.terms,
+            v_s=options.v_s,
+            prior=options.prior,
+            weights=options.weights,
+            callback=tell,
+        )
+    (log,) = logs
+    v_s = float(options.v_s)
+    fit = identify.fit_torques(model, log, options.terms, v_s=v_s, prior=float(options.prior), callback=show)
+    dt = float(np.median(np.diff(np.asarray(log.t))))
     return identify.fit_trajectory(
         fit.model,
-        train,
-        args.terms,
-        v_s=args.v_s,
-        horizon=horizon,
+        log,
+        options.terms,
+        v_s=v_s,
+        horizon=min(max(1, round(args.horizon / dt)), len(log) - 1),
         steps=args.steps,
         callback=show,
         # Fixed steps: in a batch of segments, adaptive ones cost every segment what the stiffest needs.
@@ -209,101 +367,31 @@ def _fit(model: Model, train: Log, args) -> Fit | LeastSquares:
     )
 
 
-def _outcome(result: Fit | LeastSquares) -> str:
-    if isinstance(result, Fit):
-        return f"{result.result.replace('_', ' ')} after {len(result.history) - 1} steps"
-    return f"{len(result.values)} base parameters, {result.rank} excited, condition {result.condition:.4g}"
+def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
+    if isinstance(result, LeastSquares):
+        return f"{len(result.values)} base parameters, {result.rank} excited, condition {result.condition:.4g}"
+    fit = result.fit if isinstance(result, RobotFit) else result
+    return f"{fit.result.replace('_', ' ')} after {len(fit.history) - 1} steps"
 
 
-def _errors(model: Model, result: Fit | LeastSquares, train: Log, test: Log) -> dict[str, float]:
-    from jaxdyn.identify import nominal_parameters, regressor, torque_error
-
-    nominal = regressor(model, test.q, test.v, test.a) @ nominal_parameters(model)
-    return {
-        "train_percent": result.error(train),
-        "test_percent": result.error(test),
-        "nominal_test_percent": torque_error(nominal, test.tau),
-    }
-
-
-def _error_text(errors: dict[str, float], train: Log, test: Log) -> str:
-    return (
-        f"torque error: {errors['test_percent']:.2f} % on the {len(test)} samples held out, "
-        f"{errors['train_percent']:.2f} % on the {len(train)} fitted; "
-        f"{errors['nominal_test_percent']:.1f} % with the URDF's own numbers"
-    )
-
-
-def _joint_rms(result: Fit | LeastSquares, log: Log) -> np.ndarray:
-    return np.sqrt(np.mean((result.torques(log) - np.asarray(log.tau)) ** 2, axis=0))
-
-
-def _vector(result: Fit | LeastSquares) -> np.ndarray:
-    return result.vector if isinstance(result, Fit) else result.parameters
-
-
-def _terms(model: Model, result: Fit | LeastSquares) -> dict[str, np.ndarray]:
-    blocks = _vector(result)[10 * model.nb :].reshape(len(identify.TERMS), model.nv)
-    return dict(zip(identify.TERMS, blocks, strict=True))
-
-
-def _joint_table(model: Model, result: Fit | LeastSquares, test: Log) -> str:
-    labels, units = coordinate_labels(model)
-    measured = np.sqrt(np.mean(np.asarray(test.tau) ** 2, axis=0))
-    columns = [measured, _joint_rms(result, test), *(_terms(model, result)[term] for term in identify.TERMS)]
-    rows = [
-        [label, unit, *(short(float(x), 3) for x in row)]
-        for label, unit, row in zip(labels, units, np.stack(columns, 1), strict=True)
+def _judged(model: Model, result, names: list[str], logs: list[Log]) -> list[Judged]:
+    nominal = identify.nominal_parameters(model)
+    fit = result.fit if isinstance(result, RobotFit) else result
+    return [
+        Judged(name, log, fit.torques(log), identify.regressor(model, log.q, log.v, log.a) @ nominal)
+        for name, log in zip(names, logs, strict=True)
     ]
-    header = ["joint", "unit", "torque rms", "error rms", "viscous", "coulomb", "offset", "rotor inertia"]
-    return "Joints on the held-out samples, and their friction and rotor inertia\n" + table(header, rows)
 
 
-def _mass_table(model: Model, fit: Fit) -> str:
-    rows = []
-    for name, old, new in zip(
-        model.body_names, np.asarray(model.inertias), np.asarray(fit.model.inertias), strict=True
-    ):
-        centre = [short(x, 3) for x in new[1:4] / new[0]] if new[0] > 0 else ["-"] * 3
-        rows.append([name, short(old[0]), short(new[0]), *centre])
-    text = "Bodies: mass (kg) in the URDF and fitted, fitted centre of mass (m); single masses are partly the prior's choice"
-    return text + "\n" + table(["body", "URDF", "fitted", "x", "y", "z"], rows)
-
-
-def _base_table(result: LeastSquares) -> str:
-    rows = [[name, short(x0), short(x), short(s, 2)] for name, x0, x, s in result.table()]
-    return "Base parameters: URDF, fitted, standard deviation\n" + table(["combination", "URDF", "fitted", "std"], rows)
-
-
-def _report(model: Model, result: Fit | LeastSquares, errors, train: Log, test: Log, args) -> dict[str, Any]:
-    base = identify.base_parameters(model, args.terms, v_s=args.v_s)
-    columns = [i for i, name in enumerate(identify.parameter_names(model)) if name in set(base.parameter_names)]
-    nominal, fitted = identify.nominal_parameters(model), _vector(result)
-    std = [None if np.isinf(s) else float(s) for s in result.std] if isinstance(result, LeastSquares) else None
-    content = {
-        "jaxdyn": __version__,
-        "urdf": str(pathlib.Path(args.urdf)),
-        "log": str(pathlib.Path(args.log)),
-        "method": args.method,
-        "terms": list(args.terms),
-        "v_s": args.v_s,
-        "cutoff_hz": None if args.filtered else args.cutoff,
-        "outcome": _outcome(result),
-        "samples": {"train": len(train), "test": len(test)},
-        "torque_error": errors,
-        "joint_names": list(model.joint_names),
-        "test_rms": _joint_rms(result, test).tolist(),
-        "friction": {term: values.tolist() for term, values in _terms(model, result).items()},
-        "base_parameters": {
-            "expressions": list(base.expressions),
-            "nominal": base.values(nominal[columns]).tolist(),
-            "fitted": base.values(fitted[columns]).tolist(),
-        },
-    }
-    if std is not None:
-        content["base_parameters"]["std"] = std
-    if isinstance(result, Fit):
-        names = identify.parameter_names(model)
-        rows = zip(names, nominal.tolist(), fitted.tolist(), strict=True)
-        content["parameters"] = {name: {"nominal": x0, "fitted": x} for name, x0, x in rows}
-    return content
+def _warnings(findings: Findings, args) -> list[str]:
+    lines = []
+    labels, _ = coordinate_labels(findings.model)
+    for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
+        lines += [f"{one.name}: {line}" for line in suspicions(findings.model, one.log, labels)]
+        share, edge = vibration(one.log, one.predicted - np.asarray(one.log.tau))
+        if share > _VIBRATES and (args.filtered or edge < args.cutoff):
+            lines.append(
+                f"{one.name}: {100 * share:.0f} % of the power of what the fit leaves over is above {edge:.2g} Hz, ten times "
+                f"the fastest motion, where no rigid body is: vibration; try --cutoff {edge:.2g}"
+            )
+    return lines

@@ -1,6 +1,6 @@
 """Physically feasible inertias and friction by torque error."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,8 +11,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart, positive_terms
+from jaxdyn.identify.condensed import Condensed
 from jaxdyn.identify.friction import TERMS, check_terms
-from jaxdyn.identify.logs import Log, check_log, root_mean_square
+from jaxdyn.identify.logs import Log, as_logs, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
 from jaxdyn.identify.regression import condense, free_columns, noise_level
 from jaxdyn.identify.result import Fit
@@ -42,7 +43,7 @@ def torque_loss(point: Coordinates, problem: Problem) -> Float[Array, ""]:
 
 def fit_torques(
     model: Model,
-    log: Log,
+    log: Log | Sequence[Log],
     terms=TERMS,
     *,
     v_s: float = 0.01,
@@ -67,7 +68,7 @@ def fit_torques(
 
     **Arguments:**
 
-    - `model`: nominal model, where the fit starts; `log` with v and a.
+    - `model`: nominal model, where the fit starts; `log` with v and a, or several such logs.
     - `terms`: fitted beside the links, tau_f = viscous v + coulomb tanh(v / v_s) + offset, and armature a; viscous,
       coulomb and armature stay at or above zero. A term left out keeps the model's value.
     - `inertia`: "full", all ten numbers of each body; "mass", its density alone; "fixed".
@@ -89,18 +90,18 @@ def fit_torques(
     identification: a convex programming approach", divergence and convexity.
     """
     check_bodies(model)
-    check_log(log, model)
+    logs = as_logs(log, model)
     terms = check_terms(terms, v_s)
-    if not prior > 0:
-        raise ValueError(f"prior is {prior}; it must be positive: torques alone do not determine single bodies")
-    problem, point, sigma = _problem(model, log, terms, v_s, inertia, weights, prior, sigma)
+    check_prior(prior)
+    condensed = condense(model, logs, v_s=v_s, weights=weights)
+    problem, point, sigma = make_problem(model, condensed, signal_sizes(logs), terms, v_s, inertia, prior, sigma)
     chart = problem.chart
     if method != "newton" and isinstance(method, str) and method not in METHODS:
         raise ValueError(f"method is {method!r}; take one of {('newton', *METHODS)} or an optax.GradientTransformation")
     limit = _STEPS.get(method, _STEPS["adam"]) if isinstance(method, str) else _STEPS["adam"]
     steps = limit if steps is None else steps
     if isinstance(method, str) and method == "newton":
-        chart, point, history, result = _newton(model, problem, point, steps, tolerance, callback)
+        chart, point, history, result = newton(model, problem, point, steps, tolerance, callback)
     else:
         start, unflatten = ravel_pytree(point)
 
@@ -134,18 +135,36 @@ def fit_torques(
     )
 
 
-def _problem(model, log, terms, v_s, inertia, weights, prior, sigma):
-    condensed = condense(model, log, v_s=v_s, weights=weights)
-    tau = np.asarray(log.tau, np.float64)
-    rms = [root_mean_square(x) for x in (tau, log.v, log.a)]
+def check_prior(prior) -> None:
+    """**Raises:** ValueError for a prior that is not positive."""
+    if not prior > 0:
+        raise ValueError(f"prior is {prior}; it must be positive: torques alone do not determine single bodies")
+
+
+def signal_sizes(logs: Sequence[Log]) -> list[np.ndarray]:
+    """Root mean squares (nv,) of torque, velocity and acceleration over all logs."""
+    return [
+        root_mean_square(np.concatenate([np.asarray(getattr(log, name), np.float64) for log in logs]))
+        for name in ("tau", "v", "a")
+    ]
+
+
+def make_problem(model: Model, condensed: Condensed, sizes, terms, v_s, inertia, prior, sigma=None):
+    """The problem of condensed logs, the point to start from, and the torque noise sigma (N m).
+
+    `sizes` as `signal_sizes` gives them; the other arguments as in `fit_torques`.
+    """
     if sigma is None:
-        sigma = max(noise_level(condensed), _FINEST * float(np.sqrt(np.mean(tau**2))))
+        sigma = max(noise_level(condensed), _FINEST * float(np.sqrt(np.mean(sizes[0] ** 2))))
     if not sigma > 0:
         raise ValueError(f"sigma is {sigma}; the torque noise must be positive (all torques of the log may be zero)")
-    chart, point = make_chart(model, terms, v_s, inertia, *rms)
+    chart, point = make_chart(model, terms, v_s, inertia, *sizes)
     dtype = np.dtype(model.home.dtype)
     numbers = (condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, prior)
     return Problem(chart, *(jnp.asarray(x, dtype) for x in numbers)), point, float(sigma)
+
+
+_loss = eqx.filter_jit(torque_loss)
 
 
 class _Dual(eqx.Module):
@@ -155,7 +174,7 @@ class _Dual(eqx.Module):
     terms: Float[Array, " n"]
 
 
-def _newton(model: Model, problem: Problem, point: Coordinates, steps: int, tolerance: float, callback):
+def newton(model: Model, problem: Problem, point: Coordinates, steps: int, tolerance: float, callback=None):
     """Primal-dual interior-point method: chart, point, history of the loss, result.
 
     The loss is min |R x - d|^2 / 2 + prior tr(P0^-1 P) with -prior log det P as the barrier that stays. The barrier starts as
@@ -167,7 +186,7 @@ def _newton(model: Model, problem: Problem, point: Coordinates, steps: int, tole
     prior = float(problem.prior)
     inequalities = point.s.shape[1] * int(positive_terms(problem.chart.terms).sum())
     least = 0.1 * tolerance / max(inequalities, 1)
-    gap = max(prior, float(torque_loss(point, problem)) / (4 * len(problem.chart.bodies) + max(inequalities, 1)))
+    gap = max(prior, float(_loss(point, problem)) / (4 * len(problem.chart.bodies) + max(inequalities, 1)))
     one = jnp.broadcast_to(jnp.eye(4, dtype=dtype), problem.chart.origin.shape)
     dual = _Dual(gap * one, jnp.full((point.s.size,), gap, dtype) / jnp.maximum(point.s.reshape(-1) ** 2, 1e-3))
     targets = gap, gap
@@ -219,8 +238,7 @@ def _newton_step(problem: Problem, point: Coordinates, dual: _Dual, weight, barr
     places = free_columns(nb, nv, chart.terms)[10 * nb :]
     rows = [problem.R[:, : 10 * nb] @ inertial, problem.R[:, places] * chart.scale.reshape(1, -1)]
     rows = jnp.concatenate(rows, axis=1)
-    basis = jax.vmap(_linear_factor)(jnp.eye(size, dtype=dtype))
-    basis = basis + jnp.swapaxes(basis, 1, 2)
+    basis = stretches(size, dtype)
     traces = jnp.trace(basis, axis1=1, axis2=2)
     # prior tr(P0^-1 P) is what remains of the divergence without its log det.
     slope = problem.prior * (jax.grad(chart.divergence)(point.theta) + traces[None]) - weight * traces[None]
@@ -270,6 +288,15 @@ def _length(*rates):
     """Longest step up to 1 that leaves a twentieth of everything that shrinks at these rates."""
     fastest = jnp.min(jnp.concatenate([rate.reshape(-1) for rate in rates]), initial=0)
     return jnp.minimum(1, -0.95 / jnp.minimum(fastest, -0.95))
+
+
+def stretches(size: int, dtype) -> Float[Array, "size 4 4"]:
+    """Derivatives of U U^T by the coordinates of a body, at the chart's origin.
+
+    Traces of their products are the curvature of the divergence along straight lines in x: tr(P^-1 dP P^-1 dP).
+    """
+    basis = jax.vmap(_linear_factor)(jnp.eye(size, dtype=dtype))
+    return basis + jnp.swapaxes(basis, 1, 2)
 
 
 def _linear_factor(step):

@@ -1,6 +1,6 @@
 """Logs: measured motion and torque, checked, and the signal preparation that makes one from raw samples."""
 
-import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ class Log(eqx.Module):
     - `t` (n,), strictly increasing (s); `q` (n, nq) (rad, m); `v`, `a` (n, nv) (rad/s, rad/s^2; m/s, m/s^2), or None
       when they were not measured; `tau` (n, nv) (N m; N).
     - `joint_names`: names of the columns of tau, when the file gave them.
+    - `cutoff`: Hz, of the low-pass that `from_raw` sent the signals through; None for other logs.
 
     Numpy arrays are kept as they are (a log is data of the host; float64 time stamps do not become float32); anything
     else is converted to float64. The arrays are leaves, so a log passes through `jax.vmap` and `jax.jit`.
@@ -31,13 +32,15 @@ class Log(eqx.Module):
     a: Float[Array | np.ndarray, "n nv"] | None
     tau: Float[Array | np.ndarray, "n nv"]
     joint_names: tuple[str, ...] | None = eqx.field(static=True)
+    cutoff: float | None = eqx.field(static=True)
 
-    def __init__(self, t, q, v=None, a=None, tau=None, *, joint_names=None):
+    def __init__(self, t, q, v=None, a=None, tau=None, *, joint_names=None, cutoff=None):
         if tau is None:
             raise ValueError("Log: tau is missing; give the measured joint torques, zeros for a free motion")
         for name, value in (("t", t), ("q", q), ("v", v), ("a", a), ("tau", tau)):
             setattr(self, name, _as_array(value))
         self.joint_names = None if joint_names is None else tuple(joint_names)
+        self.cutoff = None if cutoff is None else float(cutoff)
 
     def __check_init__(self):
         _check_signals({name: getattr(self, name) for name in ("t", "q", "v", "a", "tau")})
@@ -68,6 +71,23 @@ def split(log: Log, fraction: float = 0.7) -> tuple[Log, Log]:
     if not 0 < cut < len(log):
         raise ValueError(f"fraction={fraction} of {len(log)} samples leaves one part empty; take one between 0 and 1")
     return log[:cut], log[cut:]
+
+
+def as_logs(log, system=None, *, needs=("v", "a")) -> tuple[Log, ...]:
+    """One log or a sequence of logs as a tuple, each checked against the system unless that is None.
+
+    **Raises:** ValueError for something else, for an empty sequence, and as `check_log`, with the log's place in the sequence.
+    """
+    logs = (log,) if isinstance(log, Log) else tuple(log) if isinstance(log, Sequence) else ()
+    if not logs or not all(isinstance(one, Log) for one in logs):
+        raise ValueError(f"log is {type(log).__name__}; give a jd.identify.Log, or a sequence of at least one")
+    for place, one in enumerate(logs):
+        try:
+            if system is not None:
+                check_log(one, system, needs=needs)
+        except ValueError as error:
+            raise ValueError(f"log {place + 1} of {len(logs)}: {error}" if len(logs) > 1 else str(error)) from None
+    return logs
 
 
 def check_log(log: Log, system, *, needs=("v", "a")) -> None:
@@ -158,7 +178,23 @@ def from_raw(
     a = low(np.gradient(v, grid, axis=0))
     tau = low(uniform(tau))
     keep = slice(trim, n - trim, every)
-    return Log(grid[keep], q[keep], v[keep], a[keep], tau[keep], joint_names=raw.joint_names)
+    return Log(grid[keep], q[keep], v[keep], a[keep], tau[keep], joint_names=raw.joint_names, cutoff=cutoff)
+
+
+def as_measured(log: Log, columns: np.ndarray, order: int = 4) -> np.ndarray:
+    """Columns (n, ...) as the log's filter would have left them; as they are where the log came through none.
+
+    Friction that jumps where a joint turns round is a torque like any other when it is measured: what predicts it must go through
+    the same low-pass as the torque, or the jump counts as an error.
+    """
+    rate = (len(log) - 1) / float(log.t[-1] - log.t[0]) if len(log) > 1 else 0.0
+    shortest = 3 * (order + 1) + 1
+    if log.cutoff is None or not log.cutoff < 0.45 * rate or len(log) < shortest or not columns.size:
+        return columns
+    from scipy.signal import butter, filtfilt
+
+    numerator, denominator = butter(order, 2 * log.cutoff / rate, output="ba")  # pyright: ignore
+    return filtfilt(numerator, denominator, columns, axis=0)
 
 
 def _as_array(value):
@@ -203,8 +239,9 @@ def _check_signals(signals: dict) -> None:
 
 
 def _select(log: Log, rows) -> Log:
-    values = {f.name: getattr(log, f.name) for f in dataclasses.fields(log) if f.name != "joint_names"}
-    return Log(**{k: None if x is None else x[rows] for k, x in values.items()}, joint_names=log.joint_names)
+    values = {name: getattr(log, name) for name in ("t", "q", "v", "a", "tau")}
+    sliced = {k: None if x is None else x[rows] for k, x in values.items()}
+    return Log(**sliced, joint_names=log.joint_names, cutoff=log.cutoff)
 
 
 def root_mean_square(samples) -> np.ndarray:

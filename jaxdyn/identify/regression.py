@@ -1,5 +1,6 @@
 """Torques are linear in the parameters: the stacked regressor, what it can identify, and linear least squares."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.identify.condensed import Blocks, Condensed, condense_blocks, condensed_rows
 from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
-from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.identify.logs import Log, as_logs, check_log
 from jaxdyn.model.arguments import as_array, check_shapes
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, integrate, neutral
@@ -21,19 +23,6 @@ _NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 _KEPT_FIRST = (9, 1, 2, 4, 5, 7, 8)
 _KEPT_LAST = (6, 3, 0)
 _BLOCK = 256
-
-
-class Condensed(NamedTuple):
-    """Stacked regressor and torques of a log, W x = w, condensed: |W x - w|^2 = |R x - d|^2 + rest for every x.
-
-    `R` (p, p) upper triangular, `d` (p,), `rest` a number, `rows` the number of rows of W. Taking R instead of the
-    normal matrix W^T W = R^T R keeps the condition number from being squared.
-    """
-
-    R: np.ndarray
-    d: np.ndarray
-    rest: float
-    rows: int
 
 
 def parameter_names(model: Model, terms=TERMS) -> tuple[str, ...]:
@@ -92,19 +81,37 @@ def _regressor_block(model, q, v, a, v_s):
     return jax.vmap(one)(q, v, a)
 
 
-def condense(model: Model, log: Log, *, v_s=0.01, weights=None) -> Condensed:
-    """Stack the regressor (all terms) over a log and condense it by QR, block by block: memory does not grow with the
-    log."""
-    weights = _check_weights(weights, model.nv)
-    p = 10 * model.nb + model.nv * len(TERMS)
-    triangle = np.zeros((0, p + 1))
-    for start in range(0, len(log), 4 * _BLOCK):
-        part = log[start : start + 4 * _BLOCK]
-        rows = regressor(model, part.q, part.v, part.a, v_s=v_s)
-        stacked = np.concatenate([rows, np.asarray(part.tau, np.float64)[:, :, None]], axis=2) * weights[:, None]
-        triangle = np.linalg.qr(np.concatenate([triangle, stacked.reshape(-1, p + 1)]), mode="r")
-    triangle = np.concatenate([triangle, np.zeros((max(p + 1 - len(triangle), 0), p + 1))])
-    return Condensed(triangle[:p, :p], triangle[:p, p], float(triangle[p, p] ** 2), len(log) * model.nv)
+def condense(model: Model, log: Log | Sequence[Log], *, v_s=0.01, weights=None) -> Condensed:
+    """Stack the regressor (all terms) over one log or several and condense it by QR: memory does not grow with the logs."""
+    weights = check_weights(weights, model.nv)
+    blocks = condense_model(model, as_logs(log), v_s=v_s)
+    return condensed_rows(blocks.rows(weights), blocks.count())
+
+
+def condense_model(
+    model: Model,
+    logs: Sequence[Log],
+    *,
+    v_s=0.01,
+    coulomb: Sequence[np.ndarray] | None = None,
+    extra: Sequence[np.ndarray] = (),
+    blocks: int = 1,
+) -> Blocks:
+    """`condense_blocks` of the regressor with all terms.
+
+    `coulomb`: for each log, columns (n, nv) of Coulomb friction instead of tanh(v / v_s); `extra`: more terms (n, nv, k).
+    """
+    start = 10 * model.nb + model.nv * TERMS.index("coulomb")
+
+    def rows(which, piece):
+        log = logs[which][piece]
+        W = regressor(model, log.q, log.v, log.a, v_s=v_s)
+        if coulomb is not None:
+            joints = np.arange(model.nv)
+            W[:, joints, start + joints] = coulomb[which][piece]
+        return W
+
+    return condense_blocks(logs, rows, 10 * model.nb, extra=extra, blocks=blocks)
 
 
 class BaseParameters(eqx.Module):
@@ -267,13 +274,13 @@ class LeastSquares(eqx.Module):
 
 
 def least_squares(
-    model: Model, log: Log, terms=TERMS, *, v_s: float = 0.01, weights=None, rcond: float = 1e-6
+    model: Model, log: Log | Sequence[Log], terms=TERMS, *, v_s: float = 0.01, weights=None, rcond: float = 1e-6
 ) -> LeastSquares:
     """Base parameters, friction and rotor inertia by linear least squares on the torques: min |weights (W x - tau)|^2.
 
     **Arguments:**
 
-    - `model`: geometry and nominal parameters; `log` with v and a.
+    - `model`: geometry and nominal parameters; `log` with v and a, or several such logs.
     - `terms`: what is fitted beside the links: tau_f = viscous v + coulomb tanh(v / v_s) + offset, and armature a.
     - `weights` (nv,): one over the noise of each joint's torque; ones by default.
     - `rcond`: directions whose singular value is below this times the largest are not excited by the log; along them
@@ -287,11 +294,12 @@ def least_squares(
     Source: Atkeson, An & Hollerbach (1986); Gautier (1991).
     """
     terms = check_terms(terms, v_s)
-    check_log(log, model)
+    logs = as_logs(log, model)
     base = base_parameters(model, terms, v_s=v_s)
-    condensed = condense(model, log, v_s=v_s, weights=weights)
+    condensed = condense(model, logs, v_s=v_s, weights=weights)
     if condensed.rows <= len(base):
-        raise ValueError(f"the log has {len(log)} samples of {model.nv} torques, too few for {len(base)} combinations")
+        samples = sum(map(len, logs))
+        raise ValueError(f"the log has {samples} samples of {model.nv} torques, too few for {len(base)} combinations")
     x0 = nominal_parameters(model)
     columns = free_columns(model.nb, model.nv, terms)
     # What is not fitted (friction terms left out) stays at the model's value, on the other side.
@@ -369,7 +377,8 @@ def torque_error(predicted, measured) -> float:
     return float(100 * np.linalg.norm(np.asarray(predicted, np.float64) - measured) / np.linalg.norm(measured))
 
 
-def _check_weights(weights, nv: int) -> np.ndarray:
+def check_weights(weights, nv: int) -> np.ndarray:
+    """Weights (nv,), ones when None. **Raises:** ValueError unless they are nv positive numbers."""
     if weights is None:
         return np.ones(nv)
     weights = np.asarray(weights, np.float64)

@@ -10,8 +10,9 @@ import numpy as np
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.friction import Friction
-from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.identify.logs import Log, as_measured, check_log
 from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
+from jaxdyn.identify.torque_terms import ExtraTorque, coulomb_column
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
@@ -75,6 +76,8 @@ class Fit(AbstractFit):
     - `nominal`: the model the fit started from.
     - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps" or "not_finite".
     - `sigma`: torque noise (N m) that weighed the data against the prior, or None.
+    - `extra`: fitted torque terms beyond `friction`, or None. They belong to logs, and are no force of the scene.
+    - `as_measured`: whether friction was fitted, and is predicted, as the low-pass of a log leaves it (`from_raw`).
     """
 
     model: Model
@@ -85,11 +88,28 @@ class Fit(AbstractFit):
     method: str = eqx.field(static=True)
     terms: tuple[str, ...] = eqx.field(static=True)
     sigma: float | None = None
+    extra: ExtraTorque | None = None
+    as_measured: bool = eqx.field(static=True, default=False)
 
     @property
     def scene(self) -> Scene:
         """The model with its friction."""
         return Scene(self.model, forces=(self.friction,))
+
+    def torques(self, log: Log) -> np.ndarray:
+        """Torques (n, nv) that the fitted robot needs along a log, with friction and all extra terms (N m, N)."""
+        torque = super().torques(log)
+        if self.as_measured:
+            column = coulomb_column(log, float(self.friction.v_s))
+            torque = torque + np.asarray(self.friction.coulomb) * (as_measured(log, column) - column)
+        if self.extra is None:
+            return torque
+        load = np.zeros_like(torque)
+        if self.extra.needs_load:
+            dtype = state_dtype(self.model)
+            signals = (jnp.asarray(x, dtype) for x in (log.t, log.q, log.v, log.a))
+            load = np.asarray(_torques(Scene(self.model), *signals), np.float64)
+        return torque + self.extra.torque(log, load)
 
     @property
     def vector(self) -> np.ndarray:

@@ -12,22 +12,25 @@ _SIGNALS = ("q", "v", "a", "tau")
 _NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit behind a column's name
 
 
-def read_log(path, *, joint_names=None, rollout: int | None = None) -> Log:
+def read_log(path, *, joint_names=None, rename=None, rollout: int | None = None) -> Log:
     """Read a log from a CSV file with one header line, or from an NPZ archive.
 
     Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1,
     ...` torques. The numbers may be replaced by joint names: `q_shoulder, tau_shoulder`. In an NPZ archive each column
     is an array (n,), or a signal is one array (n, columns) named `q`, `v`, `a`, `tau`. Columns of other names are
     ignored, and so is a unit in brackets behind a name of a CSV file, `q_shoulder [rad]`; numbers are taken in SI units.
+    Columns of a CSV file may be separated by commas, semicolons or tabs; numbers have a decimal point.
 
     **Arguments:** `path`; `joint_names`: order of the joints in the result for columns with joint names (a model's
-    `joint_names`); columns of other joints are left out. Without it the order of the file's tau columns. `rollout`: which
-    motion of a file that holds several, as `Solution.to_csv` and `to_npz` write them of a batch; the first is 1.
+    `joint_names`); columns of other joints are left out. Without it the order of the file's tau columns. `rename`: from
+    names of joints in the file to those wanted, {"motor1": "shoulder"}. `rollout`: which motion of a file that holds
+    several, as `Solution.to_csv` and `to_npz` write them of a batch; the first is 1.
 
     **Returns:** `jd.identify.Log`; v and a are None when the file has none. Make them with `jd.identify.from_raw`.
 
     **Raises:** FileNotFoundError; ValueError, with the path, for another file type, a cell that is no number (line and
-    column), missing or repeated columns, and all that `Log` refuses (NaN, unequal lengths, time running backwards).
+    column), a first line that is no header, missing or repeated columns (with the `rename` that would give the joints their
+    names, where there are as many), and all that `Log` refuses (NaN, unequal lengths, time running backwards).
     """
     path = as_path(path)
     readers = {".csv": _read_csv, ".npz": _read_npz}
@@ -37,6 +40,7 @@ def read_log(path, *, joint_names=None, rollout: int | None = None) -> Log:
         raise FileNotFoundError(f"{path}: no such log file")
     columns = _one_motion(readers[path.suffix.lower()](path), rollout, path)
     try:
+        columns = _renamed(columns, rename or {})
         return _assemble(columns, None if joint_names is None else tuple(joint_names))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -90,10 +94,20 @@ def write_log(path, log: Log) -> None:
 
 def _read_csv(path) -> dict[str, np.ndarray]:
     with path.open(newline="") as file:
-        reader = csv.reader(file)
+        first = file.readline()
+        file.seek(0)
+        separator = next((sign for sign in ",;\t" if sign in first), ",")
+        # A semicolon beside commas is that of a country that writes 0,5.
+        separator = ";" if ";" in first else separator
+        reader = csv.reader(file, delimiter=separator)
         header = [_NOTE.sub("", name.strip().lstrip("\ufeff")) for name in next(reader, [])]
         if not header:
             raise ValueError(f"{path}: the file is empty; the first line names the columns t, q1, ..., tau1, ...")
+        if all(_is_number(name) for name in header):
+            raise ValueError(
+                f"{path}: line 1 is {', '.join(header[:3])}, ...: numbers, no header; the first line names the columns: t, q1, "
+                f"q2, ..., tau1, tau2, ... ({len(header)} columns)"
+            )
         repeated = sorted({name for name in header if header.count(name) > 1})
         if repeated:
             raise ValueError(f"{path}: repeated columns {', '.join(repeated)}")
@@ -107,7 +121,10 @@ def _read_csv(path) -> dict[str, np.ndarray]:
                 rows.append([float(cell) for cell in cells])
             except ValueError:
                 name, cell = next((n, c) for n, c in zip(header, cells, strict=True) if not _is_number(c))
-                raise ValueError(f"{path}: line {reader.line_num}, column {name}: {cell!r} is no number") from None
+                point = "; write decimal points" if _is_number(cell.replace(",", ".", 1)) else ""
+                raise ValueError(
+                    f"{path}: line {reader.line_num}, column {name}: {cell!r} is no number{point}"
+                ) from None
     table = np.array(rows).reshape(len(rows), len(header))
     return {name: table[:, i] for i, name in enumerate(header)}
 
@@ -157,13 +174,39 @@ def _assemble(columns: dict[str, np.ndarray], joint_names) -> Log:
         missing += [f"{signal}{'' if by_number else '_'}{label}" for label in wanted if label not in found[signal]]
         arrays[signal] = [columns[found[signal][label]] for label in wanted if label in found[signal]]
     if missing:
-        raise ValueError(f"missing columns {', '.join(missing)}; the file has {', '.join(columns)}")
+        raise ValueError(
+            f"missing columns {', '.join(missing)}; the file has {', '.join(columns)}{_mapping(found['tau'], labels)}"
+        )
     lengths = {len(column) for group in arrays.values() if group for column in group}
     if len(lengths) > 1:
         sizes = {name: len(column) for name, column in columns.items()}
         raise ValueError(f"unequal lengths: {', '.join(f'{name} has {n} rows' for name, n in sizes.items())}")
     stacked = {signal: None if group is None else np.stack(group, axis=1) for signal, group in arrays.items()}
     return Log(columns["t"], **stacked, joint_names=None if by_number else labels)
+
+
+def _renamed(columns: dict[str, np.ndarray], names) -> dict[str, np.ndarray]:
+    """Columns with the joints' names replaced. **Raises:** ValueError for a name that no column has."""
+    result, used = {}, set()
+    for column, values in columns.items():
+        signal, _, joint = column.partition("_")
+        if signal in _SIGNALS and joint in names:
+            used.add(joint)
+            column = f"{signal}_{names[joint]}"
+        result[column] = values
+    if unused := sorted(set(names) - used):
+        raise ValueError(f"rename: no column is of joint {', '.join(unused)}; the file has {', '.join(columns)}")
+    return result
+
+
+def _mapping(found: dict[str, str], labels) -> str:
+    """The mapping that would do, where the file has as many joints of other names."""
+    others = [label for label in found if label not in labels]
+    wanted = [label for label in labels if label not in found]
+    if not others or len(others) != len(wanted) or others[0].isdecimal():
+        return ""
+    pairs = " ".join(f"{theirs}={ours}" for theirs, ours in zip(others, wanted, strict=True))
+    return f". If the joints are the same in this order, rename them: {pairs}"
 
 
 def _signal_columns(columns, signal: str) -> dict[str, str]:

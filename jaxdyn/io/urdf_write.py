@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxdyn.io.files import replacing
 from jaxdyn.io.urdf import NO_LIMIT, ROOT_JOINT
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import as_path, check_shapes
@@ -48,7 +49,8 @@ def save_urdf(model: Model, path: str | os.PathLike) -> None:
     for edge in edges:
         _write_joint(robot, model, edge)
     ET.indent(robot)
-    ET.ElementTree(robot).write(path, encoding="utf-8", xml_declaration=True)
+    with replacing(path) as part:
+        ET.ElementTree(robot).write(part, encoding="utf-8", xml_declaration=True)
 
 
 def _edges(model: Model) -> tuple[str, list[_Edge]]:

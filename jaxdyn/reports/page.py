@@ -11,7 +11,7 @@ from jaxdyn.reports.front import pareto_front, standings
 from jaxdyn.reports.plotting import GREY, SERIES, new_figure
 from jaxdyn.reports.records import COLUMNS, Known, Record, Report, rows
 
-_STYLE = """
+STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; }
 table { border-collapse: collapse; font-size: 12px; font-variant-numeric: tabular-nums; }
@@ -48,8 +48,8 @@ def html_page(report: Report) -> str:
     head = report.head
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Error against run time</title>",
-        f"<style>{_STYLE}</style></head><body><h1>Error against run time</h1>",
-        f"<p>{_escaped(_machine(head))}</p><p class='note'>{_READING}</p>",
+        f"<style>{STYLE}</style></head><body><h1>Error against run time</h1>",
+        f"<p>{escaped(_machine(head))}</p><p class='note'>{_READING}</p>",
         "<h2>Ways to integrate, by class of scene</h2>",
         "<p class='note'>Cost relative to the best way at the errors 1e-3, 1e-5, 1e-7 and 1e-9, geometric mean over the "
         "scenes of the class and the errors that it reaches; how many of those that any way reaches.</p>",
@@ -69,13 +69,15 @@ def _machine(head) -> str:
     )
 
 
-def _escaped(value) -> str:
+def escaped(value) -> str:
+    """A value as text of a page."""
     return html.escape(str(value))
 
 
-def _table(header: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
-    lines = [f"<tr>{''.join(f'<th>{_escaped(x)}</th>' for x in header)}</tr>"]
-    lines += [f"<tr>{''.join(f'<td>{_escaped(x)}</td>' for x in row)}</tr>" for row in cells]
+def html_table(header: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
+    """A table of texts, first column to the left."""
+    lines = [f"<tr>{''.join(f'<th>{escaped(x)}</th>' for x in header)}</tr>"]
+    lines += [f"<tr>{''.join(f'<td>{escaped(x)}</td>' for x in row)}</tr>" for row in cells]
     return f"<div class='wide'><table>{''.join(lines)}</table></div>"
 
 
@@ -84,17 +86,17 @@ def _standings(records) -> str:
         (s.kind, s.label, f"{s.ratio:.2f}" if math.isfinite(s.ratio) else "-", f"{s.reached}/{s.wanted}")
         for s in standings(records)
     ]
-    return _table(("class", "way", "cost", "reached"), cells)
+    return html_table(("class", "way", "cost", "reached"), cells)
 
 
 def _scene(name: str, known: Known, records: tuple[Record, ...]) -> list[str]:
     reference = f"Reference: {known.kind}, {known.source}; its own error is about {known.error:.0e}."
-    parts = [f"<h2 id='{_escaped(name)}'>{_escaped(known.text)}</h2>", f"<p>{_escaped(reference)}</p>"]
+    parts = [f"<h2 id='{escaped(name)}'>{escaped(known.text)}</h2>", f"<p>{escaped(reference)}</p>"]
     for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
         group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
         drawn = figure(f"{dtype}, {batch} at once", known, group)
-        parts.append(_svg(drawn, f"{name}{dtype}{batch}"))
-    cells = _table(COLUMNS, rows(records))
+        parts.append(svg(drawn, f"{name}{dtype}{batch}"))
+    cells = html_table(COLUMNS, rows(records))
     return [*parts, f"<details><summary>{len(records)} runs</summary>{cells}</details>"]
 
 
@@ -124,7 +126,7 @@ def figure(title: str, known: Known, records: Sequence[Record]) -> Any:
     return drawn
 
 
-def _svg(drawn, salt: str) -> str:
+def svg(drawn, salt: str) -> str:
     """A figure as an element of a page; `salt` keeps the names of its parts apart from those of other figures."""
     import matplotlib
 

@@ -1,0 +1,103 @@
+"""Tables that `jaxdyn identify` prints."""
+
+import numpy as np
+
+from jaxdyn.cli.common import coordinate_labels, short, table
+from jaxdyn.identify import TERMS, LeastSquares, RobotFit, nominal_parameters
+from jaxdyn.identify.regression import free_columns
+from jaxdyn.identify.selection import Choice
+from jaxdyn.model.tree import Model
+from jaxdyn.reports.identification import Findings, total_percent
+
+_BASE_ROWS = 200
+
+
+def judged_table(findings: Findings) -> str:
+    """Torque errors, in per cent: of what was not fitted first, of all joints together and of each."""
+    labels, _ = coordinate_labels(findings.model)
+    rows = []
+    for kind, group in (("test", findings.tests), ("fitted", findings.train)):
+        rows += [[one.name, kind, f"{one.percent:.2f}", *_each(one.percent_by_joint)] for one in group]
+    text = (
+        f"torque error: {total_percent(findings.tests):.2f} % on what was not fitted, {total_percent(findings.train):.2f} % on "
+        f"what was; {total_percent(findings.tests, 'nominal'):.1f} % with the URDF's own numbers\n"
+    )
+    text += "Torque error in per cent of the torque measured\n" + table(["log", "", "all", *labels], rows)
+    if findings.is_refit:
+        text += (
+            f"\nWhat is written was then fitted to all samples: {total_percent(findings.final):.2f} % on them; the tables "
+            "below are of that fit."
+        )
+    return text
+
+
+def tables(findings: Findings) -> str:
+    """Joints and bodies, or base parameters; what was chosen."""
+    parts = [_joint_table(findings)]
+    result, model = findings.result, findings.model
+    if isinstance(result, LeastSquares):
+        rows = [[name, short(x0), short(x), short(s, 2)] for name, x0, x, s in result.table()]
+        header = ["combination", "URDF", "fitted", "std"]
+        parts.append("Base parameters: URDF, fitted, standard deviation for independent errors\n" + table(header, rows))
+        return "\n".join(parts)
+    if isinstance(result, RobotFit):
+        parts += [_choice_text(findings.choice or result.choice, model), _robot_base_table(result, model)]
+    parts.append(_mass_table(findings))
+    return "\n".join(parts)
+
+
+def _each(values: np.ndarray) -> list[str]:
+    return [f"{x:.1f}" if np.isfinite(x) else "-" for x in values]
+
+
+def _joint_table(findings: Findings) -> str:
+    labels, units = coordinate_labels(findings.model)
+    first = findings.tests[0]
+    measured = np.sqrt(np.mean(np.asarray(first.log.tau) ** 2, axis=0))
+    columns = [measured, first.rms, *(findings.friction[term] for term in TERMS)]
+    header = ["joint", "unit", "torque rms", "error rms", "viscous", "coulomb", "offset", "rotor inertia"]
+    extra = findings.result.fit.extra if isinstance(findings.result, RobotFit) else None
+    if extra is not None:
+        for name, values in extra.named.items():
+            group = np.array(values).reshape(-1, findings.model.nv)
+            header += [name if len(group) == 1 else f"{name} {k + 1}" for k in range(len(group))]
+            columns += list(group)
+    rows = [
+        [label, unit, *(short(float(x), 3) for x in row)]
+        for label, unit, row in zip(labels, units, np.stack(columns, 1), strict=True)
+    ]
+    return f"Joints: errors on {first.name}, friction and rotor inertia\n" + table(header, rows)
+
+
+def _choice_text(choice: Choice, model: Model) -> str:
+    setting, labels = choice.setting, coordinate_labels(model)[0]
+    extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
+    how = f", chosen over {len(choice.trials)} settings, each judged on {choice.by} left out in turn"
+    return f"v_s {setting.v_s:g}, prior {setting.prior:g}, extra terms: {extra}{how if choice.trials else ''}"
+
+
+def _robot_base_table(result: RobotFit, model: Model) -> str:
+    base, combinations = result.intervals.base, result.intervals.combinations
+    basic = tuple(term for term in result.fit.terms if term in TERMS)
+    start = combinations.values(nominal_parameters(model)[free_columns(model.nb, model.nv, basic)])
+    rows = [
+        [name, short(x0), short(x), short(result.intervals.factor * s, 2), source]
+        for name, x0, x, s, source in zip(base.names, start, base.values, base.std, base.sources, strict=True)
+    ]
+    text = "Base parameters: URDF, fitted, half of the 95 % interval, and what settled them"
+    return text + "\n" + table(["combination", "URDF", "fitted", "+-", "from"], rows[:_BASE_ROWS])
+
+
+def _mass_table(findings: Findings) -> str:
+    model = findings.model
+    sources = {}
+    if isinstance(findings.result, RobotFit):
+        spread = findings.result.intervals.parameters
+        sources = dict(zip(spread.names, spread.sources, strict=True))
+    rows = []
+    fitted = findings.parameters[: 10 * model.nb].reshape(-1, 10)
+    for name, old, new in zip(model.body_names, np.asarray(model.inertias), fitted, strict=True):
+        centre = [short(x, 3) for x in new[1:4] / new[0]] if new[0] > 0 else ["-"] * 3
+        rows.append([name, short(old[0]), short(new[0]), sources.get(f"{name}.m", "-"), *centre])
+    text = "Bodies: mass (kg) in the URDF and fitted, what settled it, fitted centre of mass (m)"
+    return text + "\n" + table(["body", "URDF", "fitted", "from", "x", "y", "z"], rows)

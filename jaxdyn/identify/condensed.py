@@ -1,0 +1,173 @@
+"""Logs condensed to triangles: whatever a fit asks of the stacked regressor, at a cost that does not grow with the logs.
+
+The rows of one torque hold the inertial columns and that torque's own terms. For each block of consecutive samples and each
+torque they are replaced by the triangle of their QR factorisation, which keeps all squares and products. Weights of torques,
+samples that are left out, and columns that are left out can then be chosen afterwards, and the error that parameters make on a
+block is known without its samples.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdyn.identify.logs import Log
+
+# Samples whose regressor is held at a time.
+_SAMPLES = 1024
+
+
+class Condensed(NamedTuple):
+    """Stacked regressor and torques of a log, W x = w, condensed: |W x - w|^2 = |R x - d|^2 + rest for every x.
+
+    `R` (p, p) upper triangular, `d` (p,), `rest` a number, `rows` the number of rows of W. Taking R instead of the
+    normal matrix W^T W = R^T R keeps the condition number from being squared.
+    """
+
+    R: np.ndarray
+    d: np.ndarray
+    rest: float
+    rows: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Blocks:
+    """Regressor and torques of logs, condensed for each block of samples and each torque.
+
+    - `triangles`: for each block a list of nv upper-trapezoidal matrices (m, s + k + 1): columns shared by all torques, the
+      torque's own k terms, and the torque measured (N m).
+    - `shared`: number s of columns that all torques share. `terms`: number k of terms of each torque.
+    - `samples` (blocks,): samples in each block. `logs` (blocks,): which log each block comes from.
+
+    Parameters x (s + k nv,) are those shared, then one number for each torque of the first term, of the second, ...
+    """
+
+    triangles: list[list[np.ndarray]]
+    shared: int
+    terms: int
+    samples: np.ndarray
+    logs: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.triangles)
+
+    @property
+    def nv(self) -> int:
+        """Number of torques."""
+        return len(self.triangles[0])
+
+    @property
+    def size(self) -> int:
+        """Number of parameters, s + k nv."""
+        return self.shared + self.terms * self.nv
+
+    def places(self, joint: int) -> np.ndarray:
+        """Positions in x of the columns that one torque has."""
+        return np.concatenate([np.arange(self.shared), self.shared + joint + self.nv * np.arange(self.terms)])
+
+    def merged(self, chosen=None) -> list[np.ndarray]:
+        """One triangle for each torque, of the blocks chosen (an array of bool or of numbers; None: all)."""
+        picked = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
+        return [
+            np.asarray(np.linalg.qr(np.concatenate([self.triangles[block][joint] for block in picked]), mode="r"))
+            for joint in range(self.nv)
+        ]
+
+    def squares(self, x: np.ndarray, chosen=None) -> np.ndarray:
+        """Sums of squared errors (blocks, nv) that the parameters x make on the blocks chosen."""
+        picked = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
+        columns = [np.append(x[self.places(joint)], -1.0) for joint in range(self.nv)]
+        return np.array(
+            [[np.sum((R @ c) ** 2) for R, c in zip(self.triangles[i], columns, strict=True)] for i in picked]
+        )
+
+    def torque_squares(self, chosen=None) -> np.ndarray:
+        """Sums of the squared torques measured (blocks, nv)."""
+        return self.squares(np.zeros(self.size), chosen)
+
+    def scores(self, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Half the gradients (blocks, p) of each block's weighted squared error at x."""
+        result = np.zeros((len(self), self.size))
+        for row, triangles in zip(result, self.triangles, strict=True):
+            for joint, R in enumerate(triangles):
+                error = R @ np.append(x[self.places(joint)], -1.0)
+                row[self.places(joint)] += weights[joint] ** 2 * (R[:, :-1].T @ error)
+        return result
+
+    def grams(self, weights: np.ndarray) -> np.ndarray:
+        """W^T W of each block (blocks, p, p), rows weighted."""
+        result = np.zeros((len(self), self.size, self.size))
+        for matrix, triangles in zip(result, self.triangles, strict=True):
+            for joint, R in enumerate(triangles):
+                places = self.places(joint)
+                matrix[np.ix_(places, places)] += weights[joint] ** 2 * (R[:, :-1].T @ R[:, :-1])
+        return result
+
+    def rows(self, weights: np.ndarray, chosen=None) -> np.ndarray:
+        """Rows [W, w] (m, p + 1) with the squares and products of the blocks chosen, each torque's times its weight."""
+        parts = []
+        for joint, R in enumerate(self.merged(chosen)):
+            part = np.zeros((len(R), self.size + 1))
+            part[:, np.append(self.places(joint), self.size)] = weights[joint] * R
+            parts.append(part)
+        return np.concatenate(parts)
+
+    def count(self, chosen=None) -> int:
+        """Number of torques measured in the blocks chosen."""
+        samples = self.samples if chosen is None else self.samples[chosen]
+        return int(samples.sum()) * self.nv
+
+
+def condensed_rows(rows: np.ndarray, count: int) -> Condensed:
+    """`Condensed` of rows [W, w] (m, p + 1) that stand for `count` torques."""
+    p = rows.shape[1] - 1
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+    triangle = np.concatenate([triangle, np.zeros((max(p + 1 - len(triangle), 0), p + 1))])
+    return Condensed(triangle[:p, :p], triangle[:p, p], float(triangle[p, p] ** 2), count)
+
+
+def block_slices(lengths: Sequence[int], total: int) -> list[tuple[int, slice]]:
+    """About `total` blocks of logs of these lengths, (log, its samples): none crosses a joint, each log has one at least."""
+    result = []
+    for which, length in enumerate(lengths):
+        count = min(max(1, round(total * length / sum(lengths))), length)
+        edges = np.linspace(0, length, count + 1).astype(int)
+        result += [(which, slice(a, b)) for a, b in itertools.pairwise(edges)]
+    return result
+
+
+def condense_blocks(
+    logs: Sequence[Log],
+    rows: Callable[[int, slice], np.ndarray],
+    shared: int,
+    *,
+    extra: Sequence[np.ndarray] = (),
+    blocks: int = 1,
+) -> Blocks:
+    """Condense logs, block by block.
+
+    **Arguments:** `logs`; `rows(which, piece)`, the regressor (n, nv, s + k nv) of some samples of a log, whose terms are
+    diagonal blocks; `shared`, its number s of columns before the terms; `extra`: for each log, more terms (n, nv, k');
+    `blocks`: about how many, over all logs.
+    """
+    triangles, samples, owners = [], [], []
+    for which, part in block_slices([len(log) for log in logs], blocks):
+        nv = logs[which].nv
+        found = [np.zeros((0, 0))] * nv
+        for start in range(part.start, part.stop, _SAMPLES):
+            piece = slice(start, min(start + _SAMPLES, part.stop))
+            log = logs[which][piece]
+            W, tau = rows(which, piece), np.asarray(log.tau, np.float64)
+            own = W[:, :, shared:].reshape(len(log), nv, -1, nv)
+            more = np.zeros((len(log), nv, 0)) if not len(extra) else extra[which][piece]
+            for j in range(nv):
+                table = np.concatenate([W[:, j, :shared], own[:, j, :, j], more[:, j], tau[:, j, None]], axis=1)
+                before = found[j] if found[j].size else np.zeros((0, table.shape[1]))
+                found[j] = np.asarray(np.linalg.qr(np.concatenate([before, table]), mode="r"))
+        triangles.append(found)
+        samples.append(part.stop - part.start)
+        owners.append(which)
+    terms = triangles[0][0].shape[1] - 1 - shared
+    return Blocks(triangles, shared, terms, np.array(samples), np.array(owners))

@@ -1,0 +1,174 @@
+"""Standard deviations that count blocks of samples, not samples, and say what the data told and what the prior.
+
+Residuals of a filtered log are correlated and hold what no term of the model explains, so that independent errors of single
+samples would promise far too much. Here consecutive samples form blocks, each block is left out in turn, and the scatter of what
+is then found is the uncertainty (delete-a-group jackknife). The prior's pull is counted as if the nominal bodies were off by as
+much as a prior of weight 1 believes.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from jaxdyn.identify.chart import Chart, Coordinates, positive_terms
+from jaxdyn.identify.feasible import stretches
+from jaxdyn.identify.one_fit import Data, Estimate, Setting
+from jaxdyn.identify.regression import BaseParameters, base_parameters, free_columns, parameter_names
+from jaxdyn.model.tree import Model
+
+# Share of the variance from which on a number is called one from the prior.
+_FROM_PRIOR = 0.5
+# Blocks left out together: the longer they are, the less errors in one have to do with those in the next.
+_TOGETHER = 2
+
+
+class Spread(NamedTuple):
+    """Numbers with uncertainty, all (n,): names, values, standard deviations, and the share of the variance from the prior."""
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    std: np.ndarray
+    prior_share: np.ndarray
+
+    @property
+    def sources(self) -> list[str]:
+        """For each number "data" or "prior": where most of its uncertainty, hence its value, comes from; "bound" at zero."""
+        source = np.where(self.prior_share > _FROM_PRIOR, "prior", "data")
+        return np.where(np.isfinite(self.std), source, "bound").tolist()
+
+
+class Intervals(NamedTuple):
+    """Uncertainty of a feasible fit.
+
+    - `parameters`: all of x in the order of `parameter_names`, then coefficients of extra terms. Terms that the fit holds at
+      zero have no standard deviation (NaN).
+    - `base`: the combinations of inertias and terms that torques tell apart, and `combinations`, which these are.
+    - `factor`: a 95 % interval is the value plus and minus this many standard deviations (Student's t, blocks - 1).
+    """
+
+    parameters: Spread
+    base: Spread
+    combinations: BaseParameters
+    base_covariance: np.ndarray
+    factor: float
+
+
+def intervals(model: Model, data: Data, setting: Setting, estimate: Estimate, weights: np.ndarray, terms) -> Intervals:
+    """`Intervals` of one fit of condensed logs.
+
+    With D_b the data's curvature and g_b their slope on block b, both over sigma^2, P the prior's curvature and H = sum D_b + P:
+    leaving b out moves the fit by (H - D_b)^-1 g_b. Their covariance times (B - 1) is the data's share, and
+    max(prior, 1) H^-1 P H^-1 the prior's. All in the coordinates of the chart, then carried over to x.
+
+    Source: Efron (1982), the jackknife; Cameron & Miller (2015), cluster-robust inference (CR3).
+    """
+    jacobian, curvature, free = _local(data, setting, estimate)
+    blocks, sigma = data.blocks, estimate.sigma
+    slopes = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
+    grams = np.einsum("pi,bpq,qj->bij", jacobian, blocks.grams(weights), jacobian, optimize=True) / sigma**2
+    groups = block_groups(len(blocks))
+    slopes, grams = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (slopes, grams))
+    moves, inverse = jackknife(grams, slopes, curvature)
+    count = len(groups)
+    moves, pulled = jacobian @ moves, jacobian @ inverse @ _root(curvature) * np.sqrt(max(setting.prior, 1.0))
+
+    nb, nv = model.nb, model.nv
+    names = list(parameter_names(model))
+    for term, size in data.counts.items():
+        for k in range(size):
+            names += [f"{joint}.{term}{k + 1 if size > 1 else ''}" for joint in _joints(model)]
+    fitted = np.concatenate([free, np.zeros(blocks.size - len(free), bool)])
+    fitted[data.places(setting.extra)] = True
+    shown = np.flatnonzero(fitted | (np.arange(blocks.size) < data.basic))
+    parameters = _spread([names[i] for i in shown], estimate.x[shown], moves[shown], pulled[shown], fitted[shown])
+
+    base = base_parameters(model, terms)
+    columns = free_columns(nb, nv, terms)
+    known = base.matrix @ fitted[columns].astype(float) != 0
+    a, b = base.matrix @ moves[columns], base.matrix @ pulled[columns]
+    spread = _spread(base.names, base.values(estimate.x[columns]), a, b, known)
+    return Intervals(parameters, spread, base, a @ a.T + b @ b.T, student(count - 1))
+
+
+def block_groups(count: int) -> list[np.ndarray]:
+    """Numbers of the blocks that are left out together."""
+    return np.array_split(np.arange(count), max(2, count // _TOGETHER))
+
+
+def jackknife(grams: np.ndarray, slopes: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A root (n, groups) of the covariance of a minimum, each group of samples left out in turn, and the inverse Hessian (n, n).
+
+    `grams` (groups, n, n) and `slopes` (groups, n) are the groups' curvatures and slopes there, `curvature` (n, n) what stays.
+    """
+    H = grams.sum(axis=0) + curvature
+    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    scale = unit[:, None] * unit[None, :]
+    moves = np.stack(
+        [unit * (_inverse((H - gram) * scale) @ (unit * slope)) for gram, slope in zip(grams, slopes, strict=True)]
+    )
+    count = len(grams)
+    return (moves - moves.mean(axis=0)).T * np.sqrt((count - 1) / count), _inverse(H * scale) * scale
+
+
+def _spread(names, values, moves, pulled, fitted) -> Spread:
+    from_data, from_prior = np.sum(moves**2, axis=1), np.sum(pulled**2, axis=1)
+    total = from_data + from_prior
+    share = np.where(total > 0, from_prior / np.where(total > 0, total, 1), 1.0)
+    return Spread(tuple(names), np.asarray(values), np.where(fitted, np.sqrt(total), np.nan), share)
+
+
+def _local(data: Data, setting: Setting, estimate: Estimate):
+    """Slopes of x by the free coordinates, the prior's curvature in them, and which basic parameters are free at all."""
+    chart, point = estimate.chart, estimate.point
+    slopes = np.asarray(_chart_slopes(chart, point), np.float64)
+    count, size = point.theta.shape
+    basis = np.asarray(stretches(size, point.theta.dtype), np.float64)
+    bent = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
+    bodies = count * size
+    moves = np.ones(slopes.shape[1], bool)
+    # What is at its bound stays there.
+    moves[bodies:] = ~(
+        np.broadcast_to(positive_terms(chart.terms), point.s.shape) & (np.asarray(point.s) == 0)
+    ).reshape(-1)
+    places = data.places(setting.extra)
+    count = int(moves.sum())
+    jacobian = np.zeros((data.blocks.size, count + len(places)))
+    jacobian[: data.basic, :count] = slopes[:, moves]
+    jacobian[places, count + np.arange(len(places))] = 1.0
+    curvature = np.zeros((jacobian.shape[1],) * 2)
+    curvature[:bodies, :bodies] = bent
+    units = data.units.reshape(-1)[places - data.basic]
+    curvature[count + np.arange(len(places)), count + np.arange(len(places))] = setting.prior / units**2
+    return jacobian, curvature, np.any(jacobian[: data.basic] != 0, axis=1)
+
+
+@eqx.filter_jit
+def _chart_slopes(chart: Chart, point: Coordinates):
+    y, unflatten = ravel_pytree(point)
+    return jax.jacfwd(lambda y: chart.parameters(unflatten(y)))(y)
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Inverse of a symmetric matrix of unit diagonal; directions without curvature are taken as having that of rounding."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return (vectors / np.maximum(values, 1e-12)) @ vectors.T
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(matrix)
+    return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def _joints(model: Model) -> list[str]:
+    start = 10 * model.nb
+    return [name.rpartition(".")[0] for name in parameter_names(model)[start : start + model.nv]]
+
+
+def student(freedoms: int) -> float:
+    """Half of a 95 % interval in standard deviations, by Student's t with so many degrees of freedom."""
+    from scipy.stats import t
+
+    return float(t.ppf(0.975, freedoms))

@@ -1,0 +1,146 @@
+"""One feasible fit of condensed logs at a given setting, extra torque terms eliminated exactly in front of the Newton steps.
+
+The loss 1/2 |W x + E c - tau|^2 / sigma^2 + prior (D(x) + 1/2 sum (c / unit)^2) is quadratic in the coefficients c. The QR
+factorisation of [E, W, tau] with the prior's rows under E leaves a triangle of x alone, whose loss is that of the best c for x.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxdyn.identify.chart import Chart, Coordinates
+from jaxdyn.identify.condensed import Blocks, condensed_rows
+from jaxdyn.identify.feasible import make_problem, newton
+from jaxdyn.identify.logs import Log, as_measured, root_mean_square
+from jaxdyn.identify.regression import condense_model, noise_level
+from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_column
+from jaxdyn.model.tree import Model
+
+# A coefficient's unit is what makes this share of the joint's torque.
+_UNIT = 0.1
+
+
+class Setting(NamedTuple):
+    """What a fit is told besides the logs.
+
+    `v_s`, smoothing velocity; `extra`: extra terms, (name, numbers of the torques that have it); `prior`, weight of the
+    divergence of the bodies and of the coefficients of extra terms.
+    """
+
+    v_s: float
+    extra: tuple[tuple[str, tuple[int, ...]], ...]
+    prior: float
+
+
+class Data(NamedTuple):
+    """Condensed logs for one v_s, with the columns of all extra terms that may be chosen.
+
+    `basic`: number of parameters before them; `counts`: columns of each of them; `units` (columns, nv): coefficient that makes
+    a tenth of the joint's torque, zero where the column is zero.
+    """
+
+    blocks: Blocks
+    basic: int
+    counts: dict[str, int]
+    units: np.ndarray
+
+    def places(self, extra) -> np.ndarray:
+        """Positions in x of the coefficients of extra terms, as `Setting.extra` names them."""
+        wanted, start, result = dict(extra), 0, []
+        for name, count in self.counts.items():
+            for column in range(start, start + count):
+                places = [joint for joint in wanted.get(name, ()) if self.units[column, joint] > 0]
+                result += [self.basic + column * self.blocks.nv + joint for joint in places]
+            start += count
+        return np.array(result, int)
+
+
+class Estimate(NamedTuple):
+    """Result of `fit_condensed`: all parameters x, the torque noise, and where in the chart the fit ended."""
+
+    x: np.ndarray
+    sigma: float
+    chart: Chart
+    point: Coordinates
+    history: np.ndarray
+    result: str
+
+
+def gather(
+    model: Model, logs: Sequence[Log], v_s: float, extra: Sequence[TorqueTerm], loads: Sequence[np.ndarray], blocks: int
+) -> Data:
+    """Condense logs with the columns of extra terms; `loads` (n, nv) of each log is the torque of the rigid bodies."""
+    parts = [[as_measured(log, term(log, load, v_s)) for term in extra] for log, load in zip(logs, loads, strict=True)]
+    coulomb = [as_measured(log, coulomb_column(log, v_s)) for log in logs]
+    counts = {term.name: part.shape[2] for term, part in zip(extra, parts[0], strict=True)}
+    columns = [
+        np.concatenate([np.zeros((len(log), log.nv, 0)), *part], axis=2) for log, part in zip(logs, parts, strict=True)
+    ]
+    torque = root_mean_square(np.concatenate([np.asarray(log.tau) for log in logs]))
+    joined = np.concatenate(columns)
+    size = root_mean_square(joined.reshape(len(joined), -1)).reshape(joined.shape[1:]).T
+    torque = np.where(torque > 0, torque, torque.max(initial=0) or 1.0)
+    units = np.where(size > 0, _UNIT * torque / np.where(size > 0, size, 1), 0.0)
+    data = condense_model(model, logs, v_s=v_s, coulomb=coulomb, extra=columns, blocks=blocks)
+    return Data(data, 10 * model.nb + 4 * model.nv, counts, units)
+
+
+def fit_condensed(
+    model: Model,
+    data: Data,
+    setting: Setting,
+    sizes,
+    terms,
+    weights: np.ndarray,
+    *,
+    rows: np.ndarray | None = None,
+    count: int | None = None,
+    inertia: str = "full",
+    steps: int = 200,
+    tolerance: float = 1e-6,
+    callback=None,
+) -> Estimate:
+    """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for.
+
+    `sizes` as of `signal_sizes`, the other arguments as in `fit_torques`.
+    """
+    rows, size = data.blocks.rows(weights) if rows is None else rows, data.blocks.size
+    count = data.blocks.count() if count is None else count
+    places = data.places(setting.extra)
+    kept = np.append(np.arange(data.basic), places)
+    rows = rows[:, [*places, *range(data.basic), size]]
+    sigma = noise_level(condensed_rows(rows, count))
+    units = data.units.reshape(-1)[places - data.basic]
+    R, coefficients = eliminate(rows, len(places), np.sqrt(setting.prior) * sigma / units)
+    condensed = condensed_rows(R, count)
+    problem, point, sigma = make_problem(
+        model, condensed, sizes, terms, setting.v_s, inertia, setting.prior, sigma or None
+    )
+    chart, point, history, result = newton(model, problem, point, steps, tolerance, callback)
+    point = chart.settled(point)
+    x = np.zeros(size)
+    basic = np.asarray(_parameters(chart, point), np.float64)
+    x[kept] = np.append(basic, coefficients(basic))
+    return Estimate(x, sigma, chart, point, history, result)
+
+
+@eqx.filter_jit
+def _parameters(chart: Chart, point: Coordinates):
+    return chart.parameters(point)
+
+
+def eliminate(rows: np.ndarray, count: int, ridge: np.ndarray) -> tuple[np.ndarray, Callable]:
+    """Minimise |E c + W x - w|^2 + |ridge c|^2 over c for every x; `rows` are [E, W, w] with `count` columns of E.
+
+    **Returns:** the rows [R, d] of the squared error that is left, |R x - d|^2, and the function from x to c.
+    """
+    prior = np.concatenate([np.diag(ridge), np.zeros((count, rows.shape[1] - count))], axis=1)
+    R = np.asarray(np.linalg.qr(np.concatenate([rows, prior]), mode="r"))
+
+    def coefficients(x: np.ndarray) -> np.ndarray:
+        rest = R[:count, -1] - R[:count, count:-1] @ x
+        return np.linalg.solve(R[:count, :count], rest) if count else np.zeros(0)
+
+    return R[count:, count:], coefficients

@@ -1,0 +1,60 @@
+"""What looks wrong with a log before anything is fitted: units, torques of motors, joints that stand still."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxdyn.identify.logs import Log
+from jaxdyn.identify.regression import nominal_parameters, regressor
+from jaxdyn.model.tree import Model
+
+# Angles beyond this many turns, and torques this many times off what the nominal bodies need, are worth a question.
+_TURNS, _OFF = 3.0, 20.0
+# A joint whose velocity stays below this share of the fastest one's is at rest.
+_STILL = 1e-4
+
+
+def suspicions(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
+    """Sentences about a log with v and a, none where it looks as expected; `labels` of each number of v.
+
+    - Angles of revolute joints beyond three turns: degrees. Joints that turn without end ("continuous") may go there.
+    - Torques that are less than a twentieth, or more than twenty times, of what the nominal bodies need, at most joints where
+      these need a tenth of the largest: torques of the motors in front of the gears, or in other units.
+    - Joints that stand still, whose friction and rotors cannot be told.
+    """
+    lines = []
+    q = np.abs(np.asarray(log.q, np.float64))
+    if model.nq == model.nv:
+        turning = np.array([kind == "revolute" for kind in model.topology.kinds])
+        far = np.flatnonzero(turning & (q.max(axis=0) > _TURNS * 2 * np.pi))
+        if len(far):
+            names = ", ".join(labels[int(i)] for i in far)
+            lines.append(
+                f"positions of {names} reach {q[:, far].max():.0f} rad, beyond three turns: are they in degrees?"
+            )
+    needed = _rms(regressor(model, log.q, log.v, log.a) @ nominal_parameters(model))
+    measured = _rms(np.asarray(log.tau, np.float64))
+    tells = (needed > 0.1 * needed.max(initial=0)) & (measured > 0)
+    ratio = measured[tells] / needed[tells]
+    names = ", ".join(label for label, told in zip(labels, tells, strict=True) if told)
+    if len(ratio) and np.mean(ratio < 1 / _OFF) > 0.5:
+        lines.append(
+            f"torques of {names} are about 1/{1 / np.median(ratio):.0f} of what the file's bodies need: are they of the motors, "
+            "in front of the gears, or in another unit? Joint torques in N m are expected; multiply by the gear ratios"
+        )
+    elif len(ratio) and np.mean(ratio > _OFF) > 0.5:
+        lines.append(
+            f"torques of {names} are about {np.median(ratio):.0f} times what the file's bodies need: are they in N mm or in per "
+            "cent? N m are expected"
+        )
+    speed = _rms(np.asarray(log.v, np.float64))
+    still = [label for label, v in zip(labels, speed, strict=True) if not v > _STILL * speed.max(initial=0)]
+    if still:
+        lines.append(
+            f"{', '.join(still)} stand still: their friction and rotor inertia stay near the file's, or mean nothing"
+        )
+    return lines
+
+
+def _rms(x: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(x**2, axis=0))

@@ -1,0 +1,177 @@
+"""What an identification found, on which logs, and all of it as JSON."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdyn.identify import (
+    TERMS,
+    Fit,
+    LeastSquares,
+    Log,
+    RobotFit,
+    base_parameters,
+    nominal_parameters,
+    parameter_names,
+    torque_error,
+)
+from jaxdyn.identify.regression import free_columns
+from jaxdyn.identify.selection import Choice
+from jaxdyn.model.tree import Model
+
+
+class Judged(NamedTuple):
+    """A log and the torques (n, nv) that a fit and the nominal model predict along it (N m, N)."""
+
+    name: str
+    log: Log
+    predicted: np.ndarray
+    nominal: np.ndarray
+
+    @property
+    def percent(self) -> float:
+        """100 |predicted - measured| / |measured| over all samples and joints."""
+        return torque_error(self.predicted, self.log.tau)
+
+    @property
+    def rms(self) -> np.ndarray:
+        """Root mean square error of each torque (nv,)."""
+        return np.sqrt(np.mean((self.predicted - np.asarray(self.log.tau)) ** 2, axis=0))
+
+    @property
+    def percent_by_joint(self) -> np.ndarray:
+        """Error of each torque in per cent of its own root mean square (nv,); NaN where none was measured."""
+        measured = np.sqrt(np.mean(np.asarray(self.log.tau) ** 2, axis=0))
+        return 100 * np.where(measured > 0, self.rms / np.where(measured > 0, measured, 1), np.nan)
+
+
+class Findings(NamedTuple):
+    """Everything that is reported.
+
+    `result`: what is written, fitted to all training logs. `tests`: logs, or parts of logs, that were not fitted, under the fit
+    that is to be judged; `train`: what that fit was made from; `final`: all training logs under `result`. `is_refit`: whether
+    `result` is another fit than the one judged. `choice`: how its setting was chosen, on `train`; None for other fits.
+    """
+
+    model: Model
+    result: RobotFit | Fit | LeastSquares
+    tests: list[Judged]
+    train: list[Judged]
+    final: list[Judged]
+    outcome: str
+    is_refit: bool
+    warnings: list[str]
+    choice: Choice | None = None
+
+    @property
+    def fit(self) -> Fit | LeastSquares:
+        """The fit that is written, without its choice and intervals."""
+        return self.result.fit if isinstance(self.result, RobotFit) else self.result
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """x (10 nb + 4 nv,) of it."""
+        return self.fit.parameters if isinstance(self.fit, LeastSquares) else self.fit.vector
+
+    @property
+    def friction(self) -> dict[str, np.ndarray]:
+        """Terms of friction and rotors, (nv,) each."""
+        blocks = self.parameters[10 * self.model.nb :].reshape(len(TERMS), self.model.nv)
+        return dict(zip(TERMS, blocks, strict=True))
+
+
+def total_percent(judged: Sequence[Judged], which: str = "predicted") -> float:
+    """Torque error over several logs, in per cent."""
+    rows = [np.asarray(getattr(one, which)).reshape(-1) for one in judged]
+    return torque_error(np.concatenate(rows), np.concatenate([np.asarray(one.log.tau).reshape(-1) for one in judged]))
+
+
+def content(findings: Findings, settings: dict[str, Any]) -> dict[str, Any]:
+    """What goes into the JSON file; `settings` are what the user asked for, and come first."""
+    model, result, fit = findings.model, findings.result, findings.fit
+    names = parameter_names(model)
+    base = base_parameters(model, tuple(term for term in fit.terms if term in TERMS))
+    columns = free_columns(model.nb, model.nv, tuple(term for term in fit.terms if term in TERMS))
+    nominal, fitted = nominal_parameters(model), findings.parameters
+    found = {
+        **settings,
+        "outcome": findings.outcome,
+        "joint_names": list(model.joint_names),
+        "test_logs": {one.name: _errors(one) for one in findings.tests},
+        "torque_error": {
+            "test_percent": total_percent(findings.tests),
+            "train_percent": total_percent(findings.train),
+            "nominal_test_percent": total_percent(findings.tests, "nominal"),
+            "final_percent": total_percent(findings.final),
+        },
+        "train_logs": {one.name: _errors(one) for one in findings.final},
+        "samples": {
+            "train": sum(len(one.log) for one in findings.train),
+            "test": sum(len(one.log) for one in findings.tests),
+            "final": sum(len(one.log) for one in findings.final),
+        },
+        "test_rms": findings.tests[0].rms.tolist(),
+        "warnings": findings.warnings,
+        "terms": list(fit.terms),
+        "friction": {term: values.tolist() for term, values in findings.friction.items()},
+        "base_parameters": {
+            "expressions": list(base.expressions),
+            "nominal": base.values(nominal[columns]).tolist(),
+            "fitted": base.values(fitted[columns]).tolist(),
+        },
+    }
+    if isinstance(result, LeastSquares):
+        found["base_parameters"]["std"] = _numbers(result.std)
+    else:
+        rows = zip(names, nominal.tolist(), fitted.tolist(), strict=True)
+        found["parameters"] = {name: {"nominal": x0, "fitted": x} for name, x0, x in rows}
+    if isinstance(result, RobotFit):
+        _add_robot(found, result, findings.choice or result.choice, model)
+    return found
+
+
+def _add_robot(found: dict[str, Any], result: RobotFit, choice: Choice, model: Model) -> None:
+    setting, extra = choice.setting, result.fit.extra
+    spreads = result.intervals
+    found["chosen"] = {
+        "v_s": setting.v_s,
+        "prior": setting.prior,
+        "extra_terms": {name: [model_joint(model, j) for j in joints] for name, joints in setting.extra},
+        "by": choice.by,
+        "trials": [
+            {"v_s": t.setting.v_s, "prior": t.setting.prior, "extra_terms": dict(t.setting.extra), "percent": t.percent}
+            for t in choice.trials
+        ],
+    }
+    found["extra_terms"] = {} if extra is None else extra.named
+    found["weights"] = result.weights.tolist()
+    found["interval_factor"] = spreads.factor
+    rows = zip(spreads.parameters.names, _numbers(spreads.parameters.std), spreads.parameters.sources, strict=True)
+    for name, std, source in rows:
+        found["parameters"].setdefault(name, {})
+        found["parameters"][name] |= {"std": std, "from": source}
+    for name, value in zip(spreads.parameters.names, spreads.parameters.values, strict=True):
+        found["parameters"][name].setdefault("fitted", float(value))
+    found["base_parameters"] |= {"std": _numbers(spreads.base.std), "from": spreads.base.sources}
+
+
+def model_joint(model: Model, coordinate: int) -> str:
+    """Name of a number of v: the joint's, with an index where it has several."""
+    start = 10 * model.nb
+    return parameter_names(model)[start + coordinate].rpartition(".")[0]
+
+
+def _errors(one: Judged) -> dict[str, Any]:
+    return {
+        "percent": one.percent,
+        "percent_by_joint": _numbers(one.percent_by_joint),
+        "rms_by_joint": one.rms.tolist(),
+        "nominal_percent": torque_error(one.nominal, one.log.tau),
+        "samples": len(one.log),
+    }
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    """Numbers for JSON, which has no infinity."""
+    return [float(x) if np.isfinite(x) else None for x in values]

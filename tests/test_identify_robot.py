@@ -1,0 +1,394 @@
+"""Several logs, torque terms and their choice, weights, and intervals that cover."""
+
+import itertools
+
+import jax
+import numpy as np
+import pytest
+
+from jaxdyn import identify, inertia
+from jaxdyn.identify.condensed import block_slices, condensed_rows
+from jaxdyn.identify.logs import as_measured
+from jaxdyn.identify.one_fit import eliminate
+from jaxdyn.identify.regression import condense, condense_model
+from jaxdyn.identify.selection import folds, helped
+from jaxdyn.identify.spectra import motion_band, vibration
+from jaxdyn.identify.suspicions import suspicions
+from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
+from jaxdyn.model.builder import ModelBuilder
+
+
+def arm(stretch=0.0, seed=0):
+    """Two links that are solid in all directions; `stretch` is the size of a random change of both."""
+    builder = ModelBuilder("arm")
+    moments = np.array([0.1, 0.09, 0.02])
+    builder.add_body("a", axis=(0, 1, 0), inertia=(1.0, (0.02, 0.01, -0.5), moments))
+    builder.add_body("b", "a", pose=(0, 0, -1), axis=(0, 1, 0), inertia=(0.8, (0.01, 0, -0.4), 0.8 * moments))
+    model = builder.build()
+    step = stretch * np.random.default_rng(seed).normal(size=(2, 10))
+    move = jax.jit(jax.vmap(lambda x, step: inertia.from_log_cholesky(inertia.to_log_cholesky(x) + step)))
+    return model.replace(inertias=move(model.inertias, step))
+
+
+def motion(seed, n=300, duration=6.0):
+    """A log of a sum of sines with exact derivatives, without torques yet."""
+    generator = np.random.default_rng(seed)
+    t = np.linspace(0, duration, n)
+    amplitude, phase = generator.uniform(0.3, 1.0, (4, 2)), generator.uniform(0, 2 * np.pi, (4, 2))
+    w = np.arange(1, 5)[:, None] * 1.3
+    angle = w * t[:, None, None] + phase
+    q = np.sum(amplitude * np.sin(angle), 1)
+    v = np.sum(amplitude * w * np.cos(angle), 1)
+    return identify.Log(t, q, v, np.sum(-amplitude * w**2 * np.sin(angle), 1), np.zeros((n, 2)))
+
+
+def measured(model, log, x=None, more=0.0, noise=0.0, seed=0):
+    """The log with the torques of parameters x, of the model's own by default, and noise."""
+    x = identify.nominal_parameters(model) if x is None else x
+    tau = identify.regressor(model, log.q, log.v, log.a) @ x + more
+    return identify.Log(log.t, log.q, log.v, log.a, tau + noise * np.random.default_rng(seed).normal(size=tau.shape))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """Parameters of an arm with friction, rotors and offsets."""
+    x = identify.nominal_parameters(arm())
+    x[20:] = [0.3, 0.2, 0.4, 0.3, 0.1, -0.2, 0.05, 0.02]
+    return x
+
+
+# --- several logs -----------------------------------------------------------------------------------------------------
+
+
+def test_blocks_cross_no_joint():
+    slices = block_slices([100, 10, 57], 8)
+    for log, length in enumerate([100, 10, 57]):
+        own = [part for which, part in slices if which == log]
+        assert [own[0].start, own[-1].stop] == [0, length]
+        assert all(a.stop == b.start for a, b in itertools.pairwise(own))
+    assert len(slices) in (8, 9) and [log for log, _ in slices] == sorted(log for log, _ in slices)
+
+
+def test_condensed_blocks_keep_all_squares_and_products(truth):
+    """Against the stacked matrix itself: gram, squared errors, slopes, for all blocks and for some, weighted."""
+    model, weights = arm(), np.array([1.0, 3.0])
+    logs = [measured(model, motion(1, 2100, 40.0), truth), measured(model, motion(2, 150), truth)]
+    blocks = condense_model(model, logs, blocks=6)
+    assert blocks.logs.tolist() == [0] * (len(blocks) - 1) + [1] and blocks.samples.sum() == 2250
+    chosen = np.array([1, len(blocks) - 1])
+    parts = block_slices([len(log) for log in logs], 6)
+    x = np.random.default_rng(0).normal(size=28)
+
+    def stacked(parts):
+        rows = [logs[which][part] for which, part in parts]
+        W = np.concatenate([identify.regressor(model, log.q, log.v, log.a) for log in rows])
+        return W, np.concatenate([log.tau for log in rows])
+
+    for picked, given in ((chosen, [parts[i] for i in chosen]), (None, parts)):
+        W, tau = stacked(given)
+        whole = np.concatenate([W, tau[:, :, None]], axis=2) * weights[:, None]
+        rows = blocks.rows(weights, picked)
+        gram = np.einsum("nij,nik->jk", whole, whole)
+        np.testing.assert_allclose(rows.T @ rows, gram, atol=1e-12 * np.abs(gram).max())
+        error = W @ x - tau
+        np.testing.assert_allclose(blocks.squares(x, picked).sum(axis=0), np.sum(error**2, axis=0), rtol=1e-11)
+        assert blocks.count(picked) == tau.size
+    slopes = np.einsum("nij,ni->j", W, weights**2 * error)
+    np.testing.assert_allclose(blocks.scores(x, weights).sum(axis=0), slopes, atol=1e-11 * np.abs(slopes).max())
+    gram = np.einsum("nij,i,nik->jk", W, weights**2, W)
+    np.testing.assert_allclose(blocks.grams(weights).sum(axis=0), gram, atol=1e-12 * np.abs(gram).max())
+
+
+def test_fits_of_several_logs_are_fits_of_all_their_rows(truth):
+    model = arm()
+    first, second = measured(model, motion(1), truth, noise=0.1), measured(model, motion(2, 100), truth, noise=0.1)
+    t = np.concatenate([first.t, second.t + 100])
+    both = identify.Log(t, *(np.concatenate([getattr(x, k) for x in (first, second)]) for k in ("q", "v", "a", "tau")))
+    for fit in (identify.least_squares, identify.fit_torques):
+        one, two = fit(model, both), fit(model, [first, second])
+        x, y = (f.parameters if fit is identify.least_squares else f.vector for f in (one, two))
+        np.testing.assert_allclose(x, y, rtol=1e-7, atol=1e-7)
+    with pytest.raises(ValueError, match=r"log 2 of 2: the log has no a"):
+        identify.fit_torques(model, [first, identify.Log(second.t, second.q, second.v, None, second.tau)])
+    with pytest.raises(ValueError, match="log is list; give"):
+        identify.fit_torques(model, [])
+
+
+def test_presliding_starts_anew_in_every_log():
+    """It follows dz/dq = (sign v - z) / z0, from the side the motion starts on; a log does not know the one before."""
+    (dahl,) = split_terms("dahl", 1)[1]
+    q = np.concatenate([np.linspace(0, 0.01, 40), np.linspace(0.01, 0.004, 40)])[:, None]
+    log = identify.Log(np.arange(80.0), q, np.gradient(q, axis=0), q, q)
+    z = dahl(log, np.zeros_like(q), 1e-9)[:, 0, 0]
+    np.testing.assert_allclose(z[:40], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(z[40:], -1 + 2 * np.exp(-(0.01 - q[40:, 0]) / PRESLIDING), rtol=1e-12)
+    assert dahl(log[60:], np.zeros((20, 1)), 1e-9)[0, 0, 0] == -1.0
+
+
+# --- torque terms -----------------------------------------------------------------------------------------------------
+
+
+def test_elimination_is_exact():
+    """Minimising over c first, then over x, is minimising over both."""
+    generator = np.random.default_rng(0)
+    rows, ridge = generator.normal(size=(50, 3 + 5 + 1)), np.array([0.1, 1.0, 3.0])
+    R, coefficients = eliminate(rows, 3, ridge)
+    x = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=None)[0]
+    whole = np.concatenate([rows, np.concatenate([np.diag(ridge), np.zeros((3, 6))], axis=1)])
+    both = np.linalg.lstsq(whole[:, :-1], whole[:, -1], rcond=None)[0]
+    np.testing.assert_allclose(np.append(coefficients(x), x), both, rtol=1e-11)
+    rest = np.sum((R[:, :-1] @ x - R[:, -1]) ** 2)
+    np.testing.assert_allclose(rest, np.sum((whole[:, :-1] @ both - whole[:, -1]) ** 2), rtol=1e-11)
+
+
+def test_terms_that_are_there_are_recovered(truth):
+    """Pre-sliding, quadratic friction and a term of the user's own, without noise; and the fit predicts another log."""
+    model = arm()
+    own = identify.TorqueTerm("cable", lambda log, load, v_s: np.asarray(log.q) ** 2)
+    terms = (identify.EXTRA["dahl"], identify.EXTRA["quadratic"], own)
+    coefficients = np.array([[0.5, 0.2], [0.03, 0.04], [0.3, -0.2]])
+
+    def log(seed, n=300):
+        bare = motion(seed, n)
+        more = sum(c * term(bare, bare.tau, 0.01)[:, :, 0] for c, term in zip(coefficients, terms, strict=True))
+        return measured(model, bare, truth, more)
+
+    fit = identify.fit_robot(model, [log(1), log(2, 200)], (*identify.TERMS, *terms), v_s=0.01, prior=1.0, weights=None)
+    assert fit.choice.trials == () and fit.fit.terms == (*identify.TERMS, "dahl", "quadratic", "cable")
+    # The noise that weighs the priors is the floor, so they pull a little.
+    np.testing.assert_allclose(fit.fit.extra.coefficients, coefficients, atol=1e-4)
+    base = identify.base_parameters(model, identify.TERMS)
+    np.testing.assert_allclose(base.values(fit.fit.vector), base.values(truth), atol=1e-4)
+    assert fit.fit.error(log(3)) < 1e-2
+    assert fit.fit.extra.named["cable"] == pytest.approx([0.3, -0.2], abs=1e-4)
+
+
+def test_load_dependent_friction_follows_the_fitted_robot(truth):
+    model = arm()
+    (load,) = split_terms("load", 2)[1]
+
+    def log(seed, noise=0.01):
+        bare = motion(seed)
+        bodies = truth.copy()
+        bodies[20:26] = 0
+        carried = identify.regressor(model, bare.q, bare.v, bare.a) @ bodies
+        return measured(model, bare, truth, 0.1 * load(bare, carried, 0.01)[:, :, 0], noise)
+
+    fit = identify.fit_robot(model, log(1), (*identify.TERMS, "load"), v_s=0.01, prior=1.0)
+    np.testing.assert_allclose(fit.fit.extra.coefficients, 0.1, atol=3e-3)
+    assert fit.fit.error(log(2, noise=0.0)) < 0.2
+
+
+def test_friction_goes_through_the_filter_of_the_log(truth):
+    """Raw samples of an arm with Coulomb friction, low-passed: a jump of the torque is then a slope, and so is the column's."""
+    model = arm()
+    raw = measured(model, motion(1, 12001, 24.0), truth)
+    log = identify.from_raw(raw.t, raw.q, raw.tau, cutoff=8.0, trim=200, every=4)
+    assert log.cutoff == log[10:].cutoff == 8.0 and raw.cutoff is None
+    fit = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, weights=None).fit
+    plain = identify.fit_torques(model, log, v_s=0.01)
+    assert fit.error(log) < 0.2 * plain.error(log)
+    np.testing.assert_allclose(fit.friction.coulomb, truth[22:24], rtol=0.01)
+    # Smooth signals pass as they are, and a log without a filter leaves every column alone.
+    np.testing.assert_allclose(as_measured(log, log.v)[50:-50], log.v[50:-50], atol=2e-3)
+    column = np.tanh(raw.v / 0.01)
+    assert as_measured(raw, column) is column
+
+
+def test_choice_by_cross_validation(truth):
+    """What is there is chosen where it is, what is not there is left out, and every trial is told."""
+    model = arm()
+    dahl = identify.EXTRA["dahl"]
+
+    def log(seed):
+        bare = motion(seed)
+        return measured(model, bare, truth, 0.5 * np.array([1, 0]) * dahl(bare, bare.tau, 0.01)[:, :, 0], 0.05, seed)
+
+    told = []
+    fit = identify.fit_robot(model, [log(1), log(2)], prior=1.0, callback=told.append)
+    extra = dict(fit.choice.setting.extra)
+    assert extra["dahl"] == (0,) and "spring" not in extra
+    # A smooth sign of 0.003 or 0.03 rad/s differs from one of 0.01 in few samples of these logs.
+    assert 0.001 <= fit.choice.setting.v_s <= 0.03
+    assert len(told) == len(fit.choice.trials) and "parts of consecutive samples" in fit.choice.by
+    plain = identify.fit_robot(model, [log(1), log(2)], identify.TERMS, v_s=0.01, prior=1.0)
+    assert fit.fit.error(log(3)) < plain.fit.error(log(3))
+
+
+def test_folds_are_logs_or_parts_of_them(truth):
+    model = arm()
+    logs = [measured(model, motion(seed), truth) for seed in range(3)]
+    parts, by = folds(condense_model(model, logs, blocks=9))
+    assert by == "logs" and [part.tolist() for part in parts] == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
+    parts, by = folds(condense_model(model, logs[:2], blocks=10))
+    assert by.startswith("5 parts") and [part.tolist() for part in parts][-1] == [8, 9]
+    with pytest.raises(ValueError, match="too short to leave a part"):
+        folds(condense_model(model, logs[:1], blocks=1))
+    before = np.ones((5, 3))
+    after = np.stack([np.full(5, 0.5), np.full(5, 0.999), [0.1, 1.1, 1.1, 1.1, 1.1]], axis=1)
+    assert helped(before, after) == (0,)
+
+
+def test_weights_are_one_over_the_noise_of_each_joint(truth):
+    model = arm()
+    bare = motion(1, 600)
+    log = measured(model, bare, truth, np.random.default_rng(5).normal(size=(600, 2)) * [0.5, 0.02])
+    fit = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0)
+    assert fit.weights[1] / fit.weights[0] == pytest.approx(25, rel=0.15)
+    even = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, weights=None)
+    base = fit.intervals.combinations
+    off = [np.linalg.norm((base.values(f.fit.vector) - base.values(truth))[3:6]) for f in (fit, even)]
+    assert off[0] < off[1]
+
+
+def test_bad_arguments_raise(truth):
+    model = arm()
+    log = measured(model, motion(1), truth)
+    for words, arguments in (
+        (r"term 'stiction' is unknown; take some of viscous.*dahl", {"terms": "stiction"}),
+        (r"term 'dahl' is for torques \(2,\); there are 2", {"terms": (("dahl", (2,)),)}),
+        ("each may be given once", {"terms": ("dahl", "dahl")}),
+        ("v_s is 'fast'", {"v_s": "fast"}),
+        ("v_s is -1.0", {"v_s": -1.0, "prior": 1.0}),
+        ("prior is 0", {"prior": 0.0}),
+        (r"weights is \[1.0, -1.0\]", {"weights": (1.0, -1.0)}),
+        ("blocks is 1", {"blocks": 1}),
+    ):
+        with pytest.raises(ValueError, match=words):
+            identify.fit_robot(model, log, **arguments)
+    bad = identify.TorqueTerm("bad", lambda log, load, v_s: np.ones(3))
+    with pytest.raises(ValueError, match=r"term 'bad' gave an array of shape \(3,\) for 300 samples"):
+        identify.fit_robot(model, log, bad, v_s=0.01, prior=1.0)
+
+
+# --- intervals --------------------------------------------------------------------------------------------------------
+
+
+def coverage(noises, count, size=0.05):
+    """Share of 95 % intervals of base parameters that hold the truth, over random arms; noises(seed, n) are (n, 2)."""
+    inside = []
+    for seed in range(count):
+        model, nominal = arm(0.2, seed), arm()
+        x = identify.nominal_parameters(model)
+        x[20:] = [0.3, 0.2, 0.4, 0.3, 0.1, -0.2, 0.05, 0.02]
+        bare = motion(seed)
+        log = measured(model, bare, x, size * noises(seed, len(bare)))
+        found = identify.fit_robot(nominal, log, identify.TERMS, v_s=0.01, prior=1.0).intervals
+        off = np.abs(found.base.values - found.combinations.values(x))
+        inside.append(off <= found.factor * found.base.std)
+    return np.mean(inside)
+
+
+def white(seed, n):
+    return np.random.default_rng(100 + seed).normal(size=(n, 2))
+
+
+def correlated(seed, n):
+    """Noise whose correlation lasts some ten samples, as a low-pass leaves it."""
+    kernel = np.exp(-(np.linspace(-2, 2, 21) ** 2))
+    return np.stack([np.convolve(x, kernel / np.linalg.norm(kernel), "same") for x in white(seed, n).T], axis=1)
+
+
+def test_intervals_cover():
+    """1 % of noise on the torques, 8 arms of 13 combinations: 95 % intervals hold the truth nine times in ten."""
+    assert coverage(white, 8) >= 0.90
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noises", [white, correlated])
+def test_intervals_cover_for_many_arms(noises):
+    """As above; 40 arms, and noise that is correlated."""
+    assert 0.90 <= coverage(noises, 40) <= 0.99
+
+
+def test_what_no_data_touch_is_from_the_prior(truth):
+    model = arm()
+    found = identify.fit_robot(model, measured(model, motion(1), truth, noise=0.05), v_s=0.01, prior=1.0).intervals
+    sources = dict(zip(found.parameters.names, found.parameters.sources, strict=True))
+    assert sources["a.Ixx"] == sources["b.Izz"] == "prior"  # the arm moves in a plane
+    assert sources["b_joint.viscous"] == sources["b_joint.coulomb"] == "data"
+    base = dict(zip(found.base.names, found.base.sources, strict=True))
+    assert base["b.mcz"] == "data"
+    no_friction = measured(model, motion(1), truth * np.repeat([1, 0, 1], [20, 4, 4]), noise=0.05)
+    found = identify.fit_robot(model, no_friction, identify.TERMS, v_s=0.01, prior=1.0).intervals.parameters
+    at_bound = found.values[20:24] == 0
+    assert np.isnan(found.std[20:24][at_bound]).all() and np.isfinite(found.std[20:24][~at_bound]).all()
+
+
+def test_two_halves_agree_within_their_intervals(truth):
+    model = arm()
+    log = measured(model, motion(4, 600, 12.0), truth, 0.1 * correlated(3, 600))
+    first, second = (
+        identify.fit_robot(model, part, identify.TERMS, v_s=0.01, prior=1.0).intervals.base
+        for part in identify.split(log, 0.5)
+    )
+    z = (first.values - second.values) / np.hypot(first.std, second.std)
+    assert np.sqrt(np.mean(z**2)) < 1.5
+
+
+def test_one_log_condenses_as_before(truth):
+    """R of `condense` and of the rows of its blocks are one."""
+    model = arm()
+    log = measured(model, motion(1), truth)
+    blocks = condense_model(model, [log], blocks=4)
+    one, two = condense(model, log), condensed_rows(blocks.rows(np.ones(2)), blocks.count())
+    np.testing.assert_allclose(one.R.T @ one.R, two.R.T @ two.R, atol=1e-10)
+    assert one.rows == two.rows == 600
+
+
+# --- what looks wrong -------------------------------------------------------------------------------------------------
+
+
+def test_suspicions(truth):
+    model, names = arm(), ("a", "b")
+    good = measured(model, motion(1), truth)
+    assert suspicions(model, good, names) == []
+
+    def changed(**signals):
+        values = {name: getattr(good, name) for name in ("t", "q", "v", "a", "tau")} | signals
+        return suspicions(model, identify.Log(**values), names)
+
+    (line,) = changed(tau=good.tau / 150)
+    assert line.startswith("torques of a, b are about 1/") and "gear ratios" in line
+    (line,) = changed(tau=1000 * good.tau)
+    assert "N mm" in line
+    assert any("are they in degrees" in line for line in changed(q=np.rad2deg(good.q)))
+    still = changed(v=good.v * [1, 0], a=good.a * [1, 0])
+    assert any(line.startswith("b stand still") for line in still)
+
+
+def test_vibration_is_told_from_friction():
+    """A residual at the motion's own frequencies is none; one at 15 Hz is, and the edge is ten times the motion's band."""
+    t = np.linspace(0, 10, 2001)[:, None]
+    log = identify.Log(
+        t[:, 0], np.sin(2 * np.pi * t), 2 * np.pi * np.cos(2 * np.pi * t), -40 * np.sin(2 * np.pi * t), t
+    )
+    slow, fast = np.sin(4 * np.pi * t), np.sin(30 * np.pi * t)
+    assert motion_band(log) == pytest.approx(1.0, abs=0.21)  # the window's width is two tenths of a hertz
+    share, edge = vibration(log, slow + fast)
+    assert share == pytest.approx(0.5, abs=1e-3) and edge == 10 * motion_band(log)
+    assert vibration(log, slow)[0] < 1e-6
+    still = identify.Log(t[:, 0], 0 * t, 0 * t, 0 * t, t)
+    assert motion_band(still) == 0.0 and vibration(still, fast) == (0.0, 0.0)
+
+
+# --- payloads ---------------------------------------------------------------------------------------------------------
+
+
+def test_payload_is_what_loaded_logs_differ_by(truth):
+    """A wrong nominal robot, friction and noise: mass, centre and inertia come back within their intervals."""
+    model, nominal = arm(), arm(0.2, 3)
+    held = np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
+    x = truth.copy()
+    x[10:20] += held
+    unloaded = [measured(model, motion(seed), truth, noise=0.02, seed=seed) for seed in (1, 2)]
+    loaded = measured(model, motion(3), x, noise=0.02, seed=3)
+    found = identify.fit_payload(nominal, unloaded, loaded, terms=identify.TERMS, v_s=0.01, prior=1.0)
+    assert found.body == "b" and found.error < 0.5 * found.without
+    # A planar arm shows m x, m z and the inertia about its axis alone, and not the mass without them.
+    seen = [1, 3, 6]
+    assert np.all(np.abs(found.inertia - held)[seen] <= found.factor * found.std[seen] + 1e-3)
+    assert np.abs(found.inertia - held)[seen].max() < 0.03
+    assert inertia.is_feasible(found.inertia)
+    with pytest.raises(ValueError, match=r"body is 'hand'; the bodies are a, b"):
+        identify.fit_payload(nominal, unloaded, loaded, "hand")
