@@ -96,9 +96,9 @@ def _read_csv(path) -> dict[str, np.ndarray]:
     with path.open(newline="") as file:
         first = file.readline()
         file.seek(0)
-        separator = next((sign for sign in ",;\t" if sign in first), ",")
+        names = re.sub(r"\[[^\]]*\]", "", first)  # units may hold any sign
         # A semicolon beside commas is that of a country that writes 0,5.
-        separator = ";" if ";" in first else separator
+        separator = next((sign for sign in ";,\t" if sign in names), ",")
         reader = csv.reader(file, delimiter=separator)
         header = [_NOTE.sub("", name.strip().lstrip("\ufeff")) for name in next(reader, [])]
         if not header:
