@@ -2,12 +2,14 @@
 
 import os
 import pathlib
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_concrete
@@ -16,8 +18,14 @@ from jaxdyn.model import float64 as f64
 
 _OPTIONAL = ("a", "external")
 
+if TYPE_CHECKING:
+    Numbers = ArrayLike | Sequence[Any]  # what `as_array` takes
+    Given = Array  # what it returns, which may be an array of numpy
+else:
+    Numbers = Given = Any  # `as_array` looks at them, and its errors name the argument
 
-def as_array(value: Any, name: str, dtype=None) -> Any:
+
+def as_array(value: Any, name: str, dtype=None) -> Given:
     """Real numbers as an array of `dtype`, by JAX.
 
     Without a dtype arrays stay as they are, and lists and numbers become arrays of numpy, which stay known inside a trace,
@@ -35,7 +43,7 @@ def as_array(value: Any, name: str, dtype=None) -> Any:
     if not (jnp.issubdtype(value.dtype, jnp.number) or value.dtype == bool):
         raise ValueError(f"{name} is {value!r}; pass an array of numbers")
     if dtype is None or (isinstance(value, jax.Array) and value.dtype == dtype):
-        return value
+        return value  # pyright: ignore[reportReturnType]
     return jnp.asarray(value, dtype)
 
 

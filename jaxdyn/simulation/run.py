@@ -5,17 +5,20 @@ returned to unit length at the end of every step (`ProjectedSolver`), which keep
 without quaternions gets no projection at all.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, is_known, specialized
 from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.model.arguments import as_array, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, state_dtype
+from jaxdyn.model.tree import Model
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
@@ -42,19 +45,27 @@ from jaxdyn.simulation.start import checked_start, chosen_method
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import System, has_followers
 
+if TYPE_CHECKING:
+    SceneLike = Scene | Model | System
+    Control = Callable[[Array, Array, Array], Array] | controls.Controller | controls.Sampled | None
+    Solver = diffrax.AbstractSolver | Stepper | None
+    Stepsize = ArrayLike | diffrax.AbstractStepSizeController | None
+else:
+    SceneLike = Control = Solver = Stepsize = Any  # looked at below, by errors that name the argument
+
 
 def simulate(
-    scene: Any,
-    q0: Any,
-    v0: Any,
-    ts: Any,
+    scene: "SceneLike",
+    q0: Numbers,
+    v0: Numbers,
+    ts: Numbers,
     *,
-    control: Any = None,
+    control: "Control" = None,
     method: str | Method = "auto",
-    solver: Any = None,
-    stepsize: Any = None,
-    rtol: Any = 1e-8,
-    atol: Any = 1e-8,
+    solver: "Solver" = None,
+    stepsize: "Stepsize" = None,
+    rtol: Numbers = 1e-8,
+    atol: Numbers = 1e-8,
     adjoint: str | diffrax.AbstractAdjoint | None = None,
     outputs: Sequence[str] = (),
     contacts: str = "stop",
@@ -192,7 +203,7 @@ def simulate(
         "max_events": max_events,
     }
     dtype = state_dtype(scene.system)
-    numbers = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
+    numbers: list[Any] = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
     numbers.append(jnp.asarray(stepsize, dtype) if is_fixed(stepsize) else stepsize)
     concrete = is_known(scene, control, method, numbers)
     solution = (_run_with_events if modal else _run)(scene, control, method, numbers, options)
