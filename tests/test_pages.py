@@ -38,6 +38,12 @@ def test_gallery_shows_what_its_command_makes():
     assert shown == list(SCENES) and set(shown) <= set(jd.scenes.names())
 
 
+@pytest.mark.slow
+def test_example_of_the_gallery_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("docs/gallery.md", least=1)["motion"].success and (tmp_path / "four_bar.gif").stat().st_size > 50_000
+
+
 def test_reference_has_every_export():
     """Each by its name, on one of the pages below docs/reference."""
     listed = re.findall(
