@@ -279,6 +279,27 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     assert text.strip().endswith("</html>") and not list(tmp_path.glob(".*"))
 
 
+def test_identify_a_payload(arm, tmp_path, capsys):
+    truth = jd.repair_inertias(jd.load_urdf(arm))
+    path, report = tmp_path / "true.urdf", tmp_path / "fit.json"
+    jd.save_urdf(truth, path)
+    held = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
+    (tmp_path / "loaded").mkdir()
+    empty = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
+    loaded = simulated_logs(
+        truth.replace(inertias=truth.inertias.at[-1].add(held)), tmp_path / "loaded", (2,), noise=0.01
+    )
+    args = ["identify", "--urdf", str(path), "--log", *empty, "--payload-log", *loaded, "--report", str(report)]
+    args += ["--terms", "viscous", "coulomb", "--v-s", "0.01", "--prior", "1"]
+    assert main(args) == 0
+    assert f"Payload on {truth.body_names[-1]}" in capsys.readouterr().out
+    found = json.loads(report.read_text())["payload"]
+    # A slider carries it: the mass is told.
+    assert abs(found["mass"] - 0.7) < 0.01 and found["percent"] < 0.2 * found["percent_without"]
+    assert main([*args, "--payload-body", "foot"]) == 2
+    assert "the bodies are" in capsys.readouterr().err
+
+
 def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):
     truth = jd.repair_inertias(jd.load_urdf(arm))
     a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)

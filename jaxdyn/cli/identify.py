@@ -10,16 +10,16 @@ import numpy as np
 
 from jaxdyn import __version__, identify
 from jaxdyn.cli.common import Stopwatch, add_model_options, coordinate_labels, load_model, number, output_path
-from jaxdyn.cli.identify_tables import judged_table, tables
+from jaxdyn.cli.identify_logs import filtered_log, log_names, log_paths
+from jaxdyn.cli.identify_tables import judged_table, payload_text, tables
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.identify.spectra import vibration
 from jaxdyn.identify.suspicions import suspicions
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
-from jaxdyn.io.logs import read_log
 from jaxdyn.model.builder import inertia_report, repair_inertias
 from jaxdyn.model.tree import Model
-from jaxdyn.reports.identification import Findings, Judged, content
+from jaxdyn.reports.identification import Findings, Judged, content, payload_content
 
 # Of the simulation in a trajectory fit (s).
 _LONGEST_STEP = 0.0025
@@ -36,6 +36,7 @@ examples:
   jaxdyn identify --urdf panda.urdf --log log.csv --out fitted.urdf
   jaxdyn identify --urdf arm.urdf --log A.csv B.csv --test-log C.csv --out fitted.urdf --report fit.json --html fit.html
   jaxdyn identify --urdf panda.urdf --log log.csv --lock panda_finger_joint1 panda_finger_joint2 --plot fit.png
+  jaxdyn identify --urdf arm.urdf --log empty.csv --payload-log holding.csv --report fit.json
   jaxdyn identify --urdf panda.urdf --log log.csv --method least-squares --report base_parameters.json
 
 logs (--log FILE.csv ..., --test-log FILE.csv ..., one header line, or FILE.npz):
@@ -87,6 +88,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--test-log", nargs="+", action="extend", default=[], metavar="FILE", help="logs that only tell the error"
     )
+    parser.add_argument(
+        "--payload-log",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="FILE",
+        help="logs of the same robot with something in its hand, which is then told apart from it",
+    )
+    parser.add_argument("--payload-body", metavar="LINK", help="the link that holds it (default: the last one)")
     parser.add_argument(
         "--rename",
         nargs="+",
@@ -169,20 +179,24 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("--out: least squares gives combinations of parameters and no bodies, so there is no URDF to "
                          "write; take --method feasible, or --report FILE.json")  # fmt: skip
     json_path = out.with_suffix(".json") if json_path is None and out is not None else json_path
-    train_paths, test_paths = _paths(args)
+    train_paths, test_paths = log_paths(args)
     if args.method == "trajectory" and len(train_paths) > 1:
         raise ValueError("--log: --method trajectory fits one log; take --method feasible for several")
+    if args.payload_log and args.method != "feasible":
+        raise ValueError(f"--payload-log: --method {args.method} knows no payload; take --method feasible")
     model = load_model(args.urdf, args)
+    if args.payload_body is not None and args.payload_body not in model.body_names:
+        raise ValueError(f"--payload-body {args.payload_body}: the bodies are {', '.join(model.body_names)}")
     if args.repair:
         print(f"repaired inertias: {', '.join(dict(inertia_report(model))) or 'none needed it'}")
         model = repair_inertias(model)
-    logs = [_log(model, path, args) for path in train_paths]
-    names = _names(train_paths + test_paths)
+    logs = [filtered_log(model, path, args) for path in train_paths]
+    names = log_names(train_paths + test_paths)
 
     watch = Stopwatch()
     if test_paths:
         final = judge = _fit(model, logs, options, args)
-        tests = [_log(model, path, args) for path in test_paths]
+        tests = [filtered_log(model, path, args) for path in test_paths]
         test_names, trained = names[len(logs) :], logs
     else:
         trained, tests = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
@@ -211,8 +225,14 @@ def run(args: argparse.Namespace) -> None:
     if out is not None and not isinstance(final, LeastSquares):
         save_urdf((final.fit if isinstance(final, RobotFit) else final).model, out)
         print(f"Wrote {out}.")
+    payload = None
+    if isinstance(final, RobotFit) and args.payload_log:
+        loaded = [filtered_log(model, path, args) for path in args.payload_log]
+        payload = identify.fit_payload(model, logs, loaded, args.payload_body, robot=final)
+        print(payload_text(payload))
     if json_path is not None:
-        write_text(json_path, json.dumps(content(findings, _asked(args)), indent=2) + "\n")
+        found = content(findings, _asked(args)) | ({} if payload is None else {"payload": payload_content(payload)})
+        write_text(json_path, json.dumps(found, indent=2) + "\n")
         print(f"Wrote {json_path}.")
     if html is not None:
         from jaxdyn.reports.identification_page import page
@@ -263,68 +283,6 @@ def _settled(options: _Options, result) -> _Options:
         return options
     setting = result.choice.setting
     return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior)
-
-
-def _paths(args) -> tuple[list[str], list[str]]:
-    seen: dict[pathlib.Path, str] = {}
-    for path in [*args.log, *args.test_log]:
-        place = pathlib.Path(path).resolve()
-        if place in seen:
-            where = "--test-log: a log that is fitted tells no error" if path in args.test_log else "--log"
-            raise ValueError(f"{where}: {path} is given twice")
-        seen[place] = path
-    return list(args.log), list(args.test_log)
-
-
-def _renaming(items: list[str]) -> dict[str, str]:
-    pairs = [item.partition("=") for item in items]
-    bad = [item for item, (theirs, sign, ours) in zip(items, pairs, strict=True) if not (theirs and sign and ours)]
-    if bad:
-        raise ValueError(f"--rename {bad[0]}: give the name in the log and the joint's, as motor1=shoulder")
-    return {theirs: ours for theirs, _, ours in pairs}
-
-
-def _names(paths: list[str]) -> list[str]:
-    """Names of files, with their folders where two would be the same."""
-    names = [pathlib.Path(path).name for path in paths]
-    return [path if names.count(name) > 1 else name for path, name in zip(paths, names, strict=True)]
-
-
-def _log(model: Model, path: str, args) -> Log:
-    """The log of a file, filtered unless it has been."""
-    raw = read_log(path, joint_names=model.joint_names, rename=_renaming(args.rename))
-    if raw.q.shape[1] != model.nq or raw.nv != model.nv:
-        raise ValueError(
-            f"{path}: the log has {raw.q.shape[1]} columns of q and {raw.nv} of tau, the model has {model.nq} and "
-            f"{model.nv} (joints {', '.join(model.joint_names)}); hold joints that were not logged with --lock"
-        )
-    span = f"{path}: {len(raw)} samples, {float(raw.t[-1] - raw.t[0]):.4g} s"
-    if len(raw) < 2:
-        raise ValueError(f"{span}; a log needs more than one sample")
-    if raw.a is not None and raw.v is not None:
-        print(f"{span}, with v and a: taken as filtered")
-        return raw
-    if args.filtered:
-        print(f"{span}, taken as filtered; what is missing of v and a is made by differences")
-        v = np.gradient(np.asarray(raw.q), np.asarray(raw.t), axis=0) if raw.v is None else raw.v
-        a = np.gradient(np.asarray(v), np.asarray(raw.t), axis=0)
-        return Log(raw.t, raw.q, v, a, raw.tau, joint_names=raw.joint_names)
-    rate = (len(raw) - 1) / float(raw.t[-1] - raw.t[0])
-    if not args.cutoff > 0:
-        raise ValueError(f"--cutoff is {args.cutoff} Hz; give a positive frequency")
-    every = max(1, int(rate / (15 * args.cutoff))) if args.every is None else args.every
-    trim = 25 * every if args.trim is None else args.trim
-    if every < 1 or trim < 0:
-        raise ValueError(f"--every is {every}, --trim is {trim}; give --every of at least 1 and --trim of at least 0")
-    try:
-        log = identify.from_raw(
-            raw.t, raw.q, raw.tau, cutoff=args.cutoff, trim=trim, every=every, joint_names=raw.joint_names
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    print(f"{span} at {rate:.4g} Hz; low-passed at {args.cutoff:g} Hz, {trim} samples dropped at each end, "
-          f"each {every}th kept: {len(log)}")  # fmt: skip
-    return log
 
 
 def _fit(model: Model, logs: list[Log], options: _Options, args) -> RobotFit | Fit | LeastSquares:

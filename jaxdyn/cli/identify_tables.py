@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxdyn.cli.common import coordinate_labels, short, table
-from jaxdyn.identify import TERMS, LeastSquares, RobotFit, nominal_parameters
+from jaxdyn.identify import TERMS, LeastSquares, Payload, RobotFit, nominal_parameters
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.model.tree import Model
@@ -101,3 +101,19 @@ def _mass_table(findings: Findings) -> str:
         rows.append([name, short(old[0]), short(new[0]), sources.get(f"{name}.m", "-"), *centre])
     text = "Bodies: mass (kg) in the URDF and fitted, what settled it, fitted centre of mass (m)"
     return text + "\n" + table(["body", "URDF", "fitted", "from", "x", "y", "z"], rows)
+
+
+def payload_text(payload: Payload) -> str:
+    """Mass, centre and inertia of what the robot held, with half of the 95 % intervals."""
+    half = payload.factor * payload.std
+    numbers = [
+        f"{name} {short(float(x))} +- {short(float(h), 2)}"
+        for name, x, h in zip(("m", "mx", "my", "mz"), payload.inertia[:4], half[:4], strict=True)
+    ]
+    moments = ", ".join(short(float(x), 3) for x in np.linalg.eigvalsh(payload.rotational))
+    centre = ", ".join(short(float(x), 3) for x in payload.centre)
+    return (
+        f"Payload on {payload.body}: torque error {payload.error:.2f} % with it, {payload.without:.2f} % without\n"
+        f"  mass {short(payload.mass)} kg, centre ({centre}) m, principal moments {moments} kg m^2\n"
+        f"  {', '.join(numbers)} (kg, kg m)"
+    )

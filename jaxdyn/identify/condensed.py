@@ -122,8 +122,12 @@ class Blocks:
 
 def condensed_rows(rows: np.ndarray, count: int) -> Condensed:
     """`Condensed` of rows [W, w] (m, p + 1) that stand for `count` torques."""
-    p = rows.shape[1] - 1
-    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+    return condensed_triangle(np.asarray(np.linalg.qr(rows, mode="r")), count)
+
+
+def condensed_triangle(triangle: np.ndarray, count: int) -> Condensed:
+    """`Condensed` of rows [W, w] that are a triangle (m, p + 1) already, as of `numpy.linalg.qr`."""
+    p = triangle.shape[1] - 1
     triangle = np.concatenate([triangle, np.zeros((max(p + 1 - len(triangle), 0), p + 1))])
     return Condensed(triangle[:p, :p], triangle[:p, p], float(triangle[p, p] ** 2), count)
 

@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.identify.chart import Chart, Coordinates
-from jaxdyn.identify.condensed import Blocks, condensed_rows
+from jaxdyn.identify.condensed import Blocks, condensed_rows, condensed_triangle
 from jaxdyn.identify.feasible import make_problem, newton
 from jaxdyn.identify.logs import Log, as_measured, root_mean_square
 from jaxdyn.identify.regression import condense_model, noise_level
@@ -20,6 +20,8 @@ from jaxdyn.model.tree import Model
 
 # A coefficient's unit is what makes this share of the joint's torque.
 _UNIT = 0.1
+# How close to the minimum of the loss a fit comes, and one that only tells how good a setting is.
+_FINE, _ROUGH = 1e-6, 1e-2
 
 
 class Setting(NamedTuple):
@@ -98,11 +100,10 @@ def fit_condensed(
     rows: np.ndarray | None = None,
     count: int | None = None,
     inertia: str = "full",
+    is_rough: bool = False,
     steps: int = 200,
-    tolerance: float = 1e-6,
-    callback=None,
 ) -> Estimate:
-    """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for.
+    """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for; `is_rough` for what only compares settings.
 
     `sizes` as of `signal_sizes`, the other arguments as in `fit_torques`.
     """
@@ -110,15 +111,19 @@ def fit_condensed(
     count = data.blocks.count() if count is None else count
     places = data.places(setting.extra)
     kept = np.append(np.arange(data.basic), places)
-    rows = rows[:, [*places, *range(data.basic), size]]
-    sigma = noise_level(condensed_rows(rows, count))
+    free = condensed_rows(rows[:, [*places, *range(data.basic), size]], count)
+    spare = count - free.R.shape[1]
+    # Columns that depend on others make the rest a little smaller than it is, which matters to no choice between settings.
+    sigma = np.sqrt(free.rest / spare) if is_rough and spare > 0 and free.rest > 0 else noise_level(free)
+    rows = np.concatenate([free.R, free.d[:, None]], axis=1)
+    rows = np.concatenate([rows, np.append(np.zeros(free.R.shape[1]), np.sqrt(free.rest))[None]])
     units = data.units.reshape(-1)[places - data.basic]
     R, coefficients = eliminate(rows, len(places), np.sqrt(setting.prior) * sigma / units)
-    condensed = condensed_rows(R, count)
+    condensed = condensed_triangle(R, count)
     problem, point, sigma = make_problem(
         model, condensed, sizes, terms, setting.v_s, inertia, setting.prior, sigma or None
     )
-    chart, point, history, result = newton(model, problem, point, steps, tolerance, callback)
+    chart, point, history, result = newton(model, problem, point, steps, _ROUGH if is_rough else _FINE)
     point = chart.settled(point)
     x = np.zeros(size)
     basic = np.asarray(_parameters(chart, point), np.float64)

@@ -69,6 +69,8 @@ def fit_payload(
     loaded: Log | Sequence[Log],
     body: str | None = None,
     terms="auto",
+    *,
+    robot: RobotFit | None = None,
     **options,
 ) -> Payload:
     """The ten inertial numbers of what the last body holds in some logs and not in others.
@@ -81,7 +83,7 @@ def fit_payload(
 
     - `model`: nominal robot. `unloaded`, `loaded`: logs with v and a, or sequences of them.
     - `body`: name of the body that holds the payload, the last one by default.
-    - `terms`, `options`: of `fit_robot`, for the logs without payload.
+    - `terms`, `options`: of `fit_robot`, for the logs without payload; `robot`: its result, where it is there already.
 
     **Returns:** `Payload`. The prior of the payload is a ball of 0.1 m about where least squares finds its centre, with weight 1.
 
@@ -95,7 +97,7 @@ def fit_payload(
     if body not in model.body_names:
         raise ValueError(f"body is {body!r}; the bodies are {', '.join(model.body_names)}")
     number = model.body_names.index(body)
-    robot = fit_robot(model, unloaded, terms, **options)
+    robot = fit_robot(model, unloaded, terms, **options) if robot is None else robot
     setting, x = robot.choice.setting, robot.fit.vector.copy()
     _, extra, _ = split_terms(robot.terms, model.nv)
     x[10 * model.nb : -model.nv] = 0  # the bodies and the rotors, whose torque the gears carry

@@ -22,8 +22,6 @@ _BLOCKS = 20
 # Fits in which weights of the joints, and the torque that gears carry, are brought up to date.
 _ROUNDS = 3
 _V_S, _PRIOR = 0.01, 1.0
-# How close to the minimum of the loss a fit comes that only tells how good a setting is.
-_ROUGH = 1e-2
 
 
 class RobotFit(eqx.Module):
@@ -149,7 +147,7 @@ class _Problem:
         rest = np.setdiff1d(np.arange(len(blocks)), part)
         if key not in self._rows:
             self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
-        found = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), tolerance=_ROUGH)
+        found = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
         return blocks.squares(found.x, part).sum(axis=0)
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:

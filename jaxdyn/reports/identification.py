@@ -10,6 +10,7 @@ from jaxdyn.identify import (
     Fit,
     LeastSquares,
     Log,
+    Payload,
     RobotFit,
     base_parameters,
     nominal_parameters,
@@ -154,6 +155,21 @@ def _add_robot(found: dict[str, Any], result: RobotFit, choice: Choice, model: M
     for name, value in zip(spreads.parameters.names, spreads.parameters.values, strict=True):
         found["parameters"][name].setdefault("fitted", float(value))
     found["base_parameters"] |= {"std": _numbers(spreads.base.std), "from": spreads.base.sources}
+
+
+def payload_content(payload: Payload) -> dict[str, Any]:
+    """A payload for the JSON file."""
+    return {
+        "body": payload.body,
+        "mass": payload.mass,
+        "centre": payload.centre.tolist(),
+        "inertia_about_centre": payload.rotational.tolist(),
+        "ten_numbers": payload.inertia.tolist(),
+        "std": payload.std.tolist(),
+        "interval_factor": payload.factor,
+        "percent": payload.error,
+        "percent_without": payload.without,
+    }
 
 
 def model_joint(model: Model, coordinate: int) -> str:
