@@ -108,11 +108,8 @@ def child(function: str, *arguments, cores: int | None = None) -> tuple[float, i
     """Seconds of the loop and peak memory (bytes) of a process that runs `function`."""
     command = [sys.executable, "-m", "benchmarks.scale", "--child", function, *map(str, arguments)]
 
-    def pin() -> None:
-        if cores is not None:
-            os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
-
-    done = subprocess.run(command, check=True, capture_output=True, text=True, preexec_fn=pin)
+    command += [] if cores is None else [str(cores)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
     seconds, peak = done.stdout.split()[-2:]
     return float(seconds), int(peak)
 
@@ -180,7 +177,9 @@ def main() -> None:
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if args.child:
-        name, samples, out = args.what
+        name, samples, out, *limit = args.what
+        if limit:  # before jax counts the cores
+            os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(limit[0])])
         if name == "resumed":
             run = disks(int(samples), out, points=11, chunk=max(1, int(samples) // 100))
         else:

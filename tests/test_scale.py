@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -218,7 +219,7 @@ def ended(process, timeout=120.0):
 
 def recorded(path):
     folder = Path(path) / "record" / "checksum" / "c"
-    return len(list(folder.iterdir())) if folder.is_dir() else 0
+    return len(list(folder.glob("*/0")))  # the folder of a chunk is there before its file
 
 
 def killed_at(processes, path, chunks, which):
@@ -727,3 +728,101 @@ def test_progress_has_rate_and_time_left(capsys):
     assert lines[0].strip() == "30.0 %, 30 of 100 rollouts, 2/s, 35 s left, 1 failed"
     assert lines[1].split(",")[2].strip() == "5/s" and "8 s left" in lines[1]
     assert lines[2].startswith("100.0 %") and "left" not in lines[2]
+
+
+# From the shell
+
+STUDY = """
+scene = "study.py"
+out = "study.zarr"
+samples = 12
+duration = 0.1
+points = 3
+outputs = ["energy"]
+cost = "damping"
+[parameters]
+damping = { log_uniform = [0.1, 1.0], units = "N m s" }
+angle = { normal = [0.5, 0.1] }
+speed = { uniform = [-1.0, 1.0], size = 2 }
+length = 0.7
+[options]
+stepsize = 0.01
+[reductions]
+energy = { mean = "energy" }
+"""
+FUNCTIONS = """
+import jax.numpy as jnp
+import jaxdyn as jd
+
+def scene(p):
+    system = jd.scenes.double_pendulum().system
+    return jd.Scene(system, forces=(jd.JointDamping(p["damping"] * jnp.ones(2)),))
+
+def states(p):
+    return p["angle"] * jnp.ones(2), p["speed"] * p["length"]
+"""
+
+
+def test_sweep_runs_a_study_and_goes_on_with_it(tmp_path, capsys):
+    from jaxdyn.cli import main
+
+    study = tmp_path / "study.toml"
+    study.write_text(STUDY)
+    (tmp_path / "study.py").write_text(FUNCTIONS)
+    assert main(["sweep", str(study), "--quiet", "--chunk", "5"]) == 0
+    assert "12 rollouts, 12 of them computed" in capsys.readouterr().out
+    table = xarray.open_zarr(tmp_path / "study.zarr", chunks=None)
+    assert table.parameter_damping.attrs["units"] == "N m s" and table.energy_mean.dims == ("t",)
+    damping = np.asarray(table.parameter_damping)
+    assert (np.diff(damping) < 0).all() and damping.min() >= 0.1 and damping.max() <= 1.0
+    np.testing.assert_array_equal(table.v[:, 0], 0.7 * np.asarray(table.parameter_speed))
+    np.testing.assert_array_equal(table.q[:, 0, 1], table.parameter_angle)
+    assert main(["sweep", str(study), "--quiet"]) == 0
+    assert "12 rollouts, 0 of them computed" in capsys.readouterr().out
+    assert main(["sweep", str(study), "--quiet", "--seed", "1"]) == 2
+    assert "of another seed: there it is 0, here 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error"),
+    [
+        ('"study.py"', '"no_scene"', "name one of andrews"),
+        ('"study.py"', '"other.py"', "there is no file"),
+        ("samples = 12", "", "has no samples"),
+        ("samples = 12", "sample = 12", "has sample; a study has"),
+        ("log_uniform = [0.1, 1.0]", "log_uniform = [-0.1, 1.0]", "give positive numbers"),
+        ("normal = [0.5, 0.1]", "normal = [0.5]", "parameter angle is .*give a number, or one of uniform"),
+        ('mean = "energy"', 'median = "energy"', "give one of mean"),
+        ('cost = "damping"', 'cost = "mass"', "name one of the parameters"),
+        ("duration = 0.1", "duration = ", "is no TOML"),
+        ('"study.py"', '"rolling_disk"', "rolling_disk has no parameter angle"),
+    ],
+)
+def test_sweep_refuses(tmp_path, capsys, old, new, error):
+    from jaxdyn.cli import main
+
+    study = tmp_path / "study.toml"
+    study.write_text(STUDY.replace(old, new))
+    (tmp_path / "study.py").write_text(FUNCTIONS)
+    assert main(["sweep", str(study), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert re.search(error, said), said
+    assert not (tmp_path / "study.zarr").exists()
+
+
+def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
+    from jaxdyn.cli import main
+
+    builder = jd.ModelBuilder("arm")
+    builder.add_body("rod", None, "revolute", (1.0, (0, 0, 0.3), (0.1, 0.1, 0.01)), axis=(0, 1, 0))
+    jd.save_urdf(builder.build(), tmp_path / "arm.urdf")
+    study = tmp_path / "study.toml"
+    head = 'out = "a.zarr"\nsamples = 6\nduration = 0.1\n'
+    study.write_text(head + 'scene = "arm.urdf"\n[parameters]\nq0 = { uniform = [0.1, 0.2], size = 1 }\n')
+    assert main(["sweep", str(study), "--quiet"]) == 0
+    table = xarray.open_zarr(tmp_path / "a.zarr", chunks=None)
+    np.testing.assert_array_equal(table.q[:, 0], table.parameter_q0)
+    assert list(table.coordinate.values) == list(jd.load_urdf(tmp_path / "arm.urdf").joint_names)
+    study.write_text(head + 'scene = "chaplygin_sleigh"\n[parameters]\nmass = { uniform = [1.0, 2.0] }\n')
+    assert main(["sweep", str(study), "--quiet", "--out", str(tmp_path / "b.zarr")]) == 2
+    assert "is built from known numbers, so that mass cannot be drawn" in capsys.readouterr().err

@@ -237,13 +237,13 @@ def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[
     def build(p: Mapping[str, Any]) -> Any:
         try:
             return named(**{key: value for key, value in p.items() if key in of_scene})
-        except (jax.errors.JAXTypeError, TypeError) as error:
+        except (jax.errors.JAXTypeError, TypeError, ValueError) as error:
             raise known_numbers(error) from error
 
     def start(p: Mapping[str, Any]) -> Any:
         try:
             return named.start(**{key: value for key, value in p.items() if key in of_start})
-        except (jax.errors.JAXTypeError, TypeError) as error:
+        except (jax.errors.JAXTypeError, TypeError, ValueError) as error:
             raise known_numbers(error) from error
 
     return build, start

@@ -23,7 +23,7 @@ from jaxdyn.scale.reductions import Arrays
 from jaxdyn.scale.store import Store
 
 SECONDS = 2.0  # of computing to a chunk, if it may be so large
-BYTES = 2**26  # of rows in a chunk
+BYTES = 2**25  # of rows in a chunk
 SHARES = 8  # chunks to a process at least, so that all end at about the same time
 POLL = 0.2  # s between looks at what other processes still do
 

@@ -181,10 +181,11 @@ class Store:
         return self._file("record/checksum", self._record, chunk).exists()
 
     def done(self) -> list[int]:
-        """Recorded chunks, by the names of their files."""
+        """Recorded chunks."""
         folder = self._file("record/checksum", self._record, 0).parent.parent
         names = os.listdir(folder) if folder.is_dir() else []
-        return sorted(int(name) for name in names if name.isdigit())
+        # The folder of a chunk is there before its file.
+        return sorted(int(name) for name in names if name.isdigit() and self.is_done(int(name)))
 
     def finished(self) -> int:
         """Rollouts of the recorded chunks."""
