@@ -1,8 +1,8 @@
 """Control laws: Modules called as `law(q, v, t) -> tau`, with gains and targets as leaves.
 
 `gains` checks gains, `errors` writes what a law controls as rows of constraints, `motion` holds the laws of free motion,
-`constrained` those of motion and force on constraints, `grasping` that of an object in a hand, and `feet` and `legs` are for
-robots whose base has no motor.
+`constrained` those of motion and force on constraints, `grasping` that of an object in a hand, and `feet`, `legs` and
+`whole_body` are for robots whose base has no motor.
 
 Sources: EQUATIONS sections 8 to 10.
 """
@@ -16,3 +16,5 @@ from jaxdyn.control.legs import missing_wrench as missing_wrench
 from jaxdyn.control.motion import CartesianStiffness as CartesianStiffness
 from jaxdyn.control.motion import ComputedTorque as ComputedTorque
 from jaxdyn.control.motion import OperationalSpace as OperationalSpace
+from jaxdyn.control.whole_body import WholeBody as WholeBody
+from jaxdyn.control.whole_body import standing as standing

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -53,7 +54,8 @@ def as_target(target: Any, name: str = "target") -> Callable:
     return Fixed(jnp.asarray(found, found.dtype if jnp.issubdtype(found.dtype, jnp.floating) else float))
 
 
-def _placed(target: Callable, t, shape: tuple, like) -> Array:
+def placed(target: Callable, t, shape: tuple, like) -> Array:
+    """A target at a time, in the dtype of `like`. **Raises:** ValueError for another shape."""
     found = target(t)
     if jnp.shape(found) != shape:
         raise ValueError(f"target has shape {jnp.shape(found)}, expected {shape}{batch_hint(found, shape)}")
@@ -68,7 +70,7 @@ class ConfigurationError(Constraint):
 
     def position(self, system, q, t):
         """q - q_d, and the twists from the target in joints that turn in space."""
-        return displacement(system, _placed(self.target, t, q.shape, q), q)
+        return displacement(system, placed(self.target, t, q.shape, q), q)
 
 
 class FrameError(Constraint):
@@ -81,7 +83,7 @@ class FrameError(Constraint):
 
     def position(self, system, q, t):
         """(3,) m, (3,) rad, or both."""
-        pose, target = frame_pose(system, q, self.frame), _placed(self.target, t, TASKS[self.task], q)
+        pose, target = frame_pose(system, q, self.frame), placed(self.target, t, TASKS[self.task], q)
         if self.task == "position":
             return pose[:3, 3] - target
         turned = so3.log(_product(target[:3, :3].T, pose[:3, :3]))
@@ -100,7 +102,7 @@ class TaskError(Constraint):
         found = jnp.asarray(self.task(q), q.dtype)
         if found.ndim != 1:
             raise ValueError(f"task returned shape {found.shape}; return a vector (m,){batch_hint(found, (1,))}")
-        return found - _placed(self.target, t, found.shape, q)
+        return found - placed(self.target, t, found.shape, q)
 
 
 class RateError(Constraint):
@@ -115,7 +117,7 @@ class RateError(Constraint):
         found = jnp.asarray(self.task(q, v), q.dtype)
         if found.ndim != 1:
             raise ValueError(f"task returned shape {found.shape}; return a vector (m,){batch_hint(found, (1,))}")
-        return found - _placed(self.target, t, found.shape, q)
+        return found - placed(self.target, t, found.shape, q)
 
 
 def frame_error(model: Any, frame: str, target: Any, task: str) -> FrameError:
@@ -144,6 +146,25 @@ def least_acceleration(system, q, t, A, wanted, start) -> Float[Array, " nv"]:
     Y = metric.whiten(A.T)
     missing = wanted - _product(A, start)
     return start + metric.unwhiten(_product(pseudo_inverse(Y, tolerance(None, Y)).T, missing))
+
+
+def ordered_acceleration(system, q, t, orders, start) -> Float[Array, " nv"]:
+    """The acceleration nearest to `start` (nv,), in the metric M, that meets pairs (A, wanted) in their order.
+
+    Each is met, as near as can be, by what all before it leave free; where it cannot be, those before are not disturbed.
+    """
+    metric = mass_factor(mass_matrix(system, q, t))
+    free, a = jnp.eye(start.shape[0], dtype=start.dtype), start
+    for A, wanted in orders:
+        Y = metric.whiten(A.T)
+        left = _product(free, Y)
+        # Where those before have taken all of the rows, rounding is left of them, which is no direction.
+        sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, Y)]
+        left = jnp.where(sizes[0] > tolerance(None, Y) ** 2 * sizes[1], left, jnp.zeros_like(left))
+        inverse = pseudo_inverse(left, tolerance(None, left)).T
+        a = a + metric.unwhiten(_product(inverse, wanted - _product(A, a)))
+        free = free - _product(inverse, left.T)
+    return a
 
 
 def row_rank(matrix: Float[Array, "m n"]) -> Array:

@@ -1,5 +1,6 @@
 """Feet: where a robot with legs touches the ground, which forces it may take there, and the rows that hold it there."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -19,6 +20,14 @@ from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 
 _FLAT = ("rigid", "surface")
+
+
+class HeldFoot(Loop):
+    """A foot that stays where it is; its multipliers are the components of its force."""
+
+    def wrench_components(self):
+        """All rows, in the order of the wrench: a point's forces, or a weld's forces and torques."""
+        return tuple(range(self.kind.count))
 
 
 class Foot(eqx.Module):
@@ -55,15 +64,16 @@ class Foot(eqx.Module):
         kind = "rigid" if self.cone.kind == "surface" else self.cone.kind
         return _product(jnp.asarray(wrench_basis(kind).T, q.dtype), twist)
 
-    def hold(self, model: Model, q: Float[Array, " nq"]) -> Loop:
-        """The constraint that keeps the foot where it is at q (nq,).
+    def hold(self, model: Model, q: Float[Array, " nq"]) -> HeldFoot:
+        """The constraint that keeps the foot where it is at q (nq,): a point, or a weld for a flat foot.
 
-        For a point its rows' multipliers are the force f of a hard finger. A flat foot is welded; its wrench is that of
-        `jd.constraint_wrenches`.
+        Its multipliers are the foot's force in its contact frame, so that the scene may give it the foot's cone
+        (`jd.control.standing`).
         """
         local = self.pose if self.is_flat else self.pose.at[:3, :3].set(jnp.eye(3, dtype=self.pose.dtype))
         joint = "weld" if self.is_flat else "point"
-        return loop(None, self.contact_pose(model, q), self.frame, local, joint, name=self.frame)
+        held = loop(None, self.contact_pose(model, q), self.frame, local, joint, name=self.frame)
+        return HeldFoot(**{part.name: getattr(held, part.name) for part in dataclasses.fields(held)})
 
 
 def foot(frame: str, cone: Any, *, pose: Any = None, ground: Any = None) -> Foot:

@@ -97,7 +97,7 @@ def underactuated_inverse_dynamics(
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
     feet = check_feet(model, contacts)
-    base = _passive(model, passive)
+    base = passive_velocities(model, passive)
     motors = np.setdiff1d(np.arange(model.nv), base)
     preload = as_float(preload, "preload", (), q.dtype)
     torque_weight = non_negative(torque_weight, "torque_weight").astype(q.dtype)
@@ -157,7 +157,7 @@ def missing_wrench(
     **Raises:** ValueError as there.
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
-    feet, base = check_feet(model, contacts), _passive(model, passive)
+    feet, base = check_feet(model, contacts), passive_velocities(model, passive)
     needed = inverse_dynamics(model, q, v, a)[base]
     if not feet:
         return needed
@@ -168,7 +168,7 @@ def missing_wrench(
     return needed - _product(G, solve_qp(Q, -_product(G.T, needed), **bounds).x)
 
 
-def _passive(model: Model, passive) -> np.ndarray:
+def passive_velocities(model: Model, passive: tuple[int, ...] | None) -> np.ndarray:
     """Indices of the velocities without a motor. **Raises:** ValueError for none, and for indices that there are not."""
     top = model.topology
     if passive is None:
