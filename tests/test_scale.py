@@ -277,7 +277,7 @@ if len(sys.argv) > 3:
     assert jd.scale.initialize().count == jax.process_count() == 2
 found = jd.scale.run(
     lambda p: jd.scenes.rolling_disk(**p), start, draw, jnp.linspace(0.0, 1.0, 6), samples=int(sys.argv[2]),
-    out=sys.argv[1], lanes=1024, chunk=2048, stepsize=0.002, outputs=("energy",),
+    out=sys.argv[1], lanes=1024, chunk=2048, stepsize=0.004, outputs=("energy",),
     reductions={"energy": jd.scale.Mean("energy")}, progress=False)
 print(found.computed)
 """
