@@ -126,7 +126,11 @@ def test_what_the_feet_cannot_carry_has_a_code(biped, evaluated):
     law, still = law_of(biped, (2.0, 0.0, 0.0)), jnp.zeros(model.nv)
     wanted, _, a, _, missing = evaluated(law, q, still)
     assert wanted.result == jd.contact.RESULTS.infeasible
-    # 8 kg at 12 m/s^2 along x are more than mu times the weight.
+    # 8 kg at 12 m/s^2 along x are more than mu times the weight; glued feet could do it, with the shortest forces.
+    assert np.asarray(wanted.margins).min() < -1.0
+    sums = sum(wanted.by_foot().values())
+    np.testing.assert_allclose(sums, 8.0 * np.asarray([KP * 2.0, 0.0, 9.81]), atol=1e-8)
+    assert np.abs(wanted.forces).max() < 200.0
     assert float(missing[0]) > 1.0
     np.testing.assert_allclose(missing, jd.control.missing_wrench(model, q, still, a, feet, passive=BASE), atol=1e-6)
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.optimal import cone_bounds
 from jaxdyn.contact.qp import RESULTS, solve_qp
@@ -30,7 +31,8 @@ class LeggedDynamics(eqx.Module):
     - `tau` (nv,), N m: zero where there is no motor. `forces` (m,), N and N m: of all feet, in their order, each in its
       contact frame (`Foot`). `margins` (k,): how far each foot's force is from leaving its cone; negative outside.
     - `result`: one of `jd.contact.RESULTS`; `infeasible` where no forces in the cones balance the motion within the
-      limits of the torques (`missing_wrench` says what is missing). Forces and torques then leave a cone or a limit.
+      limits of the torques (`missing_wrench` says what is missing). Forces are then the shortest that do so without cones and
+      limits, which leave one of these.
     """
 
     tau: Float[Array, " nv"]
@@ -123,12 +125,15 @@ def underactuated_inverse_dynamics(
         bounds["h"] = jnp.concatenate([levels, limit - needed[motors], limit + needed[motors]])
     linear = -torque_weight * _product(across, needed[motors])
     found = solve_qp(Q, linear, A=along, b=needed[base], tol=tol, **bounds)
+    # What a program without a solution ends with grows without bound.
+    shortest = _product(pseudo_inverse(along.T, tolerance(None, along)).T, needed[base])
+    forces = jnp.where(found.result == RESULTS.infeasible, shortest, found.x)  # pyright: ignore[reportArgumentType]
     sizes = np.cumsum([one.size for one in feet])[:-1]
-    margins = [one.cone.margin(f) for one, f in zip(feet, jnp.split(found.x, sizes), strict=True)]
-    tau = (needed - _product(J.T, found.x)).at[base].set(0)
+    margins = [one.cone.margin(f) for one, f in zip(feet, jnp.split(forces, sizes), strict=True)]
+    tau = (needed - _product(J.T, forces)).at[base].set(0)
     return LeggedDynamics(
         tau=tau,
-        forces=found.x,
+        forces=forces,
         margins=jnp.stack(margins),
         result=found.result,
         feet=tuple((one.frame, one.size) for one in feet),
