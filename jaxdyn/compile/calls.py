@@ -38,14 +38,18 @@ def compiled(function: Callable) -> Callable:
 
 _jit: Any = eqx.filter_jit
 
-# What XLA compiles is the glue between kernels. Its emitters of fusions, each a module of its own, take most of the time to compile
-# it and bring nothing at run time: `python -m benchmarks.first_calls` with JAXDYN_COMPILATION_OPTIONS=usual in the environment.
+# What XLA compiles is the glue between kernels. Its emitters of fusions, each a module of its own, take most of the time to
+# compile it and bring nothing at run time: `python -m benchmarks.first_calls`, and again with
+# JAXDYN_COMPILATION_OPTIONS=usual in the environment.
 _QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 
 
 @functools.cache
 def quick_options() -> dict[str, Any] | None:
-    """Options with which XLA compiles glue quickly; None where the environment asks for the usual ones or XLA does not know them."""
+    """Options with which XLA compiles glue quickly.
+
+    None where the environment asks for the usual ones, or XLA does not know these.
+    """
     if os.environ.get("JAXDYN_COMPILATION_OPTIONS") == "usual":
         return None
     try:

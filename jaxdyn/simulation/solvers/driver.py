@@ -184,7 +184,9 @@ def drive(
         unfinished = partial(_is_unfinished, max_steps, limits)
         carry = lax.while_loop(unfinished, lambda carry: run_on(step_on(carry))[0], carry)
     lane, rows = carry.state, carry.rows
-    history = None if history is None else reverse.History(*carry.records[:3], lane.taken)
+    if history is not None:
+        states, times, kept = carry.records
+        history = reverse.History(states, times, kept, lane.taken)
     codes: Any = diffrax.RESULTS
     result = codes.where(lane.t < end, codes.max_steps_reached, codes.successful)
     result = codes.where(lane.failed, codes.dt_min_reached, result)
