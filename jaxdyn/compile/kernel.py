@@ -19,7 +19,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jaxdyn.compile import derive, mode
+from jaxdyn.compile import derive, mode, sharding
 from jaxdyn.compile.expand import expand
 from jaxdyn.compile.graph import inlined
 from jaxdyn.compile.known import Known, partition, partition_traced
@@ -75,7 +75,7 @@ def run(
         return by_jax()
     traced, known = partition_traced(tree)
     leaves, structure = jax.tree.flatten(args)
-    leaves = [*map(jnp.asarray, (*traced, *leaves))]
+    leaves = sharding.varying_alike([*map(jnp.asarray, (*traced, *leaves))])
     shapes = tuple((x.shape, x.dtype) for x in leaves)
     found = _program(function, static, known, len(traced), structure, shapes, tangent, most, calls, served)
     if isinstance(found, str):
@@ -240,8 +240,7 @@ def _(*args, program):
 
 @kernel_p.def_abstract_eval
 def _(*avals, program):
-    lead = max((x.shape[:-1] for x in avals), key=len, default=())
-    return [ShapedArray((*lead, array.size), array.dtype) for array in program.outputs]
+    return sharding.results_of(avals, program.outputs)
 
 
 def _batched(args, axes, *, program):
@@ -358,7 +357,21 @@ def _lower_on_cpu(ctx, *operands, program):
     except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
         mode.say_once(f"functions run on JAX's own operations: {reason}")
         return _lower_elsewhere(ctx, *operands, program=program)
-    return jax.ffi.ffi_lowering(target.TARGET)(ctx, *operands, program=np.int64(number))
+    if sharding.may_be_divided(ctx.avals_in, lead):
+        return _lower_with_last_axis(ctx, *operands, program=program)
+    order = target.varying_first(uniform)
+    ctx = ctx.replace(avals_in=[ctx.avals_in[i] for i in order])
+    lower = jax.ffi.ffi_lowering(target.TARGET, extra_attributes=sharding.attributes(ctx.avals_in, ctx.avals_out))
+    return lower(ctx, *(operands[i] for i in order), program=np.int64(number))
+
+
+def _with_last_axis(*args, program):
+    """The call with one more batch axis, of length one (see `sharding.may_be_divided`)."""
+    results = kernel_p.bind(*(x if x.ndim == 1 else lax.expand_dims(x, [x.ndim - 1]) for x in args), program=program)
+    return [lax.squeeze(x, [x.ndim - 2]) for x in results]
+
+
+_lower_with_last_axis = mlir.lower_fun(_with_last_axis, multiple_results=True)
 
 
 mlir.register_lowering(kernel_p, _lower_elsewhere)
