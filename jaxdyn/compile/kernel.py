@@ -359,7 +359,7 @@ def _lower_on_cpu(ctx, *operands, program):
         return _lower_elsewhere(ctx, *operands, program=program)
     if sharding.may_be_divided(ctx.avals_in, lead):
         return _lower_with_last_axis(ctx, *operands, program=program)
-    order = target.varying_first(uniform)
+    order = target.order_of(program, uniform)
     ctx = ctx.replace(avals_in=[ctx.avals_in[i] for i in order])
     lower = jax.ffi.ffi_lowering(target.TARGET, extra_attributes=sharding.attributes(ctx.avals_in, ctx.avals_out))
     return lower(ctx, *(operands[i] for i in order), program=np.int64(number))

@@ -121,6 +121,11 @@ def width_of(program, samples: int | None) -> int:
     return 1 if samples == 1 else vector_bytes() // (4 if kinds == {"f4"} else 8)
 
 
+def order_of(program, uniform: Sequence[bool]) -> list[int]:
+    """In which the kernel takes the arguments of its program."""
+    return varying_first(uniform) if isinstance(program, Program) else [*range(len(uniform))]
+
+
 def kernel(program, width: int, uniform: Sequence[bool]) -> int:
     """The number by which the handler finds the kernel of a program, which is compiled when it is called for the first time."""
     uniform = tuple(uniform)
@@ -145,8 +150,8 @@ class _Kernel:
         self.program: Any = program
         self.width, self.uniform = width, uniform
         self.code: Code | None = None
-        sizes = [program.inputs[i].size for i in varying_first(uniform)]
-        sizes = [-1 - size if k >= uniform.count(False) else size for k, size in enumerate(sizes)]
+        order = order_of(program, uniform)
+        sizes = [-1 - program.inputs[i].size if uniform[i] else program.inputs[i].size for i in order]
         sizes += [array.size for array in program.outputs]
         self.sizes = (ctypes.c_int64 * len(sizes))(*sizes)
         slot = number % SLOTS

@@ -147,7 +147,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, max_steps: int, m
         after, kept, hit = _decided(laws, lane, t1, end, found, eps)
         after = jax.tree.map(lambda a, b: jnp.where(active, a, b), after, lane)
         kept, hit = kept & active, hit & active & kept
-        saved, rows = save(laws.plan, ts, lane, after.t, kept, found[0], saved, rows)
+        saved, rows = save(laws.plan, ts, lane, after, kept, found[0], saved, rows)
         happens = hit.any()
         after, records = lax.cond(
             any_in_batch(happens),

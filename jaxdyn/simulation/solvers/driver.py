@@ -167,60 +167,28 @@ def drive(
     sums = no_sums(plan.structure(y0))
     lane = _Lane(start, jnp.minimum(start + length, end), y0, rate, no, none, none, no, quality, quality == 0, sums)
     rows = jnp.broadcast_to(jnp.full_like(y0, jnp.inf), (count, y0.size))
-    # Fixed steps that nothing ends early are the same for all samples of a batch: no step asks all of them who is done.
-    alike = not isinstance(how, Adaptive) and plan.quality is None
 
     def is_active(lane: _Lane):
         return (lane.t < end) & ~lane.failed & ~lane.stopped & (lane.taken < max_steps)
 
-    def is_running(clock: _Clock):
-        return (clock.t < end) & (clock.taken < max_steps)
-
     def body(carry):
-        lane, clock, saved, rows, history = carry
+        lane, saved, rows, history = carry
         after, kept, found = _advanced(plan, how, args, limits, lane, is_active(lane))
         if history is not None:
             history = reverse.written(history, lane.y, lane.t, lane.t_next, kept)
-        reached = after.t
-        if alike:
-            kept, clock = is_running(clock), _next(clock, limits)
-            reached = clock.t
-        return after, clock, *save(plan, ts, lane, reached, kept, found, saved, rows), history
+        return after, *save(plan, ts, lane, after, kept, found, saved, rows), history
 
     def unfinished(carry):
-        lane, clock = carry[:2]
-        return any_in_batch(is_running(clock) if alike else is_active(lane))
+        return any_in_batch(is_active(carry[0]))
 
     history = reverse.blank(y0, start, max_steps) if record else None
-    clock = _Clock(start, lane.t_next, none) if alike else None
-    lane, _, _, rows, history = lax.while_loop(unfinished, body, (lane, clock, none, rows, history))
+    lane, _, rows, history = lax.while_loop(unfinished, body, (lane, none, rows, history))
     codes: Any = diffrax.RESULTS
     result = codes.where(lane.t < end, codes.max_steps_reached, codes.successful)
     result = codes.where(lane.failed, codes.dt_min_reached, result)
     result = codes.where(lane.stopped, codes.event_occurred, result)
     counts = {"num_steps": lane.taken, "num_accepted_steps": lane.kept, "num_rejected_steps": lane.taken - lane.kept}
     return Driven(rows, result, counts, lane.t, None if isinstance(how, Adaptive) else lane.sums, history)
-
-
-class _Clock(NamedTuple):
-    """Where all samples are that take the same fixed steps."""
-
-    t: Array
-    t_next: Array
-    taken: Array
-
-
-def _next(clock: _Clock, limits: _Limits) -> _Clock:
-    after = _fixed(clock.taken + 2, limits)
-    return _Clock(clock.t_next, jnp.minimum(after, limits.end), clock.taken + 1)
-
-
-def _fixed(taken, limits: _Limits):
-    """Time (s) after so many fixed steps."""
-    after = limits.start + (limits.end - limits.start) * (
-        taken.astype(limits.end.dtype) / limits.steps.astype(limits.end.dtype)
-    )
-    return jnp.where((taken >= limits.steps) | (after > limits.floor), limits.end, after)
 
 
 def number_of_steps(start, end, stepsize):
@@ -261,7 +229,9 @@ def _accepted(plan: Plan, how, args, limits: _Limits, lane: _Lane, active, step:
         kept, t, at_least, failed = jnp.asarray(True), t_next, lane.at_least, jnp.asarray(False)
         start, before, y, error = (plan.structure(x) for x in (limits.y0, lane.y, step.projected, step.error))
         sums = watched(how.order, how.error_order, start, before, y, error, *lane.sums)
-        after = _fixed(lane.taken + 2, limits)
+        done = (lane.taken + 2).astype(end.dtype) / limits.steps.astype(end.dtype)
+        after = limits.start + (end - limits.start) * done
+        after = jnp.where((lane.taken + 2 >= limits.steps) | (after > limits.floor), end, after)
     kept, one = kept & active, active.astype(jnp.int32)
     quality = jnp.where(kept, plan.quality_of(args, t_next, step.projected), lane.quality)
     lane = _Lane(
@@ -280,17 +250,17 @@ def _accepted(plan: Plan, how, args, limits: _Limits, lane: _Lane, active, step:
     return lane, kept
 
 
-def save(plan: Plan, ts, before: Any, reached, kept, step: Step, saved, rows):
-    """How many save points a step that ends at the time `reached` has passed, if it is kept, and their rows."""
+def save(plan: Plan, ts, before: Any, after: Any, kept, step: Step, saved, rows):
+    """How many save points have been passed, and their rows."""
     count = ts.shape[0] - 1
 
     def is_passed(saved):
-        return kept & (saved < count) & (ts[jnp.minimum(saved + 1, count)] <= reached)
+        return kept & (saved < count) & (ts[jnp.minimum(saved + 1, count)] <= after.t)
 
     def body(carry):
         saved, rows = carry
         here, place = is_passed(saved), jnp.minimum(saved, count - 1)
-        at = ts[place + 1], before.t, reached, before.y, step.raw, step.stages, step.shift
+        at = ts[place + 1], before.t, after.t, before.y, step.raw, step.stages, step.shift
         row = run(bent_output, None, *at, static=(plan,))
         rows = rows.at[place].set(jnp.where(here, row, rows[place]))
         return saved + here.astype(jnp.int32), rows
