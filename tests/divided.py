@@ -9,6 +9,7 @@ import os
 import re
 import sys
 from collections import Counter
+from functools import partial
 
 os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=8"
 os.environ["JAX_PLATFORMS"] = "cpu"
@@ -19,6 +20,7 @@ import numpy as np
 from jax import monitoring
 
 import jaxdyn as jd
+from jaxdyn.identify import minimise
 
 jax.config.update("jax_enable_x64", True)
 COLLECTIVES = "all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast"
@@ -27,17 +29,21 @@ model = jd.robots.iiwa()
 states = tuple(jax.random.normal(jax.random.key(0), (3, 16, 7)))
 
 
+def exchanged(program) -> dict:
+    """What devices exchange in a compiled program, by the names of XLA."""
+    return Counter(re.findall(rf"\s({COLLECTIVES})(?:-start)?\(", program.as_text()))
+
+
 def compare(name, function, *args):
     """Whether results on many devices are those on one, and what the compiled program exchanges."""
     program = jax.jit(function).lower(*args).compile()
     divided, whole = program(*args), jax.jit(function)(*jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), args))
     leaves = [*zip(jax.tree.leaves(divided), jax.tree.leaves(whole), strict=True)]
     apart = max(float(np.max(np.abs(np.asarray(a) - b) / (1 + np.abs(b)))) for a, b in leaves)
-    text = program.as_text()
-    calls = Counter(re.findall(rf"\s({COLLECTIVES})(?:-start)?\(", text))
     shards = len({str(shard.index) for shard in leaves[0][0].addressable_shards})
-    found = {"name": name, "apart": apart, "calls": calls, "shards": shards}
-    print(json.dumps(found | {"kernels": text.count('custom_call_target="jaxdyn_kernel"')}))
+    kernels = program.as_text().count('custom_call_target="jaxdyn_kernel"')
+    found = {"name": name, "apart": apart, "calls": exchanged(program), "shards": shards, "kernels": kernels}
+    print(json.dumps(found))
 
 
 def dynamics(q, v, tau):
@@ -123,5 +129,52 @@ def compare_cached():
     compare("cached", shared, q, v, states[2][0])
 
 
+def arm(mass):
+    """Two links about parallel axes, and their torques along a motion that is known."""
+    builder = jd.ModelBuilder("arm")
+    for name, parent in (("a", None), ("b", "a")):
+        body = (mass, (0.02, 0.01, -0.5), mass * np.array([0.1, 0.09, 0.02]))
+        builder.add_body(name, parent, pose=(0, 0, -1.0 if parent else 0.0), axis=(0, 1, 0), inertia=body)
+    return builder.build()
+
+
+def log_of(model, phase):
+    t = np.linspace(0.0, 1.0, 41)
+    angle = np.array([2.0, 3.0]) * t[:, None] + phase
+    q, v, a = np.sin(angle), np.array([2.0, 3.0]) * np.cos(angle), -np.array([4.0, 9.0]) * np.sin(angle)
+    return jd.identify.Log(t, q, v, a, np.asarray(jax.vmap(partial(jd.inverse_dynamics, model))(q, v, a)))
+
+
+def compare_fits(*names):
+    true, nominal = arm(1.2), arm(1.0)
+    logs = [log_of(true, phase) for phase in (0.3, 1.1)]
+    damped = jd.Scene(true, forces=(jd.JointDamping(0.1 * jnp.ones(2)),))
+    options = {"horizon": 10, "substeps": 2, "steps": 2}
+
+    def parameters(**more):
+        return jd.identify.fit_parameters(damped, logs, free=lambda scene: scene.forces[0].coefficient, **more)
+
+    fits = {
+        "trajectory": partial(jd.identify.fit_trajectory, nominal, logs, **options),
+        "slopes": partial(parameters, **options),
+        "torque": partial(parameters, error="torque", method="lbfgs", steps=2),
+    }
+    evaluate, programs = minimise._evaluate, []
+
+    def noted(*args):
+        programs.append(evaluate.lower(*args).compile()) if not programs else None
+        return programs[0](*args)
+
+    for name in names:
+        one = fits[name]()
+        minimise._evaluate = noted
+        many = fits[name](devices=jax.devices())
+        minimise._evaluate = evaluate
+        calls = exchanged(programs.pop().compiled) if programs else {}
+        history = [np.asarray(found.history).tolist() for found in (one, many)]
+        print(json.dumps({"name": name, "calls": calls, "history": history}))
+
+
 if __name__ == "__main__":
-    {"compare": compare_all, "cached": compare_cached}[sys.argv[1]]()
+    what, *names = sys.argv[1:]
+    {"compare": compare_all, "cached": compare_cached, "fits": compare_fits}[what](*names)

@@ -644,6 +644,31 @@ def test_rollouts_of_equal_cost_stand_together(tmp_path, kind):
     assert worst.reductions["w"]["rollout"][0] == np.argmax(np.asarray(plain.steps))
 
 
+def test_a_cost_that_nobody_knows_is_measured(tmp_path):
+    """Soft and stiff pendulums, whose steps differ by more than 30, in batches of eight: nobody waits long, and rows stay put."""
+    stiffness = np.where(np.random.default_rng(4).random(96) < 0.5, 1.0, 1e5)
+
+    def build(p):
+        return jd.Scene(jd.scenes.double_pendulum().system, forces=(jd.JointSpring(p["stiffness"] * jnp.ones(2)),))
+
+    def run(name, **options):
+        start = (np.array([0.3, 0.4]), np.zeros(2))
+        given = {"stiffness": stiffness}
+        return jd.scale.run(
+            build, start, given, np.array([0.0, 0.5]), out=tmp_path / name, lanes=16, chunk=96, **QUIET, **options
+        )
+
+    plain, measured = run("a.zarr"), run("b.zarr", cost="measured")
+    steps = np.asarray(plain.dataset().num_steps)
+    assert steps.max() > 30 * steps.min()
+    assert plain.waiting > 1.5 > 1.2 > measured.waiting >= 1.0  # devices have eight lanes; the mean cost is 1
+    assert_equal(arrays(plain.out), arrays(measured.out))
+    with pytest.raises(ValueError, match="cost is 'measured'; give a function of the parameters"):
+        run("c.zarr", cost="measured", stepsize=0.1)
+    with pytest.raises(ValueError, match="cost is 'guessed'"):
+        run("c.zarr", cost="guessed")
+
+
 def test_blocks_fit_the_memory(tmp_path):
     free = evaluated(tmp_path / "a.zarr", function=heavy, samples=400, chunk=400, lanes=400)
     tight = evaluated(tmp_path / "b.zarr", function=heavy, samples=400, chunk=400, lanes=400, memory=2**20)

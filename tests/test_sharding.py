@@ -6,11 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 
-def _run(what: str, **environment: str) -> list:
-    command = [sys.executable, str(Path(__file__).with_name("divided.py")), what]
+def _run(*what: str, **environment: str) -> list:
+    command = [sys.executable, str(Path(__file__).with_name("divided.py")), *what]
     done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-2000:]
     return [json.loads(line) for line in done.stdout.splitlines()]
@@ -79,3 +80,21 @@ def test_a_divided_program_is_found_in_the_compilation_cache(tmp_path):
         found, compared = _run("cached", **options)
         assert found == hits
         assert compared["calls"] == {} and compared["apart"] < 1e-12
+
+
+def _check_fits(*names: str) -> None:
+    for found, name in zip(_run("fits", *names), names, strict=True):
+        one, many = found["history"]
+        assert many[-1] < 0.9 * many[0], name
+        np.testing.assert_allclose(many, one, rtol=1e-9)
+        # Gauss-Newton steps are taken by the host, which reads the slopes of all devices.
+        assert found["calls"] == ({} if name == "slopes" else ONCE), name
+
+
+def test_a_fit_to_samples_of_two_logs_is_shared_among_devices():
+    _check_fits("torque")
+
+
+@pytest.mark.slow
+def test_fits_to_segments_of_two_logs_are_shared_among_devices():
+    _check_fits("trajectory", "slopes")
