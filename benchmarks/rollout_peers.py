@@ -5,9 +5,9 @@
 A rollout is `steps` steps of RK4 of 1 ms, from random states, of which the last state is kept; constant torques for the robots.
 Robots are read by all from one URDF, without joint limits, damping and friction; end states are compared first. C MuJoCo runs
 in its own threads (`mujoco.rollout`), as many as there are cores. The forward dynamics of frax, which has no integrator, and of
-MJX are stepped by the RK4 below, compiled with it. They read no floating base from a URDF as we write it: the G1 stands on a
-fixed base here, with 29 joints; MJX compiles it for minutes: `--mjx-g1`; it computes a sixteenth of the batch. Rolling without slip, a hand with rolling contacts
-and forty windows whose loops stay closed are in none of the three: those rows are ours alone.
+MJX are stepped by the RK4 below, compiled with it; MJX computes a sixteenth of the batch. They read no floating base from a URDF
+as we write it: the G1 stands on a fixed base here, with 29 joints; MJX compiles it for minutes: `--mjx-g1`. Rolling without
+slip, a hand with rolling contacts and forty windows whose loops stay closed are in none of the three: those rows are ours alone.
 """
 
 import argparse
