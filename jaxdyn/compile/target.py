@@ -100,6 +100,16 @@ def register() -> None:
     _handler.append(code)
 
 
+@functools.cache
+def is_supported() -> bool:
+    """Whether kernels can be called here; if not, that is said where one is lowered."""
+    try:
+        register()
+    except Unsupported:
+        return False
+    return True
+
+
 def _architecture() -> str:
     import llvmlite.binding as llvm
 
@@ -119,11 +129,6 @@ def width_of(program, samples: int | None) -> int:
         return program.lanes(samples)
     kinds = {kind_of(array.dtype) for array in (*program.inputs, *program.outputs)} & set(FLOATS)
     return 1 if samples == 1 else vector_bytes() // (4 if kinds == {"f4"} else 8)
-
-
-def order_of(program, uniform: Sequence[bool]) -> list[int]:
-    """In which the kernel takes the arguments of its program."""
-    return varying_first(uniform) if isinstance(program, Program) else [*range(len(uniform))]
 
 
 def kernel(program, width: int, uniform: Sequence[bool]) -> int:
@@ -150,7 +155,7 @@ class _Kernel:
         self.program: Any = program
         self.width, self.uniform = width, uniform
         self.code: Code | None = None
-        order = order_of(program, uniform)
+        order = varying_first(uniform)
         sizes = [-1 - program.inputs[i].size if uniform[i] else program.inputs[i].size for i in order]
         sizes += [array.size for array in program.outputs]
         self.sizes = (ctypes.c_int64 * len(sizes))(*sizes)
@@ -158,7 +163,7 @@ class _Kernel:
         while _table[slot].hash:
             slot = (slot + 1) % SLOTS
         self.entry = _table[slot]
-        chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.cost)))
+        chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.turns * program.cost)))
         self.entry.kernel, self.entry.chunk, self.entry.least = 0, chunk, 2 * chunk
         self.entry.buffers, self.entry.sizes = len(sizes), ctypes.addressof(self.sizes)
         self.entry.hash = number  # last: from here on it is found
@@ -168,12 +173,10 @@ class _Kernel:
         if self.code is None:
             program, width = self.program, self.width
             with _announced(program):
-                if isinstance(program, Program):
-                    for called in (program,) if calls_itself(program, width) else program.subprograms:
-                        _publish(called, width)
-                    text = kernel_ir(program, width, self.uniform)
-                else:
-                    text = program.ir(width, self.uniform)
+                is_program = isinstance(program, Program)
+                for called in (program,) if is_program and calls_itself(program, width) else program.subprograms:
+                    _publish(called, width)
+                text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
                 self.code = Code(text)
             self.program = None
             self.entry.kernel = self.code.address("kernel")
