@@ -1,45 +1,94 @@
-"""Batches that are divided between devices. Their number is fixed when jax starts, hence the process of its own."""
+"""Batches that are divided between devices (`divided.py`): the same numbers, and what devices exchange, which is counted."""
 
 import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
-PROGRAM = """
-import json
-import jax, jax.numpy as jnp
 import numpy as np
-jax.config.update("jax_enable_x64", True)
-import jaxdyn as jd
-
-mesh = jax.sharding.Mesh(np.asarray(jax.devices()), ("batch",))
+import pytest
 
 
-def steps(q, v):
-    return jd.simulate(jd.scenes.double_pendulum(), q, v, jnp.linspace(0.0, 0.2, 3), stepsize=0.01).q[-1]
-
-
-def acceleration(q, v):
-    return jd.constrained_dynamics(jd.scenes.four_bar(), q, v).acceleration
-
-
-for name, function in (("double_pendulum", steps), ("four_bar", acceleration)):
-    q, v = getattr(jd.scenes, name).start()
-    starts = jnp.tile(q, (4, 1)), (1.0 + v) * jnp.linspace(1.0, 1.3, 4)[:, None]
-    run = jax.jit(jax.vmap(function))
-    found, whole = run(*(jax.device_put(x, jax.NamedSharding(mesh, jax.P("batch"))) for x in starts)), run(*starts)
-    apart = np.max(np.abs(np.asarray(found) - np.asarray(whole)) / (1 + np.abs(whole)))
-    print(json.dumps({"devices": len(found.devices()), "apart": float(apart), "spread": float(np.ptp(whole[:, 0]))}))
-"""
-
-
-def test_a_batch_on_two_devices_is_that_on_one():
-    env = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run([sys.executable, "-c", PROGRAM], env=env, capture_output=True, text=True, timeout=600)
+def _run(*what: str, **environment: str) -> list:
+    command = [sys.executable, str(Path(__file__).with_name("divided.py")), *what]
+    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-2000:]
-    checks = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(checks) == 2
-    for found in checks:
-        assert found["devices"] == 2
-        assert found["spread"] > 1e-3
-        assert found["apart"] < 1e-12
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@pytest.fixture(scope="module")
+def compared() -> dict:
+    """What each function does on eight devices, by its name."""
+    return {row["name"]: row for row in _run("compare")}
+
+
+# Samples exchange nothing. Only a mean over all of them does, once: the value and the derivative of a fit go together.
+ONCE = {"all-reduce": 1}
+EXCHANGED = {
+    "dynamics": {},
+    "gradient": {},
+    "rollout": {},
+    "shared torque": {},
+    "one of three": {},
+    "two axes": {},
+    "four-bar in shard_map": {},
+    "dynamics explicit": {},
+    "gradient explicit": {},
+    "fit": ONCE,
+    "fit explicit": ONCE,
+    "fit in shard_map": ONCE,
+}
+
+
+@pytest.mark.parametrize("name", EXCHANGED)
+def test_samples_exchange_nothing_and_a_fit_once(compared, name):
+    found = compared[name]
+    assert found["calls"] == EXCHANGED[name]
+    assert found["shards"] == (1 if name.startswith("fit") else 8)
+    assert found["kernels"] > 0
+
+
+def test_results_are_those_of_one_device(compared):
+    assert len(compared) == len(EXCHANGED) + 1
+    assert max(found["apart"] for found in compared.values()) < 1e-12
+
+
+def test_singular_samples_are_looked_for_by_one_bit(compared):
+    """Whether a sample of any device needs care is asked of all; what is gathered then stands in a branch."""
+    found = compared["four-bar"]
+    assert found["shards"] == 8
+    assert 1 <= found["calls"].get("all-reduce", 0) <= 3 and found["calls"].get("all-gather", 0) <= 1
+
+
+@pytest.mark.slow
+def test_a_divided_program_is_found_in_the_compilation_cache(tmp_path):
+    """Nothing of a process, an address or the number of a callback, is in the text of a program."""
+    options = {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "programs"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        "TF_CPP_MIN_LOG_LEVEL": "3",
+    }
+    for hits in (0, 1):
+        found, compared = _run("cached", **options)
+        assert found == hits
+        assert compared["calls"] == {} and compared["apart"] < 1e-12
+
+
+def _check_fits(*names: str) -> None:
+    for found, name in zip(_run("fits", *names), names, strict=True):
+        one, many = found["history"]
+        assert many[-1] < 0.9 * many[0], name
+        np.testing.assert_allclose(many, one, rtol=1e-9)
+        # Gauss-Newton steps are taken by the host, which reads the slopes of all devices.
+        assert found["calls"] == ({} if name == "slopes" else ONCE), name
+
+
+def test_a_fit_to_samples_of_two_logs_is_shared_among_devices():
+    _check_fits("torque")
+
+
+@pytest.mark.slow
+def test_fits_to_segments_of_two_logs_are_shared_among_devices():
+    _check_fits("trajectory", "slopes")

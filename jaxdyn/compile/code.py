@@ -1,8 +1,8 @@
 """The text of kernels: from a program of numbers to LLVM's intermediate representation.
 
-A kernel is `void kernel(ptr data, i64 n, i64 begin, i64 end)`: `data` points to the arguments and then to the results, each a row
-of numbers per sample (one row for all samples where an argument is uniform); samples begin .. end - 1 of n are computed, W at a
-time. Where fewer are left than W, the last sample stands in the other lanes.
+A kernel is `void kernel(ptr data, i64 n, i64 begin, i64 end)`: `data` points to the arguments, first those that have a row of
+numbers per sample, then those that are uniform, one row for all samples, and then to the results; samples begin .. end - 1 of n
+are computed, W at a time. Where fewer are left than W, the last sample stands in the other lanes.
 
 A subprogram is a function of the same name wherever its text is the same, so that it is compiled once for all kernels that call
 it: `void called(ptr ..., ptr ...)` with the arrays of its inputs, then of its outputs, each entry with its W lanes. A row of one
@@ -154,6 +154,11 @@ def calls_itself(program: Program, width: int) -> bool:
     return width == 1 and program.cost >= LEAST_SHARED and not program.subprograms
 
 
+def varying_first(uniform: Sequence[bool]) -> list[int]:
+    """The order in which a kernel takes the arguments of its program. (XLA divides a call as its first argument is divided.)"""
+    return sorted(range(len(uniform)), key=lambda i: uniform[i])
+
+
 def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
     """The text of a kernel; `uniform` says which arguments are the same for all samples."""
     e = Emitter(width)
@@ -187,8 +192,8 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         for i, (row, output) in enumerate(zip(body.results(), program.outputs, strict=True)):
             e.store_array(rows[count + i], kind_of(output.dtype), row)
     pointers = []
-    for i in range(len(arrays)):
-        pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {i}", f"  %a{i} = load ptr, ptr %p{i}"]
+    for at, i in enumerate([*varying_first(uniform), *range(count, len(arrays))]):
+        pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {at}", f"  %a{i} = load ptr, ptr %p{i}"]
     # Arguments that are not read are not in the code, but the handler checks their sizes: they are part of what is hashed.
     sizes = " ".join(
         f"{'same' if i < count and uniform[i] else 'each'}:{x.size}x{x.dtype}" for i, x in enumerate(arrays)

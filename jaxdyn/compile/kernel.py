@@ -19,11 +19,12 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jaxdyn.compile import derive, mode
+from jaxdyn.compile import derive, mode, sharding
 from jaxdyn.compile.expand import expand
 from jaxdyn.compile.graph import inlined
 from jaxdyn.compile.known import Known, partition, partition_traced
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
+from jaxdyn.compile.trigonometry import cosine, sine
 
 try:
     from jaxdyn.compile import target
@@ -131,7 +132,7 @@ def program_of(
     """
     traced, known = partition_traced(tree)
     leaves, structure = jax.tree.flatten(args)
-    leaves = [*map(jnp.asarray, (*traced, *leaves))]
+    leaves = sharding.varying_alike([*map(jnp.asarray, (*traced, *leaves))])
     shapes = tuple((x.shape, x.dtype) for x in leaves)
     return leaves, _program(function, static, known, len(traced), structure, shapes, tangent, most, calls, served)
 
@@ -258,8 +259,7 @@ def _(*args, program):
 
 @kernel_p.def_abstract_eval
 def _(*avals, program):
-    lead = max((x.shape[:-1] for x in avals), key=len, default=())
-    return [ShapedArray((*lead, array.size), array.dtype) for array in program.outputs]
+    return sharding.results_of(avals, program.outputs)
 
 
 def _batched(args, axes, *, program):
@@ -322,8 +322,8 @@ ad.primitive_transposes[kernel_p] = _transpose
 _OPERATIONS: dict[str, Callable] = {
     "add": lax.add, "sub": lax.sub, "mul": lax.mul, "div": lax.div, "neg": lax.neg, "max": lax.max, "min": lax.min,
     "pow": lax.pow, "atan2": lax.atan2, "rem": lax.rem, "and": lax.bitwise_and, "or": lax.bitwise_or, "not": lax.bitwise_not,
-    "is_finite": lax.is_finite, "select": lambda which, no, yes: lax.select(which, yes, no), "sqrt": lax.sqrt, "sin": lax.sin,
-    "cos": lax.cos, "tan": lax.tan, "asin": lax.asin, "acos": lax.acos, "atan": lax.atan, "sinh": lax.sinh, "cosh": lax.cosh,
+    "is_finite": lax.is_finite, "select": lambda which, no, yes: lax.select(which, yes, no), "sqrt": lax.sqrt, "sin": sine,
+    "cos": cosine, "tan": lax.tan, "asin": lax.asin, "acos": lax.acos, "atan": lax.atan, "sinh": lax.sinh, "cosh": lax.cosh,
     "tanh": lax.tanh, "exp": lax.exp, "exp2": lax.exp2, "expm1": lax.expm1, "log": lax.log, "log1p": lax.log1p, "abs": lax.abs,
     "floor": lax.floor, "ceil": lax.ceil, "sign": lax.sign, "cbrt": lax.cbrt, "stop_gradient": lax.stop_gradient,
     "round": lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN),
@@ -376,7 +376,21 @@ def _lower_on_cpu(ctx, *operands, program):
     except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
         mode.say_once(f"functions run on JAX's own operations: {reason}")
         return _lower_elsewhere(ctx, *operands, program=program)
-    return jax.ffi.ffi_lowering(target.TARGET)(ctx, *operands, program=np.int64(number))
+    if sharding.may_be_divided(ctx.avals_in, lead):
+        return _lower_with_last_axis(ctx, *operands, program=program)
+    order = target.varying_first(uniform)
+    ctx = ctx.replace(avals_in=[ctx.avals_in[i] for i in order])
+    lower = jax.ffi.ffi_lowering(target.TARGET, extra_attributes=sharding.attributes(ctx.avals_in, ctx.avals_out))
+    return lower(ctx, *(operands[i] for i in order), program=np.int64(number))
+
+
+def _with_last_axis(*args, program):
+    """The call with one more batch axis, of length one (see `sharding.may_be_divided`)."""
+    results = kernel_p.bind(*(x if x.ndim == 1 else lax.expand_dims(x, [x.ndim - 1]) for x in args), program=program)
+    return [lax.squeeze(x, [x.ndim - 2]) for x in results]
+
+
+_lower_with_last_axis = mlir.lower_fun(_with_last_axis, multiple_results=True)
 
 
 mlir.register_lowering(kernel_p, _lower_elsewhere)

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.code import ATTRIBUTES, Body, bytes_of
+from jaxdyn.compile.code import ATTRIBUTES, Body, bytes_of, varying_first
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import Array, kind_of
 
@@ -64,8 +64,8 @@ class _LoopText:
         if loop.row is not None:
             e.store(self.lanes[self.saved_after], 0, "i4", e.load_at("%saved", 0, "i4"))
         pointers = []
-        for i in range(len(self.arrays)):
-            pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {i}", f"  %a{i} = load ptr, ptr %p{i}"]
+        for at, i in enumerate([*varying_first(self.uniform[: self.results]), *range(self.results, len(self.arrays))]):
+            pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {at}", f"  %a{i} = load ptr, ptr %p{i}"]
         return "\n".join(
             [
                 f"; {loop.digest} {self.uniform}",

@@ -19,6 +19,7 @@ from jaxdyn.compile.kernel import kernel_p, program_of, target
 from jaxdyn.compile.known import Known, partition_traced
 from jaxdyn.compile.loop_text import loop_ir
 from jaxdyn.compile.program import Array, Constant, Program
+from jaxdyn.compile.sharding import varying_alike
 
 
 class Turn(NamedTuple):
@@ -108,7 +109,8 @@ def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[C
     loop = _loop(task, program, row, structure, known, len(traced), _Form.of((constants, given, carry)))
     leaves = leaves[: len(leaves) - len(read)]
     after = jax.tree.leaves(carry)[len(jax.tree.leaves(carry.state)) :]
-    results = kernel_p.bind(*(x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)), program=loop)
+    flat = varying_alike([x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)])
+    results = kernel_p.bind(*flat, program=loop)
     return _Form.of(carry)(results), loop.always_ends
 
 

@@ -22,6 +22,7 @@ from jaxdyn.compile.flags import unless
 from jaxdyn.compile.kernel import run
 from jaxdyn.compile.known import partition_traced
 from jaxdyn.compile.mode import is_expanding
+from jaxdyn.compile.sharding import varying_alike
 
 AT_ONCE = 32  # samples that are computed again together
 
@@ -143,7 +144,11 @@ def _one(careful: Callable):
         fixed = _many(lambda *leaves: careful(*jax.tree.unflatten(structure, leaves)), axes)(flag, found, leaves)
         return fixed, jax.tree.map(lambda _: True, fixed)
 
-    return one
+    def alike(*args):
+        leaves, structure = jax.tree.flatten(args)
+        return one(*jax.tree.unflatten(structure, varying_alike(leaves)))
+
+    return alike
 
 
 def _many(careful: Callable, axes: list):
@@ -180,8 +185,8 @@ def _many(careful: Callable, axes: list):
 
 
 def _like(new, found):
-    """The same arrays with the dtypes of `found`."""
-    return jax.tree.map(lambda x, y: jnp.asarray(x, y.dtype), new, found)
+    """The same arrays with the dtypes of `found`, varying along the manual axes of meshes along which those do."""
+    return jax.tree.map(lambda x, y: varying_alike([jnp.asarray(x, y.dtype), y])[0], new, found)
 
 
 def _along_one_axis(args, axes, batched, shape):

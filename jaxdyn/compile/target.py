@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of
+from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
 from jaxdyn.compile.objects import Code, features
 from jaxdyn.compile.program import FLOATS, Program, kind_of
 
@@ -96,6 +96,7 @@ def register() -> None:
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
     jax.ffi.register_ffi_target(TARGET, new(code.address("handler"), None, None), platform="cpu", api_version=1)
+    jax.ffi.register_ffi_target_as_batch_partitionable(TARGET)
     _handler.append(code)
 
 
@@ -154,7 +155,8 @@ class _Kernel:
         self.program: Any = program
         self.width, self.uniform = width, uniform
         self.code: Code | None = None
-        sizes = [-1 - array.size if same else array.size for array, same in zip(program.inputs, uniform, strict=True)]
+        order = varying_first(uniform)
+        sizes = [-1 - program.inputs[i].size if uniform[i] else program.inputs[i].size for i in order]
         sizes += [array.size for array in program.outputs]
         self.sizes = (ctypes.c_int64 * len(sizes))(*sizes)
         slot = number % SLOTS

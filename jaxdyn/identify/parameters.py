@@ -1,7 +1,8 @@
 """Any numbers of any system or scene, fitted by torque error or by trajectory error."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,20 +13,23 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxdyn.identify.chosen import Chosen, choose
+from jaxdyn.identify.divided import mapped, shared_out, summed
 from jaxdyn.identify.gauss_newton import Unknowns, gauss_newton, linear, standard_deviation
-from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.minimise import METHODS, minimise
 from jaxdyn.identify.replay import (
     HOLDS,
     INITIAL,
     Segments,
     check_replay,
+    check_spacing,
     motion_errors,
     motion_scale,
     moving_scale,
     replayed,
     simulate_segment,
     simulation_options,
+    spaced,
 )
 from jaxdyn.identify.result import ParameterFit, needed_torque
 from jaxdyn.model.arguments import state_dtype
@@ -51,11 +55,12 @@ class _Problem(eqx.Module):
     scale: Array
     hold: str = eqx.field(static=True)
     options: Any
+    mesh: Any = eqx.field(static=True)
 
 
 def fit_parameters(
     system: Any,
-    log: Log,
+    log: Log | Sequence[Log],
     *,
     positive: Any = None,
     free: Any = None,
@@ -68,6 +73,7 @@ def fit_parameters(
     steps: int = 200,
     learning_rate: float = 0.1,
     tolerance: float = 1e-9,
+    devices: Sequence[Any] | None = None,
     callback: Callable[[int, float, Any], None] | None = None,
     **simulation,
 ) -> ParameterFit:
@@ -82,7 +88,7 @@ def fit_parameters(
 
     - `system`: any system (a `LagrangianSystem`, an immersed one, ...) or a `Scene`, whose forces count; where the fit
       starts.
-    - `log` with q, v, tau, and a for error="torque".
+    - `log` with q, v, tau, and a for error="torque", or several such logs, all cut by `horizon`.
     - `positive`, `free`: what is fitted, as functions that pick leaves, or whole parts, of `system`:
       `lambda system: [system.parameters["mass"], system.parameters["length"]]`. Positive numbers stay so at every
       iterate; free ones may have any sign. All else stays as given.
@@ -94,7 +100,8 @@ def fit_parameters(
       until the next one promises to lower the loss by less than `tolerance` of it. For more, those of a network say, "lbfgs",
       "adam" or an optax.GradientTransformation, by reverse mode. `learning_rate`: of adam, a share of each number (of one
       where it starts at zero); `tolerance` of "lbfgs" as in `fit_trajectory`.
-      `steps`: the most steps. `callback(step, loss, system)` is called before every step with the system at that point.
+      `steps`: the most steps. `devices`: as in `fit_trajectory`, for segments, or samples where error="torque".
+      `callback(step, loss, system)` is called before every step with the system at that point.
 
     **Returns:** `ParameterFit`. Its `result` is "not_finite" when a simulation failed; the system is then the best before.
 
@@ -116,17 +123,19 @@ def fit_parameters(
     methods = (_GAUSS_NEWTON, *METHODS)
     if isinstance(method, str) and method not in methods:
         raise ValueError(f"method is {method!r}; take one of {methods} or an optax.GradientTransformation")
-    check_log(log, inner, needs=("v",) if error == "trajectory" else ("v", "a"))
+    logs = as_logs(log, inner, needs=("v",) if error == "trajectory" else ("v", "a"))
     chosen, names = choose(system, positive, free, state_dtype(inner))
     if error == "trajectory":
-        problem = _trajectory_problem(system, chosen, log, horizon, hold, simulation_options(substeps, simulation))
+        problem = _trajectory_problem(
+            system, chosen, logs, horizon, hold, simulation_options(substeps, simulation), devices
+        )
     else:
         simulated = {"horizon": horizon, "substeps": substeps, **simulation}
         simulated |= {"initial": None if initial == INITIAL[0] else initial, "hold": None if hold == HOLDS[0] else hold}
         given = [name for name, value in simulated.items() if value is not None]
         if given:
             raise ValueError(f"{', '.join(given)} with error='torque', which simulates nothing; leave it out")
-        problem = _torque_problem(system, chosen, log)
+        problem = _torque_problem(system, chosen, logs, devices)
     y0 = jnp.zeros_like(chosen.origin)
     start = jnp.zeros((len(problem.pieces.q), 2, inner.nv), y0.dtype) if initial == "free" else None
     unknowns = Unknowns(y0, start)
@@ -170,24 +179,29 @@ def fit_parameters(
     )
 
 
-def _trajectory_problem(system, chosen: Chosen, log: Log, horizon, hold: str, options: dict) -> _Problem:
-    scene, data = replayed(system, log, horizon)
-    return _Problem(chosen, data, motion_scale(scene.system, data), hold, options)
+def _trajectory_problem(system, chosen: Chosen, logs, horizon, hold: str, options: dict, devices) -> _Problem:
+    scene, data = replayed(system, logs, horizon)
+    options = spaced(options, data)
+    check_spacing(options, devices)
+    data, mesh = shared_out(data, devices)
+    return _Problem(chosen, data, motion_scale(scene.system, data), hold, options, mesh)
 
 
-def _torque_problem(system, chosen: Chosen, log: Log) -> _Problem:
+def _torque_problem(system, chosen: Chosen, logs, devices) -> _Problem:
     if isinstance(system, Scene) and system.constraints:
         raise ValueError(
             f"the scene has {len(system.constraints)} constraints, whose forces the torques do not tell; take "
             "error='trajectory'"
         )
     dtype = chosen.origin.dtype
-    samples = _Samples(*(jnp.asarray(np.asarray(x), dtype) for x in (log.t, log.q, log.v, log.a, log.tau)))
+    signals = ([getattr(log, name) for log in logs] for name in ("t", "q", "v", "a", "tau"))
+    samples = _Samples(*(jnp.asarray(np.concatenate(parts), dtype) for parts in signals))
+    samples, mesh = shared_out(samples, devices)
     scale = moving_scale(jnp.sqrt(jnp.mean(samples.tau**2, axis=0)))
-    return _Problem(chosen, samples, scale, HOLDS[0], {})
+    return _Problem(chosen, samples, scale, HOLDS[0], {}, mesh)
 
 
-def _residual(problem: _Problem, y, start, piece) -> Float[Array, " n"]:
+def _residual(problem: _Problem, whole: int, y, start, piece) -> Float[Array, " n"]:
     """Errors of one piece, in shares of the whole: the loss is the sum of all their squares."""
     scene, scale = problem.chosen.scene(y), problem.scale
     if isinstance(piece, _Samples):
@@ -197,15 +211,27 @@ def _residual(problem: _Problem, y, start, piece) -> Float[Array, " n"]:
         change = None if start is None else start * scale
         motion = simulate_segment(scene, piece, change, problem.hold, problem.options)
         errors = jnp.concatenate(motion_errors(scene.system, piece, *motion, scale))
-    return errors.reshape(-1) / problem.pieces.tau.size**0.5
+    return errors.reshape(-1) / whole**0.5
+
+
+def _apart(problem: _Problem) -> tuple[_Problem, Segments | _Samples]:
+    """What all devices know, and the pieces that are shared among them."""
+    return eqx.tree_at(lambda problem: problem.pieces, problem, None), problem.pieces
 
 
 def _loss(z, args):
     problem, unknowns = args
     _, unflatten = ravel_pytree(unknowns)
     found = unflatten(z)
-    errors = jax.vmap(lambda start, piece: _residual(problem, found.y, start, piece))(found.start, problem.pieces)
-    return jnp.sum(errors * errors)
+    rest, pieces = _apart(problem)
+    whole = pieces.tau.size
+
+    def squares(searched, known):
+        (y, start), (problem, pieces) = searched, known
+        errors = jax.vmap(partial(_residual, problem, whole, y))(start, pieces)
+        return jnp.sum(errors * errors)
+
+    return summed(squares, problem.mesh)((found.y, found.start), (rest, pieces))
 
 
 @eqx.filter_jit
@@ -214,14 +240,20 @@ def _slopes(problem: _Problem, found: Unknowns):
     if isinstance(problem.pieces, Segments):
         problem = dataclasses.replace(problem, options=problem.options | {"adjoint": "forward"})
 
-    def one(start, piece):
+    rest, pieces = _apart(problem)
+    whole = pieces.tau.size
+
+    def one(problem, y, start, piece):
         def twice(y, start):
-            errors = _residual(problem, y, start, piece)
+            errors = _residual(problem, whole, y, start, piece)
             return errors, errors
 
-        return jax.jacfwd(twice, 0 if start is None else (0, 1), has_aux=True)(found.y, start)
+        return jax.jacfwd(twice, 0 if start is None else (0, 1), has_aux=True)(y, start)
 
-    slopes, errors = jax.vmap(one)(found.start, problem.pieces)
+    def rows(shared, pieces):
+        return jax.vmap(partial(one, *shared))(*pieces)
+
+    slopes, errors = mapped(rows, problem.mesh)((rest, found.y), (found.start, pieces))
     if found.start is None:
         return errors, slopes, None
     return errors, slopes[0], slopes[1].reshape(*errors.shape, -1)

@@ -1,5 +1,6 @@
 """Logs replayed: the motion under the measured torques, simulated in segments, and how far it is from the measured one."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.run import simulate
@@ -51,13 +52,25 @@ class Segments(eqx.Module):
     tau: Float[Array, "*segments n nv"]
 
 
-def segments(log: Log, horizon: int | None, dtype, *, restart: bool = True) -> Segments:
-    """Cut a log into segments of `horizon` steps (None: one segment); samples left over at the end are not used.
+def segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: bool = True) -> Segments:
+    """Cut a log, or each of several, into segments of `horizon` steps (None: one); samples left over at an end are not used.
 
     Time starts at zero in each, or goes on as in the log (`restart=False`), for systems that depend on it.
 
-    **Raises:** ValueError for a log without velocities or a horizon that does not fit.
+    **Raises:** ValueError for a log without velocities, a horizon that does not fit, or none for logs of unequal length.
     """
+    logs = as_logs(log)
+    lengths = sorted({len(one) for one in logs})
+    if horizon is None and len(lengths) > 1:
+        raise ValueError(
+            f"horizon is None, which takes logs whole, and they have {lengths[0]} to {lengths[-1]} samples; give the steps "
+            "of a segment"
+        )
+    parts = [_segments(one, horizon, dtype, restart) for one in logs]
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
+
+
+def _segments(log: Log, horizon: int | None, dtype, restart: bool) -> Segments:
     if log.v is None:
         raise ValueError(
             "the log has no v; a simulation starts from velocities: measure them or use jd.identify.from_raw"
@@ -80,7 +93,7 @@ def rollout(system: Any, log: Log, friction: Any = None, *, horizon=None, hold="
     """
     check_replay(INITIAL[0], hold)
     scene, data = replayed(system, log, horizon, friction)
-    return _rollout(scene, data, hold, simulation_options(substeps, simulation))
+    return _rollout(scene, data, hold, spaced(simulation_options(substeps, simulation), data))
 
 
 def trajectory_error(
@@ -92,16 +105,18 @@ def trajectory_error(
     """
     check_replay(INITIAL[0], hold)
     scene, data = replayed(system, log, horizon, friction)
-    q, v = _rollout(scene, data, hold, simulation_options(substeps, simulation))
+    q, v = _rollout(scene, data, hold, spaced(simulation_options(substeps, simulation), data))
     scale = motion_scale(scene.system, data)
     errors = _batched_errors(scene.system, data, q, v, scale)
     return tuple(100 * float(jnp.sqrt(jnp.mean(error**2))) for error in errors)
 
 
-def replayed(system: Any, log: Log, horizon: int | None, friction: Any = None) -> tuple[Scene, Segments]:
+def replayed(
+    system: Any, log: Log | Sequence[Log], horizon: int | None, friction: Any = None
+) -> tuple[Scene, Segments]:
     """The scene of a `Model`, another system or a `Scene`, with one more force; and the log's segments for it."""
     scene = as_scene(system)
-    check_log(log, scene.system, needs=("v",))
+    log = as_logs(log, scene.system, needs=("v",))
     if friction is not None:
         scene = Scene(scene.system, scene.constraints, (*scene.forces, friction))
     return scene, segments(log, horizon, state_dtype(scene.system), restart=isinstance(system, Model))
@@ -126,6 +141,31 @@ def simulation_options(substeps: int | None, simulation: dict) -> dict:
     if "stepsize" in simulation:
         raise ValueError("substeps and stepsize both say how to step; give one of them")
     return {"solver": diffrax.Tsit5(), "substeps": substeps} | simulation
+
+
+def check_spacing(options: dict, devices: Any) -> None:
+    """**Raises:** ValueError for `substeps` of samples that are not evenly spaced, on several devices: diffrax's loops, which
+    make such steps, are not differentiated there."""
+    if devices is not None and "substeps" in options:
+        raise ValueError(
+            f"substeps is {options['substeps']}, devices are given, and the log's samples are not evenly spaced; take "
+            "substeps=None, or interpolate the log to even times"
+        )
+
+
+def spaced(options: dict, data: Segments) -> dict:
+    """The options with fixed steps of one length in place of `substeps` where samples are evenly spaced, up to rounding.
+
+    Steps end on the samples then too, and are kernels.
+    """
+    t = np.asarray(data.t, np.float64)
+    gaps, rounding = np.diff(t, axis=1), 8 * float(jnp.finfo(data.t.dtype).eps) * np.abs(t).max()
+    if "substeps" not in options or np.ptp(gaps) > rounding:
+        return options
+    options = dict(options)
+    count = gaps.shape[1] * options.pop("substeps")
+    # The number of steps is rounded up, and their length then follows from it.
+    return {"max_steps": count + 1} | options | {"stepsize": float(np.ptp(t[0])) / (count - 0.5)}
 
 
 def simulate_segment(scene: Scene, one: Segments, change: Float[Array, "2 nv"] | None, hold: str, options: dict):

@@ -1,6 +1,6 @@
 """Physically feasible inertias and friction by trajectory error: simulate the log and compare the motion."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,18 +12,21 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart
+from jaxdyn.identify.divided import shared_out, summed
 from jaxdyn.identify.friction import check_terms
-from jaxdyn.identify.logs import Log, check_log, root_mean_square
+from jaxdyn.identify.logs import Log, as_logs, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
 from jaxdyn.identify.regression import regressor
 from jaxdyn.identify.replay import (
     Segments,
     check_replay,
+    check_spacing,
     motion_errors,
     motion_scale,
     segments,
     simulate_segment,
     simulation_options,
+    spaced,
 )
 from jaxdyn.identify.result import Fit
 from jaxdyn.model.tree import Model
@@ -45,11 +48,12 @@ class _Problem(eqx.Module):
     prior: Float[Array, ""]
     hold: str = eqx.field(static=True)
     options: Any
+    mesh: Any = eqx.field(static=True)
 
 
 def fit_trajectory(
     model: Model,
-    log: Log,
+    log: Log | Sequence[Log],
     terms=(),
     *,
     v_s: float = 0.01,
@@ -63,6 +67,7 @@ def fit_trajectory(
     steps: int = 200,
     learning_rate: float = 0.1,
     tolerance: float = 1e-9,
+    devices: Sequence[Any] | None = None,
     callback: Callable[[int, float, Model], None] | None = None,
     **simulation,
 ) -> Fit:
@@ -76,7 +81,7 @@ def fit_trajectory(
 
     **Arguments:**
 
-    - `model`: nominal model, where the fit starts; `log` with q, v and tau.
+    - `model`: nominal model, where the fit starts; `log` with q, v and tau, or several such logs, all cut by `horizon`.
     - `terms`, `v_s`, `inertia`: as in `fit_torques`. A small v_s makes the simulation stiff.
     - `horizon`: steps of the log in a segment; None: the whole log is one.
     - `initial`: "measured" states start the segments; "free" ones are fitted too, for noisy measurements.
@@ -85,6 +90,8 @@ def fit_trajectory(
       as in `fit_torques`.
     - `substeps`: fixed steps between two samples (Tsit5 unless `solver` says otherwise); None: adaptive steps. Fixed
       steps end on every sample, where the torques have their kinks, and cost the same in every segment.
+    - `devices`: some of `jax.devices()`, among which the segments are shared, by as many of them as can have equally many; an
+      iteration exchanges one all-reduce. None: one device.
     - `simulation`: options of `jd.simulate` (solver, stepsize, rtol, atol, adjoint, max_steps).
 
     **Returns:** `Fit`. Its `result` is "not_finite" when a simulation failed; the model is then the best before.
@@ -94,7 +101,7 @@ def fit_trajectory(
     Source: Bock (1983), multiple shooting; output error methods, Ljung (1999), section 7.
     """
     check_bodies(model)
-    check_log(log, model, needs=("v",))
+    logs = as_logs(log, model, needs=("v",))
     terms = check_terms(terms, v_s)
     check_replay(initial, hold)
     if isinstance(method, str) and method not in METHODS:
@@ -103,12 +110,15 @@ def fit_trajectory(
         raise ValueError(f"prior is {prior}; it must not be negative")
     options = simulation_options(substeps, simulation)
     dtype = np.dtype(model.home.dtype)
-    data = segments(log, horizon, dtype)
-    a = np.gradient(np.asarray(log.v, np.float64), np.asarray(log.t, np.float64), axis=0) if log.a is None else log.a
-    rms = [root_mean_square(x) for x in (log.tau, log.v, a)]
+    data = segments(logs, horizon, dtype)
+    options = spaced(options, data)
+    check_spacing(options, devices)
+    data, mesh = shared_out(data, devices)
+    q, v, tau, a = (np.concatenate(parts) for parts in zip(*map(_signals, logs), strict=True))
+    rms = [root_mean_square(x) for x in (tau, v, a)]
     chart, point = make_chart(model, terms, v_s, inertia, *rms)
     start = jnp.zeros((data.q.shape[0], 2, model.nv), dtype) if initial == "free" else None
-    problem = _Problem(model, chart, data, motion_scale(model, data), jnp.asarray(prior, dtype), hold, options)
+    problem = _Problem(model, chart, data, motion_scale(model, data), jnp.asarray(prior, dtype), hold, options, mesh)
     unknowns = _Unknowns(point, start)
     y0, unflatten = ravel_pytree(unknowns)
 
@@ -124,7 +134,7 @@ def fit_trajectory(
         steps=steps,
         learning_rate=learning_rate,
         tolerance=tolerance,
-        scaling=lambda y: _scaling(problem, unflatten(y).point, log, a, y.size),
+        scaling=lambda y: _scaling(problem, unflatten(y).point, (q, v, a), y.size),
         callback=report,
     )
     fitted, friction = chart.fitted(model, chart.settled(unflatten(y).point))
@@ -140,24 +150,39 @@ def fit_trajectory(
     )
 
 
+def _signals(log: Log):
+    """q, v, tau and a of a log."""
+    v, t = np.asarray(log.v, np.float64), np.asarray(log.t, np.float64)
+    return log.q, log.v, log.tau, np.gradient(v, t, axis=0) if log.a is None else log.a
+
+
 def _flat_loss(y, args):
     problem, unknowns = args
     _, unflatten = ravel_pytree(unknowns)
     found = unflatten(y)
-    chart, data, scale = problem.chart, problem.data, problem.scale
-    model, friction = chart.fitted(problem.model, found.point)
-    has_friction = chart.terms or model.damping is not None or model.friction is not None
-    scene = Scene(model, forces=(friction,) if has_friction else ())
+    chart, data = problem.chart, problem.data
+    whole = data.v.size
+    # Everything but the segments is known to all devices.
+    rest = eqx.tree_at(lambda problem: problem.data, problem, None)
 
-    def errors(one, change):
-        change = None if change is None else change * scale
-        return motion_errors(model, one, *simulate_segment(scene, one, change, problem.hold, problem.options), scale)
+    def squares(searched, known):
+        (point, start), (problem, data) = searched, known
+        model, friction = chart.fitted(problem.model, point)
+        has_friction = chart.terms or model.damping is not None or model.friction is not None
+        scene = Scene(model, forces=(friction,) if has_friction else ())
 
-    found_errors = jax.vmap(errors)(data, found.start)
-    return sum(jnp.mean(error**2) for error in found_errors) + problem.prior * chart.divergence(found.point.theta)
+        def errors(one, change):
+            change = None if change is None else change * problem.scale
+            motion = simulate_segment(scene, one, change, problem.hold, problem.options)
+            return motion_errors(model, one, *motion, problem.scale)
+
+        return sum(jnp.sum(error**2) for error in jax.vmap(errors)(data, start)) / whole
+
+    error = summed(squares, problem.mesh)((found.point, found.start), (rest, data))
+    return error + problem.prior * chart.divergence(found.point.theta)
 
 
-def _scaling(problem: _Problem, point: Coordinates, log: Log, a, size: int) -> Float[Array, "n n"]:
+def _scaling(problem: _Problem, point: Coordinates, signals, size: int) -> Float[Array, "n n"]:
     """S with S S^T about the inverse of the Hessian of the motion error.
 
     A change dx of the parameters changes the acceleration by -M^-1 Y dx at first, and the velocity by that times the time
@@ -165,8 +190,9 @@ def _scaling(problem: _Problem, point: Coordinates, log: Log, a, size: int) -> F
     """
     chart, span = problem.chart, float(problem.data.t[0, -1])
     model, _ = chart.fitted(problem.model, point)
-    few = np.linspace(0, len(log) - 1, min(len(log), 200)).astype(int)
-    q, v, a = (np.asarray(x, model.home.dtype)[few] for x in (log.q, log.v, a))
+    count = len(signals[0])
+    few = np.linspace(0, count - 1, min(count, 200)).astype(int)
+    q, v, a = (np.asarray(x, model.home.dtype)[few] for x in signals)
     effect = regressor(model, q, v, a, v_s=float(chart.v_s)) @ np.asarray(_parameter_jacobian(chart, point), np.float64)
     rows = np.linalg.solve(np.asarray(_mass_matrices(model, jnp.asarray(q)), np.float64), effect)
     rows *= span / np.sqrt(3) / np.asarray(problem.scale, np.float64)[1][:, None]

@@ -22,6 +22,9 @@ from jaxdyn.scale.store import Store, full_disk, packages
 
 LISTED = 1000  # failures that a result lists
 PROGRAM = "program of a rollout (scene, control, solver, functions)"  # how a store names its hash
+MEASURED = "measured"  # of a cost that nobody has to know
+BATCHES = 16  # of a chunk at least, where rollouts are put in order within chunks
+LEAST_LANES = 64  # of a device then
 LEFTOVER = 600.0  # s, after which a file that was not finished is nobody's, where there are several processes
 
 
@@ -35,7 +38,8 @@ class Run:
     - `reductions`: the arrays of each reduction, by its name and theirs.
     - `computed`: rollouts computed by this process in this call; `seconds`, of the loop, without compilation. `repaired`: chunks
       of before that were not whole and were computed again. `lanes`: rollouts at once; `program_bytes`: memory of their program
-      and its results, by XLA's account.
+      and its results, by XLA's account. `waiting`: steps that lanes waited for, until the slowest of a batch was done, over
+      those that rollouts needed, in this call; 1 where nobody waits, NaN where no steps are counted.
     """
 
     out: Path
@@ -49,6 +53,7 @@ class Run:
     repaired: tuple[int, ...]
     lanes: int
     program_bytes: int
+    waiting: float
 
     @property
     def success(self) -> bool:
@@ -88,8 +93,17 @@ class Options:
     units: Mapping[str, str]
 
 
-def whole(describe: Callable[[Any], Described], words: dict[str, Any], batch: Members, options: Options) -> Run:
-    """Compute a batch that `describe(reductions)` describes; `words` tell it from others, by argument."""
+def whole(
+    describe: Callable[[Any], Described],
+    words: dict[str, Any],
+    batch: Members,
+    options: Options,
+    pilot: Callable | None = None,
+) -> Run:
+    """Compute a batch that `describe(reductions)` describes; `words` tell it from others, by argument.
+
+    `pilot(drawn, row)` counts the steps of a short part of a rollout, for a cost that is measured.
+    """
     packages()
     path = as_path(options.out, "out")
     if not path.parent.is_dir():
@@ -103,7 +117,15 @@ def whole(describe: Callable[[Any], Described], words: dict[str, Any], batch: Me
     reductions = checked_reductions(options.reductions)
     found = describe(reductions)
     kept = _kept(found, options.rows)
-    order = _order(options.cost, batch)
+    if isinstance(options.cost, str):
+        if options.cost != MEASURED or pilot is None:
+            raise ValueError(
+                f"cost is {options.cost!r}; give a function of the parameters, an array of one number for each rollout, or, "
+                f"to jd.scale.run with adaptive steps, {MEASURED!r}"
+            )
+    else:
+        pilot = None
+    order = None if pilot else _order(options.cost, batch)
     reducer = Reducer(reductions, found.shapes, found.variables)
     job = driver.Job(order, reducer, kept, found.codes, process)
     description = (
@@ -121,14 +143,18 @@ def whole(describe: Callable[[Any], Described], words: dict[str, Any], batch: Me
             store.check(description)
             store.remove_leftovers(0.0 if process.count == 1 else LEFTOVER)
         lanes = options.lanes or _lanes(devices, batch.count, process.count, row_bytes)
+        if pilot and not options.lanes:
+            lanes = max(len(devices) * LEAST_LANES, lanes // BATCHES)
         memory = options.memory
         if memory is None and process.count > 1:  # which of them share this host is not known
             memory = int(program.SHARE * program.available_memory(devices) / process.count)
         compiled = program.Program(found.one, batch, devices, lanes, memory)
+        if pilot:
+            job.pilot = program.Program(pilot, batch, devices, compiled.lanes, memory)
         if store is None:
             variables = [found.variables[name] for name in kept] + reducer.variables
             variables = [replace(one, compressed=one.compressed or options.compress) for one in variables]
-            chunk = options.chunk or _chunk(job, compiled, row_bytes)
+            chunk = options.chunk or max(_chunk(job, compiled, row_bytes), BATCHES * compiled.lanes if pilot else 0)
             programs = {PROGRAM: program.fingerprint(found.one, batch), "lowered program": compiled.lowered}
             store = Store.create(
                 path, variables, found.coordinates(order), description | programs, batch.count, min(chunk, batch.count)
@@ -154,6 +180,7 @@ def whole(describe: Callable[[Any], Described], words: dict[str, Any], batch: Me
         tuple(repaired),
         compiled.lanes,
         compiled.bytes,
+        job.tally.ratio,
     )
 
 

@@ -8,7 +8,7 @@ is killed. While a chunk is computed a thread writes the one before.
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -25,7 +25,26 @@ from jaxdyn.scale.store import Store
 SECONDS = 2.0  # of computing to a chunk, if it may be so large
 BYTES = 2**25  # of rows in a chunk
 SHARES = 8  # chunks to a process at least, so that all end at about the same time
+STEPS = "num_steps"  # of a rollout, by this name among its arrays
 POLL = 0.2  # s between looks at what other processes still do
+
+
+@dataclass
+class Tally:
+    """Steps that rollouts needed, and steps that the lanes of their batches waited for; of one process."""
+
+    needed: int = 0
+    waited: int = 0
+
+    def add(self, steps: np.ndarray, devices: int) -> None:
+        """A batch: each device's lanes go on until its slowest one is done."""
+        self.needed += int(steps.sum())
+        self.waited += int(steps.reshape(devices, -1).max(1).sum()) * (len(steps) // devices)
+
+    @property
+    def ratio(self) -> float:
+        """Steps waited for to those needed; NaN where none were counted."""
+        return self.waited / self.needed if self.needed else float("nan")
 
 
 @dataclass
@@ -33,7 +52,8 @@ class Job:
     """All that the loop needs.
 
     `order` (count,): numbers of the rollouts in the order in which they are computed and stored, None for that of their
-    numbers. `kept`: names of the arrays of a rollout that are stored. `codes`: names of result codes.
+    numbers. `kept`: names of the arrays of a rollout that are stored. `codes`: names of result codes. `pilot`: a program that
+    counts the steps of a short part of rollouts, or None.
     """
 
     order: np.ndarray | None
@@ -41,6 +61,8 @@ class Job:
     kept: tuple[str, ...]
     codes: tuple[str, ...]
     process: Process
+    pilot: Program | None = None
+    tally: Tally = field(default_factory=Tally)
 
     def numbers(self, places: slice) -> np.ndarray:
         """Numbers of the rollouts at these places of the store."""
@@ -59,7 +81,16 @@ def chunk_size(seconds: float, lanes: int, row_bytes: int, count: int, processes
     return min(lanes * max(1, int(batches)), count)
 
 
-def compute(program: Program, numbers: np.ndarray) -> dict[str, np.ndarray]:
+def by_cost(program: Program, pilot: Program, numbers: np.ndarray, tally: Tally) -> dict[str, np.ndarray]:
+    """Rows of these rollouts, computed by falling steps of a short part of each, so that those of a batch take about equally
+    many; in the order of `numbers`."""
+    order = np.argsort(-compute(pilot, numbers)[STEPS].astype(np.int64), kind="stable")
+    rows = compute(program, numbers[order], tally)
+    place = np.argsort(order)
+    return {name: values[place] for name, values in rows.items()}
+
+
+def compute(program: Program, numbers: np.ndarray, tally: Tally | None = None) -> dict[str, np.ndarray]:
     """Rows of these rollouts; two batches are under way at a time."""
     found: dict[str, np.ndarray] = {}
     starts = range(0, len(numbers), program.lanes)
@@ -73,6 +104,8 @@ def compute(program: Program, numbers: np.ndarray) -> dict[str, np.ndarray]:
                 found[name] = np.empty((len(numbers), *values.shape[1:]), values.dtype)
             part = found[name][begin : begin + program.lanes]
             part[...] = values[: len(part)]
+            if name == STEPS and tally is not None:
+                tally.add(values, len(program.devices))
 
     for begin in starts:
         under_way.append((begin, program.start(numbers[begin : begin + program.lanes])))
@@ -104,7 +137,10 @@ def fill(job: Job, program: Program, store: Store, lock: Lock, meter: Progress, 
                 lock.release(chunk)
                 continue
             numbers = job.numbers(store.rows(chunk))
-            rows = compute(program, numbers)
+            if job.pilot is None:
+                rows = compute(program, numbers, job.tally)
+            else:
+                rows = by_cost(program, job.pilot, numbers, job.tally)
             if written is not None:
                 written.result()
             written = writer.submit(write, chunk, numbers, rows)

@@ -10,10 +10,13 @@ from jaxdyn.model.arguments import as_array
 from jaxdyn.model.printed import scene_lines
 from jaxdyn.scale.batch import Options, Run, whole
 from jaxdyn.scale.described import described_function, described_motion
+from jaxdyn.scale.driver import STEPS
 from jaxdyn.scale.members import digest, members
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers.inputs import check_times
 from jaxdyn.systems.scene import Scene
+
+SHARE = 0.05  # of the times that are simulated to measure what a rollout costs
 
 
 def run(
@@ -61,7 +64,9 @@ def run(
       are left out of them. They are variables NAME_PART of the store.
     - `rows`: True to store all arrays, False for none (codes and reductions alone), or the names of those to store.
     - `cost`: a function `cost(parameters)` or an array (samples,): about how long a rollout takes, in any unit. Rollouts are
-      computed and stored in the order of falling cost, so that those of one batch take about equally many steps.
+      computed and stored in the order of falling cost, so that those of one batch take about equally many steps. Or "measured",
+      where nobody knows, for adaptive steps: the first twentieth of the times is simulated first, and the rollouts of a chunk
+      are computed by falling steps of that; they are stored in the order of their numbers.
     - `units`: of parameters, by name.
     - `process`: (index, count) of this process among those that write to the store; by default as `jax.distributed` or the
       environment (Slurm, Open MPI, an indexed job of Kubernetes with JAXDYN_PROCESSES) says. They exchange nothing: each
@@ -115,15 +120,25 @@ def run(
             (named if value.ndim > 1 else fixed)[name] = value
     batch = members(named, draw, samples, seed)
 
-    def one(drawn: Any, row: Any) -> tuple[Any, Any, Any]:
+    def begun(drawn: Any, row: Any) -> tuple[Any, Any, Any, Any]:
         own = drawn if draw is not None else row.get("parameters")
         built = scene(own) if builds else scene
         law = control
         if isinstance(built, tuple):
             built, law = built
         start: Any = states(own) if callable(states) else [(row | fixed)[name] for name in ("q0", "v0")]
-        q0, v0 = start
+        return built, law, *start
+
+    def one(drawn: Any, row: Any) -> tuple[Any, Any, Any]:
+        built, law, q0, v0 = begun(drawn, row)
+        own = drawn if draw is not None else row.get("parameters")
         return simulate(built, q0, v0, ts, control=law, throw=False, **options), built, own
+
+    def pilot(drawn: Any, row: Any) -> dict[str, Any]:
+        built, law, q0, v0 = begun(drawn, row)
+        early = np.array([ts[0], ts[0] + SHARE * (ts[-1] - ts[0])])
+        found = simulate(built, q0, v0, early, control=law, throw=False, **{**options, "outputs": ()})
+        return {STEPS: found.stats[STEPS]}
 
     if not builds and not isinstance(scene, Scene):
         scene = Scene(scene)
@@ -135,7 +150,10 @@ def run(
     shared = Options(
         out, reductions, rows, cost, process, devices, lanes, chunk, memory, compress, verify, progress, units or {}
     )
-    return whole(lambda reducing: described_motion(one, batch, reducing, shared.units, ts), given, batch, shared)
+    adaptive = pilot if options.get("stepsize") is None else None
+    return whole(
+        lambda reducing: described_motion(one, batch, reducing, shared.units, ts), given, batch, shared, adaptive
+    )
 
 
 def evaluate(

@@ -1,0 +1,246 @@
+"""For whoever has a GPU: dynamics and rollouts there with their roofline. Nothing of this has been run on one by us.
+
+    python -m benchmarks.gpu [--batches 4096 65536] [--robots panda g1] [--steps 100]
+    python -m benchmarks.gpu --count [--robots panda]
+
+Times are those of the first device of `jax.devices()`: best of some calls, in float32. The roofline is the larger of two
+times: operations over the operations a second that a long chain of multiply-adds reaches on this device, and bytes over the
+bytes a second that adding two long arrays reaches, both measured here; counts are by XLA's account of the compiled program.
+On a CPU, whose kernels XLA cannot see into, the tables have no roofline.
+
+`--count` compiles for an H100 without one, where the CUDA plugin is installed (`pip install jax-cuda12-plugin
+jax-cuda12-pjrt nvidia-cuda-nvcc-cu12`, of jax's version), and counts what a call launches: kernels, calls of libraries
+(cuSOLVER, cuBLAS), callbacks of the host.
+"""
+
+import argparse
+import importlib.util
+import os
+import re
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+
+if "--count" in sys.argv:  # with the platform of the host alone the plugin looks for no driver
+    os.environ["JAX_PLATFORMS"] = "cpu"
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxdyn as jd
+
+# What XLA has to know of an H100 SXM to compile for it: NVIDIA's data sheet, and limits of compute capability 9.0.
+H100 = """
+gpu_device_info {
+  threads_per_block_limit: 1024 threads_per_warp: 32 shared_memory_per_block: 49152 shared_memory_per_core: 233472
+  threads_per_core_limit: 2048 core_count: 132 fpus_per_core: 128 block_dim_limit_x: 2147483647 block_dim_limit_y: 65535
+  block_dim_limit_z: 65535 memory_bandwidth: 3352320000000 l2_cache_size: 52428800 clock_rate_ghz: 1.98
+  device_memory_size: 84942979072 shared_memory_per_block_optin: 232448 cuda_compute_capability { major: 9 }
+  registers_per_core_limit: 65536 registers_per_block_limit: 65536
+}
+platform_name: "CUDA"
+dnn_version_info { major: 9 minor: 8 patch: 0 }
+runtime_version { major: 12 minor: 9 patch: 0 }
+"""
+# Instructions of a compiled program that launch nothing.
+FREE = {"parameter", "constant", "bitcast", "tuple", "get-tuple-element", "after-all", "partition-id", "replica-id"}
+LIBRARIES = ("cublas", "cusolver", "cudnn", "cufft")
+
+
+def robot(name: str):
+    """A robot in float32."""
+    if name == "iiwa":
+        return jd.robots.iiwa(dtype=jnp.float32)
+    from benchmarks.dynamics import load
+
+    return load(name)[0]
+
+
+def functions(name: str, steps: int) -> dict[str, tuple[Callable, tuple[int, ...]]]:
+    """What is measured of a robot, or of "four-bar": functions of one sample, and the lengths of their arguments."""
+    if name == "four-bar":
+        scene = jd.scenes.four_bar()
+        sizes = (scene.nq, scene.nv)
+        return {"constrained dynamics": (lambda q, v: jd.constrained_dynamics(scene, q, v).acceleration, sizes)}
+    model = robot(name)
+    ts = np.linspace(0.0, 1e-3 * steps, 2)
+
+    def rollout(q, v):
+        return jd.simulate(model, q, v, ts, stepsize=1e-3, throw=False).q[-1]
+
+    def gradient(q, v, tau):
+        return jax.grad(lambda *x: jnp.sum(jd.forward_dynamics(model, *x)), (0, 1, 2))(q, v, tau)
+
+    three = (model.nq, model.nv, model.nv)
+    return {
+        "forward dynamics": (lambda q, v, tau: jd.forward_dynamics(model, q, v, tau), three),
+        "inverse dynamics": (lambda q, v, a: jd.inverse_dynamics(model, q, v, a), three),
+        "gradient of forward dynamics": (gradient, three),
+        f"RK4 rollout, {steps} steps": (rollout, three[:2]),
+    }
+
+
+# --- counted without a device ---
+
+
+def why_not() -> str | None:
+    """Why nothing can be compiled for a GPU here, or None."""
+    missing = [name for name in ("jax_cuda12_plugin", "jax_plugins.xla_cuda12") if not _is_there(name)]
+    return f"{', '.join(missing)} is not installed" if missing else None
+
+
+def _is_there(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def compiled_text(function: Callable, *args) -> str:
+    """The program of XLA for an H100 of a function of `jax.ShapeDtypeStruct`s. No device is needed."""
+    from jax.experimental import topologies
+
+    topology = topologies.get_topology_desc(platform="cuda", target_config=H100, topology="1x1x1")
+    here = jax.NamedSharding(jax.sharding.Mesh(np.array(topology.devices), ("x",)), jax.P())
+    return jax.jit(function, in_shardings=here).trace(*args).lower().compile().as_text()
+
+
+def launches(text: str) -> dict:
+    """What a compiled program launches: kernels once, kernels of each turn of its loops, libraries, callbacks of the host."""
+    computations: dict[str, list[tuple[str, str]]] = {}
+    name = entry = ""
+    for line in text.splitlines():
+        head = re.match(r"(ENTRY )?%?([\w.\-]+) .*-> .*\{$", line)
+        if head and not line.startswith(" "):
+            name = head.group(2)
+            computations[name] = []
+            entry = name if head.group(1) else entry
+            continue
+        found = re.match(r"\s+(?:ROOT )?%?[\w.\-]+ = (?:\(.*?\)|\S+) ([\w\-]+)\(", re.sub(r"/\*.*?\*/", "", line))
+        if found and name:
+            computations[name].append((found.group(1), line))
+
+    def walk(name: str) -> Counter:
+        count: Counter = Counter()
+        for op, line in computations[name]:
+            called = re.findall(
+                r"(?:body|condition|to_apply|calls|branch_computations)=\{?((?:%[\w.\-]+(?:, )?)+)", line
+            )
+            inner = [x for group in called for x in re.findall(r"%([\w.\-]+)", group)]
+            if op in ("while", "conditional", "call"):
+                key = "each turn" if op == "while" else "once"
+                for part in map(walk, inner):
+                    count += Counter({key if k == "once" else k: n for k, n in part.items()})
+            elif op not in FREE:
+                target = re.search(r'custom_call_target="([^"]+)"', line)
+                target = target.group(1).lower() if target else ""
+                count["libraries"] += any(library in target for library in LIBRARIES)
+                count["callbacks"] += "callback" in target
+                count["once"] += 1
+        return count
+
+    found = walk(entry)
+    return {key: found[key] for key in ("once", "each turn", "libraries", "callbacks")}
+
+
+def count(names, batches, steps: int, wanted: str) -> None:
+    """Print what calls launch, of functions whose name has `wanted` in it."""
+    reason = why_not()
+    if reason:
+        print(f"nothing counted: {reason}")
+        return
+    print("| robot | function | batch | kernels once | kernels each turn of loops | libraries | callbacks | s |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name in names:
+        for label, (function, sizes) in functions(name, steps).items():
+            for batch in batches if wanted in label else ():
+                args = [jax.ShapeDtypeStruct((batch, n), jnp.float32) for n in sizes]
+                before = time.perf_counter()
+                found = launches(compiled_text(jax.vmap(function), *args))
+                row = [name, label, batch, *found.values(), f"{time.perf_counter() - before:.0f}"]
+                print("| " + " | ".join(map(str, row)) + " |", flush=True)
+
+
+# --- measured on a device ---
+
+
+def seconds(call: Callable, *args, rounds: int = 10) -> float:
+    """The best of some calls."""
+    jax.block_until_ready(call(*args))
+    times = []
+    for _ in range(rounds):
+        before = time.perf_counter()
+        jax.block_until_ready(call(*args))
+        times.append(time.perf_counter() - before)
+    return min(times)
+
+
+def peaks(size: int) -> tuple[float, float]:
+    """Operations and bytes a second that this device reaches, on arrays of `size` numbers."""
+    x = jnp.ones(size, jnp.float32)
+    chain = jax.jit(lambda x: jax.lax.fori_loop(0, 64, lambda _, y: y * x + x, x))
+    unrolled = jax.jit(lambda x: jax.lax.fori_loop(0, 4, lambda _, y: _chained(y, x), x))
+    operations = max(2 * 64 * size / seconds(chain, x), 2 * 4 * 64 * size / seconds(unrolled, x))
+    return operations, 3 * 4 * size / seconds(jax.jit(jnp.add), x, 2 * x)
+
+
+def _chained(y, x):
+    for _ in range(64):
+        y = y * x + x
+    return y
+
+
+def measure(names, batches, steps: int, size: int) -> None:
+    """Print times with their roofline."""
+    device = jax.devices()[0]
+    is_gpu = device.platform == "gpu"
+    print(f"device: {device.device_kind} ({device.platform}), float32, jax {jax.__version__}")
+    if not is_gpu:
+        print(
+            "no GPU here: the figures below are those of this CPU, without roofline; on GPUs nothing has been run by us"
+        )
+    else:
+        operations, bandwidth = peaks(size)
+        print(f"reached by a chain of multiply-adds: {operations:.3g} 1/s; by adding arrays: {bandwidth:.3g} B/s")
+    print("| robot | function | batch | us a call | samples/s | operations | bytes | roofline us | share |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for name in names:
+        for label, (function, sizes) in functions(name, steps).items():
+            for batch in batches:
+                keys = jax.random.split(jax.random.key(0), len(sizes))
+                args = [
+                    0.3 * jax.random.normal(key, (batch, n), jnp.float32) for key, n in zip(keys, sizes, strict=True)
+                ]
+                program = jax.jit(jax.vmap(function)).lower(*args).compile()
+                took, rest = seconds(program, *args), ["-"] * 4
+                if is_gpu:
+                    cost = program.cost_analysis() or {}
+                    flops, moved = cost.get("flops", 0.0), cost.get("bytes accessed", 0.0)
+                    least = max(flops / operations, moved / bandwidth)
+                    rest = [f"{flops:.3g}", f"{moved:.3g}", f"{1e6 * least:.3g}", f"{least / took:.2f}"]
+                row = [name, label, batch, f"{1e6 * took:.3g}", f"{batch / took:.3g}", *rest]
+                print("| " + " | ".join(map(str, row)) + " |", flush=True)
+
+
+def main() -> None:
+    """Print the tables that were asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--batches", type=int, nargs="+", default=[4096, 65536])
+    parser.add_argument("--robots", nargs="+", default=["panda", "g1", "four-bar"], help="panda, g1, iiwa, four-bar")
+    parser.add_argument("--steps", type=int, default=100, help="of a rollout")
+    parser.add_argument(
+        "--size", type=int, default=2**26, help="numbers in an array that measures what a device reaches"
+    )
+    parser.add_argument("--count", action="store_true", help="count launches by compiling for an H100, without one")
+    parser.add_argument("--only", default="", help="with --count: part of the names of functions")
+    args = parser.parse_args()
+    if args.count:
+        count(args.robots, args.batches, args.steps, args.only)
+    else:
+        measure(args.robots, args.batches, args.steps, args.size)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""What programs would launch on a GPU, counted by compiling for one: none is needed, but the CUDA plugin is."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+from benchmarks import gpu
+from jaxdyn.compile.trigonometry import cosine, sine
+
+
+def test_forward_dynamics_calls_no_library_and_no_host():
+    """One kernel of the dynamics, and one or two that put its columns together."""
+    reason = gpu.why_not()
+    if reason:
+        pytest.skip(f"nothing can be compiled for a GPU: {reason}")
+    command = [sys.executable, "-m", "benchmarks.gpu", "--count", "--robots", "iiwa", "--batches", "1", "4096"]
+    root = Path(jd.__file__).parents[1]
+    done = subprocess.run(
+        [*command, "--only", "forward dynamics"], cwd=root, capture_output=True, text=True, timeout=900
+    )
+    rows = [[cell.strip() for cell in line.split("|")[2:8]] for line in done.stdout.splitlines()[2:]]
+    counted = {(label, batch): counts for label, batch, *counts in rows}
+    # Kernels once and each turn of a loop, calls of libraries, callbacks.
+    assert counted["forward dynamics", "4096"] == ["2", "0", "0", "0"], done.stderr[-2000:]
+    assert counted["forward dynamics", "1"] == ["3", "0", "0", "0"]
+
+
+def test_launches_are_counted_in_the_text_of_a_program():
+    text = """
+%fused (p: f32[4]) -> f32[4] {
+  %p = f32[4]{0} parameter(0)
+  ROOT %s = f32[4]{0} sine(%p)
+}
+%body (c: (s32[], f32[4])) -> (s32[], f32[4]) {
+  %c = (s32[], f32[4]{0}) parameter(0)
+  %x = f32[4]{0} get-tuple-element(%c), index=1
+  %f = f32[4]{0} fusion(%x), kind=kLoop, calls=%fused
+  %g = f32[4]{0} custom-call(%f), custom_call_target="__cublas$gemm"
+  ROOT %t = (s32[], f32[4]{0}) tuple(%i, %g)
+}
+%condition (c.1: (s32[], f32[4])) -> pred[] {
+  %c.1 = (s32[], f32[4]{0}) parameter(0)
+  ROOT %less = pred[] fusion(%c.1), kind=kLoop, calls=%fused
+}
+ENTRY %main (q: f32[4]) -> f32[4] {
+  %q = f32[4]{0} parameter(0)
+  %h = f32[4]{0} custom-call(%q), custom_call_target="xla_ffi_python_gpu_callback"
+  %w = (s32[], f32[4]{0}) while(%tuple), condition=%condition, body=%body
+  ROOT %o = f32[4]{0} get-tuple-element(%w), index=1
+}
+"""
+    assert gpu.launches(text) == {"once": 1, "each turn": 3, "libraries": 1, "callbacks": 1}
+
+
+def test_the_benchmark_for_gpus_runs_to_its_end_without_one(capsys):
+    gpu.measure(["iiwa"], [4], steps=2, size=2**10)
+    printed = capsys.readouterr().out
+    assert "no GPU here" in printed
+    assert [line.split("|")[2].strip() for line in printed.splitlines()[-4:]] == [
+        "forward dynamics", "inverse dynamics", "gradient of forward dynamics", "RK4 rollout, 2 steps"
+    ]  # fmt: skip
+    assert all(rate > 0 for rate in gpu.peaks(2**10))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_sines_of_polynomials(dtype):
+    """To a unit and a half in the last place of one, within ten turns and at numbers that are none."""
+    x = np.concatenate([np.linspace(-63.0, 63.0, 4001), np.arange(-40, 41) * np.pi / 4]).astype(dtype)
+    exact = x.astype(np.longdouble)
+    for found, want in ((sine(jnp.asarray(x)), np.sin(exact)), (cosine(jnp.asarray(x)), np.cos(exact))):
+        assert found.dtype == dtype
+        assert np.abs(np.asarray(found) - want).max() < 1.5 * np.finfo(dtype).eps
+    odd = jnp.asarray([0.0, jnp.inf, -jnp.inf, jnp.nan], dtype)
+    assert float(sine(odd)[0]) == 0.0 and float(cosine(odd)[0]) == 1.0
+    assert np.isnan(np.asarray(sine(odd)))[1:].all() and np.isnan(np.asarray(cosine(odd)))[1:].all()
