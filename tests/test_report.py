@@ -94,7 +94,7 @@ def test_turning_closed_forms_solve_the_equations():
     )
     np.testing.assert_allclose(turned.apply(found.v[:, :3]), np.outer(0.5 + pull * ts, [1, 0, 0]), atol=1e-13)
     np.testing.assert_allclose(found.v[:, 4] * 0.1, 0.5 + pull * ts, atol=1e-14)
-    found, r = falling_table(ts), 0.52
+    found, r = falling_table(ts), 0.145
     moment = 20 * (1 + 0.05**2) / 12 + (0.2**2 + 0.24**2) / 12 + r**2
     start = [found.q[0, 7], 0.0]
     solved = solve_ivp(

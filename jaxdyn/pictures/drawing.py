@@ -10,12 +10,13 @@ from jaxdyn.constraints.base import layout
 from jaxdyn.model.arguments import as_array, as_path
 from jaxdyn.pictures.inferred import place_of
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, joint_axes, marks, motion_of
-from jaxdyn.pictures.solids import simplified
+from jaxdyn.pictures.solids import finer, simplified
 from jaxdyn.pictures.stage import AXIS, FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
 
 _MOST_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
 _SIDES = 24  # of a round cone
-CONE_HEIGHT = 0.17  # of a friction cone, as a share of the mechanism's size
+CONE_HEIGHT = 0.13  # of a friction cone, as a share of the mechanism's size
+_LONGEST = 0.1  # side of a triangle, as a share of the mechanism's size: by its middle matplotlib sorts what hides what
 _LIGHT = np.array([0.4, -0.5, 0.77])
 
 
@@ -32,8 +33,8 @@ def draw(scene, q, ax=None, *, shapes=None, multipliers=None) -> Any:
 
     **Returns:** the axes, in m, axes of the world; `ax.figure.savefig(path)` writes the picture. Blue lines are axes
     of joints, orange circles loops and contacts, dashed lines distances. Orange cones are the friction cones of the scene,
-    around the forces that neither pull nor slip; red arrows are forces, those of contacts on the object, the largest of them a
-    quarter of the mechanism long.
+    around the forces that neither pull nor slip; red arrows are forces, those of contacts on the object; the longest is as
+    long as the cones are high, or a quarter of the mechanism.
 
     **Raises:** ValueError for a system without bodies, a q or multipliers that do not fit, and axes that are not 3D. ImportError
     without matplotlib.
@@ -115,6 +116,7 @@ class _Picture:
         self.solids = []
         for shape in parts:
             vertices, faces = simplified(*shape.triangles(), _MOST_VERTICES)
+            vertices, faces = finer(vertices, faces, _LONGEST * self.stage.size)
             self.solids.append((shape.frame, vertices, faces, np.array(color_of(shape, model)), shape.opacity))
         self.axes, self.marks, self.forces = joint_axes(motion), marks(motion), forces(motion)
         self.cones = cones(motion)
@@ -150,12 +152,11 @@ class _Picture:
             shades = np.concatenate(colors)
             # Edges in the colour of their face close the seams that smoothing leaves between faces.
             # Those of a translucent face would show twice.
-            seams = shades * [1, 1, 1, 0] if self.cones else shades
-            seams[:, 3] = np.where(shades[:, 3] >= 1, 1.0, 0.0)
+            seams = np.concatenate([shades[:, :3], shades[:, 3:] >= 1], axis=1)
             faces = Poly3DCollection(np.concatenate(corners), facecolors=shades, edgecolors=seams, linewidths=0.3)
             self.drawn.append(ax.add_collection3d(faces))
         self._lines(row, 0.06 * size)
-        self._arrows(row, 0.25 * size)
+        self._arrows(row, arrow_length(self.cones, self.stage.size))
 
     def _lines(self, row: int, length: float) -> None:
         for _, _, place, axis in self.axes:
@@ -173,7 +174,8 @@ class _Picture:
         for force, scale in scaled(self.forces, length):
             at, vector = force.places[0, row], force.vectors[0, row] * scale
             color = FORCE if force.kind == "force" else TORQUE
-            self.drawn.append(self.ax.quiver(*at, *vector, color=color, linewidth=1.6, arrow_length_ratio=0.2))
+            # Lines, unlike matplotlib's arrows, are drawn above the faces in front of them.
+            self.drawn += self.ax.plot(*arrow(at, vector).T, color=color, linewidth=1.8, zorder=20)
 
 
 def cone_sides(cone: Cone, row: int, height: float) -> np.ndarray:
@@ -188,6 +190,22 @@ def cone_sides(cone: Cone, row: int, height: float) -> np.ndarray:
         rim = axis + cone.slope * (np.cos(angles) * first + np.sin(angles) * np.cross(axis, first))
     rim = apex + height * rim
     return np.stack([np.broadcast_to(apex, rim[1:].shape), rim[:-1], rim[1:]], 1)
+
+
+def arrow(at: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Points (9, 3) of a line that draws an arrow: the shaft, then a head of four lines."""
+    tip, length = at + vector, np.linalg.norm(vector)
+    if not length > 0:
+        return np.broadcast_to(at, (2, 3))
+    first = np.cross(vector, np.eye(3)[np.argmin(np.abs(vector))])
+    first = 0.06 * length * first / np.linalg.norm(first)
+    second, back = np.cross(vector, first) / length, at + 0.8 * vector
+    return np.array([at, tip, back + first, tip, back - first, tip, back + second, tip, back - second])
+
+
+def arrow_length(shown: list[Cone], size: float) -> float:
+    """Length (m) of the longest arrow: a quarter of the mechanism, or that of its friction cones, within which it then lies."""
+    return size * (CONE_HEIGHT if shown else 0.25)
 
 
 def scaled(found, length: float):

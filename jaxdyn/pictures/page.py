@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.float64 import quaternion
-from jaxdyn.pictures.drawing import CONE_HEIGHT, cone_sides, scaled
+from jaxdyn.pictures.drawing import CONE_HEIGHT, arrow_length, cone_sides, scaled
 from jaxdyn.pictures.inferred import place_of
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, marks, motion_of
 from jaxdyn.pictures.solids import Shapes, by_frame, joined, sharpened, simplified
@@ -192,7 +192,7 @@ class _Content:
             self._add_bodies(n, meshes)
         self.marks = [(mark, self._ball(k)) for k, mark in enumerate(marks(motion))]
         self.cones = [(cone, self._cone(k, cone)) for k, cone in enumerate(cones(motion))]
-        self.forces = list(scaled(forces(motion), 0.25 * self.size))
+        self.forces = list(scaled(forces(motion), arrow_length([cone for cone, _ in self.cones], self.size)))
         self.arrows = None
         if self.forces:
             colors = np.array([rgb(FORCE if force.kind == "force" else TORQUE) for force, _ in self.forces])

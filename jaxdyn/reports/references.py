@@ -249,7 +249,7 @@ def rolling_down(
 
 
 def falling_table(
-    ts, tilt=0.02, size=(0.2, 0.16, 0.24), mass=1.0, table=(1.0, 0.6, 0.05), table_mass=20.0, height=0.4, gravity=9.81
+    ts, tilt=0.02, size=(0.2, 0.16, 0.24), mass=1.0, table=(1.0, 0.6, 0.05), table_mass=20.0, height=0.025, gravity=9.81
 ) -> Reference:
     """Box that stands on a table which falls over with it: a pendulum from rest near its highest place.
 

@@ -101,7 +101,7 @@ def allegro_with_cube(*, size=0.06, mass=0.1, mu=0.8, gravity=9.81) -> Grasp:
     return Grasp(robots.allegro(gravity=fall), cube.build(), point_contacts(places), cones=cones)
 
 
-def _table_start(tilt=0.02, rate=0.0, height=0.4, size=(0.2, 0.16, 0.24)):
+def _table_start(tilt=0.02, rate=0.0, height=0.025, size=(0.2, 0.16, 0.24)):
     s, c = np.sin(tilt), np.cos(tilt)
     center = height + size[2] / 2
     place = [center * s, 0.0, center * c, np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0]
@@ -111,7 +111,7 @@ def _table_start(tilt=0.02, rate=0.0, height=0.4, size=(0.2, 0.16, 0.24)):
 
 @named(_table_start)
 def box_on_table(
-    *, size=(0.2, 0.16, 0.24), mass=1.0, table=(1.0, 0.6, 0.05), table_mass=20.0, height=0.4, mu=0.4, gravity=9.81
+    *, size=(0.2, 0.16, 0.24), mass=1.0, table=(1.0, 0.6, 0.05), table_mass=20.0, height=0.025, mu=0.4, gravity=9.81
 ) -> Grasp:
     """A box that stands on a table by its whole base: six rows, and the wrench cone of a rectangle in place of a friction cone.
 
