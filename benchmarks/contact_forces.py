@@ -55,10 +55,10 @@ def ours(Q, q, G, S):
     h, c = jnp.zeros(20), jnp.zeros((4, 3))
 
     def pyramids(Q, q):
-        return jd.contact.solve_qp(Q, q, jnp.asarray(G), h)
+        return jd.contact.solve_qp(Q, q, G, h)
 
     def cones(Q, q):
-        return jd.contact.solve_qp(Q, q, cones=[(jnp.asarray(S), c)])
+        return jd.contact.solve_qp(Q, q, cones=[(S, c)])
 
     def gradient(Q, q):
         return jax.grad(lambda Q, q: jnp.sum(cones(Q, q).x ** 2), argnums=(0, 1))(Q, q)

@@ -15,7 +15,7 @@ from jaxdyn.pictures.stage import AXIS, FORCE, LOOP, TORQUE, Stage, all_solids, 
 
 _MOST_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
 _SIDES = 24  # of a round cone
-CONE_HEIGHT = 0.13  # of a friction cone, as a share of the mechanism's size
+CONE_HEIGHT = 0.095  # of a friction cone, as a share of the mechanism's size
 _LONGEST = 0.1  # side of a triangle, as a share of the mechanism's size: by its middle matplotlib sorts what hides what
 _LIGHT = np.array([0.4, -0.5, 0.77])
 
@@ -146,7 +146,9 @@ class _Picture:
         for cone in self.cones:
             sides = cone_sides(cone, row, CONE_HEIGHT * self.stage.size)
             corners.append(sides)
-            colors.append(np.tile([*rgb(LOOP), 0.25], (len(sides), 1)))
+            colors.append(np.tile([*rgb(LOOP), 0.2], (len(sides), 1)))
+            rim = np.concatenate([sides[:, 1], sides[-1:, 2]])
+            self.drawn += self.ax.plot(*rim.T, color=LOOP, linewidth=1.0, zorder=15)
         if corners:
             # One collection for all: depth is then sorted by triangles and not by bodies.
             shades = np.concatenate(colors)
