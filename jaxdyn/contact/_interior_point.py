@@ -215,9 +215,9 @@ def _iteration(pattern: Pattern, tol: float, target: float, _, program: Program,
     valid = inside & jnp.isfinite(measure)
     # Below the tolerance only what is better is taken.
     taken = valid & ((error > tol) | (measure < error))
-    kept = _where(taken & going, (new, left, measure), (point, residuals, error))
+    point, residuals, error = _where(taken & going, (new, left, measure), (point, residuals, error))
     ended = infeasible | (going & valid & _contradicts(program, new, tol))
-    return _State(*kept, ended, alive & (taken | ~going), steps + going.astype(steps.dtype))
+    return _State(point, residuals, error, ended, alive & (taken | ~going), steps + going.astype(steps.dtype))
 
 
 def _refinement(pattern: Pattern, _, program: Program, point: Point, error, alive):
@@ -309,8 +309,9 @@ def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End
         state, count = carry
         return run(_iteration, None, program, state, static=(pattern, tol, target)), count + 1
 
-    start, none = run(_start, None, program, static=(pattern,)), jnp.zeros((), bool)
-    begin = _State(*start, none, ~none, jnp.zeros((), program.q.dtype))
+    point, residuals, error = run(_start, None, program, static=(pattern,))
+    none = jnp.zeros((), bool)
+    begin = _State(point, residuals, error, none, ~none, jnp.zeros((), program.q.dtype))
     state, _ = lax.while_loop(going, advance, (begin, 0))
     last, _, error, infeasible, _, steps = state
 
