@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxdyn as jd
+from benchmarks.hand_figure import turned_ball
 
 # Length of the motion, s.
 SCENES = {
@@ -31,18 +32,30 @@ SCENES = {
     "hand_rolling_ball": 0.3,
     "coordinated_lifting": 0.5,
     "sphere_arm": 2.0,
+    "hand_with_ball": 2.0,
+    "hand_with_bar": 0.3,
+    "hand_with_disk": 0.3,
+    "hand_rolling_egg": 0.3,
+    "allegro_with_cube": 0.1,
+    "box_on_table": 4.0,
 }
+# Scenes whose pictures show the forces of their contacts.
+_FORCES = ("hand_with_ball", "box_on_table")
 _FRAMES = 40
 
 
 def write(name: str, folder: Path) -> float:
     """Write FOLDER/NAME.gif; returns its seconds."""
     began = time.perf_counter()
-    make = getattr(jd.scenes, name)
-    scene, start, duration = make(), make.start(), SCENES[name]
-    ts = jnp.linspace(0.0, duration, _FRAMES)
-    # Fingers that only roll, under no torques, would soon pull: the picture shows the motion that the rows allow.
-    motion = jd.simulate(scene, start[0], start[1], ts, contacts="report")
+    make, duration = getattr(jd.scenes, name), SCENES[name]
+    if name == "hand_with_ball":
+        scene, motion = turned_ball()
+    else:
+        scene, start = make(), make.start()
+        ts = jnp.linspace(0.0, duration, _FRAMES)
+        # Fingers under no torques would soon pull: the picture shows the motion that the rows allow.
+        outputs = ("multipliers",) if name in _FORCES else ()
+        motion = jd.simulate(scene, start[0], start[1], ts, contacts="report", outputs=outputs)
     partial = folder / f"{name}.part.gif"
     jd.animate(scene, motion, partial, fps=15, speed=duration * 15 / _FRAMES)
     partial.replace(folder / f"{name}.gif")

@@ -4,35 +4,42 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pinocchio_bridge import assert_close
-from scipy.spatial.transform import Rotation
 
 import jaxdyn as jd
 
-# Index and ring finger on one face of a cube of 60 mm, the thumb on the opposite one; the middle finger is free.
 PLACES = {
     "link_3.0_tip": ((0.03, 0.02, 0.0), (-1, 0, 0)),
     "link_15.0_tip": ((-0.03, 0.0, 0.0), (1, 0, 0)),
     "link_11.0_tip": ((0.03, -0.02, 0.01), (-1, 0, 0)),
 }
-GUESS = [-0.248, 0.833, 0.756, 0.583, 1.288, 0.56, 0.477, 0.493, 0.0, 0.9, 0.8, 0.6, 0.288, 0.946, 0.792, 0.585]
 
 
 @pytest.fixture(scope="module")
-def hand(robots_dir):
-    """The grasp and a configuration on its contacts."""
-    model = jd.load_urdf(robots_dir / "allegro_hand_description" / "urdf" / "allegro_right_hand.urdf")
-    cube = jd.ModelBuilder("cube", gravity=model.gravity).add_body(
-        "cube", None, "free", jd.inertia.box(0.1, (0.06,) * 3), joint_name="object"
-    )
-    cones = jd.contact.friction_cone("hard-finger", 0.8)
-    grasp = jd.grasp.Grasp(model, cube.build(), jd.grasp.point_contacts(PLACES), cones=cones)
-    x, y, z, w = Rotation.from_rotvec([0.404, -1.79, -0.078]).as_quat()
+def hand():
+    """The grasp, the place of the cube in q, and a configuration on its contacts."""
+    grasp = jd.scenes.allegro_with_cube()
     top = grasp.system.topology
-    q = np.zeros(grasp.nq)
-    place = top.q_slices[top.body_names.index("cube")]
-    q[place] = [0.108, 0.013, 0.004, w, x, y, z]
-    q[np.setdiff1d(np.arange(grasp.nq), np.arange(place.start, place.stop))] = GUESS
-    return grasp, place, jd.assemble(grasp, jnp.asarray(q)).q
+    return grasp, top.q_slices[top.body_names.index("cube")], jd.scenes.allegro_with_cube.start()[0]
+
+
+def test_the_hand_is_that_of_its_file(robots_dir):
+    """Every number of the built-in hand is the URDF's, and its damping and friction are left out."""
+    path = robots_dir / "allegro_hand_description" / "urdf" / "allegro_right_hand.urdf"
+    read, hand = jd.load_urdf(path), jd.robots.allegro()
+    for name in ("parents", "kinds", "joint_names", "body_names", "frame_names", "frame_bodies", "couplings"):
+        assert getattr(read.topology, name) == getattr(hand.topology, name), name
+    for name in ("home", "screws", "inertias", "frame_poses", "lower", "upper", "velocity_limit", "effort_limit"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(hand, name), err_msg=name)
+    assert not np.any(hand.damping) and not np.any(hand.friction)
+
+
+def test_the_fingers_move_with_the_cube(hand):
+    """The start is on the contacts and moves along them; a cube out of reach is refused."""
+    grasp, _, _ = hand
+    q, v = jd.scenes.allegro_with_cube.start()
+    assert float(jnp.abs(jd.constraint_jacobian(grasp, q) @ v).max()) < 1e-15
+    with pytest.raises(ValueError, match=r"link_3.0_tip cannot reach"):
+        jd.scenes.allegro_with_cube.start(position=(0.3, 0.0, 0.0))
 
 
 def test_allegro_hand_grasps_a_cube(hand):

@@ -13,7 +13,8 @@ import jaxdyn as jd
 from jaxdyn.io import NotTakenWarning
 from jaxdyn.model import float64 as f64
 from jaxdyn.pictures import inferred, motion
-from jaxdyn.pictures.solids import SIZES, Shape, Shapes, joined, sharpened, simplified
+from jaxdyn.pictures.drawing import cone_sides
+from jaxdyn.pictures.solids import SIZES, Shape, Shapes, finer, joined, sharpened, simplified
 
 WITH_BODIES = [name for name in jd.scenes.names() if isinstance(getattr(jd.scenes, name)().system, jd.Model)]
 
@@ -266,6 +267,56 @@ def test_force_of_a_wheel_is_at_its_contact_and_as_newton_has_it():
     # The ground is all that touches the coin: the force that its motion asks for.
     asked = np.asarray(jd.inverse_dynamics(scene.system, q, v, found.acceleration))[:3]
     np.testing.assert_allclose(force.vectors[0, 0], moved.poses[0, 0, 0, :3, :3] @ asked, atol=1e-10)
+
+
+def test_friction_cones_are_where_their_forces_are():
+    """Apex at the contact, axis along the force of a unit normal multiplier, the slope of the cone, and its sides."""
+    scene, q = jd.scenes.hand_with_ball(mu=0.6), jd.scenes.hand_with_ball.start()[0]
+    found = motion.cones(motion.motion_of(scene, q))
+    assert [cone.name for cone in found] == ["tip1", "tip2", "tip3"]
+    ball = np.asarray(jd.frame_pose(scene.system, q, "ball"))
+    for cone, one in zip(found, scene.constraints, strict=True):
+        frame = ball @ np.asarray(one.pose)
+        np.testing.assert_allclose(cone.apex[0, 0], frame[:3, 3], atol=1e-12)
+        np.testing.assert_allclose(cone.axis[0, 0], frame[:3, 2], atol=1e-12)
+        assert cone.slope == pytest.approx(0.6) and cone.across is None
+        sides = cone_sides(cone, 0, 0.1)
+        rim = (sides[:, 1] - frame[:3, 3]) @ frame[:3, :3]
+        np.testing.assert_allclose(rim[:, 2], 0.1, atol=1e-12)
+        np.testing.assert_allclose(np.hypot(rim[:, 0], rim[:, 1]), 0.06, atol=1e-12)
+    # In a plane the cone is a wedge in that plane; a scene without cones, and a surface, have none.
+    flat = motion.cones(motion.motion_of(jd.scenes.hand_with_bar(), jd.scenes.hand_with_bar.start()[0]))
+    assert len(flat) == 2 and all(abs(float(cone.across[0, 0, 2])) < 1e-12 for cone in flat)
+    assert cone_sides(flat[0], 0, 0.1).shape == (1, 3, 3)
+    for name in ("four_bar", "box_on_table"):
+        assert motion.cones(motion.motion_of(getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()[0])) == []
+
+
+def test_what_a_hand_holds_is_seen_through_and_has_its_shape():
+    """A ball with contacts on its surface, a cube of the same three moments, a bar between two contacts."""
+    shapes = {}
+    for name, held in (("hand_with_ball", "ball"), ("allegro_with_cube", "cube"), ("hand_with_bar", "bar")):
+        shapes[name] = [s for s in inferred.completed(getattr(jd.scenes, name)(), Shapes()) if s.frame == held]
+    (ball,), (cube,) = shapes["hand_with_ball"], shapes["allegro_with_cube"]
+    assert ball.kind == "ellipsoid" and ball.size == pytest.approx((0.1,) * 3) and 0 < ball.opacity < 0.5
+    assert cube.kind == "box" and cube.size == pytest.approx((0.06,) * 3) and 0 < cube.opacity < 0.5
+    assert [s.kind for s in shapes["hand_with_bar"]] == ["capsule"] * 2
+
+
+def test_triangles_are_cut_and_stay_the_surface():
+    vertices, faces = Shape("b", "box", (1.0, 0.5, 0.1)).triangles()
+    many, cut = finer(vertices, faces, 0.2)
+    sides = np.linalg.norm(many[np.roll(cut, -1, 1)] - many[cut], axis=2)
+    assert sides.max() <= 0.2 and len(cut) > len(faces)
+    assert volume(many, cut) == pytest.approx(0.05, rel=1e-12)
+
+
+def test_forces_are_drawn_where_they_are_given(tmp_path):
+    scene, q = jd.scenes.hand_with_ball(), jd.scenes.hand_with_ball.start()[0]
+    lines = [len(jd.draw(scene, q, multipliers=x).lines) for x in (None, np.ones(9))]
+    assert lines[1] - lines[0] == 3
+    with pytest.raises(ValueError, match=r"multipliers has shape \(4,\), expected \(9,\)"):
+        jd.draw(scene, q, multipliers=np.ones(4))
 
 
 def test_draw_and_animate(turning, solids, urdf, tmp_path):

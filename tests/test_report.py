@@ -21,13 +21,19 @@ from jaxdyn.reports.measure import Contestant, Motion, evaluations, flop_counter
 from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
 from jaxdyn.reports.records import Known
 from jaxdyn.reports.references import (
+    braked,
     car_axis,
     coin,
+    falling_table,
     free_top,
     integral,
     plane_pendulum,
+    rolling_down,
+    skate,
     sleigh,
     sphere_pendulum,
+    swing,
+    thrown,
     windows,
 )
 from jaxdyn.reports.timing import interleaved
@@ -48,6 +54,60 @@ def test_references_start_where_the_scenes_do():
         assert reference.q.shape == (len(reference.ts), len(q)), name
         np.testing.assert_allclose(reference.q[0], q, atol=1e-14, err_msg=name)
         np.testing.assert_allclose(reference.v[0], v, atol=1e-14, err_msg=name)
+
+
+def test_the_report_knows_every_scene():
+    """All of `jd.scenes`, immersed systems and hands included, are cases of their names."""
+    assert set(jd.scenes.names()) <= set(cases())
+    assert len(cases()) >= 48
+
+
+# Of closed forms: times, and the rates of a state by the equations of motion as a textbook has them, from q[0] and v[0].
+EQUATIONS = {
+    "swing": (swing, lambda q, v: [*v, -9.81 * np.sin(q[0])]),
+    "thrown": (thrown, lambda q, v: [*v, 0.0, -9.81]),
+    "braked": (braked, lambda q, v: [*v, -0.3 * 9.81]),
+    # The pull of the slope along the blade; what is across it the blade takes.
+    "skate": (skate, lambda q, v: [v[0] * np.cos(q[2]), v[0] * np.sin(q[2]), v[2], 9.81 / 2 * np.cos(q[2]), 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", EQUATIONS)
+def test_closed_forms_solve_the_equations(name):
+    """By scipy's DOP853."""
+    form, rates = EQUATIONS[name]
+    ts = np.linspace(0.0, 0.6, 4)
+    found = form(ts)
+    n = found.q.shape[1]
+    start = np.concatenate([found.q[0], found.v[0]])
+    solved = solve_ivp(lambda t, y: rates(y[:n], y[n:]), (0, 0.6), start, "DOP853", ts, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(np.concatenate([found.q, found.v], 1), solved.y.T, atol=1e-10)
+
+
+def test_turning_closed_forms_solve_the_equations():
+    """The ball that rolls down and the box that falls: one scalar equation each, places and turns by trigonometry."""
+    ts = np.linspace(0.0, 1.0, 6)
+    found, pull = rolling_down(ts), 5 / 14 * 9.81
+    turned = Rotation.from_quat(np.roll(found.q[:, 3:], -1, 1))
+    np.testing.assert_allclose(
+        turned.as_rotvec()[1], [0.0, (0.5 * ts[1] + pull * ts[1] ** 2 / 2) / 0.1, 0.0], atol=1e-13
+    )
+    np.testing.assert_allclose(turned.apply(found.v[:, :3]), np.outer(0.5 + pull * ts, [1, 0, 0]), atol=1e-13)
+    np.testing.assert_allclose(found.v[:, 4] * 0.1, 0.5 + pull * ts, atol=1e-14)
+    found, r = falling_table(ts), 0.145
+    moment = 20 * (1 + 0.05**2) / 12 + (0.2**2 + 0.24**2) / 12 + r**2
+    start = [found.q[0, 7], 0.0]
+    solved = solve_ivp(
+        lambda t, y: [y[1], 9.81 * r * np.sin(y[0]) / moment], (0, 1), start, "DOP853", ts, rtol=1e-12, atol=1e-14
+    )
+    np.testing.assert_allclose(found.q[:, 7], solved.y[0], atol=1e-11)
+    np.testing.assert_allclose(found.v[:, 6], solved.y[1], atol=1e-11)
+    turned = Rotation.from_quat(np.roll(found.q[:, 3:7], -1, 1))
+    np.testing.assert_allclose(turned.as_rotvec(), np.outer(found.q[:, 7], [0, 1, 0]), atol=1e-13)
+    np.testing.assert_allclose(found.q[:, :3], turned.apply([0, 0, r]), atol=1e-13)
+    np.testing.assert_allclose(
+        turned.apply(found.v[:, :3]), np.cross(found.v[:, 6:] * [0, 1, 0], found.q[:, :3]), atol=1e-13
+    )
 
 
 def test_plane_pendulum_has_the_printed_digits():

@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from jaxdyn.compile import run
+from jaxdyn.compile import any_in_batch, run
 from jaxdyn.contact import _jordan as jordan
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_factored
@@ -164,11 +164,12 @@ def _step(program: Program, point: Point, residuals) -> Point:
     mu = _gap(point)
     lam, solve = _newton(program, s, z)
 
-    def reach(ds, dz):
-        return jnp.min(jnp.stack([jordan.longest_step(v, dv) for v, dv in zip((*s, *z), (*ds, *dz), strict=True)]))
+    def exit_rate(wds, wdz):
+        # s + t ds leaves its cone where W^-1 s + t W^-1 ds does, and z + t dz where W z + t W dz does: both from lam.
+        return jnp.max(jnp.stack([jordan.exit_rate(v, dv) for v, dv in zip((*lam, *lam), (*wds, *wdz), strict=True)]))
 
-    _, ds, dz, wds, wdz = solve(rx, rz, _zip(lambda v: -v, lam), is_refined=False)
-    centring = (1 - jnp.minimum(reach(ds, dz), 1)) ** 3
+    *_, wds, wdz = solve(rx, rz, _zip(lambda v: -v, lam), is_refined=False)
+    centring = (1 - 1 / jnp.maximum(exit_rate(wds, wdz), 1)) ** 3
     u = _zip(
         lambda v, a, b: jordan.quotient(
             v, centring * mu * jordan.identity(v) - jordan.product(v, v) - jordan.product(a, b)
@@ -177,28 +178,55 @@ def _step(program: Program, point: Point, residuals) -> Point:
         wds,
         wdz,
     )
-    dx, ds, dz, *_ = solve(rx, rz, u)
-    length = jnp.minimum(0.99 * reach(ds, dz), 1)
+    dx, ds, dz, wds, wdz = solve(rx, rz, u)
+    length = 1 / jnp.maximum(exit_rate(wds, wdz) / 0.99, 1)
     move = lambda v, dv: v + length * dv  # noqa: E731
     return Point(move(x, dx), _zip(move, s, ds), _zip(move, z, dz))
 
 
-def _iteration(pattern: Pattern, tol: float, _, program: Program, point: Point, residuals, error):
-    """The next point, its residuals and their measure, whether it is a certificate, and whether it was taken."""
+class _State(NamedTuple):
+    """Where the interior point is: the point, its residuals, their measure, whether there is no solution, whether the last step
+    was taken, and the number of steps."""
+
+    point: Point
+    residuals: tuple
+    error: Array
+    infeasible: Bool[Array, ""]
+    alive: Bool[Array, ""]
+    steps: Array
+
+
+def _going(state: _State, target: float):
+    """Whether a sample has not ended."""
+    return (state.error > target) & ~state.infeasible & state.alive
+
+
+def _iteration(pattern: Pattern, tol: float, target: float, _, program: Program, state: "_State") -> "_State":
+    """The next point, its residuals and their measure, whether it is a certificate, and whether it was taken.
+
+    A sample that has ended stays as it is: in a batch the others go on.
+    """
     program = _sparse(program, pattern)
+    point, residuals, error, infeasible, alive, steps = state
+    going = _going(state, target)
     new = _step(program, point, residuals)
     inside = jnp.stack([jnp.all(jordan.depth(v) > 0) for v in (*new.s, *new.z)]).all()
     left, measure = _measured(program, new)
     valid = inside & jnp.isfinite(measure)
     # Below the tolerance only what is better is taken.
     taken = valid & ((error > tol) | (measure < error))
-    kept = _where(taken, (new, left, measure), (point, residuals, error))
-    return *kept, valid & _contradicts(program, new, tol), taken
+    point, residuals, error = _where(taken & going, (new, left, measure), (point, residuals, error))
+    ended = infeasible | (going & valid & _contradicts(program, new, tol))
+    return _State(point, residuals, error, ended, alive & (taken | ~going), steps + going.astype(steps.dtype))
 
 
-def _refinement(pattern: Pattern, _, program: Program, point: Point, error):
-    """A Newton step on the equations of the projection, its residual, and whether it was taken, where that is less."""
+def _refinement(pattern: Pattern, _, program: Program, point: Point, error, alive):
+    """A Newton step on the equations of the projection, its residual, and whether it was taken, where that is less.
+
+    A sample that is at rounding already, or whose last step was not taken, stays as it is.
+    """
     program = _sparse(program, pattern)
+    alive = alive & (error > 4 * float(jnp.finfo(error.dtype).eps))
     x, s, z = point
     v = _zip(lambda a, b: a - b, s, z)
 
@@ -215,7 +243,7 @@ def _refinement(pattern: Pattern, _, program: Program, point: Point, error):
     # Not less is also what a residual that is not a number is.
     better = less < residual
     new, residual = _where(better, there, here), jnp.where(better, less, residual)
-    better = residual < error
+    better = (residual < error) & alive
     return _where(better, new, point), jnp.where(better, residual, error), better
 
 
@@ -272,33 +300,35 @@ def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End
     # A step costs less than what it gains in accuracy, so steps go on below `tol` while they help.
     target = max(1e-3 * tol, 8 * eps)
 
+    # Where a sample has ended its numbers are kept by the kernel itself, so that the loop has one condition for the batch.
     def going(carry):
-        *_, error, infeasible, alive, steps = carry
-        return (steps < max_steps) & (error > target) & ~infeasible & alive
+        state, count = carry
+        return (count < max_steps) & any_in_batch(_going(state, target))
 
     def advance(carry):
-        *state, _, _, steps = carry
-        return *run(_iteration, None, program, *state, static=(pattern, tol)), steps + 1
+        state, count = carry
+        return run(_iteration, None, program, state, static=(pattern, tol, target)), count + 1
 
-    start = run(_start, None, program, static=(pattern,))
-    carry = (*start, jnp.zeros((), bool), jnp.ones((), bool), jnp.zeros((), jnp.int32))
-    last, _, error, infeasible, _, steps = lax.while_loop(going, advance, carry)
+    point, residuals, error = run(_start, None, program, static=(pattern,))
+    none = jnp.zeros((), bool)
+    begin = _State(point, residuals, error, none, ~none, jnp.zeros((), program.q.dtype))
+    state, _ = lax.while_loop(going, advance, (begin, 0))
+    last, _, error, infeasible, _, steps = state
 
     # Newton's method ends within rounding in two or three steps, where the interior point would lose its digits.
     def improving(carry):
-        _, tries, error, alive = carry
-        return (tries < REFINEMENTS) & alive & (error > 4 * eps)
+        (_, error, alive), count = carry
+        return (count < REFINEMENTS) & any_in_batch(alive & (error > 4 * eps))
 
     def refine(carry):
-        point, tries, error, _ = carry
-        point, error, alive = run(_refinement, None, program, point, error, static=(pattern,))
-        return point, tries + 1, error, alive
+        refined, count = carry
+        return run(_refinement, None, program, *refined, static=(pattern,)), count + 1
 
-    carry = (last, jnp.zeros((), jnp.int32), 10 * jnp.maximum(error, tol), ~infeasible)
-    refined, _, less, _ = lax.while_loop(improving, refine, carry)
+    carry = ((last, 10 * jnp.maximum(error, tol), ~infeasible), 0)
+    (refined, less, _), _ = lax.while_loop(improving, refine, carry)
     rest = (program, last, error, refined, less, infeasible)
     point, solved, infeasible = run(_end, None, *rest, static=(pattern, tol))
-    return End(point, steps, solved, infeasible)
+    return End(point, steps.astype(jnp.int32), solved, infeasible)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -1,6 +1,6 @@
 """Second-order cones {v : v0 >= |v1|} of R^d, many at once: arrays (k, d). Half-lines are those of d = 1.
 
-Products, the scaling of Nesterov and Todd, steps to the boundary, and the projection on the cone with its derivative.
+Products, the scaling of Nesterov and Todd, rates at which steps reach the boundary, the projection and its derivative.
 
 Source: Vandenberghe, The CVXOPT linear and quadratic cone program solvers (2010), sections 3-5; for the projection
 Fukushima, Luo & Tseng, SIAM J. Optim. 12 (2002), 436-460.
@@ -44,11 +44,12 @@ def product(a, b):
 
 def quotient(a, b):
     """x with product(a, x) = b."""
+    inverse = 1 / a[..., :1]
     if a.shape[-1] == 1:
-        return b / a
+        return b * inverse
     along = jnp.sum(a[..., 1:] * b[..., 1:], -1, keepdims=True)
-    x0 = (a[..., :1] * b[..., :1] - along) / determinant(a)[..., None]
-    return jnp.concatenate([x0, (b[..., 1:] - x0 * a[..., 1:]) / a[..., :1]], -1)
+    x0 = (a[..., :1] * b[..., :1] - along) * (1 / determinant(a))[..., None]
+    return jnp.concatenate([x0, (b[..., 1:] - x0 * a[..., 1:]) * inverse], -1)
 
 
 class Scaling(NamedTuple):
@@ -82,7 +83,8 @@ def _reflected(x):
 def scaling(s, z) -> Scaling:
     """The scaling of points s and z inside the cones."""
     if s.shape[-1] == 1:
-        return Scaling(jnp.ones_like(s), jnp.sqrt(s / z), jnp.sqrt(z / s))
+        shared = 1 / jnp.sqrt(s * z)
+        return Scaling(jnp.ones_like(s), s * shared, z * shared)
     norm_s, norm_z = jnp.sqrt(determinant(s))[..., None], jnp.sqrt(determinant(z))[..., None]
     beta = jnp.sqrt(norm_s / norm_z)
     s, z = s * (1 / norm_s), z * (1 / norm_z)
@@ -91,19 +93,20 @@ def scaling(s, z) -> Scaling:
     return Scaling((w + identity(w)) * (1 / jnp.sqrt(2 * (w[..., :1] + 1))), beta, 1 / beta)
 
 
-def longest_step(v, dv):
-    """Largest t, of all cones, with v + t dv in them; infinite where dv never leaves."""
-    falls = dv[..., 0] < 0
-    second = jnp.where(falls, -v[..., 0] / jnp.where(falls, dv[..., 0], 1), jnp.inf)
+def exit_rate(v, dv):
+    """Largest 1/t, of all cones, of the t > 0 at which v + t dv leaves them, for v inside; zero or less where it never does.
+
+    Inverses are of v alone: a program has each of them once, for all dv and for `quotient`.
+    """
+    second = -dv[..., 0] * (1 / v[..., 0])
     if v.shape[-1] == 1:
-        return jnp.min(second, initial=jnp.inf)
+        return jnp.max(second, initial=0)
     a = dv[..., 0] ** 2 - jnp.sum(dv[..., 1:] ** 2, -1)
     b = v[..., 0] * dv[..., 0] - jnp.sum(v[..., 1:] * dv[..., 1:], -1)
     c = determinant(v)
-    # The least positive root of a t^2 + 2 b t + c, in the form that does not cancel, and the root of v0 + t dv0.
-    slope = jnp.sqrt(jnp.maximum(b * b - a * c, 0)) - b
-    first = jnp.where(slope > 0, c / jnp.where(slope > 0, slope, 1), jnp.inf)
-    return jnp.min(jnp.minimum(first, second), initial=jnp.inf)
+    # Of the least positive root of a t^2 + 2 b t + c, in the form that does not cancel, and of the root of v0 + t dv0.
+    first = (jnp.sqrt(jnp.maximum(b * b - a * c, 0)) - b) * (1 / c)
+    return jnp.max(jnp.maximum(first, second), initial=0)
 
 
 def projection(v):

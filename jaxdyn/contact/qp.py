@@ -90,6 +90,7 @@ def solve_qp(Q, q, G=None, h=None, A=None, b=None, *, cones=(), tol: float | Non
         raise ValueError(f"Q has shape {Q.shape}, expected (n, n) with n > 0")
     q = as_float(q, "q", (n,), Q.dtype)
     _check_definite(Q)
+    given = G  # as it was given: what becomes an array while a program is traced is not known any more
     G, h = _pair(G, h, "G", "h", n, Q.dtype)
     A, b = _pair(A, b, "A", "b", n, Q.dtype)
     pairs = [cones] if len(cones) == 2 and hasattr(cones[0], "ndim") else list(cones)
@@ -101,7 +102,7 @@ def solve_qp(Q, q, G=None, h=None, A=None, b=None, *, cones=(), tol: float | Non
         checked.append((S, as_float(pair[1], f"cones[{i}]: c", S.shape[:2], Q.dtype)))
         if S.shape[1] == 0:
             raise ValueError(f"cones[{i}]: S has shape {S.shape}; a cone has at least one row")
-    groups = [G, *(pair[0] for pair in pairs)]
+    groups = [G if given is None else given, *(pair[0] for pair in pairs)]
     pattern = tuple(_pattern(g, A) for g in groups)
     if tol is None:
         tol = max(1e-9, float(jnp.finfo(Q.dtype).eps) ** 0.575)

@@ -1,4 +1,4 @@
-"""Built-in mechanisms: a real arm, and generators of chains and random trees."""
+"""Built-in mechanisms: a real arm and a real hand, and generators of chains and random trees."""
 
 import jax
 import numpy as np
@@ -61,6 +61,115 @@ def iiwa(*, gravity=GRAVITY, dtype=None) -> Model:
             upper=reach,
             velocity_limit=np.radians(_IIWA_DEGREES_PER_SECOND[i]),
             effort_limit=_IIWA_TORQUES[i],
+        )
+    return builder.build()
+
+
+# A finger of the Allegro hand from its palm to its tip: (mass, moments xx, yy, zz, products xy, yz, xz) of a link about its own
+# frame's origin, which is its centre of mass, kg and kg m^2; the length to the next link, m; and the limits of its joint, rad.
+_ALLEGRO_FINGER = (
+    (0.0119, (1.01666658333e-06, 6.47677333333e-07, 1.01666658333e-06), (0, 0, 0), 0.0164, (-0.47, 0.47)),
+    (
+        0.065,
+        (8.08728875979549e-05, 2.85700490570738e-05, 7.96647061621031e-05),
+        (1.48386162019941e-05, 2.14347646011766e-05, 4.2343545689576e-06),
+        0.054,
+        (-0.196, 1.61),
+    ),
+    (
+        0.0355,
+        (2.7108908376807e-05, 1.49716294427206e-05, 2.66287347075153e-05),
+        (5.4115225794551e-06, 7.93657186922407e-06, 2.85079817622615e-06),
+        0.0384,
+        (-0.174, 1.709),
+    ),
+    (
+        0.0096,
+        (4.701248e-06, 3.649312e-06, 4.701248e-06),
+        (1.255968e-06, 1.7622e-06, 1.2936e-06),
+        0.0267,
+        (-0.227, 1.618),
+    ),
+)
+_ALLEGRO_THUMB = (
+    (
+        0.0176,
+        (1.96731938544998e-05, 1.55885860593306e-05, 1.97505895464656e-05),
+        (5.34714941558415e-06, 5.0204641842028e-06, 3.28371818678657e-06),
+        (-0.027, 0.005, 0.0399),
+        (0.263, 1.396),
+    ),
+    (
+        0.0119,
+        (4.3875110939419e-06, 4.65422984297958e-06, 4.34097290977866e-06),
+        (7.95929506936549e-07, 1.18904291699917e-06, 1.35226331844583e-06),
+        0.0177,
+        (-0.105, 1.163),
+    ),
+    (
+        0.038,
+        (4.3811817294825e-05, 1.66059448592103e-05, 4.31323573125218e-05),
+        (8.18299639785789e-06, 1.1844769255572e-05, 2.55404234759754e-06),
+        0.0514,
+        (-0.189, 1.644),
+    ),
+    (
+        0.0388,
+        (3.29223173333e-05, 1.47493026667e-05, 3.29223173333e-05),
+        (8.042076e-06, 1.1283525e-05, 5.2283e-06),
+        0.0423,
+        (-0.162, 1.719),
+    ),
+)
+# Where each finger stands on the palm, and the axes of its joints.
+_BEND = ((0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 1, 0))
+_ALLEGRO = (
+    (((0, 0.0435, -0.001542), (-0.08726646255, 0, 0)), _BEND, _ALLEGRO_FINGER),
+    ((0, 0, 0.0007), _BEND, _ALLEGRO_FINGER),
+    (((0, -0.0435, -0.001542), (0.08726646255, 0, 0)), _BEND, _ALLEGRO_FINGER),
+    (
+        ((-0.0182, 0.019333, -0.045987), (0, -1.65806278845, -1.5707963259)),
+        ((-1, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 0)),
+        _ALLEGRO_THUMB,
+    ),
+)
+_ALLEGRO_TIP = (0.0168, (0, 0, 0), (9.68e-07,) * 3)
+
+
+def allegro(*, gravity=GRAVITY, dtype=None) -> Model:
+    """The right Allegro hand: index, middle and ring finger and a thumb of four revolute joints each on a fixed palm.
+
+    Joints joint_0.0 .. 3.0 are those of the index finger from the palm outwards, 4 .. 7 of the middle finger, 8 .. 11 of the ring
+    finger and 12 .. 15 of the thumb; they move bodies link_0.0 .. link_15.0. The frames link_3.0_tip, link_7.0_tip, link_11.0_tip
+    and link_15.0_tip are in the middles of the fingertips, 12 mm balls; the frame palm_link is the palm.
+
+    Source: allegro_right_hand.urdf of Wonik Robotics (allegro_hand_linux_v4, BSD); its damping and friction are left out.
+    """
+    palm = (0.4154, (0, 0, 0.0475), (1e-4, 1e-4, 1e-4))
+    builder = ModelBuilder("allegro", gravity=gravity, dtype=dtype).add_body(
+        "palm_link", None, "fixed", palm, joint_name="root_joint"
+    )
+    for finger, (place, axes, links) in enumerate(_ALLEGRO):
+        parent, pose = "palm_link", place
+        for i, (axis, (mass, moments, products, length, (lower, upper))) in enumerate(zip(axes, links, strict=True)):
+            number, (xy, yz, xz) = 4 * finger + i, products
+            moment = np.diag(moments) + np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
+            builder.add_body(
+                f"link_{number}.0",
+                parent,
+                "revolute",
+                (mass, (0, 0, 0), moment),
+                joint_name=f"joint_{number}.0",
+                axis=axis,
+                pose=pose,
+                lower=lower,
+                upper=upper,
+                velocity_limit=7,
+                effort_limit=15,
+            )
+            parent, pose = f"link_{number}.0", length if isinstance(length, tuple) else (0, 0, length)
+        builder.add_body(
+            f"{parent}_tip", parent, "fixed", _ALLEGRO_TIP, joint_name=f"joint_{parent[5:]}_tip", pose=pose
         )
     return builder.build()
 

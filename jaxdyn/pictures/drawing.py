@@ -6,18 +6,22 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.model.arguments import as_path
+from jaxdyn.constraints.base import layout
+from jaxdyn.model.arguments import as_array, as_path
 from jaxdyn.pictures.inferred import place_of
-from jaxdyn.pictures.motion import Motion, forces, joint_axes, marks, motion_of
-from jaxdyn.pictures.solids import simplified
-from jaxdyn.pictures.stage import AXIS, FORCE, LOOP, TORQUE, Stage, all_solids, color_of, stage_of
+from jaxdyn.pictures.motion import Cone, Motion, cones, forces, joint_axes, marks, motion_of
+from jaxdyn.pictures.solids import finer, simplified
+from jaxdyn.pictures.stage import AXIS, FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
 
 _MOST_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
+_SIDES = 24  # of a round cone
+CONE_HEIGHT = 0.095  # of a friction cone, as a share of the mechanism's size
+_LONGEST = 0.1  # side of a triangle, as a share of the mechanism's size: by its middle matplotlib sorts what hides what
 _LIGHT = np.array([0.4, -0.5, 0.77])
 
 
-def draw(scene, q, ax=None, *, shapes=None) -> Any:
-    """Draw a mechanism at a configuration: its bodies, joints with their axes, loops and contacts.
+def draw(scene, q, ax=None, *, shapes=None, multipliers=None) -> Any:
+    """Draw a mechanism at a configuration: its bodies, joints with their axes, loops and contacts with their friction cones.
 
     **Arguments:**
 
@@ -25,18 +29,27 @@ def draw(scene, q, ax=None, *, shapes=None) -> Any:
     - `q` (nq,): the configuration.
     - `ax`: matplotlib axes of projection "3d" to draw into; None makes a figure of its own.
     - `shapes`: solids to show, of `jd.shapes(path)`; None draws rods between joints and solids of the bodies' inertias.
+    - `multipliers` (nc,): of the scene's rows, N and N m, as the contact forces of `jd.grasp.hold`, to be drawn as arrows.
 
     **Returns:** the axes, in m, axes of the world; `ax.figure.savefig(path)` writes the picture. Blue lines are axes
-    of joints, orange circles loops and contacts, dashed lines distances.
+    of joints, orange circles loops and contacts, dashed lines distances. Orange cones are the friction cones of the scene,
+    around the forces that neither pull nor slip; red arrows are forces, those of contacts on the object; the longest is as
+    long as the cones are high, or a quarter of the mechanism.
 
-    **Raises:** ValueError for a system without bodies, a q that does not fit, and axes that are not 3D. ImportError without
-    matplotlib.
+    **Raises:** ValueError for a system without bodies, a q or multipliers that do not fit, and axes that are not 3D. ImportError
+    without matplotlib.
 
     ```python
     jd.draw(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0]).figure.savefig("four_bar.png")
     ```
     """
     motion = motion_of(scene, q)
+    if multipliers is not None:
+        count = places[-1].end if (places := layout(motion.scene)) else 0
+        found = np.asarray(as_array(multipliers, "multipliers"), float)
+        if found.shape != (count,):
+            raise ValueError(f"multipliers has shape {found.shape}, expected ({count},), one per row of the scene")
+        motion = motion._replace(multipliers=found[None, None])
     picture = _Picture(motion, shapes, ax)
     picture.show(0)
     return picture.ax
@@ -103,8 +116,10 @@ class _Picture:
         self.solids = []
         for shape in parts:
             vertices, faces = simplified(*shape.triangles(), _MOST_VERTICES)
+            vertices, faces = finer(vertices, faces, _LONGEST * self.stage.size)
             self.solids.append((shape.frame, vertices, faces, np.array(color_of(shape, model)), shape.opacity))
         self.axes, self.marks, self.forces = joint_axes(motion), marks(motion), forces(motion)
+        self.cones = cones(motion)
         self.drawn: list = []
         _set_stage(self.ax, self.stage)
 
@@ -128,14 +143,22 @@ class _Picture:
                 corners.append(sides)
                 shaded = np.clip(light[:, None] * color, 0, 1)
                 colors.append(np.concatenate([shaded, np.full((len(faces), 1), opacity * ghost)], axis=1))
+        for cone in self.cones:
+            sides = cone_sides(cone, row, CONE_HEIGHT * self.stage.size)
+            corners.append(sides)
+            colors.append(np.tile([*rgb(LOOP), 0.2], (len(sides), 1)))
+            rim = np.concatenate([sides[:, 1], sides[-1:, 2]])
+            self.drawn += self.ax.plot(*rim.T, color=LOOP, linewidth=1.0, zorder=15)
         if corners:
             # One collection for all: depth is then sorted by triangles and not by bodies.
             shades = np.concatenate(colors)
             # Edges in the colour of their face close the seams that smoothing leaves between faces.
-            faces = Poly3DCollection(np.concatenate(corners), facecolors=shades, edgecolors=shades, linewidths=0.3)
+            # Those of a translucent face would show twice.
+            seams = np.concatenate([shades[:, :3], shades[:, 3:] >= 1], axis=1)
+            faces = Poly3DCollection(np.concatenate(corners), facecolors=shades, edgecolors=seams, linewidths=0.3)
             self.drawn.append(ax.add_collection3d(faces))
         self._lines(row, 0.06 * size)
-        self._arrows(row, 0.25 * size)
+        self._arrows(row, arrow_length(self.cones, self.stage.size))
 
     def _lines(self, row: int, length: float) -> None:
         for _, _, place, axis in self.axes:
@@ -153,7 +176,38 @@ class _Picture:
         for force, scale in scaled(self.forces, length):
             at, vector = force.places[0, row], force.vectors[0, row] * scale
             color = FORCE if force.kind == "force" else TORQUE
-            self.drawn.append(self.ax.quiver(*at, *vector, color=color, linewidth=1.6, arrow_length_ratio=0.2))
+            # Lines, unlike matplotlib's arrows, are drawn above the faces in front of them.
+            self.drawn += self.ax.plot(*arrow(at, vector).T, color=color, linewidth=1.8, zorder=20)
+
+
+def cone_sides(cone: Cone, row: int, height: float) -> np.ndarray:
+    """Triangles (k, 3, 3) of a friction cone of the first motion at one row, of a height (m)."""
+    apex, axis = cone.apex[0, row], cone.axis[0, row]
+    if cone.across is not None:
+        rim = np.stack([axis + sign * cone.slope * cone.across[0, row] for sign in (-1.0, 1.0)])
+    else:
+        first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+        first = first / np.linalg.norm(first)
+        angles = np.linspace(0.0, 2 * np.pi, _SIDES + 1)[:, None]
+        rim = axis + cone.slope * (np.cos(angles) * first + np.sin(angles) * np.cross(axis, first))
+    rim = apex + height * rim
+    return np.stack([np.broadcast_to(apex, rim[1:].shape), rim[:-1], rim[1:]], 1)
+
+
+def arrow(at: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Points (9, 3) of a line that draws an arrow: the shaft, then a head of four lines."""
+    tip, length = at + vector, np.linalg.norm(vector)
+    if not length > 0:
+        return np.broadcast_to(at, (2, 3))
+    first = np.cross(vector, np.eye(3)[np.argmin(np.abs(vector))])
+    first = 0.06 * length * first / np.linalg.norm(first)
+    second, back = np.cross(vector, first) / length, at + 0.8 * vector
+    return np.array([at, tip, back + first, tip, back - first, tip, back + second, tip, back - second])
+
+
+def arrow_length(shown: list[Cone], size: float) -> float:
+    """Length (m) of the longest arrow: a quarter of the mechanism, or that of its friction cones, within which it then lies."""
+    return size * (CONE_HEIGHT if shown else 0.25)
 
 
 def scaled(found, length: float):

@@ -16,10 +16,13 @@ from jaxdyn.constraints.loops import Distance, Loop
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.rolling import RollingContact
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid
+from jaxdyn.grasp.contacts import Contact
+from jaxdyn.grasp.hand import Grasp
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
+from jaxdyn.pictures.held import held_body, held_solids, see_through
 from jaxdyn.pictures.solids import Shape, Shapes, rod
 from jaxdyn.systems.scene import Scene
 
@@ -37,7 +40,8 @@ def completed(scene: Scene, shapes: Shapes) -> Shapes:
     size = extent(scene)
     thin = _THIN * size
     rolling, wheeled = _rolling(scene, carried)
-    found += rolling
+    held = held_body(scene)
+    found += [see_through(shape) if shape.frame == held and held is not None else shape for shape in rolling]
     bare = [i for i in range(model.nb) if i not in carried]
     points = _joints_on(scene)
     whole = not shapes
@@ -47,6 +51,9 @@ def completed(scene: Scene, shapes: Shapes) -> Shapes:
         solid = _of_inertia(model, i, thin, i in wheeled)
         longest = max((rod.size[1] for rod in rods), default=_SHARE * size if whole and model.nb > 3 else 0.0)
         longest *= model.nb > 1  # one body alone is its solid
+        if isinstance(scene, Grasp) and model.body_names[i] == held:
+            found += held_solids(scene, solid, thin)
+            continue
         found += rods + [_or_mark(shape, longest, thin) for shape in solid]
     return Shapes(found, shapes.missing)
 
@@ -108,15 +115,21 @@ def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
             points[i].insert(0, np.zeros(3))
             points[parent].append(home[i, :3, 3])
     for constraint in pairs(scene):
-        # Of a contact frame A lies on a surface, which no rod leads to.
-        for body, pose in (
-            constraint.ends() if isinstance(constraint, Loop | Distance | RollingContact) else constraint.ends()[1:]
-        ):
+        # Of a contact frame A lies on a surface, which no rod leads to, and a rigid grip is one of two surfaces.
+        if isinstance(constraint, Contact) and constraint.kind == "rigid":
+            continue
+        for body, pose in constraint.ends() if _has_middles(constraint) else constraint.ends()[1:]:
             if body is not None:
                 index = frame_index(model, body)
                 offset = np.asarray(model.frame_poses[index], float) @ np.asarray(pose, float)
                 points[model.topology.frame_bodies[index]].append(offset[:3, 3])
     return points
+
+
+def _has_middles(constraint: Pair) -> bool:
+    """Whether both frames of a constraint are places in bodies, and none on a surface."""
+    round_surface = isinstance(constraint, RollingSphere) and constraint.on == "sphere" and not constraint.inside
+    return round_surface or isinstance(constraint, Loop | Distance | RollingContact)
 
 
 def _rods(model: Model, i: int, points: list[np.ndarray], thin: float) -> list[Shape]:

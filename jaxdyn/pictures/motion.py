@@ -11,6 +11,8 @@ import numpy as np
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import Distance, Loop
+from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.contact.kinds import components
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.model.arguments import as_array
@@ -53,6 +55,19 @@ class Mark(NamedTuple):
     a: np.ndarray
     b: np.ndarray
     axis: np.ndarray
+
+
+class Cone(NamedTuple):
+    """Friction cone of a contact: its apex and the direction in which it presses, (n, nt, 3), in the world, and its slope.
+
+    `across` (n, nt, 3): the direction of slip of a contact in a plane, whose cone is a wedge; None for a round cone.
+    """
+
+    name: str
+    apex: np.ndarray
+    axis: np.ndarray
+    across: np.ndarray | None
+    slope: float
 
 
 def drawable(scene: Any) -> Scene:
@@ -183,16 +198,8 @@ def forces(motion: Motion) -> list[Force]:
     found = []
     if motion.multipliers is not None:
         for constraint, place in zip(motion.scene.constraints, layout(motion.scene), strict=True):
-            if not isinstance(constraint, Pair):
-                continue
-            a, b = _ends(motion, constraint)
-            R, p, q = _rows(motion, a, b)
-            lam = jnp.asarray(motion.multipliers[..., place.start : place.end].reshape(len(p), -1))
-            wrench = np.asarray(_wrenches(motion.scene.system, constraint, R, p, q, lam), float)
-            wrench = wrench[:, :3].reshape(*a.shape[:2], 3)
-            vectors = (a[..., :3, :3] @ wrench[..., None])[..., 0] * (-1.0 if isinstance(constraint, Contact) else 1.0)
-            at = b[..., :3, 3] if isinstance(constraint, Loop | Distance) else _contact(motion, constraint, a, b)[0]
-            found.append(Force(place.name, "force", at, vectors))
+            if isinstance(constraint, Pair):
+                found.append(_force(motion, constraint, place.name, motion.multipliers[..., place.start : place.end]))
     if motion.torque is not None:
         model = motion.scene.system
         top = model.topology
@@ -206,6 +213,42 @@ def forces(motion: Motion) -> list[Force]:
             word = "force" if kind == "prismatic" else "torque"
             found.append(Force(top.joint_names[i], word, motion.poses[:, :, i, :3, 3], direction * size))
     return [force for force in found if np.abs(force.vectors).max(initial=0.0) > 0]
+
+
+def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray) -> Force:
+    """The force of a constraint between two bodies for its multipliers (n, nt, rows)."""
+    a, b = _ends(motion, constraint)
+    R, p, q = _rows(motion, a, b)
+    lam = jnp.asarray(multipliers.reshape(len(p), -1))
+    wrench = np.asarray(_wrenches(motion.scene.system, constraint, R, p, q, lam), float)
+    wrench = wrench[:, :3].reshape(*a.shape[:2], 3)
+    vectors = (a[..., :3, :3] @ wrench[..., None])[..., 0] * (-1.0 if isinstance(constraint, Contact) else 1.0)
+    at = b[..., :3, 3] if isinstance(constraint, Loop | Distance) else _contact(motion, constraint, a, b)[0]
+    return Force(name, "force", at, vectors)
+
+
+def cones(motion: Motion) -> list[Cone]:
+    """The friction cones of a scene's contacts, but those of surfaces, whose cones have six dimensions."""
+    scene, found = motion.scene, []
+    if scene.cones is None:
+        return found
+    places = {place.name: place for place in layout(scene)}
+    constraints = dict(zip(places, scene.constraints, strict=True))
+    for contact in coned_contacts(scene):
+        constraint, place, cone = constraints[contact.name], places[contact.name], contact.cone
+        if cone.mu is None or not isinstance(constraint, Pair):
+            continue
+        normal, first = components(cone.kind, cone.in_plane, contact.name).index(2), 0
+
+        def direction(component, contact=contact, constraint=constraint, place=place) -> Force:
+            unit = np.zeros((*motion.q.shape[:2], place.end - place.start))
+            unit[..., contact.rows[component] - place.start] = 1.0
+            return _force(motion, constraint, contact.name, unit)
+
+        along = direction(normal)
+        across = direction(first).vectors if cone.in_plane else None
+        found.append(Cone(contact.name, along.places, along.vectors, across, float(cone.mu)))
+    return found
 
 
 @eqx.filter_jit

@@ -18,9 +18,9 @@ import numpy as np
 
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.float64 import quaternion
-from jaxdyn.pictures.drawing import scaled
+from jaxdyn.pictures.drawing import CONE_HEIGHT, arrow_length, cone_sides, scaled
 from jaxdyn.pictures.inferred import place_of
-from jaxdyn.pictures.motion import Motion, forces, marks, motion_of
+from jaxdyn.pictures.motion import Cone, Motion, cones, forces, marks, motion_of
 from jaxdyn.pictures.solids import Shapes, by_frame, joined, sharpened, simplified
 from jaxdyn.pictures.stage import FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
 
@@ -42,7 +42,8 @@ def view(
 
     The first motion of a batch is solid; up to seven more, evenly from the batch, stand beside it as ghosts. Red arrows are
     forces of constraints and contacts, where the solution has `multipliers` (`outputs=("multipliers",)`), green ones
-    joint torques, where it has `torque`; the largest of each kind is a quarter of the mechanism long.
+    joint torques, where it has `torque`; the largest of each kind is a quarter of the mechanism long. Orange cones are the
+    friction cones of the scene, those of the first motion.
 
     **Arguments:**
 
@@ -190,7 +191,8 @@ class _Content:
         for n in range(len(motion.q)):
             self._add_bodies(n, meshes)
         self.marks = [(mark, self._ball(k)) for k, mark in enumerate(marks(motion))]
-        self.forces = list(scaled(forces(motion), 0.25 * self.size))
+        self.cones = [(cone, self._cone(k, cone)) for k, cone in enumerate(cones(motion))]
+        self.forces = list(scaled(forces(motion), arrow_length([cone for cone, _ in self.cones], self.size)))
         self.arrows = None
         if self.forces:
             colors = np.array([rgb(FORCE if force.kind == "force" else TORQUE) for force, _ in self.forces])
@@ -227,6 +229,16 @@ class _Content:
         color = tuple(round(255 * x) for x in rgb(LOOP))
         return self.scene.add_icosphere(f"/constraints/{k}", 0.012 * self.size, color, subdivisions=2)
 
+    def _cone(self, k: int, cone: Cone) -> tuple[Any, np.ndarray]:
+        """The cone of the first row, and the inverse of its attitude there: a page moves solids and does not bend them."""
+        sides = cone_sides(cone, 0, CONE_HEIGHT * self.size) - cone.apex[0, 0]
+        color = tuple(round(255 * x) for x in rgb(LOOP))
+        faces = np.arange(3 * len(sides), dtype=np.uint32).reshape(-1, 3)
+        handle = self.scene.add_mesh_simple(
+            f"/cones/{k}", sides.reshape(-1, 3).astype(np.float32), faces, color=color, opacity=0.3, side="double"
+        )
+        return handle, _attitude(cone, 0).T
+
     def _arrows(self, row: int) -> np.ndarray:
         ends = [(f.places[0, row], f.places[0, row] + scale * f.vectors[0, row]) for f, scale in self.forces]
         return np.array(ends, np.float32)
@@ -239,8 +251,18 @@ class _Content:
             handle.wxyz, handle.position = quaternion(pose[:3, :3]), pose[:3, 3]
         for mark, handle in self.marks:
             handle.position = mark.a[0, row]
+        for cone, (handle, back) in self.cones:
+            handle.wxyz, handle.position = quaternion(_attitude(cone, row) @ back), cone.apex[0, row]
         if self.arrows is not None:
             self.arrows.points = self._arrows(row)
+
+
+def _attitude(cone: Cone, row: int) -> np.ndarray:
+    """A rotation that takes z to the cone's axis and, of a wedge, x to the direction across it."""
+    axis = cone.axis[0, row]
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]) if cone.across is None else cone.across[0, row]
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first), axis], 1)
 
 
 def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:

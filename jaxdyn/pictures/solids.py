@@ -146,6 +146,21 @@ def _ellipsoid(size) -> tuple[np.ndarray, np.ndarray]:
 _SOLIDS = {"box": _box, "cylinder": _cylinder, "capsule": _capsule, "ellipsoid": _ellipsoid}
 
 
+def finer(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface of triangles whose sides are at most so long (m): the longest side of the others is cut in two."""
+    while len(faces):
+        sides = np.linalg.norm(vertices[np.roll(faces, -1, 1)] - vertices[faces], axis=2)
+        long = sides.max(1) > longest
+        if not long.any():
+            break
+        turned = np.stack([np.roll(face, -k) for face, k in zip(faces[long], sides[long].argmax(1), strict=True)])
+        middle = len(vertices) + np.arange(len(turned))
+        vertices = np.concatenate([vertices, vertices[turned[:, :2]].mean(1)])
+        a, b, c = turned.T
+        faces = np.concatenate([faces[~long], np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
+    return vertices, faces
+
+
 def simplified(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """A mesh of at most about `most` vertices: those within a cell of a grid become one, flat triangles are left out.
 

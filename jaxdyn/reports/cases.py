@@ -1,61 +1,16 @@
-"""The scenes a report runs: each with its reference, what is measured of it, and points that others have published."""
-
-from collections.abc import Callable
-from typing import Any, NamedTuple
+"""The scenes a report runs, one after the other; each case says what is measured of it."""
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn import scenes
 from jaxdyn.forces.elements import Drive
 from jaxdyn.model import robots
 from jaxdyn.reports import references
-from jaxdyn.reports.references import Reference
+from jaxdyn.reports.case import Case as Case
+from jaxdyn.reports.case import Published, named
+from jaxdyn.reports.cases_in_contact import in_contact
+from jaxdyn.reports.cases_of_mechanisms import mechanisms
 from jaxdyn.systems.scene import Scene
-
-
-class Published(NamedTuple):
-    """Somebody else's run of the same motion: CPU `seconds`, and the largest `error` or `energy_error` (J) if stated."""
-
-    label: str
-    seconds: float
-    error: float | None = None
-    energy_error: float | None = None
-
-
-class Case(NamedTuple):
-    """A scene of the report.
-
-      - `name`, `text`: what it is called and what it is; `kind`: the class of scenes for which defaults are compared.
-      - `build()` -> (scene, (q0, v0)); `reference(start)` -> `Reference`, or None where a
-    converged solution at `ts` serves.
-      - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
-      - `largest`: the most trajectories at once that are measured unless `ways` are chosen; None for any number.
-    """
-
-    name: str
-    text: str
-    kind: str
-    build: Callable[[], tuple[Scene, tuple]]
-    reference: Callable[[Any], Reference] | None
-    ts: np.ndarray
-    steps: int
-    conserves: bool = True
-    stiff: bool = False
-    largest: int | None = None
-    published: tuple[Published, ...] = ()
-
-
-def named(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
-    """`build` of a scene of `jaxdyn.scenes`, its start in numpy."""
-
-    def build():
-        scene = getattr(scenes, name)
-        taken = {key: value for key, value in parameters.items() if key in ("formulation", "count")}
-        q, v = scene.start(**parameters)
-        return scene(**taken), (np.asarray(q), np.asarray(v))
-
-    return build
 
 
 def _held_elbow() -> tuple[Scene, tuple]:
@@ -216,5 +171,5 @@ def _cases() -> tuple[Case, ...]:
 
 
 def cases() -> dict[str, Case]:
-    """Every scene of the report by its name."""
-    return {case.name: case for case in _cases()}
+    """Every scene of the report by its name: all of `jd.scenes`, some in several forms, and one with a stiff drive."""
+    return {case.name: case for case in (*_cases(), *mechanisms(), *in_contact())}

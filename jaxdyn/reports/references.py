@@ -206,6 +206,67 @@ def coin(ts, radius=0.05, circle=0.5, lean=np.pi / 36, gravity=9.81) -> Referenc
     return closed_form(ts, q, [*velocity.T, *rates.T], "steady rolling (Le Saux, Leine & Glocker 2005, eqs 5.10-5.12)")
 
 
+def swing(ts, length: float = 1.0, gravity: float = 9.81) -> Reference:
+    """The pendulum of `plane_pendulum` by its angle from the downward vertical."""
+    known = plane_pendulum(ts, length, gravity)
+    x, y = known.q.T
+    rate = (known.v[:, 1] * x - known.v[:, 0] * y) / length**2
+    return closed_form(ts, [np.arctan2(x, -y)], [rate], known.source)
+
+
+def thrown(ts, velocity=(1.0, 2.0), gravity: float = 9.81) -> Reference:
+    """A particle from the origin."""
+    (x, y), zero = velocity, 0 * ts
+    return closed_form(ts, (x * ts, y * ts - gravity * ts**2 / 2), (x + zero, y - gravity * ts), "parabola")
+
+
+def braked(ts, velocity: float = 2.0, friction: float = 0.3, gravity: float = 9.81) -> Reference:
+    """A block that slides with Coulomb friction, before it stops."""
+    slower = friction * gravity
+    return closed_form(ts, [velocity * ts - slower * ts**2 / 2], [velocity - slower * ts], "parabola")
+
+
+def skate(ts, turn: float = 2.0, slope: float = np.pi / 6, gravity: float = 9.81) -> Reference:
+    """Knife edge on an inclined plane, from rest: a cycloid; velocities along the blade, across it, and the turning."""
+    pull, angle = gravity * np.sin(slope), turn * ts
+    size = pull / (2 * turn**2)
+    q = size * np.sin(angle) ** 2, size * (angle - np.sin(2 * angle) / 2), angle
+    v = pull / turn * np.sin(angle), 0 * ts, turn + 0 * ts
+    return closed_form(ts, q, v, "cycloid (Bloch 2003, section 1.6)")
+
+
+def rolling_down(
+    ts, velocity: float = 0.5, radius: float = 0.1, slope: float = np.pi / 6, gravity: float = 9.81
+) -> Reference:
+    """Solid ball that rolls straight down an inclined plane: (5/7) g sin(slope), turning about y."""
+    pull, zero = 5 / 7 * gravity * np.sin(slope), 0 * ts
+    way, speed = velocity * ts + pull * ts**2 / 2, velocity + pull * ts
+    half = way / radius / 2
+    # v is in the axes of the ball, which turn about y.
+    c, s = np.cos(2 * half), np.sin(2 * half)
+    q = way, zero, radius + zero, np.cos(half), zero, np.sin(half), zero
+    return closed_form(ts, q, (speed * c, zero, speed * s, zero, speed / radius, zero), "parabola")
+
+
+def falling_table(
+    ts, tilt=0.02, size=(0.2, 0.16, 0.24), mass=1.0, table=(1.0, 0.6, 0.05), table_mass=20.0, height=0.025, gravity=9.81
+) -> Reference:
+    """Box that stands on a table which falls over with it: a pendulum from rest near its highest place.
+
+    With phi = pi - theta from below, sin(phi/2) = k sn(K(k) + w t), k = cos(tilt/2).
+    """
+    from scipy.special import ellipj, ellipk
+
+    r = height + size[2] / 2
+    moment = table_mass * (table[0] ** 2 + table[2] ** 2) / 12 + mass * ((size[0] ** 2 + size[2] ** 2) / 12 + r**2)
+    k, rate = np.cos(tilt / 2), np.sqrt(mass * gravity * r / moment)
+    sn, cn, _, _ = ellipj(ellipk(k**2) + rate * ts, k**2)
+    angle, turn = np.pi - 2 * np.arcsin(k * sn), -2 * k * rate * cn
+    zero, half = 0 * ts, angle / 2
+    q = r * np.sin(angle), zero, r * np.cos(angle), np.cos(half), zero, np.sin(half), zero, angle
+    return closed_form(ts, q, (r * turn, zero, zero, zero, turn, zero, turn), "Jacobi's elliptic functions")
+
+
 # Andrews' mechanism at 0.03 s, from DOP853 on the index-1 form, tolerances 1e-11 to 3e-14 agree to 7e-11; the printed state
 # (PSIDE, test set for IVP solvers) agrees with it to 1.3e-10 in (q, beta', Theta') and to 5e-8 in the other rates.
 _ANDREWS_END = (

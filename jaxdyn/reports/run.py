@@ -8,7 +8,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.reports.cases import Case, cases
+from jaxdyn.reports.case import Case
+from jaxdyn.reports.cases import cases
 from jaxdyn.reports.journal import Journal
 from jaxdyn.reports.measure import Contestant, flop_counter, ladder, measure
 from jaxdyn.reports.page import write
@@ -31,8 +32,9 @@ def combinations(case: Case, constrained: bool, *, full: bool, plain: bool = Tru
         return [("free", solver) for solver in [*explicit, *(["Dopri5"] if full and plain else []), *implicit]]
     pairs = [("projected", solver) for solver in [*explicit, *implicit]]
     if not full:
-        return [*pairs, ("reduced", "Dopri8")]
-    return pairs + [(method, solver) for method in ("reduced", "multipliers") for solver in explicit]
+        return [*pairs, ("reduced", "Dopri8")] if case.reduces else [*pairs, ("multipliers", "Dopri8")]
+    others = ("reduced", "multipliers") if case.reduces else ("multipliers",)
+    return pairs + [(method, solver) for method in others for solver in explicit]
 
 
 def settings(case: Case, solver: str, dtype: str, *, full: bool) -> list[float]:

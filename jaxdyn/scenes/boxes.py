@@ -1,0 +1,140 @@
+"""Boxes that are held: a cube in a hand of four fingers, and a box that stands on a table by the friction of its base."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.contact.cones import friction_cone, surface_cone
+from jaxdyn.contact.wrench_cones import wrench_cone
+from jaxdyn.grasp import Grasp, contact, point_contacts
+from jaxdyn.model import float64 as f64
+from jaxdyn.model import inertia, robots
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.names import frame_index
+from jaxdyn.scenes._named import named
+from jaxdyn.scenes.hands import _carried, _quaternion
+
+# Where the fingertips touch the cube, in half edges, and the normals into it: index and ring finger on one face, the thumb on the
+# opposite one.
+_PLACES = {
+    "link_3.0_tip": ((1.0, 2 / 3, 0.0), (-1.0, 0.0, 0.0)),
+    "link_11.0_tip": ((1.0, -2 / 3, 1 / 3), (-1.0, 0.0, 0.0)),
+    "link_15.0_tip": ((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+}
+# Angles near those of the fingers that hold a cube of 60 mm at `position`, by the names of the joints' numbers.
+_GUESS = {
+    **dict(zip(range(4), (-0.248, 0.833, 0.756, 0.583), strict=True)),
+    **dict(zip(range(4, 8), (0.0, 0.9, 0.8, 0.6), strict=True)),
+    **dict(zip(range(8, 12), (0.288, 0.946, 0.792, 0.585), strict=True)),
+    **dict(zip(range(12, 16), (1.288, 0.56, 0.477, 0.493), strict=True)),
+}
+
+_ROUNDS = 30  # of Newton's method, for the angles of a finger
+
+
+def _chain(model, tip: str) -> tuple[list[int], np.ndarray]:
+    """Joints from the palm to a fingertip, and the tip's pose in the last body."""
+    frame = frame_index(model, tip)
+    joints, offset = [model.topology.frame_bodies[frame]], np.asarray(model.frame_poses[frame], float)
+    while (parent := model.topology.parents[joints[0]]) >= 0:
+        joints.insert(0, parent)
+    return joints, offset
+
+
+def _tip(model, joints, offset, angles):
+    """Position (3,) of a fingertip, and its Jacobian (3, n)."""
+    pose, axes, origins = np.eye(4), [], []
+    home, screws = np.asarray(model.home, float), np.asarray(model.screws, float)
+    for joint, angle in zip(joints, angles, strict=True):
+        kind = model.topology.kinds[joint]
+        pose = pose @ home[joint] @ f64.joint_pose(kind, screws[joint], np.array([angle]))
+        axes.append(pose[:3, :3] @ screws[joint, 3:])
+        origins.append(pose[:3, 3])
+    place = (pose @ offset)[:3, 3]
+    return place, np.cross(axes, place - np.array(origins)).T
+
+
+def _cube_start(
+    size=0.06, position=(0.108, 0.013, 0.004), turned=(0.404, -1.79, -0.078), twist=(0.02, 0.0, -0.01, 0.1, 0.2, -0.1)
+):
+    model = robots.allegro()
+    quaternion, rotation = _quaternion(turned)
+    position, twist = np.asarray(position, float), np.asarray(twist, float)
+    angles, rates = np.array([_GUESS[int(name[6:-2])] for name in model.joint_names]), np.zeros(model.nv)
+    for name, (point, _) in _PLACES.items():
+        joints, offset = _chain(model, name)
+        target = position + size / 2 * rotation @ np.asarray(point)
+        for _ in range(_ROUNDS):
+            place, jacobian = _tip(model, joints, offset, angles[joints])
+            angles[joints] += np.linalg.pinv(jacobian) @ (target - place)
+        if not np.linalg.norm(target - place) < 1e-12:
+            raise ValueError(
+                f"size is {size}, position {position.tolist()}, turned {list(turned)}: {name} cannot reach its place on the "
+                "cube; give a place nearer to the default one"
+            )
+        velocity = _carried(position, rotation @ twist[:3], rotation @ twist[3:], target)
+        # Of all joint velocities that move the fingertip with the cube, the smallest.
+        rates[joints] = np.linalg.pinv(jacobian) @ velocity
+    # The cube's joint comes last: its name does.
+    return jnp.asarray([*angles, *position, *quaternion]), jnp.asarray([*rates, *twist])
+
+
+@named(_cube_start)
+def allegro_with_cube(*, size=0.06, mass=0.1, mu=0.8, gravity=9.81) -> Grasp:
+    """The Allegro hand, its palm upright, with a cube between index finger, ring finger and thumb; the middle finger is free.
+
+    q = (joints of the index finger, of the thumb, of the middle and of the ring finger, four each, the cube's free joint): 22
+    velocities and 9 rows, of three hard fingers. The hand is redundant: seven of its motions leave the fingertips where they are
+    (`jd.grasp.hand_motions`). `size` (m), `mass` (kg) of the cube; `mu` as of `hand_with_bar`. Fingertips are points, in the
+    middles of the balls of the real ones.
+
+    Start: the cube's `position` (m), rotation vector `turned` (rad) and body `twist`, with the angles of the fingers that reach
+    it and the smallest joint velocities that follow it. ValueError for a cube out of their reach.
+
+    Source: the hand, `jd.robots.allegro`; contacts and cones, EQUATIONS section 10.
+    """
+    fall = (0.0, 0.0, -gravity)
+    cube = ModelBuilder("cube", gravity=fall).add_body(
+        "cube", None, "free", inertia.box(mass, (size,) * 3), joint_name="object"
+    )
+    places = {name: (tuple(size / 2 * x for x in point), normal) for name, (point, normal) in _PLACES.items()}
+    cones = friction_cone("hard-finger", mu) if mu is not None else None
+    return Grasp(robots.allegro(gravity=fall), cube.build(), point_contacts(places), cones=cones)
+
+
+def _table_start(tilt=0.02, rate=0.0, height=0.025, size=(0.2, 0.16, 0.24)):
+    s, c = np.sin(tilt), np.cos(tilt)
+    center = height + size[2] / 2
+    place = [center * s, 0.0, center * c, np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0]
+    moving = [center * rate, 0.0, 0.0, 0.0, rate, 0.0]
+    return jnp.asarray([*place, tilt]), jnp.asarray([*moving, rate])
+
+
+@named(_table_start)
+def box_on_table(
+    *, size=(0.2, 0.16, 0.24), mass=1.0, table=(1.0, 0.6, 0.05), table_mass=20.0, height=0.025, mu=0.4, gravity=9.81
+) -> Grasp:
+    """A box that stands on a table by its whole base: six rows, and the wrench cone of a rectangle in place of a friction cone.
+
+    The table turns freely about the y axis through its centre of mass at the origin, so that it falls over with the box, slowly
+    at first: with I the moment of both about the axis and r = height + size[2]/2 the height of the box's centre above it,
+
+        I thetadd = m g r sin(theta),    fx = m (r thetadd - g sin(theta)),    fz = m (g cos(theta) - r thetad^2).
+
+    The box slips where -fx = mu fz, or tips over its edge where the torque |ty| about the middle of the base is size[0]/2 fz,
+    whichever comes first; `jd.simulate` ends there, as `contact_lost`.
+
+    q = (the box's free joint, the table's angle). `size` of the box, `table` of the table (m, along x, y, z); `height` of the
+    table's top above its axis (m); `mass`, `table_mass` (kg); `mu`: friction coefficient of the base, whose 16 rows are those of
+    `jd.contact.wrench_cone`, those of torques divided by half the longer side, so that margins are in N. Start: `tilt` (rad) and
+    its `rate` (rad/s).
+
+    Source: Caron, Pham & Nakamura (2015); EQUATIONS section 11.
+    """
+    builder = ModelBuilder("box on a table", gravity=(0.0, 0.0, -gravity))
+    builder.add_body("table", None, "continuous", inertia.box(table_mass, table), joint_name="table", axis=(0, 1, 0))
+    builder.add_body("box", None, "free", inertia.box(mass, size), joint_name="object")
+    base = contact("rigid", "table", (0.0, 0.0, -size[2] / 2), finger_pose=(0.0, 0.0, height), name="base")
+    half_x, half_y = size[0] / 2, size[1] / 2
+    rows = wrench_cone(half_x, half_y, mu)
+    rows = rows.at[4:].divide(max(half_x, half_y))
+    return Grasp(builder.build(), "box", [base], cones=surface_cone(rows))
