@@ -241,7 +241,7 @@ def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
     time = brentq(beside, 0.0, 2.0, xtol=1e-14)
     np.testing.assert_allclose(found.stats["time_reached"], time, rtol=1e-7)
     assert np.isfinite(found.q[TS < time]).all() and np.isnan(found.q[TS > time]).all()
-    with pytest.raises(RuntimeError, match="lose rank.*least_regularity"):
+    with pytest.raises(RuntimeError, match=r"lose rank.*least_regularity"):
         jd.simulate(scene, q0, v0, TS, control=law)
 
 
@@ -307,7 +307,10 @@ def test_arm_on_a_sphere(contact):
             lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, force=jnp.zeros(2))(*_state(s)),
             r"force has shape \(2,\), expected \(1,\)",
         ),
-        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, least_regularity=-1.0), "least_regularity is -1"),
+        (
+            lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, least_regularity=-1.0),
+            "least_regularity is -1",
+        ),
         (lambda s: jd.control.GaugeInvariant(s, first_two, circle, 1.0, 0.0), "kd is 0.0"),
         (lambda s: jd.control.GaugeInvariant(s, lambda q: q[:1], jnp.zeros(1), 1.0, 1.0)(*_state(s)), "1 coordinates"),
     ],

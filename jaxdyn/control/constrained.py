@@ -137,9 +137,7 @@ class HybridForce(_ForceLoop):
         self.ki = None if ki is None else gain(ki, "ki")
         self.actuated = None if actuated is None else _indices(actuated, scene.nv)
         self.internal = None if internal is None else jnp.asarray(as_array(internal, "internal"), float)
-        self.least_regularity = (
-            None if least_regularity is None else non_negative(least_regularity, "least_regularity")
-        )
+        self.least_regularity = None if least_regularity is None else non_negative(least_regularity, "least_regularity")
         if self.actuated is None and self.internal is not None:
             raise ValueError("internal is given without actuated; name the velocities that have a motor")
         if self.actuated is not None and not (self.force is None and self.ki is None):

@@ -4,7 +4,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.contact.coordinates import contact_coordinates
@@ -21,10 +20,10 @@ from jaxdyn.systems.system import velocity_to_rate
 class ContactCoordinates(eqx.Module):
     """The contact coordinates of a tip on an object that stands still, as tasks of `HybridForce`.
 
-    As a function of q it is eta = (u_o, v_o, u_f, v_f, psi) (5,): the task of a tip that slides, five coordinates of the motion that
-    a frictionless contact leaves free. `rolling` is alpha_f_dot (2,), the rates of (u_f, v_f): the task of velocities of a tip that
-    rolls without spin. The laws are then, with the rows J_F of Montana's equations (`jd.contact.montana`) and M, C, N of the arm in
-    the twist of the tip,
+    As a function of q it is eta = (u_o, v_o, u_f, v_f, psi) (5,): the task of a tip that slides, five coordinates of the
+    motion that a frictionless contact leaves free. `rolling` is alpha_f_dot (2,), the rates of (u_f, v_f): the task of
+    velocities of a tip that rolls without spin. The laws are then, with the rows J_F of Montana's equations
+    (`jd.contact.montana`) and M, C, N of the arm in the twist of the tip,
 
         F_m = M J_F (eta_dd_d - Kd ed - Kp e) + (M J_F_dot + C J_F) eta_dot + N + A^T (-lam_d + KI z),    tau = J^T F_m,
 

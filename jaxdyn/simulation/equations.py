@@ -26,8 +26,8 @@ class Equations(NamedTuple):
     - `args`: what is traced. `derivative(t, y, args)`, and its two parts for solvers that split it.
     - `torque(args, y, q, v, t)` of the control and `effort`, which is that plus the scene's forces, (nv,) or None.
     - `project(t, y, error, args)` after a step; `quality` of the method's basis; `begin`, `advance` for steps of its own.
-    - `allowances(args, y, q, v, t)` of contacts, joints and the control, which can end the run; `least_allowance(t, y, args)`, or None
-      where nothing can.
+    - `allowances(args, y, q, v, t)` of contacts, joints and the control, which can end the run;
+      `least_allowance(t, y, args)`, or None where nothing can.
     """
 
     args: tuple | None
