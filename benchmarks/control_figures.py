@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.figure
 import numpy as np
+import optax
 
 import jaxdyn as jd
 from benchmarks.timing import chosen_names
@@ -144,7 +145,7 @@ def cartesian_stiffness():
 
 
 def hybrid_force():
-    """A particle on a sphere: motion and force with the right mass, the force with a wrong one, with integral action and without."""
+    """A particle on a sphere: motion and force with the right mass, the force with a wrong one, with and without KI."""
     (q, v), ts = scenes.spherical_pendulum.start(theta=1.0, phi_rate=0.7), jnp.linspace(0, 3, 151)
     plant, wrong = scenes.spherical_pendulum(mass=1.3), scenes.spherical_pendulum(mass=1.6)
     figure, left, right = pair()
@@ -340,6 +341,54 @@ def whole_body():
     return figure
 
 
+MASSES = 1.3 * np.random.default_rng(0).uniform(0.7, 1.3, 256)
+
+
+def tuning_cost(log_gains, mass, end=1.0):
+    """Of one particle on a sphere whose mass the law takes for 1.3 kg: errors of motion and of force, and torque."""
+    kp, kd, ki = jnp.exp(log_gains)
+    plant, model = scenes.spherical_pendulum(mass=mass), scenes.spherical_pendulum(mass=1.3)
+    q, v = scenes.spherical_pendulum.start(theta=1.0, phi_rate=0.7)
+    ts = jnp.linspace(0.0, end, 26)
+    law = jd.control.HybridForce(model, first_two, circle, kp, kd, force=jnp.asarray([2.0]), ki=ki)
+    outputs = ("multipliers", "torque")
+    motion = jd.simulate(plant, q, v, ts, control=law, stepsize=0.02, outputs=outputs)
+    errors = motion.q[:, :2] - jax.vmap(circle)(ts)
+    force = motion.multipliers[:, 0] - 2.0
+    return jnp.mean(jnp.sum(errors**2, 1) + 1e-3 * force**2 + 1e-4 * jnp.sum(motion.torque**2, 1))
+
+
+def tuning():
+    """Three gains tuned by gradient over 256 particles of other masses than the law's."""
+    costs = jax.jit(jax.vmap(tuning_cost, (None, 0)))
+    slope = jax.jit(jax.value_and_grad(lambda gains: jnp.mean(jax.vmap(tuning_cost, (None, 0))(gains, MASSES))))
+    start = gains = jnp.log(jnp.asarray([4.0, 3.0, 1.0]))
+    rule = optax.adam(0.2)
+    state, history = rule.init(gains), []
+    for _ in range(30):
+        value, found = slope(gains)
+        history.append([float(value), *np.exp(gains)])
+        step, state = rule.update(found, state)
+        gains = gains + step
+    history = np.array(history)
+    figure, left, right = pair()
+    left.semilogy(history[:, 0], "k", label="mean cost")
+    other = left.twinx()
+    for i, name in enumerate(("kp (1/s2)", "kd (1/s)", "KI (1/s)")):
+        other.semilogy(history[:, 1 + i], color=f"C{i}", label=name)
+    left.set(xlabel="step", title="256 systems: mean cost and gains")
+    left.legend(fontsize=8, loc="upper right"), other.legend(fontsize=8, loc="center right")
+    for values, label in ((start, "before"), (gains, "after")):
+        right.semilogy(MASSES, costs(values, MASSES), ".", label=label)
+    right.axvline(1.3, color="k", linewidth=0.8, linestyle="--")
+    right.set(xlabel="mass of the plant (kg)", title="cost of each; the law takes 1.3 kg")
+    right.legend(fontsize=8)
+    print(
+        f"  cost {history[0, 0]:.4f} to {history[-1, 0]:.4f}, gains {np.exp(start).round(2)} to {np.exp(gains).round(2)}"
+    )
+    return figure
+
+
 LAWS = {
     law.__name__: law
     for law in (
@@ -353,6 +402,7 @@ LAWS = {
         gauge_invariant,
         grasp_force,
         whole_body,
+        tuning,
     )
 }
 

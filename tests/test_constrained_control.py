@@ -292,6 +292,22 @@ def test_arm_on_a_sphere(contact):
     np.testing.assert_allclose(gap, np.linalg.norm(at.g_of[:3, 3]), atol=1e-9)
 
 
+@pytest.mark.slow
+def test_gains_are_tuned_over_perturbed_systems():
+    """The cost of the page on tuning: its gradient in three gains against differences, and a step that lowers it."""
+    from benchmarks.control_figures import MASSES, tuning_cost
+
+    gains, masses = jnp.log(jnp.asarray([4.0, 3.0, 1.0])), MASSES[:8]
+    cost = jax.jit(lambda gains: jnp.mean(jax.vmap(lambda m: tuning_cost(gains, m, end=0.5))(masses)))
+    value, slope = jax.jit(jax.value_and_grad(cost))(gains)
+    step = 1e-4
+    for i, direction in enumerate(step * np.eye(3)):
+        np.testing.assert_allclose(
+            slope[i], (cost(gains + direction) - cost(gains - direction)) / (2 * step), rtol=1e-6
+        )
+    assert cost(gains - 0.1 * slope / jnp.linalg.norm(slope)) < value
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [

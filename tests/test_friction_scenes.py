@@ -2,8 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
+from test_events import box
 
 import jaxdyn as jd
 from jaxdyn import scenes
@@ -216,8 +218,29 @@ def test_gradient_of_a_bounce_and_its_end():
     assert rests.success and abs(float(rests.q[-1, 0])) < 1e-9 and float(rests.v[-1, 0]) == 0
 
 
+@pytest.mark.slow
+def test_mujocos_box_falls_and_slides_to_its_softness():
+    """A box of 2 kg lands flat with 2 m/s and slides to rest: where it stops, by C MuJoCo with its soft contact, to 1 %."""
+    source = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="2e-4" cone="elliptic" gravity="0 0 {-G}" iterations="100" tolerance="1e-12"/>
+        <worldbody><geom type="plane" size="9 9 1" friction="0.4 0 0" condim="3"/>
+        <body pos="0 0 0.5"><freejoint/><geom type="box" size="0.2 0.2 0.1" mass="2" friction="0.4 0 0" condim="3"
+        solref="0.004 1" solimp="0.99 0.99 0.001"/></body></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(source)
+    data.qvel[0] = 2.0
+    while data.time < 1.0:
+        mujoco.mj_step(source, data)
+    motion = jd.simulate(box(0.4), [0.0, 0.5, 0.0], [2.0, 0.0, 0.0], jnp.linspace(0.0, 1.0, 5), **TIGHT)
+    assert abs(data.qvel[0]) < 1e-2 and float(motion.v[-1, 0]) == 0
+    np.testing.assert_allclose(motion.q[-1, 0], data.qpos[0], rtol=0.01)
+    np.testing.assert_allclose(motion.q[-1, 1], data.qpos[2], atol=1e-4)  # it sinks in
+
+
 def test_what_does_not_fit_is_refused():
     for call, words in (
+        (lambda: jd.simulate(jd.Scene(scenes.bowling_ball().system, forces=[jd.ground_contact("cube", name="lane")]),
+                             *scenes.bowling_ball.start(), [0.0, 1.0]), "'cube'"),
         (lambda: jd.ground_contact("ball", restitution=1.2), "restitution is 1.2"),
         (lambda: jd.gap_contact(0.5), "gap is 0.5"),
         (lambda: jd.gap_contact(lambda q, t: q[0], friction=-1.0), "0 <= sliding"),
