@@ -11,8 +11,6 @@ call, and the force error after the first second, in which integral action takes
 
 import argparse
 import time
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +20,6 @@ from mujoco import mjx
 
 import jaxdyn as jd
 from benchmarks import timing
-from benchmarks.peers.twins import Twin
-from benchmarks.peers.with_mujoco import to_mujoco
 
 FORCE, CENTER, RADIUS, TIP = 5.0, (0.5, 0.0, 0.0), 0.15, 0.03
 MASSES = (1.0, 1.5, 1.0, 0.3, 0.3, 0.3)
@@ -38,16 +34,27 @@ def law_for(goal):
 
 
 def with_contact(model) -> mujoco.MjModel:
-    """The arm in MuJoCo, a sphere at its tip and one in space."""
-    with TemporaryDirectory() as folder:
-        path = str(Path(folder) / "arm.xml")
-        mujoco.mj_saveLastXML(path, to_mujoco(Twin(jd.Scene(model))))
-        spec = mujoco.MjSpec.from_file(path)
-    spec.option.disableflags = 0
-    spec.option.timestep = 0.002
-    sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "condim": 1, "contype": 1, "conaffinity": 1}
+    """The chain of revolute joints in MuJoCo, a sphere at its tip and one in space."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree, spec.compiler.boundinertia = False, 1e-13
+    spec.option.gravity, spec.option.timestep = np.asarray(model.gravity), 0.002
+    sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "condim": 1}
     spec.worldbody.add_geom(pos=CENTER, size=[RADIUS, 0, 0], **sphere)
-    spec.bodies[-1].add_geom(pos=[0.1, 0.0, 0.0], size=[TIP, 0, 0], mass=0.0, **sphere)
+    body = spec.worldbody
+    homes, numbers, screws = (np.asarray(x, float) for x in (model.home, model.inertias, model.screws))
+    for home, (m, *first, xx, xy, yy, xz, yz, zz), screw in zip(homes, numbers, screws, strict=True):
+        c = np.asarray(first) / m
+        about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - m * (c @ c * np.eye(3) - np.outer(c, c))
+        moments, axes = np.linalg.eigh(about)
+        axes[:, 0] *= np.linalg.det(axes)
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, axes.ravel())
+        turned = np.zeros(4)
+        mujoco.mju_mat2Quat(turned, home[:3, :3].ravel())
+        inertial = {"mass": m, "ipos": c, "iquat": quat, "inertia": np.maximum(moments, 1e-13), "explicitinertial": True}
+        body = body.add_body(pos=home[:3, 3], quat=turned, **inertial)
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=screw[3:])
+    body.add_geom(pos=[0.1, 0.0, 0.0], size=[TIP, 0, 0], **sphere)
     return spec.compile()
 
 

@@ -360,8 +360,9 @@ def tuning_cost(log_gains, mass, end=1.0):
 
 def tuning():
     """Three gains tuned by gradient over 256 particles of other masses than the law's."""
+    masses = jnp.asarray(MASSES)
     costs = jax.jit(jax.vmap(tuning_cost, (None, 0)))
-    slope = jax.jit(jax.value_and_grad(lambda gains: jnp.mean(jax.vmap(tuning_cost, (None, 0))(gains, MASSES))))
+    slope = jax.jit(jax.value_and_grad(lambda gains: jnp.mean(jax.vmap(tuning_cost, (None, 0))(gains, masses))))
     start = gains = jnp.log(jnp.asarray([4.0, 3.0, 1.0]))
     rule = optax.adam(0.2)
     state, history = rule.init(gains), []
@@ -379,7 +380,7 @@ def tuning():
     left.set(xlabel="step", title="256 systems: mean cost and gains")
     left.legend(fontsize=8, loc="upper right"), other.legend(fontsize=8, loc="center right")
     for values, label in ((start, "before"), (gains, "after")):
-        right.semilogy(MASSES, costs(values, MASSES), ".", label=label)
+        right.semilogy(MASSES, costs(values, masses), ".", label=label)
     right.axvline(1.3, color="k", linewidth=0.8, linestyle="--")
     right.set(xlabel="mass of the plant (kg)", title="cost of each; the law takes 1.3 kg")
     right.legend(fontsize=8)

@@ -297,7 +297,7 @@ def test_gains_are_tuned_over_perturbed_systems():
     """The cost of the page on tuning: its gradient in three gains against differences, and a step that lowers it."""
     from benchmarks.control_figures import MASSES, tuning_cost
 
-    gains, masses = jnp.log(jnp.asarray([4.0, 3.0, 1.0])), MASSES[:8]
+    gains, masses = jnp.log(jnp.asarray([4.0, 3.0, 1.0])), jnp.asarray(MASSES[:8])
     cost = jax.jit(lambda gains: jnp.mean(jax.vmap(lambda m: tuning_cost(gains, m, end=0.5))(masses)))
     value, slope = jax.jit(jax.value_and_grad(cost))(gains)
     step = 1e-4
