@@ -136,11 +136,11 @@ def main(argv=None) -> None:
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     start = jnp.asarray([0.2, -0.1, 0.15, 0.1, 0.3])  # of `jd.scenes.sphere_arm.start`
-    moves = np.random.default_rng(0).uniform(-0.1, 0.1, (options.arms, 5))
+    moves = np.random.default_rng(0).uniform(-0.1, 0.1, (max(options.arms, options.peers), 5))
     goals, rows = start + jnp.asarray(moves), {}
-    peers = goals[: options.peers]
+    goals, peers = goals[: options.arms], goals[: options.peers]
     for name, batch, found in (
-        ("jaxdyn", goals, rigid(goals, options.seconds, options.gradient)),
+        ("jaxdyn", goals, rigid(goals, options.seconds, options.gradient) if options.arms else None),
         ("MJX", peers, soft(peers, options.seconds) if options.peers else None),
     ):
         if found is None:

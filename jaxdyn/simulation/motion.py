@@ -162,7 +162,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     if lost is not None and unilateral.can_end(scene, options["contacts"]):
-        stats["lost_contact"] = jnp.where(at_limit | by_control, -1, lost.entry)
+        stats["lost_contact"] = jnp.where(lost.entry < count, lost.entry, -1)
     if lost is not None and options["limits"] == "stop":
         stats["passed_limit"] = jnp.where(at_limit, (lost.entry - count) % q.shape[1], -1).astype(jnp.int32)
     return Solution(ts=given_times, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
