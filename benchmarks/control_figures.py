@@ -288,7 +288,8 @@ def grasp_force():
     squeeze = 10.0 * jd.grasp.normal_forces(plant)
     for ki in (None, 4.0):
         law = jd.control.GraspForce(scenes.hand_with_bar(masses=(0.5, 0.4)), q[4:], 400.0, 40.0, preload=10.0, ki=ki)
-        motion = jd.simulate(plant, q, v, ts, control=law, stepsize=0.01, outputs=("multipliers",))
+        options = {"stepsize": 0.01, "contacts": "report", "outputs": ("multipliers",)}
+        motion = jd.simulate(plant, q, v, ts, control=law, **options)
         inside = jax.vmap(lambda q, lam: jd.grasp.internal_forces(plant, q, lam))(motion.q, motion.multipliers)
         error = np.abs(np.asarray(inside) - squeeze).max(1)
         right.semilogy(ts, error, label="without integral action" if ki is None else "KI = 4 1/s")
@@ -336,8 +337,8 @@ def whole_body():
     least = min(float(margin.min()) for margin in motion.contact_margins.values())
     print(f"  least margin {least:.3f} N")
     right.axhline(0.0, color="k", linewidth=0.8)
-    right.set(xlabel="t (s)", title="forces of the feet (N)")
-    right.legend(fontsize=7)
+    right.set(xlabel="t (s)", title="forces of the feet (N)", ylim=(-2, 72))
+    right.legend(fontsize=7, loc="upper center", ncol=2)
     return figure
 
 
