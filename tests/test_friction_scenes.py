@@ -43,19 +43,17 @@ def phases(mu, speed):
 
     # The bottom slides if it cannot be held.
     _, _, R = rates(True, False)
-    bottom, top = abs(R) > mu2 * N2, True
-    for _ in range(2):
-        a, _, _ = rates(top, bottom)
+    free = [True, abs(R) > mu2 * N2]
+    while any(free):
+        a, _, _ = rates(*free)
         slip = np.array([state[2] - state[0] + state[1], state[0] + state[1]])
         change = np.array([a[2] - a[0] + a[1], a[0] + a[1]])
-        ends = [-slip[i] / change[i] for i, free in enumerate((top, bottom)) if free]
-        if not ends:
-            break
-        time = min(ends)
+        # What begins to slide from rest does not end at once.
+        ends = [-slip[i] / change[i] if free[i] and slip[i] * change[i] < -1e-12 else np.inf for i in range(2)]
+        time, free[int(np.argmin(ends))] = min(ends), False
         state = state + time * a
         times.append(times[-1] + time)
         states.append(state)
-        top, bottom = (top and not np.isclose(ends[0], time)), (bottom and not np.isclose(ends[-1], time))
     return np.array(times), np.array(states)
 
 
