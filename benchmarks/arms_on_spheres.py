@@ -51,7 +51,13 @@ def with_contact(model) -> mujoco.MjModel:
         mujoco.mju_mat2Quat(quat, axes.ravel())
         turned = np.zeros(4)
         mujoco.mju_mat2Quat(turned, home[:3, :3].ravel())
-        inertial = {"mass": m, "ipos": c, "iquat": quat, "inertia": np.maximum(moments, 1e-13), "explicitinertial": True}
+        inertial = {
+            "mass": m,
+            "ipos": c,
+            "iquat": quat,
+            "inertia": np.maximum(moments, 1e-13),
+            "explicitinertial": True,
+        }
         body = body.add_body(pos=home[:3, 3], quat=turned, **inertial)
         body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=screw[3:])
     body.add_geom(pos=[0.1, 0.0, 0.0], size=[TIP, 0, 0], **sphere)

@@ -277,7 +277,7 @@ def grasp_force():
     figure, left, right = pair()
     law = jd.control.GraspForce(plant, goal, KP, KD, preload=10.0)
     motion = jd.simulate(plant, q, v, ts, control=law, stepsize=0.02, contacts="report")
-    errors = np.asarray(motion.q[:, 4:] - goal)
+    errors = np.asarray(jax.vmap(lambda q: law.error.position(plant.system, q, 0.0))(motion.q))
     promised = decayed(np.asarray(ts), errors[0], np.zeros(3))
     against(left, ts, errors, promised, ("x", "y", "angle"), "|error of the bar| (m, rad)")
     squeeze = 10.0 * jd.grasp.normal_forces(plant)
