@@ -230,7 +230,7 @@ def test_mujocos_box_falls_and_slides_to_its_softness():
     while data.time < 1.0:
         mujoco.mj_step(source, data)
     motion = jd.simulate(box(0.4), [0.0, 0.5, 0.0], [2.0, 0.0, 0.0], jnp.linspace(0.0, 1.0, 5), **TIGHT)
-    assert abs(data.qvel[0]) < 1e-2 and float(motion.v[-1, 0]) == 0
+    assert abs(data.qvel[0]) < 1e-2 and abs(float(motion.v[-1, 0])) < 1e-12
     np.testing.assert_allclose(motion.q[-1, 0], data.qpos[0], rtol=0.01)
     np.testing.assert_allclose(motion.q[-1, 1], data.qpos[2], atol=1e-4)  # it sinks in
 
