@@ -32,6 +32,7 @@ from jaxdyn.contact import RollingModel as RollingModel
 from jaxdyn.contact import rolling_contact as rolling_contact
 from jaxdyn.contact.unilateral import DryFriction as DryFriction
 from jaxdyn.contact.unilateral import UnilateralContact as UnilateralContact
+from jaxdyn.contact.unilateral import gap_contact as gap_contact
 from jaxdyn.contact.unilateral import ground_contact as ground_contact
 from jaxdyn.control.legs import LeggedDynamics as LeggedDynamics
 from jaxdyn.control.legs import underactuated_inverse_dynamics as underactuated_inverse_dynamics

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pinocchio_bridge import quick
+from scipy.optimize import brentq
 from test_control import KD, KP, assert_decays, decayed
 
 import jaxdyn as jd
@@ -224,6 +225,26 @@ def test_rank_loss_is_told(pendulum):
     assert np.isfinite(law(equator, jnp.zeros(3))).all()
 
 
+def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
+    """A target beside the sphere: x goes as the gains say until z is 0.1, where the run ends."""
+    scene, reach = pendulum[0], jnp.asarray([1.5, 0.0])
+    q0, v0 = jnp.asarray([0.6, 0.0, -0.8]), jnp.zeros(3)
+    law = jd.control.HybridForce(scene, first_two, reach, KP, KD, least_regularity=0.1)
+    found = jd.simulate(scene, q0, v0, TS, control=law, throw=False)
+    assert found.result == jd.RESULTS.control_singular and not bool(found.success)
+    # The row of x is at the angle to the sphere's normal whose sine is |z|.
+    np.testing.assert_allclose(law.regularity(q0, v0), 0.8, rtol=1e-12)
+
+    def beside(t):
+        return 1.5 + decayed(np.array([t]), np.array([-0.9]), np.zeros(1))[0, 0] - np.sqrt(1 - 0.1**2)
+
+    time = brentq(beside, 0.0, 2.0, xtol=1e-14)
+    np.testing.assert_allclose(found.stats["time_reached"], time, rtol=1e-7)
+    assert np.isfinite(found.q[TS < time]).all() and np.isnan(found.q[TS > time]).all()
+    with pytest.raises(RuntimeError, match=r"lose rank.*least_regularity"):
+        jd.simulate(scene, q0, v0, TS, control=law)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("contact", ["frictionless", "rolling"])
 def test_arm_on_a_sphere(contact):
@@ -271,6 +292,22 @@ def test_arm_on_a_sphere(contact):
     np.testing.assert_allclose(gap, np.linalg.norm(at.g_of[:3, 3]), atol=1e-9)
 
 
+@pytest.mark.slow
+def test_gains_are_tuned_over_perturbed_systems():
+    """The cost of the page on tuning: its gradient in three gains against differences, and a step that lowers it."""
+    from benchmarks.control_figures import MASSES, tuning_cost
+
+    gains, masses = jnp.log(jnp.asarray([4.0, 3.0, 1.0])), jnp.asarray(MASSES[:8])
+    cost = jax.jit(lambda gains: jnp.mean(jax.vmap(lambda m: tuning_cost(gains, m, end=0.5))(masses)))
+    value, slope = jax.jit(jax.value_and_grad(cost))(gains)
+    step = 1e-4
+    for i, direction in enumerate(step * np.eye(3)):
+        np.testing.assert_allclose(
+            slope[i], (cost(gains + direction) - cost(gains - direction)) / (2 * step), rtol=1e-6
+        )
+    assert cost(gains - 0.1 * slope / jnp.linalg.norm(slope)) < value
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [
@@ -285,6 +322,10 @@ def test_arm_on_a_sphere(contact):
         (
             lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, force=jnp.zeros(2))(*_state(s)),
             r"force has shape \(2,\), expected \(1,\)",
+        ),
+        (
+            lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, least_regularity=-1.0),
+            "least_regularity is -1",
         ),
         (lambda s: jd.control.GaugeInvariant(s, first_two, circle, 1.0, 0.0), "kd is 0.0"),
         (lambda s: jd.control.GaugeInvariant(s, lambda q: q[:1], jnp.zeros(1), 1.0, 1.0)(*_state(s)), "1 coordinates"),

@@ -92,6 +92,16 @@ def test_examples_of_the_page_on_pictures_run(tmp_path, monkeypatch):
     np.testing.assert_array_equal(names["log"].q, names["recorded"].q)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("page", sorted(path.stem for path in (ROOT / "docs/control").glob("*.md")))
+def test_pages_of_control_laws(page):
+    """Each has its equation, an example that runs, a drawing and the command that makes it."""
+    text = (ROOT / f"docs/control/{page}.md").read_text()
+    assert "python -m benchmarks.control_figures" in text and "](../figures/control_" in text
+    if "```python" in text:
+        run(f"docs/control/{page}.md", least=1)
+
+
 def recipe(section: str, least: int = 2) -> dict:
     return run("docs/recipes.md", section, least, head=True)
 

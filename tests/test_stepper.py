@@ -68,6 +68,35 @@ def test_batches_and_gradients_of_steps(scene):
 
 
 @pytest.mark.slow
+def test_a_law_is_held_over_a_step_and_keeps_nothing(scene):
+    """The same steps as of its torques; what a gradient keeps of each step more is its state alone."""
+    gain = jnp.asarray([[3.0, 0.5], [0.2, 1.0]])
+    step = jd.stepper(scene, DT)
+
+    def run_law(gain, start, count, inside):
+        def law(q, v, t):
+            return -jnp.tanh(gain @ q) - 0.1 * jnp.tanh(gain @ v)
+
+        def advance(state, _):
+            return step(state, law if inside else law(*state, 0.0)), None
+
+        return jax.lax.scan(advance, start, None, length=count)[0]
+
+    inside, outside = (jax.jit(lambda g, way=way: run_law(g, START, 5, way)[0])(gain) for way in (True, False))
+    np.testing.assert_allclose(inside, outside, rtol=1e-13)
+    starts = jax.tree.map(lambda x: jnp.tile(x, (64, 1)), START)
+
+    def kept(count):
+        def loss(gain):
+            return jnp.sum(jax.vmap(lambda s: run_law(gain, s, count, True)[0])(starts))
+
+        return jax.jit(jax.grad(loss)).lower(gain).compile().memory_analysis().temp_size_in_bytes
+
+    # Four numbers a step and sample; buffers are aligned.
+    assert kept(300) - kept(100) == pytest.approx(8 * 4 * 200 * 64, rel=0.01)
+
+
+@pytest.mark.slow
 def test_constraints_are_closed_after_every_step():
     scene = jd.scenes.four_bar()
     q, v = jd.scenes.four_bar.start()
@@ -105,6 +134,7 @@ def test_limits_cut_the_control_and_nothing_else():
         (lambda: jd.stepper(jd.Scene(arm(), forces=(jd.DryFriction(0.1, 1.0),)), 0.1), "CoulombFriction"),
         (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(3), jnp.zeros(2)), TAU), "q has shape"),
         (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(2), jnp.zeros(2)), jnp.zeros(3)), "tau"),
+        (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(2), jnp.zeros(2)), lambda q, v, t: jnp.zeros(3)), "tau"),
         (lambda: jd.JointStops(-1.0), "stiffness"),
         (lambda: jd.JointStops(joints="9")(arm(), jnp.zeros(2), jnp.zeros(2), 0.0), "9"),
         (lambda: jd.EffortLimits(-1.0), "negative"),

@@ -58,6 +58,7 @@ class RESULTS(optimistix.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     open_constraints = "The constraints opened, and the projection could not close them."
     contact_lost = "A contact pulled or left its friction cone."
     joint_limit_passed = "A joint passed one of its position limits."
+    control_singular = "The control came to where its task cannot be followed: task and constraints lose rank."
     too_many_events = "Events followed each other without end, or there were more than max_events."
     painleve_paradox = (
         "Friction and normal force of a sliding contact left no forces, or more than one (Painleve's paradox)."

@@ -8,6 +8,7 @@ from jaxdyn.contact.closure import force_closure as force_closure
 from jaxdyn.contact.cones import FrictionCone as FrictionCone
 from jaxdyn.contact.cones import friction_cone as friction_cone
 from jaxdyn.contact.cones import surface_cone as surface_cone
+from jaxdyn.contact.coordinates import contact_coordinates as contact_coordinates
 from jaxdyn.contact.forces import ContactForces as ContactForces
 from jaxdyn.contact.forces import contact_forces as contact_forces
 from jaxdyn.contact.kinds import wrench_basis as wrench_basis

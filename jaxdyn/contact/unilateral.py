@@ -93,14 +93,19 @@ class DryFriction(WithModes):
 class UnilateralContact(WithModes):
     """A contact that pushes and does not pull, with Coulomb friction: open, or closed and sticking or slipping.
 
-    It closes by an impact without rebound: p is the least impulse, in the metric of the mass matrix, that keeps the bodies
-    from each other, and it lies in the friction cone. It opens where its normal force would have to pull.
+    It closes by an impact: without rebound p is the least impulse, in the metric of the mass matrix, that keeps the bodies
+    from each other, and it lies in the friction cone. With a coefficient e of restitution the velocity of the gap after
+    the impact is at least -e times the one before (Newton's hypothesis, for each contact); friction takes no rebound. It
+    opens where its normal force would have to pull.
 
     **Arguments:**
 
     - `contact`: a constraint with a gap and up to two rows without slip: `jd.rolling_sphere(...)`, `jd.rolling_wheel(...)`; or
       see `ground_contact`. The gap is positive where the contact is open.
     - `friction`: mu while it slides; `static`: mu at rest, None for the same.
+    - `restitution`: e, from 0 to 1. Contacts that hit at once with friction and different coefficients may gain energy
+      by Newton's hypothesis. A body that bounces to rest has infinitely many impacts: rebounds below
+      eps^0.3 m/s (2e-5 in float64) are none.
     - `name`: of its events; by default that of the constraint.
 
     **Raises:** ValueError for what is no contact, and bad coefficients.
@@ -109,9 +114,10 @@ class UnilateralContact(WithModes):
     contact: Constraint
     coefficient: Float[Array, "..."]
     static: Float[Array, "..."]
+    restitution: Float[Array, "..."]
     name: str = eqx.field(static=True)
 
-    def __init__(self, contact: Any, friction=0.0, *, static=None, name: str | None = None):
+    def __init__(self, contact: Any, friction=0.0, *, static=None, restitution=0.0, name: str | None = None):
         if not (isinstance(contact, Constraint) and contact.wrench_components() is not None):
             raise ValueError(
                 f"UnilateralContact: contact is {contact!r}; give a constraint with a gap, as jd.rolling_sphere(...), or take "
@@ -119,7 +125,12 @@ class UnilateralContact(WithModes):
             )
         self.contact = contact
         self.name = _checked_name(contact.name if name is None else name, "UnilateralContact")
-        self.coefficient, self.static = _coefficients(friction, static, f"UnilateralContact {self.name!r}")
+        owner = f"UnilateralContact {self.name!r}"
+        self.coefficient, self.static = _coefficients(friction, static, owner)
+        self.restitution = jnp.asarray(as_array(restitution, f"{owner}: restitution"), float)
+        known = None if isinstance(self.restitution, Tracer) else np.asarray(self.restitution)
+        if known is not None and not ((known >= 0) & (known <= 1)).all():
+            raise ValueError(f"{owner}: restitution is {restitution}; give a number from 0 to 1")
 
 
 def ground_contact(
@@ -128,6 +139,7 @@ def ground_contact(
     friction=0.0,
     *,
     static=None,
+    restitution=0.0,
     radius=0.0,
     plane=None,
     plane_body=None,
@@ -138,7 +150,7 @@ def ground_contact(
     **Arguments:**
 
     - `body`: body or frame; `point` (3,) in it, None for its origin, m; `radius` of a sphere about the point, m, 0 for none.
-    - `friction`, `static`: see `UnilateralContact`.
+    - `friction`, `static`, `restitution`: see `UnilateralContact`.
     - `plane`: pose of the ground in `plane_body` (None: the world), z its normal; by default the plane z = 0.
 
     **Raises:** ValueError for a bad pose, radius or coefficient; when used, for unknown bodies.
@@ -165,7 +177,30 @@ def ground_contact(
         contact=True,
         spin=False,
     )
-    return UnilateralContact(touching, friction, static=static, name=name)
+    return UnilateralContact(touching, friction, static=static, restitution=restitution, name=name)
+
+
+def gap_contact(
+    gap: Any, along: Any = None, friction=0.0, *, static=None, restitution=0.0, name: str = "contact"
+) -> UnilateralContact:
+    """Contact by functions of the coordinates, of systems without bodies too, which holds on one side.
+
+    **Arguments:**
+
+    - `gap`: gap(q, t) -> () in m, positive where the contact is open; differentiable twice.
+    - `along`: A(q, t) -> (nv,) or (2, nv): the velocity with which the contact slides is A v, m/s; None without friction.
+    - `friction`, `static`, `restitution`: see `UnilateralContact`. `name`: of its events.
+
+    **Raises:** ValueError for what cannot be called and bad coefficients; when used, for shapes that do not fit.
+
+    ```python
+    stop = jd.gap_contact(lambda q, t: 0.5 - q[0], restitution=0.3, name="stop")
+    ```
+    """
+    name = _checked_name(name, "gap_contact")
+    rows = None if along is None else as_pytree(along, f"gap_contact {name!r}: along")
+    touching = _Gap(gap=as_pytree(gap, f"gap_contact {name!r}: gap"), along=rows, name=name)
+    return UnilateralContact(touching, friction, static=static, restitution=restitution, name=name)
 
 
 def has_modes(scene: Scene) -> bool:
@@ -183,6 +218,27 @@ class _Coordinate(Constraint):
         if self.index >= v.shape[0]:
             raise ValueError(f"DryFriction {self.name!r}: along is {self.index}, but the system has nv = {v.shape[0]}")
         return v[self.index : self.index + 1]
+
+
+class _Gap(Constraint):
+    """A contact by its gap and the directions in which it slides."""
+
+    gap: Any
+    along: Any
+    name: str = eqx.field(static=True)
+
+    def wrench_components(self):
+        """Of a contact; without a frame in space."""
+        return ()
+
+    def position(self, system, q, t):
+        found = jnp.asarray(self.gap(q, t), q.dtype)
+        if found.shape != ():
+            raise ValueError(f"contact {self.name!r}: gap returned shape {found.shape}; return one number (m), ()")
+        return found[None]
+
+    def slip(self, system, q, v, t):
+        return None if self.along is None else Pfaffian(self.along, name=self.name).slip(system, q, v, t)
 
 
 def _checked_name(name: Any, owner: str) -> str:

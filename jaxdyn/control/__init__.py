@@ -9,6 +9,7 @@ Sources: EQUATIONS sections 8 to 10.
 
 from jaxdyn.control.constrained import GaugeInvariant as GaugeInvariant
 from jaxdyn.control.constrained import HybridForce as HybridForce
+from jaxdyn.control.contacts import ContactCoordinates as ContactCoordinates
 from jaxdyn.control.feet import Foot as Foot
 from jaxdyn.control.feet import foot as foot
 from jaxdyn.control.grasping import GraspForce as GraspForce

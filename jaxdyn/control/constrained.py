@@ -21,8 +21,16 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
 from jaxdyn.constraints.dynamics import projections
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
-from jaxdyn.control.errors import RateError, TaskError, as_target, least_acceleration, row_rank, wanted_rows
-from jaxdyn.control.gains import gain, times
+from jaxdyn.control.errors import (
+    RateError,
+    TaskError,
+    as_target,
+    least_acceleration,
+    regularity,
+    row_rank,
+    wanted_rows,
+)
+from jaxdyn.control.gains import gain, non_negative, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
@@ -87,6 +95,8 @@ class HybridForce(_ForceLoop):
     - `actuated`: indices of the velocities that have a motor; None: all. Of their torques those of least size are taken that
       give the motion, plus what `internal` (na,), N m, has along directions that change forces alone: with as many motors as
       freedoms there are none. Forces are then not controlled, and `force` and `ki` are to be left out.
+    - `least_regularity`: a number from 0 to 1. Where `regularity(q, v, t)` falls to it, a simulation ends, with the code
+      `control_singular` and the time. None: it goes on, the task followed as near as can be.
 
     **Raises:** ValueError for a scene without constraints, gains that are not positive definite, gains that do not fit the
     kind of task; (when called) for shapes that do not fit.
@@ -103,6 +113,7 @@ class HybridForce(_ForceLoop):
     ki: Array | None
     actuated: tuple[int, ...] | None = eqx.field(static=True)
     internal: Array | None
+    least_regularity: Array | None
 
     def __init__(
         self,
@@ -117,6 +128,7 @@ class HybridForce(_ForceLoop):
         ki: Any = None,
         actuated: Any = None,
         internal: Any = None,
+        least_regularity: Any = None,
     ):
         self.scene = constrained(scene)
         self.kp, self.kd = gain(kp, "kp"), None if kd is None else gain(kd, "kd")
@@ -125,6 +137,7 @@ class HybridForce(_ForceLoop):
         self.ki = None if ki is None else gain(ki, "ki")
         self.actuated = None if actuated is None else _indices(actuated, scene.nv)
         self.internal = None if internal is None else jnp.asarray(as_array(internal, "internal"), float)
+        self.least_regularity = None if least_regularity is None else non_negative(least_regularity, "least_regularity")
         if self.actuated is None and self.internal is not None:
             raise ValueError("internal is given without actuated; name the velocities that have a motor")
         if self.actuated is not None and not (self.force is None and self.ki is None):
@@ -144,6 +157,23 @@ class HybridForce(_ForceLoop):
         A = constraint_jacobian(self.scene, q, t)
         both, _ = self._rows(q, v, t)
         return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
+
+    def regularity(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, ""]:
+        """How far the law is from where task and constraints lose rank, 1 to 0.
+
+        The least sine of the angle, in the metric M^-1, between a row of the task and the span of the constraints' and
+        the rows of the task before it. Beside a singular place the law's accelerations grow as its inverse.
+        """
+        t = jnp.asarray(t, q.dtype)
+        both, _ = self._rows(q, v, t)
+        count = _count(self.scene)
+        return regularity(self.scene.system, q, t, both[:count], both[count:])
+
+    def allowance(self, q, v, t):
+        """Of `regularity`, above the least one."""
+        if self.least_regularity is None:
+            return None
+        return self.regularity(q, v, t) - self.least_regularity.astype(q.dtype)
 
     def __call__(self, q, v, t=0.0, state=None, multipliers=None) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N."""

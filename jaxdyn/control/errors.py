@@ -167,6 +167,27 @@ def ordered_acceleration(system, q, t, orders, start) -> Float[Array, " nv"]:
     return a
 
 
+def regularity(system, q, t, A, T) -> Float[Array, ""]:
+    """How far the rows T (m, nv) of a task are from depending on each other and on the rows A (nc, nv) of constraints, 0 to 1.
+
+    The least sine of the angle, in the metric M^-1, between a row of T and the span of A and the rows of T before it.
+    """
+    metric = mass_factor(mass_matrix(system, q, t))
+    Y, Z = metric.whiten(A.T), metric.whiten(T.T)
+    Z = Z - _product(Y, _product(pseudo_inverse(Y, tolerance(None, Y)), Z))
+    sizes = jnp.sum(metric.whiten(T.T) ** 2, 0)
+    free, least = list(Z.T), []
+    for i, row in enumerate(free):
+        square = jnp.sum(row * row)
+        some = square > 0
+        least.append(square / jnp.where(sizes[i] > 0, sizes[i], jnp.ones_like(square)))
+        unit = row / jnp.sqrt(jnp.where(some, square, jnp.ones_like(square)))
+        free[i + 1 :] = [other - jnp.sum(unit * other) * unit for other in free[i + 1 :]]
+    smallest = jnp.min(jnp.stack(least))
+    some = smallest > 0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, smallest, jnp.ones_like(smallest))), jnp.zeros_like(smallest))
+
+
 def row_rank(matrix: Float[Array, "m n"]) -> Array:
     """Number of independent rows, ()."""
     return jnp.round(jnp.sum(pseudo_inverse(matrix, tolerance(None, matrix), True) * matrix.T))

@@ -10,6 +10,8 @@ from jaxdyn.scenes.balls import bowling_ball as bowling_ball
 from jaxdyn.scenes.bodies import free_body as free_body
 from jaxdyn.scenes.boxes import allegro_with_cube as allegro_with_cube
 from jaxdyn.scenes.boxes import box_on_table as box_on_table
+from jaxdyn.scenes.friction import rough_disk_and_link as rough_disk_and_link
+from jaxdyn.scenes.friction import woodpecker as woodpecker
 from jaxdyn.scenes.hands import hand_rolling_ball as hand_rolling_ball
 from jaxdyn.scenes.hands import hand_with_ball as hand_with_ball
 from jaxdyn.scenes.hands import hand_with_bar as hand_with_bar

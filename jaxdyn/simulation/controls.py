@@ -71,6 +71,13 @@ class Controller(eqx.Module):
         """Rate of the state, of its structure. `multipliers` (nc,), under the torque that the law gives."""
         return None
 
+    def allowance(self, q, v, t) -> Float[Array, ""] | None:
+        """How far the law is from where it cannot do what it promises; None: not known, or not to be looked at.
+
+        Where this number falls to zero a simulation ends, with the code `control_singular`.
+        """
+        return None
+
 
 class Sampled(eqx.Module):
     """A discrete controller: the law is called at the start and after every `period`, and its torque is held in between.
@@ -134,6 +141,11 @@ def check_steps(control: Any, stepsize: Any) -> None:
                 f"stepsize is {float(np.asarray(stepsize)):.6g} s, of which {ratio:.6g} fill the period of the sampled control, "
                 f"{float(control.period):.6g} s; take a whole part of it"
             )
+
+
+def can_end(control: Any, q, v, t) -> bool:
+    """Whether a control says where it ends the motion."""
+    return isinstance(control, Controller) and eqx.filter_eval_shape(control.allowance, q, v, t) is not None
 
 
 def check_control(scene: Scene, control: Any, q, v, t) -> None:

@@ -26,8 +26,8 @@ class Equations(NamedTuple):
     - `args`: what is traced. `derivative(t, y, args)`, and its two parts for solvers that split it.
     - `torque(args, y, q, v, t)` of the control and `effort`, which is that plus the scene's forces, (nv,) or None.
     - `project(t, y, error, args)` after a step; `quality` of the method's basis; `begin`, `advance` for steps of its own.
-    - `allowances(args, y, q, v, t)` of contacts and joints that can end the run; `least_allowance(t, y, args)`, or None
-      where nothing can.
+    - `allowances(args, y, q, v, t)` of contacts, joints and the control, which can end the run;
+      `least_allowance(t, y, args)`, or None where nothing can.
     """
 
     args: tuple | None
@@ -134,16 +134,18 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
         scene, _, method = given(args)
         return method.begin(scene, y, t)
 
-    by_contacts = unilateral.can_end(scene, options["contacts"])
+    by_contacts, by_control = unilateral.can_end(scene, options["contacts"]), options["control_ends"]
 
     def allowances(args, y, q, v, t):
-        """How far the contacts are from being lost, and the joints from their limits."""
-        scene, _, method = given(args)
+        """How far the contacts are from being lost, the joints from their limits, and the control from where it ends."""
+        scene, control, method = given(args)
         found = []
         if by_contacts:
             found.append(unilateral.allowances(scene, method.multipliers(scene, q, v, t, effort(args, y, q, v, t))))
         if options["limits"] == "stop":
             found.append(joint_limits.limit_margins(scene.system, q))
+        if by_control:
+            found.append(control.allowance(q, v, t)[None])
         return jnp.concatenate(found)
 
     @jax.jit
@@ -157,7 +159,7 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
         scene, _, method = given(args)
         return method.advance(scene, y, t0, t1, carried, functools.partial(effort, args, y))
 
-    watched = by_contacts or options["limits"] == "stop"
+    watched = by_contacts or by_control or options["limits"] == "stop"
     return Equations(
         args, torque, effort, derivative, explicit_part, implicit_part, project, quality, begin, advance, allowances,
         least_allowance if watched else None,

@@ -67,6 +67,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     controls.check_control(scene, control, q0, v0, ts[0])
     states = controls.started(control, q0, v0, ts[0])
     added = tuple(states)  # names alone, as functions of a run hold no arrays
+    options = options | {"control_ends": controls.can_end(control, q0, v0, ts[0])}
     eqs = equations(scene, control, method, added, options)
     eqx.filter_eval_shape(eqs.effort, eqs.args, states, q0, v0, ts[0])
     y0 = method.start(scene, q0, v0, ts[0]) | states
@@ -112,9 +113,12 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         time_reached = jnp.where(lost.happened, lost.time, time_reached)
         by_contacts = unilateral.can_end(scene, options["contacts"])
         count = len(coned_contacts(scene)) if by_contacts else 0
-        at_limit = lost.happened & (lost.entry >= count)
-        result = RESULTS.where(lost.happened & ~at_limit, RESULTS.contact_lost, result)
+        limits = 2 * q.shape[1] if options["limits"] == "stop" else 0
+        at_limit = lost.happened & (lost.entry >= count) & (lost.entry < count + limits)
+        by_control = lost.happened & (lost.entry >= count + limits)
+        result = RESULTS.where(lost.happened & (lost.entry < count), RESULTS.contact_lost, result)
         result = RESULTS.where(at_limit, RESULTS.joint_limit_passed, result)
+        result = RESULTS.where(by_control, RESULTS.control_singular, result)
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
     if has_followers(system):
         follows = jnp.cumsum(~lax.map(system.follows, q)) == 0
@@ -158,7 +162,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     if lost is not None and unilateral.can_end(scene, options["contacts"]):
-        stats["lost_contact"] = jnp.where(at_limit, -1, lost.entry)
+        stats["lost_contact"] = jnp.where(lost.entry < count, lost.entry, -1)
     if lost is not None and options["limits"] == "stop":
         stats["passed_limit"] = jnp.where(at_limit, (lost.entry - count) % q.shape[1], -1).astype(jnp.int32)
     return Solution(ts=given_times, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))

@@ -59,6 +59,8 @@ ADVICE = {
     "no_single_contact": "take surfaces that are more convex where they come to touch, or other starts",
     "contact_lost": "grip harder (jd.contact.optimal_forces finds forces within the cones, jd.grasp.internal_forces what "
     "squeezes), or pass contacts='report' to go on with two-sided contacts",
+    "control_singular": "choose another task or target, or leave out the control's least_regularity to go on, where the task is "
+    "followed as near as can be",
     "joint_limit_passed": "change the start or the control, or pass limits='report' to go on, or None",
     "too_many_events": "raise max_events (now {max_events}); where events accumulate (a body that rocks to rest, friction that "
     "chatters) there is no more motion of rigid bodies behind that time: give friction a smoothing, or end before",

@@ -21,9 +21,10 @@ from jaxdyn.systems.scene import as_scene, checked_force
 
 
 def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Callable:
-    """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a constant tau.
+    """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a tau that is held.
 
     The state is a pair (q (nq,), v (nv,)); batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
+    torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
     steps are those of `jd.simulate` with `stepsize=dt/substeps`: RK4, constraints closed at the end of each, the scene's
     forces applied (friction, stops, drives), and tau cut off by its `jd.EffortLimits`.
 
@@ -33,7 +34,8 @@ def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Calla
       do not have: take `jd.CoulombFriction`.
     - `dt`: s; `substeps`: steps in it.
     - `remat`: whether reverse mode keeps no more of a step than its state and tau, and computes the rest again. That costs a
-      step, and a run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64.
+      step, and a run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau, which is computed
+      again too, 8 (nq + nv) n bytes and nothing of what happens inside the law.
 
     **Raises:** ValueError for a dt that is not positive, substeps that are no count, forces with modes; (when called) for shapes
     that do not fit.
@@ -41,6 +43,7 @@ def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Calla
     ```python
     step = jd.stepper(robot, dt=0.01, substeps=2)
     q, v = step((q, v), tau)
+    q, v = step((q, v), lambda q, v, t: -gain @ q)
     ```
     """
     scene = as_scene(scene)
@@ -96,7 +99,13 @@ def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Calla
         q, v = jnp.asarray(as_array(q, "q"), dtype), jnp.asarray(as_array(v, "v"), dtype)
         for name, value in (("q", q), ("v", v)):
             check_shape(system, name, value)
-        tau = checked_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau")
-        return taken(q, v, tau, jnp.asarray(t, dtype))
+        t = jnp.asarray(t, dtype)
+        if not callable(tau):
+            return taken(q, v, checked_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t)
+
+        def under_law(q, v, t):
+            return advance(q, v, checked_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t)
+
+        return (jax.checkpoint(under_law) if remat else under_law)(q, v, t)
 
     return step

@@ -221,9 +221,29 @@ def gaps(scene: Scene, elements: Elements, q, t) -> Array:
     return jnp.stack(found)
 
 
-def jumped(scene: Scene, elements: Elements, mode: Mode, place: Place, along, v) -> tuple[Array, Pushed]:
-    """The velocity after impulses that end the motion of the active rows, and these."""
-    pushed = push(scene, elements, mode, place, along, -place.row.velocity)
+def rebounds(scene: Scene, elements: Elements, place: Place) -> Array:
+    """Velocity of each gap (n,) after an impact by Newton's hypothesis: e times that with which it closes.
+
+    Slow ones are zero, as the flight after them would be hardly higher than the rounding of the gap.
+    """
+    zero, found = jnp.zeros((), place.row.velocity.dtype), []
+    least = float(jnp.finfo(zero.dtype).eps) ** 0.3
+    for one in elements.each:
+        if one.opens:
+            rebound = -force_at(scene, one).restitution.astype(zero.dtype) * place.row.velocity[one.normal]
+            found.append(jnp.where(rebound > least, rebound, zero))
+        else:
+            found.append(zero)
+    return jnp.stack(found)
+
+
+def jumped(scene: Scene, elements: Elements, mode: Mode, place: Place, along, v, rebound) -> tuple[Array, Pushed]:
+    """The velocity after impulses that end the motion of the active rows, or give gaps the velocity `rebound` (n,), and these."""
+    wanted = -place.row.velocity
+    for i, one in enumerate(elements.each):
+        if one.opens:
+            wanted = wanted.at[one.normal].add(rebound[i])
+    pushed = push(scene, elements, mode, place, along, wanted)
     return v + pushed.change, pushed
 
 

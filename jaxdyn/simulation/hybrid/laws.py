@@ -25,6 +25,7 @@ from jaxdyn.simulation.hybrid.dynamics import (
     jumped,
     motion_at,
     place_at,
+    rebounds,
     solve_rows,
 )
 from jaxdyn.simulation.hybrid.machine import Laws
@@ -139,12 +140,13 @@ def put_back(scene: Scene, elements: Elements, mode: Mode, t, y, error):
 
 def _jumped(scene: Scene, elements: Elements, mode: Mode, slip, t, q, v) -> Jumped:
     place = place_at(scene, elements, q, v, t)
-    after, pushed = jumped(scene, elements, mode, place, directions(scene, elements, jnp.zeros_like(slip), slip), v)
+    along, rebound = directions(scene, elements, jnp.zeros_like(slip), slip), rebounds(scene, elements, place)
+    after, pushed = jumped(scene, elements, mode, place, along, v, rebound)
     rates = _product(place.row.A, after - v) + place.row.velocity
-    gap = jnp.stack([rates[one.normal] if one.opens else jnp.zeros((), v.dtype) for one in elements.each])
+    gap = jnp.stack([rates[one.normal] if one.opens else jnp.zeros((), v.dtype) for one in elements.each]) - rebound
     M = mass_matrix(scene.system, q, t)
     size = jnp.max(jnp.abs(_product(M, v))) + jnp.max(jnp.abs(M)) + jnp.max(jnp.abs(pushed.multipliers))
-    return Jumped(after, pushed.normal, pushed.holding, by_element(elements, rates), gap, size)
+    return Jumped(after, pushed.normal, pushed.holding, by_element(elements, rates), gap, rebound, size)
 
 
 def _judged(scene: Scene, elements: Elements, mode: Mode, place: Place, motion, slip, q, v, t) -> Judged:

@@ -1,13 +1,13 @@
-"""What a mode becomes at an event: first velocities, by an impact without rebound, then forces.
+"""What a mode becomes at an event: first velocities, by an impact, then forces.
 
 Both are problems of complementarity: what is closed must push, what is open must not be pressed in, what sticks must stay in its
 cone, what slides must not turn round. A contact that sticks and would pull slides first: then it may well push. They are solved
 by changing the first element that disagrees, one at a time, which ends for problems of one solution (Murty's rule); where it does
 not end, no mode was found.
 
-The impact is that of least change in the metric of M over the bodies that are kept apart. An impulse that leaves the cone
-slides, against the direction of the impulse that would have held it: exact in a plane, an approximation of the sliding
-direction in space.
+The impact is that of least change in the metric of M over the bodies that are kept apart, or rebound by Newton's
+hypothesis. An impulse that leaves the cone slides, against the direction of the impulse that would have held it: exact in a
+plane, an approximation of the sliding direction in space.
 """
 
 from collections.abc import Callable
@@ -43,13 +43,15 @@ class Judged(NamedTuple):
 
 
 class Jumped(NamedTuple):
-    """Velocity (nv,) after an impact; impulses of each element; velocities of slipping (n, 2) and of the gap (n,) after it."""
+    """Velocity (nv,) after an impact; impulses of each element; velocities of slipping (n, 2) after it, and of the gap (n,)
+    above the `rebound` (n,) that restitution asks for."""
 
     v: Array
     normal: Array
     holding: Array
     slip: Array
     gap_velocity: Array
+    rebound: Array
     size: Array
 
 
@@ -200,8 +202,9 @@ def changed_mode(elements: Elements, cones, mode: Mode, slip, begins, v, jump: C
     speed, unit = length(after.slip)
     moves = speed > _loose(v.dtype) * judged.slip_size
     slip = impact_slip = lax.stop_gradient(jnp.where(moves[:, None], unit, impact_slip))
-    # What came to rest with others is held if it can be.
-    resting = impact._replace(stick=impact.stick | (impact.closed & rough & ~moves & ~begins))
+    # What rebounds opens; what came to rest with others is held if it can be.
+    closed = impact.closed & ~(opens & (after.rebound > 0))
+    resting = impact._replace(closed=closed, stick=(impact.stick | (rough & ~moves & ~begins)) & closed)
     final, slip, settled, now = solve(by_force, resting, slip)
     final = final._replace(stick=final.stick & final.closed)
     # Where sliding has no forces, no mode is found; where it has two, one is.

@@ -1,0 +1,76 @@
+"""Contact coordinates of two surfaces, from how their bodies lie to each other: the inverse of `relative_pose`.
+
+Of spheres and planes the places next to each other are known at once. Those of other surfaces come from Newton's method
+(`touching`), of which the last two steps are differentiated: that gives derivatives up to the third order.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxdyn.contact._checks import as_float
+from jaxdyn.contact.surfaces import Plane, Sphere, Surface, check_surface, geometry_at
+from jaxdyn.contact.touching import newton_steps, patch_at
+from jaxdyn.lie.so3 import _product
+
+_ROUNDS, _DIFFERENTIATED = 12, 2
+
+
+def contact_coordinates(surface_o: Surface, surface_f: Surface, pose) -> Float[Array, "5"]:
+    """Contact coordinates eta (5,) of the places where two surfaces are next to each other.
+
+    Surfaces that touch are in contact there. Of others these are the places with opposite normals on one line, and
+    `relative_pose(surface_o, surface_f, eta)` is the given pose moved along that line. Both charts must have a frame there, and
+    the surfaces one such pair of places (`ContactKinematics.strict`).
+
+    **Arguments:**
+
+    - `surface_o`, `surface_f`: of the object and of the finger, each in its body's frame, with outward normals.
+    - `pose` (4, 4): of the finger's frame in the object's, m.
+
+    **Returns:** eta = (u_o, v_o, u_f, v_f, psi) (5,), in the units of the charts and rad; differentiable three times.
+
+    **Raises:** ValueError for what is no surface, a pose of another shape, two planes, and a `Parametrised` surface, which does
+    not say which of its places is next to a point.
+
+    ```python
+    ball, tip = jd.contact.Sphere(0.1), jd.contact.Sphere(0.02)
+    pose = jd.contact.relative_pose(ball, tip, jnp.array([0.1, 0.2, 0.3, 0.4, 0.5]))
+    eta = jd.contact.contact_coordinates(ball, tip, pose)
+    ```
+
+    Source: Murray, Li & Sastry (1994), section 5.6.2; EQUATIONS section 8.
+    """
+    pose = as_float(pose, "pose", (4, 4))
+    for surface in (surface_o, surface_f):
+        check_surface(surface)
+    if isinstance(surface_o, Plane) and isinstance(surface_f, Plane):
+        raise ValueError("surface_o and surface_f are both planes, which do not touch in one point")
+    R, p = pose[:3, :3], pose[:3, 3]
+    # Opposite to a plane's normal; to others along the line of the frames' origins.
+    place_o = surface_o.toward(-R[:, 2] if isinstance(surface_f, Plane) else p)
+    place_f = surface_f.toward(-R[2] if isinstance(surface_o, Plane) else -_product(p, R))
+    if place_o is None or place_f is None:
+        which = surface_o if place_o is None else surface_f
+        raise ValueError(
+            f"surface {type(which).__name__} does not say which of its places is next to a point; take a Sphere, Ellipsoid, "
+            "Plane or Cylinder"
+        )
+    if not all(isinstance(surface, Sphere | Plane) for surface in (surface_o, surface_f)):
+        place_o, place_f = _by_newton(surface_o, surface_f, R, p, (place_o, place_f))
+    at_o, at_f = surface_o.coordinates_at(place_o), surface_f.coordinates_at(place_f)
+    frame_o, frame_f = geometry_at(surface_o, at_o).frame, geometry_at(surface_f, at_f).frame
+    turn = _product(frame_o.T, _product(R, frame_f))
+    return jnp.concatenate([at_o, at_f, jnp.arctan2(-turn[0, 1], turn[0, 0])[None]])
+
+
+def _by_newton(surface_o: Surface, surface_f: Surface, R, p, places):
+    def stepped(R, p, places):
+        steps = newton_steps(patch_at(surface_o, places[0]), patch_at(surface_f, places[1]), R, p)
+        return surface_o.moved(places[0], steps.on_a), surface_f.moved(places[1], steps.on_b)
+
+    still = lax.stop_gradient((R, p))
+    places = lax.fori_loop(0, _ROUNDS, lambda _, places: stepped(*still, places), lax.stop_gradient(places))
+    for _ in range(_DIFFERENTIATED):
+        places = stepped(R, p, places)
+    return places

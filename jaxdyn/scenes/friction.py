@@ -1,0 +1,125 @@
+"""Mechanisms that move by friction: contacts that stick, slide, open and close."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints import rolling_sphere
+from jaxdyn.contact.unilateral import UnilateralContact, gap_contact, ground_contact
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.scenes._named import named
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import MetricSystem
+
+_UP, _DOWN = ((0, 0, 0), (-jnp.pi / 2, 0, 0)), ((0, 0, 0), (jnp.pi / 2, 0, 0))  # z of a plane along y, and against it
+
+
+def _rough_start(speed=3.0, place=0.1, link_place=0.0, tilt=0.0):
+    # The link touches the disk of radius 1 from above, tilted clockwise.
+    height = 1 + (1 + jnp.sin(tilt) * (place - link_place)) / jnp.cos(tilt)
+    q = jnp.stack([jnp.asarray(x, float) for x in (place, 1.0, 0.0, link_place, height, -tilt)])
+    # Along itself, so that the contact stays closed; velocities are in the link's axes.
+    return q, jnp.zeros(6).at[3].set(speed)
+
+
+@named(_rough_start)
+def rough_disk_and_link(*, masses=(1.0, 0.6), moments=(0.5, 0.2), friction=(0.3, 0.2), gravity=9.81) -> Scene:
+    """Disk of radius 1 m on the ground under a thin link that lies on it, both contacts with friction that sticks and slides.
+
+    The bodies of `disk_and_link`, free in their plane: q = (x, y, angle) of the disk and of the link's centre of mass, angles
+    counter-clockwise. `masses` (kg), `moments` (kg m^2) of the disk and the link; `friction`: coefficients of the contacts
+    "link" (link on disk) and "ground" (disk on ground). The link's centre of mass leaves the place of contact, so it tips unless
+    it is held: a torque m2 g (x_disk - x_link) about it, clockwise, keeps it level.
+
+    Start: disk at rest at `place`, the link above it with its centre at `link_place` (m), clockwise `tilt` (rad), thrown along
+    itself with `speed` (m/s). Level, the link slides on the disk with the deceleration mu1 g.
+
+    Source: EQUATIONS section 12 with erratum E57, with the normal forces of the free equations.
+    """
+    builder = ModelBuilder("disk and link", gravity=(0.0, -gravity, 0.0))
+    for name, mass, moment in zip(("disk", "link"), masses, moments, strict=True):
+        builder.add_body(name, None, "planar", (mass, (0.0, 0.0, 0.0), (moment / 2, moment / 2, moment)))
+    on_link = rolling_sphere("disk", None, 1.0, surface=_DOWN, surface_body="link", name="link")
+    ground = ground_contact("disk", None, friction[1], radius=1.0, plane=_UP, name="ground")
+    return Scene(builder.build(), forces=(UnilateralContact(on_link, friction[0]), ground))
+
+
+class _Toy(eqx.Module):
+    """A row of numbers times the coordinates, plus one: gaps of the woodpecker, and rows of its slipping velocities."""
+
+    row: Float[Array, "3"]
+    constant: Float[Array, ""]
+
+    def __call__(self, q, t):
+        return jnp.sum(self.row.astype(q.dtype) * q) + self.constant.astype(q.dtype)
+
+
+class _Row(eqx.Module):
+    row: Float[Array, "3"]
+
+    def __call__(self, q, t):
+        return self.row.astype(q.dtype)
+
+
+def _toy_metric(q, t, p):
+    return p["mass"]
+
+
+def _toy_potential(q, t, p):
+    return jnp.sum(p["weight"] * q) + 0.5 * p["stiffness"] * (q[1] - q[2]) ** 2
+
+
+def _woodpecker_start(gap=0.0006, half_height=0.0058, bird=-0.2788, velocity=(-0.3411, 0.0, -7.4583)):
+    return jnp.asarray([0.0, -gap / half_height, bird]), jnp.asarray(velocity)
+
+
+@named(_woodpecker_start)
+def woodpecker(
+    *,
+    masses=(0.0003, 0.0045),
+    moments=(5.0e-9, 7.0e-7),
+    stiffness=0.0056,
+    pole_radius=0.0025,
+    sleeve_radius=0.0031,
+    half_height=0.0058,
+    to_spring=0.010,
+    to_bird=0.015,
+    beak=(0.020, 0.0201),
+    friction=0.3,
+    restitution=0.5,
+    gravity=9.81,
+) -> Scene:
+    """Woodpecker toy: a sleeve with play on a pole, from which a bird hangs on a spring, and comes down pecking.
+
+    q = (height of the sleeve, m, its angle and the bird's, rad); equations linear in the angles. Contacts: "beak" on the
+    pole, with `restitution`; "lower" and "upper" edge of the sleeve on the pole, without. All have the same `friction`. Where
+    an edge sticks, the toy is jammed and the bird swings; it falls while the sleeve is free.
+
+    `masses`, `moments` of sleeve and bird (kg, kg m^2), the latter about the bird's centre of mass; `stiffness` (N m/rad);
+    `half_height` of the sleeve, distances `to_spring` from the sleeve's centre and from there `to_bird`; `beak`: its height above
+    and its distance from the bird's centre of mass (m).
+
+    Start: on the periodic motion, by its published numbers of four digits: the lower edge touches the pole, the bird's angle
+    and the velocities are given.
+
+    Source: Glocker (1995), pp. 162; Leine, Glocker & van Campen (2001).
+    """
+    sleeve, bird = masses
+    arms = jnp.asarray([1.0, to_spring, to_bird], float)
+    mass = bird * jnp.outer(arms, arms) + jnp.diag(jnp.asarray([sleeve, moments[0], moments[1]], float))
+    weight = gravity * (bird * arms + jnp.asarray([sleeve, 0.0, 0.0], float))
+    numbers = {"mass": mass, "weight": weight, "stiffness": jnp.asarray(stiffness, float)}
+    system = MetricSystem(_toy_metric, 3, potential=_toy_potential, parameters=numbers)
+    play, reach = sleeve_radius - pole_radius, to_spring + to_bird - beak[1]
+
+    def contact(name, rate, constant, along, e):
+        gap = _Toy(jnp.asarray(rate, float), jnp.asarray(constant, float))
+        return gap_contact(gap, _Row(jnp.asarray(along, float)), friction, restitution=e, name=name)
+
+    edge = (1.0, sleeve_radius, 0.0)
+    contacts = (
+        contact("beak", (0.0, 0.0, -beak[0]), reach - pole_radius, (1.0, to_spring, to_bird - beak[1]), restitution),
+        contact("lower", (0.0, half_height, 0.0), play, edge, 0.0),
+        contact("upper", (0.0, -half_height, 0.0), play, edge, 0.0),
+    )
+    return Scene(system, forces=contacts)
