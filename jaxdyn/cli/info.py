@@ -62,9 +62,10 @@ def run(args: argparse.Namespace) -> None:
     print(describe(model, args.file))
     print(constraint_lines(scene))
     print(_problems(urdf_inertia_report(file), body_problems) if is_urdf else _body_problems(body_problems))
-    print(
-        _unused(str(file)) if is_urdf else "\n".join(["\nNot taken from the file:", *(scene.not_taken or ["nothing"])])
-    )
+    if is_urdf:
+        print(_unused(str(file)))
+    if scene.not_taken or not is_urdf:
+        print("\n".join(["\nNot taken from the file:", *(scene.not_taken or ["nothing"])]))
     if out is not None:
         repaired = repair_inertias(model)
         save_urdf(repaired, out)
@@ -212,6 +213,10 @@ def _unused(path: str) -> str:
     """What the file holds that the model does not, counted by element."""
     counts: collections.Counter[str] = collections.Counter()
     for element in XmlFile(path, "URDF").root:
+        if element.tag == "gazebo" and (
+            element.find("joint") is not None or element.find("plugin/mimicJoint") is not None
+        ):
+            continue  # a loop or a coupling
         if element.tag not in ("link", "joint"):
             counts[element.tag] += 1
             continue

@@ -12,8 +12,8 @@ from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, built
 from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of_units
 from jaxdyn.io.sdf_frames import SdfFile
-from jaxdyn.io.sdf_joints import Axis, Edge, Joint, read_joints, spanning_tree
-from jaxdyn.io.urdf import ROOT_JOINT, _turn_from_z
+from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
+from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
@@ -22,8 +22,6 @@ from jaxdyn.model.tree import Model
 
 _KINDS = dict(revolute="revolute", continuous="revolute", revolute2="revolute", universal="revolute")
 _KINDS |= dict(prismatic="prismatic", screw="helical", ball="spherical")
-_LOOPS = dict(revolute="revolute", continuous="revolute", prismatic="prismatic", universal="universal")
-_LOOPS |= dict(revolute2="universal", ball="spherical", fixed="weld")
 _SECOND = "_axis2"  # behind the name of a joint of two axes: its second one
 _PARALLEL = 1e-4  # files give right angles with four or five digits
 _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
@@ -189,10 +187,10 @@ def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constrai
         for k, end in enumerate(ends):
             axis = joint.axes[min(k, len(joint.axes) - 1)].direction if joint.axes else joint.pose[:3, 2]
             # The loop closes as the file places the links: both frames are there, z along the end's own axis.
-            place = _turn_from_z(axis)
+            place = f64.turn_from_z(axis)
             place[:3, 3] = joint.pose[:3, 3]
             poses.append(place if end is None else f64.inverse(file.pose(end)) @ place)
-        taken.append(loop(ends[0], poses[0], ends[1], poses[1], _LOOPS[joint.kind], name=joint.name))
+        taken.append(loop(ends[0], poses[0], ends[1], poses[1], LOOPS[joint.kind], name=joint.name))
     return taken, [line for reason, names in left.items() for line in listed(reason, names)]
 
 
