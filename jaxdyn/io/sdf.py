@@ -85,7 +85,8 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype=None)
 
 def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, dtype) -> tuple[Model, dict[str, str]]:
     """The model, and the joints of its free roots with the link of each."""
-    name = next(iter(file.models)) if len(file.models) == 1 or file.world is None else ""
+    first = next(iter(file.models.values())).element.get("name")
+    name = first if len(file.models) == 1 or file.world is None else ""
     name = name or (file.world.get("name") if file.world is not None else "") or "mechanism"
     gravity: np.ndarray | tuple | None = GRAVITY
     if file.world is not None:
@@ -298,6 +299,6 @@ def _unused(file: SdfFile) -> list[str]:
     for model, scope in file.models.items():
         for tag in ("plugin", "gripper"):
             if scope.element.find(tag) is not None:
-                found.setdefault(f"<{tag}> of models", []).append(model)
+                found.setdefault(f"<{tag}> of models", []).append(scope.element.get("name") or model)
     lines = [line for reason, names in found.items() for line in listed(reason, names)]
     return [*lines, *listed("includes", file.includes)]

@@ -80,8 +80,10 @@ class SdfFile(XmlFile):
             static = scope.static or self.flag(element, "static", f"model {name!r}")
             # The one model of a file gives no prefix to its names; several do, so that they stay apart.
             alone = scope.parent is None and len(scope.element.findall("model")) == 1
-            inner = Scope(element, "" if alone else f"{name}::", name, scope, static)
-            self.models[name] = inner
+            # Without a prefix the model's own frame must not take the name of what is in it.
+            frame = "__model__" if alone and any(part.get("name") == name for part in element) else name
+            inner = Scope(element, "" if alone else f"{name}::", frame, scope, static)
+            self.models[frame] = inner
             self._collect(inner)
 
     def find(self, name: str, scope: Scope, element) -> str:
