@@ -62,7 +62,7 @@ import diffrax
 scene = model = robot = jd.robots.chain(2)
 q = q0 = jnp.array([0.3, 0.2])
 v = v0 = tau = jnp.zeros(2)
-q1, target = q0, lambda t: (jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
+q1, target = q0, lambda t: jnp.zeros(2)
 ts = jnp.linspace(0.0, 0.02, 3)
 """
 MOTIONS = """
@@ -131,9 +131,9 @@ def test_every_export_has_an_example():
             ):
                 without.append(f"{page}: {name}")
     assert count > 330 and not without, without
-    for listed in (*ELSEWHERE.values(), *NOT_RUN.values()):
-        assert (ROOT / "tests" / f"{listed}.py").exists()
-    assert not [name for name in ELSEWHERE if documented(name)]
+    for module in (*ELSEWHERE.values(), *NOT_RUN.values()):
+        assert (ROOT / "tests" / f"{module}.py").exists()
+    assert not shown & ELSEWHERE.keys()
 
 
 @contextlib.contextmanager
