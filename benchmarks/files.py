@@ -147,7 +147,7 @@ def candidates(roots: list[Path], written: Path, only_written: bool) -> list[tup
     if only_written:
         return found
     found += files(roots, ".sdf", b"<sdf")
-    found += files(roots, ".xml", b"<equality")
+    found += files(roots, ".xml", b"<mujoco")
     return found + [one for one in files(roots, ".urdf", b"<robot") if one[1].with_suffix(".yaml").exists()]
 
 
@@ -175,8 +175,8 @@ def motion_of(name: str, path: Path, html: Path, duration: float) -> tuple[str, 
     motion, note = jd.simulate(scene, start.q, start.v, ts, **options), ""
     if not motion.success or motion.stats["num_steps"] > MOST_STEPS:
         # Rows that say the same as others but for a file's digits, or only where the loop is closed (docs/sharp_bits.md).
-        reached = f"stops at {float(motion.stats['time_reached']):.2f} s" if not motion.success else "takes"
-        note = f", rank_tol {RANK_TOL:g} (by default it {reached} after {int(motion.stats['num_steps'])} steps)"
+        reached = "takes" if motion.success else f"stops at {float(motion.stats['time_reached']):.2f} s, after"
+        note = f", rank_tol {RANK_TOL:g} (by default it {reached} {int(motion.stats['num_steps'])} steps)"
         motion = jd.simulate(scene, start.q, start.v, ts, method=jd.Projected(rank_tol=RANK_TOL), **options)
     last = np.isfinite(np.asarray(motion.q)).all(1).sum()
     residual = np.nanmax(np.abs(np.asarray(motion.constraint_residual)[:last]), axis=0)
