@@ -143,7 +143,7 @@ def mjcf(roots: list[Path], match: str) -> int:
 
 def candidates(roots: list[Path], written: Path, only_written: bool) -> list[tuple[str, Path]]:
     """Files that may hold loops: those that this script writes, MJCF with equalities, SDF, URDF with a YAML file beside it."""
-    found = [(f"written/{path.name}", path) for path in linkages.write(written)]
+    found = [(f"written/{path.name}", path) for path in linkages.write(written, 4)]
     if only_written:
         return found
     found += files(roots, ".sdf", b"<sdf")
