@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxdyn.io.loaded import warn_of_units
 from jaxdyn.io.urdf_check import JOINTS
 from jaxdyn.io.urdf_parts import Inertial, Joint, read_parts
 from jaxdyn.model import float64 as f64
@@ -66,7 +67,8 @@ def load_urdf(
     velocity or effort, a zero axis; for names in `lock` that are not movable joints;
     for a joint that moves no inertia.
 
-    **Warns:** UserWarning naming the links with a negative moment of inertia.
+    **Warns:** UserWarning naming the links with a negative moment of inertia; `UnitsWarning` where limits look like degrees,
+    or lengths and inertias like millimetres.
     """
     return urdf_model(path, floating_base=floating_base, lock=lock, mimic=mimic, gravity=gravity, dtype=dtype)
 
@@ -123,9 +125,11 @@ def urdf_model(
         for name, coupling in couplings.items():
             builder.add_coupling(name, coupling.joint, coupling.multiplier, coupling.offset)
     try:
-        return builder.build()
+        model = builder.build()
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    warn_of_units(path, model, stacklevel=4)
+    return model
 
 
 def urdf_inertia_report(path: str | os.PathLike) -> list[tuple[str, str]]:
