@@ -438,7 +438,6 @@ def test_units_that_look_wrong_are_said_aloud(tmp_path):
     for read in (load_urdf, load):
         with pytest.warns(UnitsWarning) as caught:
             read(path)
-        assert caught[0].filename == __file__ or read is load
         for part in ("robot.urdf", "rad of joint 'j' (degrees?)", "body 'b' 350 m", "radius of gyration 141.421 m"):
             assert part in str(caught[0].message)
     path.write_text(text.replace("-90", "-1e16").replace("2e4", "0.1").replace("350", "0.35"), encoding="utf-8")
