@@ -80,9 +80,19 @@ def twice(scene):
     "case", [pytest.param(name, marks=[pytest.mark.slow] * (name != "free body")) for name in CASES]
 )
 def test_stages_at_once_are_those_in_turn(case, monkeypatch):
-    """A whole step in one kernel, its stages in turn, and without kernels; a batch and one sample."""
+    """All steps in one kernel, a kernel a step, its stages in turn, and without kernels; a batch and one sample."""
     one, vs = batch(*CASES[case]())
-    taken, run = [], driver.run
+    taken, looped, run, run_loop = [], [], driver.run, driver.run_loop
+
+    def counted(*args):
+        found = run_loop(*args)
+        looped.append(found is not None)
+        return found
+
+    monkeypatch.setattr(driver, "run_loop", counted)
+    in_one, alone = jax.jit(jax.vmap(one))(vs), jax.jit(one)(vs[1])
+    assert all(looped) and looped
+    monkeypatch.setattr(driver, "run_loop", lambda *_: None)
 
     def noted(function, *args, **options):
         found = run(function, *args, **options)
@@ -91,7 +101,7 @@ def test_stages_at_once_are_those_in_turn(case, monkeypatch):
         return found
 
     monkeypatch.setattr(driver, "run", noted)
-    found, alone = jax.jit(jax.vmap(one))(vs), jax.jit(one)(vs[1])
+    found = jax.jit(jax.vmap(one))(vs)
     assert all(taken) and taken
     monkeypatch.setattr(
         driver,
@@ -101,7 +111,7 @@ def test_stages_at_once_are_those_in_turn(case, monkeypatch):
     in_turn = jax.jit(jax.vmap(one))(vs)
     with jd.compilation("plain"):
         plain = jax.jit(jax.vmap(one))(vs)
-    for wanted in (in_turn, plain):
+    for wanted in (in_one, in_turn, plain):
         assert bool(found.success.all()) and bool(wanted.success.all())
         np.testing.assert_allclose(found.q, wanted.q, rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.v, wanted.v, rtol=0, atol=1e-12)

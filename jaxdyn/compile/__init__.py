@@ -22,6 +22,12 @@ from jaxdyn.compile.known import is_concrete as is_concrete
 from jaxdyn.compile.known import is_known as is_known
 from jaxdyn.compile.known import is_staged as is_staged
 from jaxdyn.compile.known import partition_traced as partition_traced
+from jaxdyn.compile.loops import Carry as Carry
+from jaxdyn.compile.loops import Given as Given
+from jaxdyn.compile.loops import Passed as Passed
+from jaxdyn.compile.loops import Task as Task
+from jaxdyn.compile.loops import Turn as Turn
+from jaxdyn.compile.loops import run_loop as run_loop
 from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import is_expanding as is_expanding
 from jaxdyn.compile.repair import any_in_batch as any_in_batch

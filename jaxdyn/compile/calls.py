@@ -1,7 +1,9 @@
 """Functions that are called with known numbers, compiled once."""
 
 import functools
+import os
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,16 +18,45 @@ _MOST_NUMBERS = 10_000  # beyond which a tree is no input of mechanics, but data
 def compiled(function: Callable) -> Callable:
     """`function`, compiled once per shape and mode; within a trace as it is, where a nested `jit` would hide what is known."""
 
-    @eqx.filter_jit
     def program(mode, *args):
         del mode  # of which there is one program each
         return function(*args)
 
+    usual = eqx.filter_jit(program)
+    quick = functools.cache(lambda: _jit(program, compiler_options=quick_options()))
+
     @functools.wraps(function)
     def call(*args):
-        return function(*args) if is_staged() else program(mode.current(), *args)
+        if is_staged():
+            return function(*args)
+        # JAX takes options for a program that stands in no transformation.
+        is_glue = mode.current() != "plain" and jax.default_backend() == "cpu" and is_concrete(args)
+        return (quick() if is_glue else usual)(mode.current(), *args)
 
     return call
+
+
+_jit: Any = eqx.filter_jit
+
+# What XLA compiles is the glue between kernels. Its emitters of fusions, each a module of its own, take most of the time to
+# compile it and bring nothing at run time: `python -m benchmarks.first_calls`, and again with
+# JAXDYN_COMPILATION_OPTIONS=usual in the environment.
+_QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+
+
+@functools.cache
+def quick_options() -> dict[str, Any] | None:
+    """Options with which XLA compiles glue quickly.
+
+    None where the environment asks for the usual ones, or XLA does not know these.
+    """
+    if os.environ.get("JAXDYN_COMPILATION_OPTIONS") == "usual":
+        return None
+    try:
+        jax.jit(lambda: 0.0, compiler_options=_QUICK)()
+    except jax.errors.JaxRuntimeError:
+        return None
+    return _QUICK
 
 
 def specialized(function: Callable) -> Callable:

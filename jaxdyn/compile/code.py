@@ -16,13 +16,13 @@ from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program
 
 LEAST_SHARED = 2000  # operations of a program of one sample, beside which those of a call do not count
 _ALIGNED = 64  # bytes
-_ATTRIBUTES = (
+ATTRIBUTES = (
     "attributes #0 = { nounwind }",
     "attributes #1 = { nounwind willreturn memory(none) }",
 )
 
 
-class _Body:
+class Body:
     """The operations of a program, as lines of an emitter.
 
     **Arguments:** `load(place, entry, kind)` reads an entry of an input; `array(place)` is the pointer to an input that has the
@@ -75,16 +75,16 @@ class _Body:
         called = self.program.subprograms[which.value]
         if called not in self.regions:
             self.regions[called] = self.bytes
-            self.bytes += sum(_bytes(x, self.e.width) for x in (*called.inputs, *called.outputs))
+            self.bytes += sum(bytes_of(x, self.e.width) for x in (*called.inputs, *called.outputs))
         at, first, pointers = self.regions[called], 0, []
         for array in called.inputs:
             entries = given[first : first + array.size]
             pointers.append(self._passed_on(entries, array) or self._copied(entries, array, at))
-            at, first = at + _bytes(array, self.e.width), first + array.size
+            at, first = at + bytes_of(array, self.e.width), first + array.size
         outputs = []
         for array in called.outputs:
             outputs.append((self._place(at), kind_of(array.dtype), array.size))
-            at += _bytes(array, self.e.width)
+            at += bytes_of(array, self.e.width)
         _write_call(self.e, called, [*pointers, *(pointer for pointer, _, _ in outputs)])
         needed, found, first = set(self.parts.get(i, ())), {}, 0
         for pointer, kind, size in outputs:
@@ -120,7 +120,7 @@ class _Body:
         return [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
 
 
-def _bytes(array: Array, width: int) -> int:
+def bytes_of(array: Array, width: int) -> int:
     return -(-array.size * array.dtype.itemsize * width // _ALIGNED) * _ALIGNED
 
 
@@ -140,13 +140,13 @@ def subprogram_ir(called: Program, width: int) -> str:
     if called.subprograms:
         raise AssertionError("a subprogram that calls others, which `expand` does not make")
     e = Emitter(width)
-    body = _Body(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: None)
+    body = Body(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: None)
     for i, (row, array) in enumerate(zip(body.results(), called.outputs, strict=True)):
         for k, name in enumerate(row):
             e.store_at(f"%r{i}", k, kind_of(array.dtype), name)
     names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
     head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
-    return "\n".join([head, *e.lines, "  ret void", "}", *e.declared.values(), *_ATTRIBUTES])
+    return "\n".join([head, *e.lines, "  ret void", "}", *e.declared.values(), *ATTRIBUTES])
 
 
 def calls_itself(program: Program, width: int) -> bool:
@@ -180,7 +180,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         """The row of one sample."""
         return None if width > 1 else rows[place][0] if place in rows else f"%a{place}"
 
-    body = _Body(e, program, load, array)
+    body = Body(e, program, load, array)
     if calls_itself(program, width):
         _write_call(e, program, [str(array(i)) for i in range(len(arrays))])
     else:
@@ -214,6 +214,6 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
             "  ret void",
             "}",
             *e.declared.values(),
-            *_ATTRIBUTES,
+            *ATTRIBUTES,
         ]
     )

@@ -34,6 +34,7 @@ class PseudoInverse:
 
     derivative = None
     subprograms = ()
+    turns = 1
 
     def __init__(self, rows: int, columns: int, dtype, tolerance: float):
         self.rows, self.columns, self.dtype, self.tolerance = rows, columns, np.dtype(dtype), tolerance

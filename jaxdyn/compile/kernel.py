@@ -73,11 +73,7 @@ def run(
         if target is None:
             mode.say_once("llvmlite is not installed, so functions run on JAX's own operations (pip install llvmlite)")
         return by_jax()
-    traced, known = partition_traced(tree)
-    leaves, structure = jax.tree.flatten(args)
-    leaves = [*map(jnp.asarray, (*traced, *leaves))]
-    shapes = tuple((x.shape, x.dtype) for x in leaves)
-    found = _program(function, static, known, len(traced), structure, shapes, tangent, most, calls, served)
+    leaves, found = program_of(function, static, tree, args, tangent=tangent, most=most, calls=calls, served=served)
     if isinstance(found, str):
         if otherwise is None:
             mode.say_once(f"{_name_of(function)} runs on JAX's own operations: {found}")
@@ -116,6 +112,28 @@ def compute(function: Callable, tree, *args, static: tuple = (), given: bool = F
                 pass
     with jax.ensure_compile_time_eval():
         return jax.tree.map(np.asarray, function(*static, tree, *map(jnp.asarray, args)))
+
+
+def program_of(
+    function: Callable,
+    static: tuple,
+    tree,
+    args: tuple,
+    *,
+    tangent: Callable | None = None,
+    most: int = mode.MAX_OPERATIONS,
+    calls: bool = False,
+    served: bool = False,
+):
+    """Inputs of the program of a function, and the program with the structure of its results, or why there is none.
+
+    **Arguments:** as of `run`.
+    """
+    traced, known = partition_traced(tree)
+    leaves, structure = jax.tree.flatten(args)
+    leaves = [*map(jnp.asarray, (*traced, *leaves))]
+    shapes = tuple((x.shape, x.dtype) for x in leaves)
+    return leaves, _program(function, static, known, len(traced), structure, shapes, tangent, most, calls, served)
 
 
 def native(function: Callable) -> Callable:

@@ -251,7 +251,7 @@ class Emitter:
         """An entry of the rows of all lanes."""
         of, value = self.type(kind), "poison"
         for lane, row in enumerate(rows):
-            x = self._load_one(row, entry, kind)
+            x = self.load_one(row, entry, kind)
             if self.width == 1:
                 return x
             value = self.put(f"insertelement {of} {value}, {_TYPES[kind]} {x}, i32 {lane}")
@@ -260,7 +260,7 @@ class Emitter:
     def load_for_all(self, place: int, entry: int, kind: str) -> str:
         """An entry of an argument that is the same for all samples, read once."""
         lines, self.lines = self.lines, self.entry
-        value = self._load_one(f"%a{place}", entry, kind)
+        value = self.load_one(f"%a{place}", entry, kind)
         if self.width > 1:
             of = self.type(kind)
             first = self.put(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
@@ -283,7 +283,8 @@ class Emitter:
             kind, value = "i1", self.put(f"zext {self.type('b1')} {value} to {self.type('i1')}")
         self.stored(f"  store {self.type(kind)} {value}, ptr {at}")
 
-    def _load_one(self, row: str, entry: int, kind: str) -> str:
+    def load_one(self, row: str, entry: int, kind: str) -> str:
+        """An entry of the row of one lane."""
         at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
         if kind != "b1":
             return self.put(f"load {_TYPES[kind]}, ptr {at}, align {_BYTES[kind]}")
@@ -346,9 +347,13 @@ class Emitter:
     def store(self, rows: Sequence[str], entry: int, kind: str, value: str) -> None:
         """Write an entry of the rows of all lanes."""
         for lane, row in enumerate(rows):
-            at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
             x = value if self.width == 1 else self.put(f"extractelement {self.type(kind)} {value}, i32 {lane}")
-            if kind == "b1":
-                self.stored(f"  store i8 {self.put(f'zext i1 {x} to i8')}, ptr {at}")
-            else:
-                self.stored(f"  store {_TYPES[kind]} {x}, ptr {at}, align {_BYTES[kind]}")
+            self.store_one(row, entry, kind, x)
+
+    def store_one(self, row: str, entry: int, kind: str, value: str) -> None:
+        """Write an entry of the row of one lane."""
+        at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
+        if kind == "b1":
+            self.stored(f"  store i8 {self.put(f'zext i1 {value} to i8')}, ptr {at}")
+        else:
+            self.stored(f"  store {_TYPES[kind]} {value}, ptr {at}, align {_BYTES[kind]}")

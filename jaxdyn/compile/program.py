@@ -56,6 +56,8 @@ class Program:
       changes of those that move.
     """
 
+    turns = 1  # how often the operations are carried out
+
     def __init__(
         self, inputs, outputs, operations, results, subprograms=(), derivative: Callable | None = None, name: str = ""
     ):

@@ -99,6 +99,16 @@ def register() -> None:
     _handler.append(code)
 
 
+@functools.cache
+def is_supported() -> bool:
+    """Whether kernels can be called here; if not, that is said where one is lowered."""
+    try:
+        register()
+    except Unsupported:
+        return False
+    return True
+
+
 def _architecture() -> str:
     import llvmlite.binding as llvm
 
@@ -151,7 +161,7 @@ class _Kernel:
         while _table[slot].hash:
             slot = (slot + 1) % SLOTS
         self.entry = _table[slot]
-        chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.cost)))
+        chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.turns * program.cost)))
         self.entry.kernel, self.entry.chunk, self.entry.least = 0, chunk, 2 * chunk
         self.entry.buffers, self.entry.sizes = len(sizes), ctypes.addressof(self.sizes)
         self.entry.hash = number  # last: from here on it is found
@@ -161,12 +171,10 @@ class _Kernel:
         if self.code is None:
             program, width = self.program, self.width
             with _announced(program):
-                if isinstance(program, Program):
-                    for called in (program,) if calls_itself(program, width) else program.subprograms:
-                        _publish(called, width)
-                    text = kernel_ir(program, width, self.uniform)
-                else:
-                    text = program.ir(width, self.uniform)
+                is_program = isinstance(program, Program)
+                for called in (program,) if is_program and calls_itself(program, width) else program.subprograms:
+                    _publish(called, width)
+                text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
                 self.code = Code(text)
             self.program = None
             self.entry.kernel = self.code.address("kernel")

@@ -18,7 +18,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from jaxdyn.compile import any_in_batch, recompute_unless, run
+from jaxdyn.compile import Carry, Given, Passed, Task, Turn, any_in_batch, recompute_unless, run, run_loop
 from jaxdyn.simulation.solvers import reverse
 from jaxdyn.simulation.solvers.explicit import Plan, Step, bent_output, step_in_turn, whole_step
 from jaxdyn.simulation.solvers.first_step import first_step
@@ -167,28 +167,68 @@ def drive(
     sums = no_sums(plan.structure(y0))
     lane = _Lane(start, jnp.minimum(start + length, end), y0, rate, no, none, none, no, quality, quality == 0, sums)
     rows = jnp.broadcast_to(jnp.full_like(y0, jnp.inf), (count, y0.size))
-
-    def is_active(lane: _Lane):
-        return (lane.t < end) & ~lane.failed & ~lane.stopped & (lane.taken < max_steps)
-
-    def body(carry):
-        lane, saved, rows, history = carry
-        after, kept, found = _advanced(plan, how, args, limits, lane, is_active(lane))
-        if history is not None:
-            history = reverse.written(history, lane.y, lane.t, lane.t_next, kept)
-        return after, *save(plan, ts, lane, after, kept, found, saved, rows), history
-
-    def unfinished(carry):
-        return any_in_batch(is_active(carry[0]))
-
     history = reverse.blank(y0, start, max_steps) if record else None
-    lane, _, rows, history = lax.while_loop(unfinished, body, (lane, none, rows, history))
+    records, strides = ((), ()) if history is None else (history.rows, history.strides)
+    carry = Carry(lane, none, rows, records)
+    how_far = plan, how, max_steps, strides
+    task, given = Task(_turn, _by_turns, how_far, bent_output, (plan,), strides), Given(ts)
+
+    def run_on(carry):
+        found = run_loop(task, args, limits, given, carry)
+        return (carry, False) if found is None else found
+
+    # All steps, or those before the first one that wants more care than machine code takes; that one, and so on.
+    carry, always_ends = run_on(carry)
+    if not always_ends:
+        step_on = partial(_by_turn, *how_far, args, limits, given)
+        unfinished = partial(_is_unfinished, max_steps, limits)
+        carry = lax.while_loop(unfinished, lambda carry: run_on(step_on(carry))[0], carry)
+    lane, rows = carry.state, carry.rows
+    if history is not None:
+        states, times, kept = carry.records
+        history = reverse.History(states, times, kept, lane.taken)
     codes: Any = diffrax.RESULTS
     result = codes.where(lane.t < end, codes.max_steps_reached, codes.successful)
     result = codes.where(lane.failed, codes.dt_min_reached, result)
     result = codes.where(lane.stopped, codes.event_occurred, result)
     counts = {"num_steps": lane.taken, "num_accepted_steps": lane.kept, "num_rejected_steps": lane.taken - lane.kept}
     return Driven(rows, result, counts, lane.t, None if isinstance(how, Adaptive) else lane.sums, history)
+
+
+def _is_active(max_steps: int, limits: _Limits, lane: _Lane):
+    return (lane.t < limits.end) & ~lane.failed & ~lane.stopped & (lane.taken < max_steps)
+
+
+def _is_unfinished(max_steps: int, limits: _Limits, carry: Carry):
+    return any_in_batch(_is_active(max_steps, limits, carry.state))
+
+
+def _turn(plan: Plan, how, max_steps: int, strides, args, limits: _Limits, lane: _Lane, _) -> Turn:
+    """A step, for a loop in machine code."""
+    active = _is_active(max_steps, limits, lane)
+    after, kept, step = _advance(plan, how, args, limits, lane, active)
+    dense = lane.t, after.t, lane.y, step.raw, step.stages, step.shift
+    written = reverse.row(lane.y, lane.t, lane.t_next, kept) if strides else ()
+    more = _is_active(max_steps, limits, after)
+    return Turn(after, active, more, Passed(kept, after.t, dense), lane.taken, written)
+
+
+def _by_turn(plan: Plan, how, max_steps: int, strides, args, limits: _Limits, given: Given, carry: Carry) -> Carry:
+    """A step, as operations of JAX around kernels."""
+    lane = carry.state
+    active = _is_active(max_steps, limits, lane)
+    after, kept, step = _advanced(plan, how, args, limits, lane, active)
+    records = carry.records
+    if records:
+        new = reverse.row(lane.y, lane.t, lane.t_next, kept)
+        records = reverse.written(records, strides, new, lane.taken, active)
+    return Carry(after, *save(plan, given.times, lane, after, kept, step, carry.saved, carry.rows), records)
+
+
+def _by_turns(plan: Plan, how, max_steps: int, strides, args, limits: _Limits, given: Given, carry: Carry) -> Carry:
+    """All steps, as operations of JAX around kernels."""
+    step_on = partial(_by_turn, plan, how, max_steps, strides, args, limits, given)
+    return lax.while_loop(partial(_is_unfinished, max_steps, limits), step_on, carry)
 
 
 def number_of_steps(start, end, stepsize):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import any_in_batch, recompute_unless, run, unless
+from jaxdyn.compile import Carry, Given, Task, Turn, any_in_batch, recompute_unless, run, run_loop, unless
 from jaxdyn.simulation.solvers.explicit import Plan, bent_output, step_in_turn, whole_step
 
 KEPT = 512  # states that are kept of a run
@@ -34,6 +34,16 @@ class History(NamedTuple):
         """Steps from a state that is kept to the next one."""
         return _stride(self.kept.shape[0])
 
+    @property
+    def rows(self) -> tuple:
+        """What steps are written down in."""
+        return self.states, self.times, self.kept
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """For each of these, of how many steps one is written down."""
+        return self.stride, 1, 1
+
 
 def _stride(room: int) -> int:
     return -(-room // KEPT)
@@ -42,32 +52,57 @@ def _stride(room: int) -> int:
 def blank(y0, t, room: int) -> History:
     """Of a run of at most `room` steps before it begins."""
     stride = _stride(room)
-    rows = -(-room // stride) + (stride > 1)  # one more for what is not kept
+    rows = -(-room // stride)
     times, kept = jnp.zeros((room, 2), t.dtype), jnp.zeros(room, bool)
     return History(jnp.zeros((rows, y0.size), y0.dtype), times, kept, jnp.zeros((), jnp.int32))
 
 
-def written(history: History, y, t0, t1, kept) -> History:
-    """With a step more."""
-    i, stride = history.count, history.stride
-    place = i if stride == 1 else jnp.where(i % stride == 0, i // stride, history.states.shape[0] - 1)
-    return History(
-        lax.dynamic_update_slice(history.states, y[None], (place, jnp.zeros_like(place))),
-        lax.dynamic_update_slice(history.times, jnp.stack([t0, t1])[None], (i, jnp.zeros_like(i))),
-        lax.dynamic_update_slice(history.kept, kept[None], (i,)),
-        i + 1,
-    )
+def row(y, t0, t1, kept) -> tuple:
+    """What is written of a step."""
+    return y, jnp.stack([t0, t1]), kept
 
 
-class _Lane(NamedTuple):
-    """Cotangents on the way back: of the state after the step, and sums of those of what does not change on the way."""
+def written(rows: tuple, strides: tuple[int, ...], new: tuple, index, active) -> tuple:
+    """The rows of a history with those of the step of a number, if it was taken."""
 
-    y: Array
+    def one(array, value, stride):
+        asked = active if stride == 1 else active & (index % stride == 0)
+        return array.at[jnp.where(asked, index // stride, array.shape[0])].set(value, mode="drop")
+
+    return tuple(map(one, rows, new, strides))
+
+
+class _Ends(NamedTuple):
+    """What does not change on the way back: the first step, the ends of the run, and the number of fixed steps or None."""
+
+    first: Array
+    start: Array
+    end: Array
+    steps: Any
+
+
+class _Way(NamedTuple):
+    """Cotangents on the way back.
+
+    Of the state after a step, and what rows within the step gave to that of the state before it; sums of those of what does not
+    change on the way; and of the save points.
+    """
+
+    after: Array
+    before: Array
     args: list
     start: Array
     end: Array
     ts: Array
     saved: Array  # rows of the solution whose cotangents have not been taken yet
+    places: Array  # (6,) of what is read next: state, times, flag, row, time of that row and of the one before it
+
+
+class _Forth(NamedTuple):
+    """The way from a state that was kept, by steps that are taken again."""
+
+    y: Array
+    places: Array  # (2,) of the times and the flag of the next step
 
 
 def pulled(plan: Plan, history: History, y0, args, ts, steps, rows, moves) -> tuple[Array, Any, Array]:
@@ -79,82 +114,165 @@ def pulled(plan: Plan, history: History, y0, args, ts, steps, rows, moves) -> tu
     moving, times_move = moves
     free, fixed = eqx.partition(args, moving)
     free_leaves, structure = jax.tree.flatten(free)
-    stride, count = history.stride, ts.shape[0] - 1
+    stride, static = history.stride, (plan, times_move, structure)
+    none, least = jnp.zeros((), ts.dtype), jnp.zeros((), jnp.int32)
+    saved = jnp.asarray(ts.shape[0] - 1, jnp.int32)
 
-    def step_back(i, y, lane: _Lane) -> _Lane:
-        """Through the step i, from the state y."""
-        (t0, t1), kept = history.times[i], history.kept[i]
+    def back(first, last, states, way: _Way) -> _Way:
+        """Through the steps first .. last - 1, which begin from the rows of `states`."""
+        ends = _Ends(first, ts[0], ts[-1], steps)
+        way = way._replace(places=_places(last - 1, first, way.saved))
+        given = Given(None, (states, history.times, history.kept, rows, ts, ts))
+        task = Task(_turn_back, _back_by_turns, static)
 
-        def has_row(saved):
-            return kept & (saved > 0) & (ts[jnp.maximum(saved, 0)] > t0)
+        def run_on(carry):
+            found = run_loop(task, (fixed, free_leaves), ends, given, carry)
+            return (carry, False) if found is None else found
 
-        def body(carry):
-            lane, after, _ = carry
-            here = has_row(lane.saved)
-            place = jnp.maximum(lane.saved - 1, 0)
-            row = jnp.where(here, rows[place], jnp.zeros_like(y))
-            after = jnp.where(kept, after, jnp.zeros_like(after))
-            at = jnp.where(here, ts[place + 1], t1)
-            back = _pull(plan, times_move, structure, free_leaves, fixed, t0, t1, y, at, after, row)
-            # What nothing depends on gets nothing, even where a step has no derivative.
-            asked = kept & ((after != 0).any() | (row != 0).any())
-            back = jax.tree.map(lambda x: jnp.where(asked, x, jnp.zeros_like(x)), back)
-            of_args, of_y, of_t0, of_t1, of_at = back
-            from_start, to_end = _shares(i, t0, ts, steps), _shares(i + 1, t1, ts, steps)
-            lane = _Lane(
-                lane.y + jnp.where(kept, of_y, jnp.zeros_like(of_y)),
-                [total + x for total, x in zip(lane.args, of_args, strict=True)],
-                lane.start + of_t0 * (1 - from_start) + of_t1 * (1 - to_end),
-                lane.end + of_t0 * from_start + of_t1 * to_end,
-                lane.ts.at[place + 1].add(jnp.where(here, of_at, jnp.zeros_like(of_at))) if times_move else lane.ts,
-                lane.saved - here.astype(jnp.int32),
-            )
-            return lane, jnp.zeros_like(after), any_in_batch(has_row(lane.saved))
+        carry, always_ends = run_on(Carry(way))
+        if not always_ends:
+            turn = partial(_back_by_turn, *static, (fixed, free_leaves), ends, given)
+            carry = lax.while_loop(partial(_is_on_the_way, ends), lambda carry: run_on(turn(carry))[0], carry)
+        return carry.state
 
-        after = lane.y
-        lane = lane._replace(y=jnp.where(kept, jnp.zeros_like(after), after))
-        return lax.while_loop(lambda carry: carry[2], body, (lane, after, any_in_batch(kept)))[0]
+    def forth(first, last, y):
+        """States from which the steps first .. last - 1 begin, (stride, n), the first of them y."""
+        state = _Forth(y, jnp.stack([first, first]))
+        given = Given(None, (history.times, history.kept))
+        task = Task(_turn_forth, _forth_by_turns, (plan,), strides=(1,))
+        carry = Carry(state, records=(jnp.zeros((stride, y.size), y.dtype),))
+        found = run_loop(task, args, (first, last), given, carry)
+        carry, always_ends = (carry, False) if found is None else found
+        return (carry if always_ends else _forth_by_turns(plan, args, (first, last), given, carry)).records[0]
 
-    def segment(s, lane: _Lane) -> _Lane:
-        """Through the steps from a state that was kept to the next one."""
-        first = s * stride
-        y = history.states[s]
-        if stride == 1:
-            return step_back(first, y, lane)
+    zeros = [jnp.zeros_like(x) for x in free_leaves]
+    way = _Way(
+        jnp.zeros_like(y0),
+        jnp.zeros_like(y0),
+        zeros,
+        none,
+        none,
+        jnp.zeros_like(ts),
+        saved,
+        _places(least, least, saved),
+    )
+    if stride == 1:
+        way = back(least, history.count, history.states, way)
+    else:
+        segments = (history.count + stride - 1) // stride
 
-        def forth(k, carry):
-            y, between = carry
-            between = lax.dynamic_update_slice(between, y[None], (k, jnp.zeros_like(k)))
-            (t0, t1), kept = history.times[first + k], history.kept[first + k]
-            after = _repeated(plan, args, t0, t1, y)
-            return jnp.where(kept, after, y), between
+        def segment(k, way):
+            s = segments - 1 - k
+            first = s * stride
+            last = jnp.minimum(first + stride, history.count)
+            return back(first, last, forth(first, last, history.states[s]), way)
 
-        last = jnp.minimum(stride, history.count - first)
-        between = jnp.zeros((stride, y.size), y.dtype)
-        between = lax.fori_loop(0, last, forth, (y, between))[1]
-        return lax.fori_loop(
-            0, last, lambda k, lane: step_back(first + last - 1 - k, between[last - 1 - k], lane), lane
-        )
-
-    none = jnp.zeros((), ts.dtype)
-    lane = _Lane(
-        jnp.zeros_like(y0), [jnp.zeros_like(x) for x in free_leaves], none, none, jnp.zeros_like(ts),
-        jnp.asarray(count, jnp.int32),
-    )  # fmt: skip
-    segments = (history.count + stride - 1) // stride
-    lane = lax.fori_loop(0, segments, lambda k, lane: segment(segments - 1 - k, lane), lane)
-    of_ts = lane.ts.at[0].add(lane.start).at[-1].add(lane.end)
-    return lane.y, jax.tree.unflatten(structure, lane.args), of_ts
+        way = lax.fori_loop(0, segments, segment, way)
+    of_ts = way.ts.at[0].add(way.start).at[-1].add(way.end)
+    return way.after, jax.tree.unflatten(structure, way.args), of_ts
 
 
-def _shares(i, t, ts, steps):
+def _places(step, first, saved):
+    """What is read on the way back at a step whose state stands at `step - first`."""
+    row = jnp.maximum(saved - 1, 0)
+    return jnp.stack([step - first, step, step, row, saved, row])
+
+
+def _is_on_the_way(ends: _Ends, carry: Carry):
+    return any_in_batch(carry.state.places[1] >= ends.first)
+
+
+def _read(given: Given, places):
+    return tuple(table[places[i]] for i, table in enumerate(given.tables))
+
+
+def _turn_back(plan: Plan, times_move, structure, args, ends: _Ends, way: _Way, read) -> Turn:
+    """Through a step, or to the next one of the rows within it."""
+    pull = partial(_pulled_step, plan, times_move, structure, *args)
+    return _taken_back(pull, times_move, ends, way, read)
+
+
+def _back_by_turn(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
+    """The same as operations of JAX around kernels."""
+    way, pull = carry.state, partial(_pull, plan, times_move, structure, *args)
+    turn = _taken_back(pull, times_move, ends, way, _read(given, way.places))
+    return Carry(jax.tree.map(lambda new, old: jnp.where(turn.active, new, old), turn.state, way))
+
+
+def _back_by_turns(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
+    turn = partial(_back_by_turn, plan, times_move, structure, args, ends, given)
+    return lax.while_loop(partial(_is_on_the_way, ends), turn, carry)
+
+
+def _taken_back(pull, times_move: bool, ends: _Ends, way: _Way, read) -> Turn:
+    """A turn; pull(t0, t1, y, at, after, row) gives the cotangents of a step."""
+    y, (t0, t1), kept, row, at_row, at_next = read
+    step, active = way.places[1], way.places[1] >= ends.first
+    kept = kept & active
+
+    def when(flag, x):
+        return jnp.where(flag, x, jnp.zeros_like(x))
+
+    here = kept & (way.saved > 0) & (at_row > t0)
+    row, after = when(here, row), when(kept, way.after)
+    at = jnp.where(here, at_row, t1)
+    # What nothing depends on gets nothing, even where a step has no derivative.
+    asked = kept & ((after != 0).any() | (row != 0).any())
+    back = jax.tree.map(lambda x: when(asked, x), pull(t0, t1, y, at, after, row))
+    of_args, of_y, of_t0, of_t1, of_at = back
+    from_start, to_end = _shares(step, t0, ends), _shares(step + 1, t1, ends)
+    saved = way.saved - here.astype(jnp.int32)
+    again = here & (saved > 0) & (at_next > t0)
+    before = way.before + of_y
+    following = jnp.where(again, step, step - 1)
+    state = _Way(
+        jnp.where(again, jnp.zeros_like(before), jnp.where(kept, before, way.after)),
+        when(again, before),
+        [total + x for total, x in zip(way.args, of_args, strict=True)],
+        way.start + of_t0 * (1 - from_start) + of_t1 * (1 - to_end),
+        way.end + of_t0 * from_start + of_t1 * to_end,
+        way.ts.at[way.saved].add(when(here, of_at)) if times_move else way.ts,
+        saved,
+        _places(following, step - way.places[0], saved),
+    )
+    return Turn(state, active, following >= ends.first)
+
+
+def _turn_forth(plan: Plan, args, ends, way: _Forth, read) -> Turn:
+    """A step that is taken again."""
+    (t0, t1), kept = read
+    return _taken_forth(_result(plan, args, t0, t1, way.y), ends, way, kept)
+
+
+def _taken_forth(after, ends, way: _Forth, kept) -> Turn:
+    first, last = ends
+    step = way.places[0]
+    state = _Forth(jnp.where(kept, after, way.y), way.places + 1)
+    return Turn(state, step < last, step + 1 < last, None, step - first, (way.y,))
+
+
+def _forth_by_turns(plan: Plan, args, ends, given: Given, carry: Carry) -> Carry:
+    """The same as operations of JAX around kernels."""
+
+    def turn(_, carry):
+        way, (between,) = carry.state, carry.records
+        (t0, t1), kept = _read(given, way.places)
+        turn = _taken_forth(_repeated(plan, args, t0, t1, way.y), ends, way, kept)
+        place = jnp.where(turn.active, turn.index, between.shape[0])
+        return Carry(turn.state, records=(between.at[place].set(way.y, mode="drop"),))
+
+    return lax.fori_loop(carry.state.places[0], ends[1], turn, carry)
+
+
+def _shares(i, t, ends: _Ends):
     """How much of a change of the run's end the end of step i, counted from one, follows; it follows the start by the rest."""
     one = jnp.ones_like(t)
+    steps = ends.steps
     share = jnp.zeros_like(t) if steps is None else jnp.where(i < 2, 0.0, i.astype(t.dtype) / steps.astype(t.dtype))
-    return jnp.where(t >= ts[-1], one, share)
+    return jnp.where(t >= ends.end, one, share)
 
 
-def _pull(plan: Plan, times_move: bool, structure, free, fixed, t0, t1, y, at, after, row):
+def _pull(plan: Plan, times_move: bool, structure, fixed, free, t0, t1, y, at, after, row):
     given = fixed, free, t0, t1, y, at, after, row
     static = plan, times_move, structure
     kernel: Any = partial(run, _pulled_step, *given, static=static, calls=True, served=True)

@@ -1,0 +1,295 @@
+"""The text of loops (see `loops`): LLVM's intermediate representation around the programs of a turn and of a row.
+
+entry   pointers, and numbers that all samples share
+block   the next samples: constants and states go to memory of the lanes, rows and records are copied to the results
+turn    the program of a turn; new states where a lane takes part and is served; its records
+rows    while a lane has a row to write: the program of a row
+out     where no lane goes on: states go to the results
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdyn.compile.code import ATTRIBUTES, Body, bytes_of
+from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.program import Array, kind_of
+
+
+def loop_ir(loop: Any, width: int, uniform: Sequence[bool]) -> str:
+    """The text of the kernel of a `loops.Loop`; `uniform` says which arguments are the same for all samples."""
+    return _LoopText(loop, width, uniform).text()
+
+
+class _LoopText:
+    def __init__(self, loop: Any, width: int, uniform: Sequence[bool]):
+        self.loop, self.width, self.e = loop, width, Emitter(width)
+        self.arrays: list[Array] = [*loop.inputs, *loop.outputs]
+        self.uniform = [*uniform, *[False] * len(loop.outputs)]
+        self.allocated: list[str] = []
+        self.labels = 0
+        # Places among the arrays: arguments of a turn, the last of them states; times; tables; then the carry without the state.
+        self.end, self.first_state = loop.end, loop.end - loop.states
+        self.times = self.end
+        self.tables = self.end + (loop.given.times is not None)
+        self.saved = self.tables + loop.reads
+        self.results = len(loop.inputs)  # the states first
+        self.saved_after = self.results + loop.states
+        self.rows_after = self.saved_after + 1
+        self.records_after = self.saved_after + 2 * (loop.row is not None)
+        ends = np.cumsum([0, *(array.size for array in loop.turn.outputs)]).tolist()
+        self.entries = [range(*ends) for ends in pairwise(ends)]  # of a turn's outputs, among all of its results
+
+    def text(self) -> str:
+        """All of it."""
+        e, loop = self.e, self.loop
+        self._set_up()
+        self._begin("turn")
+        self._find_rows()
+        turn = Body(e, loop.turn, self._load, self._array)
+        found = [name for row in turn.results() for name in row]
+        more = self._taken(found)
+        if loop.row is not None:
+            self._rows(found)
+        e.lines.append(f"  br i1 {self._any(more)}, label %turn, label %out")
+        e.lines.append("out:")
+        for k in range(loop.states):
+            kind = kind_of(loop.outputs[k].dtype)
+            values = [e.load_at(self._slot(self.first_state + k), i, kind) for i in range(loop.outputs[k].size)]
+            e.store_array(self.lanes[self.results + k], kind, values)
+        if loop.row is not None:
+            e.store(self.lanes[self.saved_after], 0, "i4", e.load_at("%saved", 0, "i4"))
+        pointers = []
+        for i in range(len(self.arrays)):
+            pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {i}", f"  %a{i} = load ptr, ptr %p{i}"]
+        return "\n".join(
+            [
+                f"; {loop.digest} {self.uniform}",
+                "define void @kernel(ptr %data, i64 %n, i64 %begin, i64 %end) #0 {",
+                "entry:",
+                *turn.allocated(),
+                *self.allocated,
+                *pointers,
+                *e.entry,
+                "  %last = sub i64 %n, 1",
+                "  %some = icmp ult i64 %begin, %end",
+                "  br i1 %some, label %block, label %done",
+                "block:",
+                "  %base = phi i64 [ %begin, %entry ], [ %next, %out ]",
+                *e.lines,
+                f"  %next = add i64 %base, {self.width}",
+                "  %again = icmp ult i64 %next, %end",
+                "  br i1 %again, label %block, label %done",
+                "done:",
+                "  ret void",
+                "}",
+                *e.declared.values(),
+                *ATTRIBUTES,
+            ]
+        )
+
+    # --- arguments ---
+
+    def _slot(self, place: int) -> str:
+        """Memory of the lanes for an argument of a turn."""
+        return f"%slot{place}"
+
+    def _is_direct(self, place: int) -> bool:
+        """Whether an argument is read where it stands."""
+        return place < self.first_state and (self.width == 1 or self.uniform[place])
+
+    def _set_up(self) -> None:
+        e = self.e
+        places = [i for i, same in enumerate(self.uniform) if not same]
+        self.lanes = e.rows(places, [self.arrays[i].size * self.arrays[i].dtype.itemsize for i in places])
+        self.lanes |= {i: [f"%a{i}"] * self.width for i, same in enumerate(self.uniform) if same}
+        read = {x.args[0] for x in self.loop.turn.operations if x.op == "input"}
+        for place in range(self.end):
+            if self._is_direct(place) or (place not in read and place < self.first_state):
+                continue
+            array = self.arrays[place]
+            size = max(64, bytes_of(array, self.width))
+            self.allocated.append(f"  {self._slot(place)} = alloca [{size} x i8], align 64")
+            for entry in range(array.size):
+                kind = kind_of(array.dtype)
+                e.store_at(self._slot(place), entry, kind, self._from_row(place, entry, kind))
+        has_rows = self.loop.row is not None
+        if has_rows:
+            self.allocated.append("  %saved = alloca [64 x i8], align 64")
+            e.store_at("%saved", 0, "i4", self._from_row(self.saved, 0, "i4"))
+        e.declared["memcpy"] = "declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)"
+        for place in range(self.saved + has_rows, self.results):
+            after = self.lanes[self.saved_after + place - self.saved]
+            size = self.arrays[place].size * self.arrays[place].dtype.itemsize
+            for source, target in zip(self.lanes[place], after, strict=True):
+                e.lines.append(f"  call void @llvm.memcpy.p0.p0.i64(ptr {target}, ptr {source}, i64 {size}, i1 false)")
+
+    def _from_row(self, place: int, entry: int, kind: str) -> str:
+        if self.uniform[place]:
+            return self.e.load_for_all(place, entry, kind)
+        return self.e.load(self.lanes[place], entry, kind)
+
+    def _find_rows(self) -> None:
+        """Pointers to the rows of the tables that are read now."""
+        e = self.e
+        self.found_rows: list[list[str]] = []
+        if not self.loop.reads:
+            return
+        places = self.first_state + self.loop.carry.state.places - self.loop.first_leaf
+        for k in range(self.loop.reads):
+            table = self.tables + k
+            place, pointers = e.load_at(self._slot(places), k, "i4"), []
+            count, *shape = self.arrays[table].shape
+            size = math.prod(shape) * self.arrays[table].dtype.itemsize
+            for lane in range(self.width):
+                at = e.put(f"sext i32 {self._lane(place, lane, 'i4')} to i64")
+                # As unsigned numbers what is below zero is large.
+                is_inside = e.put(f"icmp ult i64 {at}, {count}")
+                at = e.put(f"select i1 {is_inside}, i64 {at}, i64 0")
+                offset = e.put(f"mul i64 {at}, {size}")
+                pointers.append(e.put(f"getelementptr i8, ptr {self.lanes[table][lane]}, i64 {offset}"))
+            self.found_rows.append(pointers)
+
+    def _load(self, place: int, entry: int, kind: str) -> str:
+        if place >= self.end:
+            return self.e.load(self.found_rows[place - self.end], entry, kind)
+        if self._is_direct(place):
+            return self._from_row(place, entry, kind)
+        return self.e.load_at(self._slot(place), entry, kind)
+
+    def _array(self, place: int) -> str | None:
+        """An argument with the layout of a subprogram's, each entry with its lanes."""
+        if place >= self.end:
+            return self.found_rows[place - self.end][0] if self.width == 1 else None
+        if self._is_direct(place):
+            return self.lanes[place][0] if self.width == 1 else None
+        return self._slot(place)
+
+    # --- what a turn found ---
+
+    def _taken(self, found: list[str]) -> str:
+        """New states and records; which lanes go on."""
+        e, turn = self.e, self.loop.found
+        flag = e.type("b1")
+        take = self._both(self._one(found, turn.active), found[-1])
+        more = self._both(take, self._one(found, turn.more))
+        after = []
+        for place, out in enumerate(jax.tree.leaves(turn.state), self.first_state):
+            kind = kind_of(self.arrays[place].dtype)
+            for k, i in enumerate(self.entries[out]):
+                old = e.load_at(self._slot(place), k, kind)
+                value = e.put(f"select {flag} {take}, {e.type(kind)} {found[i]}, {e.type(kind)} {old}")
+                after.append((self._slot(place), k, kind, value))
+        for value in after:
+            e.store_at(*value)
+        self.take = take
+        for stride in sorted(set(self.loop.task.strides)):
+            self._record(found, self._one(found, turn.index), stride)
+        return more
+
+    def _record(self, found, index, stride: int) -> None:
+        """Rows of the records of which one turn in so many is written."""
+        e, strides = self.e, self.loop.task.strides
+        for lane in range(self.width):
+            turn = e.put(f"zext i32 {self._lane(index, lane, 'i4')} to i64")
+            is_one = self._lane(self.take, lane, "b1")
+            place = turn
+            if stride > 1:
+                place = e.put(f"udiv i64 {turn}, {stride}")
+                rest = e.put(f"urem i64 {turn}, {stride}")
+                is_one = e.put(f"and i1 {is_one}, {e.put(f'icmp eq i64 {rest}, 0')}")
+            with_row = []
+            for r, out in enumerate(self.loop.found.written):
+                if strides[r] == stride:
+                    with_row.append((self.records_after + r, [found[i] for i in self.entries[out]]))
+            self._write_if(is_one, lane, place, with_row)
+
+    def _write_if(self, flag: str, lane: int, place: str, rows: list) -> None:
+        """Row number `place` of some results, in a lane with a flag."""
+        e = self.e
+        write, on = self._label("write"), self._label("on")
+        e.lines += [f"  br i1 {flag}, label %{write}, label %{on}", f"{write}:"]
+        for result, values in rows:
+            kind, array = kind_of(self.arrays[result].dtype), self.arrays[result]
+            offset = e.put(f"mul i64 {place}, {len(values) * array.dtype.itemsize}")
+            at = e.put(f"getelementptr i8, ptr {self.lanes[result][lane]}, i64 {offset}")
+            for k, value in enumerate(values):
+                e.store_one(at, k, kind, self._lane(value, lane, kind))
+        e.lines += [f"  br label %{on}", f"{on}:"]
+
+    def _rows(self, found: list[str]) -> None:
+        """Rows of times that have been passed, one for each lane at a time; ends where there are none."""
+        e, turn = self.e, self.loop.found.rows
+        count = self.arrays[self.rows_after].shape[0]
+        kind, flag = kind_of(self.arrays[self.times].dtype), e.type("b1")
+        until = self._one(found, turn.until)
+        self._begin("rows")
+        saved = e.load_at("%saved", 0, "i4")
+        places, times = [], []
+        for lane in range(self.width):
+            given = e.put(f"zext i32 {self._lane(saved, lane, 'i4')} to i64")
+            is_less = e.put(f"icmp ult i64 {given}, {count}")
+            places.append(e.put(f"select i1 {is_less}, i64 {given}, i64 {count - 1}"))
+            offset = e.put(f"mul i64 {places[-1]}, {self.arrays[self.times].dtype.itemsize}")
+            at = e.put(f"getelementptr i8, ptr {self.lanes[self.times][lane]}, i64 {offset}")
+            times.append(e.load_one(at, 1, kind))
+        time = self._vector(times, kind)
+        some_left = e.put(f"icmp ult {e.type('i4')} {saved}, {e.constant(count, 'i4')}")
+        is_passed = e.put(f"fcmp ole {e.type(kind)} {time}, {until}")
+        kept = self._both(self.take, self._one(found, turn.kept))
+        passed = self._both(kept, self._both(some_left, is_passed))
+        e.lines.append(f"  br i1 {self._any(passed)}, label %row, label %all.passed")
+        e.lines.append("row:")
+        dense = [[found[i] for i in self.entries[out]] for out in jax.tree.leaves(turn.dense)]
+
+        def load(place, entry, kind):
+            return time if place == 0 else dense[place - 1][entry]
+
+        written = [name for row in Body(e, self.loop.row, load, _no_array).results() for name in row]
+        for lane in range(self.width):
+            self._write_if(self._lane(passed, lane, "b1"), lane, places[lane], [(self.rows_after, written)])
+        one = e.put(f"zext {flag} {passed} to {e.type('i4')}")
+        e.store_at("%saved", 0, "i4", e.put(f"add {e.type('i4')} {saved}, {one}"))
+        e.lines += ["  br label %rows", "all.passed:"]
+
+    # --- lines ---
+
+    def _begin(self, label: str) -> None:
+        self.e.lines += [f"  br label %{label}", f"{label}:"]
+
+    def _label(self, name: str) -> str:
+        self.labels += 1
+        return f"{name}{self.labels}"
+
+    def _one(self, found, out: int) -> str:
+        return found[self.entries[out][0]]
+
+    def _both(self, a: str, b: str) -> str:
+        return self.e.put(f"and {self.e.type('b1')} {a}, {b}")
+
+    def _lane(self, value: str, lane: int, kind: str) -> str:
+        return value if self.width == 1 else self.e.put(f"extractelement {self.e.type(kind)} {value}, i32 {lane}")
+
+    def _vector(self, values: list[str], kind: str) -> str:
+        if self.width == 1:
+            return values[0]
+        of, total = self.e.type(kind), "poison"
+        for lane, value in enumerate(values):
+            scalar = Emitter(1).type(kind)
+            total = self.e.put(f"insertelement {of} {total}, {scalar} {value}, i32 {lane}")
+        return total
+
+    def _any(self, flags: str) -> str:
+        if self.width == 1:
+            return flags
+        name, of = f"llvm.vector.reduce.or.v{self.width}i1", self.e.type("b1")
+        self.e.declared[name] = f"declare i1 @{name}({of})"
+        return self.e.put(f"call i1 @{name}({of} {flags})")
+
+
+def _no_array(place: int) -> None:
+    """Of the arguments of a row none stands in memory."""

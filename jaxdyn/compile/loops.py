@@ -1,0 +1,203 @@
+"""Loops in machine code: a program of numbers that is repeated for a sample until it has ended, with rows written on the way.
+
+A turn of a loop of XLA's costs microseconds, and all samples of a batch wait for the last one. Here every block of lanes goes
+on by itself. What a turn does is a `Program`; the state stands in memory of the lanes; rows go to places that the numbers
+decide, which a program of numbers cannot do. `loop_text` writes the machine code.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array as Numbers
+
+from jaxdyn.compile import mode
+from jaxdyn.compile.kernel import kernel_p, program_of, target
+from jaxdyn.compile.known import Known, partition_traced
+from jaxdyn.compile.loop_text import loop_ir
+from jaxdyn.compile.program import Array, Constant, Program
+
+
+class Turn(NamedTuple):
+    """What a turn of the loop found.
+
+    - `state`: the next one. `active`: whether the sample took part; if not, its state stays as it is. `more`: whether it goes on.
+    - `rows`: what decides about rows, if there are any. `index`: of the turn, from zero on; `written`: a row for each record.
+    """
+
+    state: Any
+    active: Numbers
+    more: Numbers
+    rows: "Passed | None" = None
+    index: Any = None
+    written: tuple = ()
+
+
+class Passed(NamedTuple):
+    """Rows of times up to `until` can be written now if `kept`, from the arrays `dense`."""
+
+    kept: Numbers
+    until: Numbers
+    dense: tuple
+
+
+class Carry(NamedTuple):
+    """Where a loop is: the state, how many rows have been written (int32) and the rows (m, n), or None, and the records."""
+
+    state: Any
+    saved: Any = None
+    rows: Any = None
+    records: tuple[Any, ...] = ()
+
+
+class Task(NamedTuple):
+    """What a loop does, by functions that are defined once, and what they are given first.
+
+    - `turn(*static, tree, constants, state, read) -> Turn`; `read`: rows of tables, at the places `state.places` (k,), int32.
+    - `otherwise(*static, tree, constants, given, carry) -> carry`: the same by JAX, for processors without machine code.
+    - `row(*of_row, None, time, *dense)`: the row (n,) of a time; None if there are none.
+    - `strides`: for each record, of how many turns one is written.
+    """
+
+    turn: Callable
+    otherwise: Callable
+    static: tuple
+    row: Callable | None = None
+    of_row: tuple = ()
+    strides: tuple[int, ...] = ()
+
+
+class Given(NamedTuple):
+    """Arrays that a loop reads at places that the numbers decide.
+
+    - `times` (m + 1,), of which the rows belong to the last m, or None. `tables` (k, ...), each read at one of the places.
+    """
+
+    times: Any = None
+    tables: tuple = ()
+
+
+def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[Carry, bool] | None:
+    """Take turns until the sample has ended, or meets a turn that is not for a program of numbers (see `flags`).
+
+    **Arguments:** `tree` as of `run`; `constants`, a pytree.
+
+    **Returns:** the carry, and whether there are no such turns; None where there is no such loop.
+    """
+    if mode.current() == "plain" or target is None or mode.is_expanding() or not target.is_supported():
+        return None
+    given, carry = jax.tree.map(jnp.asarray, (given, carry))
+    read = tuple(jnp.zeros(x.shape[1:], x.dtype) for x in given.tables)
+    turn_args = constants, carry.state, read
+    leaves, found = program_of(task.turn, task.static, tree, turn_args, calls=True, served=True)
+    if isinstance(found, str):
+        return None
+    program, structure = found
+    row = None
+    if task.row is not None:
+        turn = jax.tree.unflatten(structure, range(structure.num_leaves))
+        dense = [jnp.zeros(*program.outputs[i]) for i in turn.rows.dense]
+        found = program_of(task.row, task.of_row, None, (jnp.zeros((), given.times.dtype), *dense))[1]
+        if isinstance(found, str):
+            return None
+        row = found[0]
+    traced, known = partition_traced(tree)
+    loop = _loop(task, program, row, structure, known, len(traced), _Form.of((constants, given, carry)))
+    leaves = leaves[: len(leaves) - len(read)]
+    after = jax.tree.leaves(carry)[len(jax.tree.leaves(carry.state)) :]
+    results = kernel_p.bind(*(x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)), program=loop)
+    return _Form.of(carry)(results), loop.always_ends
+
+
+class _Form(NamedTuple):
+    """Structure, shapes and dtypes of a pytree of arrays; called with flat ones, it is such a tree."""
+
+    structure: Any
+    arrays: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, tree) -> "_Form":
+        leaves, structure = jax.tree.flatten(tree)
+        return cls(structure, tuple(Array(x.shape, np.dtype(x.dtype)) for x in leaves))
+
+    def __call__(self, flat):
+        leaves = [x.reshape(array.shape) for x, array in zip(flat, self.arrays, strict=True)]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+class Loop:
+    """A loop as a kernel; stands in the place of a `Program`.
+
+    Its inputs are those of a turn but for what is read, then the times and the tables, and what of the carry comes after the
+    state; its results are the carry.
+    """
+
+    derivative = None
+    turns = 100  # of a run, by which its cost is estimated
+
+    def __init__(self, task: Task, turn: Program, row, structure, known: Known, count: int, form: _Form):
+        self.task, self.turn, self.row, self.known, self.count, self.form = task, turn, row, known, count, form
+        self.found: Turn = jax.tree.unflatten(structure, range(structure.num_leaves))
+        numbered = jax.tree.unflatten(form.structure, range(len(form.arrays)))
+        self.given, self.carry = numbered[1:]
+        self.states = len(jax.tree.leaves(self.carry.state))
+        self.first_leaf = jax.tree.leaves(self.carry)[0]  # of the carry, among the form's arrays
+        self.reads = len(self.given.tables)
+        self.end = len(turn.inputs) - self.reads
+        first = self.end - self.states - count  # of the form's arrays that are not among these inputs
+        tables = len(jax.tree.leaves(self.given))
+        self.outputs = form.arrays[first + tables :]
+        self.inputs = (*turn.inputs[: self.end], *form.arrays[first : first + tables], *self.outputs[self.states :])
+        self.subprograms = turn.subprograms
+        self.derived: dict = {}
+        self.name = f"loop of {turn.name}"
+
+    @property
+    def always_ends(self) -> bool:
+        """Whether no turn needs more care than a program of numbers takes."""
+        served = self.turn.results[-1][0]
+        return type(served) is Constant and bool(served.value)
+
+    @property
+    def digest(self) -> str:
+        """As of a `Program`."""
+        sizes = [(x.size, x.dtype.name) for x in (*self.inputs, *self.outputs)]
+        row = None if self.row is None else self.row.digest
+        return f"loop {self.turn.digest} {row} {sizes} {self.task.strides} {self.found} {self.given}"
+
+    @property
+    def cost(self) -> int:
+        """Operations of a turn."""
+        return self.turn.cost
+
+    def lanes(self, samples) -> int:
+        """As of the program of a turn."""
+        return target.width_of(self.turn, samples)
+
+    def ir(self, width: int, uniform) -> str:
+        """The text of the kernel (see `code.kernel_ir`)."""
+        return loop_ir(self, width, uniform)
+
+    def as_operations(self, *arrays):
+        """The same by JAX."""
+        lead = max((x.shape[:-1] for x in arrays), key=len, default=())
+        one, axes = self._by_jax, [0 if len(x.shape) > 1 else None for x in arrays]
+        for _ in lead:
+            one = jax.vmap(one, axes)
+        return one(*arrays)
+
+    def _by_jax(self, *flat):
+        first, tables = self.end - self.states, len(jax.tree.leaves(self.given))
+        traced, constants, state = flat[: self.count], flat[self.count : first], flat[first : self.end]
+        given, after = flat[self.end : self.end + tables], flat[self.end + tables :]
+        constants, given, carry = self.form([*constants, *given, *state, *after])
+        carry = self.task.otherwise(*self.task.static, self.known(traced), constants, given, carry)
+        return [x.reshape(-1) for x in jax.tree.leaves(carry)]
+
+
+@functools.lru_cache(maxsize=256)
+def _loop(task: Task, turn: Program, row, structure, known: Known, count: int, form: _Form) -> Loop:
+    return Loop(task, turn, row, structure, known, count, form)
