@@ -109,7 +109,7 @@ def test_the_yaml_file_is_named_or_left_out(tmp_path):
     other.write_text("closed_loop: [[tip_A, b]]\ntype: 3d\n", encoding="utf-8")  # the joint b stands for the rod
     (row,) = jd.load(path, loops=other).constraints
     assert (row.body_a, row.body_b) == ("tip_A", "rod")
-    path.with_suffix(".yaml").write_text("colour: red\n", encoding="utf-8")  # about something else
+    path.with_suffix(".yaml").write_text("colour: &a red\nother: *a\n", encoding="utf-8")  # about something else
     assert not jd.load(path).constraints
     path.with_suffix(".yaml").write_text("{", encoding="utf-8")
     assert not jd.load(path).constraints
@@ -198,6 +198,7 @@ def test_what_of_the_conventions_is_not_taken_is_named(tmp_path):
         ("closed_loop: []\nname_mot: [x]\n", ("name_mot", "'x'")),
         ("closed_loop: []\njoint_name: [b]\n", ("joint_name has 1 entries, joint_type 0",)),
         ("closed_loop: []\njoint_name: [d]\njoint_type: [SPHERICAL]\n", ("bars.urdf", "'d'", "moves")),
+        ("closed_loop: &a [[tip_A, tip_B]]\ntype: [3d]\nname_mot: *a\n", ("bars.yaml", "aliases", "refused")),
         ("closed_loop: []\nname_mot: 3\n", ("name_mot is 3", "list of names")),
         ("name_mot: [b]\njoint_name: [b]\njoint_type: [SPHERICAL]\n", ("'b' is spherical",)),
     ],
@@ -228,6 +229,8 @@ def test_bad_loops_arguments(tmp_path):
     path = write(tmp_path)
     with pytest.raises(ValueError, match=r"nowhere\.yaml cannot be read"):
         jd.load(path, loops=tmp_path / "nowhere.yaml")
+    with pytest.raises(ValueError, match="loops is True; pass the path of a file"):
+        jd.load(path, loops=True)
     empty = tmp_path / "empty.yaml"
     empty.write_text("a: 1", encoding="utf-8")
     with pytest.raises(ValueError, match="names no loops"):

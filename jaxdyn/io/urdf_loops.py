@@ -25,11 +25,13 @@ from jaxdyn.io.loaded import Actuators, listed
 from jaxdyn.io.sdf_joints import LOOPS
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import as_path
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.names import frame_index, joint_index
 from jaxdyn.model.tree import Model
 
 _SUFFIXES = (".yaml", ".yml")
+_KEYS = ("closed_loop", "name_mot", "joint_name")
 _TYPES = {"3d": "spherical", "6d": "weld"}
 
 
@@ -56,7 +58,7 @@ def closures_of(urdf: pathlib.Path, loops) -> Closures:
     if loops is False:
         return Closures("")
     if loops is not None:
-        return _read(pathlib.Path(loops).expanduser(), wanted=True)
+        return _read(as_path(loops, "loops"), wanted=True)
     beside = [path for suffix in _SUFFIXES if (path := urdf.with_suffix(suffix)).is_file()]
     return _read(beside[0], wanted=False) if beside else Closures("")
 
@@ -65,14 +67,22 @@ def _read(path: pathlib.Path, wanted: bool) -> Closures:
     import yaml
 
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if not wanted and not any(key in text for key in _KEYS):
+            return Closures("")  # a file of this name that is about something else
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
+            # A few nested ones say gigabytes, and no list of loops needs them.
+            raise ValueError(
+                f"{path}: aliases (*name) are refused, as they can expand without bound; write the text out"
+            )
+        content = yaml.safe_load(text)
     except OSError as error:
         raise ValueError(f"loops: {path} cannot be read ({error.strerror}); check the path") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         if not wanted:
-            return Closures("")  # a file of this name that is about something else
+            return Closures("")
         raise ValueError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict) or not {"closed_loop", "name_mot", "joint_name"} & content.keys():
+    if not isinstance(content, dict) or not set(_KEYS) & content.keys():
         if not wanted:
             return Closures("")
         raise ValueError(f"{path}: names no loops; give closed_loop: [[FRAME, FRAME], ...] and type: [3d, 6d, ...]")
