@@ -38,8 +38,7 @@ bench: $(VENV)/.installed-bench  ## dynamics against peers, into out/; the other
 	$(BIN)/python -m benchmarks
 
 docs: $(VENV)/.installed-docs  ## the site, into out/site; pictures of the gallery that are missing are made first
-	$(BIN)/python -m benchmarks.gallery
-	$(BIN)/zensical build -f mkdocs.yml --strict
+	$(BIN)/python -m benchmarks.site
 
 wheel: $(VENV)/.installed-test  ## build the wheel, install it elsewhere and try it without the repository
 	$(BIN)/python -m benchmarks.wheel

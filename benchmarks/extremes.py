@@ -9,6 +9,7 @@ reverse mode, compared with central differences of order 4 in float64; "digits" 
 """
 
 import argparse
+import collections
 import importlib
 import math
 import time
@@ -227,12 +228,15 @@ def load() -> dict[str, Callable]:
 
 
 def markdown(name: str, rows: Sequence[Row]) -> str:
-    """One table with its heading and its advice."""
+    """One table with its heading and its advice; the rows are folded below a count of their verdicts."""
     title = (CASES[name].__doc__ or name).splitlines()[0]
-    lines = [f"### {title}", "", "| " + " | ".join(HEADER) + " |", "|" + "---|" * len(HEADER)]
+    counts = collections.Counter(row.verdict for row in rows)
+    summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.most_common())
+    lines = [f"### {title}", "", '<details markdown="1">', f"<summary>{len(rows)} rows: {summary}</summary>", ""]
+    lines += ["| " + " | ".join(HEADER) + " |", "|" + "---|" * len(HEADER)]
     lines += ["| " + " | ".join(row.cells()) + " |" for row in rows]
     advice = list(dict.fromkeys(row.advice for row in rows if row.advice))
-    return "\n".join([*lines, "", *(f"**What to do.** {text}" for text in advice), ""])
+    return "\n".join([*lines, "", "</details>", "", *(f"**What to do.** {text}" for text in advice), ""])
 
 
 def replace_section(path: Path, name: str, text: str) -> None:

@@ -32,6 +32,9 @@ assert scene.system.joint_names == model.joint_names
 q = jnp.full(7, 0.3)
 a = jd.forward_dynamics(scene.system, q, q, q)
 assert abs(jd.inverse_dynamics(scene.system, q, q, a) - q).max() < 1e-10
+pathlib.Path("arm.yaml").write_text("closed_loop: [[iiwa_link_7, iiwa_link_0]]\\ntype: [3d]\\n")
+assert len(jd.load("arm.urdf").constraints) == 1
+pathlib.Path("arm.yaml").unlink()
 bar = jd.scenes.four_bar()
 motion = jd.simulate(bar, *jd.scenes.four_bar.start(), jnp.linspace(0.0, 0.5, 6), outputs=("constraint_residual",))
 assert motion.success and abs(motion.constraint_residual).max() < 1e-10

@@ -1,6 +1,6 @@
 """A batch of rollouts of a real arm, and its inertias recovered from a noisy log: `python -m jaxdyn.demo`, or `make demo`.
 
-No file is needed: the arm is the KUKA iiwa of `jaxdyn.robots`. Two figures are written into out/.
+No file is needed: the arm is the KUKA iiwa of `jaxdyn.robots`. A drawing of it and two figures are written into out/.
 """
 
 import argparse
@@ -162,10 +162,14 @@ def main(argv=None) -> dict[str, float]:
     began = time.perf_counter()
     options.out.mkdir(parents=True, exist_ok=True)
     model = jd.robots.iiwa()
-    print(f"Arm: {model.name}, {model.nb} bodies, {model.nv} joints, {float(model.inertias[:, 0].sum()):.2f} kg")
+    mass = float(np.sum(model.inertias[:, 0]))
+    print(f"Arm: {model.name}, {model.nb} bodies, {model.nv} joints, {mass:.2f} kg", flush=True)
+    jd.draw(model, np.array(HOME)).figure.savefig(options.out / "arm.png")
+    print(f"   drawn after {time.perf_counter() - began:.1f} s: {options.out / 'arm.png'}", flush=True)
 
     print(
-        f"\n1. {options.rollouts} motions of {options.duration:g} s under random torques on top of gravity compensation"
+        f"\n1. {options.rollouts} motions of {options.duration:g} s under random torques on top of gravity compensation",
+        flush=True,
     )
     solution, seconds = rollouts(model, options.rollouts, options.duration, progress=True)
     worst = float(np.abs(_balance(solution)).max())
@@ -173,11 +177,12 @@ def main(argv=None) -> dict[str, float]:
     print(f"   {seconds:.1f} s, compiling included; energy moved by up to {reach:.1f} J")
     print(f"   energy minus work: at most {worst:.1e} J")
     rollout_figure(model, solution).savefig(options.out / "rollouts.png")
+    print(f"   drawn: {options.out / 'rollouts.png'}", flush=True)
 
     nominal = wrong_model(model)
     base = jd.identify.base_parameters(model)
     print(f"\n2. Inertias from a noisy 10 s log: 70 numbers, of which motion shows {len(base.names)} combinations")
-    print(f"   noise: {NOISE_Q:g} rad, {NOISE_V:g} rad/s, {100 * NOISE_TAU:g} % of each joint's torque")
+    print(f"   noise: {NOISE_Q:g} rad, {NOISE_V:g} rad/s, {100 * NOISE_TAU:g} % of each joint's torque", flush=True)
     train, test = experiment(model, nominal, options.samples)
     settings: dict[str, Any] = {"horizon": 10, "substeps": 1}
 
@@ -208,9 +213,8 @@ def main(argv=None) -> dict[str, float]:
     pieces = segments(test, settings["horizon"], np.dtype(float))
     figure = fit_figure(shares, truth, start, fitted, fit.history, pieces, *motions)
     figure.savefig(options.out / "fit.png")
-    print(
-        f"\nFigures: {options.out / 'rollouts.png'}, {options.out / 'fit.png'}; {time.perf_counter() - began:.0f} s in all"
-    )
+    names = ", ".join(str(options.out / f"{name}.png") for name in ("arm", "rollouts", "fit"))
+    print(f"\nFigures: {names}; {time.perf_counter() - began:.0f} s in all")
     return {
         "energy minus work": worst,
         "nominal": float(errors["nominal"][1]),

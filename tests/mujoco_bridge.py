@@ -1,14 +1,19 @@
-"""MuJoCo's numbers of an MJCF file in our coordinates: shared by the tests.
+"""MuJoCo's numbers of an MJCF file in our coordinates: shared by the tests and `benchmarks/files.py`.
 
 MuJoCo writes a free joint's linear velocity in world axes; v_mujoco = T(q) v with T the rotation there and the identity
 elsewhere. The order of joints differs.
 """
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
+from pinocchio_bridge import quick
 
+import jaxdyn as jd
 from jaxdyn.model.tree import Model
 
+# What makes M or the bias another than MuJoCo's, as the warning at load says.
+APART = ("armature of tendons", "gyroscopic part of the armature")
 SIZES = {0: (7, 6), 1: (4, 3), 2: (1, 1), 3: (1, 1)}  # free, ball, slide, hinge
 
 
@@ -122,3 +127,63 @@ class Oracle:
         m.body_gravcomp[:] = 0.0  # some of it would act through the actuators
         T, _ = self.set(q, v, data, m)
         return self.ours(T.T @ data.qfrc_actuator)
+
+
+def error(ours, theirs, floor: float = 0.0) -> float:
+    """Largest difference, relative to the largest number, so that a fly counts as much as a dog; or to a floor above it."""
+    theirs = np.asarray(theirs)
+    return float(
+        np.abs(np.asarray(ours) - theirs).max(initial=0.0) / (max(np.abs(theirs).max(initial=0.0), floor) or 1.0)
+    )
+
+
+def row_space(rows) -> np.ndarray:
+    """The projector on the space of the rows."""
+    _, sizes, right = np.linalg.svd(np.asarray(rows), full_matrices=False)
+    right = right[sizes > 1e-9 * max(1.0, sizes.max(initial=0.0))]
+    return right.T @ right
+
+
+def agreement(path, scene: jd.LoadedScene) -> dict[str, float]:
+    """Errors against MuJoCo: the mass that moves; at a random state frames, M, bias, forward dynamics, springs and dampers,
+    actuators; and at the reference, where loops close, those of the space that the constraints' rows span."""
+    model, oracle, rng = scene.system, Oracle(path, scene.system), np.random.default_rng(1)
+    start = scene.starts["reference"].q
+    v, tau, step = (jnp.asarray(rng.normal(size=model.nv)) for _ in range(3))
+    drives = scene.actuators
+    control = rng.normal(size=0 if drives is None else len(drives.names))
+
+    @quick
+    def ours(scene, start, step, v, tau, control):
+        model = scene.system
+        q = jd.integrate(model, start, 0.7 * step)
+        forces = [force for force in scene.forces if not isinstance(force, jd.CoulombFriction)]
+        found = {
+            "M": jd.mass_matrix(model, q),
+            "bias": jd.bias_force(model, q, v),
+            "acceleration": jd.forward_dynamics(model, q, v, tau),
+            "passive": sum((force(model, q, v, 0.0) for force in forces), jnp.zeros(model.nv)),
+        }
+        if scene.actuators is not None:
+            found["actuation"] = scene.actuators(model, q, v, control)
+        rows = jd.constraint_jacobian(scene, start) if scene.constraints else None
+        return q, jd.forward_kinematics(model, q), found, rows
+
+    q, poses, found, rows = ours(scene, start, step, v, tau, jnp.asarray(control))
+    theirs = dict(zip(("M", "bias", "acceleration"), oracle.dynamics(q, v, tau), strict=True))
+    frames = [model.frame_names.index(name) for name in oracle.bodies[1:]]
+    bodies = np.concatenate([np.asarray(poses), np.eye(4)[None]])[np.array(model.topology.frame_bodies)[frames]]
+    # Bodies that no joint moves are welded to the world, 0, or to a mocap body, which is fixed here.
+    carriers = oracle.m.body_weldid
+    moving = oracle.m.body_mass[(carriers != 0) & (oracle.m.body_mocapid[carriers] < 0)]
+    errors = {"mass": error(np.sum(np.asarray(model.inertias)[:, 0]), moving.sum())}
+    errors |= {"frames": error(bodies @ np.asarray(model.frame_poses)[frames], oracle.body_poses())}
+    theirs["passive"] = oracle.passive_force(q, v)
+    if drives is not None:
+        theirs["actuation"] = oracle.actuation(q, v, dict(zip(drives.names, control, strict=True)))
+    # A bias of nothing but rounding, of a hinge that is upright, is compared with forces of a thousandth of M.
+    floors = {"bias": 1e-3 * np.abs(theirs["M"]).max(initial=0.0)}
+    errors |= {name: error(value, theirs[name], floors.get(name, 0.0)) for name, value in found.items()}
+    if rows is not None:
+        errors["rows"] = error(row_space(rows), row_space(oracle.equality_rows(start)[0]))
+    return errors

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from jaxdyn import inertia, robots
 from jaxdyn.dynamics import kinematics
+from jaxdyn.dynamics.centroidal import center_of_mass
+from jaxdyn.io import load_urdf
 from jaxdyn.model import joints
 from jaxdyn.model import tree as mdl
 from jaxdyn.model.builder import ModelBuilder, inertia_report, repair_inertias
@@ -371,6 +373,36 @@ def test_iiwa_kinematics_are_the_published_ones():
     assert model.frame_names[-1] == "iiwa_link_0" and model.topology.frame_bodies[-1] == -1
     np.testing.assert_allclose(model.inertias[:, 0].sum(), 25.61, rtol=1e-15)
     np.testing.assert_allclose(model.upper[6], 3.0543261909900763, rtol=1e-15)
+
+
+def test_ur5_has_the_places_and_masses_of_its_description(robots_dir):
+    """Frames against the URDF of example-robot-data, whose right angles have eleven digits; moments are ours."""
+    model, theirs = robots.ur5(), load_urdf(robots_dir / "ur_description" / "urdf" / "ur5_robot.urdf")
+    assert model.nv == 6 and inertia_report(model) == []
+    np.testing.assert_allclose(model.inertias[:, :4], theirs.inertias[:, :4], atol=1e-9)
+    np.testing.assert_allclose(model.upper, theirs.upper, rtol=1e-11)
+    pose = quick(lambda model, q: kinematics.frame_pose(model, q, "tool0"))
+    for q in jnp.asarray(np.random.default_rng(0).uniform(-3, 3, (3, 6))):
+        np.testing.assert_allclose(pose(model, q), pose(theirs, q), atol=1e-10)
+
+
+@pytest.mark.parametrize("floating", [True, False])
+def test_quadruped_stands_on_its_feet(floating):
+    model = robots.quadruped(floating_base=floating)
+    assert (model.nv, inertia_report(model)) == (18 if floating else 12, [])
+    q = mdl.neutral(model)
+    for leg in ("FL", "FR", "RL", "RR"):
+        for joint, angle in (("hip", 0.0), ("thigh", 0.8), ("knee", -1.6)):
+            q = q.at[model.q_index(f"{leg}_{joint}")].set(angle)
+    # Thigh and shank make an isosceles triangle: the feet stand under the hips, 0.4 cos 0.8 below.
+    for leg, x, y in (("FL", 0.2, 0.14), ("RR", -0.2, -0.14)):
+        foot = quick(lambda model, q, leg=leg: kinematics.frame_pose(model, q, f"{leg}_foot"))(model, q)
+        np.testing.assert_allclose(foot[:3, 3], [x, y, -0.4 * np.cos(0.8)], atol=1e-15)
+    moving = 6.0 * floating + 4 * 1.5
+    np.testing.assert_allclose(model.inertias[:, 0].sum(), moving, rtol=1e-14)
+    # Thighs and shanks, 0.5 kg each, have their centres 0.1 sin 0.8 behind the hips.
+    center = quick(center_of_mass)(model, q)
+    np.testing.assert_allclose(center[:2], [-0.4 * np.sin(0.8) / moving, 0.0], atol=1e-15)
 
 
 def test_iiwa_torques_are_the_published_ones():

@@ -22,6 +22,7 @@ def test_demo(tmp_path, capsys):
         numbers = demo.main(
             ["--rollouts", "8", "--duration", "0.2", "--samples", "200", "--steps", "8", "--out", str(tmp_path)]
         )
+    assert (tmp_path / "arm.png").stat().st_size > 10_000
     assert (tmp_path / "rollouts.png").stat().st_size > 10_000 and (tmp_path / "fit.png").stat().st_size > 10_000
     assert numbers["energy minus work"] < 1e-6
     assert numbers["fitted"] < numbers["nominal"]

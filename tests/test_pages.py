@@ -63,8 +63,11 @@ def exports() -> dict[str, object]:
     """All that users call, by the name that they write: the names of jaxdyn, and those of its groups."""
     found = {f"jd.{name}": x for name, x in vars(jd).items() if not name.startswith("_") and not inspect.ismodule(x)}
     for group in GROUPS:
-        for name, x in vars(getattr(jd, group)).items():
-            if not name.startswith("_") and getattr(x, "__module__", "").startswith("jaxdyn"):
+        room = getattr(jd, group)
+        # A group that is one module exports what is written in it, a package what it re-exports.
+        own = "jaxdyn" if hasattr(room, "__path__") else room.__name__
+        for name, x in vars(room).items():
+            if not name.startswith("_") and getattr(x, "__module__", "").startswith(own):
                 found[f"jd.{group}.{name}"] = x
     return found
 

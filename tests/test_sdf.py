@@ -124,6 +124,17 @@ def test_poses_relative_to_frames_links_and_joints(tmp_path):
     np.testing.assert_allclose(poses(b, jnp.zeros(2))["g"][:3, 3], [1, 0, 0], atol=1e-15)
 
 
+@pytest.mark.parametrize("name", ["a", "j", "m"])
+def test_a_model_may_have_the_name_of_what_is_in_it(tmp_path, name):
+    parts = link("a", "0 0 0.5 0 0 0") + link("b", TURNED) + joint("j", "a", "b", axis="<xyz>0 1 0</xyz>")
+    text = f"<model name='{name}'><pose>0 0 2 0 0 0.3</pose><plugin name='p' filename='f'/>{parts}</model>"
+    scene = silent(write(tmp_path, text))
+    same(scene, silent(write(tmp_path, text.replace(f"<model name='{name}'", "<model name='other'"))))
+    assert scene.system.name == name
+    assert f"<plugin> of models: {name}" in scene.not_taken
+    np.testing.assert_allclose(poses(scene, scene.starts["reference"].q)["a"][:3, 3], [0, 0, 2.5], atol=1e-15)
+
+
 def test_nested_models_and_placement_frames(tmp_path):
     inner = f"<frame name='tip' attached_to='hand'><pose>0 0 0.5 0 0 0</pose></frame>{link('hand', '0 0 1 0 0 0')}"
     text = f"""<model name='m'><pose>0 0 2 0 0 0</pose>{link("arm")}{joint("w", "world", "arm")}

@@ -1,6 +1,7 @@
 """URDF files: every robot of example-robot-data against Pinocchio, locking, mimic joints, refusals, the way back."""
 
 import sys
+import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from jaxdyn import robots
 from jaxdyn.dynamics import kinematics
-from jaxdyn.io import load_urdf, save_urdf, urdf_inertia_report
+from jaxdyn.io import UnitsWarning, load, load_urdf, save_urdf, urdf_inertia_report
 from jaxdyn.model.builder import ModelBuilder, inertia_report
 from jaxdyn.model.joints import KINDS
 from tests.pinocchio_bridge import ROBOTS, quick, to_jaxdyn
@@ -424,6 +425,25 @@ def test_bad_arguments(urdf, tmp_path):
         load_urdf(tmp_path / "nowhere.urdf")
     with pytest.raises(ValueError, match="cannot be read"):
         load_urdf(tmp_path)
+
+
+def test_units_that_look_wrong_are_said_aloud(tmp_path):
+    """Degrees and millimetres; 1e16 stands for no limit."""
+    text = """<robot name="r"><link name="a"/>
+    <link name="b"><inertial><mass value="1"/><inertia ixx="2e4" iyy="2e4" izz="2e4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+    <joint name="j" type="revolute"><origin xyz="350 0 0"/><parent link="a"/><child link="b"/>
+    <limit lower="-90" upper="1e16" effort="1" velocity="1"/></joint></robot>"""
+    path = tmp_path / "robot.urdf"
+    path.write_text(text, encoding="utf-8")
+    for read in (load_urdf, load):
+        with pytest.warns(UnitsWarning) as caught:
+            read(path)
+        for part in ("robot.urdf", "rad of joint 'j' (degrees?)", "body 'b' 350 m", "radius of gyration 141.421 m"):
+            assert part in str(caught[0].message)
+    path.write_text(text.replace("-90", "-1e16").replace("2e4", "0.1").replace("350", "0.35"), encoding="utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_urdf(path)
 
 
 def test_no_other_package_is_needed(urdf, monkeypatch):

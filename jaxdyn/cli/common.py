@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.io import LoadedScene, load_urdf
-from jaxdyn.io.load import described, format_of, load, scene_of_urdf
+from jaxdyn.io.load import described, format_of, load, load_urdf_scene
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.joints import KINDS
@@ -50,7 +50,7 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
 
 def load_model(path: str, args: argparse.Namespace) -> Model:
     """The model of a URDF file under the options of `add_model_options`."""
-    return _movable(_urdf(path, args, "ignore"), path)
+    return _movable(load_urdf(path, floating_base=args.floating_base, lock=_lock(args), gravity=_gravity(args)), path)
 
 
 def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathlib.Path]:
@@ -62,7 +62,9 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
     if args.floating_base and args.fixed_base:
         raise ValueError("--floating-base and --fixed-base contradict each other; give one of them")
     if kind == "urdf":
-        return scene_of_urdf(_movable(_urdf(str(file), args, "couple"), path)), file
+        scene = load_urdf_scene(file, floating_base=args.floating_base, lock=_lock(args), gravity=_gravity(args))
+        _movable(scene.system, path)
+        return scene, file
     if args.lock:
         raise ValueError(f"--lock: joints of {kind.upper()} files cannot be held; change the file, or use a URDF")
     given = False if args.fixed_base else True if args.floating_base else None
@@ -73,13 +75,16 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
     return eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity))), file
 
 
-def _urdf(path: str, args: argparse.Namespace, mimic: str) -> Model:
+def _lock(args: argparse.Namespace) -> dict[str, Any]:
     lock: dict[str, Any] = {}
     for item in args.lock:
         name, equals, text = item.partition("=")
         lock[name] = number(text, f"--lock {item}") if equals else None
-    gravity = GRAVITY if args.gravity is None else tuple(args.gravity)
-    return load_urdf(path, floating_base=args.floating_base, lock=lock, mimic=mimic, gravity=gravity)
+    return lock
+
+
+def _gravity(args: argparse.Namespace):
+    return GRAVITY if args.gravity is None else tuple(args.gravity)
 
 
 def _movable(model: Model, path: str) -> Model:

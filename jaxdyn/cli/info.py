@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxdyn.cli.common import FILE, UNITS, add_model_options, load_scene, output_path, short, table
 from jaxdyn.constraints.assembly import assemble
-from jaxdyn.constraints.mobility import degrees_of_freedom
+from jaxdyn.constraints.mobility import degrees_of_freedom, nearly_dependent
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.load import format_of
 from jaxdyn.io.xml_lines import XmlFile
@@ -62,9 +62,10 @@ def run(args: argparse.Namespace) -> None:
     print(describe(model, args.file))
     print(constraint_lines(scene))
     print(_problems(urdf_inertia_report(file), body_problems) if is_urdf else _body_problems(body_problems))
-    print(
-        _unused(str(file)) if is_urdf else "\n".join(["\nNot taken from the file:", *(scene.not_taken or ["nothing"])])
-    )
+    if is_urdf:
+        print(_unused(str(file)))
+    if scene.not_taken or not is_urdf:
+        print("\n".join(["\nNot taken from the file:", *(scene.not_taken or ["nothing"])]))
     if out is not None:
         repaired = repair_inertias(model)
         save_urdf(repaired, out)
@@ -111,9 +112,15 @@ def constraint_lines(scene: LoadedScene) -> str:
             lines.append("They close: jd.assemble finds a configuration from the reference.")
         except ValueError as error:
             lines.append(f"They do not close from the reference: {error}.")
-    freedom, beside = degrees_of_freedom(scene, q), _freedom_beside(scene, q)
+    near = _closed_near(scene, q)
+    freedom, beside = degrees_of_freedom(scene, q), min(degrees_of_freedom(scene, x) for x in near)
     here = "" if beside == freedom else f" ({freedom} in the singular position of the reference)"
     lines.append(f"Degrees of freedom after constraints: {beside} of {scene.nv}{here}")
+    if doubtful := [x for x in (nearly_dependent(scene, x) for x in near) if x is not None]:
+        lines.append(
+            f"Some rows of the loops say the same as others but for {max(doubtful):.0e}, as the file's digits have it: simulate "
+            "with method=jd.Projected(rank_tol=1e-5), or --rank-tol 1e-5"
+        )
     if len(scene.starts) > 1:
         lines.append(f"States that the file names: {', '.join(scene.starts)}")
     if scene.actuators is not None:
@@ -121,14 +128,14 @@ def constraint_lines(scene: LoadedScene) -> str:
     return "\n".join(lines)
 
 
-def _freedom_beside(scene: LoadedScene, q) -> int:
-    """Degrees of freedom at the least of a few closed configurations around q: files like to put linkages flat."""
-    found, chance = [degrees_of_freedom(scene, q)], np.random.default_rng(0)
+def _closed_near(scene: LoadedScene, q) -> list:
+    """q and a few closed configurations around it: files like to put linkages flat."""
+    found, chance = [q], np.random.default_rng(0)
     for _ in range(2 if scene.constraints else 0):
         step = jnp.asarray(chance.uniform(-0.1, 0.1, scene.nv), q.dtype)
         with contextlib.suppress(ValueError):  # not every configuration near by can be closed
-            found.append(degrees_of_freedom(scene, assemble(scene, integrate(scene.system, q, step), guesses=1).q))
-    return int(min(found))
+            found.append(assemble(scene, integrate(scene.system, q, step), guesses=1).q)
+    return found
 
 
 def _gap(constraint, scene: LoadedScene, q) -> str:
@@ -212,6 +219,10 @@ def _unused(path: str) -> str:
     """What the file holds that the model does not, counted by element."""
     counts: collections.Counter[str] = collections.Counter()
     for element in XmlFile(path, "URDF").root:
+        if element.tag == "gazebo" and (
+            element.find("joint") is not None or element.find("plugin/mimicJoint") is not None
+        ):
+            continue  # a loop or a coupling
         if element.tag not in ("link", "joint"):
             counts[element.tag] += 1
             continue

@@ -27,6 +27,7 @@ from jaxdyn.io import LoadedScene
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.tree import Model, integrate
 from jaxdyn.pictures import save_html, shapes, view
+from jaxdyn.simulation.methods import Projected
 from jaxdyn.simulation.run import Solution, simulate
 from jaxdyn.systems.scene import Scene
 
@@ -117,6 +118,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rtol", type=float, default=1e-8, help="tolerance of adaptive steps (order 8), the default: 1e-8"
     )
     solver.add_argument("--max-steps", type=int, metavar="N", help="give up after so many steps")
+    solver.add_argument(
+        "--rank-tol",
+        type=float,
+        metavar="R",
+        help="rows of loops that say the same as others but for this part count once (default: 1e-9; `jaxdyn info` "
+        "tells when a file needs more)",
+    )
     solver.add_argument("--progress", action="store_true", help="show how far the motion has come")
     files = parser.add_argument_group("output")
     files.add_argument("--out", metavar="FILE", help="write the motions to FILE.csv or FILE.npz")
@@ -149,6 +157,8 @@ def run(args: argparse.Namespace) -> int:
     scene = Scene(model, loaded.constraints, _forces(loaded, args))
     starts, speeds = _starts(scene, q0, v0, args)
     steps = {"stepsize": args.dt} if args.dt is not None else {"rtol": args.rtol, "atol": args.rtol}
+    if args.rank_tol is not None:
+        steps["method"] = Projected(rank_tol=args.rank_tol)
     if args.max_steps is not None:
         steps["max_steps"] = args.max_steps
 

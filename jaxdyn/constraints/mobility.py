@@ -3,11 +3,13 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import checked_tolerance, pseudo_inverse, tolerance
+from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import check_state
 from jaxdyn.systems.scene import as_scene
@@ -20,8 +22,8 @@ def degrees_of_freedom(
 
     Dependent rows count once, so overconstrained linkages have the freedom that they have. It is the freedom of velocities at
     this q: it is larger in singular positions, and rolling takes from it without taking configurations away. Rows of
-    loops that are dependent only where the loops are closed need a q of `jd.assemble`. Rows are compared after each has been
-    scaled to length 1.
+    loops that are dependent only where the loops are closed need a q of `jd.assemble`. Rows are compared with distances in
+    units of the mechanism's length, each scaled down to length 1; rows that are rounding count as zero.
 
     **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `t`, s; `rank_tol`: singular values below `rank_tol` times the
     largest count as zero, by default eps^(4/7), 1e-9 in float64.
@@ -41,8 +43,30 @@ def degrees_of_freedom(
     rank_tol = checked_tolerance(rank_tol)
     if not layout(scene):
         return scene.nv
-    A = constraint_jacobian(scene, q, t)
-    size = jnp.sqrt(jnp.sum(A * A, axis=1, keepdims=True))
-    A = A / jnp.where(size > 0, size, jnp.ones_like(size))
+    A = _scaled_rows(scene, q, t)
     rank = jnp.round(jnp.trace(_product(A, pseudo_inverse(A, tolerance(rank_tol, A), True)))).astype(jnp.int32)
     return scene.nv - int(rank) if is_concrete(rank) else scene.nv - rank
+
+
+def _scaled_rows(scene: Any, q, t) -> Float[Array, "nc nv"]:
+    """Rows with distances in units of the mechanism's length, each scaled down to length 1."""
+    sizes, length = coordinate_sizes(scene.system, q.dtype)
+    A = constraint_jacobian(scene, q, t) * sizes[None]
+    # Rows that are nothing but rounding, as those out of the plane of a planar linkage, must not be scaled to length 1.
+    return A / jnp.maximum(jnp.linalg.norm(A, axis=1, keepdims=True), jnp.minimum(length, jnp.ones_like(length)))
+
+
+def nearly_dependent(scene: Any, q: Float[Array, " nq"], below: float = 1e-5) -> float | None:
+    """Largest singular value of the scaled rows, over the largest of all, that is neither rounding nor above `below`.
+
+    None where there is none. Such rows say the same as others but for the digits that a file was written with: whether they
+    count is then for the rank tolerance to say, and it has to say the same all along a motion.
+    """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=0.0)
+    if not layout(scene):
+        return None
+    found = np.linalg.svd(np.asarray(_scaled_rows(scene, q, t), np.float64), compute_uv=False)
+    ratios = found / max(found.max(initial=0.0), np.finfo(float).tiny)
+    doubtful = ratios[(ratios > 64 * float(jnp.finfo(q.dtype).eps)) & (ratios < below)]
+    return float(doubtful.max()) if doubtful.size else None

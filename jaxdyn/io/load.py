@@ -5,29 +5,41 @@ import difflib
 import importlib
 import os
 import pathlib
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.constraints.loops import model_couplings
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
-from jaxdyn.io.loaded import LoadedScene, Start
+from jaxdyn.io.loaded import LoadedScene, Start, warn_not_taken
 from jaxdyn.io.mjcf import load_mjcf
 from jaxdyn.io.sdf import load_sdf
-from jaxdyn.io.urdf import load_urdf
+from jaxdyn.io.urdf import urdf_model
+from jaxdyn.io.urdf_loops import closing, closures_of, motors_of
 from jaxdyn.model.arguments import as_path
-from jaxdyn.model.tree import Model, neutral
+from jaxdyn.model.builder import GRAVITY
+from jaxdyn.model.tree import neutral
 
 _BY_SUFFIX = {".urdf": "urdf", ".sdf": "sdf", ".world": "sdf", ".mjcf": "mjcf"}
 _BY_ROOT = {"robot": "urdf", "sdf": "sdf", "gazebo": "sdf", "mujoco": "mjcf", "mujocoinclude": "mjcf"}
 
 
-def load(source: str | os.PathLike, *, floating_base: bool | None = None, dtype=None) -> LoadedScene:
+def load(
+    source: str | os.PathLike,
+    *,
+    floating_base: bool | None = None,
+    loops: str | os.PathLike | bool | None = None,
+    dtype=None,
+) -> LoadedScene:
     """The scene of a URDF, MJCF or SDF file, or of a robot by its name in the package robot_descriptions.
 
     All formats give a `LoadedScene`, with the `Model` in `.system`. That of a URDF has the file's mimicked joints as
-    couplings, its joint damping and dry friction (smoothed at 0.01 rad/s) as forces, and the start "reference", q = 0.
-    `load_urdf`, which returns the `Model` alone, has more options, and so have `load_mjcf` and `load_sdf`.
+    couplings, its joint damping and dry friction (smoothed at 0.01 rad/s) as forces, and the start "reference", q = 0. A URDF
+    is a tree; loops are taken from a YAML file beside it (`closed_loop`: pairs of frames, `type`: 3d or 6d; `name_mot`: motors,
+    which become `.actuators`; `joint_name` and `joint_type`: joints that are balls or held), and from joints and mimicking
+    plugins in `<gazebo>` elements (`jaxdyn.io.urdf_loops`). They close with `jd.assemble(scene, scene.starts["reference"].q)`.
+    `load_urdf`, which returns the `Model` of the tree alone, has more options, and so have `load_mjcf` and `load_sdf`.
 
     **Arguments:**
 
@@ -35,12 +47,15 @@ def load(source: str | os.PathLike, *, floating_base: bool | None = None, dtype=
       cache. What it does not have there it fetches by git, once, if there is a network.
     - `floating_base`: whether the root moves freely. None: as the format has it: fixed in a URDF, free in SDF. MJCF says so
       itself.
+    - `loops`: the YAML file of a URDF's loops. None: the one with the URDF's name beside it, if there is one; False: no YAML
+      file.
     - `dtype`: as for `ModelBuilder`.
 
     **Returns:** `LoadedScene`.
 
     **Raises:** ValueError for a file that does not exist or is of no known format, an unknown name (near ones are listed), a
-    robot that could not be fetched, `floating_base` with MJCF; and as the loader of the format does. ImportError
+    robot that could not be fetched, `floating_base` with MJCF, `loops` with other formats than URDF, loops between frames that
+    do not exist; and as the loader of the format does. ImportError
     without the package that reads the format.
 
     ```python
@@ -52,6 +67,10 @@ def load(source: str | os.PathLike, *, floating_base: bool | None = None, dtype=
     if not path.suffix and not path.exists():
         path = described(str(source))
     kind = format_of(path)
+    if loops is not None and kind != "urdf":
+        raise ValueError(
+            f"loops is {loops!r}, but {path} is {kind.upper()}, which holds its loops itself; leave it out"
+        )
     if kind == "mjcf":
         if floating_base is not None:
             raise ValueError(
@@ -60,17 +79,34 @@ def load(source: str | os.PathLike, *, floating_base: bool | None = None, dtype=
         return load_mjcf(path, dtype=dtype)
     if kind == "sdf":
         return load_sdf(path, floating_base=floating_base is not False, dtype=dtype)
-    return scene_of_urdf(load_urdf(path, floating_base=bool(floating_base), mimic="couple", dtype=dtype))
+    return load_urdf_scene(path, floating_base=bool(floating_base), loops=loops, dtype=dtype)
 
 
-def scene_of_urdf(model: Model) -> LoadedScene:
-    """The scene of a model that was read from a URDF: couplings, damping and friction of its joints, q = 0 as a start."""
+def load_urdf_scene(
+    path: pathlib.Path, *, floating_base: bool = False, lock=(), gravity=GRAVITY, loops=None, dtype=None
+) -> LoadedScene:
+    """The scene of a URDF file: as `load` says, with the options of `load_urdf`."""
+    closures = closures_of(path, loops)
+    held = lock if isinstance(lock, Mapping) else dict.fromkeys(lock)
+    model = urdf_model(
+        path,
+        floating_base=floating_base,
+        lock={**dict.fromkeys(closures.held), **held},
+        mimic="couple",
+        gravity=gravity,
+        dtype=dtype,
+        balls=closures.balls,
+    )
+    rows, not_taken = closing(closures, path, model)
+    warn_not_taken(path, not_taken, stacklevel=4)
     forces: list = []
     for leaf, force in ((model.damping, JointDamping), (model.friction, CoulombFriction)):
         if leaf is not None and np.any(np.asarray(leaf) != 0):
             forces.append(force(leaf))
     starts = {"reference": Start(neutral(model), jnp.zeros((model.nv,), model.home.dtype))}
-    return LoadedScene(model, model_couplings(model), forces, starts=starts)
+    drives = motors_of(closures, model)
+    rows = [*model_couplings(model), *rows]
+    return LoadedScene(model, rows, forces, starts=starts, actuators=drives, not_taken=not_taken)
 
 
 def format_of(path: pathlib.Path) -> str:

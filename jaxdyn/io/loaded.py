@@ -129,6 +129,7 @@ def warn_not_taken(path, not_taken: Iterable[str], stacklevel: int = 3) -> None:
 
 # A robot arm turns by two or three turns at most, and its links are shorter than this; ships and cranes are named too.
 _MOST_TURNS, _LONGEST = 4.0, 100.0
+_NO_LIMIT = 1e15  # files write 1e16 where they mean none
 
 
 def warn_of_units(path, model: Model, stacklevel: int = 3) -> None:
@@ -137,7 +138,7 @@ def warn_of_units(path, model: Model, stacklevel: int = 3) -> None:
     lower, upper = np.asarray(model.lower), np.asarray(model.upper)
     for name, kind, place in zip(top.joint_names, top.kinds, top.q_slices, strict=True):
         ends = np.abs(np.concatenate([lower[place], upper[place]]))
-        if kind == "revolute" and (ends[np.isfinite(ends)] > 2 * np.pi * _MOST_TURNS).any():
+        if kind == "revolute" and (ends[ends < _NO_LIMIT] > 2 * np.pi * _MOST_TURNS).any():
             doubts.append(f"limits {lower[place][0]:g} to {upper[place][0]:g} rad of joint {name!r} (degrees?)")
     for name, home, parameters in zip(top.body_names, np.asarray(model.home), np.asarray(model.inertias), strict=True):
         if (far := np.linalg.norm(home[:3, 3])) > _LONGEST:

@@ -12,8 +12,8 @@ from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, built
 from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of_units
 from jaxdyn.io.sdf_frames import SdfFile
-from jaxdyn.io.sdf_joints import Axis, Edge, Joint, read_joints, spanning_tree
-from jaxdyn.io.urdf import ROOT_JOINT, _turn_from_z
+from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
+from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
@@ -22,8 +22,6 @@ from jaxdyn.model.tree import Model
 
 _KINDS = dict(revolute="revolute", continuous="revolute", revolute2="revolute", universal="revolute")
 _KINDS |= dict(prismatic="prismatic", screw="helical", ball="spherical")
-_LOOPS = dict(revolute="revolute", continuous="revolute", prismatic="prismatic", universal="universal")
-_LOOPS |= dict(revolute2="universal", ball="spherical", fixed="weld")
 _SECOND = "_axis2"  # behind the name of a joint of two axes: its second one
 _PARALLEL = 1e-4  # files give right angles with four or five digits
 _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
@@ -87,7 +85,8 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype=None)
 
 def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, dtype) -> tuple[Model, dict[str, str]]:
     """The model, and the joints of its free roots with the link of each."""
-    name = next(iter(file.models)) if len(file.models) == 1 or file.world is None else ""
+    first = next(iter(file.models.values())).element.get("name")
+    name = first if len(file.models) == 1 or file.world is None else ""
     name = name or (file.world.get("name") if file.world is not None else "") or "mechanism"
     gravity: np.ndarray | tuple | None = GRAVITY
     if file.world is not None:
@@ -189,10 +188,10 @@ def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constrai
         for k, end in enumerate(ends):
             axis = joint.axes[min(k, len(joint.axes) - 1)].direction if joint.axes else joint.pose[:3, 2]
             # The loop closes as the file places the links: both frames are there, z along the end's own axis.
-            place = _turn_from_z(axis)
+            place = f64.turn_from_z(axis)
             place[:3, 3] = joint.pose[:3, 3]
             poses.append(place if end is None else f64.inverse(file.pose(end)) @ place)
-        taken.append(loop(ends[0], poses[0], ends[1], poses[1], _LOOPS[joint.kind], name=joint.name))
+        taken.append(loop(ends[0], poses[0], ends[1], poses[1], LOOPS[joint.kind], name=joint.name))
     return taken, [line for reason, names in left.items() for line in listed(reason, names)]
 
 
@@ -300,6 +299,6 @@ def _unused(file: SdfFile) -> list[str]:
     for model, scope in file.models.items():
         for tag in ("plugin", "gripper"):
             if scope.element.find(tag) is not None:
-                found.setdefault(f"<{tag}> of models", []).append(model)
+                found.setdefault(f"<{tag}> of models", []).append(scope.element.get("name") or model)
     lines = [line for reason, names in found.items() for line in listed(reason, names)]
     return [*lines, *listed("includes", file.includes)]

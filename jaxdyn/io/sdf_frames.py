@@ -80,8 +80,10 @@ class SdfFile(XmlFile):
             static = scope.static or self.flag(element, "static", f"model {name!r}")
             # The one model of a file gives no prefix to its names; several do, so that they stay apart.
             alone = scope.parent is None and len(scope.element.findall("model")) == 1
-            inner = Scope(element, "" if alone else f"{name}::", name, scope, static)
-            self.models[name] = inner
+            # Without a prefix the model's own frame must not take the name of what is in it.
+            frame = "__model__" if alone and any(part.get("name") == name for part in element) else name
+            inner = Scope(element, "" if alone else f"{name}::", frame, scope, static)
+            self.models[frame] = inner
             self._collect(inner)
 
     def find(self, name: str, scope: Scope, element) -> str:
@@ -107,14 +109,7 @@ class SdfFile(XmlFile):
                 f"<pose> of {what} is in the frame {pose.get('frame')!r}, which has no settled meaning before "
                 "version 1.7; write version 1.7 and relative_to",
             )
-        if pose.get("rotation_format") == "quat_xyzw":
-            values = self.numbers(pose, 7, what)
-            if not values[3:].any():
-                raise self.fault(pose, f"<pose> of {what} has the quaternion zero; give x y z qx qy qz qw")
-            return f64.joint_pose("free", np.zeros(6), np.concatenate([values[:3], values[6:], values[3:6]]))
-        values = self.numbers(pose, 6, what)
-        turn = np.deg2rad(values[3:]) if (pose.get("degrees") or "").lower() in ("1", "true") else values[3:]
-        return f64.pose_matrix((values[:3], turn), what)
+        return self.pose_numbers(pose, what)
 
     def pose(self, name: str, stop: str = WORLD, trail: tuple[str, ...] = ()) -> np.ndarray:
         """Pose (4, 4) of a frame in the world (or in the frame `stop` that it hangs on)."""

@@ -12,6 +12,9 @@ from jaxdyn.model.builder import unknown
 
 # Axes of each kind. A gearbox is a coupling of two other joints, not a joint.
 AXES = dict(revolute=1, continuous=1, prismatic=1, screw=1, revolute2=2, universal=2, ball=0, fixed=0, gearbox=2)
+# The rows by which each closes a loop, as kinds of `jd.loop`; screws and gearboxes close none.
+LOOPS = dict(revolute="revolute", continuous="revolute", prismatic="prismatic", universal="universal")
+LOOPS |= dict(revolute2="universal", ball="spherical", fixed="weld")
 _FAR = 1e15  # limits beyond this are none; +-1e16 was the default up to version 1.6
 
 

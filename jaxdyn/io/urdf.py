@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxdyn.io.loaded import warn_of_units
 from jaxdyn.io.urdf_check import JOINTS
 from jaxdyn.io.urdf_parts import Inertial, Joint, read_parts
 from jaxdyn.model import float64 as f64
@@ -66,7 +67,25 @@ def load_urdf(
     velocity or effort, a zero axis; for names in `lock` that are not movable joints;
     for a joint that moves no inertia.
 
-    **Warns:** UserWarning naming the links with a negative moment of inertia.
+    **Warns:** UserWarning naming the links with a negative moment of inertia; `UnitsWarning` where limits look like degrees,
+    or lengths and inertias like millimetres.
+    """
+    return urdf_model(path, floating_base=floating_base, lock=lock, mimic=mimic, gravity=gravity, dtype=dtype)
+
+
+def urdf_model(
+    path: str | os.PathLike,
+    *,
+    floating_base: bool,
+    lock: Iterable[str] | Mapping[str, Any],
+    mimic: str,
+    gravity,
+    dtype,
+    balls: Iterable[str] = (),
+) -> Model:
+    """As `load_urdf`; `balls` names joints that are spherical, a kind that a URDF cannot say.
+
+    **Raises:** as `load_urdf`; ValueError for balls that are no moving joints of the file.
     """
     if mimic not in ("ignore", "couple", "error"):
         raise ValueError(f"mimic is {mimic!r}; give 'ignore', 'couple' or 'error'")
@@ -76,6 +95,10 @@ def load_urdf(
     while root_joint in urdf.joints:
         root_joint = f"_{root_joint}"
     kinds = {name: JOINTS[joint.type] for name, joint in urdf.joints.items()}
+    for name in balls:
+        if kinds.get(name, "fixed") == "fixed":
+            raise ValueError(f"{path}: {unknown('joint', name, kinds)}; a ball takes the place of a joint that moves")
+        kinds[name] = "spherical"
     held = _held({root_joint: "free", **kinds} if floating_base else kinds, lock, path)
     couplings = {name: joint.mimic for name, joint in urdf.joints.items() if joint.mimic and kinds[name] != "fixed"}
     if mimic == "error" and couplings:
@@ -95,16 +118,18 @@ def load_urdf(
         stack.extend(reversed(urdf.children[joint.child]))
         inertia = _inertia(urdf, joint.child)
         try:
-            _add_joint(builder, joint, inertia, urdf, held)
+            _add_joint(builder, joint, kinds[joint.name], inertia, urdf, held)
         except ValueError as error:
             raise ValueError(f"{urdf.places[f'joint {joint.name}']}: {error}") from error
     if mimic == "couple":
         for name, coupling in couplings.items():
             builder.add_coupling(name, coupling.joint, coupling.multiplier, coupling.offset)
     try:
-        return builder.build()
+        model = builder.build()
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    warn_of_units(path, model, stacklevel=4)
+    return model
 
 
 def urdf_inertia_report(path: str | os.PathLike) -> list[tuple[str, str]]:
@@ -134,17 +159,19 @@ def _warn_of_inertias(urdf: _Description) -> None:
             warnings.warn(
                 f"{urdf.places[f'link {name}']}: link {name!r}: a principal moment of inertia is negative "
                 f"({moments[0]:.6g} kg m^2); mend <inertia>, or take jd.repair_inertias(model)",
-                stacklevel=3,
+                stacklevel=4,
             )
 
 
-def _add_joint(builder: ModelBuilder, joint: Joint, inertia, urdf: _Description, held: dict[str, np.ndarray]) -> None:
-    kind, name = JOINTS[joint.type], joint.child
+def _add_joint(
+    builder: ModelBuilder, joint: Joint, kind: str, inertia, urdf: _Description, held: dict[str, np.ndarray]
+) -> None:
+    name = joint.child
     pose, parent, axis, turn = joint.origin, joint.parent, _Z, np.eye(4)
     if kind in SCREW_KINDS or kind == "planar":
         axis = f64.unit(joint.axis, f"joint {joint.name!r}: axis")
     if kind == "planar":
-        turn, axis = _turn_from_z(axis), _Z
+        turn, axis = f64.turn_from_z(axis), _Z
     if joint.name in held:
         screw = np.concatenate([axis, np.zeros(3)] if kind == "prismatic" else [np.zeros(3), axis])
         pose = pose @ turn @ f64.joint_pose(kind, screw, held[joint.name]) @ f64.inverse(turn)
@@ -182,18 +209,6 @@ def _inertia(urdf: _Description, link: str) -> np.ndarray:
     except ValueError as error:
         raise ValueError(f"{urdf.places[f'link {link}']}: {error}") from error
     return parameters if inertial.origin is None else f64.move_inertia(inertial.origin, parameters)
-
-
-def _turn_from_z(axis: np.ndarray) -> np.ndarray:
-    """Rotation (4, 4) by the shortest way that takes z to a unit axis; half a turn about x for -z."""
-    turn = np.eye(4)
-    across = np.array([-axis[1], axis[0], 0.0])
-    sine = np.linalg.norm(across)
-    if sine > 0:
-        turn[:3, :3] = f64.rotation_matrix(across / sine, np.arctan2(sine, axis[2]))
-    elif axis[2] < 0:
-        turn[:3, :3] = np.diag([1.0, -1.0, -1.0])
-    return turn
 
 
 def _held(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:

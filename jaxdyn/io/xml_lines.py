@@ -10,6 +10,7 @@ from xml.parsers import expat
 
 import numpy as np
 
+from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import as_path
 
 
@@ -87,6 +88,17 @@ class XmlFile:
             wanted = " or ".join(str(n) for n in counts)
             raise self.fault(element, f"<{element.tag}> of {what} is {text!r}; give {wanted} finite numbers")
         return values
+
+    def pose_numbers(self, pose, what: str) -> np.ndarray:
+        """The numbers of an SDF <pose> as (4, 4): x y z and roll pitch yaw, in degrees or as a quaternion where it says so."""
+        if pose.get("rotation_format") == "quat_xyzw":
+            values = self.numbers(pose, 7, what)
+            if not values[3:].any():
+                raise self.fault(pose, f"<pose> of {what} has the quaternion zero; give x y z qx qy qz qw")
+            return f64.joint_pose("free", np.zeros(6), np.concatenate([values[:3], values[6:], values[3:6]]))
+        values = self.numbers(pose, 6, what)
+        turn = np.deg2rad(values[3:]) if (pose.get("degrees") or "").lower() in ("1", "true") else values[3:]
+        return f64.pose_matrix((values[:3], turn), what)
 
     def number(self, element, tag: str, default: float, what: str, *, finite: bool = True) -> float:
         """A number in a child element `tag` (a path), or the default where there is none or it is empty."""

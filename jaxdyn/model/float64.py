@@ -118,6 +118,18 @@ def rotation_matrix(axis: np.ndarray, angle: float) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + 2 * np.sin(angle / 2) ** 2 * cross @ cross
 
 
+def turn_from_z(axis: np.ndarray) -> np.ndarray:
+    """Rotation (4, 4) by the shortest way that takes z to a unit axis; half a turn about x for -z."""
+    turn = np.eye(4)
+    across = np.array([-axis[1], axis[0], 0.0])
+    sine = np.linalg.norm(across)
+    if sine > 0:
+        turn[:3, :3] = rotation_matrix(across / sine, np.arctan2(sine, axis[2]))
+    elif axis[2] < 0:
+        turn[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    return turn
+
+
 def joint_pose(kind: str, screw: np.ndarray, q: np.ndarray) -> np.ndarray:
     """`joints.joint_transform` in float64: pose of the body frame relative to its home pose."""
     pose = np.eye(4)

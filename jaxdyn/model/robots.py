@@ -1,9 +1,11 @@
 """Built-in mechanisms: a real arm and a real hand, and generators of chains and random trees."""
+"""Built-in mechanisms: real arms, a robot with legs, and generators of chains and random trees."""
 
 import jax
 import numpy as np
 
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
+from jaxdyn.model.inertia import box, cylinder, displaced, sphere
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 
@@ -171,6 +173,81 @@ def allegro(*, gravity=GRAVITY, dtype=None) -> Model:
         builder.add_body(
             f"{parent}_tip", parent, "fixed", _ALLEGRO_TIP, joint_name=f"joint_{parent[5:]}_tip", pose=pose
         )
+# Of each joint: name, place in the body that carries it and turn there about y, axis, largest angle, speed and torque; of its
+# body: mass, centre of mass, radius and length of a cylinder along z.
+_UR5 = (
+    ("shoulder_pan", (0, 0, 0.089159), 0, "z", 360, 3.15, 150, 3.7, 0.0, 0.06, 0.15),
+    ("shoulder_lift", (0, 0.13585, 0), 90, "y", 360, 3.15, 150, 8.393, 0.28, 0.06, 0.56),
+    ("elbow", (0, -0.1197, 0.425), 0, "y", 180, 3.15, 150, 2.275, 0.25, 0.06, 0.5),
+    ("wrist_1", (0, 0, 0.39225), 90, "y", 360, 3.2, 28, 1.219, 0.0, 0.045, 0.12),
+    ("wrist_2", (0, 0.093, 0), 0, "z", 360, 3.2, 28, 1.219, 0.0, 0.045, 0.12),
+    ("wrist_3", (0, 0, 0.09465), 0, "y", 360, 3.2, 28, 0.1879, 0.0, 0.045, 0.04),
+)
+
+
+def ur5(*, gravity=GRAVITY, dtype=None) -> Model:
+    """The arm Universal Robots UR5: six revolute joints on a fixed base.
+
+    Joints shoulder_pan, shoulder_lift, elbow, wrist_1, wrist_2, wrist_3 move bodies of the same names with _link behind; the
+    frames are base_link and tool0, the flange, with z outwards.
+
+    Source: lengths, masses, centres of mass and limits (rad/s, N m) as the maker publishes them and ROS descriptions of the arm
+    have them. Moments of inertia are not published: each body is a cylinder of its mass.
+    """
+    axes = {"y": (0, 1, 0), "z": (0, 0, 1)}
+    builder = ModelBuilder("ur5", gravity=gravity, dtype=dtype).add_body("base_link", joint="fixed")
+    parent = "base_link"
+    for name, place, turn, axis, degrees, speed, torque, mass, com, radius, length in _UR5:
+        builder.add_body(
+            f"{name}_link",
+            parent,
+            "revolute",
+            displaced(cylinder(mass, radius, length), (0, 0, com)),
+            joint_name=name,
+            pose=(place, (0, np.radians(turn), 0)),
+            axis=axes[axis],
+            lower=-np.radians(degrees),
+            upper=np.radians(degrees),
+            velocity_limit=speed,
+            effort_limit=torque,
+        )
+        parent = f"{name}_link"
+    return builder.add_frame("tool0", parent, ((0, 0.0823, 0), (-_QUARTER, 0, 0))).build()
+
+
+def quadruped(*, floating_base: bool = True, gravity=GRAVITY, dtype=None) -> Model:
+    """A robot with four legs of no particular make, some 12 kg: a trunk and, for each leg, hip, thigh and shank.
+
+    Legs are FL, FR, RL, RR; joints LEG_hip turn about x, LEG_thigh and LEG_knee about y; feet are frames LEG_foot. At q = 0 legs
+    hang straight, 0.4 m long; thigh 0.8 and knee -1.6 rad stand it up. With `floating_base` the trunk's pose comes first in q.
+
+    Source: none, sizes and masses are round numbers like those of robots of this kind.
+    """
+    builder = ModelBuilder("quadruped", gravity=gravity, dtype=dtype)
+    trunk = "free" if floating_base else "fixed"
+    builder.add_body("trunk", joint=trunk, joint_name="root_joint", inertia=box(6.0, (0.4, 0.2, 0.1)))
+    for leg, x, y in (("FL", 1, 1), ("FR", 1, -1), ("RL", -1, 1), ("RR", -1, -1)):
+        limb = displaced(cylinder(0.5, 0.02, 0.2), (0, 0, -0.1))
+        hip = displaced(sphere(0.5, 0.04), (0, 0.04 * y, 0))
+        for name, parent, place, axis, inertia, reach in (
+            ("hip", "trunk", (0.2 * x, 0.06 * y, 0), (1, 0, 0), hip, (-0.9, 0.9)),
+            ("thigh", f"{leg}_hip_link", (0, 0.08 * y, 0), (0, 1, 0), limb, (-1.6, 3.2)),
+            ("knee", f"{leg}_thigh_link", (0, 0, -0.2), (0, 1, 0), limb, (-2.7, 0.0)),
+        ):
+            builder.add_body(
+                f"{leg}_{name}_link",
+                parent,
+                "revolute",
+                inertia,
+                joint_name=f"{leg}_{name}",
+                pose=place,
+                axis=axis,
+                lower=reach[0],
+                upper=reach[1],
+                velocity_limit=20.0,
+                effort_limit=25.0,
+            )
+        builder.add_frame(f"{leg}_foot", f"{leg}_knee_link", (0, 0, -0.2))
     return builder.build()
 
 

@@ -1,0 +1,135 @@
+"""The site: `python -m benchmarks.site` (`make docs`), into out/site.
+
+Makes the pictures of the gallery that are missing, builds the pages with zensical (strict), puts KaTeX beside them, which is
+fetched from the npm registry and kept in out/, and the sources that pages link to, and follows every link and anchor of the
+pages that came out. Without npm the pages take KaTeX from the net when they are read, and a line says so.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from benchmarks import gallery
+
+ROOT = Path(__file__).resolve().parent.parent
+SITE = ROOT / "out" / "site"
+KATEX = "0.16.22"  # as in docs/javascripts/katex.js
+_WANTED = ("katex.min.js", "katex.min.css", "contrib/auto-render.min.js")
+
+
+def katex(folder: Path) -> str:
+    """Put the files of KaTeX into a folder; returns why it was not possible, or an empty text."""
+    if all((folder / name).exists() for name in _WANTED):
+        return ""
+    npm = shutil.which("npm")
+    if npm is None:
+        return "npm is not installed"
+    with tempfile.TemporaryDirectory() as scratch:
+        found = subprocess.run(
+            [npm, "pack", f"katex@{KATEX}", "--silent"], cwd=scratch, capture_output=True, text=True, check=False
+        )
+        packed = list(Path(scratch).glob("katex-*.tgz"))
+        if found.returncode or not packed:
+            return f"npm could not fetch it: {' '.join(found.stderr.split())[:200]}"
+        with tarfile.open(packed[0]) as archive:
+            archive.extractall(scratch, filter="data")
+        dist = Path(scratch) / "package" / "dist"
+        for name in (*_WANTED, *(f"fonts/{path.name}" for path in (dist / "fonts").glob("*.woff2"))):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(dist / name, folder / name)
+    return ""
+
+
+class _Page(HTMLParser):
+    """What a page links to, and the names of its places."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.links: list[str] = []
+        self.places: set[str] = {""}
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        """Collect targets and names."""
+        given = dict(attrs)
+        self.links += [given[key] or "" for key in ("href", "src") if given.get(key)]
+        self.places |= {given[key] or "" for key in ("id", "name") if given.get(key)}
+
+
+def dead_links(site: Path) -> tuple[int, list[str]]:
+    """How many links the pages have within the site, and those that lead nowhere."""
+    pages = {path: _Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html")}
+    count, dead = 0, []
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc or path.name == "404.html":
+                continue  # other sites; the page of errors has paths from the root of wherever the site will stand
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            target = target / "index.html" if target.is_dir() else target
+            count += 1
+            if not target.exists():
+                dead.append(f"{path.relative_to(site)}: {link}")
+            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].places:
+                dead.append(f"{path.relative_to(site)}: {link} (no such place)")
+    return count, dead
+
+
+def bring_sources(site: Path) -> int:
+    """Copy the repository's files that pages link to into SITE/source, as plain text, and let the links lead there."""
+    brought = set()
+    for path in site.rglob("*.html"):
+        text, depth = path.read_text(encoding="utf-8"), path.relative_to(site).parent
+        changed = text
+        for link in set(_Page(text).links):
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc or not parts.path or (path.parent / unquote(parts.path)).exists():
+                continue
+            source = (ROOT / "docs" / depth / unquote(parts.path)).resolve()
+            if not source.is_file() or not source.is_relative_to(ROOT):
+                continue
+            ending = "" if source.suffix in (".ipynb", ".cff") else ".txt"
+            place = Path("source", f"{source.relative_to(ROOT)}{ending}")
+            (site / place).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, site / place)
+            brought.add(place)
+            up = "/".join([".."] * len(depth.parts))
+            changed = changed.replace(f'href="{link}"', f'href="{f"{up}/" if up else ""}{place.as_posix()}"')
+        if changed != text:
+            path.write_text(changed, encoding="utf-8")
+    return len(brought)
+
+
+def main(argv=None) -> int:
+    """Build and check; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--no-gallery", action="store_true", help="make no pictures; their places stay empty")
+    options = parser.parse_args(argv)
+    if not options.no_gallery:
+        gallery.main([])
+    strict = [] if options.no_gallery else ["--strict"]
+    zensical = Path(sys.executable).with_name("zensical")
+    if subprocess.run([zensical, "build", "-f", "mkdocs.yml", *strict], cwd=ROOT, check=False).returncode:
+        return 1
+    kept = ROOT / "out" / "katex"
+    if fault := katex(kept):
+        print(f"KaTeX is not part of the site ({fault}): its formulas need the net when they are read")
+    else:
+        shutil.copytree(kept, SITE / "javascripts" / "katex", dirs_exist_ok=True)
+    print(f"{bring_sources(SITE)} files of the repository that pages link to are beside them")
+    count, dead = dead_links(SITE)
+    dead = [link for link in dead if not options.no_gallery or "gallery/" not in link]
+    print(f"{len(list(SITE.rglob('*.html')))} pages, {count} links within the site, {len(dead)} of them dead")
+    for link in dead:
+        print(f"  {link}")
+    return int(bool(dead))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

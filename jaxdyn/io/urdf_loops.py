@@ -1,0 +1,260 @@
+"""Loops of URDF files: the two places beside the tree where users write them.
+
+1. A YAML file with the URDF's name, as collections of parallel robots have it:
+
+       closed_loop: [[frame_a, frame_b], ...]   links (or joints) whose frames coincide
+       type: [3d, 6d, ...]                      their origins alone, or their axes too; one word for all
+       name_mot: [joint, ...]                   joints with a motor
+       joint_name: [joint, ...]                 joints that are not what the URDF can say,
+       joint_type: [SPHERICAL, FIXED, ...]      a ball at the joint's frame, or held at zero
+
+2. `<gazebo>` elements with an SDF `<joint>` in them, which Gazebo adds to the tree (poses in the child's frame, axes in
+   the joint's, closed where all coordinates are zero), or with a plugin that mimics a joint (`<joint>`, `<mimicJoint>`,
+   `<multiplier>`, `<offset>`).
+"""
+
+import pathlib
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.constraints.base import Constraint
+from jaxdyn.constraints.loops import Gear, gear, loop
+from jaxdyn.io.loaded import Actuators, listed
+from jaxdyn.io.sdf_joints import LOOPS
+from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import as_path
+from jaxdyn.model.joints import KINDS
+from jaxdyn.model.names import frame_index, joint_index
+from jaxdyn.model.tree import Model
+
+_SUFFIXES = (".yaml", ".yml")
+_KEYS = ("closed_loop", "name_mot", "joint_name")
+_TYPES = {"3d": "spherical", "6d": "weld"}
+
+
+class Closures(NamedTuple):
+    """What the YAML file says: pairs of frames with the joint that closes each, joints that are balls, held ones, motors."""
+
+    path: str
+    pairs: tuple[tuple[str, str, str], ...] = ()
+    balls: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
+    motors: tuple[str, ...] = ()
+    not_taken: tuple[str, ...] = ()
+
+
+def closures_of(urdf: pathlib.Path, loops) -> Closures:
+    """What closes the loops of a URDF file.
+
+    **Arguments:** `loops`: a YAML file; None: the one beside the URDF with its name, if it is there and names loops or
+    motors; False: none.
+
+    **Raises:** ValueError with the file for one that is no YAML, pairs that are no pairs of names, unknown types, lists of
+    different lengths.
+    """
+    if loops is False:
+        return Closures("")
+    if loops is not None:
+        return _read(as_path(loops, "loops"), wanted=True)
+    beside = [path for suffix in _SUFFIXES if (path := urdf.with_suffix(suffix)).is_file()]
+    return _read(beside[0], wanted=False) if beside else Closures("")
+
+
+def _read(path: pathlib.Path, wanted: bool) -> Closures:
+    import yaml
+
+    try:
+        text = path.read_text(encoding="utf-8")
+        if not wanted and not any(key in text for key in _KEYS):
+            return Closures("")  # a file of this name that is about something else
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
+            # A few nested ones say gigabytes, and no list of loops needs them.
+            raise ValueError(
+                f"{path}: aliases (*name) are refused, as they can expand without bound; write the text out"
+            )
+        content = yaml.safe_load(text)
+    except OSError as error:
+        raise ValueError(f"loops: {path} cannot be read ({error.strerror}); check the path") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        if not wanted:
+            return Closures("")
+        raise ValueError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict) or not set(_KEYS) & content.keys():
+        if not wanted:
+            return Closures("")
+        raise ValueError(f"{path}: names no loops; give closed_loop: [[FRAME, FRAME], ...] and type: [3d, 6d, ...]")
+    pairs = content.get("closed_loop") or []
+    if not isinstance(pairs, list) or not all(
+        isinstance(pair, list) and len(pair) == 2 and all(isinstance(name, str) for name in pair) for pair in pairs
+    ):
+        raise ValueError(f"{path}: closed_loop is {pairs!r}; give pairs of frames, [[FRAME, FRAME], ...]")
+    types = content.get("type", "6d")
+    types = [types] * len(pairs) if isinstance(types, str) else types or []
+    if len(types) != len(pairs):
+        raise ValueError(f"{path}: type has {len(types)} entries, closed_loop {len(pairs)}; give one for each pair")
+    kinds = []
+    for pair, word in zip(pairs, types, strict=True):
+        if str(word).lower() not in _TYPES:
+            raise ValueError(f"{path}: the type of the loop {pair[0]}, {pair[1]} is {word!r}; give 3d or 6d")
+        kinds.append(_TYPES[str(word).lower()])
+    names, words, motors = (_names(content, key, path) for key in ("joint_name", "joint_type", "name_mot"))
+    if len(names) != len(words):
+        raise ValueError(
+            f"{path}: joint_name has {len(names)} entries, joint_type {len(words)}; give one for each joint"
+        )
+    chosen = list(zip(names, (word.upper() for word in words), strict=True))
+    return Closures(
+        str(path),
+        tuple((a, b, kind) for (a, b), kind in zip(pairs, kinds, strict=True)),
+        tuple(name for name, word in chosen if word == "SPHERICAL"),
+        tuple(name for name, word in chosen if word == "FIXED"),
+        tuple(motors),
+        tuple(
+            listed(
+                f"kinds of joints in {path.name}, which stay as in the URDF",
+                (f"{name} ({word})" for name, word in chosen if word not in ("SPHERICAL", "FIXED")),
+            )
+        ),
+    )
+
+
+def _names(content: dict, key: str, path) -> list[str]:
+    value = content.get(key) or []
+    value = [value] if isinstance(value, str) else value
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise ValueError(f"{path}: {key} is {value!r}; give a list of names")
+    return value
+
+
+def closing(closures: Closures, urdf: pathlib.Path, model: Model) -> tuple[list[Constraint], list[str]]:
+    """The constraints of both conventions, and in words what of them was not taken.
+
+    **Raises:** ValueError with the file for frames and joints that the model does not have, and for bad numbers.
+    """
+    taken: list[Constraint] = []
+    for a, b, kind in closures.pairs:
+        ends = [model.frame_names[_named(frame_index, model, name, f"{closures.path}: closed_loop")] for name in (a, b)]
+        taken.append(loop(ends[0], np.eye(4), ends[1], np.eye(4), kind, name=f"{a}-{b}"))
+    more, left = _gazebo(XmlFile(urdf, "URDF"), model)
+    return [*taken, *more], [*closures.not_taken, *left]
+
+
+def motors_of(closures: Closures, model: Model) -> Actuators | None:
+    """Motors with a gain of one on the joints that `name_mot` names: controls are generalised forces (N m or N)."""
+    if not closures.motors:
+        return None
+    columns = []
+    for name in closures.motors:
+        joint = _named(joint_index, model, name, f"{closures.path}: name_mot")
+        if KINDS[kind := model.topology.kinds[joint]].nv != 1:
+            raise ValueError(f"{closures.path}: name_mot: joint {name!r} is {kind}; motors drive joints of one freedom")
+        columns.append(model.topology.v_slices[joint].start)
+    n, dtype = len(columns), model.home.dtype
+    free = np.tile([-np.inf, np.inf], (n, 1))
+    moment = np.zeros((n, model.nv))
+    moment[np.arange(n), columns] = 1.0
+    places = np.full(model.nv, -1)
+    for in_q, in_v in zip(model.topology.q_slices, model.topology.v_slices, strict=True):
+        if in_q.stop - in_q.start == 1:
+            places[in_v.start] = in_q.start
+    gain = np.tile([1.0, 0.0, 0.0], (n, 1))
+    numbers = (moment, np.zeros((n, 6)), gain, 0 * gain, free, free, np.tile([-np.inf, np.inf], (model.nv, 1)))
+    leaves = (jnp.asarray(x, dtype) for x in numbers)
+    return Actuators(closures.motors, (None,) * n, tuple(int(x) for x in places), *leaves)
+
+
+def _named(index, model: Model, name: str, where: str) -> int:
+    try:
+        return index(model, name)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def _gazebo(file: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
+    """Joints and mimicking plugins of `<gazebo>` elements."""
+    taken: list[Constraint] = []
+    left: dict[str, list[str]] = {}
+    for element in file.root.iter("gazebo"):
+        for joint in element.findall("joint"):
+            name = file.name(joint, "<gazebo>")
+            kind = joint.get("type") or ""
+            if kind not in LOOPS or (kind == "prismatic" and joint.find("axis") is None):
+                left.setdefault("<gazebo> joints of kinds that close no loop", []).append(f"{name} ({kind})")
+                continue
+            taken.append(_gazebo_loop(file, joint, name, LOOPS[kind], model))
+            if any(joint.find(f"axis/{tag}") is not None for tag in ("dynamics", "limit")):
+                left.setdefault("limits and damping of <gazebo> joints", []).append(name)
+        for plugin in element.findall("plugin"):
+            if plugin.find("mimicJoint") is None:
+                continue
+            taken.append(_gazebo_mimic(file, plugin, model))
+    return taken, [line for reason, names in left.items() for line in listed(reason, names)]
+
+
+def _gazebo_loop(file: XmlFile, joint, name: str, kind: str, model: Model) -> Constraint:
+    what = f"joint {name!r}"
+    ends: list[str | None] = []
+    for tag in ("parent", "child"):
+        link = file.word(joint, tag)
+        if not link:
+            raise file.fault(joint, f"{what} in <gazebo> has no <{tag}>")
+        try:
+            ends.append(None if link == "world" else model.frame_names[frame_index(model, link)])
+        except ValueError as error:
+            raise file.fault(joint, f"{what} in <gazebo>: {error}") from error
+    pose = joint.find("pose")
+    here = np.eye(4) if pose is None or not (pose.text or "").strip() else file.pose_numbers(pose, what)
+    if pose is not None and (pose.get("relative_to") or ends[1]) != ends[1]:
+        raise file.fault(
+            pose, f"<pose> of {what} is relative to {pose.get('relative_to')!r}; write it in its child's frame"
+        )
+    places = [np.eye(4) if end is None else _placed(model, end) for end in ends]
+    world = places[1] @ here
+    turns = [_turned(file, joint, tag, world, what) for tag in ("axis", "axis2")]
+    turns = turns if kind == "universal" else turns[:1] * 2
+    poses = []
+    for place, turn in zip(places, turns, strict=True):
+        frame = world.copy()
+        frame[:3, :3] = turn if kind in ("revolute", "prismatic", "universal") else world[:3, :3]
+        poses.append(f64.inverse(place) @ frame)
+    return loop(ends[0], poses[0], ends[1], poses[1], kind, name=name)
+
+
+def _turned(file: XmlFile, joint, tag: str, world: np.ndarray, what: str) -> np.ndarray:
+    """Rotation (3, 3) of a frame in the world whose z is along an axis of the joint, given in the joint's frame."""
+    xyz: Any = joint.find(f"{tag}/xyz")
+    if xyz is not None and (xyz.get("expressed_in") or "").strip():
+        raise file.fault(
+            xyz, f"<xyz> of {what} is expressed in {xyz.get('expressed_in')!r}; write it in the joint's frame"
+        )
+    default = [0.0, 0.0, 1.0] if tag == "axis" else [1.0, 0.0, 0.0]
+    axis = np.array(default) if xyz is None else file.numbers(xyz, 3, f"<{tag}> of {what}")
+    if not axis.any():
+        raise file.fault(xyz, f"<xyz> of <{tag}> of {what} is zero; give a direction")
+    return f64.turn_from_z(world[:3, :3] @ f64.unit(axis, what))[:3, :3]
+
+
+def _gazebo_mimic(file: XmlFile, plugin, model: Model) -> Gear:
+    """follower = multiplier leader + offset."""
+    ends = []
+    for tag in ("mimicJoint", "joint"):
+        try:
+            ends.append(model.joint_names[joint_index(model, file.word(plugin, tag))])
+        except ValueError as error:
+            raise file.fault(plugin, f"<{tag}> of a mimicking plugin: {error}") from error
+    ratio, offset = (
+        file.number(plugin, tag, value, "a mimicking plugin") for tag, value in (("multiplier", 1.0), ("offset", 0.0))
+    )
+    return gear(ends[0], ends[1], ratio, offset, name=f"mimic {ends[0]}-{ends[1]}")
+
+
+def _placed(model: Model, frame: str) -> np.ndarray:
+    """World pose (4, 4) of a frame where all coordinates are zero, in float64."""
+    k = model.frame_names.index(frame)
+    pose, body = np.asarray(model.frame_poses[k], np.float64), model.topology.frame_bodies[k]
+    while body >= 0:
+        pose, body = np.asarray(model.home[body], np.float64) @ pose, model.topology.parents[body]
+    return pose

@@ -1,0 +1,176 @@
+"""The reference: every export has an example, every example runs as it stands on its page."""
+
+import contextlib
+import inspect
+import io
+import re
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pages import ROOT
+
+import jaxdyn as jd
+
+REFERENCE = ROOT / "docs" / "reference"
+PAGES = sorted(path.stem for path in REFERENCE.glob("*.md") if path.stem != "index")
+# What another export returns, whose example shows it.
+SHOWN_BY = {
+    "LeggedDynamics": "underactuated_inverse_dynamics",
+    "identify.ParameterFit": "identify.fit_parameters",
+    "solvers.ExplicitSteps": "simulate",
+    "solvers.ProjectedSolver": "Projected",
+    "solvers.Stepper": "stepper",
+}
+# Without an example: these need seconds to minutes, or a robot with legs. Where each is run instead.
+ELSEWHERE = {
+    "control.GaugeInvariant": "test_constrained_control",
+    "control.HybridForce": "test_constrained_control",
+    "geometry.pull_back": "test_lagrangian_scenes",
+    "identify.Intervals": "test_identify_robot",
+    "identify.Payload": "test_identify_robot",
+    "identify.RobotFit": "test_identify_robot",
+    "identify.fit_payload": "test_identify_robot",
+    "identify.fit_robot": "test_identify_robot",
+    "identify.fit_trajectory": "test_identify",
+    "plot.work_precision": "test_plots_and_tables",
+    "spurious_terms": "test_distributions",
+}
+# Examples of docstrings that are not run here, for the same reasons.
+NOT_RUN = {
+    "RollingModel": "test_rolling_surfaces",
+    "contact.RollingModel": "test_rolling_surfaces",
+    "control.WholeBody": "test_whole_body",
+    "ground_contact": "test_events",
+    "identify.fit_parameters": "test_identify_systems",
+    "report": "test_report",
+    "underactuated_inverse_dynamics": "test_legs",
+}
+ARM = """
+builder = jd.ModelBuilder("arm")
+for i in range(7):
+    axis = [(0, 0, 1), (0, 1, 0)][i % 2]
+    inertia = jd.inertia.box(1.0, (0.1, 0.1, 0.2))
+    builder.add_body(f"b{i}", f"b{i - 1}" if i else None, axis=axis, pose=(0, 0, 0.2), inertia=inertia)
+arm = model = builder.add_frame("hand", "b6", (0, 0, 0.1)).add_frame("tip", "b6", (0, 0, 0.2)).build()
+wanted = jnp.zeros(6)
+"""
+TWO = """
+import diffrax
+scene = model = robot = jd.robots.chain(2)
+q = q0 = jnp.array([0.3, 0.2])
+v = v0 = tau = jnp.zeros(2)
+q1, target = q0, lambda t: jnp.zeros(2)
+ts = jnp.linspace(0.0, 0.02, 3)
+"""
+MOTIONS = """
+motions = jd.grasp.hand_motions(grasp, q)
+nu = jnp.zeros(motions.object.shape[1] + motions.internal.shape[1])
+"""
+# What readers of a docstring have in hand: the names that its example takes.
+NAMES = {
+    "DryFriction": "system = jd.MetricSystem(lambda q: jnp.eye(1), 1)",
+    "JointStops": "robot = model",
+    "ModelBuilder": "from jaxdyn import ModelBuilder",
+    "compilation": TWO,
+    "control.GraspForce": """
+grasp = jd.scenes.hand_with_ball(mass=0.2)
+q0, v0 = jd.scenes.hand_with_ball.start(twist=(0.0,) * 6)
+q_object, ts = q0[grasp.system.topology.q_slices[-1]], jnp.linspace(0.0, 0.01, 2)
+""",
+    "frame_acceleration": ARM,
+    "grasp.hand_dynamics": MOTIONS,
+    "grasp.hand_motions": MOTIONS,
+    "involutive": "q = q_disk",
+    "join": "arm, box = model, free",
+    "model_couplings": "model = plain",
+    "workspace_dynamics": ARM,
+} | dict.fromkeys(
+    (
+        "LieGroup",
+        "Sampled",
+        "Variational",
+        "control.ComputedTorque",
+        "simulate",
+        "solvers.LieGroup",
+        "stepper",
+        "stiffness",
+    ),
+    TWO,
+)
+
+
+def entries(page: str) -> list[tuple[str, list[str]]]:
+    """The names on a page in its order, each with the blocks under it; what stands above the first is named ""."""
+    parts = re.split(r"^::: jaxdyn\.(\S+)$", (REFERENCE / f"{page}.md").read_text(), flags=re.M)
+    names = ["", *(name.rpartition(".")[2] if name.startswith("dynamics.") else name for name in parts[1::2])]
+    return [(n, re.findall(r"```python\n(.*?)```", text, re.S)) for n, text in zip(names, parts[::2], strict=True)]
+
+
+def documented(name: str) -> list[str]:
+    """The examples of an export's docstring."""
+    value = jd
+    for part in name.split("."):
+        value = getattr(value, part)
+    return re.findall(r"```python\n(.*?)```", inspect.getdoc(value) or "", re.S)
+
+
+def test_every_export_has_an_example():
+    """On its page or in its docstring, or by what returns it; the rest is listed with the test that runs it."""
+    listed = {name: blocks for page in PAGES for name, blocks in entries(page)[1:]}
+    shown = {name for name, blocks in listed.items() if blocks or documented(name)}
+    without = [name for name in listed if not {name, SHOWN_BY.get(name)} & shown and name not in ELSEWHERE]
+    assert len(listed) > 330 and not without, without
+    for module in (*ELSEWHERE.values(), *NOT_RUN.values()):
+        assert (ROOT / "tests" / f"{module}.py").exists()
+    assert not shown & ELSEWHERE.keys()
+
+
+@contextlib.contextmanager
+def as_a_reader(tmp_path, monkeypatch):
+    """In a folder of one's own, with jax's usual settings, nothing printed."""
+    monkeypatch.chdir(tmp_path)
+    with (
+        jax.numpy_dtype_promotion("standard"),
+        jax.numpy_rank_promotion("allow"),
+        contextlib.redirect_stdout(io.StringIO()),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        yield
+    matplotlib = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is not installed")
+    matplotlib.close("all")
+
+
+QUICK = ("files", "forces")
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=() if page in QUICK else pytest.mark.slow) for page in PAGES]
+)
+def test_examples_of_a_page_run(page, tmp_path, monkeypatch):
+    names: dict = {}
+    with as_a_reader(tmp_path, monkeypatch):
+        for name, blocks in entries(page):
+            for block in blocks:
+                exec(compile(block, f"docs/reference/{page}.md: {name}", "exec"), names)
+    arrays = [x for x in names.values() if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)]
+    assert all(np.isfinite(x).all() for x in arrays)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES)
+def test_examples_of_docstrings_run(page, tmp_path, monkeypatch):
+    """Each with what stands at the top of its page and the names that it takes."""
+    (_, head), *rest = entries(page)
+    with as_a_reader(tmp_path, monkeypatch):
+        start: dict = {}
+        for block in head:
+            exec(compile(block, f"docs/reference/{page}.md", "exec"), start)
+        for name, _ in rest:
+            for block in documented(name) if name not in NOT_RUN else ():
+                names = dict(start)
+                for text in (NAMES.get(name, ""), block):
+                    exec(compile(text, f"{page}: {name}", "exec"), names)
