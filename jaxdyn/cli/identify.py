@@ -58,7 +58,7 @@ terms (--terms), beside the links:
   viscous v + coulomb tanh(v / v_s) + offset + armature a (rotor inertia), and
   load |tau_rigid| tanh(v / v_s); dahl, pre-sliding; asymmetric |v|; quadratic v |v|; spring sin q, cos q.
   "auto" takes the first four, and of the others what lowers the error on parts of the training logs that are left out in
-  turn, joint by joint. --v-s auto and --prior auto are chosen the same way. The test logs are never looked at.
+  turn, joint by joint. --v-s, --prior and --robust auto are chosen the same way. The test logs are never looked at.
 
 methods (--method):
   feasible         convex fit of the torques over all physically possible bodies; the URDF written is sound (default)
@@ -145,6 +145,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of the joints: auto, one over the error each is left with; none, all the same (default: auto)",
     )
     fit.add_argument(
+        "--robust",
+        default="auto",
+        metavar="K",
+        help="errors beyond K standard deviations count by their size, not its square: a number, none, or auto (default)",
+    )
+    fit.add_argument(
         "--horizon", type=float, default=0.25, metavar="S", help="length of the simulated pieces, s (default: 0.25)"
     )
     fit.add_argument(
@@ -165,6 +171,7 @@ class _Options(NamedTuple):
     terms: str | tuple[str, ...]
     v_s: float | str
     prior: float | str
+    robust: float | str | None
     weights: str | None
 
 
@@ -273,8 +280,10 @@ def _options(args) -> _Options:
     prior = args.prior if args.prior == "auto" else number(args.prior, "--prior")
     if simple:
         v_s, prior = 0.01 if v_s == "auto" else v_s, 1.0 if prior == "auto" else prior
+    robust = {"auto": "auto", "none": None}.get(args.robust, args.robust)
+    robust = number(robust, "--robust") if robust not in ("auto", None) else robust
     weights = "auto" if args.weights == "auto" else None
-    return _Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, weights)
+    return _Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights)
 
 
 def _settled(options: _Options, result) -> _Options:
@@ -282,7 +291,7 @@ def _settled(options: _Options, result) -> _Options:
     if not isinstance(result, RobotFit):
         return options
     setting = result.choice.setting
-    return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior)
+    return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust)
 
 
 def _fit(model: Model, logs: list[Log], options: _Options, args) -> RobotFit | Fit | LeastSquares:
@@ -294,7 +303,7 @@ def _fit(model: Model, logs: list[Log], options: _Options, args) -> RobotFit | F
         if args.progress:
             extra = ", ".join(f"{name} {list(joints)}" for name, joints in trial.setting.extra)
             print(f"  left out: {trial.percent:.3f} % with v_s {trial.setting.v_s:g}, prior {trial.setting.prior:g}, "
-                  f"terms {extra or 'none more'}", flush=True)  # fmt: skip
+                  f"robust {trial.setting.robust}, terms {extra or 'none more'}", flush=True)  # fmt: skip
 
     if options.method == "least-squares":
         return identify.least_squares(model, logs, options.terms, v_s=float(options.v_s))
@@ -305,6 +314,7 @@ def _fit(model: Model, logs: list[Log], options: _Options, args) -> RobotFit | F
             options.terms,
             v_s=options.v_s,
             prior=options.prior,
+            robust=options.robust,
             weights=options.weights,
             callback=tell,
         )

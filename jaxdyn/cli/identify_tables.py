@@ -73,7 +73,10 @@ def _choice_text(choice: Choice, model: Model) -> str:
     setting, labels = choice.setting, coordinate_labels(model)[0]
     extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
     how = f", chosen over {len(choice.trials)} settings, each judged on {choice.by} left out in turn"
-    return f"v_s {setting.v_s:g}, prior {setting.prior:g}, extra terms: {extra}{how if choice.trials else ''}"
+    loss = "squares" if setting.robust is None else f"Huber's beyond {setting.robust:g}"
+    return (
+        f"v_s {setting.v_s:g}, prior {setting.prior:g}, loss {loss}, extra terms: {extra}{how if choice.trials else ''}"
+    )
 
 
 def _robot_base_table(result: RobotFit, model: Model) -> str:

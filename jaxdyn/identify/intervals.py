@@ -8,13 +8,10 @@ much as a prior of weight 1 believes.
 
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import numpy as np
-from jax.flatten_util import ravel_pytree
+from scipy.special import stdtrit
 
-from jaxdyn.identify.chart import Chart, Coordinates, positive_terms
-from jaxdyn.identify.feasible import stretches
+from jaxdyn.identify.interior import STRETCHES, Linear
 from jaxdyn.identify.one_fit import Data, Estimate, Setting
 from jaxdyn.identify.regression import BaseParameters, base_parameters, free_columns, parameter_names
 from jaxdyn.model.tree import Model
@@ -122,17 +119,15 @@ def _spread(names, values, moves, pulled, fitted) -> Spread:
 
 def _local(data: Data, setting: Setting, estimate: Estimate):
     """Slopes of x by the free coordinates, the prior's curvature in them, and which basic parameters are free at all."""
-    chart, point = estimate.chart, estimate.point
-    slopes = np.asarray(_chart_slopes(chart, point), np.float64)
-    count, size = point.theta.shape
-    basis = np.asarray(stretches(size, point.theta.dtype), np.float64)
+    linear, minimum = Linear(estimate.chart), estimate.minimum
+    slopes = linear.slopes_at(minimum.origin, minimum.s)
+    count, size = len(minimum.origin), linear.count
+    basis = STRETCHES[:size]
     bent = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
     bodies = count * size
     moves = np.ones(slopes.shape[1], bool)
     # What is at its bound stays there.
-    moves[bodies:] = ~(
-        np.broadcast_to(positive_terms(chart.terms), point.s.shape) & (np.asarray(point.s) == 0)
-    ).reshape(-1)
+    moves[bodies:] = ~(linear.positive & (minimum.s.reshape(-1) == 0))
     places = data.places(setting.extra)
     count = int(moves.sum())
     jacobian = np.zeros((data.blocks.size, count + len(places)))
@@ -143,12 +138,6 @@ def _local(data: Data, setting: Setting, estimate: Estimate):
     units = data.units.reshape(-1)[places - data.basic]
     curvature[count + np.arange(len(places)), count + np.arange(len(places))] = setting.prior / units**2
     return jacobian, curvature, np.any(jacobian[: data.basic] != 0, axis=1)
-
-
-@eqx.filter_jit
-def _chart_slopes(chart: Chart, point: Coordinates):
-    y, unflatten = ravel_pytree(point)
-    return jax.jacfwd(lambda y: chart.parameters(unflatten(y)))(y)
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
@@ -169,6 +158,4 @@ def _joints(model: Model) -> list[str]:
 
 def student(freedoms: int) -> float:
     """Half of a 95 % interval in standard deviations, by Student's t with so many degrees of freedom."""
-    from scipy.stats import t
-
-    return float(t.ppf(0.975, freedoms))
+    return float(stdtrit(freedoms, 0.975))

@@ -12,6 +12,7 @@ from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.condensed import Blocks, Condensed, condense_blocks, condensed_rows
 from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
 from jaxdyn.identify.logs import Log, as_logs, check_log
+from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.model.arguments import as_array, check_shapes
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, integrate, neutral
@@ -96,10 +97,12 @@ def condense_model(
     coulomb: Sequence[np.ndarray] | None = None,
     extra: Sequence[np.ndarray] = (),
     blocks: int = 1,
+    weights: Sequence[np.ndarray] | None = None,
 ) -> Blocks:
     """`condense_blocks` of the regressor with all terms.
 
-    `coulomb`: for each log, columns (n, nv) of Coulomb friction instead of tanh(v / v_s); `extra`: more terms (n, nv, k).
+    `coulomb`: for each log, columns (n, nv) of Coulomb friction instead of tanh(v / v_s); `extra`: more terms (n, nv, k);
+    `weights`: for each log, those of its torques (n, nv).
     """
     start = 10 * model.nb + model.nv * TERMS.index("coulomb")
 
@@ -111,7 +114,7 @@ def condense_model(
             W[:, joints, start + joints] = coulomb[which][piece]
         return W
 
-    return condense_blocks(logs, rows, 10 * model.nb, extra=extra, blocks=blocks)
+    return condense_blocks(logs, rows, 10 * model.nb, extra=extra, blocks=blocks, weights=weights)
 
 
 class BaseParameters(eqx.Module):
@@ -273,6 +276,7 @@ class LeastSquares(eqx.Module):
         return "\n".join(lines)
 
 
+@on_one_thread()
 def least_squares(
     model: Model, log: Log | Sequence[Log], terms=TERMS, *, v_s: float = 0.01, weights=None, rcond: float = 1e-6
 ) -> LeastSquares:

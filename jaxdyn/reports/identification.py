@@ -138,11 +138,11 @@ def _add_robot(found: dict[str, Any], result: RobotFit, choice: Choice, model: M
     found["chosen"] = {
         "v_s": setting.v_s,
         "prior": setting.prior,
+        "robust": setting.robust,
         "extra_terms": {name: [model_joint(model, j) for j in joints] for name, joints in setting.extra},
         "by": choice.by,
         "trials": [
-            {"v_s": t.setting.v_s, "prior": t.setting.prior, "extra_terms": dict(t.setting.extra), "percent": t.percent}
-            for t in choice.trials
+            {**t.setting._asdict(), "extra": dict(t.setting.extra), "percent": t.percent} for t in choice.trials
         ],
     }
     found["extra_terms"] = {} if extra is None else extra.named

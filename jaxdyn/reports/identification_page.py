@@ -79,6 +79,7 @@ def _spectrum(one: Judged, labels: Sequence[str]) -> Any:
         for x, colour, label in ((measured, GREY, "measured"), (one.predicted - measured, RED, "left over")):
             size = np.abs(np.fft.rfft(window * (x - x.mean(axis=0)), axis=0))[1:, j]
             ax.loglog(frequency, size / len(t), color=colour, linewidth=0.9, label=label)
+        ax.minorticks_off()  # drawing hundreds of them would take most of the page's time
         ax.set_title(labels[j], fontsize=9)
         if j + columns >= count:
             ax.set_xlabel("frequency (Hz)")
@@ -93,10 +94,12 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
     assert isinstance(result, RobotFit)
     choice = findings.choice or result.choice
     setting, trials, base = choice.setting, choice.trials, result.intervals.base
+    loss = "squares" if setting.robust is None else f"Huber's loss beyond {setting.robust:g} standard deviations"
     extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
     parts = [
         "<h2>What was chosen</h2>",
-        f"<p>v_s {setting.v_s:g}, prior {setting.prior:g}; terms beyond viscous and Coulomb friction: {escaped(extra)}.</p>",
+        f"<p>v_s {setting.v_s:g}, prior {setting.prior:g}, {loss}; terms beyond viscous and Coulomb friction: "
+        f"{escaped(extra)}.</p>",
     ]
     if trials:
         cells = [
@@ -104,6 +107,7 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
                 f"{t.percent:.3f}",
                 f"{t.setting.v_s:g}",
                 f"{t.setting.prior:g}",
+                "squares" if t.setting.robust is None else f"{t.setting.robust:g}",
                 "; ".join(f"{name} {','.join(map(str, joints))}" for name, joints in t.setting.extra) or "none",
             )
             for t in sorted(trials, key=lambda t: t.score)
@@ -111,7 +115,7 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
         parts += [
             f"<p class='note'>{len(trials)} settings, each judged on {escaped(choice.by)} left out in turn.</p>",
             "<details><summary>all of them, best first</summary>",
-            html_table(("error (%)", "v_s", "prior", "extra terms"), cells) + "</details>",
+            html_table(("error (%)", "v_s", "prior", "loss", "extra terms"), cells) + "</details>",
         ]
     cells = [
         (name, short(float(x)), short(float(result.intervals.factor * s), 2), source)
