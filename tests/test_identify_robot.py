@@ -425,3 +425,39 @@ def test_a_robust_loss_is_bent_less_by_torques_that_no_robot_makes(truth):
     for bad in (0.0, "huber"):
         with pytest.raises(ValueError, match="robust is"):
             identify.fit_robot(model, log, robust=bad, **given)
+
+
+# --- what logs tell ---------------------------------------------------------------------------------------------------
+
+
+def test_identifiability_in_words(truth):
+    """Rank and condition are those of the stacked regressor; a log at constant speed of one joint is said to tell less."""
+    model = arm()
+    log = measured(model, motion(1), truth)
+    told = identify.identifiability(model, log)
+    W = identify.regressor(model, log.q, log.v, log.a).reshape(600, -1)[:, told.base.independent]
+    s = np.linalg.svd(W / np.linalg.norm(W, axis=0), compute_uv=False)
+    assert told.rank == len(told.base) == len(s) and told.condition == pytest.approx(s[0] / s[-1], rel=1e-8)
+    assert [d.strength for d in told.weakest] == pytest.approx((s[::-1] / s[0])[:3], rel=1e-6)
+    assert "a.Ixx" in told.unidentifiable and "no motion tells" in told.summary()
+    held = identify.Log(log.t, log.q * [1, 0], log.v * [1, 0], log.a * [1, 0], log.tau)
+    told = identify.identifiability(model, held)
+    assert {"b_joint.viscous", "b_joint.coulomb", "b_joint.armature"} <= set(told.silent)
+    assert told.rank < len(told.base) and "not excited by these logs" in told.summary()
+    assert told.weakest[0].strength == 0
+
+
+def test_whiteness_of_known_noise():
+    """White noise is worth its samples; a first-order process with factor r lasts dt (1 + r) / (1 - r)."""
+    n, r = 40000, 0.9
+    noise = np.random.default_rng(0).normal(size=n)
+    slow = np.zeros(n)
+    for i in range(1, n):
+        slow[i] = r * slow[i - 1] + noise[i]
+    t = 0.01 * np.arange(n)
+    x = np.stack([noise, slow, np.zeros(n)], axis=1)
+    found = identify.whiteness(identify.Log(t, x, tau=x), x)
+    # The sum of the correlation up to its first zero has a standard error of some per cent.
+    assert found.lasting[0] == pytest.approx(0.01, rel=0.1) and found.worth[0] == pytest.approx(n, rel=0.1)
+    assert found.lasting[1] == pytest.approx(0.19, rel=0.15)
+    assert found.lasting[2] == pytest.approx(0.01)

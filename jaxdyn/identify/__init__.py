@@ -3,6 +3,10 @@
 from jaxdyn.identify.feasible import fit_torques as fit_torques
 from jaxdyn.identify.friction import TERMS as TERMS
 from jaxdyn.identify.friction import Friction as Friction
+from jaxdyn.identify.identifiability import Identifiability as Identifiability
+from jaxdyn.identify.identifiability import Whiteness as Whiteness
+from jaxdyn.identify.identifiability import identifiability as identifiability
+from jaxdyn.identify.identifiability import whiteness as whiteness
 from jaxdyn.identify.intervals import Intervals as Intervals
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import from_raw as from_raw

@@ -9,17 +9,15 @@ much as a prior of weight 1 believes.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from jaxdyn.identify.interior import STRETCHES, Linear
+from jaxdyn.identify.jackknife import block_groups, jackknife, student
 from jaxdyn.identify.one_fit import Data, Estimate, Setting
 from jaxdyn.identify.regression import BaseParameters, base_parameters, free_columns, parameter_names
 from jaxdyn.model.tree import Model
 
 # Share of the variance from which on a number is called one from the prior.
 _FROM_PRIOR = 0.5
-# Blocks left out together: the longer they are, the less errors in one have to do with those in the next.
-_TOGETHER = 2
 
 
 class Spread(NamedTuple):
@@ -90,26 +88,6 @@ def intervals(model: Model, data: Data, setting: Setting, estimate: Estimate, we
     return Intervals(parameters, spread, base, a @ a.T + b @ b.T, student(count - 1))
 
 
-def block_groups(count: int) -> list[np.ndarray]:
-    """Numbers of the blocks that are left out together."""
-    return np.array_split(np.arange(count), max(2, count // _TOGETHER))
-
-
-def jackknife(grams: np.ndarray, slopes: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A root (n, groups) of the covariance of a minimum, each group of samples left out in turn, and the inverse Hessian (n, n).
-
-    `grams` (groups, n, n) and `slopes` (groups, n) are the groups' curvatures and slopes there, `curvature` (n, n) what stays.
-    """
-    H = grams.sum(axis=0) + curvature
-    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-    scale = unit[:, None] * unit[None, :]
-    moves = np.stack(
-        [unit * (_inverse((H - gram) * scale) @ (unit * slope)) for gram, slope in zip(grams, slopes, strict=True)]
-    )
-    count = len(grams)
-    return (moves - moves.mean(axis=0)).T * np.sqrt((count - 1) / count), _inverse(H * scale) * scale
-
-
 def _spread(names, values, moves, pulled, fitted) -> Spread:
     from_data, from_prior = np.sum(moves**2, axis=1), np.sum(pulled**2, axis=1)
     total = from_data + from_prior
@@ -140,12 +118,6 @@ def _local(data: Data, setting: Setting, estimate: Estimate):
     return jacobian, curvature, np.any(jacobian[: data.basic] != 0, axis=1)
 
 
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Inverse of a symmetric matrix of unit diagonal; directions without curvature are taken as having that of rounding."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return (vectors / np.maximum(values, 1e-12)) @ vectors.T
-
-
 def _root(matrix: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(matrix)
     return vectors * np.sqrt(np.maximum(values, 0))
@@ -154,8 +126,3 @@ def _root(matrix: np.ndarray) -> np.ndarray:
 def _joints(model: Model) -> list[str]:
     start = 10 * model.nb
     return [name.rpartition(".")[0] for name in parameter_names(model)[start : start + model.nv]]
-
-
-def student(freedoms: int) -> float:
-    """Half of a 95 % interval in standard deviations, by Student's t with so many degrees of freedom."""
-    return float(stdtrit(freedoms, 0.975))

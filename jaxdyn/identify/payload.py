@@ -11,7 +11,7 @@ from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed import Blocks, condensed_rows
 from jaxdyn.identify.feasible import make_problem, newton
 from jaxdyn.identify.interior import STRETCHES
-from jaxdyn.identify.intervals import block_groups, jackknife, student
+from jaxdyn.identify.jackknife import block_groups, jackknife, student
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.one_fit import eliminate, gather
 from jaxdyn.identify.regression import noise_level, regressor, truncated

@@ -42,6 +42,11 @@ def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title:
             svg(figure, f"torque{number}"),
             svg(_spectrum(one, labels), f"spectrum{number}"),
         ]
+    parts += [
+        "<h2>What the logs tell</h2>",
+        *(f"<p>{escaped(line)}.</p>" for line in findings.told.summary().split("\n")),
+    ]
+    parts += [_lasting(findings, labels)]
     parts += _robot(findings, labels) if isinstance(findings.result, RobotFit) else []
     parts += ["<h2>Friction and rotors</h2>", _friction(findings, labels, units)]
     return "\n".join([*parts, "</body></html>\n"])
@@ -54,6 +59,16 @@ def _errors(findings: Findings, labels: Sequence[str]) -> str:
         for one in group
     ]
     return html_table(("log", "", "samples", "all", *labels), rows)
+
+
+def _lasting(findings: Findings, labels: Sequence[str]) -> str:
+    """How long errors last, of each log and joint."""
+    rows = [
+        (one.name, str(len(one.log)), *(f"{x:.2g} s ({n:.0f})" for x, n in zip(*one.whiteness, strict=True)))
+        for one in (*findings.tests, *findings.train)
+    ]
+    note = "How long errors last, and in brackets how many independent samples the log is then worth"
+    return f"<p class='note'>{note}.</p>" + html_table(("log", "samples", *labels), rows)
 
 
 def _thinned(one: Judged) -> Judged:
