@@ -173,8 +173,8 @@ def test_least_squares_noise_is_within_its_statistics(iiwa, wrong_iiwa):
     assert abs(chi2 - p) < 4 * np.sqrt(2 * p)  # chi-square: mean p, variance 2 p
     white = np.sqrt(np.diag(fit.covariance))
     assert np.all(np.abs(off) < 4.5 * white)
-    # Ten groups of blocks know a standard deviation to a quarter; over all combinations that averages out.
-    assert abs(np.mean(np.log(fit.std / white))) < 0.15
+    # Ten groups of blocks know a standard deviation to a quarter, and leaving out blocks that tell much errs to the safe side.
+    assert -0.1 < np.mean(np.log(fit.std / white)) < 0.4
 
 
 def test_least_squares_counts_errors_that_last(iiwa, wrong_iiwa):

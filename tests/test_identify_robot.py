@@ -461,3 +461,44 @@ def test_whiteness_of_known_noise():
     assert found.lasting[0] == pytest.approx(0.01, rel=0.1) and found.worth[0] == pytest.approx(n, rel=0.1)
     assert found.lasting[1] == pytest.approx(0.19, rel=0.15)
     assert found.lasting[2] == pytest.approx(0.01)
+
+
+# --- excitation -------------------------------------------------------------------------------------------------------
+
+
+def test_exciting_motion_tells_more_within_its_limits():
+    """Rest at both ends, all limits kept on a fine grid, torques by inverse dynamics; better condition than where it began."""
+    model = arm().replace(lower=np.array([-1.0, -0.5]), upper=np.array([1.0, 2.0]), velocity_limit=np.array([2.0, 3.0]))
+    model = model.replace(effort_limit=np.array([25.0, 9.0]))
+    found = identify.exciting_motion(model, period=4.0, harmonics=3, steps=60, starts=2)
+    assert found.condition < 0.9 * found.start_condition and found.logdet > 1
+    assert max(found.used.values()) <= 1 and found.history[-1] < found.history[0]
+    log = found.log(rate=250.0, periods=2)
+    assert len(log) == 2001 and log.joint_names == model.joint_names
+    middle, half = np.array([0.0, 0.75]), 0.9 * np.array([1.0, 1.25])
+    assert np.all(np.abs(log.q - middle) <= half * (1 + 1e-3))  # peaks may lie between the samples that were looked at
+    assert np.all(np.abs(log.v) <= 0.9 * np.array([2.0, 3.0]) * (1 + 1e-3))
+    assert np.all(np.abs(log.tau) <= 0.9 * np.array([25.0, 9.0]) * (1 + 1e-3))
+    np.testing.assert_allclose(log.v[[0, 1000, 2000]], 0, atol=1e-12)
+    np.testing.assert_allclose(log.q[:1000], log.q[1000:2000], atol=1e-10)
+    told = identify.identifiability(model, measured(model, log), v_s=0.1)
+    assert told.rank == len(told.base) and told.condition == pytest.approx(found.condition, rel=0.15)
+    tau = identify.regressor(model, log.q, log.v, log.a)[:, :, :20] @ np.asarray(model.inertias).reshape(-1)
+    np.testing.assert_allclose(log.tau, tau, atol=1e-10)
+    other = identify.exciting_motion(model, period=4.0, harmonics=3, objective="condition", steps=60, starts=2)
+    assert other.condition < other.start_condition
+
+
+def test_exciting_motion_says_no():
+    model = arm()
+    for words, arguments in (
+        ("objective is 'trace'", {"objective": "trace"}),
+        ("harmonics is 1; give at least 2", {"harmonics": 1}),
+        ("margin is 1.5; give a share", {"margin": 1.5}),
+        ("velocity has limits", {"velocity": [0.0, 1.0]}),
+    ):
+        with pytest.raises(ValueError, match=words):
+            identify.exciting_motion(model, **arguments)
+    lying = ModelBuilder("lying").add_body("a", axis=(0, 1, 0), inertia=(1.0, (0.5, 0, 0), (0.1, 0.1, 0.1))).build()
+    with pytest.raises(ValueError, match="to hold the robot at the middle of its ranges takes"):
+        identify.exciting_motion(lying, torque=1.0, steps=1)
