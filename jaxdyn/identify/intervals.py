@@ -51,19 +51,32 @@ class Intervals(NamedTuple):
     factor: float
 
 
-def intervals(model: Model, data: Data, setting: Setting, estimate: Estimate, weights: np.ndarray, terms) -> Intervals:
+def intervals(
+    model: Model,
+    data: Data,
+    setting: Setting,
+    estimate: Estimate,
+    weights: np.ndarray,
+    terms,
+    curved: Data | None = None,
+) -> Intervals:
     """`Intervals` of one fit of condensed logs.
 
     With D_b the data's curvature and g_b their slope on block b, both over sigma^2, P the prior's curvature and H = sum D_b + P:
     leaving b out moves the fit by (H - D_b)^-1 g_b. Their covariance times (B - 1) is the data's share, and
     max(prior, 1) H^-1 P H^-1 the prior's. All in the coordinates of the chart, then carried over to x.
 
-    Source: Efron (1982), the jackknife; Cameron & Miller (2015), cluster-robust inference (CR3).
+    `curved`: logs whose curvature counts, where the loss is not made of squares: Huber's has none beyond its threshold, though it
+    has a slope there.
+
+    Source: Efron (1982), the jackknife; Cameron & Miller (2015), cluster-robust inference (CR3); Huber
+    (1981), "Robust statistics", section 6.4, whose curvature is that of psi'.
     """
     jacobian, curvature, free = _local(data, setting, estimate)
     blocks, sigma = data.blocks, estimate.sigma
     slopes = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
-    grams = np.einsum("pi,bpq,qj->bij", jacobian, blocks.grams(weights), jacobian, optimize=True) / sigma**2
+    bent = (data if curved is None else curved).blocks.grams(weights)
+    grams = np.einsum("pi,bpq,qj->bij", jacobian, bent, jacobian, optimize=True) / sigma**2
     groups = block_groups(len(blocks))
     slopes, grams = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (slopes, grams))
     moves, inverse = jackknife(grams, slopes, curvature)

@@ -122,7 +122,7 @@ def fit_robot(
     estimate = problem.refine(setting, fixed, rounds=_ROUNDS)
     data = problem.data(setting)
     fit = problem.result(setting, estimate, data)
-    found = intervals(model, data, setting, estimate, problem.weights, basic)
+    found = intervals(model, data, setting, estimate, problem.weights, basic, problem.curved(setting))
     used = dict(setting.extra)
     chosen = (*basic, *((term, used[term.name]) for term in extra if term.name in used))
     return RobotFit(fit, problem.weights, Choice(setting, trials, by), found, chosen)
@@ -195,6 +195,14 @@ class _Problem:
         """Bring the weights of single torques up to date for a setting with a robust loss."""
         for _ in range(rounds):
             self._weigh(setting, self.fit(setting))
+
+    def curved(self, setting: Setting) -> Data | None:
+        """The logs without the torques beyond the threshold of a robust loss, where it has no curvature."""
+        weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
+        if weights is None:
+            return None
+        kept = [np.where(weight < 1, 0.0, 1.0) for weight in weights]
+        return gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, kept)
 
     def _weigh(self, setting: Setting, estimate: Estimate) -> None:
         fit, threshold = self.result(setting, estimate, self.data(setting)), setting.robust
