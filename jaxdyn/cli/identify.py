@@ -17,7 +17,8 @@ from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.identify.identifiability import base_terms
 from jaxdyn.identify.spectra import vibration
-from jaxdyn.identify.suspicions import suspicions
+from jaxdyn.identify.suspicions import at_rest, suspicions
+from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
 from jaxdyn.model.builder import inertia_report, repair_inertias
@@ -182,6 +183,7 @@ class _Options(NamedTuple):
     weights: str | None
 
 
+@on_one_thread()
 def run(args: argparse.Namespace) -> None:
     """Fit, print the errors and the parameters, write the files."""
     args = with_file(args, add_arguments)
@@ -393,6 +395,7 @@ def _warnings(findings: Findings, args) -> list[str]:
     labels, _ = coordinate_labels(findings.model)
     for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
         lines += [f"{one.name}: {line}" for line in suspicions(findings.model, one.log, labels)]
+        lines += [f"{one.name}: {line}" for line in at_rest(one.log, one.predicted - np.asarray(one.log.tau), labels)]
         share, edge = vibration(one.log, one.predicted - np.asarray(one.log.tau))
         if share > _VIBRATES and (args.filtered or edge < args.cutoff):
             lines.append(
