@@ -73,8 +73,8 @@ def at_rest(log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:
         share = float(np.sum(residual[:start, j] ** 2)) / total if total > 0 else 0.0
         if start > 1 and share > _MUCH:
             lines.append(
-                f"{label} stands still for the first {t[start] - t[0]:.2g} s, where {100 * share:.0f} % of the power of its error "
-                "is: friction at rest is anything within its level; leave that part out (cut the log), or move before you record"
+                f"{label} stands still for the first {t[start] - t[0]:.2g} s, where {100 * share:.0f} % of the power of its "
+                "error is: no term foretells friction at rest; cut the log there, or move before you record"
             )
     return lines
 
