@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from jaxdyn.identify.chart import Chart, positive_terms
 from jaxdyn.identify.regression import free_columns
@@ -203,6 +202,8 @@ def _step(problem: TorqueProblem, linear: Linear, state: _State, weight: float, 
 
     **Raises:** numpy.linalg.LinAlgError where numbers are not finite or rounding makes the equations indefinite.
     """
+    from scipy.linalg import cho_factor, cho_solve  # not when jaxdyn is imported
+
     positive, terms = linear.positive, state.terms
     count, size = len(state.origin), linear.count
     bodies = count * size

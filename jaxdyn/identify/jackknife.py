@@ -4,7 +4,6 @@ Source: Efron (1982), "The jackknife, the bootstrap and other resampling plans".
 """
 
 import numpy as np
-from scipy.special import stdtrit
 
 # Blocks left out together: the longer they are, the less errors in one have to do with those in the next.
 _TOGETHER = 2
@@ -38,4 +37,6 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
 
 def student(freedoms: int) -> float:
     """Half of a 95 % interval in standard deviations, by Student's t with so many degrees of freedom."""
+    from scipy.special import stdtrit
+
     return float(stdtrit(freedoms, 0.975))
