@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.quantities import inverse_dynamics, torque_regressor
@@ -246,6 +245,8 @@ def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...
 
 
 def _descend(motion, task, places, objective, steps, learning_rate, callback):
+    import optax  # not when jaxdyn is imported
+
     span = (task.limits.upper - task.limits.lower) / 2
     amplitudes = _amplitudes(motion)
     optimiser = optax.adam(optax.cosine_decay_schedule(learning_rate, steps, alpha=0.05))
