@@ -75,7 +75,10 @@ def z_scores(model, fit, logs) -> np.ndarray:
     """Differences of the base parameters of fits to each of two logs, over their standard deviations."""
     setting = fit.choice.setting
     first, second = (
-        identify.fit_robot(model, log, fit.terms, v_s=setting.v_s, prior=setting.prior).intervals.base for log in logs
+        identify.fit_robot(
+            model, log, fit.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust
+        ).intervals.base
+        for log in logs
     )
     z = (first.values - second.values) / np.hypot(first.std, second.std)
     return z[np.isfinite(z)]
@@ -99,7 +102,8 @@ def case(name, model, train, test, halves=None) -> dict:
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     setting = fit.choice.setting
     extra = "; ".join(f"{term} {','.join(names[j][-1] for j in joints)}" for term, joints in setting.extra)
-    note = f"v_s {setting.v_s:g}, prior {setting.prior:g}, {extra}; {len(fit.choice.trials)} settings, {seconds:.0f} s"
+    note = f"v_s {setting.v_s:g}, prior {setting.prior:g}, loss {setting.robust}, {extra}; "
+    note += f"{len(fit.choice.trials)} settings, {seconds:.0f} s"
     found["chosen"] = row("chosen", fit.fit.torques(test), note) | {"seconds": seconds, "cpu": cpu}
     if halves is not None:
         z = z_scores(model, fit, halves)

@@ -4,12 +4,15 @@ import csv
 import json
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
+import pinocchio
 import pytest
 
 import jaxdyn as jd
 from jaxdyn.cli import main
 from jaxdyn.identify.logs import as_measured
+from jaxdyn.io import joint_torques
 from jaxdyn.io.logs import read_log, write_log
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
@@ -261,7 +264,8 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
         "coulomb",
         "quadratic",
     ]
-    args += ["--v-s", "0.01", "--prior", "1", "--out", str(out), "--report", str(report), "--html", str(page)]
+    args += ["--v-s", "0.01", "--prior", "1", "--robust", "none"]
+    args += ["--out", str(out), "--report", str(report), "--html", str(page)]
     assert main(args) == 0
     text = capsys.readouterr().out
     assert text.index("torque error:") < text.index("feasible fit of")
@@ -279,6 +283,67 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     assert text.strip().endswith("</html>") and not list(tmp_path.glob(".*"))
 
 
+def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys):
+    """Options of a TOML file, overruled by the command line; Pinocchio and MuJoCo read the URDF, we its offsets and terms too."""
+    truth = jd.repair_inertias(jd.load_urdf(arm))
+    simulated_logs(truth, tmp_path, (0, 1, 2), noise=0.01)
+    jd.save_urdf(truth, tmp_path / "true.urdf")
+    options = {
+        "urdf": "true.urdf",
+        "log": ["A.csv", "B.csv"],
+        "test-log": "C.csv",
+        "out": "fitted.urdf",
+        "robust": "none",
+    }
+    options |= {
+        "terms": ["viscous", "coulomb", "offset", "quadratic"],
+        "v_s": 0.02,
+        "prior": 5,
+        "gravity": [0, 0, -9.81],
+    }
+    file = tmp_path / "fit.toml"
+    file.write_text("".join(f"{name} = {json.dumps(value)}\n" for name, value in options.items()))
+    assert main(["identify", str(file), "--prior", "1"]) == 0
+    assert "v_s 0.02, prior 1, loss squares" in capsys.readouterr().out
+    found = json.loads((tmp_path / "fitted.json").read_text())
+    torques = joint_torques(tmp_path / "fitted.urdf")
+    assert [torques[name]["offset"] for name in truth.joint_names] == found["friction"]["offset"]
+    assert {torques[name]["v_s"] for name in truth.joint_names} == {0.02}
+    assert [torques[name]["quadratic"] for name in truth.joint_names] == found["extra_terms"]["quadratic"]
+    read = pinocchio.buildModelFromUrdf(str(tmp_path / "fitted.urdf"))
+    fitted = jd.load_urdf(tmp_path / "fitted.urdf")
+    np.testing.assert_allclose(read.friction, fitted.friction, rtol=1e-12)
+    np.testing.assert_allclose(read.damping, fitted.damping, rtol=1e-12)
+    body = mujoco.MjModel.from_xml_path(str(tmp_path / "fitted.urdf"))
+    np.testing.assert_allclose(body.dof_frictionloss, fitted.friction, rtol=1e-6)
+    np.testing.assert_allclose(body.body_mass[1:], fitted.inertias[:, 0], rtol=1e-6)
+    for text, words in (
+        ("urdf = 1\nlogs = 2", "logs is no option; options are"),
+        ("urdf = [", "fit.toml"),
+        ("log = [[1]]", "give a number, a string, or a list"),
+        ("cutoff = [1, 2]", "unrecognized arguments"),
+        ("train = 0.5", "--urdf and --log: missing"),
+    ):
+        file.write_text(text)
+        assert main(["identify", str(file)]) == 2
+        assert words in capsys.readouterr().err
+    with pytest.raises(ValueError, match="elbow are no joints"):
+        jd.save_urdf(truth, tmp_path / "x.urdf", torques={"elbow": {"offset": 1.0}})
+
+
+def test_identify_repairs_a_link_of_zero_inertia(arm, tmp_path, capsys):
+    truth = jd.repair_inertias(jd.load_urdf(arm))
+    a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
+    path = tmp_path / "zero.urdf"
+    jd.save_urdf(truth.replace(inertias=truth.inertias.at[1, 4:].set(0.0).at[2].set(0.0)), path)
+    args = ["identify", "--urdf", str(path), "--log", a, "--test-log", b, "--terms", "viscous", "coulomb"]
+    args += ["--v-s", "0.01", "--prior", "1", "--robust", "none"]
+    assert main(args) == 2
+    assert "moves no inertia" in capsys.readouterr().err
+    assert main([*args, "--repair"]) == 0
+    assert "repaired inertias: hand, slide" in capsys.readouterr().out
+
+
 def test_identify_a_payload(arm, tmp_path, capsys):
     truth = jd.repair_inertias(jd.load_urdf(arm))
     path, report = tmp_path / "true.urdf", tmp_path / "fit.json"
@@ -290,7 +355,7 @@ def test_identify_a_payload(arm, tmp_path, capsys):
         truth.replace(inertias=truth.inertias.at[-1].add(held)), tmp_path / "loaded", (2,), noise=0.01
     )
     args = ["identify", "--urdf", str(path), "--log", *empty, "--payload-log", *loaded, "--report", str(report)]
-    args += ["--terms", "viscous", "coulomb", "--v-s", "0.01", "--prior", "1"]
+    args += ["--terms", "viscous", "coulomb", "--v-s", "0.01", "--prior", "1", "--robust", "none"]
     assert main(args) == 0
     assert f"Payload on {truth.body_names[-1]}" in capsys.readouterr().out
     found = json.loads(report.read_text())["payload"]

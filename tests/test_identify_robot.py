@@ -9,11 +9,13 @@ import pytest
 from jaxdyn import identify, inertia
 from jaxdyn.identify.condensed import block_slices, condensed_rows
 from jaxdyn.identify.logs import as_measured
+from jaxdyn.identify.low_pass import coefficients, low_pass
 from jaxdyn.identify.one_fit import eliminate
 from jaxdyn.identify.regression import condense, condense_model
+from jaxdyn.identify.robot import huber_weights
 from jaxdyn.identify.selection import folds, helped
 from jaxdyn.identify.spectra import motion_band, vibration
-from jaxdyn.identify.suspicions import suspicions
+from jaxdyn.identify.suspicions import at_rest, suspicions
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
 from jaxdyn.model.builder import ModelBuilder
 
@@ -153,7 +155,9 @@ def test_terms_that_are_there_are_recovered(truth):
         more = sum(c * term(bare, bare.tau, 0.01)[:, :, 0] for c, term in zip(coefficients, terms, strict=True))
         return measured(model, bare, truth, more)
 
-    fit = identify.fit_robot(model, [log(1), log(2, 200)], (*identify.TERMS, *terms), v_s=0.01, prior=1.0, weights=None)
+    fit = identify.fit_robot(
+        model, [log(1), log(2, 200)], (*identify.TERMS, *terms), v_s=0.01, prior=1.0, robust=None, weights=None
+    )
     assert fit.choice.trials == () and fit.fit.terms == (*identify.TERMS, "dahl", "quadratic", "cable")
     # The noise that weighs the priors is the floor, so they pull a little.
     np.testing.assert_allclose(fit.fit.extra.coefficients, coefficients, atol=1e-4)
@@ -174,7 +178,7 @@ def test_load_dependent_friction_follows_the_fitted_robot(truth):
         carried = identify.regressor(model, bare.q, bare.v, bare.a) @ bodies
         return measured(model, bare, truth, 0.1 * load(bare, carried, 0.01)[:, :, 0], noise)
 
-    fit = identify.fit_robot(model, log(1), (*identify.TERMS, "load"), v_s=0.01, prior=1.0)
+    fit = identify.fit_robot(model, log(1), (*identify.TERMS, "load"), v_s=0.01, prior=1.0, robust=None)
     np.testing.assert_allclose(fit.fit.extra.coefficients, 0.1, atol=3e-3)
     assert fit.fit.error(log(2, noise=0.0)) < 0.2
 
@@ -185,14 +189,32 @@ def test_friction_goes_through_the_filter_of_the_log(truth):
     raw = measured(model, motion(1, 12001, 24.0), truth)
     log = identify.from_raw(raw.t, raw.q, raw.tau, cutoff=8.0, trim=200, every=4)
     assert log.cutoff == log[10:].cutoff == 8.0 and raw.cutoff is None
-    fit = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, weights=None).fit
-    plain = identify.fit_torques(model, log, v_s=0.01)
+    fit = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None, weights=None).fit
+    plain = identify.least_squares(model, log, v_s=0.01)  # whose column of friction did not go through the filter
     assert fit.error(log) < 0.2 * plain.error(log)
+    np.testing.assert_allclose(identify.fit_torques(model, log, v_s=0.01).vector, fit.vector, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(fit.friction.coulomb, truth[22:24], rtol=0.01)
     # Smooth signals pass as they are, and a log without a filter leaves every column alone.
     np.testing.assert_allclose(as_measured(log, log.v)[50:-50], log.v[50:-50], atol=2e-3)
     column = np.tanh(raw.v / 0.01)
     assert as_measured(raw, column) is column
+
+
+def test_low_pass_is_that_of_scipy():
+    """Butterworth coefficients, and both passes over steps, ramps and noise, of one column and of several."""
+    from scipy.signal import butter, filtfilt
+
+    noise = np.random.default_rng(0).normal(size=(900, 2, 3)) + np.linspace(5, 9, 900)[:, None, None]
+    noise[300:] -= 20
+    for order, cutoff in ((4, 8.0), (4, 100.0), (2, 30.0)):
+        b, a = butter(order, 2 * cutoff / 250.0)
+        ours = coefficients(cutoff, 250.0, order)
+        np.testing.assert_allclose(ours[0], b, rtol=1e-9)  # zeros and poles are multiplied out in another order
+        np.testing.assert_allclose(ours[1], a, rtol=1e-12)
+        for x in (noise, noise[:40, 0, 0]):
+            np.testing.assert_allclose(low_pass(x, cutoff, 250.0, order), filtfilt(b, a, x, axis=0), atol=1e-8)
+    with pytest.raises(ValueError, match="15 samples are too few"):
+        low_pass(noise[:15], 8.0, 250.0)
 
 
 def test_choice_by_cross_validation(truth):
@@ -211,7 +233,7 @@ def test_choice_by_cross_validation(truth):
     # A smooth sign of 0.003 or 0.03 rad/s differs from one of 0.01 in few samples of these logs.
     assert 0.001 <= fit.choice.setting.v_s <= 0.03
     assert len(told) == len(fit.choice.trials) and "parts of consecutive samples" in fit.choice.by
-    plain = identify.fit_robot(model, [log(1), log(2)], identify.TERMS, v_s=0.01, prior=1.0)
+    plain = identify.fit_robot(model, [log(1), log(2)], identify.TERMS, v_s=0.01, prior=1.0, robust=None)
     assert fit.fit.error(log(3)) < plain.fit.error(log(3))
 
 
@@ -233,9 +255,9 @@ def test_weights_are_one_over_the_noise_of_each_joint(truth):
     model = arm()
     bare = motion(1, 600)
     log = measured(model, bare, truth, np.random.default_rng(5).normal(size=(600, 2)) * [0.5, 0.02])
-    fit = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0)
+    fit = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None)
     assert fit.weights[1] / fit.weights[0] == pytest.approx(25, rel=0.15)
-    even = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, weights=None)
+    even = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None, weights=None)
     base = fit.intervals.combinations
     off = [np.linalg.norm((base.values(f.fit.vector) - base.values(truth))[3:6]) for f in (fit, even)]
     assert off[0] < off[1]
@@ -258,7 +280,7 @@ def test_bad_arguments_raise(truth):
             identify.fit_robot(model, log, **arguments)
     bad = identify.TorqueTerm("bad", lambda log, load, v_s: np.ones(3))
     with pytest.raises(ValueError, match=r"term 'bad' gave an array of shape \(3,\) for 300 samples"):
-        identify.fit_robot(model, log, bad, v_s=0.01, prior=1.0)
+        identify.fit_robot(model, log, bad, v_s=0.01, prior=1.0, robust=None)
 
 
 # --- intervals --------------------------------------------------------------------------------------------------------
@@ -273,7 +295,7 @@ def coverage(noises, count, size=0.05):
         x[20:] = [0.3, 0.2, 0.4, 0.3, 0.1, -0.2, 0.05, 0.02]
         bare = motion(seed)
         log = measured(model, bare, x, size * noises(seed, len(bare)))
-        found = identify.fit_robot(nominal, log, identify.TERMS, v_s=0.01, prior=1.0).intervals
+        found = identify.fit_robot(nominal, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals
         off = np.abs(found.base.values - found.combinations.values(x))
         inside.append(off <= found.factor * found.base.std)
     return np.mean(inside)
@@ -303,14 +325,18 @@ def test_intervals_cover_for_many_arms(noises):
 
 def test_what_no_data_touch_is_from_the_prior(truth):
     model = arm()
-    found = identify.fit_robot(model, measured(model, motion(1), truth, noise=0.05), v_s=0.01, prior=1.0).intervals
+    found = identify.fit_robot(
+        model, measured(model, motion(1), truth, noise=0.05), v_s=0.01, prior=1.0, robust=None
+    ).intervals
     sources = dict(zip(found.parameters.names, found.parameters.sources, strict=True))
     assert sources["a.Ixx"] == sources["b.Izz"] == "prior"  # the arm moves in a plane
     assert sources["b_joint.viscous"] == sources["b_joint.coulomb"] == "data"
     base = dict(zip(found.base.names, found.base.sources, strict=True))
     assert base["b.mcz"] == "data"
     no_friction = measured(model, motion(1), truth * np.repeat([1, 0, 1], [20, 4, 4]), noise=0.05)
-    found = identify.fit_robot(model, no_friction, identify.TERMS, v_s=0.01, prior=1.0).intervals.parameters
+    found = identify.fit_robot(
+        model, no_friction, identify.TERMS, v_s=0.01, prior=1.0, robust=None
+    ).intervals.parameters
     at_bound = found.values[20:24] == 0
     assert np.isnan(found.std[20:24][at_bound]).all() and np.isfinite(found.std[20:24][~at_bound]).all()
 
@@ -319,7 +345,7 @@ def test_two_halves_agree_within_their_intervals(truth):
     model = arm()
     log = measured(model, motion(4, 600, 12.0), truth, 0.1 * correlated(3, 600))
     first, second = (
-        identify.fit_robot(model, part, identify.TERMS, v_s=0.01, prior=1.0).intervals.base
+        identify.fit_robot(model, part, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals.base
         for part in identify.split(log, 0.5)
     )
     z = (first.values - second.values) / np.hypot(first.std, second.std)
@@ -357,6 +383,19 @@ def test_suspicions(truth):
     assert any(line.startswith("b stand still") for line in still)
 
 
+def test_an_error_at_rest_is_named():
+    """A joint that is held by friction for a second before it moves, with an error there; another without."""
+    t = np.linspace(0, 5, 501)
+    v = np.where(t > 1, np.sin(t - 1), 0)[:, None] * [1, 1]
+    residual = np.where(t < 0.9, 10.0, 0.5)[:, None] * [1, 0] + 0.1
+    log = identify.Log(t, v, v, v, v)
+    (line,) = at_rest(log, residual, ("a", "b"))
+    assert line.startswith("a stands still for the first 1 s") and "friction at rest" in line
+    assert (
+        at_rest(log, 0 * residual, ("a", "b")) == [] and at_rest(identify.Log(t, v, 0 * v, v, v), residual, "ab") == []
+    )
+
+
 def test_vibration_is_told_from_friction():
     """A residual at the motion's own frequencies is none; one at 15 Hz is, and the edge is ten times the motion's band."""
     t = np.linspace(0, 10, 2001)[:, None]
@@ -383,7 +422,7 @@ def test_payload_is_what_loaded_logs_differ_by(truth):
     x[10:20] += held
     unloaded = [measured(model, motion(seed), truth, noise=0.02, seed=seed) for seed in (1, 2)]
     loaded = measured(model, motion(3), x, noise=0.02, seed=3)
-    found = identify.fit_payload(nominal, unloaded, loaded, terms=identify.TERMS, v_s=0.01, prior=1.0)
+    found = identify.fit_payload(nominal, unloaded, loaded, terms=identify.TERMS, v_s=0.01, prior=1.0, robust=None)
     assert found.body == "b" and found.error < 0.5 * found.without
     # A planar arm shows m x, m z and the inertia about its axis alone, and not the mass without them.
     seen = [1, 3, 6]
@@ -392,3 +431,110 @@ def test_payload_is_what_loaded_logs_differ_by(truth):
     assert inertia.is_feasible(found.inertia)
     with pytest.raises(ValueError, match=r"body is 'hand'; the bodies are a, b"):
         identify.fit_payload(nominal, unloaded, loaded, "hand")
+
+
+# --- outliers ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_robust_loss_is_bent_less_by_torques_that_no_robot_makes(truth):
+    """Bursts at one joint: Huber's fit is nearer to the truth, and is what cross-validation takes; weights are closed forms."""
+    model = arm()
+    burst = np.zeros((300, 2))
+    burst[40:55, 1] = burst[180:190, 1] = 4.0
+    log = measured(model, motion(1), truth, burst, 0.05)
+    given = {"terms": identify.TERMS, "v_s": 0.01, "prior": 1.0}
+    plain = identify.fit_robot(model, log, robust=None, **given)
+    robust = identify.fit_robot(model, log, robust=1.345, **given)
+    off = [np.linalg.norm(f.intervals.base.values - f.intervals.combinations.values(truth)) for f in (plain, robust)]
+    assert off[1] < 0.5 * off[0]
+    chosen = identify.fit_robot(model, [log, measured(model, motion(2), truth, 0, 0.05)], robust="auto", **given)
+    assert chosen.choice.setting.robust in (1.345, 3.0) and len(chosen.choice.trials) == 3
+    errors = [np.array([[0.5], [-1.0], [1.0], [4.0], [0.0]])]
+    (weights,) = huber_weights(errors, 2.0)  # the median size is 1
+    np.testing.assert_allclose(weights[:, 0], np.sqrt([1, 1, 1, 2 * 1.4826 / 4, 1]), rtol=1e-12)
+    np.testing.assert_array_equal(huber_weights([np.zeros((3, 1))], 1.0)[0], 1.0)
+    for bad in (0.0, "huber"):
+        with pytest.raises(ValueError, match="robust is"):
+            identify.fit_robot(model, log, robust=bad, **given)
+
+
+# --- what logs tell ---------------------------------------------------------------------------------------------------
+
+
+def test_identifiability_in_words(truth):
+    """Rank and condition are those of the stacked regressor; a log at constant speed of one joint is said to tell less."""
+    model = arm()
+    log = measured(model, motion(1), truth)
+    told = identify.identifiability(model, log)
+    W = identify.regressor(model, log.q, log.v, log.a).reshape(600, -1)[:, told.base.independent]
+    s = np.linalg.svd(W / np.linalg.norm(W, axis=0), compute_uv=False)
+    assert told.rank == len(told.base) == len(s) and told.condition == pytest.approx(s[0] / s[-1], rel=1e-8)
+    assert [d.strength for d in told.weakest] == pytest.approx((s[::-1] / s[0])[:3], rel=1e-6)
+    assert "a.Ixx" in told.unidentifiable and "no motion tells" in told.summary()
+    held = identify.Log(log.t, log.q * [1, 0], log.v * [1, 0], log.a * [1, 0], log.tau)
+    told = identify.identifiability(model, held)
+    assert {"b_joint.viscous", "b_joint.coulomb", "b_joint.armature"} <= set(told.silent)
+    assert told.rank < len(told.base) and "not excited by these logs" in told.summary()
+    assert told.weakest[0].strength == 0
+
+
+def test_whiteness_of_known_noise():
+    """White noise is worth its samples; a first-order process with factor r lasts dt (1 + r) / (1 - r)."""
+    n, r = 40000, 0.9
+    noise = np.random.default_rng(0).normal(size=n)
+    slow = np.zeros(n)
+    for i in range(1, n):
+        slow[i] = r * slow[i - 1] + noise[i]
+    t = 0.01 * np.arange(n)
+    x = np.stack([noise, slow, np.zeros(n)], axis=1)
+    found = identify.whiteness(identify.Log(t, x, tau=x), x)
+    # The sum of the correlation up to its first zero has a standard error of some per cent.
+    assert found.lasting[0] == pytest.approx(0.01, rel=0.1) and found.worth[0] == pytest.approx(n, rel=0.1)
+    assert found.lasting[1] == pytest.approx(0.19, rel=0.15)
+    assert found.lasting[2] == pytest.approx(0.01)
+
+
+# --- excitation -------------------------------------------------------------------------------------------------------
+
+
+def test_exciting_motion_tells_more_within_its_limits():
+    """Rest at both ends, all limits kept on a fine grid, torques by inverse dynamics; better condition than where it began."""
+    model = arm().replace(lower=np.array([-1.0, -0.5]), upper=np.array([1.0, 2.0]), velocity_limit=np.array([2.0, 3.0]))
+    model = model.replace(effort_limit=np.array([25.0, 9.0]))
+    found = identify.exciting_motion(model, period=4.0, harmonics=3, steps=60, starts=2)
+    assert found.condition < 0.9 * found.start_condition and found.logdet > 1
+    assert max(found.used.values()) <= 1 and found.history[-1] < found.history[0]
+    log = found.log(rate=250.0, periods=2)
+    assert len(log) == 2001 and log.joint_names == model.joint_names
+    middle, half = np.array([0.0, 0.75]), 0.9 * np.array([1.0, 1.25])
+    assert np.all(np.abs(log.q - middle) <= half * (1 + 1e-3))  # peaks may lie between the samples that were looked at
+    assert np.all(np.abs(log.v) <= 0.9 * np.array([2.0, 3.0]) * (1 + 1e-3))
+    assert np.all(np.abs(log.tau) <= 0.9 * np.array([25.0, 9.0]) * (1 + 1e-3))
+    np.testing.assert_allclose(log.v[[0, 1000, 2000]], 0, atol=1e-12)
+    np.testing.assert_allclose(log.q[:1000], log.q[1000:2000], atol=1e-10)
+    told = identify.identifiability(model, measured(model, log), v_s=0.1)
+    assert told.rank == len(told.base) and told.condition == pytest.approx(found.condition, rel=0.15)
+    tau = identify.regressor(model, log.q, log.v, log.a)[:, :, :20] @ np.asarray(model.inertias).reshape(-1)
+    np.testing.assert_allclose(log.tau, tau, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_exciting_motion_of_the_best_condition():
+    model = arm().replace(effort_limit=np.array([25.0, 9.0]))
+    found = identify.exciting_motion(model, period=4.0, harmonics=3, objective="condition", steps=60, starts=2)
+    assert found.condition < found.start_condition
+
+
+def test_exciting_motion_says_no():
+    model = arm()
+    for words, arguments in (
+        ("objective is 'trace'", {"objective": "trace"}),
+        ("harmonics is 1; give at least 2", {"harmonics": 1}),
+        ("margin is 1.5; give a share", {"margin": 1.5}),
+        ("velocity has limits", {"velocity": [0.0, 1.0]}),
+    ):
+        with pytest.raises(ValueError, match=words):
+            identify.exciting_motion(model, **arguments)
+    lying = ModelBuilder("lying").add_body("a", axis=(0, 1, 0), inertia=(1.0, (0.5, 0, 0), (0.1, 0.1, 0.1))).build()
+    with pytest.raises(ValueError, match="to hold the robot at the middle of its ranges takes"):
+        identify.exciting_motion(lying, torque=1.0, steps=1)

@@ -59,6 +59,7 @@ USERS = {
     "scipy": {"contact", "identify"}
     | FILES_AND_PLOTS,  # a dependency of jax, so always there; not when jaxdyn is imported
     "mujoco": FILES_AND_PLOTS,
+    "threadpoolctl": {"identify"},
     "robot_descriptions": {"io"},
     "trimesh": {"pictures"},
     "viser": {"pictures"},

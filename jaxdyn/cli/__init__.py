@@ -1,4 +1,4 @@
-"""The command line: `jaxdyn info`, `jaxdyn simulate`, `jaxdyn sweep`, `jaxdyn identify` and `jaxdyn report`."""
+"""The command line: `jaxdyn info`, `jaxdyn simulate`, `jaxdyn sweep`, `jaxdyn excite`, `jaxdyn identify` and `jaxdyn report`."""
 
 import argparse
 import sys
@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import jax
 
 from jaxdyn import __version__
-from jaxdyn.cli import identify, info, report, simulate, sweep
+from jaxdyn.cli import excite, identify, info, report, simulate, sweep
 
-COMMANDS = (info, simulate, sweep, identify, report)
+COMMANDS = (info, simulate, sweep, excite, identify, report)
 _EPILOG = """\
 examples:
   jaxdyn info panda.urdf

@@ -10,11 +10,15 @@ import numpy as np
 
 from jaxdyn import __version__, identify
 from jaxdyn.cli.common import Stopwatch, add_model_options, coordinate_labels, load_model, number, output_path
+from jaxdyn.cli.identify_file import with_file
 from jaxdyn.cli.identify_logs import filtered_log, log_names, log_paths
 from jaxdyn.cli.identify_tables import judged_table, payload_text, tables
+from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
+from jaxdyn.identify.identifiability import base_terms
 from jaxdyn.identify.spectra import vibration
-from jaxdyn.identify.suspicions import suspicions
+from jaxdyn.identify.suspicions import at_rest, suspicions
+from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
 from jaxdyn.model.builder import inertia_report, repair_inertias
@@ -33,6 +37,7 @@ robot that is written is fitted to everything.
 """
 EPILOG = """\
 examples:
+  jaxdyn identify fit.toml          urdf = "arm.urdf", log = ["A.csv", "B.csv"], test-log = ["C.csv"], out = "fitted.urdf", ...
   jaxdyn identify --urdf panda.urdf --log log.csv --out fitted.urdf
   jaxdyn identify --urdf arm.urdf --log A.csv B.csv --test-log C.csv --out fitted.urdf --report fit.json --html fit.html
   jaxdyn identify --urdf panda.urdf --log log.csv --lock panda_finger_joint1 panda_finger_joint2 --plot fit.png
@@ -58,7 +63,7 @@ terms (--terms), beside the links:
   viscous v + coulomb tanh(v / v_s) + offset + armature a (rotor inertia), and
   load |tau_rigid| tanh(v / v_s); dahl, pre-sliding; asymmetric |v|; quadratic v |v|; spring sin q, cos q.
   "auto" takes the first four, and of the others what lowers the error on parts of the training logs that are left out in
-  turn, joint by joint. --v-s auto and --prior auto are chosen the same way. The test logs are never looked at.
+  turn, joint by joint. --v-s, --prior and --robust auto are chosen the same way. The test logs are never looked at.
 
 methods (--method):
   feasible         convex fit of the torques over all physically possible bodies; the URDF written is sound (default)
@@ -68,8 +73,8 @@ methods (--method):
 output:
   --out            URDF with the fitted inertias, damping, friction and armature (rotor inertia, an attribute of
                    <dynamics>), fitted to all of the training logs. Base parameters are what the logs tell; where they leave a
-                   choice between links, the URDF stays close to the file given. Offsets and the other terms have no place
-                   in a URDF; they are in the report.
+                   choice between links, the URDF stays close to the file given. Offsets and the other terms, which URDF has
+                   no place for, stand in an element <jaxdyn> that other readers pass over, and in the report.
   --report         everything in numbers as JSON (default: beside --out, with the ending .json)
   --html           the same as a page with plots, in one file
   The error is 100 |predicted - measured| / |measured| of the torques, over all samples, and all joints or each.
@@ -80,10 +85,11 @@ METHODS = ("feasible", "least-squares", "trajectory")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument(
-        "--urdf", required=True, help="the robot; its geometry is taken as right, its inertias as a guess"
+        "file", nargs="?", metavar="FIT.toml", help="options in a file, under their names without dashes"
     )
+    parser.add_argument("--urdf", help="the robot; its geometry is taken as right, its inertias as a guess")
     parser.add_argument(
-        "--log", required=True, nargs="+", action="extend", metavar="FILE", help="recorded logs to fit, .csv or .npz"
+        "--log", default=[], nargs="+", action="extend", metavar="FILE", help="recorded logs to fit, .csv or .npz"
     )
     parser.add_argument(
         "--test-log", nargs="+", action="extend", default=[], metavar="FILE", help="logs that only tell the error"
@@ -106,7 +112,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="joints whose columns have other names in the logs",
     )
     add_model_options(parser)
-    parser.add_argument("--repair", action="store_true", help="replace inertias no body can have before fitting")
+    parser.add_argument(
+        "--repair", action="store_true", help="replace inertias that no body can have, or none at all, before fitting"
+    )
     data = parser.add_argument_group("data")
     data.add_argument(
         "--train",
@@ -145,6 +153,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of the joints: auto, one over the error each is left with; none, all the same (default: auto)",
     )
     fit.add_argument(
+        "--robust",
+        default="auto",
+        metavar="K",
+        help="errors beyond K standard deviations count by their size, not its square: a number, none, or auto (default)",
+    )
+    fit.add_argument(
         "--horizon", type=float, default=0.25, metavar="S", help="length of the simulated pieces, s (default: 0.25)"
     )
     fit.add_argument(
@@ -165,11 +179,19 @@ class _Options(NamedTuple):
     terms: str | tuple[str, ...]
     v_s: float | str
     prior: float | str
+    robust: float | str | None
     weights: str | None
 
 
+@on_one_thread()
 def run(args: argparse.Namespace) -> None:
     """Fit, print the errors and the parameters, write the files."""
+    args = with_file(args, add_arguments)
+    missing = [name for name, value in (("--urdf", args.urdf), ("--log", args.log)) if not value]
+    if missing:
+        raise ValueError(
+            f"{' and '.join(missing)}: missing; give the robot's URDF file and at least one log, or a file fit.toml"
+        )
     out = output_path(args.out, (".urdf",), "--out")
     json_path = output_path(args.report, (".json",), "--report")
     html = output_path(args.html, (".html",), "--html")
@@ -184,11 +206,12 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError("--log: --method trajectory fits one log; take --method feasible for several")
     if args.payload_log and args.method != "feasible":
         raise ValueError(f"--payload-log: --method {args.method} knows no payload; take --method feasible")
-    model = load_model(args.urdf, args)
+    model, given = load_for_repair(args.urdf, args) if args.repair else (load_model(args.urdf, args), [])
     if args.payload_body is not None and args.payload_body not in model.body_names:
         raise ValueError(f"--payload-body {args.payload_body}: the bodies are {', '.join(model.body_names)}")
     if args.repair:
-        print(f"repaired inertias: {', '.join(dict(inertia_report(model))) or 'none needed it'}")
+        repaired = dict.fromkeys((*given, *dict(inertia_report(model))))
+        print(f"repaired inertias: {', '.join(repaired) or 'none needed it'}")
         model = repair_inertias(model)
     logs = [filtered_log(model, path, args) for path in train_paths]
     names = log_names(train_paths + test_paths)
@@ -205,6 +228,8 @@ def run(args: argparse.Namespace) -> None:
         # What was chosen on the training part stays; the numbers are those of everything.
         final = _fit(model, logs, _settled(options, judge), args)
     seconds = str(watch)
+    fit = final.fit if isinstance(final, RobotFit) else final
+    v_s = float(fit.v_s if isinstance(fit, LeastSquares) else fit.friction.v_s)
     findings = Findings(
         model=model,
         result=final,
@@ -214,6 +239,7 @@ def run(args: argparse.Namespace) -> None:
         outcome=_outcome(final),
         is_refit=not test_paths,
         warnings=[],
+        told=identify.identifiability(model, logs, base_terms(fit.terms), v_s=v_s),
         choice=judge.choice if isinstance(judge, RobotFit) else None,
     )
     findings.warnings.extend(_warnings(findings, args))
@@ -223,7 +249,7 @@ def run(args: argparse.Namespace) -> None:
         print(f"warning: {line}")
     print(tables(findings))
     if out is not None and not isinstance(final, LeastSquares):
-        save_urdf((final.fit if isinstance(final, RobotFit) else final).model, out)
+        save_urdf((final.fit if isinstance(final, RobotFit) else final).model, out, torques=_torques_beside(final))
         print(f"Wrote {out}.")
     payload = None
     if isinstance(final, RobotFit) and args.payload_log:
@@ -247,6 +273,26 @@ def run(args: argparse.Namespace) -> None:
         first = findings.tests[0]
         torque_figure(first.log, first.predicted, labels, units, title=first.name).savefig(plot)
         print(f"Wrote {plot}.")
+
+
+def _torques_beside(result: RobotFit | Fit) -> dict[str, dict[str, float]]:
+    """Of joints with one coordinate: offsets, the smoothing velocity, coefficients of extra terms."""
+    fit = result.fit if isinstance(result, RobotFit) else result
+    model = fit.model
+    named: dict[str, Any] = {"offset": fit.friction.offset, "v_s": np.full(model.nv, float(fit.friction.v_s))}
+    if fit.extra is not None:
+        for name, values in fit.extra.named.items():
+            group = np.array(values).reshape(-1, model.nv)
+            named |= {f"{name}{k + 1 if len(group) > 1 else ''}": row for k, row in enumerate(group)}
+    places = {
+        name: where.start
+        for name, where in zip(model.joint_names, model.topology.v_slices, strict=True)
+        if where.stop - where.start == 1
+    }
+    return {
+        joint: {name: float(row[place]) for name, row in named.items() if name in ("offset", "v_s") or row[place]}
+        for joint, place in places.items()
+    }
 
 
 def _asked(args) -> dict[str, Any]:
@@ -273,8 +319,10 @@ def _options(args) -> _Options:
     prior = args.prior if args.prior == "auto" else number(args.prior, "--prior")
     if simple:
         v_s, prior = 0.01 if v_s == "auto" else v_s, 1.0 if prior == "auto" else prior
+    robust = {"auto": "auto", "none": None}.get(args.robust, args.robust)
+    robust = number(robust, "--robust") if robust not in ("auto", None) else robust
     weights = "auto" if args.weights == "auto" else None
-    return _Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, weights)
+    return _Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights)
 
 
 def _settled(options: _Options, result) -> _Options:
@@ -282,7 +330,7 @@ def _settled(options: _Options, result) -> _Options:
     if not isinstance(result, RobotFit):
         return options
     setting = result.choice.setting
-    return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior)
+    return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust)
 
 
 def _fit(model: Model, logs: list[Log], options: _Options, args) -> RobotFit | Fit | LeastSquares:
@@ -294,7 +342,7 @@ def _fit(model: Model, logs: list[Log], options: _Options, args) -> RobotFit | F
         if args.progress:
             extra = ", ".join(f"{name} {list(joints)}" for name, joints in trial.setting.extra)
             print(f"  left out: {trial.percent:.3f} % with v_s {trial.setting.v_s:g}, prior {trial.setting.prior:g}, "
-                  f"terms {extra or 'none more'}", flush=True)  # fmt: skip
+                  f"robust {trial.setting.robust}, terms {extra or 'none more'}", flush=True)  # fmt: skip
 
     if options.method == "least-squares":
         return identify.least_squares(model, logs, options.terms, v_s=float(options.v_s))
@@ -305,6 +353,7 @@ def _fit(model: Model, logs: list[Log], options: _Options, args) -> RobotFit | F
             options.terms,
             v_s=options.v_s,
             prior=options.prior,
+            robust=options.robust,
             weights=options.weights,
             callback=tell,
         )
@@ -346,6 +395,7 @@ def _warnings(findings: Findings, args) -> list[str]:
     labels, _ = coordinate_labels(findings.model)
     for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
         lines += [f"{one.name}: {line}" for line in suspicions(findings.model, one.log, labels)]
+        lines += [f"{one.name}: {line}" for line in at_rest(one.log, one.predicted - np.asarray(one.log.tau), labels)]
         share, edge = vibration(one.log, one.predicted - np.asarray(one.log.tau))
         if share > _VIBRATES and (args.filtered or edge < args.cutoff):
             lines.append(

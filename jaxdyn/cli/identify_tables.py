@@ -35,10 +35,11 @@ def tables(findings: Findings) -> str:
     """Joints and bodies, or base parameters; what was chosen."""
     parts = [_joint_table(findings)]
     result, model = findings.result, findings.model
+    parts.append(_told_text(findings))
     if isinstance(result, LeastSquares):
         rows = [[name, short(x0), short(x), short(s, 2)] for name, x0, x, s in result.table()]
         header = ["combination", "URDF", "fitted", "std"]
-        parts.append("Base parameters: URDF, fitted, standard deviation for independent errors\n" + table(header, rows))
+        parts.append("Base parameters: URDF, fitted, standard deviation by blocks of samples\n" + table(header, rows))
         return "\n".join(parts)
     if isinstance(result, RobotFit):
         parts += [_choice_text(findings.choice or result.choice, model), _robot_base_table(result, model)]
@@ -69,11 +70,28 @@ def _joint_table(findings: Findings) -> str:
     return f"Joints: errors on {first.name}, friction and rotor inertia\n" + table(header, rows)
 
 
+def _told_text(findings: Findings) -> str:
+    """What the logs tell, and what the error on the first test log is worth."""
+    labels = coordinate_labels(findings.model)[0]
+    first = findings.tests[0]
+    lasting = ", ".join(
+        f"{label} {short(float(x), 2)}" for label, x in zip(labels, first.whiteness.lasting, strict=True)
+    )
+    worst = round(float(first.whiteness.worth.min()))
+    return (
+        f"What the logs tell: {findings.told.summary()}\n"
+        f"Errors on {first.name} last (s): {lasting}; its {len(first.log)} samples are worth {worst} independent ones or more"
+    )
+
+
 def _choice_text(choice: Choice, model: Model) -> str:
     setting, labels = choice.setting, coordinate_labels(model)[0]
     extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
     how = f", chosen over {len(choice.trials)} settings, each judged on {choice.by} left out in turn"
-    return f"v_s {setting.v_s:g}, prior {setting.prior:g}, extra terms: {extra}{how if choice.trials else ''}"
+    loss = "squares" if setting.robust is None else f"Huber's beyond {setting.robust:g}"
+    return (
+        f"v_s {setting.v_s:g}, prior {setting.prior:g}, loss {loss}, extra terms: {extra}{how if choice.trials else ''}"
+    )
 
 
 def _robot_base_table(result: RobotFit, model: Model) -> str:

@@ -1,8 +1,14 @@
 """Parameters from measurements: least squares, and physically feasible fits by torque or by trajectory error."""
 
+from jaxdyn.identify.exciting import Excitation as Excitation
+from jaxdyn.identify.exciting import exciting_motion as exciting_motion
 from jaxdyn.identify.feasible import fit_torques as fit_torques
 from jaxdyn.identify.friction import TERMS as TERMS
 from jaxdyn.identify.friction import Friction as Friction
+from jaxdyn.identify.identifiability import Identifiability as Identifiability
+from jaxdyn.identify.identifiability import Whiteness as Whiteness
+from jaxdyn.identify.identifiability import identifiability as identifiability
+from jaxdyn.identify.identifiability import whiteness as whiteness
 from jaxdyn.identify.intervals import Intervals as Intervals
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import from_raw as from_raw

@@ -149,12 +149,13 @@ def condense_blocks(
     *,
     extra: Sequence[np.ndarray] = (),
     blocks: int = 1,
+    weights: Sequence[np.ndarray] | None = None,
 ) -> Blocks:
     """Condense logs, block by block.
 
     **Arguments:** `logs`; `rows(which, piece)`, the regressor (n, nv, s + k nv) of some samples of a log, whose terms are
     diagonal blocks; `shared`, its number s of columns before the terms; `extra`: for each log, more terms (n, nv, k');
-    `blocks`: about how many, over all logs.
+    `blocks`: about how many, over all logs; `weights`: for each log, those of its torques (n, nv), ones by default.
     """
     triangles, samples, owners = [], [], []
     for which, part in block_slices([len(log) for log in logs], blocks):
@@ -168,6 +169,7 @@ def condense_blocks(
             more = np.zeros((len(log), nv, 0)) if not len(extra) else extra[which][piece]
             for j in range(nv):
                 table = np.concatenate([W[:, j, :shared], own[:, j, :, j], more[:, j], tau[:, j, None]], axis=1)
+                table = table if weights is None else table * weights[which][piece, j, None]
                 before = found[j] if found[j].size else np.zeros((0, table.shape[1]))
                 found[j] = np.asarray(np.linalg.qr(np.concatenate([before, table]), mode="r"))
         triangles.append(found)

@@ -10,14 +10,16 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart, positive_terms
-from jaxdyn.identify.condensed import Condensed
+from jaxdyn.identify import interior
+from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart
+from jaxdyn.identify.condensed import Condensed, condensed_rows
 from jaxdyn.identify.friction import TERMS, check_terms
-from jaxdyn.identify.logs import Log, as_logs, root_mean_square
+from jaxdyn.identify.logs import Log, as_logs, as_measured, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
-from jaxdyn.identify.regression import condense, free_columns, noise_level
+from jaxdyn.identify.regression import check_weights, condense_model, noise_level
 from jaxdyn.identify.result import Fit
-from jaxdyn.model import inertia as _inertia
+from jaxdyn.identify.threads import on_one_thread
+from jaxdyn.identify.torque_terms import coulomb_column
 from jaxdyn.model.tree import Model
 
 # A fit is never trusted beyond this share of the torque: rounding and noise-free logs stay well posed.
@@ -41,6 +43,7 @@ def torque_loss(point: Coordinates, problem: Problem) -> Float[Array, ""]:
     return 0.5 * (residual @ residual + problem.rest) + problem.prior * problem.chart.divergence(point.theta)
 
 
+@on_one_thread()
 def fit_torques(
     model: Model,
     log: Log | Sequence[Log],
@@ -64,7 +67,7 @@ def fit_torques(
     nominal one. It settles what the torques leave open, is the same in every frame and unit, and grows without bound
     towards bodies that do not exist. x is searched in coordinates in which every point is a feasible body with friction
     that takes energy (`Chart`), so no iterate can be infeasible. The log is condensed once: a step costs the same for
-    any log.
+    any log. Where `from_raw` low-passed a log, the column of Coulomb friction goes through the same low-pass.
 
     **Arguments:**
 
@@ -93,7 +96,9 @@ def fit_torques(
     logs = as_logs(log, model)
     terms = check_terms(terms, v_s)
     check_prior(prior)
-    condensed = condense(model, logs, v_s=v_s, weights=weights)
+    coulomb = [as_measured(one, coulomb_column(one, v_s)) for one in logs]
+    blocks = condense_model(model, logs, v_s=v_s, coulomb=coulomb)
+    condensed = condensed_rows(blocks.rows(check_weights(weights, model.nv)), blocks.count())
     problem, point, sigma = make_problem(model, condensed, signal_sizes(logs), terms, v_s, inertia, prior, sigma)
     chart = problem.chart
     if method != "newton" and isinstance(method, str) and method not in METHODS:
@@ -132,6 +137,7 @@ def fit_torques(
         method=f"torque fit by {name}",
         terms=terms,
         sigma=sigma,
+        as_measured=True,
     )
 
 
@@ -154,160 +160,47 @@ def make_problem(model: Model, condensed: Condensed, sizes, terms, v_s, inertia,
 
     `sizes` as `signal_sizes` gives them; the other arguments as in `fit_torques`.
     """
+    sigma = torque_noise(condensed, sizes, sigma)
+    chart, point = make_chart(model, terms, v_s, inertia, *sizes)
+    dtype = np.dtype(model.home.dtype)
+    numbers = (condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, prior)
+    return Problem(chart, *(jnp.asarray(x, dtype) for x in numbers)), point, sigma
+
+
+def torque_noise(condensed: Condensed, sizes, sigma: float | None = None) -> float:
+    """sigma (N m) where it is given, else the residual of the unconstrained least squares.
+
+    **Raises:** ValueError for a sigma that is not positive, or not known.
+    """
     if sigma is None:
         sigma = max(noise_level(condensed), _FINEST * float(np.sqrt(np.mean(sizes[0] ** 2))))
     if not sigma > 0:
         raise ValueError(f"sigma is {sigma}; the torque noise must be positive (all torques of the log may be zero)")
-    chart, point = make_chart(model, terms, v_s, inertia, *sizes)
-    dtype = np.dtype(model.home.dtype)
-    numbers = (condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, prior)
-    return Problem(chart, *(jnp.asarray(x, dtype) for x in numbers)), point, float(sigma)
-
-
-_loss = eqx.filter_jit(torque_loss)
-
-
-class _Dual(eqx.Module):
-    """Multipliers: of a body's pseudo-inertia being positive definite, in the frame where that is 1, and of terms >= 0."""
-
-    bodies: Float[Array, "bodies 4 4"]
-    terms: Float[Array, " n"]
+    return float(sigma)
 
 
 def newton(model: Model, problem: Problem, point: Coordinates, steps: int, tolerance: float, callback=None):
-    """Primal-dual interior-point method: chart, point, history of the loss, result.
+    """The minimum by `interior.newton`: chart moved there, point, history of the loss, result."""
+    chart = problem.chart
+    numbers = (np.asarray(x, np.float64) for x in (problem.R, problem.d))
+    host = interior.TorqueProblem(chart, *numbers, float(problem.rest), float(problem.prior))
+    watch = None
+    if callback is not None:
 
-    The loss is min |R x - d|^2 / 2 + prior tr(P0^-1 P) with -prior log det P as the barrier that stays. The barrier starts as
-    strong as the data, so that bodies are not pushed against the edge of what is feasible, and is released as fast as the
-    complementarity of bodies and multipliers allows: down to the prior for the bodies, to nothing for the terms.
-    """
-    history, result = [], "max_steps"
-    dtype = problem.R.dtype
-    prior = float(problem.prior)
-    inequalities = point.s.shape[1] * int(positive_terms(problem.chart.terms).sum())
-    least = 0.1 * tolerance / max(inequalities, 1)
-    gap = max(prior, float(_loss(point, problem)) / (4 * len(problem.chart.bodies) + max(inequalities, 1)))
-    one = jnp.broadcast_to(jnp.eye(4, dtype=dtype), problem.chart.origin.shape)
-    dual = _Dual(gap * one, jnp.full((point.s.size,), gap, dtype) / jnp.maximum(point.s.reshape(-1) ** 2, 1e-3))
-    targets = gap, gap
-    for step in range(steps + 1):
-        weights = (jnp.asarray(target, dtype) for target in targets)
-        value, decrement, gaps, length, origin, s, dual = _newton_step(problem, point, dual, *weights)
-        history.append(float(value))
-        if callback is not None:
-            callback(step, history[-1], problem.chart.fitted(model, point)[0])
-        if not np.isfinite(history[-1] + float(decrement)):
-            result = "not_finite"
-            break
-        # Rounding of the loss limits how small a decrease can be seen.
-        resolution = 10 * float(jnp.finfo(dtype).eps) * abs(history[-1])
-        if targets == (prior, least) and float(decrement) / 2 <= max(tolerance, resolution):
-            result = "converged"
-            break
-        if step < steps:
-            problem = eqx.tree_at(lambda p: p.chart.origin, problem, origin)
-            point = Coordinates(point.theta, s)
-            # The longer the step was, the more of the barrier goes next; short steps are for getting back to the middle.
-            share = min(max(0.02, (1 - float(length)) ** 2), 0.9)
-            targets = max(prior, share * float(gaps[0])), max(least, share * float(gaps[1]))
-    return problem.chart, point, np.array(history), result
+        def watch(step, loss, origin, s):
+            callback(step, loss, placed(chart, origin, s)[0].fitted(model, placed(chart, origin, s)[1])[0])
+
+    resolution = float(jnp.finfo(problem.R.dtype).eps)
+    found = interior.newton(host, np.asarray(point.s), steps, tolerance, watch, resolution)
+    return *placed(chart, found.origin, found.s), found.history, found.result
 
 
-@eqx.filter_jit
-def _newton_step(problem: Problem, point: Coordinates, dual: _Dual, weight, barrier):
-    """One step towards P Z = weight, terms * multipliers = barrier, and what it starts from.
-
-    Steps go straight in x and stop short of the edge, P = A (1 + h S) A^T with A the factor now: a curved step would leave
-    the narrow valley that a precise log makes. The equations are those of Newton's method on the loss with barriers, but the
-    barrier's curvature is that of the multipliers, Z S + S Z, which already know where the edge is (Helmberg, Rendl,
-    Vanderbei & Wolkowicz 1996; Nesterov & Nemirovskii 1994).
-
-    **Returns:** loss, decrement, mean products with the multipliers, length of the step, then the origin, terms and
-    multipliers after it.
-    """
-    chart, dtype = problem.chart, problem.R.dtype
-    positive = jnp.broadcast_to(jnp.asarray(positive_terms(chart.terms)), point.s.shape).reshape(-1)
-    start = point.s.reshape(-1)
-    terms = jnp.where(positive, start**2, start)
-    inverse = jnp.where(positive, 1 / jnp.where(positive, terms, 1), 0)
-    multiplier = jnp.where(positive, dual.terms, 0)
-    count, size = point.theta.shape
-    nb, nv = chart.nominal_inertias.shape[0], chart.nominal_terms.shape[1]
-
-    inertial = jax.jacfwd(lambda theta: chart.inertias(theta).reshape(-1))(point.theta).reshape(10 * nb, count * size)
-    places = free_columns(nb, nv, chart.terms)[10 * nb :]
-    rows = [problem.R[:, : 10 * nb] @ inertial, problem.R[:, places] * chart.scale.reshape(1, -1)]
-    rows = jnp.concatenate(rows, axis=1)
-    basis = stretches(size, dtype)
-    traces = jnp.trace(basis, axis1=1, axis2=2)
-    # prior tr(P0^-1 P) is what remains of the divergence without its log det.
-    slope = problem.prior * (jax.grad(chart.divergence)(point.theta) + traces[None]) - weight * traces[None]
-    gradient = rows.T @ (problem.R @ chart.parameters(point) - problem.d)
-    gradient = gradient + jnp.append(slope.reshape(-1), -barrier * inverse)
-    curvature = jnp.einsum("kij,bjm,lmi->bkl", basis, dual.bodies, basis)
-    blocks = jnp.einsum("bkl,bc->bkcl", curvature, jnp.eye(count, dtype=dtype)).reshape(count * size, count * size)
-    hessian = rows.T @ rows + jax.scipy.linalg.block_diag(blocks, jnp.diag(multiplier * inverse))
-    diagonal = jnp.diagonal(hessian)
-    unit = jnp.sqrt(jnp.where(diagonal > 0, diagonal, jnp.ones_like(diagonal)))
-    damping = 4 * jnp.finfo(dtype).eps * jnp.eye(unit.size, dtype=dtype)
-    factor = jax.scipy.linalg.cho_factor(hessian / (unit[:, None] * unit[None, :]) + damping)
-    direction = -jax.scipy.linalg.cho_solve(factor, gradient / unit) / unit
-
-    one = jnp.eye(4, dtype=dtype)[None]
-    stretch = jnp.einsum("bk,kij->bij", direction[: count * size].reshape(count, size), basis)
-    change = direction[count * size :]
-    product = dual.bodies @ stretch
-    dual_stretch = weight * one - dual.bodies - (product + jnp.swapaxes(product, 1, 2)) / 2
-    dual_change = jnp.where(positive, (barrier - multiplier * change) * inverse - multiplier, 0)
-
-    length = _length(jnp.linalg.eigvalsh(stretch), change * inverse)
-    roots = jax.vmap(_upper_root)(dual.bodies)
-    relative = jax.vmap(lambda root, step: jax.scipy.linalg.solve(root, jax.scipy.linalg.solve(root, step).T))(
-        roots, dual_stretch
-    )
-    dual_length = _length(
-        jnp.linalg.eigvalsh((relative + jnp.swapaxes(relative, 1, 2)) / 2),
-        dual_change / jnp.where(positive, multiplier, 1),
-    )
-    roots = jax.vmap(_upper_root)(one + length * stretch)
-    bodies = dual.bodies + dual_length * dual_stretch
-    moved = _Dual(jnp.swapaxes(roots, 1, 2) @ bodies @ roots, multiplier + dual_length * dual_change)
-    following = terms + length * change
-    s = jnp.where(positive, jnp.sqrt(jnp.where(positive, following, 1)), following)
-    # Mean products of what must stay positive and its multipliers.
-    gaps = (
-        jnp.sum(jnp.trace(moved.bodies, axis1=1, axis2=2)) / max(4 * count, 1),
-        jnp.sum(jnp.where(positive, moved.terms * following, 0)) / max(int(positive_terms(chart.terms).sum()) * nv, 1),
-    )
-    origin = jnp.einsum("bij,bjk->bik", chart.origin, roots)
-    value, decrement = torque_loss(point, problem), -(gradient @ direction)
-    return value, decrement, gaps, jnp.minimum(length, dual_length), origin, s.reshape(point.s.shape), moved
-
-
-def _length(*rates):
-    """Longest step up to 1 that leaves a twentieth of everything that shrinks at these rates."""
-    fastest = jnp.min(jnp.concatenate([rate.reshape(-1) for rate in rates]), initial=0)
-    return jnp.minimum(1, -0.95 / jnp.minimum(fastest, -0.95))
-
-
-def stretches(size: int, dtype) -> Float[Array, "size 4 4"]:
-    """Derivatives of U U^T by the coordinates of a body, at the chart's origin.
-
-    Traces of their products are the curvature of the divergence along straight lines in x: tr(P^-1 dP P^-1 dP).
-    """
-    basis = jax.vmap(_linear_factor)(jnp.eye(size, dtype=dtype))
-    return basis + jnp.swapaxes(basis, 1, 2)
-
-
-def _linear_factor(step):
-    """Derivative of `log_cholesky_factor` at zero along a step (10,), or along its first number (1,)."""
-    step = jnp.append(step, jnp.zeros((10 - step.size,), step.dtype))
-    return jax.jvp(_inertia.log_cholesky_factor, (jnp.zeros_like(step),), (step,))[1]
-
-
-def _upper_root(matrix):
-    """Upper-triangular U with U U^T = matrix; NaN when it is not positive definite."""
-    return jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
+def placed(chart: Chart, origin: np.ndarray, s: np.ndarray) -> tuple[Chart, Coordinates]:
+    """The chart with its origin moved, and the point there."""
+    size = {"full": 10, "mass": 1, "fixed": 0}[chart.inertia]
+    dtype = chart.factors.dtype
+    chart = eqx.tree_at(lambda chart: chart.origin, chart, jnp.asarray(origin, dtype))
+    return chart, Coordinates(jnp.zeros((len(chart.bodies), size), dtype), jnp.asarray(s, dtype))
 
 
 @eqx.filter_jit

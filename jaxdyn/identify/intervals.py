@@ -8,21 +8,16 @@ much as a prior of weight 1 believes.
 
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
-from jaxdyn.identify.chart import Chart, Coordinates, positive_terms
-from jaxdyn.identify.feasible import stretches
+from jaxdyn.identify.interior import STRETCHES, Linear
+from jaxdyn.identify.jackknife import block_groups, jackknife, student
 from jaxdyn.identify.one_fit import Data, Estimate, Setting
 from jaxdyn.identify.regression import BaseParameters, base_parameters, free_columns, parameter_names
 from jaxdyn.model.tree import Model
 
 # Share of the variance from which on a number is called one from the prior.
 _FROM_PRIOR = 0.5
-# Blocks left out together: the longer they are, the less errors in one have to do with those in the next.
-_TOGETHER = 2
 
 
 class Spread(NamedTuple):
@@ -56,19 +51,32 @@ class Intervals(NamedTuple):
     factor: float
 
 
-def intervals(model: Model, data: Data, setting: Setting, estimate: Estimate, weights: np.ndarray, terms) -> Intervals:
+def intervals(
+    model: Model,
+    data: Data,
+    setting: Setting,
+    estimate: Estimate,
+    weights: np.ndarray,
+    terms,
+    curved: Data | None = None,
+) -> Intervals:
     """`Intervals` of one fit of condensed logs.
 
     With D_b the data's curvature and g_b their slope on block b, both over sigma^2, P the prior's curvature and H = sum D_b + P:
     leaving b out moves the fit by (H - D_b)^-1 g_b. Their covariance times (B - 1) is the data's share, and
     max(prior, 1) H^-1 P H^-1 the prior's. All in the coordinates of the chart, then carried over to x.
 
-    Source: Efron (1982), the jackknife; Cameron & Miller (2015), cluster-robust inference (CR3).
+    `curved`: logs whose curvature counts, where the loss is not made of squares: Huber's has none beyond its threshold, though it
+    has a slope there.
+
+    Source: Efron (1982), the jackknife; Cameron & Miller (2015), cluster-robust inference (CR3); Huber
+    (1981), "Robust statistics", section 6.4, whose curvature is that of psi'.
     """
     jacobian, curvature, free = _local(data, setting, estimate)
     blocks, sigma = data.blocks, estimate.sigma
     slopes = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
-    grams = np.einsum("pi,bpq,qj->bij", jacobian, blocks.grams(weights), jacobian, optimize=True) / sigma**2
+    bent = (data if curved is None else curved).blocks.grams(weights)
+    grams = np.einsum("pi,bpq,qj->bij", jacobian, bent, jacobian, optimize=True) / sigma**2
     groups = block_groups(len(blocks))
     slopes, grams = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (slopes, grams))
     moves, inverse = jackknife(grams, slopes, curvature)
@@ -93,26 +101,6 @@ def intervals(model: Model, data: Data, setting: Setting, estimate: Estimate, we
     return Intervals(parameters, spread, base, a @ a.T + b @ b.T, student(count - 1))
 
 
-def block_groups(count: int) -> list[np.ndarray]:
-    """Numbers of the blocks that are left out together."""
-    return np.array_split(np.arange(count), max(2, count // _TOGETHER))
-
-
-def jackknife(grams: np.ndarray, slopes: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A root (n, groups) of the covariance of a minimum, each group of samples left out in turn, and the inverse Hessian (n, n).
-
-    `grams` (groups, n, n) and `slopes` (groups, n) are the groups' curvatures and slopes there, `curvature` (n, n) what stays.
-    """
-    H = grams.sum(axis=0) + curvature
-    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-    scale = unit[:, None] * unit[None, :]
-    moves = np.stack(
-        [unit * (_inverse((H - gram) * scale) @ (unit * slope)) for gram, slope in zip(grams, slopes, strict=True)]
-    )
-    count = len(grams)
-    return (moves - moves.mean(axis=0)).T * np.sqrt((count - 1) / count), _inverse(H * scale) * scale
-
-
 def _spread(names, values, moves, pulled, fitted) -> Spread:
     from_data, from_prior = np.sum(moves**2, axis=1), np.sum(pulled**2, axis=1)
     total = from_data + from_prior
@@ -122,17 +110,15 @@ def _spread(names, values, moves, pulled, fitted) -> Spread:
 
 def _local(data: Data, setting: Setting, estimate: Estimate):
     """Slopes of x by the free coordinates, the prior's curvature in them, and which basic parameters are free at all."""
-    chart, point = estimate.chart, estimate.point
-    slopes = np.asarray(_chart_slopes(chart, point), np.float64)
-    count, size = point.theta.shape
-    basis = np.asarray(stretches(size, point.theta.dtype), np.float64)
+    linear, minimum = Linear(estimate.chart), estimate.minimum
+    slopes = linear.slopes_at(minimum.origin, minimum.s)
+    count, size = len(minimum.origin), linear.count
+    basis = STRETCHES[:size]
     bent = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
     bodies = count * size
     moves = np.ones(slopes.shape[1], bool)
     # What is at its bound stays there.
-    moves[bodies:] = ~(
-        np.broadcast_to(positive_terms(chart.terms), point.s.shape) & (np.asarray(point.s) == 0)
-    ).reshape(-1)
+    moves[bodies:] = ~(linear.positive & (minimum.s.reshape(-1) == 0))
     places = data.places(setting.extra)
     count = int(moves.sum())
     jacobian = np.zeros((data.blocks.size, count + len(places)))
@@ -145,18 +131,6 @@ def _local(data: Data, setting: Setting, estimate: Estimate):
     return jacobian, curvature, np.any(jacobian[: data.basic] != 0, axis=1)
 
 
-@eqx.filter_jit
-def _chart_slopes(chart: Chart, point: Coordinates):
-    y, unflatten = ravel_pytree(point)
-    return jax.jacfwd(lambda y: chart.parameters(unflatten(y)))(y)
-
-
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Inverse of a symmetric matrix of unit diagonal; directions without curvature are taken as having that of rounding."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return (vectors / np.maximum(values, 1e-12)) @ vectors.T
-
-
 def _root(matrix: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(matrix)
     return vectors * np.sqrt(np.maximum(values, 0))
@@ -165,10 +139,3 @@ def _root(matrix: np.ndarray) -> np.ndarray:
 def _joints(model: Model) -> list[str]:
     start = 10 * model.nb
     return [name.rpartition(".")[0] for name in parameter_names(model)[start : start + model.nv]]
-
-
-def student(freedoms: int) -> float:
-    """Half of a 95 % interval in standard deviations, by Student's t with so many degrees of freedom."""
-    from scipy.stats import t
-
-    return float(t.ppf(0.975, freedoms))

@@ -7,12 +7,12 @@ factorisation of [E, W, tau] with the prior's rows under E leaves a triangle of 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 
-from jaxdyn.identify.chart import Chart, Coordinates
+from jaxdyn.identify.chart import Chart
 from jaxdyn.identify.condensed import Blocks, condensed_rows, condensed_triangle
-from jaxdyn.identify.feasible import make_problem, newton
+from jaxdyn.identify.feasible import torque_noise
+from jaxdyn.identify.interior import Linear, Minimum, TorqueProblem, newton
 from jaxdyn.identify.logs import Log, as_measured, root_mean_square
 from jaxdyn.identify.regression import condense_model, noise_level
 from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_column
@@ -28,12 +28,13 @@ class Setting(NamedTuple):
     """What a fit is told besides the logs.
 
     `v_s`, smoothing velocity; `extra`: extra terms, (name, numbers of the torques that have it); `prior`, weight of the
-    divergence of the bodies and of the coefficients of extra terms.
+    divergence of the bodies and of the coefficients of extra terms; `robust`: threshold of Huber's loss, None for squares.
     """
 
     v_s: float
     extra: tuple[tuple[str, tuple[int, ...]], ...]
     prior: float
+    robust: float | None = None
 
 
 class Data(NamedTuple):
@@ -65,15 +66,22 @@ class Estimate(NamedTuple):
     x: np.ndarray
     sigma: float
     chart: Chart
-    point: Coordinates
-    history: np.ndarray
-    result: str
+    minimum: Minimum
 
 
 def gather(
-    model: Model, logs: Sequence[Log], v_s: float, extra: Sequence[TorqueTerm], loads: Sequence[np.ndarray], blocks: int
+    model: Model,
+    logs: Sequence[Log],
+    v_s: float,
+    extra: Sequence[TorqueTerm],
+    loads: Sequence[np.ndarray],
+    blocks: int,
+    weights: Sequence[np.ndarray] | None = None,
 ) -> Data:
-    """Condense logs with the columns of extra terms; `loads` (n, nv) of each log is the torque of the rigid bodies."""
+    """Condense logs with the columns of extra terms; `loads` (n, nv) of each log is the torque of the rigid bodies.
+
+    `weights` (n, nv) of each log: of single torques, ones by default.
+    """
     parts = [[as_measured(log, term(log, load, v_s)) for term in extra] for log, load in zip(logs, loads, strict=True)]
     coulomb = [as_measured(log, coulomb_column(log, v_s)) for log in logs]
     counts = {term.name: part.shape[2] for term, part in zip(extra, parts[0], strict=True)}
@@ -85,27 +93,26 @@ def gather(
     size = root_mean_square(joined.reshape(len(joined), -1)).reshape(joined.shape[1:]).T
     torque = np.where(torque > 0, torque, torque.max(initial=0) or 1.0)
     units = np.where(size > 0, _UNIT * torque / np.where(size > 0, size, 1), 0.0)
-    data = condense_model(model, logs, v_s=v_s, coulomb=coulomb, extra=columns, blocks=blocks)
+    data = condense_model(model, logs, v_s=v_s, coulomb=coulomb, extra=columns, blocks=blocks, weights=weights)
     return Data(data, 10 * model.nb + 4 * model.nv, counts, units)
 
 
 def fit_condensed(
-    model: Model,
+    chart: Chart,
+    start: np.ndarray,
     data: Data,
     setting: Setting,
     sizes,
-    terms,
     weights: np.ndarray,
     *,
     rows: np.ndarray | None = None,
     count: int | None = None,
-    inertia: str = "full",
     is_rough: bool = False,
     steps: int = 200,
 ) -> Estimate:
     """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for; `is_rough` for what only compares settings.
 
-    `sizes` as of `signal_sizes`, the other arguments as in `fit_torques`.
+    `chart` and `start` (terms, nv) as of `make_chart`, `sizes` as of `signal_sizes`.
     """
     rows, size = data.blocks.rows(weights) if rows is None else rows, data.blocks.size
     count = data.blocks.count() if count is None else count
@@ -120,20 +127,15 @@ def fit_condensed(
     units = data.units.reshape(-1)[places - data.basic]
     R, coefficients = eliminate(rows, len(places), np.sqrt(setting.prior) * sigma / units)
     condensed = condensed_triangle(R, count)
-    problem, point, sigma = make_problem(
-        model, condensed, sizes, terms, setting.v_s, inertia, setting.prior, sigma or None
-    )
-    chart, point, history, result = newton(model, problem, point, steps, _ROUGH if is_rough else _FINE)
-    point = chart.settled(point)
+    sigma = torque_noise(condensed, sizes, sigma or None)
+    problem = TorqueProblem(chart, condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, setting.prior)
+    minimum = newton(problem, start, steps, _ROUGH if is_rough else _FINE)
+    linear = Linear(chart)
+    minimum = minimum._replace(s=linear.settled(minimum.s))
     x = np.zeros(size)
-    basic = np.asarray(_parameters(chart, point), np.float64)
+    basic = linear.at(minimum.origin, minimum.s)
     x[kept] = np.append(basic, coefficients(basic))
-    return Estimate(x, sigma, chart, point, history, result)
-
-
-@eqx.filter_jit
-def _parameters(chart: Chart, point: Coordinates):
-    return chart.parameters(point)
+    return Estimate(x, sigma, chart, minimum)
 
 
 def eliminate(rows: np.ndarray, count: int, ridge: np.ndarray) -> tuple[np.ndarray, Callable]:

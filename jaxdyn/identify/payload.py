@@ -9,12 +9,14 @@ import numpy as np
 
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed import Blocks, condensed_rows
-from jaxdyn.identify.feasible import make_problem, newton, stretches
-from jaxdyn.identify.intervals import block_groups, jackknife, student
+from jaxdyn.identify.feasible import make_problem, newton
+from jaxdyn.identify.interior import STRETCHES
+from jaxdyn.identify.jackknife import block_groups, jackknife, student
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.one_fit import eliminate, gather
 from jaxdyn.identify.regression import noise_level, regressor, truncated
 from jaxdyn.identify.robot import RobotFit, fit_robot
+from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import split_terms
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model import inertia as _inertia
@@ -63,6 +65,7 @@ class Payload(eqx.Module):
         return _f64.about_com(self.inertia)[2]
 
 
+@on_one_thread()
 def fit_payload(
     model: Model,
     unloaded: Log | Sequence[Log],
@@ -148,7 +151,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows):
     found = robot(payload)
     # In the coordinates of the chart, where the prior's curvature is known; it also holds what no log tells.
     stretch = np.asarray(jax.jacfwd(lambda theta: chart.inertias(theta)[0])(point.theta), np.float64).reshape(10, 10)
-    basis = np.asarray(stretches(10, point.theta.dtype), np.float64)
+    basis = STRETCHES
     curvature = np.zeros((count + 10, count + 10))
     curvature[np.arange(count), np.arange(count)] = hold**2 / sigma**2
     curvature[count:, count:] = np.einsum("kij,lji->kl", basis, basis)

@@ -11,7 +11,9 @@ import numpy as np
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.condensed import Blocks, Condensed, condense_blocks, condensed_rows
 from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
+from jaxdyn.identify.jackknife import block_groups, jackknife, student
 from jaxdyn.identify.logs import Log, as_logs, check_log
+from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.model.arguments import as_array, check_shapes
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, integrate, neutral
@@ -96,10 +98,12 @@ def condense_model(
     coulomb: Sequence[np.ndarray] | None = None,
     extra: Sequence[np.ndarray] = (),
     blocks: int = 1,
+    weights: Sequence[np.ndarray] | None = None,
 ) -> Blocks:
     """`condense_blocks` of the regressor with all terms.
 
-    `coulomb`: for each log, columns (n, nv) of Coulomb friction instead of tanh(v / v_s); `extra`: more terms (n, nv, k).
+    `coulomb`: for each log, columns (n, nv) of Coulomb friction instead of tanh(v / v_s); `extra`: more terms (n, nv, k);
+    `weights`: for each log, those of its torques (n, nv).
     """
     start = 10 * model.nb + model.nv * TERMS.index("coulomb")
 
@@ -111,7 +115,7 @@ def condense_model(
             W[:, joints, start + joints] = coulomb[which][piece]
         return W
 
-    return condense_blocks(logs, rows, 10 * model.nb, extra=extra, blocks=blocks)
+    return condense_blocks(logs, rows, 10 * model.nb, extra=extra, blocks=blocks, weights=weights)
 
 
 class BaseParameters(eqx.Module):
@@ -221,12 +225,14 @@ def base_parameters(model: Model, terms=(), *, v_s: float = 0.01, seed: int = 0)
 class LeastSquares(eqx.Module):
     """Result of `least_squares`: base parameters with standard deviations. No body may exist that has them.
 
-    - `base`: which combinations; `values`, `std`, `nominal` (nbase,): fitted, standard deviation, of the model given.
+    - `base`: which combinations; `values`, `std`, `nominal` (nbase,): fitted, standard deviation, of the model given. Standard
+      deviations count blocks of consecutive samples, as in `Intervals`; `factor`: a 95 % interval is plus and minus this many.
     - `parameters` (10 nb + 4 nv,): one x with these values, the one nearest to the model's; its numbers mean nothing
       alone.
     - `sigma`: root mean square of the (weighted) residual; `condition`: of the regressor with columns of unit length;
       `rank`: combinations that the log excites, at most nbase.
-    - `covariance` (nbase, nbase).
+    - `covariance` (nbase, nbase) for independent errors of all samples, which those of a filtered log are not: how combinations
+      hang together, not how well they are known.
     """
 
     base: BaseParameters
@@ -238,6 +244,7 @@ class LeastSquares(eqx.Module):
     sigma: float
     condition: float
     rank: int
+    factor: float
     model: Model
     terms: tuple[str, ...] = eqx.field(static=True)
     v_s: float = eqx.field(static=True)
@@ -273,8 +280,16 @@ class LeastSquares(eqx.Module):
         return "\n".join(lines)
 
 
+@on_one_thread()
 def least_squares(
-    model: Model, log: Log | Sequence[Log], terms=TERMS, *, v_s: float = 0.01, weights=None, rcond: float = 1e-6
+    model: Model,
+    log: Log | Sequence[Log],
+    terms=TERMS,
+    *,
+    v_s: float = 0.01,
+    weights=None,
+    rcond: float = 1e-6,
+    blocks: int = 20,
 ) -> LeastSquares:
     """Base parameters, friction and rotor inertia by linear least squares on the torques: min |weights (W x - tau)|^2.
 
@@ -285,9 +300,9 @@ def least_squares(
     - `weights` (nv,): one over the noise of each joint's torque; ones by default.
     - `rcond`: directions whose singular value is below this times the largest are not excited by the log; along them
       the model's values stay.
+    - `blocks`: consecutive samples are cut into about this many blocks, whose scatter gives the standard deviations.
 
-    **Returns:** `LeastSquares`. Standard deviations hold for white noise on the torques; filtered samples are
-    correlated, and the true ones are then larger by about the root of the correlation length in samples.
+    **Returns:** `LeastSquares`.
 
     **Raises:** ValueError when log and model do not fit together or the log has fewer rows than combinations.
 
@@ -296,7 +311,9 @@ def least_squares(
     terms = check_terms(terms, v_s)
     logs = as_logs(log, model)
     base = base_parameters(model, terms, v_s=v_s)
-    condensed = condense(model, logs, v_s=v_s, weights=weights)
+    weights = check_weights(weights, model.nv)
+    parts = condense_model(model, logs, v_s=v_s, blocks=blocks)
+    condensed = condensed_rows(parts.rows(weights), parts.count())
     if condensed.rows <= len(base):
         samples = sum(map(len, logs))
         raise ValueError(f"the log has {samples} samples of {model.nv} torques, too few for {len(base)} combinations")
@@ -308,7 +325,11 @@ def least_squares(
     rest = condensed.rest + fit.rest
     sigma = float(np.sqrt(rest / (condensed.rows - fit.rank)))
     covariance = sigma**2 * fit.half @ fit.half.T
-    std = np.where(fit.unknown, np.inf, np.sqrt(np.diag(covariance)))
+    places = columns[base.independent]
+    fitted = x0.copy()
+    fitted[places] += fit.change
+    std, factor = _scatter(parts, fitted, places, fit.half, weights)
+    std = np.where(fit.unknown, np.inf, std)
     nominal = base.values(x0[columns])
     parameters = x0.copy()
     parameters[columns] += np.linalg.pinv(base.matrix) @ fit.change
@@ -322,10 +343,24 @@ def least_squares(
         sigma=sigma,
         condition=fit.condition,
         rank=fit.rank,
+        factor=factor,
         model=model,
         terms=terms,
         v_s=float(v_s),
     )
+
+
+def _scatter(blocks: Blocks, x: np.ndarray, places, half: np.ndarray, weights) -> tuple[np.ndarray, float]:
+    """Standard deviations of x[places] from groups of blocks left out in turn, and the factor of a 95 % interval.
+
+    In coordinates y with x[places] = half y, in which all samples together have the curvature 1.
+    """
+    groups = block_groups(len(blocks))
+    slopes = blocks.scores(x, weights)[:, places] @ half
+    grams = np.einsum("pi,bpq,qj->bij", half, blocks.grams(weights)[:, places][:, :, places], half, optimize=True)
+    slopes, grams = (np.stack([part[group].sum(axis=0) for group in groups]) for part in (slopes, grams))
+    moves, _ = jackknife(grams, slopes, np.zeros((half.shape[1],) * 2))
+    return np.sqrt(np.sum((half @ moves) ** 2, axis=1)), student(len(groups) - 1)
 
 
 def noise_level(condensed: Condensed, *, rcond: float = 1e-9) -> float:

@@ -6,15 +6,16 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxdyn.identify.chart import check_bodies
-from jaxdyn.identify.feasible import check_prior, signal_sizes
+from jaxdyn.identify.chart import check_bodies, make_chart
+from jaxdyn.identify.feasible import check_prior, placed, signal_sizes
 from jaxdyn.identify.friction import TERMS
 from jaxdyn.identify.intervals import Intervals, intervals
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.one_fit import Data, Estimate, Setting, fit_condensed, gather
 from jaxdyn.identify.regression import check_weights, regressor
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.selection import PRIORS, VELOCITIES, Choice, Search, folds, search
+from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, folds, search
+from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import EXTRA, ExtraTorque, TorqueTerm, split_terms
 from jaxdyn.model.tree import Model
 
@@ -41,6 +42,7 @@ class RobotFit(eqx.Module):
     terms: tuple
 
 
+@on_one_thread()
 def fit_robot(
     model: Model,
     log: Log | Sequence[Log],
@@ -49,6 +51,7 @@ def fit_robot(
     v_s: float | str = "auto",
     prior: float | str = "auto",
     weights: Any = "auto",
+    robust: float | str | None = "auto",
     inertia: str = "full",
     blocks: int = _BLOCKS,
     callback: Callable | None = None,
@@ -69,6 +72,9 @@ def fit_robot(
     - `v_s`: smoothing velocity of Coulomb friction (rad/s, m/s), or "auto".
     - `prior`: its weight, or "auto". `weights` (nv,): one over the noise of each torque, None for ones, or "auto": one over the
       root mean square of the residual, iterated.
+    - `robust`: errors beyond this many standard deviations of their joint's count by their size instead of its square (Huber's
+      loss): what no term explains and collisions then bend the fit less. None: all by their square; "auto": what foretells
+      left-out parts best, in squares, of these two and of 3 and 1.345.
     - `inertia`: as in `fit_torques`.
     - `blocks`: consecutive samples are cut into about this many blocks, whose scatter gives the intervals.
     - `callback(trial)` is called after each setting tried, with a `jaxdyn.identify.selection.Trial`.
@@ -92,70 +98,87 @@ def fit_robot(
         check_prior(prior)
     if blocks < 2:
         raise ValueError(f"blocks is {blocks}; give at least 2")
+    if robust not in (None, "auto") and (isinstance(robust, str) or not robust > 0):
+        raise ValueError(f'robust is {robust!r}; give a positive number of standard deviations, None or "auto"')
     problem = _Problem(model, logs, basic, extra, inertia, blocks)
     fixed = None if isinstance(weights, str) and weights == "auto" else check_weights(weights, model.nv)
     setting = Setting(
-        _V_S if isinstance(v_s, str) else float(v_s), where, _PRIOR if isinstance(prior, str) else float(prior)
+        _V_S if isinstance(v_s, str) else float(v_s),
+        where,
+        _PRIOR if isinstance(prior, str) else float(prior),
+        None if robust is None or isinstance(robust, str) else float(robust),
     )
-    problem.refine(setting, fixed, rounds=2 if extra or fixed is None else 1)
+    problem.refine(setting, fixed, rounds=2)
     trials, by = (), "given"
-    if is_auto or isinstance(v_s, str) or isinstance(prior, str):
-        parts, by = folds(problem.data(setting.v_s).blocks)
+    if is_auto or any(isinstance(value, str) for value in (v_s, prior, robust)):
+        parts, by = folds(problem.data(setting).blocks)
         trying = Search(problem.left_out, parts, problem.torque, callback)
         velocities = VELOCITIES if isinstance(v_s, str) else (setting.v_s,)
         priors = PRIORS if isinstance(prior, str) else (setting.prior,)
         names = [term.name for term in extra] if is_auto else []
-        setting = search(trying, setting, names, model.nv, velocities=velocities, priors=priors)
+        losses = ROBUST if isinstance(robust, str) else (setting.robust,)
+        setting = search(trying, setting, names, model.nv, velocities=velocities, priors=priors, losses=losses)
         trials = tuple(trying.trials.values())
-    estimate = problem.refine(setting, fixed, rounds=_ROUNDS if extra or fixed is None else 1)
-    data = problem.data(setting.v_s)
+    estimate = problem.refine(setting, fixed, rounds=_ROUNDS)
+    data = problem.data(setting)
     fit = problem.result(setting, estimate, data)
-    found = intervals(model, data, setting, estimate, problem.weights, basic)
+    found = intervals(model, data, setting, estimate, problem.weights, basic, problem.curved(setting))
     used = dict(setting.extra)
     chosen = (*basic, *((term, used[term.name]) for term in extra if term.name in used))
     return RobotFit(fit, problem.weights, Choice(setting, trials, by), found, chosen)
 
 
 class _Problem:
-    """Logs, and what is brought up to date between fits: weights of the joints, and the torque that gears carry."""
+    """Logs, and what is brought up to date between fits: weights of joints and of single torques, torques that gears carry."""
 
     def __init__(self, model: Model, logs: tuple[Log, ...], basic, extra: tuple[TorqueTerm, ...], inertia, blocks: int):
         self.model, self.logs, self.basic, self.extra = model, logs, basic, extra
         self.inertia, self.blocks = inertia, blocks
+        self.sample_weights: dict[float, list[np.ndarray]] = {}
         self.sizes, self.weights = signal_sizes(logs), np.ones(model.nv)
         self.loads = [np.zeros_like(np.asarray(log.tau, np.float64)) for log in logs]
         self.torque = float(sum(np.sum(np.asarray(log.tau, np.float64) ** 2) for log in logs))
-        self._data: dict[float, Data] = {}
+        self._data: dict[tuple, Data] = {}
         self._rows: dict[tuple, np.ndarray] = {}
+        self._charts: dict[float, tuple] = {}
 
-    def data(self, v_s: float) -> Data:
-        """Condensed logs for one v_s."""
-        if v_s not in self._data:
-            self._data[v_s] = gather(self.model, self.logs, v_s, self.extra, self.loads, self.blocks)
-        return self._data[v_s]
+    def data(self, setting: Setting) -> Data:
+        """Condensed logs for the v_s and the loss of a setting."""
+        weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
+        key = setting.v_s, None if weights is None else setting.robust
+        if key not in self._data:
+            self._data[key] = gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, weights)
+        return self._data[key]
 
     def fit(self, setting: Setting, **options) -> Estimate:
         """One fit, of all blocks unless the options of `fit_condensed` say otherwise."""
-        data = self.data(setting.v_s)
-        return fit_condensed(
-            self.model, data, setting, self.sizes, self.basic, self.weights, inertia=self.inertia, **options
-        )
+        v_s, data = setting.v_s, self.data(setting)
+        if v_s not in self._charts:
+            chart, point = make_chart(self.model, self.basic, v_s, self.inertia, *self.sizes)
+            self._charts[v_s] = chart, np.asarray(point.s, np.float64)
+        return fit_condensed(*self._charts[v_s], data, setting, self.sizes, self.weights, **options)
 
     def left_out(self, setting: Setting, part: np.ndarray) -> np.ndarray:
-        """Squared errors (nv,) on some blocks, of a fit to the others. No more digits than the choice needs."""
-        blocks, key = self.data(setting.v_s).blocks, (setting.v_s, tuple(part.tolist()))
+        """Squared errors (nv,) on some blocks, of a fit to the others. No more digits than the choice needs.
+
+        A robust loss takes the weights of single torques from the first setting that asks for it.
+        """
+        if setting.robust is not None and setting.robust not in self.sample_weights:
+            self.reweigh(setting)
+        blocks, key = self.data(setting).blocks, (setting.v_s, setting.robust, tuple(part.tolist()))
         rest = np.setdiff1d(np.arange(len(blocks)), part)
         if key not in self._rows:
             self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
         found = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
-        return blocks.squares(found.x, part).sum(axis=0)
+        return self.data(setting._replace(robust=None)).blocks.squares(found.x, part).sum(axis=0)
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
         """Fit some times over; after each but the last, update weights and loads."""
         if fixed is not None:
             self.weights = fixed
         self._rows = {}
-        for left in reversed(range(rounds)):
+        is_iterated = bool(self.extra) or fixed is None or setting.robust is not None
+        for left in reversed(range(rounds if is_iterated else 1)):
             estimate = self.fit(setting)
             if not left:
                 return estimate
@@ -164,10 +187,33 @@ class _Problem:
             if any(term.needs_load for term in self.extra):
                 self.loads = [self._load(log, estimate.x) for log in self.logs]
                 self._data = {}
+            if setting.robust is not None:
+                self._weigh(setting, estimate)
         raise ValueError(f"rounds is {rounds}")
 
+    def reweigh(self, setting: Setting, rounds: int = 2) -> None:
+        """Bring the weights of single torques up to date for a setting with a robust loss."""
+        for _ in range(rounds):
+            self._weigh(setting, self.fit(setting))
+
+    def curved(self, setting: Setting) -> Data | None:
+        """The logs without the torques beyond the threshold of a robust loss, where it has no curvature."""
+        weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
+        if weights is None:
+            return None
+        kept = [np.where(weight < 1, 0.0, 1.0) for weight in weights]
+        return gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, kept)
+
+    def _weigh(self, setting: Setting, estimate: Estimate) -> None:
+        fit, threshold = self.result(setting, estimate, self.data(setting)), setting.robust
+        assert threshold is not None
+        errors = [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
+        self.sample_weights[threshold] = huber_weights(errors, threshold)
+        self._data = {key: data for key, data in self._data.items() if key[1] != threshold}
+        self._rows = {key: rows for key, rows in self._rows.items() if key[1] != threshold}
+
     def _new_weights(self, setting: Setting, estimate: Estimate) -> np.ndarray:
-        blocks = self.data(setting.v_s).blocks
+        blocks = self.data(setting).blocks
         rms = np.sqrt(blocks.squares(estimate.x).sum(axis=0) / blocks.samples.sum())
         # A torque that is fitted exactly, or never moved, gets the largest weight of the others, not an infinite one.
         weights = 1 / np.maximum(rms, 1e-3 * rms.max(initial=0) or 1.0)
@@ -180,7 +226,8 @@ class _Problem:
 
     def result(self, setting: Setting, estimate: Estimate, data: Data) -> Fit:
         """The fit as others are given."""
-        model, friction = estimate.chart.fitted(self.model, estimate.point)
+        chart, point = placed(estimate.chart, estimate.minimum.origin, estimate.minimum.s)
+        model, friction = chart.fitted(self.model, point)
         used = dict(setting.extra)
         coefficients = estimate.x[data.basic :].reshape(-1, self.model.nv)
         edges = dict(zip(data.counts, np.cumsum((0, *data.counts.values()))[:-1], strict=True))
@@ -192,11 +239,22 @@ class _Problem:
             model=model,
             friction=friction,
             nominal=self.model,
-            history=estimate.history,
-            result=estimate.result,
+            history=estimate.minimum.history,
+            result=estimate.minimum.result,
             method="torque fit by newton",
             terms=(*self.basic, *(term.name for term in terms)),
             sigma=estimate.sigma,
             extra=extra,
             as_measured=True,
         )
+
+
+def huber_weights(errors: Sequence[np.ndarray], threshold: float) -> list[np.ndarray]:
+    """Weights (n, nv) of each log's torques whose squares make Huber's loss: sqrt(min(1, threshold scale / |error|)).
+
+    The scale of each torque is 1.4826 times the median size of its errors over all logs, which is the standard deviation of
+    normal ones.
+    """
+    scale = 1.4826 * np.median(np.abs(np.concatenate(errors)), axis=0)
+    limit = threshold * np.where(scale > 0, scale, np.inf)
+    return [np.sqrt(np.where(np.abs(x) > limit, limit / np.maximum(np.abs(x), 1e-300), 1.0)) for x in errors]

@@ -1,4 +1,4 @@
-"""Smoothing velocity, extra torque terms and prior weight by cross-validation over logs, or over blocks of them.
+"""Smoothing velocity, loss, extra torque terms and prior weight by cross-validation over logs, or over blocks of them.
 
 Every setting is fitted with one part of the blocks left out in turn, and judged by its error there: the mean over the torques of
 the logarithm of their squared errors, which asks for the same share of improvement of a wrist as of a shoulder.
@@ -14,6 +14,8 @@ from jaxdyn.identify.one_fit import Setting
 
 VELOCITIES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
 PRIORS = (0.1, 1.0, 10.0, 100.0, 1000.0)
+# Thresholds of Huber's loss, in standard deviations: 1.345 is the usual one, 3 leaves all but outliers alone.
+ROBUST = (None, 3.0, 1.345)
 _FOLDS = 5
 # A term stays at a joint where it lowers the squared error on what was left out by this share, and in most of the parts.
 _WORTH, _MOST = 0.01, 0.6
@@ -77,10 +79,18 @@ class Search:
 
 
 def search(
-    search: Search, start: Setting, extra: Sequence[str], nv: int, *, velocities=VELOCITIES, priors=PRIORS
+    search: Search,
+    start: Setting,
+    extra: Sequence[str],
+    nv: int,
+    *,
+    velocities=VELOCITIES,
+    priors=PRIORS,
+    losses=ROBUST,
 ) -> Setting:
-    """Coordinate descent: v_s, then terms joint by joint in order of what they gain, then the prior, then v_s again."""
+    """Coordinate descent: v_s, the loss, terms joint by joint in order of what they gain, the prior, v_s and the loss again."""
     setting = search.best([start._replace(v_s=v_s) for v_s in velocities])
+    setting = search.best([setting._replace(robust=threshold) for threshold in losses])
     remaining = list(extra)
     while remaining:
         before = search(setting)
@@ -98,7 +108,8 @@ def search(
         setting = following
         remaining.remove(setting.extra[-1][0])
     setting = search.best([setting._replace(prior=prior) for prior in priors])
-    return search.best([setting._replace(v_s=v_s) for v_s in velocities])
+    setting = search.best([setting._replace(v_s=v_s) for v_s in velocities])
+    return search.best([setting._replace(robust=threshold) for threshold in losses])
 
 
 def helped(before: np.ndarray, after: np.ndarray) -> tuple[int, ...]:

@@ -12,6 +12,8 @@ from jaxdyn.model.tree import Model
 _TURNS, _OFF = 3.0, 20.0
 # A joint whose velocity stays below this share of the fastest one's is at rest.
 _STILL = 1e-4
+# Below this share of its own largest velocity a joint has not begun to move; from this share of the error on it is worth a word.
+_REST, _MUCH = 0.01, 0.5
 
 
 def suspicions(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
@@ -53,6 +55,27 @@ def suspicions(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
         lines.append(
             f"{', '.join(still)} stand still: their friction and rotor inertia stay near the file's, or mean nothing"
         )
+    return lines
+
+
+def at_rest(log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:
+    """Sentences about joints whose errors (n, nv) are for the most part those of a start at rest.
+
+    A joint that stands still is held by friction, whose torque is then anything within its level and depends on how the joint
+    came there. No term foretells it, least of all before the first motion of a log.
+    """
+    lines = []
+    v, t = np.abs(np.asarray(log.v, np.float64)), np.asarray(log.t, np.float64)
+    for j, label in enumerate(labels):
+        moving = v[:, j] > _REST * v[:, j].max(initial=0)
+        start = int(np.argmax(moving)) if moving.any() else 0
+        total = float(np.sum(residual[:, j] ** 2))
+        share = float(np.sum(residual[:start, j] ** 2)) / total if total > 0 else 0.0
+        if start > 1 and share > _MUCH:
+            lines.append(
+                f"{label} stands still for the first {t[start] - t[0]:.2g} s, where {100 * share:.0f} % of the power of its "
+                "error is: no term foretells friction at rest; cut the log there, or move before you record"
+            )
     return lines
 
 

@@ -12,4 +12,5 @@ from jaxdyn.io.mjcf import load_mjcf as load_mjcf
 from jaxdyn.io.sdf import load_sdf as load_sdf
 from jaxdyn.io.urdf import load_urdf as load_urdf
 from jaxdyn.io.urdf import urdf_inertia_report as urdf_inertia_report
+from jaxdyn.io.urdf_write import joint_torques as joint_torques
 from jaxdyn.io.urdf_write import save_urdf as save_urdf

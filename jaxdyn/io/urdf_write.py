@@ -2,6 +2,7 @@
 
 import os
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,9 @@ class _Edge(NamedTuple):
     body: int | None
 
 
-def save_urdf(model: Model, path: str | os.PathLike) -> None:
+def save_urdf(
+    model: Model, path: str | os.PathLike, *, torques: Mapping[str, Mapping[str, float]] | None = None
+) -> None:
     """Write a model as a URDF file; `load_urdf` gives the same model back, to rounding.
 
     Bodies become links, other frames become links on fixed joints; what was merged stays merged. A single root body on
@@ -35,9 +38,13 @@ def save_urdf(model: Model, path: str | os.PathLike) -> None:
     `mimic="couple"`), armature an attribute of `<dynamics>`; gravity has no place in the file. Infinite limits are
     written as the largest double, because readers of URDF take no "inf".
 
+    `torques`: of joints by name, numbers of torques that URDF has no place for, as {"shoulder": {"offset": 0.3}}. They go into
+    an element `<jaxdyn>` below `<robot>`, which other readers of URDF pass over; `jaxdyn.io.joint_torques` reads them back.
+
     **Raises:** ValueError naming the joint or body for what URDF cannot express: helical and spherical joints, limits
     of planar and free joints, friction or armature that differs between the directions of one joint, first moments
-    without mass. OSError when the file cannot be written.
+    without mass; for `torques` of joints that the model does not have, or numbers that are not finite.
+    OSError when the file cannot be written.
     """
     check_shapes(model)
     path = as_path(path)
@@ -48,9 +55,46 @@ def save_urdf(model: Model, path: str | os.PathLike) -> None:
         _write_link(robot, link, inertias.get(link))
     for edge in edges:
         _write_joint(robot, model, edge)
+    if torques:
+        _write_torques(robot, model, torques)
     ET.indent(robot)
     with replacing(path) as part:
         ET.ElementTree(robot).write(part, encoding="utf-8", xml_declaration=True)
+
+
+def joint_torques(path: str | os.PathLike) -> dict[str, dict[str, float]]:
+    """Numbers of joints' torques that `save_urdf` wrote beside what URDF has a place for; empty where the file has none.
+
+    **Raises:** ValueError for a file that is no XML, or a number that is none, with the joint.
+    """
+    path = as_path(path)
+    try:
+        root = ET.parse(path).getroot()
+    except ET.ParseError as error:
+        raise ValueError(f"{path}: {error}") from None
+    result: dict[str, dict[str, float]] = {}
+    for joint in root.iterfind("jaxdyn/joint"):
+        numbers = dict(joint.attrib)
+        name = numbers.pop("name", "")
+        try:
+            result[name] = {key: float(value) for key, value in numbers.items()}
+        except ValueError as error:
+            raise ValueError(f"{path}: <jaxdyn> of joint {name!r}: {error}") from None
+    return result
+
+
+def _write_torques(robot: ET.Element, model: Model, torques: Mapping[str, Mapping[str, float]]) -> None:
+    unknown = sorted(set(torques) - set(model.joint_names))
+    if unknown:
+        raise ValueError(
+            f"torques: {', '.join(unknown)} are no joints of {model.name!r}: {', '.join(model.joint_names)}"
+        )
+    element = ET.SubElement(robot, "jaxdyn")
+    for joint, numbers in torques.items():
+        values = {name: float(value) for name, value in numbers.items()}
+        if not np.isfinite(list(values.values())).all():
+            raise ValueError(f"torques of joint {joint!r} are {values}; they must be finite")
+        ET.SubElement(element, "joint", name=joint, **{name: repr(value) for name, value in values.items()})
 
 
 def _edges(model: Model) -> tuple[str, list[_Edge]]:

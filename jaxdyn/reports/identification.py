@@ -17,6 +17,7 @@ from jaxdyn.identify import (
     parameter_names,
     torque_error,
 )
+from jaxdyn.identify.identifiability import Identifiability, Whiteness, whiteness
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.model.tree import Model
@@ -41,6 +42,11 @@ class Judged(NamedTuple):
         return np.sqrt(np.mean((self.predicted - np.asarray(self.log.tau)) ** 2, axis=0))
 
     @property
+    def whiteness(self) -> Whiteness:
+        """How far the error is from independent noise."""
+        return whiteness(self.log, self.predicted - np.asarray(self.log.tau, np.float64))
+
+    @property
     def percent_by_joint(self) -> np.ndarray:
         """Error of each torque in per cent of its own root mean square (nv,); NaN where none was measured."""
         measured = np.sqrt(np.mean(np.asarray(self.log.tau) ** 2, axis=0))
@@ -52,7 +58,8 @@ class Findings(NamedTuple):
 
     `result`: what is written, fitted to all training logs. `tests`: logs, or parts of logs, that were not fitted, under the fit
     that is to be judged; `train`: what that fit was made from; `final`: all training logs under `result`. `is_refit`: whether
-    `result` is another fit than the one judged. `choice`: how its setting was chosen, on `train`; None for other fits.
+    `result` is another fit than the one judged. `told`: what the training logs can tell.
+    `choice`: how its setting was chosen, on `train`; None for other fits.
     """
 
     model: Model
@@ -63,6 +70,7 @@ class Findings(NamedTuple):
     outcome: str
     is_refit: bool
     warnings: list[str]
+    told: Identifiability
     choice: Choice | None = None
 
     @property
@@ -114,6 +122,7 @@ def content(findings: Findings, settings: dict[str, Any]) -> dict[str, Any]:
         },
         "test_rms": findings.tests[0].rms.tolist(),
         "warnings": findings.warnings,
+        "identifiability": _told(findings.told),
         "terms": list(fit.terms),
         "friction": {term: values.tolist() for term, values in findings.friction.items()},
         "base_parameters": {
@@ -138,11 +147,11 @@ def _add_robot(found: dict[str, Any], result: RobotFit, choice: Choice, model: M
     found["chosen"] = {
         "v_s": setting.v_s,
         "prior": setting.prior,
+        "robust": setting.robust,
         "extra_terms": {name: [model_joint(model, j) for j in joints] for name, joints in setting.extra},
         "by": choice.by,
         "trials": [
-            {"v_s": t.setting.v_s, "prior": t.setting.prior, "extra_terms": dict(t.setting.extra), "percent": t.percent}
-            for t in choice.trials
+            {**t.setting._asdict(), "extra": dict(t.setting.extra), "percent": t.percent} for t in choice.trials
         ],
     }
     found["extra_terms"] = {} if extra is None else extra.named
@@ -185,6 +194,19 @@ def _errors(one: Judged) -> dict[str, Any]:
         "rms_by_joint": one.rms.tolist(),
         "nominal_percent": torque_error(one.nominal, one.log.tau),
         "samples": len(one.log),
+        "error_lasts_seconds": one.whiteness.lasting.tolist(),
+        "worth_independent_samples": one.whiteness.worth.tolist(),
+    }
+
+
+def _told(told: Identifiability) -> dict[str, Any]:
+    return {
+        "rank": told.rank,
+        "combinations": len(told.base),
+        "condition": told.condition if np.isfinite(told.condition) else None,
+        "weakest": [direction._asdict() for direction in told.weakest],
+        "not_excited": list(told.silent),
+        "told_by_no_motion": list(told.unidentifiable),
     }
 
 

@@ -42,6 +42,11 @@ def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title:
             svg(figure, f"torque{number}"),
             svg(_spectrum(one, labels), f"spectrum{number}"),
         ]
+    parts += [
+        "<h2>What the logs tell</h2>",
+        *(f"<p>{escaped(line)}.</p>" for line in findings.told.summary().split("\n")),
+    ]
+    parts += [_lasting(findings, labels)]
     parts += _robot(findings, labels) if isinstance(findings.result, RobotFit) else []
     parts += ["<h2>Friction and rotors</h2>", _friction(findings, labels, units)]
     return "\n".join([*parts, "</body></html>\n"])
@@ -54,6 +59,16 @@ def _errors(findings: Findings, labels: Sequence[str]) -> str:
         for one in group
     ]
     return html_table(("log", "", "samples", "all", *labels), rows)
+
+
+def _lasting(findings: Findings, labels: Sequence[str]) -> str:
+    """How long errors last, of each log and joint."""
+    rows = [
+        (one.name, str(len(one.log)), *(f"{x:.2g} s ({n:.0f})" for x, n in zip(*one.whiteness, strict=True)))
+        for one in (*findings.tests, *findings.train)
+    ]
+    note = "How long errors last, and in brackets how many independent samples the log is then worth"
+    return f"<p class='note'>{note}.</p>" + html_table(("log", "samples", *labels), rows)
 
 
 def _thinned(one: Judged) -> Judged:
@@ -79,6 +94,7 @@ def _spectrum(one: Judged, labels: Sequence[str]) -> Any:
         for x, colour, label in ((measured, GREY, "measured"), (one.predicted - measured, RED, "left over")):
             size = np.abs(np.fft.rfft(window * (x - x.mean(axis=0)), axis=0))[1:, j]
             ax.loglog(frequency, size / len(t), color=colour, linewidth=0.9, label=label)
+        ax.minorticks_off()  # drawing hundreds of them would take most of the page's time
         ax.set_title(labels[j], fontsize=9)
         if j + columns >= count:
             ax.set_xlabel("frequency (Hz)")
@@ -93,10 +109,12 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
     assert isinstance(result, RobotFit)
     choice = findings.choice or result.choice
     setting, trials, base = choice.setting, choice.trials, result.intervals.base
+    loss = "squares" if setting.robust is None else f"Huber's loss beyond {setting.robust:g} standard deviations"
     extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
     parts = [
         "<h2>What was chosen</h2>",
-        f"<p>v_s {setting.v_s:g}, prior {setting.prior:g}; terms beyond viscous and Coulomb friction: {escaped(extra)}.</p>",
+        f"<p>v_s {setting.v_s:g}, prior {setting.prior:g}, {loss}; terms beyond viscous and Coulomb friction: "
+        f"{escaped(extra)}.</p>",
     ]
     if trials:
         cells = [
@@ -104,6 +122,7 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
                 f"{t.percent:.3f}",
                 f"{t.setting.v_s:g}",
                 f"{t.setting.prior:g}",
+                "squares" if t.setting.robust is None else f"{t.setting.robust:g}",
                 "; ".join(f"{name} {','.join(map(str, joints))}" for name, joints in t.setting.extra) or "none",
             )
             for t in sorted(trials, key=lambda t: t.score)
@@ -111,7 +130,7 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
         parts += [
             f"<p class='note'>{len(trials)} settings, each judged on {escaped(choice.by)} left out in turn.</p>",
             "<details><summary>all of them, best first</summary>",
-            html_table(("error (%)", "v_s", "prior", "extra terms"), cells) + "</details>",
+            html_table(("error (%)", "v_s", "prior", "loss", "extra terms"), cells) + "</details>",
         ]
     cells = [
         (name, short(float(x)), short(float(result.intervals.factor * s), 2), source)

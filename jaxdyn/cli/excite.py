@@ -1,0 +1,92 @@
+"""`jaxdyn excite`: a motion that tells the parameters of a robot best, for `jaxdyn identify`."""
+
+import argparse
+
+from jaxdyn import identify
+from jaxdyn.cli.common import add_model_options, coordinate_labels, load_model, output_path, per_coordinate, table
+from jaxdyn.identify import TERMS
+from jaxdyn.identify.exciting import OBJECTIVES
+from jaxdyn.io import write_log
+
+HELP = "find a motion within limits that tells inertias and friction best"
+DESCRIPTION = """\
+Find a periodic motion of all joints (a finite Fourier series that starts at rest), within limits of position, velocity and
+torque, whose measured torques tell the robot's inertias and friction best, and write it for a controller.
+"""
+EPILOG = """\
+examples:
+  jaxdyn excite panda.urdf --lock panda_finger_joint1 panda_finger_joint2 --out motion.csv --plot motion.png
+  jaxdyn excite arm.urdf --period 20 --harmonics 8 --velocity 1.0 --torque 50 --objective condition --out motion.csv
+
+The CSV file has columns t, q_.., v_.., a_.. and tau_.., the torques that the file's own bodies need (N m). Run it, log q and
+tau, and give the log to `jaxdyn identify`. Contacts with the ground, or of the robot with itself, are not looked at: look at
+the motion before you run it.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("urdf", help="the robot; its limits of position, velocity and effort hold")
+    add_model_options(parser)
+    parser.add_argument("--out", metavar="FILE", help="write the motion, .csv or .npz")
+    parser.add_argument("--plot", metavar="FILE", help="draw it to FILE.png, .pdf or .svg")
+    parser.add_argument("--period", type=float, default=10.0, metavar="S", help="of the motion, s (default: 10)")
+    parser.add_argument("--periods", type=int, default=1, metavar="N", help="written one after the other (default: 1)")
+    parser.add_argument("--harmonics", type=int, default=5, metavar="N", help="of the series (default: 5)")
+    parser.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="rows a second (default: 100)")
+    parser.add_argument("--terms", nargs="*", choices=TERMS, default=TERMS, help="to be identified beside the bodies")
+    parser.add_argument("--objective", choices=OBJECTIVES, default="logdet", help="what is best (default: logdet)")
+    parser.add_argument("--margin", type=float, default=0.9, help="share of all limits that is used (default: 0.9)")
+    parser.add_argument(
+        "--velocity", nargs="+", type=float, metavar="V", help="limits instead of the file's, rad/s, m/s"
+    )
+    parser.add_argument("--torque", nargs="+", type=float, metavar="T", help="limits instead of the file's, N m, N")
+    parser.add_argument("--seed", type=int, default=0, help="of the random motions to start from (default: 0)")
+    parser.add_argument("--steps", type=int, default=300, metavar="N", help="of the search (default: 300)")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Search, say what it brings, write the motion."""
+    out, plot = (
+        output_path(args.out, (".csv", ".npz"), "--out"),
+        output_path(args.plot, (".png", ".pdf", ".svg"), "--plot"),
+    )
+    if not args.rate > 0 or args.periods < 1:
+        raise ValueError(f"--rate is {args.rate}, --periods is {args.periods}; give positive numbers")
+    model = load_model(args.urdf, args)
+    given = {
+        name: None if value is None else per_coordinate(model, value, f"--{name}")
+        for name, value in (("velocity", args.velocity), ("torque", args.torque))
+    }
+    found = identify.exciting_motion(
+        model,
+        args.terms,
+        period=args.period,
+        harmonics=args.harmonics,
+        objective=args.objective,
+        margin=args.margin,
+        seed=args.seed,
+        steps=args.steps,
+        **given,
+    )
+    log = found.log(args.rate, args.periods)
+    labels, units = coordinate_labels(model)
+    print(
+        f"condition of the regressor {found.condition:.4g}, of a random motion within the same limits "
+        f"{found.start_condition:.4g}; log-det of the information larger by {found.logdet:.3g}"
+    )
+    print("limits used: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.used.items()))
+    extremes = [log.q.min(axis=0), log.q.max(axis=0), abs(log.v).max(axis=0), abs(log.tau).max(axis=0)]
+    rows = [
+        [label, *(f"{float(x[j]):.3g}" for x in extremes), unit]
+        for j, (label, unit) in enumerate(zip(labels, units, strict=True))
+    ]
+    print(table(["joint", "lowest", "highest", "fastest", "torque", "unit"], rows))
+    if out is not None:
+        write_log(out, log)
+        print(f"Wrote {out}.")
+    if plot is not None:
+        from jaxdyn.reports.plotting import motion_figure
+
+        motion_figure(model, log.t, log.q[None], log.v[None], log.tau[None]).savefig(plot)
+        print(f"Wrote {plot}.")

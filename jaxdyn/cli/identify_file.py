@@ -1,0 +1,65 @@
+"""`jaxdyn identify fit.toml`: the options of the command in a file."""
+
+import argparse
+import tomllib
+from typing import Any
+
+from jaxdyn.model.arguments import as_path
+
+# Files, which are named as seen from the folder that the TOML file is in.
+_FILES = ("urdf", "log", "test_log", "payload_log", "out", "report", "html", "plot")
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that raises ValueError."""
+
+    def error(self, message):
+        raise ValueError(message)
+
+
+def with_file(args: argparse.Namespace, add_arguments) -> argparse.Namespace:
+    """The arguments with those of the TOML file `args.file` where the command line leaves the default.
+
+    **Raises:** ValueError, with the file, for broken TOML, a name that is no option, and a value that the option does not take.
+    """
+    if args.file is None:
+        return args
+    path = as_path(args.file, "file")
+    if path.suffix.lower() != ".toml":
+        raise ValueError(f"{path}: options are read from a file .toml; the robot is --urdf, a log --log")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: {error}") from None
+    parser = _Parser(add_help=False)
+    add_arguments(parser)
+    defaults = vars(parser.parse_args([]))
+    tokens: list[str] = []
+    for name, value in table.items():
+        if name.replace("-", "_") not in defaults or name == "file":
+            names = ", ".join(option.replace("_", "-") for option in defaults if option != "file")
+            raise ValueError(f"{path}: {name} is no option; options are {names}")
+        tokens += _tokens(name, value, path)
+    try:
+        given = vars(parser.parse_args(tokens))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    if given["file"] is not None:
+        raise ValueError(f"{path}: unrecognized arguments: {given['file']}; an option of one value has a list")
+    merged = vars(args) | {key: given[key] for key, value in defaults.items() if getattr(args, key) == value}
+    return argparse.Namespace(**merged | {"file": args.file})
+
+
+def _tokens(name: str, value: Any, path) -> list[str]:
+    """What one would write on the command line for one entry."""
+    option = f"--{name.replace('_', '-')}"
+    if isinstance(value, bool):
+        return [option] if value else []
+    values = value if isinstance(value, list) else [value]
+    if any(isinstance(item, bool | dict | list) for item in values):
+        raise ValueError(f"{path}: {name} is {value!r}; give a number, a string, or a list of them")
+    if name.replace("-", "_") in _FILES:
+        values = [path.parent / str(item) for item in values]
+    return [option, *map(str, values)] if isinstance(value, list) else [f"{option}={values[0]}"]

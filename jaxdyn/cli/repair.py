@@ -1,0 +1,59 @@
+"""Robots whose file gives some moving link no inertia at all, read for a fit that is to find it."""
+
+import argparse
+import pathlib
+import tempfile
+import xml.etree.ElementTree as ET
+
+from jaxdyn.cli.common import load_model
+from jaxdyn.model.tree import Model
+
+# What a link without inertia is given to start from: this share of the heaviest link's mass, as a ball of this radius (m).
+_SHARE, _RADIUS = 1e-2, 0.05
+
+
+def load_for_repair(path: str, args: argparse.Namespace) -> tuple[Model, list[str]]:
+    """The model, and the links that were given a small ball because the file could not be read without one.
+
+    **Raises:** ValueError as `load_model`, where such a ball does not help.
+    """
+    try:
+        return load_model(path, args), []
+    except ValueError:
+        try:
+            tree = ET.parse(path)
+        except (ET.ParseError, OSError):
+            tree = None
+        names = [] if tree is None else _give_balls(tree.getroot())
+        if tree is None or not names:
+            raise
+        with tempfile.TemporaryDirectory() as folder:
+            file = pathlib.Path(folder) / pathlib.Path(path).name
+            tree.write(file)
+            return load_model(str(file), args), names
+
+
+def _give_balls(robot: ET.Element) -> list[str]:
+    """Give links that a joint moves and that have no mass a ball; their names."""
+    moved = {
+        child.get("link")
+        for joint in robot.iterfind("joint")
+        if joint.get("type") != "fixed"
+        for child in joint.iterfind("child")
+    }
+    masses = [float(mass.get("value", 0)) for mass in robot.iterfind("link/inertial/mass")]
+    mass = _SHARE * (max(masses, default=0) or 1.0)
+    names = []
+    for link in robot.iterfind("link"):
+        given = link.find("inertial/mass")
+        if link.get("name") not in moved or (given is not None and float(given.get("value", 0)) > 0):
+            continue
+        for old in link.findall("inertial"):
+            link.remove(old)
+        inertial = ET.SubElement(link, "inertial")
+        ET.SubElement(inertial, "mass", value=repr(mass))
+        moment = repr(0.4 * mass * _RADIUS**2)
+        zero = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
+        ET.SubElement(inertial, "inertia", {"ixx": moment, "iyy": moment, "izz": moment, **zero})
+        names.append(str(link.get("name")))
+    return names

@@ -1,0 +1,122 @@
+"""What a log can tell: rank, condition and the weakest directions in words; how far what is left over is from noise."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdyn.identify.friction import TERMS
+from jaxdyn.identify.logs import Log, as_logs
+from jaxdyn.identify.regression import BaseParameters, base_parameters, condense, free_columns
+from jaxdyn.model.tree import Model
+
+# Parameters named of a direction, and the share of it below which one is left out.
+_NAMED, _SHARE = 4, 0.15
+
+
+class Direction(NamedTuple):
+    """A combination of base parameters: its singular value over the largest one, and its largest parts in words."""
+
+    strength: float
+    words: str
+
+
+class Identifiability(NamedTuple):
+    """What logs can tell of a robot.
+
+    - `base`: the combinations that torques can tell apart on any motion. `rank`: how many of them these logs excite.
+    - `condition`: of the regressor in them, columns of unit length, over the directions that are excited.
+    - `weakest`: the directions that are told worst, the worst first; those not excited at all have strength 0.
+    - `silent`: base parameters that the logs do not determine. `unidentifiable`: parameters that no motion can tell.
+    """
+
+    base: BaseParameters
+    rank: int
+    condition: float
+    weakest: list[Direction]
+    silent: tuple[str, ...]
+    unidentifiable: tuple[str, ...]
+
+    def summary(self) -> str:
+        """All of it in words."""
+        lines = [
+            f"the logs excite {self.rank} of the {len(self.base)} combinations that torques can tell apart, condition "
+            f"{self.condition:.4g}"
+            + (" (well above 100: weak directions follow the prior)" if self.condition > 300 else "")
+        ]
+        if self.silent:
+            lines.append(f"not excited by these logs: {', '.join(self.silent)}")
+        lines += [f"told worst ({d.strength:.2g} of the best): {d.words}" for d in self.weakest if d.strength > 0]
+        if self.unidentifiable:
+            lines.append(f"no motion tells, and the file's values stay: {', '.join(self.unidentifiable)}")
+        return "\n".join(lines)
+
+
+def identifiability(
+    model: Model, log: Log | Sequence[Log], terms=TERMS, *, v_s: float = 0.01, rcond: float = 1e-6, count: int = 3
+) -> Identifiability:
+    """What logs tell of the bodies and the terms of a model, whatever the torques in them.
+
+    **Arguments:** as `least_squares`; `count`: how many of the weakest directions are named.
+
+    **Returns:** `Identifiability`.
+
+    **Raises:** ValueError as `least_squares`.
+
+    Source: Gautier & Khalil (1992), "Exciting trajectories for the identification of base inertial parameters of robots".
+    """
+    logs = as_logs(log, model)
+    base = base_parameters(model, terms, v_s=v_s)
+    columns = free_columns(model.nb, model.nv, base_terms(terms))[base.independent]
+    A = condense(model, logs, v_s=v_s).R[:, columns]
+    scale = np.linalg.norm(A, axis=0)
+    scale[scale <= 1e-12 * scale.max(initial=0.0)] = np.inf
+    _, s, Vt = np.linalg.svd(A / scale, full_matrices=False)
+    rank = int(np.sum(s > rcond * s.max(initial=0.0)))
+    unknown = np.sum(Vt[rank:] ** 2, axis=0) > 1e-12
+    order = range(len(s) - 1, max(len(s) - 1 - count, -1), -1)
+    weakest = [Direction(float(s[i] / s[0]) if i < rank else 0.0, _words(Vt[i], base.names)) for i in order]
+    silent = tuple(name for name, is_unknown in zip(base.names, unknown, strict=True) if is_unknown)
+    condition = float(s[0] / s[rank - 1]) if rank else np.inf
+    return Identifiability(base, rank, condition, weakest, silent, base.unidentifiable)
+
+
+def base_terms(terms) -> tuple[str, ...]:
+    """Those of `TERMS` among terms."""
+    return tuple(term for term in ((terms,) if isinstance(terms, str) else terms) if term in TERMS)
+
+
+def _words(direction: np.ndarray, names: Sequence[str]) -> str:
+    order = [i for i in np.argsort(-np.abs(direction))[:_NAMED] if abs(direction[i]) > _SHARE]
+    signs = np.sign(direction[order[0]]) if order else 1.0
+    parts = [f"{signs * direction[i]:+.2f} {names[i]}" for i in order]
+    return " ".join(parts).removeprefix("+") + (" ..." if np.sum(direction[order] ** 2) < 0.9 else "")
+
+
+class Whiteness(NamedTuple):
+    """Of a residual (n, nv): how long errors of each torque last (s), and how many independent samples they are worth (nv,)."""
+
+    lasting: np.ndarray
+    worth: np.ndarray
+
+
+def whiteness(log: Log, residual: np.ndarray) -> Whiteness:
+    """How far what a fit leaves over is from independent errors.
+
+    The integrated correlation time, dt (1 + 2 sum of the autocorrelation up to its first zero), is dt for white noise; the
+    residual is worth the length of the log over it. The low-pass of `from_raw` alone leaves some 1 / (2 cutoff).
+
+    Source: Priestley (1981), "Spectral analysis and time series", section 5.3.
+    """
+    n, nv = residual.shape
+    step = float(log.t[-1] - log.t[0]) / max(n - 1, 1)
+    lasting = np.full(nv, step)
+    for j, x in enumerate((residual - residual.mean(axis=0)).T):
+        spectrum = np.abs(np.fft.rfft(x, 2 * n)) ** 2
+        correlation = np.fft.irfft(spectrum)[:n]
+        if not correlation[0] > 0:
+            continue
+        correlation = correlation / correlation[0]
+        end = int(np.argmax(correlation < 0)) or n
+        lasting[j] = step * max(1.0, 1 + 2 * float(correlation[1:end].sum()))
+    return Whiteness(lasting, n * step / lasting)

@@ -1,0 +1,42 @@
+"""Uncertainty from blocks of consecutive samples, each left out in turn (delete-a-group jackknife).
+
+Source: Efron (1982), "The jackknife, the bootstrap and other resampling plans".
+"""
+
+import numpy as np
+
+# Blocks left out together: the longer they are, the less errors in one have to do with those in the next.
+_TOGETHER = 2
+
+
+def block_groups(count: int) -> list[np.ndarray]:
+    """Numbers of the blocks that are left out together."""
+    return np.array_split(np.arange(count), max(2, count // _TOGETHER))
+
+
+def jackknife(grams: np.ndarray, slopes: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A root (n, groups) of the covariance of a minimum, each group of samples left out in turn, and the inverse Hessian (n, n).
+
+    `grams` (groups, n, n) and `slopes` (groups, n) are the groups' curvatures and slopes there, `curvature` (n, n) what stays.
+    """
+    H = grams.sum(axis=0) + curvature
+    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    scale = unit[:, None] * unit[None, :]
+    moves = np.stack(
+        [unit * (_inverse((H - gram) * scale) @ (unit * slope)) for gram, slope in zip(grams, slopes, strict=True)]
+    )
+    count = len(grams)
+    return (moves - moves.mean(axis=0)).T * np.sqrt((count - 1) / count), _inverse(H * scale) * scale
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Inverse of a symmetric matrix of unit diagonal; directions without curvature are taken as having that of rounding."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return (vectors / np.maximum(values, 1e-12)) @ vectors.T
+
+
+def student(freedoms: int) -> float:
+    """Half of a 95 % interval in standard deviations, by Student's t with so many degrees of freedom."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedoms, 0.975))
