@@ -2,6 +2,8 @@
 
 import argparse
 
+import numpy as np
+
 from jaxdyn import identify
 from jaxdyn.cli.common import add_model_options, coordinate_labels, load_model, output_path, per_coordinate, table
 from jaxdyn.identify import TERMS
@@ -54,10 +56,10 @@ def run(args: argparse.Namespace) -> None:
     if not args.rate > 0 or args.periods < 1:
         raise ValueError(f"--rate is {args.rate}, --periods is {args.periods}; give positive numbers")
     model = load_model(args.urdf, args)
-    given = {
-        name: None if value is None else per_coordinate(model, value, f"--{name}")
+    velocity, torque = (
+        None if value is None else per_coordinate(model, value, f"--{name}")
         for name, value in (("velocity", args.velocity), ("torque", args.torque))
-    }
+    )
     found = identify.exciting_motion(
         model,
         args.terms,
@@ -67,7 +69,8 @@ def run(args: argparse.Namespace) -> None:
         margin=args.margin,
         seed=args.seed,
         steps=args.steps,
-        **given,
+        velocity=velocity,
+        torque=torque,
     )
     log = found.log(args.rate, args.periods)
     labels, units = coordinate_labels(model)
@@ -76,7 +79,8 @@ def run(args: argparse.Namespace) -> None:
         f"{found.start_condition:.4g}; log-det of the information larger by {found.logdet:.3g}"
     )
     print("limits used: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.used.items()))
-    extremes = [log.q.min(axis=0), log.q.max(axis=0), abs(log.v).max(axis=0), abs(log.tau).max(axis=0)]
+    q, v, tau = (np.asarray(x) for x in (log.q, log.v, log.tau))
+    extremes = [q.min(axis=0), q.max(axis=0), abs(v).max(axis=0), abs(tau).max(axis=0)]
     rows = [
         [label, *(f"{float(x[j]):.3g}" for x in extremes), unit]
         for j, (label, unit) in enumerate(zip(labels, units, strict=True))
@@ -88,5 +92,5 @@ def run(args: argparse.Namespace) -> None:
     if plot is not None:
         from jaxdyn.reports.plotting import motion_figure
 
-        motion_figure(model, log.t, log.q[None], log.v[None], log.tau[None]).savefig(plot)
+        motion_figure(model, log.t, q[None], v[None], tau[None]).savefig(plot)
         print(f"Wrote {plot}.")

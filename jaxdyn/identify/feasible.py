@@ -182,13 +182,13 @@ def torque_noise(condensed: Condensed, sizes, sigma: float | None = None) -> flo
 def newton(model: Model, problem: Problem, point: Coordinates, steps: int, tolerance: float, callback=None):
     """The minimum by `interior.newton`: chart moved there, point, history of the loss, result."""
     chart = problem.chart
-    numbers = (np.asarray(x, np.float64) for x in (problem.R, problem.d))
-    host = interior.TorqueProblem(chart, *numbers, float(problem.rest), float(problem.prior))
-    watch = None
-    if callback is not None:
+    R, d = np.asarray(problem.R, np.float64), np.asarray(problem.d, np.float64)
+    host = interior.TorqueProblem(chart, R, d, float(problem.rest), float(problem.prior))
 
-        def watch(step, loss, origin, s):
-            callback(step, loss, placed(chart, origin, s)[0].fitted(model, placed(chart, origin, s)[1])[0])
+    def watch(step, loss, origin, s):
+        if callback is not None:
+            there, at = placed(chart, origin, s)
+            callback(step, loss, there.fitted(model, at)[0])
 
     resolution = float(jnp.finfo(problem.R.dtype).eps)
     found = interior.newton(host, np.asarray(point.s), steps, tolerance, watch, resolution)

@@ -39,7 +39,7 @@ def coefficients(cutoff: float, rate: float, order: int) -> tuple[np.ndarray, np
 
 def _forward(numerator: np.ndarray, denominator: np.ndarray, x: np.ndarray) -> np.ndarray:
     """One pass over samples (n, columns), whose first has always been there: constants pass unchanged."""
-    from scipy.linalg.blas import dtbsv
+    from scipy.linalg.blas import dtbsv  # pyright: ignore[reportAttributeAccessIssue]
 
     change = x - x[:1]
     driven = sum(b * np.concatenate([np.zeros((k, x.shape[1])), change[: len(x) - k]]) for k, b in enumerate(numerator))

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxdyn.identify.chart import check_bodies, make_chart
+from jaxdyn.identify.chart import Chart, check_bodies, make_chart
 from jaxdyn.identify.feasible import check_prior, placed, signal_sizes
 from jaxdyn.identify.friction import TERMS
 from jaxdyn.identify.intervals import Intervals, intervals
@@ -140,7 +140,7 @@ class _Problem:
         self.torque = float(sum(np.sum(np.asarray(log.tau, np.float64) ** 2) for log in logs))
         self._data: dict[tuple, Data] = {}
         self._rows: dict[tuple, np.ndarray] = {}
-        self._charts: dict[float, tuple] = {}
+        self._charts: dict[float, tuple[Chart, np.ndarray]] = {}
 
     def data(self, setting: Setting) -> Data:
         """Condensed logs for the v_s and the loss of a setting."""
@@ -156,7 +156,8 @@ class _Problem:
         if v_s not in self._charts:
             chart, point = make_chart(self.model, self.basic, v_s, self.inertia, *self.sizes)
             self._charts[v_s] = chart, np.asarray(point.s, np.float64)
-        return fit_condensed(*self._charts[v_s], data, setting, self.sizes, self.weights, **options)
+        chart, start = self._charts[v_s]
+        return fit_condensed(chart, start, data, setting, self.sizes, self.weights, **options)
 
     def left_out(self, setting: Setting, part: np.ndarray) -> np.ndarray:
         """Squared errors (nv,) on some blocks, of a fit to the others. No more digits than the choice needs.

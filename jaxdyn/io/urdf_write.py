@@ -94,7 +94,7 @@ def _write_torques(robot: ET.Element, model: Model, torques: Mapping[str, Mappin
         values = {name: float(value) for name, value in numbers.items()}
         if not np.isfinite(list(values.values())).all():
             raise ValueError(f"torques of joint {joint!r} are {values}; they must be finite")
-        ET.SubElement(element, "joint", name=joint, **{name: repr(value) for name, value in values.items()})
+        ET.SubElement(element, "joint", {"name": joint, **{name: repr(value) for name, value in values.items()}})
 
 
 def _edges(model: Model) -> tuple[str, list[_Edge]]:
