@@ -1,5 +1,4 @@
-"""Built-in mechanisms: a real arm and a real hand, and generators of chains and random trees."""
-"""Built-in mechanisms: real arms, a robot with legs, and generators of chains and random trees."""
+"""Built-in mechanisms: real arms, a real hand, a robot with legs, and generators of chains and random trees."""
 
 import jax
 import numpy as np
@@ -173,6 +172,9 @@ def allegro(*, gravity=GRAVITY, dtype=None) -> Model:
         builder.add_body(
             f"{parent}_tip", parent, "fixed", _ALLEGRO_TIP, joint_name=f"joint_{parent[5:]}_tip", pose=pose
         )
+    return builder.build()
+
+
 # Of each joint: name, place in the body that carries it and turn there about y, axis, largest angle, speed and torque; of its
 # body: mass, centre of mass, radius and length of a cylinder along z.
 _UR5 = (
