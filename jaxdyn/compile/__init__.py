@@ -35,6 +35,7 @@ from jaxdyn.compile.repair import is_rank_safe as is_rank_safe
 from jaxdyn.compile.repair import recompute_unless as recompute_unless
 from jaxdyn.compile.repair import repair_flagged as repair_flagged
 from jaxdyn.compile.repair import run_repaired as run_repaired
+from jaxdyn.compile.rows import map_rows as map_rows
 from jaxdyn.compile.rules import along as along
 from jaxdyn.compile.rules import implicit as implicit
 from jaxdyn.compile.versions import warn_of_version as _warn_of_version

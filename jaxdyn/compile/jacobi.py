@@ -244,4 +244,4 @@ def pseudo_inverse_by_rotations(matrix: jax.Array, tolerance: float) -> jax.Arra
     program = pseudo_inverse_program(*matrix.shape, matrix.dtype, float(tolerance))
     if mode.current() == "plain" or target is None:
         return program.as_operations(matrix.reshape(-1))[0].reshape(matrix.shape[::-1])
-    return kernel_p.bind(matrix.reshape(-1), program=program)[0].reshape(matrix.shape[::-1])
+    return kernel_p.bind(matrix.reshape(-1), program=program, rows=0)[0].reshape(matrix.shape[::-1])

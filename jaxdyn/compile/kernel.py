@@ -24,6 +24,7 @@ from jaxdyn.compile.expand import expand
 from jaxdyn.compile.graph import inlined
 from jaxdyn.compile.known import Known, partition, partition_traced
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
+from jaxdyn.compile.rows import is_row
 from jaxdyn.compile.trigonometry import cosine, sine
 
 try:
@@ -80,7 +81,7 @@ def run(
             mode.say_once(f"{_name_of(function)} runs on JAX's own operations: {found}")
         return by_jax()
     program, out_structure = found
-    results = kernel_p.bind(*(x.reshape(-1) if x.ndim != 1 else x for x in leaves), program=program)
+    results = kernel_p.bind(*(x.reshape(-1) if x.ndim != 1 else x for x in leaves), program=program, rows=0)
     shaped = [
         x if len(array.shape) == 1 else x.reshape(array.shape)
         for x, array in zip(results, program.outputs, strict=True)
@@ -246,23 +247,23 @@ kernel_p.multiple_results = True
 
 
 @functools.lru_cache(maxsize=1024)
-def _jitted(program):
-    return jax.jit(lambda *args: kernel_p.bind(*args, program=program))
+def _jitted(program, rows: int):
+    return jax.jit(lambda *args: kernel_p.bind(*args, program=program, rows=rows))
 
 
 @kernel_p.def_impl
-def _(*args, program):
+def _(*args, program, rows):
     # A kernel is always compiled: under `jax.disable_jit()` it would be called by itself for ever.
     with jax.disable_jit(False):
-        return _jitted(program)(*args)
+        return _jitted(program, rows)(*args)
 
 
 @kernel_p.def_abstract_eval
-def _(*avals, program):
+def _(*avals, program, rows):
     return sharding.results_of(avals, program.outputs)
 
 
-def _batched(args, axes, *, program):
+def _batched(args, axes, *, program, rows):
     """A new leading axis for what varies; what all samples share stays a row."""
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not batching.not_mapped)
     moved = [x if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
@@ -276,18 +277,19 @@ def _batched(args, axes, *, program):
         elif v and lead != inner:
             x = jnp.broadcast_to(x.reshape(size, *[1] * len(inner), x.shape[-1]), (size, *inner, x.shape[-1]))
         full.append(x)
-    results = kernel_p.bind(*full, program=program)
+    rows += is_row() and not mode.is_expanding()
+    results = kernel_p.bind(*full, program=program, rows=rows)
     return results, [0] * len(results)
 
 
 batching.primitive_batchers[kernel_p] = _batched
 
 
-def _jvp(primals, tangents, *, program):
-    results = kernel_p.bind(*primals, program=program)
+def _jvp(primals, tangents, *, program, rows):
+    results = kernel_p.bind(*primals, program=program, rows=rows)
     moving = tuple(type(step) is not ad.Zero for step in tangents)
     change = derive.tangent(program, moving)
-    changes = iter(kernel_p.bind(*primals, *(x for x in tangents if type(x) is not ad.Zero), program=change))
+    changes = iter(kernel_p.bind(*primals, *(x for x in tangents if type(x) is not ad.Zero), program=change, rows=rows))
     out = []
     for x, array in zip(results, program.outputs, strict=True):
         out.append(next(changes) if array.dtype.kind == "f" else ad.Zero(ShapedArray(x.shape, jax.dtypes.float0)))
@@ -297,12 +299,14 @@ def _jvp(primals, tangents, *, program):
 ad.primitive_jvps[kernel_p] = _jvp
 
 
-def _transpose(cotangents, *operands, program):
+def _transpose(cotangents, *operands, program, rows):
     linear = [ad.is_undefined_primal(x) for x in operands]
     given = [type(x) is not ad.Zero for x in cotangents]
     backwards = derive.transposed(program, linear, given)
     fixed = [x for x, moves in zip(operands, linear, strict=True) if not moves]
-    found = iter(kernel_p.bind(*fixed, *(x for x in cotangents if type(x) is not ad.Zero), program=backwards))
+    found = iter(
+        kernel_p.bind(*fixed, *(x for x in cotangents if type(x) is not ad.Zero), program=backwards, rows=rows)
+    )
     out = []
     for x, moves in zip(operands, linear, strict=True):
         if not moves:
@@ -330,7 +334,7 @@ _OPERATIONS: dict[str, Callable] = {
 } | {name: getattr(lax, name) for name in COMPARISONS}  # fmt: skip
 
 
-def as_operations(*args, program: Program):
+def as_operations(*args, program: Program, rows: int = 0):
     """The program's numbers as operations of JAX on arrays over the batch."""
     if not isinstance(program, Program):
         return program.as_operations(*args)
@@ -366,30 +370,42 @@ def as_operations(*args, program: Program):
 _lower_elsewhere = mlir.lower_fun(as_operations, multiple_results=True)
 
 
-def _lower_on_cpu(ctx, *operands, program):
+def _lower_on_cpu(ctx, *operands, program, rows):
     lead = ctx.avals_out[0].shape[:-1] if ctx.avals_out else ()
     uniform = [bool(lead) and len(x.shape) == 1 for x in ctx.avals_in]
-    samples = math.prod(lead) if all(isinstance(n, int) for n in lead) else None
+    if any(uniform) and not all(uniform) and len(lead) == rows:  # the kernel of one sample shares nothing
+        return _lower_repeated(ctx, *operands, program=program, rows=rows)
+    apart = lead[: len(lead) - rows]  # rows of one sample go through the kernel of one sample
+    samples = math.prod(apart) if all(isinstance(n, int) for n in apart) else None
     try:
         assert target is not None
         number = target.kernel(program, target.width_of(program, samples), uniform)
     except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
         mode.say_once(f"functions run on JAX's own operations: {reason}")
-        return _lower_elsewhere(ctx, *operands, program=program)
+        return _lower_elsewhere(ctx, *operands, program=program, rows=rows)
     if sharding.may_be_divided(ctx.avals_in, lead):
-        return _lower_with_last_axis(ctx, *operands, program=program)
+        return _lower_with_last_axis(ctx, *operands, program=program, rows=rows and rows + 1)
     order = target.varying_first(uniform)
     ctx = ctx.replace(avals_in=[ctx.avals_in[i] for i in order])
     lower = jax.ffi.ffi_lowering(target.TARGET, extra_attributes=sharding.attributes(ctx.avals_in, ctx.avals_out))
     return lower(ctx, *(operands[i] for i in order), program=np.int64(number))
 
 
-def _with_last_axis(*args, program):
+def _with_last_axis(*args, program, rows):
     """The call with one more batch axis, of length one (see `sharding.may_be_divided`)."""
-    results = kernel_p.bind(*(x if x.ndim == 1 else lax.expand_dims(x, [x.ndim - 1]) for x in args), program=program)
+    results = kernel_p.bind(
+        *(x if x.ndim == 1 else lax.expand_dims(x, [x.ndim - 1]) for x in args), program=program, rows=rows
+    )
     return [lax.squeeze(x, [x.ndim - 2]) for x in results]
 
 
+def _repeated(*args, program, rows):
+    """The call with arguments of its own for every row."""
+    lead = max((x.shape[:-1] for x in args), key=len)
+    return kernel_p.bind(*(jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in args), program=program, rows=rows)
+
+
+_lower_repeated = mlir.lower_fun(_repeated, multiple_results=True)
 _lower_with_last_axis = mlir.lower_fun(_with_last_axis, multiple_results=True)
 
 

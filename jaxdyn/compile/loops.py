@@ -110,7 +110,7 @@ def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[C
     leaves = leaves[: len(leaves) - len(read)]
     after = jax.tree.leaves(carry)[len(jax.tree.leaves(carry.state)) :]
     flat = varying_alike([x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)])
-    results = kernel_p.bind(*flat, program=loop)
+    results = kernel_p.bind(*flat, program=loop, rows=0)
     return _Form.of(carry)(results), loop.always_ends
 
 

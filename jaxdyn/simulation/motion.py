@@ -6,8 +6,8 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 
+from jaxdyn.compile import map_rows
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation import contacts as unilateral
@@ -100,11 +100,11 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         y, t = row
         return method.place(scene, method.corrected(scene, y, t), t)
 
-    # One after the other, by the kernels that have put the start on the constraints.
-    q, v = lax.map(place, (y, ts))
+    # By the kernels that have put the start on the constraints.
+    q, v = map_rows(place, (y, ts))
     lost = None
     if eqs.least_allowance is not None:
-        margins, within = lax.map(lambda row: eqs.allowances(eqs.args, *row), (y, q, v, ts)), None
+        margins, within = map_rows(lambda row: eqs.allowances(eqs.args, *row), (y, q, v, ts)), None
         if last is not None:
             there = eqs.allowances(eqs.args, last, *method.place(scene, last, time_reached), time_reached)
             within = (result == RESULTS.event_occurred, time_reached, there)
@@ -121,7 +121,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         result = RESULTS.where(by_control, RESULTS.control_singular, result)
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
     if has_followers(system):
-        follows = jnp.cumsum(~lax.map(system.follows, q)) == 0
+        follows = jnp.cumsum(~map_rows(system.follows, q)) == 0
         result = RESULTS.where(follows.all(), result, RESULTS.no_single_contact)
         reached = reached & follows
         time_reached = jnp.where(follows.all(), time_reached, jnp.max(jnp.where(reached, ts, ts[0])))
@@ -131,10 +131,10 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     kept = jnp.max(jnp.where(reached, ts, ts[0]))
     time_reached = jnp.where(result == RESULTS.nonfinite_state, kept, time_reached)
     if method.projects and scene.constraints:
-        closed = lax.map(lambda row: consistent(scene, *row), (q, v, ts))
+        closed = map_rows(lambda row: consistent(scene, *row), (q, v, ts))
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
     elif scene.constraints:
-        met = lax.map(lambda row: method.satisfies(scene, *row[1:], eqs.effort(eqs.args, *row)), (y, q, v, ts))  # pyright: ignore[reportCallIssue]
+        met = map_rows(lambda row: method.satisfies(scene, *row[1:], eqs.effort(eqs.args, *row)), (y, q, v, ts))  # pyright: ignore[reportCallIssue]
         result = RESULTS.where((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows, result)
     if first is not None:
         result = RESULTS.where(serves(first), result, RESULTS.singular_basis)
@@ -155,7 +155,8 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
 
     of_control = {name: y[name] for name in added}
-    computed = jax.vmap(functools.partial(at_save_point, scene, control, method, eqs, outputs))(q, v, ts, of_control)
+    of_row = functools.partial(at_save_point, scene, control, method, eqs, outputs)
+    computed = map_rows(lambda row: of_row(*row), (q, v, ts, of_control))
     rows = {"q": q, "v": v} | computed | ({} if work is None else {"work": work})
     whole = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
     result = RESULTS.where((result == RESULTS.successful) & ~whole, RESULTS.nonfinite_state, result)
