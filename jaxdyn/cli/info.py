@@ -98,9 +98,9 @@ def constraint_lines(scene: LoadedScene) -> str:
     if scene.constraints:
         rows = []
         for one in scene.constraints:
-            held, slips = one.sizes(scene.system, q.dtype)
+            holonomic, nonholonomic = one.sizes(scene.system, q.dtype)
             gaps = [_gap(one, scene, start.q) for start in scene.starts.values()]
-            rows.append([one.name, type(one).__name__.lower(), str(held + slips), *gaps])
+            rows.append([one.name, type(one).__name__.lower(), str(holonomic + nonholonomic), *gaps])
         heads = ["constraint", "kind", "rows", *(f"gap at {name!r}" for name in list(scene.starts)[:4])]
         lines += [
             "Loops and couplings such as <mimic>, and how far each is open (m or rad)",
@@ -123,12 +123,12 @@ def constraint_lines(scene: LoadedScene) -> str:
 
 def _freedom_beside(scene: LoadedScene, q) -> int:
     """Degrees of freedom at the least of a few closed configurations around q: files like to put linkages flat."""
-    found, chance = [degrees_of_freedom(scene, q)], np.random.default_rng(0)
+    freedoms, chance = [degrees_of_freedom(scene, q)], np.random.default_rng(0)
     for _ in range(2 if scene.constraints else 0):
         step = jnp.asarray(chance.uniform(-0.1, 0.1, scene.nv), q.dtype)
         with contextlib.suppress(ValueError):  # not every configuration near by can be closed
-            found.append(degrees_of_freedom(scene, assemble(scene, integrate(scene.system, q, step), guesses=1).q))
-    return int(min(found))
+            freedoms.append(degrees_of_freedom(scene, assemble(scene, integrate(scene.system, q, step), guesses=1).q))
+    return int(min(freedoms))
 
 
 def _gap(constraint, scene: LoadedScene, q) -> str:

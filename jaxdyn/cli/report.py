@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
     watch = Stopwatch()
     ways = None if args.way is None else [tuple(way.split(":")) for way in args.way]
     options = {"dtypes": args.dtype, "batches": args.batch, "ways": ways, "rounds": args.rounds, "out": args.out}
-    found = report(args.scenes or None, full=args.full, echo=lambda line: print(line, flush=True), **options)
-    print(f"\n{found.table()}\n\n{len(found.records)} runs in {watch}, compilation included.")
+    result = report(args.scenes or None, full=args.full, echo=lambda line: print(line, flush=True), **options)
+    print(f"\n{result.table()}\n\n{len(result.records)} runs in {watch}, compilation included.")
     if args.out:
         print(f"Wrote {args.out}/report.html, .json and .txt.")
     return 0

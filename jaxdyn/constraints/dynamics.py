@@ -156,12 +156,12 @@ def constrained_dynamics(
         return _by_schur(scene, *state, method=method)
     if places[-1].end > scene.nv or is_rank_safe():
         return _by_rank(scene, *state, rank_tol)
-    found = run(_by_pivots, scene, *state, otherwise=_nothing)
-    if found is None and scene.forces:
+    solution = run(_by_pivots, scene, *state, otherwise=_nothing)
+    if solution is None and scene.forces:
         # Forces may be anything. The rest may be a program of numbers without them.
         bare = Scene(scene.system, scene.constraints)
         return constrained_dynamics(bare, q, v, applied(scene, q, v, tau, t), t, rank_tol=rank_tol)
-    return _by_rank(scene, *state, rank_tol) if found is None else _repaired(scene, found, state, rank_tol)
+    return _by_rank(scene, *state, rank_tol) if solution is None else _repaired(scene, solution, state, rank_tol)
 
 
 def _nothing(*_):
@@ -198,24 +198,24 @@ def _judged(scene: Scene, q, quality):
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
 
 
-def _repaired(scene: Scene, found, state, rank_tol) -> ConstrainedDynamics:
-    """`found` = (a, lam, quality of the rows), with the rank-aware solve for the samples whose rows it could not serve."""
-    a, lam, quality = found
+def _repaired(scene: Scene, solution, state, rank_tol) -> ConstrainedDynamics:
+    """`solution` = (a, lam, quality of the rows), with the rank-aware solve for samples whose pivots are too small."""
+    a, lam, quality = solution
     traced, known = partition_traced(scene)
 
-    def careful(traced, state):
+    def by_rank(traced, state):
         q, v, tau, t = state
-        found = _by_rank(known(traced), q, v, tau, t, rank_tol)
-        return (found.acceleration, found.multipliers), (found.rank, found.result)
+        solution = _by_rank(known(traced), q, v, tau, t, rank_tol)
+        return (solution.acceleration, solution.multipliers), (solution.rank, solution.result)
 
     def fast(traced, state):
         return run(_by_pivots, known(traced), *state)[:2]
 
     # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
-    careful = jax.checkpoint(careful, prevent_cse=False)
+    by_rank = jax.checkpoint(by_rank, prevent_cse=False)
     flag = ~(quality > least_pivot(state[0], rank_tol))
     start = (a, lam), _judged(scene, state[0], quality)
-    (a, lam), (rank, result) = repair_flagged(flag, careful, fast, start, (traced, state))
+    (a, lam), (rank, result) = repair_flagged(flag, by_rank, fast, start, (traced, state))
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
 
 

@@ -109,11 +109,11 @@ class Loop(Pair):
         """As given."""
         return (self.body_a, self.pose_a), (self.body_b, self.pose_b)
 
-    def likeness(self):
+    def structure_key(self):
         """The joint."""
         return self.joint, self.in_plane
 
-    def apart(self, R, p):
+    def pose_residual(self, R, p):
         """Residual of the joint, (n,)."""
         return self.kind.residual(R, p)
 
@@ -191,11 +191,11 @@ class Distance(Pair):
         """As given."""
         return (self.body_a, self.pose_a), (self.body_b, self.pose_b)
 
-    def likeness(self):
+    def structure_key(self):
         """All are alike."""
         return ()
 
-    def apart(self, R, p):
+    def pose_residual(self, R, p):
         """(|p|^2 - length^2) / (2 length), (1,), m: smooth everywhere, and the change of length to first order."""
         length = self.length.astype(p.dtype)
         return ((jnp.sum(p**2) - length**2) / (2.0 * length))[None]

@@ -71,21 +71,21 @@ class Touching(Pair):
         slips = self.count
         return (*range(1, 1 + slips), 0, *((1 + slips,) if self.spin else ()))
 
-    def likeness(self):
+    def structure_key(self):
         """Which rows there are."""
         return self.contact, self.spin, self.count
 
-    def apart(self, R, p):
+    def pose_residual(self, R, p):
         """Gap between body and surface, (1,), m; None when the height is not constrained."""
         return self.touching(R, p).gap[None] if self.contact else None
 
-    def sliding(self, R, p, U):
+    def twist_residual(self, R, p, U):
         """Velocities of slipping (m/s), and of spinning (rad/s) where it is resisted."""
         touch = self.touching(R, p)
         if not self.count:
             return jnp.sum(touch.normal * U[3:])[None] if self.spin else None
-        found = _product(touch.directions, U[:3] + cross(U[3:], touch.point))
-        return jnp.concatenate([found, jnp.sum(touch.normal * U[3:])[None]]) if self.spin else found
+        slip = _product(touch.directions, U[:3] + cross(U[3:], touch.point))
+        return jnp.concatenate([slip, jnp.sum(touch.normal * U[3:])[None]]) if self.spin else slip
 
 
 def _unit(i, like):
@@ -130,7 +130,7 @@ class RollingWheel(Touching):
 
     def touching(self, R, p):
         axis, normal = R[:, 2], _unit(2, p)
-        # Down the wheel's plane; for a wheel that lies flat there is no lowest point and any direction serves.
+        # Down the wheel's plane; for a wheel that lies flat there is no lowest point, and any direction is right.
         down = unit_or(axis[2] * axis - normal, -R[:, 0])
         point = p + self.radius.astype(p.dtype) * down
         forward = unit_or(cross(axis, normal), R[:, 1])
@@ -233,7 +233,7 @@ class RollingSphere(Touching):
     spin: bool = eqx.field(static=True)
     count: int = eqx.field(static=True, default=2)
 
-    def likeness(self):
+    def structure_key(self):
         """Which rows there are, and on what."""
         return self.on, self.inside, self.contact, self.spin
 

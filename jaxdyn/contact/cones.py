@@ -113,12 +113,12 @@ class FrictionCone(eqx.Module):
         **Raises:** ValueError for a force of another size.
         """
         force = as_float(force, "force", (self.size,))
-        found = []
+        cone_margins = []
         second = self.second_order_rows()
         if second.shape[0]:
             first, *rest = jnp.unstack(_product(second[0].astype(force.dtype), force))
-            found.append((first - _length(rest, smoothing))[None])
-        return jnp.concatenate([*found, -_product(self.linear_rows().astype(force.dtype), force)])
+            cone_margins.append((first - _length(rest, smoothing))[None])
+        return jnp.concatenate([*cone_margins, -_product(self.linear_rows().astype(force.dtype), force)])
 
     def margin(self, force, smoothing=0.0) -> Float[Array, ""]:
         """Least of `margins`, () : positive inside the cone, zero on its boundary, infinite for a rigid contact.

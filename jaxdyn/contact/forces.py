@@ -75,7 +75,7 @@ def coned_contacts(scene: Scene, cones=None) -> tuple[ConedContact, ...]:
     """
     places = layout(scene)
     chosen = _by_name(scene.cones if cones is None else cones, [place.name for place in places])
-    found = []
+    coned = []
     for constraint, place in zip(scene.constraints, places, strict=True):
         if place.name not in chosen:
             continue
@@ -90,8 +90,8 @@ def coned_contacts(scene: Scene, cones=None) -> tuple[ConedContact, ...]:
                 f"cone of contact {place.name!r} is of kind {cone.kind!r} with {cone.size} components, the contact has "
                 f"{len(order)}; give the cone of the contact's kind"
             )
-        found.append(ConedContact(place.name, place.start + np.array(order, int), cone))
-    return tuple(found)
+        coned.append(ConedContact(place.name, place.start + np.array(order, int), cone))
+    return tuple(coned)
 
 
 def _by_name(cones, names: list[str]) -> dict[str, FrictionCone]:

@@ -117,16 +117,16 @@ def montana(surface_o: Surface, surface_f: Surface, eta) -> ContactKinematics:
     eta = _checked(eta)
     for surface in (surface_o, surface_f):
         check_surface(surface)
-    found = _montana(surface_o, surface_f, eta)
-    check_regular(surface_o, eta[:2], found.object)
-    check_regular(surface_f, eta[2:4], found.finger)
-    if is_concrete(found.strict) and not bool(found.strict):
+    kinematics = _montana(surface_o, surface_f, eta)
+    check_regular(surface_o, eta[:2], kinematics.object)
+    check_regular(surface_f, eta[2:4], kinematics.finger)
+    if is_concrete(kinematics.strict) and not bool(kinematics.strict):
         raise ValueError(
-            f"eta is {np.asarray(eta).tolist()}, where the relative curvature {np.asarray(found.relative_curvature).tolist()} "
-            "is not positive definite; the surfaces do not touch in one point from outside, choose more convex ones or another "
-            "place"
+            f"eta is {np.asarray(eta).tolist()}, where the relative curvature "
+            f"{np.asarray(kinematics.relative_curvature).tolist()} is not positive definite; the surfaces do not touch in "
+            "one point from outside, choose more convex ones or another place"
         )
-    return found
+    return kinematics
 
 
 @compiled

@@ -41,7 +41,7 @@ class RollingContact(Touching):
         size = self.shape_a.place_size
         return dataclasses.replace(self, places=(place[:size], place[size:]), about=None)
 
-    def likeness(self):
+    def structure_key(self):
         """Which rows there are, and on what kinds of surfaces."""
         return self.contact, self.spin, self.count, jax.tree.structure((self.shape_a, self.shape_b))
 

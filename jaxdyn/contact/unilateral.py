@@ -179,7 +179,7 @@ class _Coordinate(Constraint):
     index: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
-    def slip(self, system, q, v, t):
+    def velocity(self, system, q, v, t):
         if self.index >= v.shape[0]:
             raise ValueError(f"DryFriction {self.name!r}: along is {self.index}, but the system has nv = {v.shape[0]}")
         return v[self.index : self.index + 1]
@@ -207,7 +207,7 @@ def _coefficients(sliding: Any, static: Any, owner: str):
 def _positive(value: Any, what: str):
     if value is None:
         return None
-    found = jnp.asarray(as_array(value, what), float)
-    if not isinstance(found, Tracer) and not (np.asarray(found) > 0).all():
+    number = jnp.asarray(as_array(value, what), float)
+    if not isinstance(number, Tracer) and not (np.asarray(number) > 0).all():
         raise ValueError(f"{what} is {value}; give a positive velocity (m/s), or None for friction that sticks")
-    return found
+    return number

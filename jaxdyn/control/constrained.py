@@ -53,13 +53,13 @@ class _ForceLoop(Controller):
         count = _count(self.scene)
         if self.force is None:
             return jnp.zeros((count,), q.dtype)
-        found = self.force(t)
-        if jnp.shape(found) != (count,):
+        force = self.force(t)
+        if jnp.shape(force) != (count,):
             raise ValueError(
-                f"force has shape {jnp.shape(found)}, expected {(count,)}, one per row of the constraints"
-                f"{batch_hint(found, (count,))}"
+                f"force has shape {jnp.shape(force)}, expected {(count,)}, one per row of the constraints"
+                f"{batch_hint(force, (count,))}"
             )
-        return jnp.asarray(found, q.dtype)
+        return jnp.asarray(force, q.dtype)
 
     def pressed(self, q, t, state) -> Float[Array, " nc"]:
         """-lam_d + KI z."""
@@ -151,10 +151,10 @@ class HybridForce(_ForceLoop):
         tau = torque_for(self.scene, q, v, self.acceleration(q, v, t), t)
         if self.actuated is None:
             return tau + _product(constraint_jacobian(self.scene, q, t).T, self.pressed(q, t, state))
-        keep, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)  # pyright: ignore[reportArgumentType]
-        by_motors = keep[:, motors]
-        inverse = pseudo_inverse(by_motors, tolerance(None, keep), True)
-        pushed = _product(inverse, _product(keep, tau))
+        P_omega, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)  # pyright: ignore[reportArgumentType]
+        by_motors = P_omega[:, motors]
+        inverse = pseudo_inverse(by_motors, tolerance(None, P_omega), True)
+        pushed = _product(inverse, _product(P_omega, tau))
         if self.internal is not None:
             internal = self.internal.astype(q.dtype)
             pushed = pushed + internal - _product(inverse, _product(by_motors, internal))
@@ -269,10 +269,16 @@ def _error(task: Any, target: Any, of: str, kd) -> Constraint:
 
 
 def _indices(actuated: Any, nv: int) -> tuple[int, ...]:
-    found = np.asarray(actuated, int)
-    if found.ndim != 1 or not found.size or found.min() < 0 or found.max() >= nv or np.unique(found).size < found.size:
+    indices = np.asarray(actuated, int)
+    if (
+        indices.ndim != 1
+        or not indices.size
+        or indices.min() < 0
+        or indices.max() >= nv
+        or np.unique(indices).size < indices.size
+    ):
         raise ValueError(f"actuated is {actuated!r}; give different indices of velocities from 0 to {nv - 1}")
-    return tuple(found.tolist())
+    return tuple(indices.tolist())
 
 
 def _count(scene: Scene) -> int:

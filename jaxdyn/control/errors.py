@@ -50,16 +50,16 @@ def as_target(target: Any, name: str = "target") -> Callable:
     """
     if callable(target):
         return as_pytree(target, name)
-    found = as_array(target, name)
-    return Fixed(jnp.asarray(found, found.dtype if jnp.issubdtype(found.dtype, jnp.floating) else float))
+    array = as_array(target, name)
+    return Fixed(jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float))
 
 
 def placed(target: Callable, t, shape: tuple, like) -> Array:
     """A target at a time, in the dtype of `like`. **Raises:** ValueError for another shape."""
-    found = target(t)
-    if jnp.shape(found) != shape:
-        raise ValueError(f"target has shape {jnp.shape(found)}, expected {shape}{batch_hint(found, shape)}")
-    return jnp.asarray(found, like.dtype)
+    values = target(t)
+    if jnp.shape(values) != shape:
+        raise ValueError(f"target has shape {jnp.shape(values)}, expected {shape}{batch_hint(values, shape)}")
+    return jnp.asarray(values, like.dtype)
 
 
 class ConfigurationError(Constraint):
@@ -99,10 +99,10 @@ class TaskError(Constraint):
 
     def position(self, system, q, t):
         """task(q) - target(t)."""
-        found = jnp.asarray(self.task(q), q.dtype)
-        if found.ndim != 1:
-            raise ValueError(f"task returned shape {found.shape}; return a vector (m,){batch_hint(found, (1,))}")
-        return found - placed(self.target, t, found.shape, q)
+        value = jnp.asarray(self.task(q), q.dtype)
+        if value.ndim != 1:
+            raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
+        return value - placed(self.target, t, value.shape, q)
 
 
 class RateError(Constraint):
@@ -112,12 +112,12 @@ class RateError(Constraint):
     target: Callable
     name: str = eqx.field(static=True, default="rates")
 
-    def slip(self, system, q, v, t):
+    def velocity(self, system, q, v, t):
         """task(q, v) - target(t)."""
-        found = jnp.asarray(self.task(q, v), q.dtype)
-        if found.ndim != 1:
-            raise ValueError(f"task returned shape {found.shape}; return a vector (m,){batch_hint(found, (1,))}")
-        return found - placed(self.target, t, found.shape, q)
+        value = jnp.asarray(self.task(q, v), q.dtype)
+        if value.ndim != 1:
+            raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
+        return value - placed(self.target, t, value.shape, q)
 
 
 def frame_error(model: Any, frame: str, target: Any, task: str) -> FrameError:

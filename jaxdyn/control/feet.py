@@ -94,15 +94,15 @@ def foot(frame: str, cone: Any, *, pose: Any = None, ground: Any = None) -> Foot
         raise ValueError(f"foot {frame!r}: cone is {cone!r}; give one in space from jd.contact.friction_cone(...)")
     if ground is not None and cone.kind in _FLAT:
         raise ValueError(f"foot {frame!r}: a flat foot stands in the axes of its pose; leave ground out")
-    found = as_array(np.eye(3) if ground is None else ground, f"foot {frame!r}: ground")
-    if found.shape != (3, 3):
-        raise ValueError(f"foot {frame!r}: ground has shape {found.shape}; give a rotation (3, 3)")
-    if not isinstance(found, Tracer):
-        known = np.asarray(found, float)
+    rotation = as_array(np.eye(3) if ground is None else ground, f"foot {frame!r}: ground")
+    if rotation.shape != (3, 3):
+        raise ValueError(f"foot {frame!r}: ground has shape {rotation.shape}; give a rotation (3, 3)")
+    if not isinstance(rotation, Tracer):
+        known = np.asarray(rotation, float)
         # Numbers as people write them, with some six digits.
         if np.abs(known @ known.T - np.eye(3)).max() > 1e-5 or np.linalg.det(known) < 0:
             raise ValueError(f"foot {frame!r}: ground is {known.tolist()}, which is no rotation; give orthogonal axes")
-    return Foot(frame, cone, pose_leaf(pose, f"foot {frame!r}: pose"), jnp.asarray(found, float))
+    return Foot(frame, cone, pose_leaf(pose, f"foot {frame!r}: pose"), jnp.asarray(rotation, float))
 
 
 def check_feet(model: Any, feet: Any) -> tuple[Foot, ...]:

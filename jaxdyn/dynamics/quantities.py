@@ -18,9 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import along, implicit, native, run
-from jaxdyn.dynamics import recursions
-from jaxdyn.dynamics import scans as looped
-from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.dynamics import recursions, scans, world_frame
 from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
 from jaxdyn.lie.so3 import _product
@@ -42,7 +40,7 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[A
     if isinstance(model, System):
         return _of_system(model, "mass_matrix", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
-    return by_recursion(recursions.crba, matrix_form.mass_matrix, model, q)
+    return by_recursion(recursions.crba, world_frame.mass_matrix, model, q)
 
 
 def coriolis_matrix(
@@ -62,7 +60,7 @@ def coriolis_matrix(
     if isinstance(model, System):
         return _of_system(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
-    return by_recursion(matrix_form.coriolis_matrix, matrix_form.coriolis_matrix, model, q, v)
+    return by_recursion(world_frame.coriolis_matrix, world_frame.coriolis_matrix, model, q, v)
 
 
 def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nv"]:
@@ -77,7 +75,7 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         return jnp.zeros((model.nv,), model.home.dtype)
-    return by_recursion(recursions.gravity_force, matrix_form.gravity_force, model, q)
+    return by_recursion(recursions.gravity_force, world_frame.gravity_force, model, q)
 
 
 def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"]:
@@ -181,7 +179,7 @@ def by_recursion(recursion, matrices, model: Model, *args):
 
 
 def _inverse_dynamics(model: Model, q, v, a):
-    return (looped if model.nb > MAX_BODIES else matrix_form).inverse_dynamics(model, q, v, a)
+    return (scans if model.nb > MAX_BODIES else world_frame).inverse_dynamics(model, q, v, a)
 
 
 def _bias_force(model: Model, q, v):
@@ -190,7 +188,7 @@ def _bias_force(model: Model, q, v):
 
 def _solve_for_acceleration(model: Model, q, v, tau):
     """Forward dynamics where there is no kernel, differentiated by the implicit function theorem."""
-    form = looped if model.nb > _MAX_BODIES_IN_MATRICES else matrix_form
+    form = scans if model.nb > _MAX_BODIES_IN_MATRICES else world_frame
 
     def tangent(model, q, v, tau, steps):
         return form.forward_dynamics_tangent(
@@ -226,7 +224,7 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
     **Returns:** (nv,), N m or N; it stands on the right, with tau.
     """
     q, external = check_shapes(model, q=q, external=external)
-    return by_recursion(matrix_form.generalized_force, matrix_form.generalized_force, model, q, external)
+    return by_recursion(world_frame.generalized_force, world_frame.generalized_force, model, q, external)
 
 
 def kinetic_energy(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, ""]:
@@ -288,7 +286,7 @@ def torque_regressor(
     Source: Atkeson, An & Hollerbach (1986).
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
-    return by_recursion(matrix_form.torque_regressor, matrix_form.torque_regressor, model, q, v, a)
+    return by_recursion(world_frame.torque_regressor, world_frame.torque_regressor, model, q, v, a)
 
 
 def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
@@ -304,7 +302,7 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     """
     (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "mass_matrix_derivative")
-    return by_recursion(matrix_form.mass_matrix_derivative, matrix_form.mass_matrix_derivative, model, q)
+    return by_recursion(world_frame.mass_matrix_derivative, world_frame.mass_matrix_derivative, model, q)
 
 
 def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv nv"]:

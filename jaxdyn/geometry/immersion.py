@@ -89,16 +89,16 @@ class ImmersedSystem(System):
 
     def place(self, s, t) -> tuple[Array, ...]:
         """Configuration of each unit at s, each (nq,) of its system."""
-        found = self.immersion(s, t) if self.moving else self.immersion(s)
-        found = tuple(found) if self.joined else (found,)
-        sizes = [jnp.shape(q) for q in found]
+        positions = self.immersion(s, t) if self.moving else self.immersion(s)
+        positions = tuple(positions) if self.joined else (positions,)
+        sizes = [jnp.shape(q) for q in positions]
         wanted = [(unit.nq,) for unit in self.units]
         if sizes != wanted:
             raise ValueError(
                 f"xi returned shapes {sizes}, expected {wanted}: "
                 + ("one configuration for each of the systems" if self.joined else "the system's configuration")
             )
-        return tuple(jnp.asarray(q, s.dtype) for q in found)
+        return tuple(jnp.asarray(q, s.dtype) for q in positions)
 
     def velocities(self, s, v, t) -> tuple[Array, ...]:
         """Velocity of each unit at s and sdot = v, each (nv,) of its system."""
@@ -188,8 +188,8 @@ class PulledForce(eqx.Module):
         ]
         if self.common is None:
             return total
-        found = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
-        return _added(total, found, "force")
+        common_forces = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
+        return _added(total, common_forces, "force")
 
     def __call__(self, system, s, v, t):
         if not isinstance(system, ImmersedSystem):
@@ -287,11 +287,11 @@ def reaction_force(system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], 
     return reactions if immersed.joined else reactions[0]
 
 
-def _added(total, found, argument: str) -> list[Array]:
+def _added(total, forces, argument: str) -> list[Array]:
     """Forces on each unit, and others that a user gave."""
-    if len(found) != len(total):
-        raise ValueError(f"{argument} has {len(found)} entries; give one for each of the {len(total)} systems")
-    return [f + checked_force(g, f, f.shape[0], argument) for f, g in zip(total, found, strict=True)]
+    if len(forces) != len(total):
+        raise ValueError(f"{argument} has {len(forces)} entries; give one for each of the {len(total)} systems")
+    return [f + checked_force(g, f, f.shape[0], argument) for f, g in zip(total, forces, strict=True)]
 
 
 def _sum(terms):

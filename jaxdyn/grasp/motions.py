@@ -106,7 +106,7 @@ def hand_motions(
 
     ```python
     motions = jd.grasp.hand_motions(grasp, q)
-    found = jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions)
+    dynamics = jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions)
     ```
 
     Source: Murray, Li & Sastry (1994), section 6.3; EQUATIONS section 10.

@@ -45,8 +45,8 @@ class Chosen(eqx.Module):
 
     def scene(self, y: Float[Array, " p"]) -> Scene:
         """The scene with the numbers of y."""
-        found = self.system(y)
-        return as_scene(found)
+        system = self.system(y)
+        return as_scene(system)
 
 
 class _Leaf:
@@ -96,9 +96,9 @@ def choose(system, positive, free, dtype) -> tuple[Chosen, tuple[str, ...]]:
     ]
     unit = np.where(origin == 0, 1, np.abs(origin))
     places = tuple(place for place, _ in picked)
-    held = [jnp.asarray(leaf) if place in places else leaf for place, leaf in enumerate(leaves)]
+    arrays = [jnp.asarray(leaf) if place in places else leaf for place, leaf in enumerate(leaves)]
     chosen = Chosen(
-        given=jax.tree.unflatten(structure, held),
+        given=jax.tree.unflatten(structure, arrays),
         origin=jnp.asarray(origin, dtype),
         unit=jnp.asarray(unit, dtype),
         positive=jnp.asarray(signs, dtype),
@@ -116,14 +116,14 @@ def _picked(where, marked, argument: str, kind: str) -> list[_Leaf]:
     if not callable(where):
         raise ValueError(f"{argument} is {where!r}; pass a function that picks leaves, {example}")
     try:
-        found = jax.tree.leaves(where(marked))
+        leaves = jax.tree.leaves(where(marked))
     except (AttributeError, IndexError, KeyError, TypeError) as error:
         raise ValueError(
             f"{argument} picks nothing of this {kind} ({type(error).__name__}: {error}); {example}, of whole leaves"
         ) from error
-    strange = [leaf for leaf in found if not isinstance(leaf, _Leaf)]
-    if strange or not found:
+    strange = [leaf for leaf in leaves if not isinstance(leaf, _Leaf)]
+    if strange or not leaves:
         raise ValueError(
             f"{argument} picks {strange[0] if strange else 'nothing'!r}, which is no leaf of this {kind}; {example}"
         )
-    return found
+    return leaves

@@ -54,13 +54,13 @@ class Linear(NamedTuple):
         dy = -np.linalg.solve(hessian + size * np.eye(len(hessian)), gradient)
         return dy, self.by_starts + float(dy @ (size * dy - gradient))
 
-    def moved(self, found: Unknowns, dy: np.ndarray) -> Unknowns:
+    def moved(self, unknowns: Unknowns, dy: np.ndarray) -> Unknowns:
         """The unknowns after a step."""
-        dtype, start = found.y.dtype, found.start
+        dtype, start = unknowns.y.dtype, unknowns.start
         if start is not None:
             change = jnp.asarray(self.offset + self.gain @ dy, dtype)
             start = start - change.reshape(start.shape)
-        return Unknowns(found.y + jnp.asarray(dy, dtype), start)
+        return Unknowns(unknowns.y + jnp.asarray(dy, dtype), start)
 
 
 def linear(errors, by_y, by_start) -> Linear:
@@ -84,9 +84,9 @@ def linear(errors, by_y, by_start) -> Linear:
 
 
 def gauss_newton(
-    linearise: Callable[[Unknowns], Linear], found: Unknowns, *, steps: int, tolerance: float, callback: Callable
+    linearise: Callable[[Unknowns], Linear], unknowns: Unknowns, *, steps: int, tolerance: float, callback: Callable
 ) -> tuple[Unknowns, Linear, np.ndarray, str]:
-    """Minimise the sum of squared errors from `found`.
+    """Minimise the sum of squared errors from `unknowns`.
 
     A step is damped the more, the more often steps in a row failed to lower the loss; where it is not finite, too.
 
@@ -100,27 +100,27 @@ def gauss_newton(
     """
     if not (steps > 0 and tolerance >= 0):
         raise ValueError(f"steps={steps}, tolerance={tolerance}; steps must be positive and tolerance not negative")
-    rounding = float(jnp.finfo(found.y.dtype).eps)
-    here, history, damping = linearise(found), [], _DAMPING
+    rounding = float(jnp.finfo(unknowns.y.dtype).eps)
+    here, history, damping = linearise(unknowns), [], _DAMPING
     while True:
         history.append(here.loss)
-        callback(len(history) - 1, here.loss, found)
+        callback(len(history) - 1, here.loss, unknowns)
         if not here.finite:
-            return found, here, np.array(history), "not_finite"
+            return unknowns, here, np.array(history), "not_finite"
         if here.loss <= (10 * rounding) ** 2:
-            return found, here, np.array(history), "converged"
+            return unknowns, here, np.array(history), "converged"
         if len(history) > steps:
-            return found, here, np.array(history), "max_steps"
+            return unknowns, here, np.array(history), "max_steps"
         while True:
             dy, fall = here.step(damping)
             if damping > _MOST_DAMPING or fall <= max(tolerance, 1e3 * rounding) * here.loss:
-                return found, here, np.array(history), "converged"
-            trial = here.moved(found, dy)
+                return unknowns, here, np.array(history), "converged"
+            trial = here.moved(unknowns, dy)
             there = linearise(trial)
             if there.finite and there.loss < here.loss:
                 break
             damping *= 10
-        found, here, damping = trial, there, max(damping / 10, _LEAST_DAMPING)
+        unknowns, here, damping = trial, there, max(damping / 10, _LEAST_DAMPING)
 
 
 def standard_deviation(end: Linear) -> np.ndarray:

@@ -126,7 +126,7 @@ def _local(data: Data, setting: Setting, estimate: Estimate):
     slopes = np.asarray(_chart_slopes(chart, point), np.float64)
     count, size = point.theta.shape
     basis = np.asarray(stretches(size, point.theta.dtype), np.float64)
-    bent = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
+    prior_curvature = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
     bodies = count * size
     moves = np.ones(slopes.shape[1], bool)
     # What is at its bound stays there.
@@ -139,7 +139,7 @@ def _local(data: Data, setting: Setting, estimate: Estimate):
     jacobian[: data.basic, :count] = slopes[:, moves]
     jacobian[places, count + np.arange(len(places))] = 1.0
     curvature = np.zeros((jacobian.shape[1],) * 2)
-    curvature[:bodies, :bodies] = bent
+    curvature[:bodies, :bodies] = prior_curvature
     units = data.units.reshape(-1)[places - data.basic]
     curvature[count + np.arange(len(places)), count + np.arange(len(places))] = setting.prior / units**2
     return jacobian, curvature, np.any(jacobian[: data.basic] != 0, axis=1)

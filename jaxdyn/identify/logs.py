@@ -177,8 +177,8 @@ def from_raw(
     v = low(np.gradient(q, grid, axis=0))
     a = low(np.gradient(v, grid, axis=0))
     tau = low(uniform(tau))
-    keep = slice(trim, n - trim, every)
-    return Log(grid[keep], q[keep], v[keep], a[keep], tau[keep], joint_names=raw.joint_names, cutoff=cutoff)
+    inside = slice(trim, n - trim, every)
+    return Log(grid[inside], q[inside], v[inside], a[inside], tau[inside], joint_names=raw.joint_names, cutoff=cutoff)
 
 
 def as_measured(log: Log, columns: np.ndarray, order: int = 4) -> np.ndarray:

@@ -132,17 +132,17 @@ def fit_parameters(
     unknowns = Unknowns(y0, start)
     z0, unflatten = ravel_pytree(unknowns)
 
-    def report(step, value, found):
+    def report(step, value, estimate):
         if callback is not None:
-            callback(step, value, chosen.system(found.y))
+            callback(step, value, chosen.system(estimate.y))
 
     deviation = None
     if isinstance(method, str) and method == _GAUSS_NEWTON:
-        linearise = lambda found: linear(*_slopes(problem, found))  # noqa: E731
-        found, end, history, result = gauss_newton(
+        linearise = lambda point: linear(*_slopes(problem, point))  # noqa: E731
+        best, end, history, result = gauss_newton(
             linearise, unknowns, steps=steps, tolerance=tolerance, callback=report
         )
-        deviation = standard_deviation(end) * np.abs(np.asarray(chosen.slopes(found.y), np.float64))
+        deviation = standard_deviation(end) * np.abs(np.asarray(chosen.slopes(best.y), np.float64))
     else:
         z, history, result = minimise(
             _loss,
@@ -156,12 +156,12 @@ def fit_parameters(
             scaling=lambda z: 1e6 * jnp.eye(z.size, dtype=z.dtype),
             callback=lambda step, value, z: report(step, value, unflatten(z)),
         )
-        found = unflatten(z)
+        best = unflatten(z)
     return ParameterFit(
-        system=chosen.system(found.y),
+        system=chosen.system(best.y),
         nominal=system,
         names=names,
-        values=np.asarray(chosen.values(found.y), np.float64),
+        values=np.asarray(chosen.values(best.y), np.float64),
         nominal_values=np.asarray(chosen.origin, np.float64),
         deviation=deviation,
         history=history,
@@ -203,13 +203,13 @@ def _residual(problem: _Problem, y, start, piece) -> Float[Array, " n"]:
 def _loss(z, args):
     problem, unknowns = args
     _, unflatten = ravel_pytree(unknowns)
-    found = unflatten(z)
-    errors = jax.vmap(lambda start, piece: _residual(problem, found.y, start, piece))(found.start, problem.pieces)
+    estimate = unflatten(z)
+    errors = jax.vmap(lambda start, piece: _residual(problem, estimate.y, start, piece))(estimate.start, problem.pieces)
     return jnp.sum(errors * errors)
 
 
 @eqx.filter_jit
-def _slopes(problem: _Problem, found: Unknowns):
+def _slopes(problem: _Problem, unknowns: Unknowns):
     """Errors (pieces, n), and their Jacobians by y (pieces, n, p) and by each piece's own start (pieces, n, 2 nv)."""
     if isinstance(problem.pieces, Segments):
         problem = dataclasses.replace(problem, options=problem.options | {"adjoint": "forward"})
@@ -219,9 +219,9 @@ def _slopes(problem: _Problem, found: Unknowns):
             errors = _residual(problem, y, start, piece)
             return errors, errors
 
-        return jax.jacfwd(twice, 0 if start is None else (0, 1), has_aux=True)(found.y, start)
+        return jax.jacfwd(twice, 0 if start is None else (0, 1), has_aux=True)(unknowns.y, start)
 
-    slopes, errors = jax.vmap(one)(found.start, problem.pieces)
-    if found.start is None:
+    slopes, errors = jax.vmap(one)(unknowns.start, problem.pieces)
+    if unknowns.start is None:
         return errors, slopes, None
     return errors, slopes[0], slopes[1].reshape(*errors.shape, -1)

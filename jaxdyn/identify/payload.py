@@ -145,7 +145,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows):
         raise ValueError(f"the payload's fit ended {result!r}; do the loaded logs move the robot?")
     payload = np.asarray(chart.inertias(point.theta), np.float64)[0]
 
-    found = robot(payload)
+    estimate = robot(payload)
     # In the coordinates of the chart, where the prior's curvature is known; it also holds what no log tells.
     stretch = np.asarray(jax.jacfwd(lambda theta: chart.inertias(theta)[0])(point.theta), np.float64).reshape(10, 10)
     basis = np.asarray(stretches(10, point.theta.dtype), np.float64)
@@ -156,7 +156,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows):
     spreads[:, kept, np.arange(count)] = 1
     spreads[1, own, count:] += stretch
     bare = np.zeros(blocks.size)
-    bare[kept] = found
+    bare[kept] = estimate
     holding = bare.copy()
     holding[own] += payload
     scores = np.stack([blocks.scores(x, weights) for x in (bare, holding)])
@@ -189,7 +189,7 @@ def _errors(model: Model, robot: RobotFit, loaded: Sequence[Log], own: slice, pa
     change = np.zeros(10 * model.nb + 4 * model.nv)
     change[own] = payload
     measured, alone, both = [], [], []
-    held = eqx.tree_at(
+    with_payload = eqx.tree_at(
         lambda fit: fit.model.inertias,
         robot.fit,
         robot.fit.model.inertias.at[own.start // 10].add(jnp.asarray(payload)),
@@ -197,7 +197,7 @@ def _errors(model: Model, robot: RobotFit, loaded: Sequence[Log], own: slice, pa
     for log in loaded:
         measured.append(np.asarray(log.tau, np.float64))
         alone.append(robot.fit.torques(log))
-        both.append(held.torques(log))
+        both.append(with_payload.torques(log))
     size = np.linalg.norm(np.concatenate(measured))
     off = [100 * float(np.linalg.norm(np.concatenate(x) - np.concatenate(measured)) / size) for x in (both, alone)]
     return off[0], off[1]

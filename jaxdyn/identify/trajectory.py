@@ -143,9 +143,9 @@ def fit_trajectory(
 def _flat_loss(y, args):
     problem, unknowns = args
     _, unflatten = ravel_pytree(unknowns)
-    found = unflatten(y)
+    estimate = unflatten(y)
     chart, data, scale = problem.chart, problem.data, problem.scale
-    model, friction = chart.fitted(problem.model, found.point)
+    model, friction = chart.fitted(problem.model, estimate.point)
     has_friction = chart.terms or model.damping is not None or model.friction is not None
     scene = Scene(model, forces=(friction,) if has_friction else ())
 
@@ -153,8 +153,8 @@ def _flat_loss(y, args):
         change = None if change is None else change * scale
         return motion_errors(model, one, *simulate_segment(scene, one, change, problem.hold, problem.options), scale)
 
-    found_errors = jax.vmap(errors)(data, found.start)
-    return sum(jnp.mean(error**2) for error in found_errors) + problem.prior * chart.divergence(found.point.theta)
+    position_errors = jax.vmap(errors)(data, estimate.start)
+    return sum(jnp.mean(error**2) for error in position_errors) + problem.prior * chart.divergence(estimate.point.theta)
 
 
 def _scaling(problem: _Problem, point: Coordinates, log: Log, a, size: int) -> Float[Array, "n n"]:

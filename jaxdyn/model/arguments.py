@@ -82,10 +82,10 @@ def check_state(system, **arguments) -> tuple[Any, ...]:
     system that has none; for a Scene in the place of its system, and for what is no system.
     """
     check_system(system)
-    dtype, found = state_dtype(system, arguments.get("q")), []
+    dtype, arrays = state_dtype(system, arguments.get("q")), []
     for name, value in arguments.items():
         if value is None and name in _OPTIONAL:
-            found.append(None)
+            arrays.append(None)
             continue
         if name == "external" and not hasattr(system, "topology"):
             raise ValueError(
@@ -93,8 +93,8 @@ def check_state(system, **arguments) -> tuple[Any, ...]:
             )
         value = as_array(value, name, dtype)
         check_shape(system, name, value)
-        found.append(value)
-    return tuple(found)
+        arrays.append(value)
+    return tuple(arrays)
 
 
 def check_shape(system, name: str, value: Array | np.ndarray) -> None:

@@ -217,8 +217,8 @@ class ModelBuilder:
         stored: dict[str, Any] = {
             key: None if value is None else jnp.asarray(value, self._dtype) for key, value in leaves.items()
         }
-        held = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
-        return Model(**stored, topology=topology, fixed_joints=held)
+        fixed_joints = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
+        return Model(**stored, topology=topology, fixed_joints=fixed_joints)
 
     def _check_new(self, name, parent) -> None:
         if not isinstance(name, str) or not name:
@@ -382,8 +382,8 @@ def _check_regular(topology: Topology, home, screws, inertias, armature) -> None
     neutral = [joint_neutral(kind) for kind in topology.kinds]
     if not f64.idle_joints(topology, home, screws, inertias, armature, neutral):
         return
-    anywhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
-    if not (idle := f64.idle_joints(topology, home, screws, inertias, armature, anywhere)):
+    elsewhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
+    if not (idle := f64.idle_joints(topology, home, screws, inertias, armature, elsewhere)):
         return
     names = [topology.joint_names[i] for i in sorted(idle)]
     i, alone = next(iter(idle.items()))

@@ -156,10 +156,10 @@ class _Picture:
             self.drawn.append(self.ax.quiver(*at, *vector, color=color, linewidth=1.6, arrow_length_ratio=0.2))
 
 
-def scaled(found, length: float):
+def scaled(forces, length: float):
     """Each force with the factor (m/N or m/(N m)) that gives the largest of its kind the length (m)."""
     for kind in ("force", "torque"):
-        members = [force for force in found if force.kind == kind]
+        members = [force for force in forces if force.kind == kind]
         largest = max((float(np.linalg.norm(force.vectors, axis=-1).max()) for force in members), default=0.0)
         yield from ((force, length / largest) for force in members)
 

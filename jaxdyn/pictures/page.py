@@ -249,10 +249,10 @@ def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:
     for frame, _, opacity, members in by_frame(parts):
         parts_of = [shape.triangles() for shape in members]
         groups.append((frame, color_of(members[0], motion.scene.system), opacity, parts_of))
-    total = sum(len(vertices) for *_, found in groups for vertices, _ in found)
+    total = sum(len(vertices) for *_, meshes in groups for vertices, _ in meshes)
     share = min(1.0, most / max(total, 1))
-    for frame, color, opacity, found in groups:
-        small = [simplified(v, f, max(24, int(share * len(v)))) if share < 1 else (v, f) for v, f in found]
+    for frame, color, opacity, meshes in groups:
+        small = [simplified(v, f, max(24, int(share * len(v)))) if share < 1 else (v, f) for v, f in meshes]
         vertices, faces = sharpened(*joined(mesh for mesh in small if len(mesh[1])))
         yield frame, color, opacity, vertices.astype(np.float32), faces.astype(np.uint32)
 

@@ -64,8 +64,8 @@ class Programs:
         def one(q, v, ts, setting):
             steps = {"stepsize": setting} if solver in FIXED else {"rtol": setting, "atol": setting}
             options = {"method": method, "solver": SOLVERS[solver](), "max_steps": MOST_STEPS, "throw": False}
-            found = simulate(scene, q, v, ts, **steps, **options)
-            return found.q, found.v, found.result, found.stats
+            solution = simulate(scene, q, v, ts, **steps, **options)
+            return solution.q, solution.v, solution.result, solution.stats
 
         several = one if batch == 1 else jax.vmap(one, (0, 0, 0, None))
         sizes = () if batch == 1 else (batch,)
@@ -93,10 +93,10 @@ class Programs:
         while len(states) < batch:
             first = len(states) - 1
             times = ts[0] + SPREAD * (ts[-1] - ts[0]) * np.arange(first, first + ahead + 1) / batch
-            found = self.solve("auto", "Dopri8", 1e-12, states[-1], times)
-            if not all(np.isfinite(x).all() for x in found):
+            solutions = self.solve("auto", "Dopri8", 1e-12, states[-1], times)
+            if not all(np.isfinite(x).all() for x in solutions):
                 raise RuntimeError("no starts for a batch: a simulation at tolerances of 1e-12 stopped early")
-            states += [*zip(*(x[1:] for x in found), strict=True)]
+            states += [*zip(*(x[1:] for x in solutions), strict=True)]
         q, v = (np.stack(x) for x in zip(*states[:batch], strict=True))
         return q, v, ts + delays[:, None]
 
@@ -151,12 +151,12 @@ def observed(scene: Scene, q, v):
     return jnp.concatenate([*parts, v])
 
 
-def largest_error(found: np.ndarray, known: np.ndarray) -> np.ndarray:
+def largest_error(computed: np.ndarray, known: np.ndarray) -> np.ndarray:
     """max |y - r|/(1 + |r|) over the columns of y (nt, n) and r (nt, n), (nt,).
 
     It is absolute for entries that are small and relative for large ones, as in the test set for IVP solvers.
     """
-    return np.max(np.abs(found - known) / (1 + np.abs(known)), 1)
+    return np.max(np.abs(computed - known) / (1 + np.abs(known)), 1)
 
 
 def converged(programs: Programs, values: Callable) -> Reference:

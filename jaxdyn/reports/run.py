@@ -122,10 +122,10 @@ def report(
         passed = time.perf_counter() - began
         left = passed / done * (len(todo) - done)
         say(f"{done}/{len(todo)} {key}: {len(records)} runs; {passed:.0f} s, about {left:.0f} s left")
-    found = journal.report(keys)
+    result = journal.report(keys)
     if out is not None:
-        write(found, out)
-    return found
+        write(result, out)
+    return result
 
 
 def _group(prepared: Prepared, dtype, batch, ways, full, rounds, peers) -> list[Record]:

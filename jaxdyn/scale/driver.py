@@ -61,7 +61,7 @@ def chunk_size(seconds: float, lanes: int, row_bytes: int, count: int, processes
 
 def compute(program: Program, numbers: np.ndarray) -> dict[str, np.ndarray]:
     """Rows of these rollouts; two batches are under way at a time."""
-    found: dict[str, np.ndarray] = {}
+    rows: dict[str, np.ndarray] = {}
     starts = range(0, len(numbers), program.lanes)
     under_way: list[tuple[int, Any]] = []
 
@@ -69,9 +69,9 @@ def compute(program: Program, numbers: np.ndarray) -> dict[str, np.ndarray]:
         begin, results = under_way.pop(0)
         for name, values in results.items():
             values = np.asarray(values)
-            if name not in found:
-                found[name] = np.empty((len(numbers), *values.shape[1:]), values.dtype)
-            part = found[name][begin : begin + program.lanes]
+            if name not in rows:
+                rows[name] = np.empty((len(numbers), *values.shape[1:]), values.dtype)
+            part = rows[name][begin : begin + program.lanes]
             part[...] = values[: len(part)]
 
     for begin in starts:
@@ -80,7 +80,7 @@ def compute(program: Program, numbers: np.ndarray) -> dict[str, np.ndarray]:
             fetch()
     while under_way:
         fetch()
-    return found
+    return rows
 
 
 def fill(job: Job, program: Program, store: Store, lock: Lock, meter: Progress, chunks: Iterable[int]) -> list[int]:
@@ -149,9 +149,9 @@ def merge(job: Job, store: Store) -> dict[str, Arrays]:
     """The results of all reductions, stored too."""
     names = [name for name in store.names if name.startswith("partial/")]
     partials = {name: np.concatenate([part for _, part in store.parts(name)]) for name in names}
-    found = job.reducer.merged(partials)
-    store.put(named(found))
-    return found
+    merged = job.reducer.merged(partials)
+    store.put(named(merged))
+    return merged
 
 
 def local_devices(devices: Sequence[Any] | None) -> list[Any]:

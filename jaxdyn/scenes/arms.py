@@ -74,11 +74,11 @@ def _sphere_arm_start(
     _check_contact(contact)
     if contact == "rolling" and (np.any(slide) or spin):
         raise ValueError(f"slide is {slide}, spin is {spin}; a rolling contact has neither, leave them out")
-    found = montana(*_surfaces(radius, tip_radius), jnp.asarray(eta, float))
-    pose = np.array(found.g_of)
+    kinematics = montana(*_surfaces(radius, tip_radius), jnp.asarray(eta, float))
+    pose = np.array(kinematics.g_of)
     pose[:3, 3] += center
     q = jnp.asarray(_joint_angles(pose, links, height))
-    twist = se3.Ad_apply(found.finger.pose, jnp.asarray([*slide, 0.0, *rolling, spin], float))
+    twist = se3.Ad_apply(kinematics.finger.pose, jnp.asarray([*slide, 0.0, *rolling, spin], float))
     arm = _six_joints(links, _MASSES, height, tip_radius, 0.0)
     return q, jnp.linalg.solve(body_jacobian(arm, q, "tip"), twist)
 

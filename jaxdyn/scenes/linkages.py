@@ -21,14 +21,14 @@ def thin_bar(mass, length):
 
 def _circles(center, radius, other, reach):
     """The intersection of two circles that lies to the left of the way from the first centre to the second."""
-    way = np.asarray(other, float) - center
-    apart = np.hypot(*way)
-    along = (radius**2 - reach**2 + apart**2) / (2 * apart)
+    direction = np.asarray(other, float) - center
+    distance = np.hypot(*direction)
+    along = (radius**2 - reach**2 + distance**2) / (2 * distance)
     square = radius**2 - along**2
     if square < 0:
-        raise ValueError(f"lengths {radius} and {reach} do not close over {apart:.6g}; no such configuration exists")
-    way = way / apart
-    return np.asarray(center, float) + along * way + np.sqrt(square) * np.array([-way[1], way[0]])
+        raise ValueError(f"lengths {radius} and {reach} do not close over {distance:.6g}; no such configuration exists")
+    direction = direction / distance
+    return np.asarray(center, float) + along * direction + np.sqrt(square) * np.array([-direction[1], direction[0]])
 
 
 def _four_bar_start(lengths=(1.0, 3.0, 2.5, 3.5), angle=1.0, rate=1.0, in_plane=True):

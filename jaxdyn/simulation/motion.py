@@ -14,7 +14,7 @@ from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.equations import equations
 from jaxdyn.simulation.integration import integrate
-from jaxdyn.simulation.methods import Method, consistent, serves, start_limit
+from jaxdyn.simulation.methods import Method, consistent, is_regular, start_limit
 from jaxdyn.simulation.outputs import at_save_point
 from jaxdyn.simulation.solution import RESULTS, Solution
 from jaxdyn.simulation.solvers import LieGroup, Stepper
@@ -50,17 +50,17 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
             harmless.at[system.topology.nq :].set(1.0).at[: system.topology.nq].set(neutral(system).astype(q0.dtype))
         )
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
-    held = jnp.asarray(True)
+    start_ok = jnp.asarray(True)
     if scene.constraints:
-        held = consistent(scene, q0, v0, ts[0])
+        start_ok = consistent(scene, q0, v0, ts[0])
         if method.projects:
             given_start = q0, v0
             q0, v0 = method.onto_constraints(scene, q0, v0, ts[0])
             # Residuals of a small mechanism are small numbers of metres: how far it moves onto the constraints tells more.
-            ways = [
+            corrections = [
                 jnp.max(jnp.abs(x - y)) / (1 + jnp.max(jnp.abs(x))) for x, y in zip(given_start, (q0, v0), strict=True)
             ]
-            held = held & (jnp.maximum(*ways) <= 10 * start_limit(q0.dtype))
+            start_ok = start_ok & (jnp.maximum(*corrections) <= 10 * start_limit(q0.dtype))
     # Refuses callbacks that do not fit before diffrax meets them.
     for i, force in enumerate(scene.forces):
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", q0, v0, ts[0], first=(system,))
@@ -68,7 +68,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     states = controls.started(control, q0, v0, ts[0])
     added = tuple(states)  # names alone, as functions of a run hold no arrays
     eqs = equations(scene, control, method, added, options)
-    eqx.filter_eval_shape(eqs.effort, eqs.args, states, q0, v0, ts[0])
+    eqx.filter_eval_shape(eqs.generalized_force, eqs.args, states, q0, v0, ts[0])
     y0 = method.start(scene, q0, v0, ts[0]) | states
     first = method.quality(scene, y0, ts[0])
     y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
@@ -78,7 +78,9 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     elif isinstance(solver, LieGroup):
         solver = solver.fitted(system)
     # Of what a projection does, local coordinates leave nothing to be done about quaternions.
-    corrects = method.projects or bool(method.jumping) if isinstance(solver, LieGroup) else method.corrects(scene)
+    corrects = (
+        method.projects or bool(method.step_constants) if isinstance(solver, LieGroup) else method.corrects(scene)
+    )
     corrects = corrects or controls.HELD in added
     term = diffrax.ODETerm(eqs.derivative)
     if is_split(solver):
@@ -130,11 +132,12 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         closed = lax.map(lambda row: consistent(scene, *row), (q, v, ts))
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
     elif scene.constraints:
-        met = lax.map(lambda row: method.satisfies(scene, *row[1:], eqs.effort(eqs.args, *row)), (y, q, v, ts))  # pyright: ignore[reportCallIssue]
+        force = lambda row: eqs.generalized_force(eqs.args, *row)  # noqa: E731
+        met = lax.map(lambda row: method.satisfies(scene, *row[1:], force(row)), (y, q, v, ts))  # pyright: ignore[reportCallIssue]
         result = RESULTS.where((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows, result)
     if first is not None:
-        result = RESULTS.where(serves(first), result, RESULTS.singular_basis)
-    result = RESULTS.where(held, result, RESULTS.inconsistent_start)
+        result = RESULTS.where(is_regular(first), result, RESULTS.singular_basis)
+    result = RESULTS.where(start_ok, result, RESULTS.inconsistent_start)
     angles = turning(system)
     if angles.size and not is_fixed(steps[-1]):
         coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)

@@ -177,7 +177,7 @@ def simulate(
         raise ValueError(
             "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
         )
-    if method.jumping and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if method.step_constants and isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards; take 'reverse', or "
             "jd.Reduced with independent velocities or a function"

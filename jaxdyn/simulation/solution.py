@@ -21,10 +21,10 @@ from jaxdyn.systems.scene import Scene
 
 def from_diffrax(result) -> Any:
     """A code of diffrax as one of `RESULTS`, by its name."""
-    found: Any = RESULTS.successful
+    translated: Any = RESULTS.successful
     for name, code in diffrax.RESULTS._name_to_item.items():
-        found = RESULTS.where(result == code, getattr(RESULTS, name), found)
-    return found
+        translated = RESULTS.where(result == code, getattr(RESULTS, name), translated)
+    return translated
 
 
 # A number for each code, its place here, for arrays and files.
