@@ -106,7 +106,7 @@ def _closed_to(dtype) -> float:
 
 
 def _from_elsewhere(assembly: Assembly, guesses: int, assembled: Callable, scene: Scene, q) -> Assembly:
-    """The first success from configurations around q, or what was found at first."""
+    """The first assembly that succeeds from configurations around q, or else the first one."""
     sizes, _ = coordinate_sizes(scene.system, q.dtype)
     chance = np.random.default_rng(0)
     for tried in range(1, guesses):
@@ -152,7 +152,7 @@ def _closed(scene, q, t, rank_tol):
         place = lax.stop_gradient(solve(fixed, guess, frozen))
         e = difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
         moved = displace(scene.system, q, _stationary(scene, q, t, e, rank_tol))
-        # The way from guess to place and back again costs digits, which the place itself has not lost.
+        # Going from the guess to the solution and back again costs digits that the solution itself has.
         return retract(scene.system, place + (moved - lax.stop_gradient(moved)))
 
     def tangent(scene, q, t, steps):

@@ -54,7 +54,7 @@ def _both_frames(members, system, q, v=None) -> Carried:
 
 
 def _seen_from_a(frames: Carried):
-    """Rotations (n, 3, 3) and positions (n, 3) of frames B seen from frames A, and the way from tree to tree (n, 3).
+    """Rotations (n, 3, 3) and positions (n, 3) of frames B seen from frames A, and the displacement between their trees (n, 3).
 
     Positions are subtracted tree by tree: a robot far from the world's origin loses nothing.
     """

@@ -1,4 +1,4 @@
-"""How many ways a constrained mechanism can move."""
+"""The degrees of freedom of a constrained mechanism."""
 
 from typing import Any
 

@@ -178,7 +178,7 @@ def _moved(scene: Scene, q, v, t, errors, every: Callable, some: Callable):
 def _allowed(errors: tuple, *corrections) -> tuple:
     """Errors less the least change that removes what they add to the rows, and with what is left open.
 
-    A way is (step, rate of the rows along an error, distance left); its step is None for no rows.
+    A correction is (step, rate of the rows along an error, distance left); its step is None for no rows.
     """
 
     def allowed(error, step, rate, left):

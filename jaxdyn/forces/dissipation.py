@@ -1,4 +1,4 @@
-"""Forces that take energy away: Rayleigh's dissipation function, and Coulomb friction while it slides a given way."""
+"""Forces that take energy away: Rayleigh's dissipation function, and Coulomb friction for sliding in a given direction."""
 
 from collections.abc import Callable
 from typing import Any

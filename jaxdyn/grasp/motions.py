@@ -31,9 +31,9 @@ class HandMotions(Basis):
 
     - `object` (no, nw): reference R_o of H = P R_o T^-1, with P = 1 - B^+ B, B = (1 - J_h J_h^+) G^T, and T the Cholesky
       factor of R_o^T P R_o. With nw = no it is H itself, the same at every place.
-    - `internal` (nh, nk): reference R_i of K, in the same way of 1 - J_h^+ J_h.
+    - `internal` (nh, nk): reference R_i of K, likewise of 1 - J_h^+ J_h.
 
-    H and K are as smooth as J_h and G wherever their ranks are constant: no signs or pivots are chosen on the way. It is a
+    H and K are as smooth as J_h and G wherever their ranks are constant: no signs or pivots are chosen. It is a
     basis for `jd.reduced_dynamics` and, around the place of its references, for `jd.Reduced`.
     """
 

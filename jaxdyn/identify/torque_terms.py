@@ -1,7 +1,7 @@
 """Joint torques beyond viscous and Coulomb friction: columns of the regressor, each with a coefficient for every joint.
 
     load        |tau_rigid| tanh(v / v_s)   Coulomb friction in proportion to the torque that the gear carries
-    dahl        z, dz/dq = (sign v - z) / z0   pre-sliding: friction that needs a way of about z0 to turn round
+    dahl        z, dz/dq = (sign v - z) / z0   pre-sliding: friction reverses over a displacement of about z0
     asymmetric  |v|                         viscous friction that differs between the directions
     quadratic   v |v|                       friction that grows faster than the velocity
     spring      sin q and cos q             springs and counterbalances between a link and the one before
@@ -18,7 +18,7 @@ import numpy as np
 from jaxdyn.identify.friction import TERMS, check_terms
 from jaxdyn.identify.logs import Log, as_measured
 
-# The way in which pre-sliding friction turns round (rad, m).
+# The displacement over which pre-sliding friction reverses (rad, m).
 PRESLIDING = 0.003
 
 
@@ -76,7 +76,7 @@ def _dahl(log, load, v_s):
     z[0] = np.tanh(np.asarray(log.v)[0] / v_s)
     for i in range(1, len(q)):
         path = q[i] - q[i - 1]
-        # The solution along a way in one direction.
+        # The solution along a displacement in one direction.
         z[i] = np.sign(path) + (z[i - 1] - np.sign(path)) * np.exp(-np.abs(path) / PRESLIDING)
     return z
 

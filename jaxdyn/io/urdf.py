@@ -269,7 +269,7 @@ def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str],
     roots = [name for name in links if name not in moved_by]
     if len(roots) > 1:
         raise ValueError(f"{path}: there are {len(roots)} root links: {', '.join(roots)}; join them by a joint")
-    # From every link the way to the parent leads to the root, unless it runs in a circle.
+    # From every link the chain of parents ends at the root, unless it is a circle.
     sound = set(roots)
     for start in links:
         visited, link = [], start

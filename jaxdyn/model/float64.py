@@ -213,10 +213,10 @@ def move_inertia(pose: np.ndarray, parameters: np.ndarray) -> np.ndarray:
 
 
 def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool]:
-    """Joints whose articulated inertia S^T I^A S (plus armature) is singular, when those found further out are held.
+    """Joints whose articulated inertia S^T I^A S (plus armature) is singular, when those further out in the tree are locked.
 
     det M is the product of det(S^T I^A S) over the joints (Featherstone 2008, section 7.2), so the mass matrix is
-    singular exactly when there is one, and is regular once all of them are held. `q` lists each joint's coordinates.
+    singular exactly when there is one, and is regular once all of them are locked. `q` lists each joint's coordinates.
 
     **Returns:** the joints, each with whether S^T I S vanishes for the composite inertia of all that it carries.
     """

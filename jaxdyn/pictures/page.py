@@ -306,7 +306,7 @@ def _stop(server) -> None:
 
 @contextlib.contextmanager
 def _recorded() -> Iterator[Any]:
-    """A server to record a page with; viser has no other way to one."""
+    """A server of which a page is recorded; viser records from a server alone."""
     server = _server(_free_port(None))
     try:
         yield server

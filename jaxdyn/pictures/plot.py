@@ -119,7 +119,7 @@ def forces(scene, solution, ax=None) -> Any:
 
 
 def work_precision(records: Any, ax=None, *, error: str = "error_path", cost: str = "seconds_best") -> Any:
-    """Cost against error of several ways to integrate one scene: further left is more exact, further down is cheaper.
+    """Cost against error of several integrators on one scene: further left is more exact, further down is cheaper.
 
     **Arguments:**
 

@@ -139,8 +139,8 @@ class Orthonormal(Basis):
     """The orthonormal basis of ker A(q, t) that a reference R (nv, nr) gives: N = P R T^-1, with P = 1 - A^+ A.
 
     T is the Cholesky factor of R^T P R, so N is as smooth as A wherever the rank of A is constant and R^T P R regular: no
-    signs or pivots are chosen on the way, as a QR factorisation of A^T would. R = `tangent_basis` at one place serves
-    around it; to go on, take N(q) as the new R, which leaves N(q), and therefore nu, as they are.
+    signs or pivots are chosen, as a QR factorisation of A^T would. R = `tangent_basis` at one configuration is enough around it;
+    to go on, take N(q) as the new R, which leaves N(q), and therefore nu, as they are.
     """
 
     reference: Float[Array, "nv nr"]

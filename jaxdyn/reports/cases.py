@@ -30,7 +30,7 @@ class Case(NamedTuple):
       - `build()` -> (scene, (q0, v0)); `reference(start)` -> `Reference`, or None where a
     converged solution at `ts` serves.
       - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
-      - `largest`: the most trajectories at once that are measured unless `ways` are chosen; None for any number.
+      - `largest`: the most trajectories at once that are measured unless `integrators` are chosen; None for any number.
     """
 
     name: str

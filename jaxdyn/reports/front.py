@@ -64,10 +64,10 @@ def beaten_by(
 
 
 class Standing(NamedTuple):
-    """How one way to integrate does in a class of scenes.
+    """How one integrator does in a class of scenes.
 
-    `ratio`: its cost over that of the best way, geometric mean over scenes and target errors that it reaches; `reached`
-    of `wanted`: how many of those that some way reaches.
+    `ratio`: its cost over that of the best integrator, geometric mean over scenes and target errors that it reaches; `reached`
+    of `wanted`: how many of those that some integrator reaches.
     """
 
     kind: str
@@ -91,11 +91,11 @@ def standings(
             ladders[kind, r.label][r.scene].append(r)
     table = []
     for kind in dict.fromkeys(kind for kind, _ in ladders):
-        ways = {label: scenes for (k, label), scenes in ladders.items() if k == kind}
-        goals = [(scene, target) for scene in {s for x in ways.values() for s in x} for target in targets]
+        integrators = {label: scenes for (k, label), scenes in ladders.items() if k == kind}
+        goals = [(scene, target) for scene in {s for x in integrators.values() for s in x} for target in targets]
         costs = {
             label: [cost_at(scenes.get(scene, ()), target, cost=cost) for scene, target in goals]
-            for label, scenes in ways.items()
+            for label, scenes in integrators.items()
         }
         best = [min(column) for column in zip(*costs.values(), strict=True)]
         rows = []

@@ -160,7 +160,7 @@ def largest_error(computed: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def converged(programs: Programs, values: Callable) -> Reference:
-    """A solution of our own at tolerances of 1e-13, its error estimated from another way to integrate it.
+    """A solution of our own at tolerances of 1e-13, its error estimated from another integrator.
 
     That is other velocities (method "reduced") for a scene with constraints, another solver for one without. The two
     share the equations of motion, so the estimate is of the integration alone.
@@ -168,7 +168,7 @@ def converged(programs: Programs, values: Callable) -> Reference:
     **Raises:** RuntimeError when one of them does not come to the end.
     """
     other = ("reduced", "Dopri8") if programs.scene.constraints else ("auto", "Tsit5")
-    fine, rough = (programs.solve(*way, 1e-13) for way in (("auto", "Dopri8"), other))
+    fine, rough = (programs.solve(*pair, 1e-13) for pair in (("auto", "Dopri8"), other))
     error = float(largest_error(values(*rough)[0], values(*fine)[0]).max())
     if not np.isfinite(error):
         raise RuntimeError("no converged reference: a simulation at tolerances of 1e-13 stopped early; loosen them")

@@ -20,7 +20,7 @@ def thin_bar(mass, length):
 
 
 def _circles(center, radius, other, reach):
-    """The intersection of two circles that lies to the left of the way from the first centre to the second."""
+    """The intersection of two circles that lies to the left of the line from the first centre to the second."""
     direction = np.asarray(other, float) - center
     distance = np.hypot(*direction)
     along = (radius**2 - reach**2 + distance**2) / (2 * distance)
@@ -143,7 +143,7 @@ def parallel_manipulator(*, length=1.0, bases=_BASES, mass=1.0, gravity=None) ->
     second angle of each is relative to the first. With motors on all six joints, or on the three at the bases, it has
     more motors than freedoms: torques in the null space of the motors change the internal forces alone.
 
-    Start: the carried `point` (m) and its `velocity` (m/s); `elbows` +1 to the left of the way from base to point.
+    Start: the carried `point` (m) and its `velocity` (m/s); `elbows` +1 to the left of the line from base to point.
 
     Source: EQUATIONS section 8.
     """

@@ -1,6 +1,6 @@
 """Contacts during a motion: their forces as outputs, and where one of them pulls or leaves its cone, which ends the motion.
 
-The rows of a contact are two-sided; what its cone says about the multipliers is tested on the way. Let m(t) be the least
+The rows of a contact are two-sided; whether its cone admits the multipliers is tested during the motion. Let m(t) be the least
 margin of all contacts (`FrictionCone.margin`). The motion ends at the first zero of m that a step or a save point shows, found
 by bisection of the step's dense output. A cone that is entered and left within one step is not seen.
 """

@@ -82,7 +82,7 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
         scene, control, method = given(args)
         return controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
 
-    # Traced once for all the places where diffrax and differentiation call it, and once for each way in which it is traced.
+    # diffrax and differentiation call it in many places: it is traced once for each mode of `jd.compilation`.
     @functools.partial(jax.jit, static_argnums=0)
     def traced(mode, t, y, args):
         scene, _, method = given(args)

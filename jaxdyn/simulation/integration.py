@@ -1,4 +1,4 @@
-"""The way from a start to the save points: which solver takes the steps, by our own loop or by diffrax's, and how that ended."""
+"""Integration from a start to the save points: the solver, the loop (our own or diffrax's), and the code at the end."""
 
 from typing import Any
 
@@ -76,7 +76,7 @@ def integrate(term, project, quality, allowance, method, y0, ts, args, steps, op
 
 
 def _is_driven(controller, adjoint, options) -> bool:
-    """Whether steps are made by a loop of our own: explicit ones, of a control that we know, with nothing shown on the way."""
+    """Whether steps are made by a loop of our own: explicit ones, with a known control and without a progress meter."""
     known = type(controller) in (Adaptive, ErrorMonitoredSteps)
     return known and isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) and not options["progress"]
 

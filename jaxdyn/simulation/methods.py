@@ -205,7 +205,7 @@ class Reduced(Method):
     **Arguments:**
 
     - `basis`: what nu is, as in `reduced_dynamics`: a tuple of indices of independent velocities, or a function N(q, t).
-      Where N becomes singular on the way the run ends with the code `singular_basis`. By default an orthonormal basis
+      Where N becomes singular the run ends with the code `singular_basis`. By default an orthonormal basis
       that is continued from step to step, which serves as long as the rank of the rows is constant.
     - `dof`: number of minimal velocities of the default basis. By default nv less the rank of the rows on concrete
       numbers, and less their number on traced ones.
@@ -337,7 +337,7 @@ class Variational(Multipliers):
         return variational.begin(scene, *self.place(scene, y, t), t, self.rank_tol)
 
     def advance(self, scene: Scene, y, t0, t1, carried: variational.Carried, generalized_force: Callable):
-        """y at t1, the mean velocity on the way, what is carried on, and whether the step succeeded."""
+        """y at t1, the mean velocity of the step, the state of the method, and whether the step succeeded."""
         stepped = variational.step(scene, y["q"], y["v"], carried, t0, t1, generalized_force, self.rank_tol)
         mean, y1 = stepped.carried.mean, {"q": stepped.q, "v": stepped.v}
         if "work" in y:

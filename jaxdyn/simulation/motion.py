@@ -1,4 +1,4 @@
-"""One run from its start to its solution: the start judged, the way integrated, the end judged, the outputs computed."""
+"""One run: checks of the start, integration, checks of the end, and the outputs."""
 
 import functools
 

@@ -58,7 +58,7 @@ def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Calla
     unknown, known = partition_traced(scene)
     length = jnp.asarray(seconds, dtype) if isinstance(seconds, Tracer) else np.asarray(seconds, dtype)
 
-    # Once for each way in which it is traced.
+    # Traced once for each mode of `jd.compilation`.
     @functools.partial(jax.jit, static_argnums=0)
     def traced(mode, t, y, args):
         unknown, tau = args

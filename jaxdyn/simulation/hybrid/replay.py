@@ -1,4 +1,4 @@
-"""The way from the start to the save points, and reverse mode through its events.
+"""Integration from the start to the save points, and reverse mode through its events.
 
 Backwards the motion is taken again in pieces, from each save point or event to the next, within the modes that are known by then.
 Each piece is differentiated as motions without events are. At an event the condition e of the mode falls to zero, so its time
