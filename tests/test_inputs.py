@@ -35,6 +35,7 @@ OF_BODIES = {
     "generalized_force": (jd.generalized_force, Q, WRENCH),
     "integrate": (jd.integrate, Q, V),
     "jacobian_dot_v": (lambda m, q, v: jd.jacobian_dot_v(m, q, v, BODY), Q, V),
+    "link_adjoints": (jd.link_adjoints, Q),
     "mass_matrix_derivative": (jd.mass_matrix_derivative, Q),
     "mass_matrix_sqrt": (jd.mass_matrix_sqrt, Q),
     "newton_euler_matrices": (lambda m, q, v: jd.newton_euler_matrices(m, q, v).V, Q, V),

@@ -22,11 +22,11 @@ from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, row
 from jaxdyn.constraints.dynamics import projections
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.control.errors import RateError, TaskError, as_target, least_acceleration, row_rank, wanted_rows
-from jaxdyn.control.gains import gain, times
+from jaxdyn.control.gains import as_matrix, gain, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.arguments import as_array, batch_hint, check_state
 from jaxdyn.reduction.gauge_invariant import gauge_invariant
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.scene import Scene, as_pytree
@@ -209,6 +209,63 @@ class GaugeInvariant(_ForceLoop):
     def __call__(self, q, v, t=0.0, state=None, multipliers=None) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N."""
         scene, system, t = self.scene, self.scene.system, jnp.asarray(t, q.dtype)
+        J, along, change = self._reference_motion(q, v, t)
+        M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)  # pyright: ignore[reportArgumentType]
+        gauge = gauge_invariant(scene, q, v, None, t, dof=J.shape[1])  # pyright: ignore[reportArgumentType]
+        # W^T J (ed + Kp e), which lies along V2.
+        eps = _product(gauge.V2.T, _product(gauge.W.T, v - along))
+        push = _product(M, change) + _product(C, along)
+        push = push - _product(gauge.W, _product(gauge.V2, times(self.kd, eps, "kd")))
+        normal = _product(gauge.Gamma_o, gauge.reduced_velocity) + _product(gauge.Lambda_r.T, self.pressed(q, t, state))
+        # Of `push` the part of the motion, W V2 V2^T W^-1, in the place of which the normal one stands.
+        free = _product(gauge.V2, _product(gauge.V2.T, jnp.linalg.solve(gauge.W, push)))
+        tau = _product(gauge.W, free + _product(gauge.V1, normal))
+        potential, force = bias_force(system, q, v, t) - _product(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
+        return tau + potential if force is None else tau + potential - force
+
+    def composite_error(self, q, v, t=0.0) -> Float[Array, " nr"]:
+        """The composite error eps = B (ed + Kp e) = V2^T W^T (v - J (xd_d - Kp e)), (nr,), in sqrt(J).
+
+        |eps|^2 / 2 is the kinetic energy of the velocity error ed + Kp e. The components depend on the gauge, the norm not.
+
+        **Arguments:** `q` (nq,), `v` (nv,), on the constraints; `t`, s. **Raises:** as calls of the law.
+
+        Source: EQUATIONS section 9.
+        """
+        system = self.scene.system
+        q, v, t = check_state(system, q=q, v=v, t=t)
+        J, along, _ = self._reference_motion(q, v, t)
+        return _product(self._to_quasi_velocities(q, t, J.shape[1]), v - along)
+
+    def equivalent_gains(self, q, t=0.0) -> tuple[Float[Array, "nr nr"], Float[Array, "nr nr"]]:
+        """Gains (Kp', Kd') with which this law is  xdd_d - Kd' ed - Kp' e  in task coordinates, as `HybridForce` writes it:
+
+            Kp' = B^-1 Kd B Kp,   Kd' = Kp + B^-1 Kd B,   B = V2^T W^T J.
+
+        The two laws then differ by (Bdot + Gamma_r B)(ed + Kp e) alone, a Coriolis force of the composite error. For a number
+        Kd = k these are k Kp and Kp + k, whatever q.
+
+        **Arguments:** `q` (nq,), on the constraints; `t`, s.
+
+        **Returns:** (nr, nr) 1/s^2, and (nr, nr) 1/s. **Raises:** as calls of the law.
+
+        Source: EQUATIONS section 9.
+        """
+        q, t = check_state(self.scene.system, q=q, t=t)
+        J, _, _ = self._reference_motion(q, jnp.zeros((self.scene.nv,), q.dtype), t)
+        B = _product(self._to_quasi_velocities(q, t, J.shape[1]), J)
+        kp, kd = as_matrix(self.kp, B[0], "kp"), as_matrix(self.kd, B[0], "kd")
+        turned = jnp.linalg.solve(B, _product(kd, B))
+        return _product(turned, kp), kp + turned
+
+    def _to_quasi_velocities(self, q, t, m: int) -> Float[Array, "nr nv"]:
+        """V2^T W^T, which takes velocities to the m quasi velocities along the constraints."""
+        gauge = gauge_invariant(self.scene, q, jnp.zeros((self.scene.nv,), q.dtype), None, t, dof=m)
+        return _product(gauge.V2.T, gauge.W.T)
+
+    def _reference_motion(self, q, v, t):
+        """J (nv, nr), the velocity J s of the reference rates s = xd_d - Kp e, and its rate, (nv,) each."""
+        scene, system = self.scene, self.scene.system
         errors = Scene(system, (self.error,))
         m = self.error.sizes(system, q.dtype)[0]
         if m + _count(scene) < scene.nv:
@@ -231,19 +288,7 @@ class GaugeInvariant(_ForceLoop):
         J = inverse[:, -m:]
         s, sdot = jax.jvp(reference, (q, t), motion)
         along = _product(J, s)
-        change = _product(J, sdot) - _product(inverse, _product(turning, along))
-        M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)  # pyright: ignore[reportArgumentType]
-        gauge = gauge_invariant(scene, q, v, None, t, dof=m)  # pyright: ignore[reportArgumentType]
-        # W^T J (ed + Kp e), which lies along V2.
-        eps = _product(gauge.V2.T, _product(gauge.W.T, v - along))
-        push = _product(M, change) + _product(C, along)
-        push = push - _product(gauge.W, _product(gauge.V2, times(self.kd, eps, "kd")))
-        normal = _product(gauge.Gamma_o, gauge.reduced_velocity) + _product(gauge.Lambda_r.T, self.pressed(q, t, state))
-        # Of `push` the part of the motion, W V2 V2^T W^-1, in the place of which the normal one stands.
-        free = _product(gauge.V2, _product(gauge.V2.T, jnp.linalg.solve(gauge.W, push)))
-        tau = _product(gauge.W, free + _product(gauge.V1, normal))
-        potential, force = bias_force(system, q, v, t) - _product(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
-        return tau + potential if force is None else tau + potential - force
+        return J, along, _product(J, sdot) - _product(inverse, _product(turning, along))
 
 
 def constrained(scene: Any) -> Scene:
