@@ -66,6 +66,7 @@ class RESULTS(optimistix.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     no_single_contact = (
         "Surfaces that roll do not touch in one point any more: their relative curvature is not positive."
     )
+    unnormalized_start = "A quaternion of the initial state is not of unit length."
 
 
 # Of optimistix the message of this one is empty, which prints as nothing.

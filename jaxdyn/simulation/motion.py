@@ -25,6 +25,7 @@ from jaxdyn.simulation.solvers.choice import (
 )
 from jaxdyn.simulation.solvers.differentiable import COUNTS
 from jaxdyn.simulation.solvers.inputs import (
+    has_unit_quaternions,
     most_turned,
     turning,
     usable_steps,
@@ -37,12 +38,13 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     """The run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
     q0, v0, ts, *steps = numbers
     system, outputs = scene.system, options["outputs"]
+    unit_start = has_unit_quaternions(system, q0)
     q0 = retract(system, q0)
     in_order = jnp.isfinite(ts).all() & (ts[1:] > ts[:-1]).all()
     given_times, ts = ts, jnp.where(in_order, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     finite_start = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
     steps, fine_steps, fine_tolerances = usable_steps(steps, ts)
-    good = finite_start & in_order & fine_steps & fine_tolerances
+    good = finite_start & unit_start & in_order & fine_steps & fine_tolerances
     # A bad lane of a batch takes a harmless start, so that it does not make the others wait.
     harmless = jnp.zeros_like(q0)
     if isinstance(system, Model):
@@ -143,6 +145,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
         result = RESULTS.where(coarse, RESULTS.coarse_start, result)
     for fine, code in (
+        (unit_start, RESULTS.unnormalized_start),
         (finite_start, RESULTS.nonfinite_start),
         (fine_tolerances, RESULTS.bad_tolerance),
         (fine_steps, RESULTS.bad_stepsize),

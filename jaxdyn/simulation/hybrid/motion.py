@@ -26,6 +26,7 @@ from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.simulation.solvers.choice import label, unwrapped
+from jaxdyn.simulation.solvers.inputs import has_unit_quaternions
 from jaxdyn.systems.scene import Scene, check_callback, checked_force
 from jaxdyn.systems.system import retract
 
@@ -89,11 +90,12 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", q0, v0, ts[0], first=(system,))
     in_order = jnp.isfinite(ts).all() & (ts[1:] > ts[:-1]).all()
     given_times, ts = ts, jnp.where(in_order, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
+    unit_start = has_unit_quaternions(system, q0)
     q0 = retract(system, q0)
     finite_start = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
     fine = jnp.isfinite(rtol) & (rtol >= 0) & jnp.isfinite(atol) & (atol >= 0)
     rtol, atol = (jnp.maximum(jnp.where(fine, x, 1e-3), 10 * eps).astype(dtype) for x in (rtol, atol))
-    good = finite_start & in_order & fine
+    good = finite_start & unit_start & in_order & fine
     harmless = neutral(system).astype(dtype) if isinstance(system, Model) else jnp.zeros_like(q0)
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
 
@@ -155,6 +157,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
     for fits, name in (
         (start_ok, "inconsistent_start"),
+        (unit_start, "unnormalized_start"),
         (finite_start, "nonfinite_start"),
         (fine, "bad_tolerance"),
         (in_order, "unordered_times"),
