@@ -85,8 +85,10 @@ class Outcome(eqx.Module):
 class ConstrainedDynamics(Outcome):
     """Accelerations and constraint forces of a scene.
 
-    - `acceleration` (nv,); `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for
-      rows in m and N m for rows in rad.
+    - `acceleration` (nv,), the rate of v: of a free or spherical joint that of its body twist, in axes that turn with the body
+      (`jd.frame_acceleration` gives accelerations in world axes).
+    - `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for rows in m and N m for rows
+      in rad.
     - `rank` (): number of independent rows. `result`: one of `RESULTS`; `success`: whether it is `successful`.
     - `layout`: name and place of each constraint's rows.
     """

@@ -131,8 +131,9 @@ def forward_dynamics(
     **Arguments:** `q` (nq,); `v` (nv,); `tau` (nv,), N m or N; `external` (nb, 6), wrench (f, tau) ON each body, at its
     frame's origin and in its axes (N, N m), or None.
 
-    **Returns:** (nv,), the rate of v. NaN when M is not positive definite, which a joint that moves no inertia causes;
-    the error grows with the condition number of M.
+    **Returns:** (nv,), the rate of v: of a free or spherical joint that of its body twist, in axes that turn with the body
+    (`frame_acceleration` gives accelerations in world axes). NaN when M is not positive definite, which a joint that moves
+    no inertia causes; the error grows with the condition number of M.
 
     **Raises:** ValueError, on concrete numbers, for a `System` without a motion here: M singular (its rank is named), a
     Lagrangian that is not finite, an immersion of too low a rank.

@@ -110,10 +110,10 @@ def simulate(
     - `adjoint`: "reverse" (default) for reverse mode with checkpoints; "forward" for jvp, jacfwd and Hessians by
       forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
-    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration",
+    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration"
+      (the rate of v: of a free joint that of its body twist; `jd.frame_acceleration` gives those of frames in world axes),
       "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control), "control_state" (of
-      a controller) and
-      "pose:<frame>". They are computed only if asked for.
+      a controller) and "pose:<frame>". They are computed only if asked for.
     - `contacts`: of a scene with `cones`. "stop": where a contact pulls or leaves its cone (a margin below zero by more than
       rounding, eps^(1/2) of its force) the run ends, with the code `contact_lost` and the time, which is found within the
       step. "report": it goes on, and contacts hold on both sides.
