@@ -18,7 +18,7 @@ from jaxdyn.constraints.rank import tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, openness, row_limits
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, check_state, or_zeros
 from jaxdyn.model.tree import Model, difference
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, as_scene
@@ -46,7 +46,7 @@ def assemble(
     scene: Scene,
     q: Float[Array, " nq"],
     v: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     hold: Mapping[str, Any] | None = None,
     guesses: int = 16,

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import run
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import batch_hint, check_state, state_dtype
+from jaxdyn.model.arguments import Function, Numbers, batch_hint, check_state, state_dtype
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -94,7 +94,7 @@ class Holonomic(Constraint):
     with_system: bool = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
-    def __init__(self, phi, with_system: bool = False, name: str | None = None):
+    def __init__(self, phi: Function, with_system: bool = False, name: str | None = None):
         self.name = _own_name(name, phi, "holonomic")
         self.phi = as_pytree(phi, f"constraint {self.name!r}: phi")
         self.with_system = bool(with_system)
@@ -211,7 +211,7 @@ def nonholonomic_rows(places: Sequence[Layout]) -> np.ndarray:
     return np.concatenate([np.arange(place.nonholonomic, place.end) for place in places] or [np.zeros(0, int)])
 
 
-def position_residual(scene: Scene, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nh"]:
+def position_residual(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, " nh"]:
     """phi(q, t) of all holonomic parts, stacked in the scene's order; (0,) when there are none."""
     return run(_position_residual, scene, q, jnp.asarray(t, q.dtype))
 
@@ -247,7 +247,7 @@ def _by_functions(scene: Scene, q, v, t):
     return jnp.concatenate(parts)
 
 
-def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Rows:
+def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Rows:
     """A, gamma and A v - b of all constraints of the scene (see `Rows`)."""
     return run(_rows, scene, q, v, jnp.asarray(t, q.dtype))
 
@@ -264,7 +264,7 @@ def _rows(scene: Scene, q, v, t) -> Rows:
     return Rows(*(jnp.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
-def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "nc nv"]:
+def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nc nv"]:
     """A(q, t) (nc, nv) of all constraints: admissible velocities satisfy A v = b, constraint forces are A^T lam.
 
     **Arguments:** `q` (nq,); `t`, s.

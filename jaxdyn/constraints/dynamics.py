@@ -22,7 +22,7 @@ from jaxdyn.constraints.rank import checked_tolerance, eps_of, least_pivot, pseu
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, check_state, or_zeros
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_factored
 from jaxdyn.systems.scene import Scene, as_scene, checked_force
@@ -116,7 +116,7 @@ def constrained_dynamics(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     method: str = "rank_aware",
     rank_tol: float | None = None,
@@ -312,7 +312,9 @@ def _solve_delassus(delassus, wanted, nv: int):
     return solve_factored(factor, wanted), fine
 
 
-def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None) -> Projections:
+def projections(
+    scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
+) -> Projections:
     """Projections P_T = 1 - M^-1 A^T (A M^-1 A^T)^+ A of velocities and P_omega = P_T^T of forces.
 
     P_T is orthogonal in the metric M and keeps what satisfies A v = 0; P_omega removes every constraint force A^T lam.
@@ -340,7 +342,7 @@ def whitened_rows(scene: Scene, q, t):
 
 
 def second_fundamental_form(
-    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0, *, rank_tol: float | None = None
+    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0, *, rank_tol: float | None = None
 ) -> Float[Array, " nv"]:
     """S(v, v) = (1 - P_T)(a + M^-1 C v): the covariant acceleration that the constraints prescribe.
 

@@ -1,7 +1,5 @@
 """The degrees of freedom of a constrained mechanism."""
 
-from typing import Any
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -9,12 +7,13 @@ from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import checked_tolerance, pseudo_inverse, tolerance
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state
+from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.systems.scene import as_scene
+from jaxdyn.systems.system import SceneLike
 
 
 def degrees_of_freedom(
-    scene: Any, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None
+    scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
 ) -> int | Int[Array, ""]:
     """Degrees of freedom at a configuration: nv minus the rank of the constraints' rows A(q, t).
 

@@ -7,12 +7,12 @@ from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.frames import Pair, places_on, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_shapes, check_state
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 
 
 def constraint_forces(
-    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t=0.0
+    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t: Numbers = 0.0
 ) -> dict[str, Float[Array, " nv"]]:
     """Generalised force A_i^T lam_i of each constraint on the system, by name.
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.lie.so3 import _product, cross
-from jaxdyn.model.arguments import pose_leaf
+from jaxdyn.model.arguments import Numbers, pose_leaf
 
 
 class TouchingPoint(NamedTuple):
@@ -140,10 +140,10 @@ class RollingWheel(Touching):
 
 def rolling_wheel(
     body: str,
-    pose,
-    radius,
+    pose: Numbers | None,
+    radius: Numbers,
     *,
-    plane=None,
+    plane: Numbers | None = None,
     plane_body: str | None = None,
     contact: bool = True,
     lateral: bool = True,
@@ -197,7 +197,13 @@ class KnifeEdge(Touching):
 
 
 def knife_edge(
-    body: str, pose=None, *, plane=None, plane_body: str | None = None, contact: bool = True, name: str | None = None
+    body: str,
+    pose: Numbers | None = None,
+    *,
+    plane: Numbers | None = None,
+    plane_body: str | None = None,
+    contact: bool = True,
+    name: str | None = None,
 ) -> KnifeEdge:
     """A blade (skate, sharp wheel without inertia) that slides along its x axis and not across.
 
@@ -255,13 +261,13 @@ class RollingSphere(Touching):
 
 def rolling_sphere(
     body: str,
-    center,
-    radius,
+    center: Numbers | None,
+    radius: Numbers,
     *,
     on: str = "plane",
     surface=None,
     surface_body: str | None = None,
-    surface_radius=None,
+    surface_radius: Numbers | None = None,
     inside: bool = False,
     slip: bool = False,
     spin: bool = False,

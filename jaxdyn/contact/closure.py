@@ -15,6 +15,7 @@ from jaxtyping import Float
 from jaxdyn.compile import is_concrete
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.cones import SIDES, FrictionCone, surface_cone
+from jaxdyn.model.arguments import Numbers
 
 _FIRST_FACES = 8
 _ROUNDS = 60
@@ -54,7 +55,7 @@ class _Rows(NamedTuple):
     kept: np.ndarray
 
 
-def force_closure(G, cones, *, faces: int | None = None, side="inscribed") -> ForceClosure:
+def force_closure(G: Numbers, cones, *, faces: int | None = None, side="inscribed") -> ForceClosure:
     """Whether the grasp with map G has force closure, with a margin, or with a wrench that it cannot resist.
 
     Round cones are taken as they are: a linear program (HiGHS) with faces around them is solved, and faces are added where

@@ -1,6 +1,6 @@
 """The force of each contact of a scene, and its margin from pulling and slipping, from the multipliers of the scene's rows."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import layout
 from jaxdyn.contact.cones import FrictionCone
-from jaxdyn.model.arguments import as_array, batch_hint, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, state_dtype
 from jaxdyn.systems.scene import Scene
 
 
@@ -34,7 +34,9 @@ class ConedContact(NamedTuple):
     cone: FrictionCone
 
 
-def contact_forces(scene: Scene, multipliers: Float[Array, " nc"], cones=None, smoothing: Any = 0.0) -> ContactForces:
+def contact_forces(
+    scene: Scene, multipliers: Float[Array, " nc"], cones=None, smoothing: Numbers = 0.0
+) -> ContactForces:
     """The force of each contact, and its margin in its friction cone.
 
     **Arguments:**

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint, Pfaffian
 from jaxdyn.constraints.rolling import RollingSphere
-from jaxdyn.model.arguments import as_array, pose_leaf
+from jaxdyn.model.arguments import Numbers, as_array, pose_leaf
 from jaxdyn.systems.scene import Scene, as_pytree
 
 
@@ -67,7 +67,16 @@ class DryFriction(WithModes):
     smoothing: Float[Array, "..."] | None
     name: str = eqx.field(static=True)
 
-    def __init__(self, coefficient, normal, along: Any = 0, *, static=None, smoothing=None, name: str = "friction"):
+    def __init__(
+        self,
+        coefficient: Numbers,
+        normal,
+        along: Any = 0,
+        *,
+        static: Numbers | None = None,
+        smoothing: Numbers | None = None,
+        name: str = "friction",
+    ):
         self.name = _checked_name(name, "DryFriction")
         self.coefficient, self.static = _coefficients(coefficient, static, f"DryFriction {name!r}")
         self.constraint = normal if isinstance(normal, str) else None
@@ -111,7 +120,7 @@ class UnilateralContact(WithModes):
     static: Float[Array, "..."]
     name: str = eqx.field(static=True)
 
-    def __init__(self, contact: Any, friction=0.0, *, static=None, name: str | None = None):
+    def __init__(self, contact: Any, friction=0.0, *, static: Numbers | None = None, name: str | None = None):
         if not (isinstance(contact, Constraint) and contact.wrench_components() is not None):
             raise ValueError(
                 f"UnilateralContact: contact is {contact!r}; give a constraint with a gap, as jd.rolling_sphere(...), or take "
@@ -124,12 +133,12 @@ class UnilateralContact(WithModes):
 
 def ground_contact(
     body: str,
-    point=None,
+    point: Numbers | None = None,
     friction=0.0,
     *,
-    static=None,
-    radius=0.0,
-    plane=None,
+    static: Numbers | None = None,
+    radius: Numbers = 0.0,
+    plane: Numbers | None = None,
     plane_body=None,
     name: str | None = None,
 ) -> UnilateralContact:

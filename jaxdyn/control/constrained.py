@@ -21,16 +21,16 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
 from jaxdyn.constraints.dynamics import projections
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
-from jaxdyn.control.errors import RateError, TaskError, as_target, least_acceleration, row_rank, wanted_rows
+from jaxdyn.control.errors import RateError, Target, TaskError, as_target, least_acceleration, row_rank, wanted_rows
 from jaxdyn.control.gains import as_matrix, gain, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state
+from jaxdyn.model.arguments import Function, Numbers, as_array, batch_hint, check_state
 from jaxdyn.reduction.gauge_invariant import gauge_invariant
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.scene import Scene, as_pytree
-from jaxdyn.systems.system import velocity_to_rate
+from jaxdyn.systems.system import SceneLike, velocity_to_rate
 
 
 class _ForceLoop(Controller):
@@ -106,15 +106,15 @@ class HybridForce(_ForceLoop):
 
     def __init__(
         self,
-        scene: Any,
-        task: Any,
-        target: Any,
-        kp: Any,
-        kd: Any = None,
+        scene: SceneLike,
+        task: Function,
+        target: Target,
+        kp: Numbers,
+        kd: Numbers | None = None,
         *,
         of: str = "position",
         force: Any = None,
-        ki: Any = None,
+        ki: Numbers | None = None,
         actuated: Any = None,
         internal: Any = None,
     ):
@@ -199,7 +199,17 @@ class GaugeInvariant(_ForceLoop):
     force: Callable | None
     ki: Array | None
 
-    def __init__(self, scene: Any, task: Any, target: Any, kp: Any, kd: Any, *, force: Any = None, ki: Any = None):
+    def __init__(
+        self,
+        scene: SceneLike,
+        task: Function,
+        target: Target,
+        kp: Numbers,
+        kd: Numbers,
+        *,
+        force: Any = None,
+        ki: Numbers | None = None,
+    ):
         self.scene = constrained(scene)
         self.error = TaskError(as_pytree(task, "task"), as_target(target))  # pyright: ignore[reportCallIssue]
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")

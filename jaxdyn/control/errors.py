@@ -10,7 +10,7 @@ so that  d2e/dt2 + Kd de/dt + Kp e = 0  and  dw/dt + Kp w = 0.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -24,12 +24,17 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import displacement
+
+if TYPE_CHECKING:
+    Target = Numbers | Callable[[Array], Any]
+else:
+    Target = Any  # `as_target` looks at it
 
 TASKS = {"position": (3,), "orientation": (3, 3), "pose": (4, 4)}
 
@@ -43,7 +48,7 @@ class Fixed(eqx.Module):
         return self.value
 
 
-def as_target(target: Any, name: str = "target") -> Callable:
+def as_target(target: Target, name: str = "target") -> Callable:
     """A target as a function of time: a function as it is, numbers as one that is constant.
 
     **Raises:** ValueError for what is neither.

@@ -21,7 +21,7 @@ from jaxdyn.control.feet import check_feet
 from jaxdyn.control.gains import non_negative
 from jaxdyn.dynamics.quantities import inverse_dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.arguments import Numbers, check_shapes
 from jaxdyn.model.tree import Model
 
 
@@ -60,10 +60,10 @@ def underactuated_inverse_dynamics(
     contacts,
     *,
     passive: tuple[int, ...] | None = None,
-    preload: Any = 0.0,
-    torque_weight: Any = 1.0,
-    force_weight: Any = 1e-3,
-    effort_limit: Any = None,
+    preload: Numbers = 0.0,
+    torque_weight: Numbers = 1.0,
+    force_weight: Numbers = 1e-3,
+    effort_limit: Numbers | None = None,
     tol: float | None = None,
 ) -> LeggedDynamics:
     """Torques and contact forces that give the acceleration a, the forces inside their cones.

@@ -22,12 +22,12 @@ from jaxdyn.dynamics import recursions, scans, world_frame
 from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_shapes, check_state
+from jaxdyn.model.arguments import Numbers, check_shapes, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.system import System, symbols
 
 
-def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv"]:
+def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv"]:
     """Mass matrix M(q) = sum of J_i^T M_i J_i over the bodies + diag(armature), symmetric.
 
     **Arguments:** `q` (nq,).
@@ -44,7 +44,7 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[A
 
 
 def coriolis_matrix(
-    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0
+    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
 ) -> Float[Array, "nv nv"]:
     """Coriolis matrix C(q, v) with the skew property: C v are the Coriolis and centrifugal forces, dM/dt = C + C^T.
 
@@ -63,7 +63,7 @@ def coriolis_matrix(
     return by_recursion(world_frame.coriolis_matrix, world_frame.coriolis_matrix, model, q, v)
 
 
-def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nv"]:
+def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, " nv"]:
     """Generalised gravity force N(q) = +dV/dq along the velocity coordinates; it stands on the left, with M a.
 
     **Arguments:** `q` (nq,).
@@ -78,7 +78,9 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float
     return by_recursion(recursions.gravity_force, world_frame.gravity_force, model, q)
 
 
-def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"]:
+def bias_force(
+    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
+) -> Float[Array, " nv"]:
     """Bias force h = C(q, v) v + N(q): what tau must be for zero acceleration a.
 
     **Arguments:** `q` (nq,); `v` (nv,).
@@ -96,7 +98,7 @@ def inverse_dynamics(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     a: Float[Array, " nv"],
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
@@ -122,7 +124,7 @@ def forward_dynamics(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     tau: Float[Array, " nv"],
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
@@ -228,7 +230,9 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
     return by_recursion(world_frame.generalized_force, world_frame.generalized_force, model, q, external)
 
 
-def kinetic_energy(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, ""]:
+def kinetic_energy(
+    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
+) -> Float[Array, ""]:
     """Kinetic energy T = 1/2 sum of V_i . M_i V_i + 1/2 sum of armature v^2 = 1/2 v . M(q) v.
 
     **Arguments:** `q` (nq,); `v` (nv,).
@@ -248,7 +252,7 @@ def _kinetic_energy(model: Model, q, v):
     return energy if model.armature is None else energy + 0.5 * jnp.sum(model.armature * v * v)
 
 
-def potential_energy(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, ""]:
+def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, ""]:
     """Potential energy of gravity, V = -sum of m_i g . c_i with c_i the world position of each centre of mass.
 
     Zero height is the plane through the world's origin. Far from it the value is large, and small differences of it are
@@ -306,7 +310,7 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     return by_recursion(world_frame.mass_matrix_derivative, world_frame.mass_matrix_derivative, model, q)
 
 
-def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv nv"]:
+def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
     """Christoffel symbols of the first kind, Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i).
 
     The matrix C_ij = sum_k Gamma_ijk v_k has the same C v and C + C^T as `coriolis_matrix`.

@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxdyn.model.arguments import as_array
+from jaxdyn.model.arguments import Numbers, as_array
 from jaxdyn.model.tree import Model
 
 
@@ -34,7 +34,7 @@ class JointStops(eqx.Module):
     damping: Float[Array, ""]
     joints: tuple[str, ...] | None = eqx.field(static=True)
 
-    def __init__(self, stiffness: Any = 1e4, damping: Any = 0.0, joints: Any = None):
+    def __init__(self, stiffness: Numbers = 1e4, damping: Numbers = 0.0, joints: Any = None):
         self.stiffness = _number(stiffness, "JointStops: stiffness", least=0.0, strict=True)
         self.damping = _number(damping, "JointStops: damping", least=0.0, strict=False)
         self.joints = (joints,) if isinstance(joints, str) else joints if joints is None else tuple(joints)
@@ -90,7 +90,7 @@ class EffortLimits(eqx.Module):
 
     limit: Float[Array, "..."] | None
 
-    def __init__(self, limit: Any = None):
+    def __init__(self, limit: Numbers | None = None):
         self.limit = None if limit is None else jnp.asarray(as_array(limit, "EffortLimits: limit"), float)
         if self.limit is not None and not isinstance(self.limit, Tracer) and not (np.asarray(self.limit) >= 0).all():
             raise ValueError(

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import is_known
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state
+from jaxdyn.model.arguments import Function, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
 from jaxdyn.systems.start import place_of
 from jaxdyn.systems.system import System, checked_size, rate_to_velocity
@@ -51,7 +51,7 @@ class PullBack(eqx.Module):
         return value
 
 
-def pull_back(field: Any, immersion: Any) -> PullBack:
+def pull_back(field: Function, immersion: Function) -> PullBack:
     """The pull-back of a covariant tensor by q = xi(s): J^T g J of a metric, J^T F of a one-form, V(xi(s)) of a function.
 
     **Arguments:**
@@ -250,7 +250,9 @@ def constrain_by_immersion(system: Any, xi: Callable, nq: int, *, moving: bool =
     return Scene(immersed, forces=(pulled,) if force is not None or any(forces) else ())
 
 
-def reaction_force(system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], force: Any = None, t: Any = 0.0) -> Any:
+def reaction_force(
+    system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], force: Any = None, t: Numbers = 0.0
+) -> Any:
     """Force R = M a + h - F with which an immersion holds its system, in the coordinates of the system; J^T R = 0.
 
     **Arguments:**

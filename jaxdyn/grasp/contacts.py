@@ -18,7 +18,7 @@ from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.kinds import components
-from jaxdyn.model.arguments import pose_leaf
+from jaxdyn.model.arguments import Numbers, pose_leaf
 
 
 class Contact(Pair):
@@ -73,9 +73,9 @@ class Contact(Pair):
 def contact(
     kind: str,
     finger: str | None,
-    pose,
+    pose: Numbers | None,
     *,
-    finger_pose=None,
+    finger_pose: Numbers | None = None,
     object: str | None = None,
     in_plane: bool = False,
     name: str | None = None,

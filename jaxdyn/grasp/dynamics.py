@@ -26,7 +26,7 @@ from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matr
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import least_quality
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -65,7 +65,11 @@ class ObjectDynamics(Outcome):
 
 
 def object_dynamics(
-    grasp: Grasp, q: Float[Array, " nq"], V: Float[Array, " no"], tau: Float[Array, " nv"] | None = None, t=0.0
+    grasp: Grasp,
+    q: Float[Array, " nq"],
+    V: Float[Array, " no"],
+    tau: Float[Array, " nv"] | None = None,
+    t: Numbers = 0.0,
 ) -> ObjectDynamics:
     """Equations of motion in the velocity of the object alone (see `ObjectDynamics`), and the contact forces.
 
@@ -104,7 +108,7 @@ def hand_dynamics(
     q: Float[Array, " nq"],
     nu: Float[Array, " nr"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     motions: HandMotions | None = None,
 ) -> ObjectDynamics:

@@ -27,7 +27,7 @@ from jaxdyn.dynamics.quantities import gravity_force
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp, check_grasp, grasp_map, hand_jacobian
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
 from jaxdyn.reduction.bases import orthonormal, split_directions
 
 
@@ -57,7 +57,7 @@ class HandForces(eqx.Module):
 
 
 def internal_force_basis(
-    grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0, *, reference: Float[Array, "nc ni"] | None = None
+    grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0, *, reference: Float[Array, "nc ni"] | None = None
 ) -> Float[Array, "nc ni"]:
     """Orthonormal basis E (nc, ni) of the internal forces: G E = 0.
 
@@ -106,7 +106,7 @@ def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
 
 
 def forces_for_wrench(
-    grasp: Grasp, q: Float[Array, " nq"], wrench: Float[Array, " no"], preload: Any = 0.0, t: Any = 0.0
+    grasp: Grasp, q: Float[Array, " nq"], wrench: Float[Array, " no"], preload: Numbers = 0.0, t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
     """Contact forces lam = G^+ F + (1 - G^+ G) lam_0 that exert the wrench F on the object, with a chosen internal force.
 
@@ -156,8 +156,8 @@ def hold(
     wrench: Float[Array, " no"] | None = None,
     *,
     cones: Any = None,
-    preload: Any = 0.0,
-    t: Any = 0.0,
+    preload: Numbers = 0.0,
+    t: Numbers = 0.0,
 ) -> HandForces:
     """Least contact forces within their cones that exert a wrench on the object, and the torques for them at rest.
 
@@ -211,7 +211,7 @@ def _static(grasp: Grasp, q, t):
 
 
 def force_closure(
-    grasp: Grasp, q: Float[Array, " nq"], *, cones: Any = None, t: Any = 0.0, required: bool = False
+    grasp: Grasp, q: Float[Array, " nq"], *, cones: Any = None, t: Numbers = 0.0, required: bool = False
 ) -> ForceClosure:
     """Whether the contacts of the grasp can resist every wrench on the object; see `jd.contact.force_closure`.
 
@@ -239,7 +239,9 @@ def force_closure(
     return ForceClosure(closure.closed, closure.margin, forces, closure.direction, closure.rank)
 
 
-def joint_torques(grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Any = 0.0) -> Float[Array, " nh"]:
+def joint_torques(
+    grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Numbers = 0.0
+) -> Float[Array, " nh"]:
     """J_h^T lam (nh,): torques of the joints that exert the contact forces lam (nc,) at rest, without the fingers' weight.
 
     Source: Murray, Li & Sastry (1994), eq. 5.31; EQUATIONS section 10.

@@ -22,7 +22,7 @@ from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import eps_of, pseudo_inverse, tolerance
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state
+from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.reduction.bases import Basis, Parametrization, orthonormal, split_directions
 
 
@@ -86,7 +86,7 @@ class HandMotions(Basis):
 
 
 def hand_motions(
-    grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0, *, sizes: tuple[int, int] | None = None
+    grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0, *, sizes: tuple[int, int] | None = None
 ) -> HandMotions:
     """Bases of the object velocities that the fingers can follow and of the hand's internal motions, at q.
 

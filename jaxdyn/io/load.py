@@ -15,14 +15,14 @@ from jaxdyn.io.loaded import LoadedScene, Start
 from jaxdyn.io.mjcf import load_mjcf
 from jaxdyn.io.sdf import load_sdf
 from jaxdyn.io.urdf import load_urdf
-from jaxdyn.model.arguments import as_path
+from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.tree import Model, neutral
 
 _BY_SUFFIX = {".urdf": "urdf", ".sdf": "sdf", ".world": "sdf", ".mjcf": "mjcf"}
 _BY_ROOT = {"robot": "urdf", "sdf": "sdf", "gazebo": "sdf", "mujoco": "mjcf", "mujocoinclude": "mjcf"}
 
 
-def load(source: str | os.PathLike, *, floating_base: bool | None = None, dtype=None) -> LoadedScene:
+def load(source: str | os.PathLike, *, floating_base: bool | None = None, dtype: DType | None = None) -> LoadedScene:
     """The scene of a URDF, MJCF or SDF file, or of a robot by its name in the package robot_descriptions.
 
     All formats give a `LoadedScene`, with the `Model` in `.system`. That of a URDF has the file's mimicked joints as

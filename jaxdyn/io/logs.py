@@ -6,13 +6,13 @@ import re
 import numpy as np
 
 from jaxdyn.identify.logs import Log
-from jaxdyn.model.arguments import as_path
+from jaxdyn.model.arguments import FilePath, as_path
 
 _SIGNALS = ("q", "v", "a", "tau")
 _NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit behind a column's name
 
 
-def read_log(path, *, joint_names=None, rename=None, rollout: int | None = None) -> Log:
+def read_log(path: FilePath, *, joint_names=None, rename=None, rollout: int | None = None) -> Log:
     """Read a log from a CSV file with one header line, or from an NPZ archive.
 
     Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1,
@@ -65,7 +65,7 @@ def _one_motion(columns: dict[str, np.ndarray], rollout: int | None, path) -> di
     return columns
 
 
-def write_log(path, log: Log) -> None:
+def write_log(path: FilePath, log: Log) -> None:
     """Write a log as CSV (every number at full precision) or NPZ, with columns as `read_log` reads them.
 
     Columns carry joint names when the log knows them and has one coordinate per joint, else numbers.

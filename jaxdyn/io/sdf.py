@@ -15,6 +15,7 @@ from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import Axis, Edge, Joint, read_joints, spanning_tree
 from jaxdyn.io.urdf import ROOT_JOINT, _turn_from_z
 from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.names import body_index
@@ -30,7 +31,7 @@ _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
 _SKIPPED = ("collision", "sensor", "plugin", "battery", "particle_emitter", "projector", "audio_source")
 
 
-def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype=None) -> LoadedScene:
+def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DType | None = None) -> LoadedScene:
     """The scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.
 
     Taken are links with their inertias, all joints (of two axes as two joints, JOINT and JOINT_axis2), limits (as the

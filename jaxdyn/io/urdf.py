@@ -14,6 +14,7 @@ import numpy as np
 from jaxdyn.io.urdf_check import JOINTS
 from jaxdyn.io.urdf_parts import Inertial, Joint, read_parts
 from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import DType, Numbers
 from jaxdyn.model.builder import GRAVITY, ModelBuilder, inertia_problems, unknown
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model
@@ -39,8 +40,8 @@ def load_urdf(
     floating_base: bool = False,
     lock: Iterable[str] | Mapping[str, Any] = (),
     mimic: str = "ignore",
-    gravity=GRAVITY,
-    dtype=None,
+    gravity: Numbers = GRAVITY,
+    dtype: DType | None = None,
 ) -> Model:
     """The mechanism of a URDF file. Meshes are not read.
 

@@ -6,17 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.model.arguments import as_path
+from jaxdyn.model.arguments import Numbers, as_path
 from jaxdyn.pictures.inferred import place_of
 from jaxdyn.pictures.motion import Motion, forces, joint_axes, marks, motion_of
 from jaxdyn.pictures.solids import simplified
 from jaxdyn.pictures.stage import AXIS, FORCE, LOOP, TORQUE, Stage, all_solids, color_of, stage_of
+from jaxdyn.systems.system import SceneLike
 
 _MOST_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
 _LIGHT = np.array([0.4, -0.5, 0.77])
 
 
-def draw(scene, q, ax=None, *, shapes=None) -> Any:
+def draw(scene: SceneLike, q: Numbers, ax=None, *, shapes=None) -> Any:
     """Draw a mechanism at a configuration: its bodies, joints with their axes, loops and contacts.
 
     **Arguments:**
@@ -42,7 +43,9 @@ def draw(scene, q, ax=None, *, shapes=None) -> Any:
     return picture.ax
 
 
-def animate(scene, solution, path: str | os.PathLike, *, fps: int = 25, speed: float = 1.0, shapes=None) -> None:
+def animate(
+    scene: SceneLike, solution, path: str | os.PathLike, *, fps: int = 25, speed: float = 1.0, shapes=None
+) -> None:
     """Write a motion as an animated picture: GIF (by pillow, which matplotlib brings) or MP4 (by ffmpeg, where installed).
 
     **Arguments:** `scene`; `solution`, what `jd.simulate` returned, batched or not (at most four motions are drawn); `path`, a

@@ -23,6 +23,7 @@ from jaxdyn.pictures.inferred import place_of
 from jaxdyn.pictures.motion import Motion, forces, marks, motion_of
 from jaxdyn.pictures.solids import Shapes, by_frame, joined, sharpened, simplified
 from jaxdyn.pictures.stage import FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
+from jaxdyn.systems.system import SceneLike
 
 MOST_BYTES = 2_000_000  # of a file
 _HOST = "127.0.0.1"
@@ -36,7 +37,7 @@ _PICTURES = 30  # a second
 
 
 def view(
-    scene, solution, *, shapes=None, port: int | None = None, browser: bool = True, block: bool | None = None
+    scene: SceneLike, solution, *, shapes=None, port: int | None = None, browser: bool = True, block: bool | None = None
 ) -> "Viewer":
     """Show a motion in the browser: a page on this machine with a slider over time and a button to play.
 
@@ -72,7 +73,7 @@ def view(
     return viewer
 
 
-def save_html(path: str | os.PathLike, scene, solution, *, shapes=None) -> None:
+def save_html(path: str | os.PathLike, scene: SceneLike, solution, *, shapes=None) -> None:
     """Write a motion as one HTML file under 2 MB that needs nothing else: no network, no Python.
 
     It plays in the browser as the page of `view` does. Meshes are simplified, and rows and trajectories left out, until it is

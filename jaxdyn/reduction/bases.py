@@ -18,7 +18,7 @@ from jaxdyn.compile import compiled, is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import batch_hint, check_state
+from jaxdyn.model.arguments import Numbers, batch_hint, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_factored, solve_lower
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
@@ -254,7 +254,7 @@ def _fitting(nu, N):
 
 
 def tangent_basis(
-    scene: Scene, q: Float[Array, " nq"], t: Any = 0.0, *, dof: int | None = None, rank_tol: float | None = None
+    scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0, *, dof: int | None = None, rank_tol: float | None = None
 ) -> Float[Array, "nv nr"]:
     """An orthonormal basis (nv, nr) of the velocities with A(q, t) v = 0, as a constant: a reference for `basis`.
 

@@ -27,7 +27,7 @@ from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import freedoms, orthonormal, split_directions
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import velocity_to_rate
@@ -69,7 +69,7 @@ def gauge_invariant(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     rotation: Float[Array, "n n"] | None = None,
     motion_rotation: Float[Array, "k k"] | None = None,

@@ -14,7 +14,7 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.dynamics import tolerance
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, tangent_basis
 from jaxdyn.reduction.minimal import reduce
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -36,7 +36,7 @@ class Involutivity(NamedTuple):
 
 
 def involutive(
-    scene: Scene, q: Float[Array, " nq"], t=0.0, *, dof: int | None = None, rank_tol: float | None = None
+    scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0, *, dof: int | None = None, rank_tol: float | None = None
 ) -> Involutivity:
     """Whether the velocities that the constraints allow can be integrated to surfaces: Frobenius's test at a place.
 
@@ -157,7 +157,7 @@ def spurious_terms(
     q: Float[Array, " nq"],
     nu: Float[Array, " nr"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     independent: Sequence[int],
 ) -> SpuriousTerms:

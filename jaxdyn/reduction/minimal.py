@@ -19,7 +19,7 @@ from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import Basis, Moving, Whole, as_basis, least_quality, moving
 from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
 from jaxdyn.systems.scene import Scene, as_scene
@@ -49,7 +49,7 @@ def reduced_dynamics(
     q: Float[Array, " nq"],
     nu: Float[Array, " nr"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     basis: Any = None,
 ) -> ReducedDynamics:

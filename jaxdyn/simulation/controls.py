@@ -27,7 +27,7 @@ from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.systems.scene import Scene, as_pytree, check_callback, checked_force
 
 STATE, HELD = "control", "held"
@@ -98,7 +98,7 @@ class Sampled(eqx.Module):
     state: Any
     period: Array
 
-    def __init__(self, law: Any, state: Any, period: Any):
+    def __init__(self, law: Any, state: Any, period: Numbers):
         self.law = as_pytree(law, "Sampled: law")
         self.state = jax.tree.map(lambda x: jnp.asarray(as_array(x, "Sampled: state")), state)
         seconds = as_array(period, "Sampled: period")

@@ -24,6 +24,7 @@ from jaxdyn.constraints.rank import checked_tolerance
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Numbers
 from jaxdyn.reduction.bases import (
     Basis,
     Given,
@@ -184,7 +185,7 @@ class Baumgarte(Multipliers):
     beta: Float[Array, ""]
     name: ClassVar[str] = "baumgarte"
 
-    def __init__(self, alpha: Any = 10.0, beta: Any = 10.0):
+    def __init__(self, alpha: Numbers = 10.0, beta: Numbers = 10.0):
         self.alpha, self.beta = jnp.asarray(alpha, float), jnp.asarray(beta, float)
 
     def acceleration(self, scene, q, v, t, force):

@@ -18,7 +18,6 @@ from jaxtyping import Array
 from jaxdyn.compile import is_concrete, is_known, specialized
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
-from jaxdyn.model.tree import Model
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
@@ -43,19 +42,18 @@ from jaxdyn.simulation.solvers.inputs import (
 )
 from jaxdyn.simulation.start import checked_start, chosen_method
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import System, has_followers
+from jaxdyn.systems.system import SceneLike, System, has_followers
 
 if TYPE_CHECKING:
-    SceneLike = Scene | Model | System
     Control = Callable[[Array, Array, Array], Array] | controls.Controller | controls.Sampled | None
     Solver = diffrax.AbstractSolver | Stepper | None
     Stepsize = ArrayLike | diffrax.AbstractStepSizeController | None
 else:
-    SceneLike = Control = Solver = Stepsize = Any  # looked at below, by errors that name the argument
+    Control = Solver = Stepsize = Any  # looked at below, by errors that name the argument
 
 
 def simulate(
-    scene: "SceneLike",
+    scene: SceneLike,
     q0: Numbers,
     v0: Numbers,
     ts: Numbers,

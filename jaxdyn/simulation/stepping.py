@@ -12,15 +12,16 @@ from jax.core import Tracer
 
 from jaxdyn.compile import is_expanding, is_rank_safe, partition_traced
 from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.model.arguments import as_array, check_shape, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
 from jaxdyn.simulation.solvers.driver import Drive
 from jaxdyn.simulation.solvers.rk4 import RK4
 from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import as_scene, checked_force
+from jaxdyn.systems.system import SceneLike
 
 
-def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Callable:
+def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True) -> Callable:
     """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a constant tau.
 
     The state is a pair (q (nq,), v (nv,)); batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
