@@ -1,6 +1,6 @@
 """Error against run time beside other tools, all timed in turn within one loop, and who lies below our front.
 
-    python -m benchmarks.work_precision [SCENE ...] [--batch 1 1024] [--way projected:Dopri8] [--rounds 20] [--full]
+    python -m benchmarks.work_precision [SCENE ...] [--batch 1 1024] [--integrator projected:Dopri8] [--rounds 20] [--full]
         [--out out/work_precision]
 
 The page is that of `jaxdyn report`, with the peers of `benchmarks.peers` as dashed lines on scenes that they can do. A run
@@ -92,7 +92,7 @@ def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", default=[], metavar="SCENE")
     parser.add_argument("--batch", nargs="+", type=int, default=(1,))
-    parser.add_argument("--way", nargs="+", help="method:solver in place of the usual ones")
+    parser.add_argument("--integrator", nargs="+", help="method:solver in place of the usual ones")
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--out", default=str(timing.OUT / "work_precision"))
@@ -108,7 +108,7 @@ def main(argv=None) -> None:
         full=options.full,
         dtypes=("float64",),
         batches=tuple(options.batch),
-        ways=None if options.way is None else [tuple(way.split(":")) for way in options.way],
+        integrators=None if options.integrator is None else [tuple(pair.split(":")) for pair in options.integrator],
         rounds=options.rounds,
         out=options.out,
         peers=peers.Peers(say),

@@ -40,6 +40,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("jaxdyn")
     group.addoption("--data", type=Path, default=ROOT.parent / "shared" / "data", help="directory of recorded data")
     group.addoption("--all-robots", action="store_true", help="run the robot tests on every robot, not on a few")
+    group.addoption(
+        "--cpu-times", type=Path, metavar="FILE", help="append the processor time (s) of each test to this file"
+    )
     group.addoption("--compilation", choices=("auto", "plain"), help="run all tests in this mode of jaxdyn.compilation")
 
 
@@ -61,6 +64,17 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 _CACHE = pytest.StashKey[str]()
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Processor time of a test, its fixtures and the processes that it starts: on a busy machine wall time says little."""
+    path, start = item.config.getoption("--cpu-times"), os.times()
+    yield
+    if path is not None:
+        seconds = sum(os.times()[:4]) - sum(start[:4])
+        with path.open("a") as file:  # one short line at a time, from each worker
+            file.write(f"{seconds:.2f} {item.nodeid}\n")
 
 
 @pytest.fixture(params=["auto", "plain"])

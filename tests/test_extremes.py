@@ -10,16 +10,14 @@ from pinocchio_bridge import assert_close, quick, random_states, random_tree
 from jaxdyn import inertia, scenes
 from jaxdyn.constraints import Holonomic
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
-from jaxdyn.dynamics import recursions
-from jaxdyn.dynamics import scans as looped
-from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.dynamics import recursions, scans, world_frame
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem
 
-FORMS = {"matrices": matrix_form.forward_dynamics, "recursion": recursions.aba, "loops": looped.forward_dynamics}
+FORMS = {"matrices": world_frame.forward_dynamics, "recursion": recursions.aba, "loops": scans.forward_dynamics}
 
 
 _programs = quick(lambda model, *states: [form(model, *states) for form in FORMS.values()])

@@ -385,7 +385,7 @@ def test_batches_above_the_largest_are_left_out(small, rungs, monkeypatch):
     found = jd.report("free_body", rounds=1, batches=(1, 64), echo=lines.append)
     assert {r.batch for r in found.records} == {1}
     assert "batches above 1 are left out" in lines[0]
-    found = jd.report("free_body", rounds=1, batches=(1, 4), ways=[("free", "Tsit5")])
+    found = jd.report("free_body", rounds=1, batches=(1, 4), integrators=[("free", "Tsit5")])
     assert {(r.batch, r.label) for r in found.records} == {(1, "free, Tsit5"), (4, "free, Tsit5")}
 
 
@@ -486,17 +486,17 @@ def test_command(small, rungs, capsys):
         (["report", "free_body", "--batch", "0"], "batches"),
         (["report", "free_body", "--dtype", "float16"], "float16"),
         (["report", "free_body", "--rounds", "0"], "rounds"),
-        (["report", "free_body", "--way", "Dopri8"], "ways"),
-        (["report", "free_body", "--way", "free:Euler"], "Euler"),
+        (["report", "free_body", "--integrator", "Dopri8"], "integrators"),
+        (["report", "free_body", "--integrator", "free:Euler"], "Euler"),
         (["report", "four_bar", "free_body", "--way", "projected:Dopri8"], "free_body cannot take"),
-        (["report", "free_body", "--way", "fre:Dopri8"], "ways"),
+        (["report", "free_body", "--way", "fre:Dopri8"], "integrators"),
     ):
         assert main(wrong) == 2
         assert word in capsys.readouterr().err
     assert small == ["free_body"]
 
 
-@pytest.mark.parametrize("name", ["scenes", "dtypes", "batches", "ways"])
+@pytest.mark.parametrize("name", ["scenes", "dtypes", "batches", "integrators"])
 def test_empty_arguments_are_refused(name):
     with pytest.raises(ValueError, match=f"{name} is empty"):
         jd.report(**({"scenes": "free_body"} | {name: []}))

@@ -59,7 +59,7 @@ def residual(scene, constraint, q) -> float:
     ends = zip(constraint.ends(), ({None: np.eye(4)} | poses(scene, q),) * 2, strict=True)
     first, second = (found[body] @ np.asarray(pose) for (body, pose), found in ends)
     relative = jnp.asarray(f64.inverse(first) @ second)
-    return float(np.abs(constraint.apart(relative[:3, :3], relative[:3, 3])).max())
+    return float(np.abs(constraint.pose_residual(relative[:3, :3], relative[:3, 3])).max())
 
 
 def same(a: jd.LoadedScene, b: jd.LoadedScene) -> None:

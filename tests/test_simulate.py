@@ -421,7 +421,7 @@ def test_other_numbers_do_not_compile_anew(pendulum):
     assert len(traces) == 3 * count
 
 
-@pytest.mark.parametrize("name", ["four_bar", "rolling_disk"])
+@pytest.mark.parametrize("name", [pytest.param("four_bar", marks=pytest.mark.slow), "rolling_disk"])
 def test_numbers_that_are_compiled_in_change_nothing(name, monkeypatch):
     """The motion and the assembled start of the first scene of its shape are those of the program for any numbers."""
     scene, (q, v) = getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()

@@ -55,16 +55,16 @@ class Code:
     def __init__(self, text: str, stored: bool = True):
         initialize()
         self.key = key_of(text)
-        found = _read(self.key) if stored else None
+        binary = _read(self.key) if stored else None
         machine = target_machine()
-        module = llvm.parse_assembly("" if found else text)
+        module = llvm.parse_assembly("" if binary else text)
         module.triple = llvm.get_process_triple()
         module.data_layout = str(machine.target_data)
-        if not found:
+        if not binary:
             _optimize(module, machine)
         self.engine = llvm.create_mcjit_compiler(module, machine)
-        if found:
-            self.engine.add_object_file(llvm.ObjectFileRef.from_data(found))
+        if binary:
+            self.engine.add_object_file(llvm.ObjectFileRef.from_data(binary))
         elif stored:
             self.engine.set_object_cache(lambda _, code: _write(self.key, bytes(code)))
         self.engine.finalize_object()
@@ -112,10 +112,10 @@ def _path(key: bytes) -> Path:
 def _read(key: bytes) -> bytes | None:
     try:
         path = _path(key)
-        found = path.read_bytes()
+        binary = path.read_bytes()
     except (OSError, RuntimeError):  # a home that cannot be determined is a RuntimeError
         return None
-    code, checksum = found[:-_CHECKSUM_BYTES], found[-_CHECKSUM_BYTES:]
+    code, checksum = binary[:-_CHECKSUM_BYTES], binary[-_CHECKSUM_BYTES:]
     if hashlib.sha256(code).digest() != checksum:
         logger.warning("jaxdyn: %s is damaged and is built again", path)
         return None

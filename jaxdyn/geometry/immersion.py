@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import is_known
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state
+from jaxdyn.model.arguments import Function, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
 from jaxdyn.systems.start import place_of
 from jaxdyn.systems.system import System, checked_size, rate_to_velocity
@@ -51,7 +51,7 @@ class PullBack(eqx.Module):
         return value
 
 
-def pull_back(field: Any, immersion: Any) -> PullBack:
+def pull_back(field: Function, immersion: Function) -> PullBack:
     """The pull-back of a covariant tensor by q = xi(s): J^T g J of a metric, J^T F of a one-form, V(xi(s)) of a function.
 
     **Arguments:**
@@ -89,16 +89,16 @@ class ImmersedSystem(System):
 
     def place(self, s, t) -> tuple[Array, ...]:
         """Configuration of each unit at s, each (nq,) of its system."""
-        found = self.immersion(s, t) if self.moving else self.immersion(s)
-        found = tuple(found) if self.joined else (found,)
-        sizes = [jnp.shape(q) for q in found]
+        positions = self.immersion(s, t) if self.moving else self.immersion(s)
+        positions = tuple(positions) if self.joined else (positions,)
+        sizes = [jnp.shape(q) for q in positions]
         wanted = [(unit.nq,) for unit in self.units]
         if sizes != wanted:
             raise ValueError(
                 f"xi returned shapes {sizes}, expected {wanted}: "
                 + ("one configuration for each of the systems" if self.joined else "the system's configuration")
             )
-        return tuple(jnp.asarray(q, s.dtype) for q in found)
+        return tuple(jnp.asarray(q, s.dtype) for q in positions)
 
     def velocities(self, s, v, t) -> tuple[Array, ...]:
         """Velocity of each unit at s and sdot = v, each (nv,) of its system."""
@@ -188,8 +188,8 @@ class PulledForce(eqx.Module):
         ]
         if self.common is None:
             return total
-        found = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
-        return _added(total, found, "force")
+        common_forces = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
+        return _added(total, common_forces, "force")
 
     def __call__(self, system, s, v, t):
         if not isinstance(system, ImmersedSystem):
@@ -250,7 +250,9 @@ def constrain_by_immersion(system: Any, xi: Callable, nq: int, *, moving: bool =
     return Scene(immersed, forces=(pulled,) if force is not None or any(forces) else ())
 
 
-def reaction_force(system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], force: Any = None, t: Any = 0.0) -> Any:
+def reaction_force(
+    system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], force: Any = None, t: Numbers = 0.0
+) -> Any:
     """Force R = M a + h - F with which an immersion holds its system, in the coordinates of the system; J^T R = 0.
 
     **Arguments:**
@@ -287,11 +289,11 @@ def reaction_force(system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], 
     return reactions if immersed.joined else reactions[0]
 
 
-def _added(total, found, argument: str) -> list[Array]:
+def _added(total, forces, argument: str) -> list[Array]:
     """Forces on each unit, and others that a user gave."""
-    if len(found) != len(total):
-        raise ValueError(f"{argument} has {len(found)} entries; give one for each of the {len(total)} systems")
-    return [f + checked_force(g, f, f.shape[0], argument) for f, g in zip(total, found, strict=True)]
+    if len(forces) != len(total):
+        raise ValueError(f"{argument} has {len(forces)} entries; give one for each of the {len(total)} systems")
+    return [f + checked_force(g, f, f.shape[0], argument) for f, g in zip(total, forces, strict=True)]
 
 
 def _sum(terms):

@@ -18,7 +18,7 @@ from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.kinds import components
-from jaxdyn.model.arguments import pose_leaf
+from jaxdyn.model.arguments import Numbers, pose_leaf
 
 
 class Contact(Pair):
@@ -55,17 +55,17 @@ class Contact(Pair):
         """The rows are the components themselves."""
         return tuple(range(len(self.components)))
 
-    def likeness(self):
+    def structure_key(self):
         """The kind of contact."""
         return self.kind, self.in_plane
 
-    def apart(self, R, p):
-        """Place, and where it is held attitude, of the contact frame seen from the fingertip, (n,), m and rad."""
+    def pose_residual(self, R, p):
+        """Position, and where the contact constrains it orientation, of the contact frame in the fingertip's, (n,), m and rad."""
         # The fingertip moves against the object as the object moves against the fingertip, with the other sign.
-        found = p if self.kind != "rigid" else jnp.concatenate([p, jnp.stack(attitude(R))])
-        return -found[np.array([i for i in self.components if i < found.shape[0]])]
+        residual = p if self.kind != "rigid" else jnp.concatenate([p, jnp.stack(attitude(R))])
+        return -residual[np.array([i for i in self.components if i < residual.shape[0]])]
 
-    def sliding(self, R, p, U):
+    def twist_residual(self, R, p, U):
         """Angular velocity of the object against the finger about the normal, (1,), rad/s, for a soft finger."""
         return -U[5:] if self._spins else None
 
@@ -73,9 +73,9 @@ class Contact(Pair):
 def contact(
     kind: str,
     finger: str | None,
-    pose,
+    pose: Numbers | None,
     *,
-    finger_pose=None,
+    finger_pose: Numbers | None = None,
     object: str | None = None,
     in_plane: bool = False,
     name: str | None = None,
@@ -131,7 +131,7 @@ def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
     """
     if not isinstance(places, dict) or not places:
         raise ValueError(f"places is {places!r}; give {{finger: (point, normal)}}")
-    found = []
+    contacts = []
     for finger, place in places.items():
         if not isinstance(place, (tuple, list)) or [np.shape(x) for x in place] != [(3,), (3,)]:
             raise ValueError(f"places[{finger!r}] is {place!r}; give (point (3,), normal (3,))")
@@ -144,8 +144,8 @@ def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
         across = across / np.linalg.norm(across)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = np.stack([across, np.cross(normal, across), normal], 1), point
-        found.append(contact(kind, finger, pose))
-    return found
+        contacts.append(contact(kind, finger, pose))
+    return contacts
 
 
 def on_object(constraint: Constraint, name: str) -> Constraint:

@@ -15,6 +15,7 @@ from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
 from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.names import body_index
@@ -28,7 +29,7 @@ _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
 _SKIPPED = ("collision", "sensor", "plugin", "battery", "particle_emitter", "projector", "audio_source")
 
 
-def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype=None) -> LoadedScene:
+def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DType | None = None) -> LoadedScene:
     """The scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.
 
     Taken are links with their inertias, all joints (of two axes as two joints, JOINT and JOINT_axis2), limits (as the
@@ -90,8 +91,10 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
     name = name or (file.world.get("name") if file.world is not None else "") or "mechanism"
     gravity: np.ndarray | tuple | None = GRAVITY
     if file.world is not None:
-        found = file.world.find("gravity")
-        gravity = np.array([0.0, 0.0, -9.8]) if found is None else file.numbers(found, 3, "the world")
+        gravity_element = file.world.find("gravity")
+        gravity = (
+            np.array([0.0, 0.0, -9.8]) if gravity_element is None else file.numbers(gravity_element, 3, "the world")
+        )
         gravity = gravity if gravity.any() else None
     builder = ModelBuilder(name, gravity=gravity, dtype=dtype)
     frames, names = Names(), Names()
@@ -280,25 +283,25 @@ def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
 
 def _unused(file: SdfFile) -> list[str]:
     """What the file holds and the scene does not, apart from joints."""
-    found: dict[str, list[str]] = {}
+    unused: dict[str, list[str]] = {}
     for link, (element, _) in file.links.items():
         for tag in _SKIPPED:
             if element.find(tag) is not None:
-                found.setdefault(f"<{tag}> of links", []).append(link)
+                unused.setdefault(f"<{tag}> of links", []).append(link)
         if element.find("gravity") is not None and not file.flag(element, "gravity", f"link {link!r}"):
-            found.setdefault("links without gravity (it acts on them here)", []).append(link)
+            unused.setdefault("links without gravity (it acts on them here)", []).append(link)
         if file.flag(element, "kinematic", f"link {link!r}"):
-            found.setdefault("kinematic links", []).append(link)
+            unused.setdefault("kinematic links", []).append(link)
         if element.find("inertial/fluid_added_mass") is not None:
-            found.setdefault("fluid added mass of links", []).append(link)
+            unused.setdefault("fluid added mass of links", []).append(link)
     for joint, (element, _) in file.joints.items():
         if element.find("sensor") is not None:
-            found.setdefault("<sensor> of joints", []).append(joint)
+            unused.setdefault("<sensor> of joints", []).append(joint)
         if any(file.number(element, f"{tag}/initial_position", 0.0, f"joint {joint!r}") for tag in ("axis", "axis2")):
-            found.setdefault("initial position of joints", []).append(joint)
+            unused.setdefault("initial position of joints", []).append(joint)
     for model, scope in file.models.items():
         for tag in ("plugin", "gripper"):
             if scope.element.find(tag) is not None:
-                found.setdefault(f"<{tag}> of models", []).append(scope.element.get("name") or model)
-    lines = [line for reason, names in found.items() for line in listed(reason, names)]
+                unused.setdefault(f"<{tag}> of models", []).append(scope.element.get("name") or model)
+    lines = [line for reason, names in unused.items() for line in listed(reason, names)]
     return [*lines, *listed("includes", file.includes)]

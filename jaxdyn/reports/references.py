@@ -48,12 +48,12 @@ def integral(rate: Callable, ts, longest: float) -> tuple[np.ndarray, float]:
         half = (b - a) / pieces / 2
         return half * np.sum(weights * rate((edges[:-1] + half)[:, None] + half * nodes))
 
-    found = []
+    integrals = []
     for refined in (1, 2):
         pieces = [refined * max(1, int(np.ceil((b - a) / longest))) for a, b in itertools.pairwise(ts)]
         parts = [over(a, b, n) for (a, b), n in zip(itertools.pairwise(ts), pieces, strict=True)]
-        found.append(np.concatenate([[0.0], np.cumsum(parts)]))
-    return found[1], float(np.abs(found[1] - found[0]).max())
+        integrals.append(np.concatenate([[0.0], np.cumsum(parts)]))
+    return integrals[1], float(np.abs(integrals[1] - integrals[0]).max())
 
 
 def plane_pendulum(ts, length: float = 1.0, gravity: float = 9.81) -> Reference:

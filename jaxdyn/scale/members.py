@@ -93,9 +93,9 @@ def member(parameters: Any, number: int, seed: int = 0) -> Any:
 
 def digest(tree: Any) -> str:
     """A hash of the numbers of a pytree, their shapes and their places."""
-    found = hashlib.sha256()
+    hashed = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         array = np.ascontiguousarray(leaf)
-        found.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
-        found.update(array.data)
-    return found.hexdigest()[:16]
+        hashed.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
+        hashed.update(array.data)
+    return hashed.hexdigest()[:16]

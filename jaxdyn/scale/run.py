@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.model.arguments import as_array
+from jaxdyn.model.arguments import Numbers, as_array
 from jaxdyn.model.printed import scene_lines
 from jaxdyn.scale.batch import Options, Run, whole
 from jaxdyn.scale.described import described_function, described_motion
@@ -23,7 +23,7 @@ def run(
     scene: Any,
     states: Any,
     parameters: Any,
-    ts: Any,
+    ts: Numbers,
     *,
     out: Any,
     samples: int | None = None,

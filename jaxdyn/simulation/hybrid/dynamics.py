@@ -78,7 +78,7 @@ def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
     They go on smoothly through w = 0 to w < 0, as the events that end a mode there are looked for from both sides: w/|w| with
     the sign that `reference` (n, 2) has, which for one row is constant.
     """
-    found = []
+    unit_vectors = []
     for i, one in enumerate(elements.each):
         w, s = slip[i], reference[i]
         least = 100 * float(jnp.finfo(w.dtype).eps)
@@ -87,13 +87,13 @@ def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
         length = jnp.sqrt(jnp.where(moves, square, jnp.ones_like(square)))
         if one.smooth:
             speed = force_at(scene, one).smoothing.astype(w.dtype)
-            found.append(w * jnp.where(moves, jnp.tanh(length / speed) / length, 1 / speed))
+            unit_vectors.append(w * jnp.where(moves, jnp.tanh(length / speed) / length, 1 / speed))
         elif len(one.tangent) < 2:
-            found.append(s)
+            unit_vectors.append(s)
         else:
             forward = jnp.where(jnp.sum(s * w) < 0, -1.0, 1.0).astype(w.dtype)
-            found.append(jnp.where(moves, forward * w / length, s))
-    return jnp.stack(found)
+            unit_vectors.append(jnp.where(moves, forward * w / length, s))
+    return jnp.stack(unit_vectors)
 
 
 def slides(elements: Elements, mode: Mode) -> list:
@@ -115,8 +115,8 @@ def push(scene: Scene, elements: Elements, mode: Mode, place: Place, along, want
     count = len(Z)
     pushes = place.metric.whiten(jnp.stack(Z).T) if count else jnp.zeros((scene.nv, 0), dtype)
     right = jnp.concatenate([wanted[:, None], _product(place.Y.T, pushes)], 1) * active[:, None]
-    found = solve_rows(place.Y * active[None], active, right)
-    base, by_normal = found[:, 0], found[:, 1:]
+    solved = solve_rows(place.Y * active[None], active, right)
+    base, by_normal = solved[:, 0], solved[:, 1:]
     sign = mode.signs(dtype)
     at = [elements.each[i].normal for i in elements.coupled]
     normal = jnp.zeros((0,), dtype)
@@ -167,14 +167,14 @@ def _eliminated(K, right):
             share = matrix[j][i] / pivot
             matrix[j] = matrix[j] - share * matrix[i]
             values[j] = values[j] - share * values[i]
-    found: list[Any] = [None] * n
+    unknowns: list[Any] = [None] * n
     for i in reversed(range(n)):
         rest = values[i]
         for j in range(i + 1, n):
-            rest = rest - matrix[i][j] * found[j]
+            rest = rest - matrix[i][j] * unknowns[j]
         pivot = matrix[i][i]
-        found[i] = rest / jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
-    return jnp.stack(found), pivots
+        unknowns[i] = rest / jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
+    return jnp.stack(unknowns), pivots
 
 
 class Motion(NamedTuple):
@@ -188,10 +188,12 @@ class Motion(NamedTuple):
     sizes: Array
 
 
-def motion_at(scene: Scene, elements: Elements, mode: Mode, place: Place, reference, effort, q, v, t) -> Motion:
-    """Accelerations in a mode; `effort` (nv,) is tau and the forces without modes, or None."""
+def motion_at(
+    scene: Scene, elements: Elements, mode: Mode, place: Place, reference, generalized_force, q, v, t
+) -> Motion:
+    """Accelerations in a mode; `generalized_force` (nv,) is tau and the forces without modes, or None."""
     along = directions(scene, elements, place.slip, reference)
-    force = jnp.zeros_like(v) if effort is None else effort
+    force = jnp.zeros_like(v) if generalized_force is None else generalized_force
     sliding = slides(elements, mode)
     given = {}
     for i, one in enumerate(elements.each):
@@ -212,13 +214,13 @@ def motion_at(scene: Scene, elements: Elements, mode: Mode, place: Place, refere
 def gaps(scene: Scene, elements: Elements, q, t) -> Array:
     """Of the elements that open, (n,); zero of others."""
     whole = extended(scene)
-    held = position_residual(whole, q, t)
+    residuals = position_residual(whole, q, t)
     # Contacts have one row each among the residuals, behind those of the scene's own constraints.
-    at, found = held.shape[0] - sum(one.opens for one in elements.each), []
+    at, gap_of_each = residuals.shape[0] - sum(one.opens for one in elements.each), []
     for one in elements.each:
-        found.append(held[at] if one.opens else jnp.zeros((), q.dtype))
+        gap_of_each.append(residuals[at] if one.opens else jnp.zeros((), q.dtype))
         at += one.opens
-    return jnp.stack(found)
+    return jnp.stack(gap_of_each)
 
 
 def rebounds(scene: Scene, elements: Elements, place: Place) -> Array:
@@ -249,7 +251,7 @@ def jumped(scene: Scene, elements: Elements, mode: Mode, place: Place, along, v,
 
 def conditions(scene: Scene, elements: Elements, mode: Mode, place: Place, motion: Motion, reference, q, t) -> Array:
     """What a mode keeps positive, (n, CHANNELS): 1 where it asks for nothing."""
-    gap, found = gaps(scene, elements, q, t), []
+    gap, condition_rows = gaps(scene, elements, q, t), []
     one_ = jnp.ones((), q.dtype)
     for i, one in enumerate(elements.each):
         normal = one_
@@ -267,5 +269,5 @@ def conditions(scene: Scene, elements: Elements, mode: Mode, place: Place, motio
             friction = jnp.where(mode.closed[i], friction, one_)
         if one.tangent:
             pivot = motion.pushed.pivots[i]
-        found.append(jnp.stack([normal, friction, pivot]))
-    return jnp.stack(found)
+        condition_rows.append(jnp.stack([normal, friction, pivot]))
+    return jnp.stack(condition_rows)

@@ -1,7 +1,7 @@
 """The functions of a motion with modes, of a scene whose unknown numbers are arguments: vector field, projection, conditions and
 transitions, on states with the entries q, v and `slip`, the directions (n, 2) in which elements slide.
 
-Directions are constants of a step (`jumping`), renewed where it ends.
+Directions are constants of a step (`step_constants`), renewed where it ends.
 """
 
 from collections.abc import Callable
@@ -43,10 +43,17 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
 
     def at(args, t, y):
         unknown, mode = args
-        scene, effort = given(unknown)
+        scene, generalized_force = given(unknown)
         q, v = retract(scene.system, y["q"]), y["v"]
         place = place_at(scene, elements, q, v, t)
-        return scene, mode, q, v, place, motion_at(scene, elements, mode, place, y["slip"], effort(q, v, t), q, v, t)
+        return (
+            scene,
+            mode,
+            q,
+            v,
+            place,
+            motion_at(scene, elements, mode, place, y["slip"], generalized_force(q, v, t), q, v, t),
+        )
 
     @jax.jit
     def field(t, y, args):
@@ -62,8 +69,8 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
     def judge(args, t, y):
         y = plan.structure(y)
         scene, mode, q, v, place, motion = at(args, t, y)
-        found = _judged(scene, elements, mode, place, motion, y["slip"], q, v, t)
-        return found.conditions, found.levels
+        judged = _judged(scene, elements, mode, place, motion, y["slip"], q, v, t)
+        return judged.conditions, judged.levels
 
     def judge_all(unknown, mode, slip, t, q, v):
         scene, _, q, v, place, motion = at((unknown, mode), t, {"q": q, "v": v, "slip": slip})
@@ -89,8 +96,8 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
 
     def land(unknown, mode, slip, t, y):
         y = plan.structure(y)
-        found = run(jump, unknown, mode, slip, t, y["q"], y["v"])
-        return ravel_pytree(y | {"v": found.v})[0]
+        jumped_state = run(jump, unknown, mode, slip, t, y["q"], y["v"])
+        return ravel_pytree(y | {"v": jumped_state.v})[0]
 
     def slip_of(y):
         return plan.structure(y)["slip"]
@@ -111,9 +118,9 @@ def put_back(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     whole, dtype = extended(scene), y["v"].dtype
     q, v = retract(scene.system, y["q"]), y["v"]
     place = place_at(scene, elements, q, v, t)
-    held = holonomic_rows(layout(whole))
+    holonomic = holonomic_rows(layout(whole))
     active = elements.active(mode).astype(dtype)
-    holds = jnp.zeros((elements.count,), dtype).at[held].set(1.0) * active
+    holds = jnp.zeros((elements.count,), dtype).at[holonomic].set(1.0) * active
 
     def change(wanted, which):
         """The least velocities that change the rows by `wanted`."""
@@ -129,9 +136,9 @@ def put_back(scene: Scene, elements: Elements, mode: Mode, t, y, error):
             "v": error["v"] - change(_product(place.row.A, error["v"]), active),
         }
     blank = jnp.zeros((elements.count,), dtype)
-    if held.size:
+    if holonomic.size:
         for _ in range(_ROUNDS):
-            q = displace(scene.system, q, -change(blank.at[held].set(position_residual(whole, q, t)), holds))
+            q = displace(scene.system, q, -change(blank.at[holonomic].set(position_residual(whole, q, t)), holds))
     for _ in range(_ROUNDS):
         v = v - change(velocity_residual(whole, q, v, t), active)
     slip = by_element(elements, velocity_residual(whole, q, v, t))

@@ -20,9 +20,9 @@ from jaxtyping import Array
 
 from jaxdyn.compile import Carry, Given, Passed, Task, Turn, any_in_batch, recompute_unless, run, run_loop
 from jaxdyn.simulation.solvers import reverse
-from jaxdyn.simulation.solvers.explicit import Plan, Step, bent_output, step_in_turn, whole_step
+from jaxdyn.simulation.solvers.explicit import Plan, Step, projected_output, step_in_turn, whole_step
 from jaxdyn.simulation.solvers.first_step import first_step
-from jaxdyn.simulation.solvers.fixed_steps import no_sums, watched
+from jaxdyn.simulation.solvers.fixed_steps import accumulated, no_sums
 
 _SAFETY, _LEAST_FACTOR, _MOST_FACTOR = 0.9, 0.2, 10.0  # of diffrax's PIDController
 _ROUNDED = 100  # numbers before the end from which on a step goes to the end
@@ -43,7 +43,7 @@ class Fixed(NamedTuple):
 
 
 class Driven(NamedTuple):
-    """Rows of the state at ts[1:], diffrax's result, counts, the time reached, sums about fixed steps (`watched`), and, where
+    """Rows of the state at ts[1:], diffrax's result, counts, the time reached, sums about fixed steps (`accumulated`), and, where
     asked for, what reverse mode needs."""
 
     rows: Array
@@ -171,7 +171,7 @@ def drive(
     records, strides = ((), ()) if history is None else (history.rows, history.strides)
     carry = Carry(lane, none, rows, records)
     how_far = plan, how, max_steps, strides
-    task, given = Task(_turn, _by_turns, how_far, bent_output, (plan,), strides), Given(ts)
+    task, given = Task(_turn, _by_turns, how_far, projected_output, (plan,), strides), Given(ts)
 
     def run_on(carry):
         found = run_loop(task, args, limits, given, carry)
@@ -268,7 +268,7 @@ def _accepted(plan: Plan, how, args, limits: _Limits, lane: _Lane, active, step:
     else:
         kept, t, at_least, failed = jnp.asarray(True), t_next, lane.at_least, jnp.asarray(False)
         start, before, y, error = (plan.structure(x) for x in (limits.y0, lane.y, step.projected, step.error))
-        sums = watched(how.order, how.error_order, start, before, y, error, *lane.sums)
+        sums = accumulated(how.order, how.error_order, start, before, y, error, *lane.sums)
         done = (lane.taken + 2).astype(end.dtype) / limits.steps.astype(end.dtype)
         after = limits.start + (end - limits.start) * done
         after = jnp.where((lane.taken + 2 >= limits.steps) | (after > limits.floor), end, after)
@@ -301,7 +301,7 @@ def save(plan: Plan, ts, before: Any, after: Any, kept, step: Step, saved, rows)
         saved, rows = carry
         here, place = is_passed(saved), jnp.minimum(saved, count - 1)
         at = ts[place + 1], before.t, after.t, before.y, step.raw, step.stages, step.shift
-        row = run(bent_output, None, *at, static=(plan,))
+        row = run(projected_output, None, *at, static=(plan,))
         rows = rows.at[place].set(jnp.where(here, row, rows[place]))
         return saved + here.astype(jnp.int32), rows
 

@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxdyn.compile import Carry, Given, Task, Turn, any_in_batch, recompute_unless, run, run_loop, unless
-from jaxdyn.simulation.solvers.explicit import Plan, bent_output, step_in_turn, whole_step
+from jaxdyn.simulation.solvers.explicit import Plan, projected_output, step_in_turn, whole_step
 
 KEPT = 512  # states that are kept of a run
 
@@ -298,7 +298,7 @@ def _pulled_by(step, plan: Plan, times_move, structure, fixed, free, t0, t1, y, 
         args = eqx.combine(jax.tree.unflatten(structure, free), fixed)
         rate = plan.field_of(args, t0_, y) if plan.passes_rate_on else jnp.zeros_like(y)
         made = step(args, t0_, t1_, y, rate)
-        return made.projected, bent_output(plan, None, at_, t0_, t1_, y, made.raw, made.stages, made.shift)
+        return made.projected, projected_output(plan, None, at_, t0_, t1_, y, made.raw, made.stages, made.shift)
 
     times = (t0, t1, at) if times_move else ()
     _, pull = jax.vjp(forward, free, y, *times)
