@@ -41,7 +41,7 @@ PACKAGES = ("mujoco", "brax", "dm_control", "gymnasium", "gymnasium_robotics", "
 AGREED = 1e-9
 CLOSED = 1e-10
 RANK_TOL, MOST_STEPS = 1e-5, 1000
-MOST = 100  # degrees of freedom; beyond that the files at hand repeat one humanoid
+MAX_FREEDOMS = 100  # degrees of freedom; beyond that the files at hand repeat one humanoid
 SHOWN = ("mass", "frames", "M", "bias", "acceleration", "passive", "actuation", "rows")
 
 
@@ -117,7 +117,7 @@ def mjcf(roots: list[Path], match: str) -> int:
             m = quietly(mujoco.MjModel.from_xml_path, str(path))
         except ValueError:
             continue  # fragments that others include, and files whose meshes other packages hold
-        if not 0 < m.nv <= MOST:
+        if not 0 < m.nv <= MAX_FREEDOMS:
             continue
         if (key := fingerprint(m)) in seen:
             twins += 1

@@ -382,7 +382,7 @@ def test_disk_and_link_in_contact():
         disk, link = reaction_force(scene, q, v)
         nu, u = link[1] / c, disk[1] + link[1]
         zero = jnp.zeros(())
-        (z1, height, _), (y1, y2, _) = scene.system.place(q, zero)
+        (z1, height, _), (y1, y2, _) = scene.system.configurations(q, zero)
         return {
             "touching": (jnp.stack([(y1 - z1) * s + (y2 - height) * c, height]), jnp.ones(2)),
             "along": ((y1 - z1) * c - (y2 - height) * s, -along),

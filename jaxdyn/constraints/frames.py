@@ -58,7 +58,7 @@ def _seen_from_a(frames: Carried):
 
     Positions are subtracted tree by tree: a robot far from the world's origin loses nothing.
     """
-    n = len(frames.moves) // 2
+    n = len(frames.velocity_mask) // 2
     turned = jnp.swapaxes(frames.pose[:n, :3, :3], 1, 2)
     across = frames.origin[n:] - frames.origin[:n]
     between = frames.pose[n:, :3, 3] - frames.pose[:n, :3, 3] + across
@@ -153,7 +153,7 @@ def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
     moved_a, moved_b = _product(by_a, twists[:n]), _product(by_b, twists[n:])
     relative = moved_b - moved_a
     turning = relative[:, :, 1] - jax.vmap(se3.ad_apply)(moved_a[:, :, 0], moved_b[:, :, 0])
-    moved_by_a, moved_by_b = frames.moves[:n], frames.moves[n:]
+    moved_by_a, moved_by_b = frames.velocity_mask[:n], frames.velocity_mask[n:]
     sides = ((1, moved_by_b & ~moved_by_a, by_b), (-1, moved_by_a & ~moved_by_b, by_a))
     motions: list = [None] * n
     for index, build, leaves in _batches(members):

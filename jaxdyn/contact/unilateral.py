@@ -249,10 +249,10 @@ class _Gap(Constraint):
         return ()
 
     def position(self, system, q, t):
-        found = jnp.asarray(self.gap(q, t), q.dtype)
-        if found.shape != ():
-            raise ValueError(f"contact {self.name!r}: gap returned shape {found.shape}; return one number (m), ()")
-        return found[None]
+        gap = jnp.asarray(self.gap(q, t), q.dtype)
+        if gap.shape != ():
+            raise ValueError(f"contact {self.name!r}: gap returned shape {gap.shape}; return one number (m), ()")
+        return gap[None]
 
     def velocity(self, system, q, v, t):
         return None if self.along is None else Pfaffian(self.along, name=self.name).velocity(system, q, v, t)

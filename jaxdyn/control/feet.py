@@ -72,8 +72,8 @@ class Foot(eqx.Module):
         """
         local = self.pose if self.is_flat else self.pose.at[:3, :3].set(jnp.eye(3, dtype=self.pose.dtype))
         joint = "weld" if self.is_flat else "point"
-        held = loop(None, self.contact_pose(model, q), self.frame, local, joint, name=self.frame)
-        return HeldFoot(**{part.name: getattr(held, part.name) for part in dataclasses.fields(held)})
+        hold_loop = loop(None, self.contact_pose(model, q), self.frame, local, joint, name=self.frame)
+        return HeldFoot(**{part.name: getattr(hold_loop, part.name) for part in dataclasses.fields(hold_loop)})
 
 
 def foot(frame: str, cone: Any, *, pose: Numbers | None = None, ground: Numbers | None = None) -> Foot:

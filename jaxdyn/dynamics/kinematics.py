@@ -116,7 +116,7 @@ class Carried(NamedTuple):
 
     - `pose` (n, 4, 4): in the tree frame of the body that carries it; `origin` (n, 3): of that tree frame in the world.
     - `coordinates` (k,): velocity coordinates that move any of them; `subspace` (k, 6): their rows of `TreeFrame.subspace`.
-    - `moves` (n, k) of bool: which frame each of these coordinates moves.
+    - `velocity_mask` (n, k) of bool: which frame each of these coordinates moves.
     - `twist`, `bias` (n, 6): twist of each frame, as a twist of the fixed frame that now coincides with the tree frame, and
       its rate at a = 0; None when no velocity was given.
     """
@@ -125,7 +125,7 @@ class Carried(NamedTuple):
     origin: Float[Array, "n 3"]
     subspace: Float[Array, "k 6"]
     coordinates: np.ndarray
-    moves: np.ndarray
+    velocity_mask: np.ndarray
     twist: Float[Array, "n 6"] | None = None
     bias: Float[Array, "n 6"] | None = None
 
@@ -369,8 +369,8 @@ def named_frame(model: Model, name: str | None) -> tuple[int, Float[Array, "4 4"
 
 def _moving(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:
     """Rows of the coordinates that move a body, the others zero."""
-    moves = model.topology.dof_ancestors[body] if body >= 0 else np.zeros(model.nv, bool)
-    return jnp.where(moves[:, None], rows, jnp.zeros_like(rows))
+    on_path = model.topology.dof_ancestors[body] if body >= 0 else np.zeros(model.nv, bool)
+    return jnp.where(on_path[:, None], rows, jnp.zeros_like(rows))
 
 
 def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Array, rows: Array) -> Float[Array, "nv 6"]:

@@ -87,7 +87,7 @@ class ImmersedSystem(System):
     moving: bool = eqx.field(static=True)
     joined: bool = eqx.field(static=True)
 
-    def place(self, s, t) -> tuple[Array, ...]:
+    def configurations(self, s, t) -> tuple[Array, ...]:
         """Configuration of each unit at s, each (nq,) of its system."""
         positions = self.immersion(s, t) if self.moving else self.immersion(s)
         positions = tuple(positions) if self.joined else (positions,)
@@ -102,7 +102,7 @@ class ImmersedSystem(System):
 
     def velocities(self, s, v, t) -> tuple[Array, ...]:
         """Velocity of each unit at s and sdot = v, each (nv,) of its system."""
-        q, rates = self._pushed(self.place, s, t, v)
+        q, rates = self._pushed(self.configurations, s, t, v)
         return tuple(rate_to_velocity(*of) for of in zip(self.units, q, rates, strict=True))
 
     def _pushed(self, function, s, t, v):
@@ -113,7 +113,7 @@ class ImmersedSystem(System):
 
     def _columns(self, s, t):
         """J (nv, m) of each unit."""
-        q, push = jax.linearize(lambda s: self.place(s, t), s)
+        q, push = jax.linearize(lambda s: self.configurations(s, t), s)
         rates = jax.vmap(push)(jnp.eye(self.nq, dtype=s.dtype))
         columns = jax.vmap(lambda *rates: [rate_to_velocity(*of) for of in zip(self.units, q, rates, strict=True)])
         return q, [J.T for J in columns(*rates)]
@@ -156,12 +156,12 @@ class ImmersedSystem(System):
 
     def kinetic_energy(self, s, v, t):
         """Sum of the units' kinetic energies, (), J."""
-        placed = zip(self.units, self.place(s, t), self.velocities(s, v, t), strict=True)
+        placed = zip(self.units, self.configurations(s, t), self.velocities(s, v, t), strict=True)
         return _sum(dynamics.kinetic_energy(unit, q, w, t) for unit, q, w in placed)
 
     def potential_energy(self, s, t):
         """Sum of the units' potential energies, (), J."""
-        placed = zip(self.units, self.place(s, t), strict=True)
+        placed = zip(self.units, self.configurations(s, t), strict=True)
         return _sum(dynamics.potential_energy(unit, q, t) for unit, q in placed)
 
     def check_start(self, q, v, t) -> None:
@@ -182,9 +182,9 @@ class PulledForce(eqx.Module):
         total = [
             _sum(
                 [jnp.zeros_like(w)]
-                + [checked_force(f(unit, place, w, t), place, unit.nv, f"forces[{i}]") for i, f in enumerate(forces)]
+                + [checked_force(f(unit, q_unit, w, t), q_unit, unit.nv, f"forces[{i}]") for i, f in enumerate(forces)]
             )
-            for unit, forces, place, w in zip(system.units, self.forces, q, v, strict=True)
+            for unit, forces, q_unit, w in zip(system.units, self.forces, q, v, strict=True)
         ]
         if self.common is None:
             return total
@@ -195,7 +195,7 @@ class PulledForce(eqx.Module):
         if not isinstance(system, ImmersedSystem):
             raise ValueError(f"a pulled-back force needs its immersed system, not a {type(system).__name__}")
         _, pull = jax.vjp(lambda v: system.velocities(s, v, t), v)
-        return pull(tuple(self.on_units(system, system.place(s, t), system.velocities(s, v, t), t)))[0]
+        return pull(tuple(self.on_units(system, system.configurations(s, t), system.velocities(s, v, t), t)))[0]
 
 
 def constrain_by_immersion(system: Any, xi: Callable, nq: int, *, moving: bool = False, force: Any = None) -> Any:
@@ -310,8 +310,8 @@ def _check_rank(J, s, t) -> None:
     sizes = np.linalg.svd(J, compute_uv=False) if np.isfinite(J).all() else np.full(1, np.nan)
     rank = int(np.sum(sizes > least * sizes.max(initial=0.0)))
     if rank < J.shape[1]:
-        place = f"s = {np.asarray(s).tolist()}" if t is None else place_of(s, t).replace("q =", "s =")
+        where = f"s = {np.asarray(s).tolist()}" if t is None else place_of(s, t).replace("q =", "s =")
         raise ValueError(
-            f"the immersion has rank {rank} at {place}, expected {J.shape[1]}, one for each coordinate; start elsewhere, "
+            f"the immersion has rank {rank} at {where}, expected {J.shape[1]}, one for each coordinate; start elsewhere, "
             "or take coordinates that are regular there"
         )

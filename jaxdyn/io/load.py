@@ -87,11 +87,11 @@ def load_urdf_scene(
 ) -> LoadedScene:
     """The scene of a URDF file: as `load` says, with the options of `load_urdf`."""
     closures = closures_of(path, loops)
-    held = lock if isinstance(lock, Mapping) else dict.fromkeys(lock)
+    locked = lock if isinstance(lock, Mapping) else dict.fromkeys(lock)
     model = urdf_model(
         path,
         floating_base=floating_base,
-        lock={**dict.fromkeys(closures.held), **held},
+        lock={**dict.fromkeys(closures.locked), **locked},
         mimic="couple",
         gravity=gravity,
         dtype=dtype,

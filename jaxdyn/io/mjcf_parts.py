@@ -156,13 +156,13 @@ def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]
         return None, lines
     n = len(taken)
     moment, wrenches = np.zeros((n, model.nv)), np.zeros((n, 6))
-    places, effort = np.full(model.nv, -1), np.tile([-np.inf, np.inf], (model.nv, 1))
+    places, force_range = np.full(model.nv, -1), np.tile([-np.inf, np.inf], (model.nv, 1))
     for j in range(m.njnt):
         if m.jnt_type[j] in (SLIDE, HINGE):
             q, v = _places(file, model, j)
             places[v] = q
             if m.jnt_actfrclimited[j]:
-                effort[v] = m.jnt_actfrcrange[j]
+                force_range[v] = m.jnt_actfrcrange[j]
     sites: list[str | None] = [None] * n
     for k, i in enumerate(taken):
         kind, target, pull = m.actuator_trntype[i], int(m.actuator_trnid[i, 0]), m.actuator_gear[i]
@@ -188,7 +188,7 @@ def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]
         bias,
         ranges_of(m.actuator_ctrllimited, m.actuator_ctrlrange, file.off("CLAMPCTRL")),
         ranges_of(m.actuator_forcelimited, m.actuator_forcerange, False),
-        effort,
+        force_range,
     )
     names = tuple(file.actuators[i] for i in taken)
     leaves = (jnp.asarray(x, model.home.dtype) for x in numbers)

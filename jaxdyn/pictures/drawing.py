@@ -47,10 +47,10 @@ def draw(scene: SceneLike, q: Numbers, ax=None, *, shapes=None, multipliers: Num
     motion = motion_of(scene, q)
     if multipliers is not None:
         count = places[-1].end if (places := layout(motion.scene)) else 0
-        found = np.asarray(as_array(multipliers, "multipliers"), float)
-        if found.shape != (count,):
-            raise ValueError(f"multipliers has shape {found.shape}, expected ({count},), one per row of the scene")
-        motion = motion._replace(multipliers=found[None, None])
+        lam = np.asarray(as_array(multipliers, "multipliers"), float)
+        if lam.shape != (count,):
+            raise ValueError(f"multipliers has shape {lam.shape}, expected ({count},), one per row of the scene")
+        motion = motion._replace(multipliers=lam[None, None])
     picture = _Picture(motion, shapes, ax)
     picture.show(0)
     return picture.ax

@@ -22,7 +22,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
-from jaxdyn.pictures.held import held_body, held_solids, see_through
+from jaxdyn.pictures.grasped import grasped_body, grasped_solids, see_through
 from jaxdyn.pictures.solids import Shape, Shapes, rod
 from jaxdyn.systems.scene import Scene
 
@@ -40,8 +40,8 @@ def completed(scene: Scene, shapes: Shapes) -> Shapes:
     size = extent(scene)
     thin = _THIN * size
     rolling, wheeled = _rolling(scene, carried)
-    held = held_body(scene)
-    drawn += [see_through(shape) if shape.frame == held and held is not None else shape for shape in rolling]
+    grasped = grasped_body(scene)
+    drawn += [see_through(shape) if shape.frame == grasped and grasped is not None else shape for shape in rolling]
     bare = [i for i in range(model.nb) if i not in carried]
     points = _joints_on(scene)
     whole = not shapes
@@ -51,8 +51,8 @@ def completed(scene: Scene, shapes: Shapes) -> Shapes:
         solid = _of_inertia(model, i, thin, i in wheeled)
         longest = max((rod.size[1] for rod in rods), default=_SHARE * size if whole and model.nb > 3 else 0.0)
         longest *= model.nb > 1  # one body alone is its solid
-        if isinstance(scene, Grasp) and model.body_names[i] == held:
-            drawn += held_solids(scene, solid, thin)
+        if isinstance(scene, Grasp) and model.body_names[i] == grasped:
+            drawn += grasped_solids(scene, solid, thin)
             continue
         drawn += rods + [_or_mark(shape, longest, thin) for shape in solid]
     return Shapes(drawn, shapes.missing)

@@ -229,9 +229,9 @@ def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray)
 
 def cones(motion: Motion) -> list[Cone]:
     """The friction cones of a scene's contacts, but those of surfaces, whose cones have six dimensions."""
-    scene, found = motion.scene, []
+    scene, drawn = motion.scene, []
     if scene.cones is None:
-        return found
+        return drawn
     places = {place.name: place for place in layout(scene)}
     constraints = dict(zip(places, scene.constraints, strict=True))
     for contact in coned_contacts(scene):
@@ -247,8 +247,8 @@ def cones(motion: Motion) -> list[Cone]:
 
         along = direction(normal)
         across = direction(first).vectors if cone.in_plane else None
-        found.append(Cone(contact.name, along.places, along.vectors, across, float(cone.mu)))
-    return found
+        drawn.append(Cone(contact.name, along.places, along.vectors, across, float(cone.mu)))
+    return drawn
 
 
 @eqx.filter_jit

@@ -51,8 +51,8 @@ class Basis(eqx.Module):
         """v = N nu + v0 and its rate Ndot nu + v0dot, by differentiation of `at`."""
 
         def velocity(q, t):
-            place = self.at(scene, q, t)
-            return _product(place.N, _fitting(nu, place.N)) + place.v0, place
+            parametrization = self.at(scene, q, t)
+            return _product(parametrization.N, _fitting(nu, parametrization.N)) + parametrization.v0, parametrization
 
         v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
         return Moving(v, push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t)), N, quality)
@@ -173,10 +173,10 @@ class Orthonormal(Basis):
 
             Ndot nu = -A^+ B nu - P Adot^T L nu + N U nu,   U the upper triangle of Z + Z^T with half of its diagonal.
         """
-        place, A, inverse, factor = self._at(scene, q, t)
-        N = place.N
+        parametrization, A, inverse, factor = self._at(scene, q, t)
+        N = parametrization.N
         nu = _fitting(nu, N)
-        v = _product(N, nu) + place.v0
+        v = _product(N, nu) + parametrization.v0
         along_motion = (q, t), (velocity_to_rate(scene.system, q, v), jnp.ones_like(t))
         rate = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), *along_motion)[1]
         drift = jax.jvp(lambda q, t: self.at(scene, q, t).v0, *along_motion)[1]
@@ -187,7 +187,7 @@ class Orthonormal(Basis):
         across = _product(rate.T, _product(L, nu))
         across = across - _product(inverse, _product(A, across))
         drift = drift - _product(inverse, _product(turned, nu)) - across + _product(N, _product(U, nu))
-        return Moving(v, drift, N, place.quality)
+        return Moving(v, drift, N, parametrization.quality)
 
     def advice(self, scene, q, t):
         """A reference R for which N is regular here."""
@@ -327,10 +327,10 @@ def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Floa
     return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots), factor
 
 
-def minimal_velocity(place: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
+def minimal_velocity(parametrization: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
     """nu (nr,) with N nu + v0 = v for an admissible v: its coefficients in the columns of N."""
-    factor = cholesky(_product(place.N.T, place.N))
-    return solve_factored(factor, _product(place.N.T, v - place.v0))
+    factor = cholesky(_product(parametrization.N.T, parametrization.N))
+    return solve_factored(factor, _product(parametrization.N.T, v - parametrization.v0))
 
 
 def least_quality(dtype) -> float:

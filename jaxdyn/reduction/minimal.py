@@ -103,9 +103,9 @@ def _reduce(given: tuple[Scene, Basis], q, nu, tau, t) -> ReducedDynamics:
     return solve_reduced(scene, moving(scene, choice, q, nu, t), q, tau, t)
 
 
-def solve_reduced(scene: Scene, place: Moving, q, tau, t) -> ReducedDynamics:
+def solve_reduced(scene: Scene, motion: Moving, q, tau, t) -> ReducedDynamics:
     """The equations of motion in the minimal velocities of a `Moving` place, and their solution."""
-    v, drift, N, quality = place
+    v, drift, N, quality = motion
     mass = _product(N.T, _product(mass_matrix(scene.system, q, t), N))
     bias = _product(N.T, inverse_dynamics(scene.system, q, v, drift, t))
     force = _product(N.T, applied(scene, q, v, tau, t))

@@ -109,7 +109,7 @@ def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[M
     state = chosen.start(scene, q, v, t)
 
     def rates(y, t):
-        q, v = chosen.place(scene, y, t)
+        q, v = chosen.to_qv(scene, y, t)
         return chosen.rates(scene, y, q, v, t, scene.applied_force(q, v, t))
 
     def cost(function):

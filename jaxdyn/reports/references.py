@@ -240,11 +240,11 @@ def rolling_down(
 ) -> Reference:
     """Solid ball that rolls straight down an inclined plane: (5/7) g sin(slope), turning about y."""
     pull, zero = 5 / 7 * gravity * np.sin(slope), 0 * ts
-    way, speed = velocity * ts + pull * ts**2 / 2, velocity + pull * ts
-    half = way / radius / 2
+    distance, speed = velocity * ts + pull * ts**2 / 2, velocity + pull * ts
+    half = distance / radius / 2
     # v is in the axes of the ball, which turn about y.
     c, s = np.cos(2 * half), np.sin(2 * half)
-    q = way, zero, radius + zero, np.cos(half), zero, np.sin(half), zero
+    q = distance, zero, radius + zero, np.cos(half), zero, np.sin(half), zero
     return closed_form(ts, q, (speed * c, zero, speed * s, zero, speed / radius, zero), "parabola")
 
 

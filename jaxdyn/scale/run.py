@@ -137,8 +137,8 @@ def run(
     def pilot(drawn: Any, row: Any) -> dict[str, Any]:
         built, law, q0, v0 = begun(drawn, row)
         early = np.array([ts[0], ts[0] + SHARE * (ts[-1] - ts[0])])
-        found = simulate(built, q0, v0, early, control=law, throw=False, **{**options, "outputs": ()})
-        return {STEPS: found.stats[STEPS]}
+        solution = simulate(built, q0, v0, early, control=law, throw=False, **{**options, "outputs": ()})
+        return {STEPS: solution.stats[STEPS]}
 
     if not builds and not isinstance(scene, Scene):
         scene = Scene(scene)

@@ -98,7 +98,7 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
     def explicit_part(t, y, args):
         """All rates but those of `implicit_part`."""
         scene, _, method = given(args)
-        q, v = method.place(scene, y, t)
+        q, v = method.to_qv(scene, y, t)
         rates = method.rates(scene, y, q, v, t, torque(args, y, q, v, t)) | {"q": jnp.zeros_like(y["q"])}
         force = generalized_force(args, y, q, v, t) if added or "work" in y else None
         rates = rates | of_control(args, y, q, v, t, force)
@@ -108,7 +108,7 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
     def implicit_part(t, y, args):
         """dq/dt = H v, and what the scene's forces add to the rates of velocity, on which they act linearly."""
         scene, _, method = given(args)
-        q, v = method.place(scene, y, t)
+        q, v = method.to_qv(scene, y, t)
         rates = jax.tree.map(jnp.zeros_like, y)
         force = scene.applied_force(q, v, t)
         if force is not None:
@@ -123,7 +123,7 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
         y = method.continued(scene, y, t)
         if controls.HELD in y:
-            y = y | {controls.HELD: controls.sampled(given(args)[1], y[controls.HELD], *method.place(scene, y, t), t)}
+            y = y | {controls.HELD: controls.sampled(given(args)[1], y[controls.HELD], *method.to_qv(scene, y, t), t)}
         return y, error, diffrax.RESULTS.successful
 
     def quality(t, y, args, **_):
@@ -153,7 +153,7 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
     @jax.jit
     def least_allowance(t, y, args):
         scene, _, method = given(args)
-        q, v = method.place(scene, y, t)
+        q, v = method.to_qv(scene, y, t)
         return jnp.min(allowances(args, y, q, v, t))
 
     @jax.jit

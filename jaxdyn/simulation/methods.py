@@ -57,17 +57,17 @@ class Method(eqx.Module):
         """State of the equation at (q, v)."""
         return {"q": q, "v": v}
 
-    def place(self, scene: Scene, y, t) -> tuple[Array, Array]:
+    def to_qv(self, scene: Scene, y, t) -> tuple[Array, Array]:
         """q, with unit quaternions, and v of a state."""
         return retract(scene.system, y["q"]), y["v"]
 
     def rates(self, scene: Scene, y, q, v, t, force) -> dict[str, Array]:
-        """dy/dt; q and v are those of `place`, `force` (nv,) is tau plus the scene's forces, or None."""
+        """dy/dt; q and v are those of `to_qv`, `force` (nv,) is tau plus the scene's forces, or None."""
         return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
 
     def evaluated(self, scene: Scene, y, t, generalized_force) -> tuple[dict[str, Array], Array | None, Array]:
         """dy/dt with effort(q, v, t) for the force; the force (nv,) or None; and v (nv,)."""
-        q, v = self.place(scene, y, t)
+        q, v = self.to_qv(scene, y, t)
         force = generalized_force(q, v, t)
         return self.rates(scene, y, q, v, t, force), force, v
 
@@ -246,7 +246,7 @@ class Reduced(Method):
             y["frame"] = reference.astype(q.dtype)
         return y | {"nu": minimal_velocity(self._at(scene, y, q, t), v)}
 
-    def place(self, scene, y, t):
+    def to_qv(self, scene, y, t):
         """q, with unit quaternions, and v = N nu + v0."""
         q = retract(scene.system, y["q"])
         basis = self._at(scene, y, q, t)
@@ -255,18 +255,18 @@ class Reduced(Method):
     def evaluated(self, scene, y, t, generalized_force):
         """From the reduced equations, which share one factorisation of the rows with v."""
         q = retract(scene.system, y["q"])
-        place = moving(scene, self._basis(y), q, y["nu"], t)
-        force = generalized_force(q, place.v, t)
-        return self._rates(scene, y, place, q, t, force), force, place.v
+        motion = moving(scene, self._basis(y), q, y["nu"], t)
+        force = generalized_force(q, motion.v, t)
+        return self._rates(scene, y, motion, q, t, force), force, motion.v
 
     def rates(self, scene, y, q, v, t, force):
         """From the reduced equations; v is found anew."""
         return self._rates(scene, y, moving(scene, self._basis(y), q, y["nu"], t), q, t, force)
 
-    def _rates(self, scene, y, place, q, t, force):
-        reduced = solve_reduced(Scene(scene.system, scene.constraints), place, q, force, t)
+    def _rates(self, scene, y, motion, q, t, force):
+        reduced = solve_reduced(Scene(scene.system, scene.constraints), motion, q, force, t)
         fixed = {name: jnp.zeros_like(y[name]) for name in self.step_constants}
-        return {"q": velocity_to_rate(scene.system, q, place.v), "nu": reduced.nu_rate} | fixed
+        return {"q": velocity_to_rate(scene.system, q, motion.v), "nu": reduced.nu_rate} | fixed
 
     def acceleration(self, scene, q, v, t, force):
         """Rate of v."""
@@ -335,7 +335,7 @@ class Variational(Multipliers):
 
     def begin(self, scene: Scene, y, t) -> variational.Carried:
         """What the first step takes beside y."""
-        return variational.begin(scene, *self.place(scene, y, t), t, self.rank_tol)
+        return variational.begin(scene, *self.to_qv(scene, y, t), t, self.rank_tol)
 
     def advance(self, scene: Scene, y, t0, t1, carried: variational.Carried, generalized_force: Callable):
         """y at t1, the mean velocity of the step, the state of the method, and whether the step succeeded."""

@@ -100,17 +100,17 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     y = jax.tree.map(lambda rows, start: jnp.where(_along(reached, rows), rows, start[None]), y, y0)
     work = y.pop("work", None)
 
-    def place(row):
+    def to_qv(row):
         y, t = row
-        return method.place(scene, method.corrected(scene, y, t), t)
+        return method.to_qv(scene, method.corrected(scene, y, t), t)
 
     # One after the other, by the kernels that have put the start on the constraints.
-    q, v = lax.map(place, (y, ts))
+    q, v = lax.map(to_qv, (y, ts))
     lost = None
     if eqs.least_allowance is not None:
         margins, within = lax.map(lambda row: eqs.allowances(eqs.args, *row), (y, q, v, ts)), None
         if last is not None:
-            there = eqs.allowances(eqs.args, last, *method.place(scene, last, time_reached), time_reached)
+            there = eqs.allowances(eqs.args, last, *method.to_qv(scene, last, time_reached), time_reached)
             within = (result == RESULTS.event_occurred, time_reached, there)
         lost = unilateral.first_loss(margins, reached, ts, within)
         reached = reached & ~(lost.happened & (ts > lost.time))

@@ -91,7 +91,7 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
             solver.plan(y), driver.Fixed(4, 3), None, None, length / substeps, substeps, substeps
         )  # fmt: skip
         rows, _, _ = drive(y, (unknown, tau), jnp.stack([t, t + length]))
-        return method.place(scene, jax.tree.map(lambda x: x[0], rows), t + length)
+        return method.to_qv(scene, jax.tree.map(lambda x: x[0], rows), t + length)
 
     taken = jax.checkpoint(advance) if remat else advance
 

@@ -17,7 +17,7 @@ from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.hybrid import machine
-from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, place_at, slides
+from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, slides, terms_at
 from jaxdyn.simulation.hybrid.events import Events
 from jaxdyn.simulation.hybrid.laws import laws_of, put_back
 from jaxdyn.simulation.hybrid.modes import Mode, elements_of, extended, force_at
@@ -128,14 +128,14 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
             tau = jnp.zeros_like(v) if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
             values["torque"] = scene_.limited(tau)
         if {"acceleration", "multipliers", "contact_forces"} & set(outputs):
-            place = place_at(scene_, elements, q, v, t)
-            at_time = motion_at(scene_, elements, mode, place, y["slip"], generalized_force(q, v, t), q, v, t)
+            terms = terms_at(scene_, elements, q, v, t)
+            at_time = motion_at(scene_, elements, mode, terms, y["slip"], generalized_force(q, v, t), q, v, t)
             if "acceleration" in outputs:
                 values["acceleration"] = at_time.acceleration
             if "multipliers" in outputs:
                 values["multipliers"] = at_time.pushed.multipliers[: elements.own]
             if "contact_forces" in outputs:
-                values["contact_forces"] = _forces(scene_, elements, mode, place, at_time, y["slip"])
+                values["contact_forces"] = _forces(scene_, elements, mode, terms, at_time, y["slip"])
         frames = [name.removeprefix("pose:") for name in outputs if name.startswith("pose:")]
         return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
 
@@ -196,9 +196,9 @@ def _guess(scene: Scene, elements, q, v, t):
     return mode._replace(stick=mode.stick & ~smooth), lax.stop_gradient(unit), start_ok
 
 
-def _forces(scene: Scene, elements, mode: Mode, place, at_time, slip) -> dict:
+def _forces(scene: Scene, elements, mode: Mode, terms, at_time, slip) -> dict:
     """Friction along the rows (2,), what holds or what brakes, and normal force, by the names of the elements: (3,)."""
-    along, sliding, forces = directions(scene, elements, place.slip, slip), slides(elements, mode), {}
+    along, sliding, forces = directions(scene, elements, terms.slip, slip), slides(elements, mode), {}
     for i, one in enumerate(elements.each):
         level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(slip.dtype) * at_time.normal[i], 0.0)
         normal = jnp.where(mode.closed[i], at_time.normal[i], 0.0)

@@ -89,9 +89,9 @@ def _first(x):
 def aligned(slip, reference):
     """Directions of slipping (n, 2) of what moves, on the side of the old ones; the old ones of what does not."""
     size, unit = length(lax.stop_gradient(slip))
-    moves = size > 100 * float(jnp.finfo(slip.dtype).eps)
+    is_sliding = size > 100 * float(jnp.finfo(slip.dtype).eps)
     forward = jnp.where(jnp.sum(unit * reference, 1) < 0, -1.0, 1.0).astype(slip.dtype)
-    return lax.stop_gradient(jnp.where(moves[:, None], forward[:, None] * unit, reference))
+    return lax.stop_gradient(jnp.where(is_sliding[:, None], forward[:, None] * unit, reference))
 
 
 def at_once(elements: Elements, mode: Mode, slip, judged: Judged, hit) -> tuple[Mode, Array, Array]:
@@ -204,11 +204,11 @@ def changed_mode(elements: Elements, cones, mode: Mode, slip, begins, v, jump: C
     impact, impact_slip, hit, after = solve(by_velocity, mode, slip)
     v = after.v
     speed, unit = length(after.slip)
-    moves = speed > _loose(v.dtype) * judged.slip_size
-    slip = impact_slip = lax.stop_gradient(jnp.where(moves[:, None], unit, impact_slip))
+    is_sliding = speed > _loose(v.dtype) * judged.slip_size
+    slip = impact_slip = lax.stop_gradient(jnp.where(is_sliding[:, None], unit, impact_slip))
     # Elements that rebound open; those that came to rest together stick if their cones allow it.
     closed = impact.closed & ~(opens & (after.rebound > 0))
-    resting = impact._replace(closed=closed, stick=(impact.stick | (rough & ~moves & ~begins)) & closed)
+    resting = impact._replace(closed=closed, stick=(impact.stick | (rough & ~is_sliding & ~begins)) & closed)
     final, slip, settled, now = solve(by_force, resting, slip)
     final = final._replace(stick=final.stick & final.closed)
     # Where sliding has no forces, no mode is found; where it has two, one is.

@@ -84,11 +84,11 @@ class ExplicitSteps(ProjectedSolver):
 
         def tangent(args, *rest):
             *state, steps = rest
-            found, moved = along(partial(_in_turn, plan), (args, *state), steps)
-            return found, jax.tree.map(_no_change, found) if moved is None else moved
+            results, changes = along(partial(_in_turn, plan), (args, *state), steps)
+            return results, jax.tree.map(_no_change, results) if changes is None else changes
 
-        found: Any = implicit(args, state, partial(_at_once, plan), tangent)
-        projected, shift, error, raw, k, result = found
+        results: Any = implicit(args, state, partial(_at_once, plan), tangent)
+        projected, shift, error, raw, k, result = results
         dense = {"y0": y0, "y1": structure(raw), "stages": k}
         if self.project is not None:
             dense = {"dense_info": dense, "shift": structure(shift)}
@@ -187,11 +187,11 @@ def _at_once(plan: Plan, args, t0, t1, start, kept, ready):
 
     first = lax.cond(ready, lambda y: dt * kept, anew, start)
     whole: Any = partial(run, _whole, args, t0, t1, start, first, static=(plan,), calls=True, served=True)
-    found, served = whole(otherwise=lambda *_: None)
-    if found is None:
+    step, served = whole(otherwise=lambda *_: None)
+    if step is None:
         return _in_turn(plan, args, t0, t1, start, kept, ready)
     again: Any = partial(_in_turn, plan)
-    return recompute_unless(served, again, (*found, diffrax.RESULTS.successful), (args, t0, t1, start, kept, ready))
+    return recompute_unless(served, again, (*step, diffrax.RESULTS.successful), (args, t0, t1, start, kept, ready))
 
 
 class Step(NamedTuple):
@@ -219,8 +219,8 @@ def whole_step(plan: Plan, args, t0, t1, y, rate) -> Step:
 
 def step_in_turn(plan: Plan, args, t0, t1, y, rate) -> Step:
     """The same as a loop over the stages, without derivatives."""
-    found: Any = _in_turn(plan, args, t0, t1, y, rate, jnp.asarray(plan.passes_rate_on))
-    projected, shift, error, raw, stages, _ = found
+    step: Any = _in_turn(plan, args, t0, t1, y, rate, jnp.asarray(plan.passes_rate_on))
+    projected, shift, error, raw, stages, _ = step
     return Step(projected, shift, error, raw, stages, _last_rate(plan, t0, t1, stages, rate))
 
 
@@ -234,11 +234,11 @@ def projected_output(plan: Plan, _, t, t0, t1, y, raw, stages, shift):
     inner: Any = plan.solver.interpolation_cls(
         t0=t0, t1=t1, y0=plan.structure(y), y1=plan.structure(raw), k=jax.vmap(plan.structure)(stages)
     )
-    found = ravel_pytree(inner.evaluate(t))[0]
+    y_dense = ravel_pytree(inner.evaluate(t))[0]
     if plan.project is None:
-        return found
+        return y_dense
     x = jnp.asarray((t - t0) / jnp.where(t1 == t0, jnp.ones_like(t1), t1 - t0), y.dtype)
-    return found + x * x * (3 - 2 * x) * shift
+    return y_dense + x * x * (3 - 2 * x) * shift
 
 
 def _first(plan: Plan, args, t0, t1, start):

@@ -127,7 +127,7 @@ def dynamic_update_slice(params, args, eqn):
     return [updated]
 
 
-MOVES: dict[str, Callable] = {
+REARRANGEMENTS: dict[str, Callable] = {
     "reshape": _reshape,
     "squeeze": lambda params, args, out: args[0].reshape(out.shape),
     "expand_dims": lambda params, args, out: args[0].reshape(out.shape),
