@@ -26,11 +26,11 @@ from jaxdyn.reports.page import figure
 SCENES = ("andrews", "car_axis", "windows_40", "free_body", "rolling_disk")
 
 
-def plots(found: Report) -> list[tuple[Record, ...]]:
+def plots(computed: Report) -> list[tuple[Record, ...]]:
     """Records by scene, dtype and batch, with peers that have no batched call brought over from one trajectory."""
-    cores, made = found.head["machine"]["cores"], []
-    for scene in found.scenes:
-        records = found.of(scene)
+    cores, made = computed.head["machine"]["cores"], []
+    for scene in computed.scenes:
+        records = computed.of(scene)
         for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
             group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
             if batch > 1:
@@ -77,12 +77,12 @@ def verdict(records: Iterable[Record]) -> tuple[list[list[str]], list[str]]:
     return rows, lines
 
 
-def draw(found: Report, directory: Path) -> None:
+def draw(computed: Report, directory: Path) -> None:
     """An image of each plot, `SCENE_BATCH.png`."""
     directory.mkdir(parents=True, exist_ok=True)
-    for group in plots(found):
+    for group in plots(computed):
         scene, batch = group[0].scene, group[0].batch
-        drawn = figure(f"{found.scenes[scene].text}: {batch} at once", found.scenes[scene], group)
+        drawn = figure(f"{computed.scenes[scene].text}: {batch} at once", computed.scenes[scene], group)
         if drawn is not None:
             drawn.savefig(directory / f"{scene}_{batch}.png", dpi=110)
 
@@ -103,7 +103,7 @@ def main(argv=None) -> None:
     def say(line):
         print(line, flush=True)
 
-    found = report(
+    measured = report(
         options.scenes or (None if options.full else SCENES),
         full=options.full,
         dtypes=("float64",),
@@ -114,10 +114,10 @@ def main(argv=None) -> None:
         peers=peers.Peers(say),
         echo=say,
     )
-    print(f"\n{found.table()}\n\nWritten to {options.out}/report.html\n")
+    print(f"\n{measured.table()}\n\nWritten to {options.out}/report.html\n")
     if options.figures:
-        draw(found, options.figures)
-    judged = [verdict(group) for group in plots(found)]
+        draw(measured, options.figures)
+    judged = [verdict(group) for group in plots(measured)]
     print("Time relative to the best peer, at an error of")
     header = ["scene", "batch", "peers that take", "points below", *(f"{x:.0e}" for x in TARGETS)]
     print(table(header, [row for rows, _ in judged for row in rows]))

@@ -153,13 +153,13 @@ def test_loops_remove_what_the_joint_removes_and_nothing_else(pair, state, every
     T_a = np.asarray(forward_kinematics(pair, q)[0])
     T_b = T_a @ pose_a @ relative @ np.linalg.inv(pose_b)
     step = difference(pair, q, q.at[7:14].set(jnp.asarray([*T_b[:3, 3], *quaternion(T_b[:3, :3])])))
-    found = evaluate(integrate(pair, q, step), jnp.zeros(pair.nv), 0.0)
+    computed = evaluate(integrate(pair, q, step), jnp.zeros(pair.nv), 0.0)
     held = [p for p in places if p.nonholonomic > p.start]
     first = sum(p.nonholonomic - p.start for p in held[: held.index(place)])
     count = place.end - place.start
     assert count == 6 - len(free)
-    np.testing.assert_allclose(found["phi"][first : first + count], 0, atol=1e-13)
-    A = np.asarray(found["A"][place.start : place.end])
+    np.testing.assert_allclose(computed["phi"][first : first + count], 0, atol=1e-13)
+    A = np.asarray(computed["A"][place.start : place.end])
     Ad = np.asarray(se3.Ad(jnp.asarray(pose_b)))
     for twist in free:
         velocity = np.zeros(pair.nv)
@@ -241,8 +241,8 @@ def test_couplings_of_a_model_become_gears():
         builder.add_body(name, None, "revolute", inertia.box(1.0, (1, 1, 1)))
     builder.add_coupling("q_joint", "p_joint", -2.0, 0.3)
     model = builder.build()
-    found = quick(lambda q: position_residual(Scene(model, model_couplings(model)), q))(jnp.asarray([0.5, 0.7]))
-    assert_close(found, [0.7 + 2.0 * 0.5 - 0.3], 1e-15)
+    computed = quick(lambda q: position_residual(Scene(model, model_couplings(model)), q))(jnp.asarray([0.5, 0.7]))
+    assert_close(computed, [0.7 + 2.0 * 0.5 - 0.3], 1e-15)
 
 
 def test_quaternion_rates_enter_rows_on_the_manifold(pair, state):

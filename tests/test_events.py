@@ -232,21 +232,23 @@ def test_gradients_go_through_events():
     """Turn, stick and slip: of rows and times of events, in coefficients, normal force and start."""
     ts = jnp.linspace(0.0, 4.0, 5)
 
-    def found(p):
+    def computed(p):
         scene = block(p[0], p[1], p[2])
         motion = jd.simulate(scene, jnp.zeros(1), p[3:], ts, control=load, rtol=1e-13, atol=1e-13, max_events=4)
         return jnp.concatenate([motion.q[:, 0], motion.v[:, 0], motion.events.time[:3]])
 
     at = jnp.asarray([MU, MU_S, G, 2.0])
     weights = jnp.asarray(np.random.default_rng(0).normal(size=13))
-    values = jax.jit(lambda p: found(p) @ weights)
-    gradients = jax.jit(jax.vmap(jax.grad(lambda p: found(p) @ weights)))(jnp.stack([at, at * 1.01]))
+    values = jax.jit(lambda p: computed(p) @ weights)
+    gradients = jax.jit(jax.vmap(jax.grad(lambda p: computed(p) @ weights)))(jnp.stack([at, at * 1.01]))
     want = differences(values, at, 3e-4 * jnp.eye(4))
     np.testing.assert_allclose(gradients[0], want, rtol=1e-8, atol=1e-7)  # of the differences
     # The time of the last event is where the load comes to what holds: LOAD cos(RATE t) RATE dt = G d mu_s.
     time = np.pi / RATE + np.arcsin(MU_S * G / LOAD) / RATE
-    moves = jax.jit(jax.grad(lambda p: found(p)[-1]))(at)
-    np.testing.assert_allclose(moves, np.array([0, G, MU_S, 0]) / (LOAD * RATE * np.cos(RATE * time)) * -1, atol=1e-9)
+    gradient = jax.jit(jax.grad(lambda p: computed(p)[-1]))(at)
+    np.testing.assert_allclose(
+        gradient, np.array([0, G, MU_S, 0]) / (LOAD * RATE * np.cos(RATE * time)) * -1, atol=1e-9
+    )
 
 
 @pytest.mark.slow
@@ -254,15 +256,15 @@ def test_gradients_go_through_an_impact():
     """Of the box that lands on a corner while it turns: start and friction."""
     ts = jnp.linspace(0.0, 0.35, 3)
 
-    def found(p):
+    def computed(p):
         q0, v0 = jnp.stack([0 * p[1], p[1], p[2]]), jnp.stack([p[3], 0 * p[3], 0 * p[3]])
         motion = jd.simulate(box(p[0]), q0, v0, ts, rtol=1e-12, atol=1e-12, max_events=6)
         return jnp.concatenate([motion.q.ravel(), motion.v.ravel(), motion.events.time[:2]])
 
     at = jnp.asarray([0.4, 0.5, 0.3, 0.7])
     weights = jnp.asarray(np.random.default_rng(0).normal(size=20))
-    values = jax.jit(lambda p: found(p) @ weights)
-    gradient = jax.jit(jax.grad(lambda p: found(p) @ weights))(at)
+    values = jax.jit(lambda p: computed(p) @ weights)
+    gradient = jax.jit(jax.grad(lambda p: computed(p) @ weights))(at)
     np.testing.assert_allclose(gradient, differences(values, at, 1e-4 * jnp.eye(4)), atol=1e-6)  # of the differences
 
 

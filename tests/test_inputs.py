@@ -96,8 +96,8 @@ def as_users_have_it():
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
-def same(found, wanted):
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+def same(computed, wanted):
+    for a, b in zip(jax.tree.leaves(computed), jax.tree.leaves(wanted), strict=True):
         assert np.asarray(a).dtype == np.asarray(b).dtype
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
@@ -249,21 +249,21 @@ def test_no_success_with_rows_that_are_not_finite():
     """A force that is infinite where the motion ends enters no step; what is reported of it counts."""
     late = lambda system, q, v, t: jnp.where(t >= 0.2, jnp.inf, 0.0) * jnp.ones(2)  # noqa: E731
     scene = jd.Scene(ARM, forces=(late,))
-    found = jd.simulate(scene, [0.1, 0.2], [0, 0], [0, 0.2], stepsize=0.01, outputs=("acceleration",), throw=False)
-    assert not found.success
+    solution = jd.simulate(scene, [0.1, 0.2], [0, 0], [0, 0.2], stepsize=0.01, outputs=("acceleration",), throw=False)
+    assert not solution.success
 
 
 def test_one_enumeration_of_results():
-    found = [
+    solution = [
         jd.assemble(CHAIN, Q),
         jd.constrained_dynamics(CHAIN, Q, V),
         jd.reduced_dynamics(CHAIN, Q, NU, basis=(0,)),
         jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 0.1], stepsize=0.1),
     ]
-    assert all(one.result == jd.RESULTS.successful and one.success for one in found)
-    assert "successful" in str(found[0].result) and "<>" not in str(found[3].result)
+    assert all(one.result == jd.RESULTS.successful and one.success for one in solution)
+    assert "successful" in str(solution[0].result) and "<>" not in str(solution[3].result)
     stopped = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 9.0], max_steps=1, throw=False)
-    assert stopped.result == jd.RESULTS.max_steps_reached != found[1].result and not stopped.success
+    assert stopped.result == jd.RESULTS.max_steps_reached != solution[1].result and not stopped.success
 
 
 def test_every_code_of_diffrax_has_its_name():
@@ -276,8 +276,8 @@ def test_models_scenes_and_solutions_print_as_short_text():
     assert text.splitlines()[0] == "Model 'chain 2': 2 bodies, nq = 2, nv = 2, float64"
     assert all(name in text for name in (*ARM.body_names, *ARM.joint_names, "revolute", "0 1 0"))
     assert "(Gear): 1 holonomic row" in str(CHAIN) and str(jd.Scene(PLANE)) == "Scene of MetricSystem: nq = 2, nv = 2"
-    found = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 0.1], stepsize=0.05, outputs=("energy",))
-    assert str(found) == (
+    solution = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 0.1], stepsize=0.05, outputs=("energy",))
+    assert str(solution) == (
         "Solution: successful, t = 0 to 0.1 s of 0.1 s\n  RK4: 2 steps, 0 rejected\n  2 rows of q (1), v (1), energy"
     )
     seen = []
@@ -373,12 +373,12 @@ def test_motions_start_from_unit_quaternions(modes):
     with pytest.raises(ValueError, match="length 2 at joint 'ball_joint', expected 1; divide it by its length"):
         jd.simulate(scene, starts[1], v0, [0.0, 0.1], **options)
     run = jax.jit(jax.vmap(lambda q: jd.simulate(scene, q, v0, [0.0, 0.1], **options)))
-    found = run(starts)
+    computed = run(starts)
     codes = ["successful", "unnormalized_start", "successful", "nonfinite_start", "nonfinite_start"]
     for i, code in enumerate(codes):
-        assert bool((found.result == getattr(jd.RESULTS, code))[i]), code
-    np.testing.assert_allclose(found.q[2], found.q[0], rtol=1e-12)
-    assert np.isnan(found.q[1]).all()
+        assert bool((computed.result == getattr(jd.RESULTS, code))[i]), code
+    np.testing.assert_allclose(computed.q[2], computed.q[0], rtol=1e-12)
+    assert np.isnan(computed.q[1]).all()
 
 
 def test_codes_of_a_batch_print_as_words():

@@ -42,8 +42,8 @@ def test_derivatives():
         at = v, tau, model.inertias
         return jax.grad(value, (0, 1, 2))(*at), jax.jvp(value, at, steps)
 
-    found, want = quick(lambda: (of(looped), of(matrix_form)))()
-    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+    computed, want = quick(lambda: (of(scans), of(world_frame)))()
+    for x, y in zip(jax.tree.leaves(computed), jax.tree.leaves(want), strict=True):
         assert_close(x, y, 1e-9)  # M is factored in two ways
 
 

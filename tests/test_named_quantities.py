@@ -139,11 +139,11 @@ def test_arnold_form_of_a_moving_body():
         if False
         else model
     )
-    still = jd.forward_dynamics(model, jd.neutral(model), jnp.zeros(6), jnp.zeros(6))
+    at_rest = jd.forward_dynamics(model, jd.neutral(model), jnp.zeros(6), jnp.zeros(6))
     V = jnp.asarray(np.random.default_rng(1).normal(size=6))
     inertia = jd.inertia.spatial_inertia(model.inertias[0])
     a = jd.forward_dynamics(model, jd.neutral(model), V, jnp.zeros(6))
-    assert_close(jd.geometry.arnold_form(inertia, V, V), a - still, 1e-11)
+    assert_close(jd.geometry.arnold_form(inertia, V, V), a - at_rest, 1e-11)
     b, c = jnp.asarray(np.random.default_rng(2).normal(size=(2, 6)))
     assert_close(jd.geometry.arnold_form(inertia, c, V) @ inertia @ b, se3.ad_apply(V, b) @ inertia @ c, 1e-12)
 
