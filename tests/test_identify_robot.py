@@ -471,9 +471,11 @@ def test_whiteness_of_known_noise():
     x = np.stack([noise, slow, np.zeros(n)], axis=1)
     found = identify.whiteness(identify.Log(t, x, tau=x), x)
     # The sum of the correlation up to its first zero has a standard error of some per cent.
-    assert found.lasting[0] == pytest.approx(0.01, rel=0.1) and found.worth[0] == pytest.approx(n, rel=0.1)
-    assert found.lasting[1] == pytest.approx(0.19, rel=0.15)
-    assert found.lasting[2] == pytest.approx(0.01)
+    assert found.correlation_time[0] == pytest.approx(0.01, rel=0.1) and found.effective_samples[0] == pytest.approx(
+        n, rel=0.1
+    )
+    assert found.correlation_time[1] == pytest.approx(0.19, rel=0.15)
+    assert found.correlation_time[2] == pytest.approx(0.01)
 
 
 # --- excitation -------------------------------------------------------------------------------------------------------
