@@ -46,6 +46,8 @@ def test_derivatives_are_those_of_diffrax(options, monkeypatch):
     own, peer = gradients("reverse", **options), gradients("direct", **options)
     for x, y in zip(own, peer, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-11)
+    if "stepsize" not in options:
+        return
     monkeypatch.setattr(reverse, "KEPT", 5)  # so that steps between are taken again
     for x, y in zip(gradients("reverse", **options), own, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12)
