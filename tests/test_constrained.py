@@ -64,7 +64,9 @@ def solved(tree):
         assembly = assemble(scene, q, guess)
         q, v = assembly.q, assembly.v
         row = rows(scene, q, v, 0.0)
-        ranked = constrained_dynamics(scene, q, v, tau)
+        ranked, schur, by_range = (
+            constrained_dynamics(scene, q, v, tau, method=method) for method in ("rank_aware", "schur", "range_space")
+        )
         return {
             "q": q,
             "v": v,
@@ -79,10 +81,10 @@ def solved(tree):
             "lam": ranked.multipliers,
             "rank": ranked.rank,
             "result": ranked.result == RESULTS.successful,
-            "schur": constrained_dynamics(scene, q, v, tau, method="schur").acceleration,
-            "schur lam": constrained_dynamics(scene, q, v, tau, method="schur").multipliers,
-            "range": constrained_dynamics(scene, q, v, tau, method="range_space").acceleration,
-            "range lam": constrained_dynamics(scene, q, v, tau, method="range_space").multipliers,
+            "schur": schur.acceleration,
+            "schur lam": schur.multipliers,
+            "range": by_range.acceleration,
+            "range lam": by_range.multipliers,
             "P_T": projections(scene, q).P_T,
             "S": second_fundamental_form(scene, q, v),
             "wrenches": constraint_wrenches(scene, q, ranked.multipliers),
