@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.constraints.assembly import assemble
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model
@@ -31,6 +32,10 @@ class SampledTorque(eqx.Module):
     hold: str = eqx.field(static=True, default="linear")
 
     def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+        return self.at(t)
+
+    def at(self, t) -> Float[Array, " nv"]:
+        """Torque (nv,) at a time (s); before the first sample and behind the last one that of these."""
         last = self.t.shape[0] - 2
         i = jnp.clip(jnp.searchsorted(self.t, t, side="right") - 1, 0, last)
         if self.hold == "previous":
@@ -49,6 +54,7 @@ class Segments(eqx.Module):
     q: Float[Array, "*segments n nq"]
     v: Float[Array, "*segments n nv"]
     tau: Float[Array, "*segments n nv"]
+    a: Float[Array, "*segments n nv"] | None = None
 
 
 def segments(log: Log, horizon: int | None, dtype, *, restart: bool = True) -> Segments:
@@ -68,7 +74,8 @@ def segments(log: Log, horizon: int | None, dtype, *, restart: bool = True) -> S
     count = (len(log) - 1) // horizon
     rows = np.arange(count)[:, None] * horizon + np.arange(horizon + 1)
     t = np.asarray(log.t, np.float64)[rows]
-    parts = (t - t[:, :1] if restart else t, *(np.asarray(x)[rows] for x in (log.q, log.v, log.tau)))
+    parts = [t - t[:, :1] if restart else t, *(np.asarray(x)[rows] for x in (log.q, log.v, log.tau))]
+    parts += [] if log.a is None else [np.asarray(log.a)[rows]]
     return Segments(*(jnp.asarray(part, dtype) for part in parts))
 
 
@@ -128,8 +135,14 @@ def simulation_options(substeps: int | None, simulation: dict) -> dict:
     return {"solver": diffrax.Tsit5(), "substeps": substeps} | simulation
 
 
-def simulate_segment(scene: Scene, one: Segments, change: Float[Array, "2 nv"] | None, hold: str, options: dict):
-    """Motion (n, nq), (n, nv) of one segment from its first state, displaced by `change`; NaN from where it fails."""
+def simulate_segment(
+    scene: Scene, one: Segments, change: Float[Array, "2 nv"] | None, hold: str, options: dict, control: Any = None
+):
+    """Motion (n, nq), (n, nv) of one segment from its first state, displaced by `change`; NaN from where it fails.
+
+    Under its torques, or under a `control`, whose torques (n, nv) then come third. With constraints the first state is put on
+    them.
+    """
     t, given = one.t, dict(options)
     substeps = given.pop("substeps", None)
     if substeps is not None:
@@ -140,8 +153,14 @@ def simulate_segment(scene: Scene, one: Segments, change: Float[Array, "2 nv"] |
     q0, v0 = one.q[0], one.v[0]
     if change is not None:
         q0, v0 = displace(scene.system, q0, change[0]), v0 + change[1]
-    motion = simulate(scene, q0, v0, t, control=SampledTorque(t, one.tau, hold), throw=False, **given)
-    return motion.q, motion.v
+    if scene.constraints:
+        state = assemble(scene, q0, v0, t[0], throw=False)
+        q0, v0 = state.q, state.v
+    if control is None:
+        motion = simulate(scene, q0, v0, t, control=SampledTorque(t, one.tau, hold), throw=False, **given)
+        return motion.q, motion.v
+    motion = simulate(scene, q0, v0, t, control=control, outputs=("torque",), throw=False, **given)
+    return motion.q, motion.v, motion.torque
 
 
 def motion_errors(system: Any, one: Segments, q: Float[Array, "n nq"], v: Float[Array, "n nv"], scale):

@@ -15,6 +15,7 @@ from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart
 from jaxdyn.identify.friction import check_terms
 from jaxdyn.identify.logs import Log, check_log, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
+from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.regression import regressor
 from jaxdyn.identify.replay import (
     Segments,
@@ -121,11 +122,10 @@ def fit_trajectory(
         y0,
         (problem, unknowns),
         method=method,
-        steps=steps,
         learning_rate=learning_rate,
         tolerance=tolerance,
         scaling=lambda y: _scaling(problem, unflatten(y).point, log, a, y.size),
-        callback=report,
+        watch=Watch(steps, report),
     )
     fitted, friction = chart.fitted(model, chart.settled(unflatten(y).point))
     name = method if isinstance(method, str) else type(method).__name__
