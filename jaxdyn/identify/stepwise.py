@@ -13,6 +13,8 @@ from jaxdyn.identify.progress import Watch
 
 SOLVERS = ("levenberg-marquardt", "dogleg")
 _OPTIONS = {"jac": "fwd"}
+# Steps without a lower loss after which rounding is all that is left.
+_STALE = 10
 
 
 def solver_of(method: str, tolerance: float) -> optx.AbstractLeastSquaresSolver:
@@ -56,6 +58,8 @@ def stepwise(
                 return y, np.array(history), "not_finite"
             if not goes_on:
                 return best, np.array(history), "stopped"
+            if len(history) > _STALE and min(history[-_STALE:]) >= min(history[:-_STALE]):
+                return best, np.array(history), "converged"
             if len(history) > watch.steps:
                 return best, np.array(history), "max_steps"
             y, state, done, failed = _step(errors, solver, y, args, state)
