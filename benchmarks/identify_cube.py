@@ -1,11 +1,10 @@
-"""A tossed cube identified from its flight: `python -m benchmarks.identify_cube [tosses_all.npz]`.
+"""A tossed cube identified from its flight: `python -m benchmarks.identify_cube [tosses_all.npz [tosses]]`.
 
 570 recorded tosses of a cube of 0.1048 m (ContactNets; position and quaternion at 148 Hz, velocities by differences). The parts
 in the air are cut into pieces of 12 steps that start from states which are fitted too. Free are gravity, inertia and the centre
 of mass; the mass is held, as flight does not depend on it. Tosses of even number are fitted, others predicted.
 """
 
-import itertools
 import sys
 from pathlib import Path
 
@@ -21,33 +20,49 @@ MASS = 0.37
 PIECE = 12
 
 
+def matrices(quaternions: np.ndarray) -> np.ndarray:
+    """Rotations (n, 3, 3) of unit quaternions (n, 4), w first."""
+    w, x, y, z = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def turns(quaternions: np.ndarray) -> np.ndarray:
+    """Rotation vectors (n - 1, 3) from each quaternion to the next, in the axes of the body, rad."""
+    (a, u), (b, v) = ((q[:, 0], q[:, 1:]) for q in (quaternions[:-1], quaternions[1:]))
+    w = a * b + np.sum(u * v, axis=1)
+    vector = (a[:, None] * v - b[:, None] * u - np.cross(u, v)) * np.where(w < 0, -1.0, 1.0)[:, None]
+    size = np.linalg.norm(vector, axis=1, keepdims=True)
+    return 2 * np.arctan2(size, np.abs(w)[:, None]) * vector / np.where(size > 0, size, 1.0)
+
+
 def airborne(toss: np.ndarray) -> np.ndarray:
     """Samples of the first flight: the lowest corner is a centimetre or more above the board."""
-    rotations = np.asarray(jax.vmap(jd.so3.quat_to_matrix)(jnp.asarray(toss[:, 3:7])))
-    lowest = toss[:, 2] - np.abs(rotations[:, 2]).sum(axis=1)
+    lowest = toss[:, 2] - np.abs(matrices(toss[:, 3:7])[:, 2]).sum(axis=1)
     up = lowest * HALF > 0.01
     end = len(up) if up.all() else int(np.argmin(up))
     return toss[:end]
 
 
 def log_of(toss: np.ndarray) -> jd.identify.Log:
-    """Pose and body twist along a flight, m and rad/s."""
+    """Pose and body twist along a flight, m and rad/s; velocities are differences of the poses."""
     quaternions = toss[:, 3:7] / np.linalg.norm(toss[:, 3:7], axis=1, keepdims=True)
-    rotations = np.asarray(jax.vmap(jd.so3.quat_to_matrix)(jnp.asarray(quaternions)))
     q = np.concatenate([HALF * toss[:, :3], quaternions], axis=1)
-    # Both velocities as differences of what was measured say, in the axes of the body.
-    linear = np.gradient(q[:, :3], STEP, axis=0)
-    turns = [np.asarray(jd.so3.log(jnp.asarray(a.T @ b))) / STEP for a, b in itertools.pairwise(rotations)]
-    omega = np.array([turns[0], *turns[1:], turns[-1]])
-    omega[1:-1] = (np.array(turns)[:-1] + np.array(turns)[1:]) / 2
-    v = np.concatenate([np.einsum("nji,nj->ni", rotations, linear), omega], axis=1)
+    linear = np.einsum("nji,nj->ni", matrices(quaternions), np.gradient(q[:, :3], STEP, axis=0))
+    steps = turns(quaternions) / STEP
+    omega = np.concatenate([steps[:1], (steps[:-1] + steps[1:]) / 2, steps[-1:]])
+    v = np.concatenate([linear, omega], axis=1)
     return jd.identify.Log(STEP * np.arange(len(q)), q, v, None, np.zeros((len(q), 6)))
 
 
-def flights(path: Path, least: int = PIECE + 1) -> list[jd.identify.Log]:
-    """Logs of all flights that are long enough."""
-    tosses = np.load(path)
-    cut = [airborne(np.asarray(tosses[f"toss_{i}"])) for i in range(len(tosses.files))]
+def flights(path: Path, tosses: int | None = None, least: int = PIECE + 1) -> list[jd.identify.Log]:
+    """Logs of the flights that are long enough, of so many tosses; all by default."""
+    arrays = np.load(path)
+    cut = [airborne(np.asarray(arrays[f"toss_{i}"])) for i in range(tosses or len(arrays.files))]
     return [log_of(toss) for toss in cut if len(toss) >= least]
 
 
@@ -97,9 +112,8 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     own = Path(__file__).resolve().parents[2] / "shared" / "data" / "contactnets_cube" / "tosses_all.npz"
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else own
-    count = int(sys.argv[2]) if len(sys.argv) > 2 else 100
-    logs = flights(path)
-    train, test = logs[0::2][:count], logs[1::2][:count]
+    logs = flights(path, int(sys.argv[2]) if len(sys.argv) > 2 else None)
+    train, test = logs[0::2], logs[1::2]
     start = cube()
     fit = identified(train, start, progress=True)
     ten, deviation = np.asarray(fit.system.inertias[0]), fit.deviation

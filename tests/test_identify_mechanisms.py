@@ -110,6 +110,7 @@ def test_a_hand_by_its_fingers_alone():
     np.testing.assert_allclose(fit.system.system.inertias[-1, 0], 0.5, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_toss_tells_gravity_and_ratios_of_inertia():
     """A simulated cube with measured poses; mass and size of the inertia are not told, ratios are."""
     from benchmarks.identify_cube import MASS, ratios

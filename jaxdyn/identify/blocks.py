@@ -158,7 +158,8 @@ class Inertias(Block):
             return found
         free = np.array(self.chart.bodies)
         own = jnp.sum(found[free, 0])
-        return found.at[free].multiply((self.total - (jnp.sum(found[:, 0]) - own)) / own)
+        ratio = (self.total - (jnp.sum(found[:, 0]) - own)) / own
+        return jnp.where(np.isin(np.arange(len(found)), free)[:, None], ratio * found, found)
 
     def values(self, y, leaves):
         free = self._inertias(y)[np.array(self.chart.bodies)]

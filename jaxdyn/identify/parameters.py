@@ -157,7 +157,7 @@ def fit_parameters(
         nominal=system,
         names=tree.names,
         values=values,
-        nominal_values=np.asarray(tree.values(tree.start), np.float64),
+        nominal_values=np.asarray(values_and_slopes(tree, tree.start)[0], np.float64),
         deviation=None if end is None else deviations(end, slopes),
         history=history,
         result=result,
@@ -243,8 +243,13 @@ def _pieces(system, scene, objective: Objective, logs, horizon, dtype):
         flat = jax.tree.map(
             lambda *parts: jnp.concatenate([x.reshape(1, -1, *x.shape[2:]) for x in parts], axis=1), *batches
         )
-        return tuple(whole), objective.scale(scene.system, flat), _origins(logs, horizon)
-    return tuple(whole), objective.scale(scene.system, whole[0]), _origins(logs, horizon)
+        return tuple(whole), _scale(objective, scene.system, flat), _origins(logs, horizon)
+    return tuple(whole), _scale(objective, scene.system, whole[0]), _origins(logs, horizon)
+
+
+@eqx.filter_jit
+def _scale(objective: Objective, system, pieces):
+    return objective.scale(system, pieces)
 
 
 def _origins(logs, horizon) -> tuple[tuple[int, int], ...]:

@@ -169,6 +169,7 @@ def motion_errors(system: Any, one: Segments, q: Float[Array, "n nq"], v: Float[
     return far / scale[0][None], (v - one.v) / scale[1][None]
 
 
+@eqx.filter_jit
 def motion_scale(system: Any, data: Segments) -> Float[Array, "2 nv"]:
     """Root mean square of each coordinate's way from the first sample, and of its velocity; the largest at rest."""
     way = jax.vmap(jax.vmap(lambda q: displacement(system, data.q[0, 0], q)))(data.q)
