@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jaxdyn.identify.blocks import Block, Directions, Inertias, Numbers, Poses, Tied
 from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.distances import METRICS
+from jaxdyn.identify.picking import across, entries_taken, free_bodies, models_of, root_of, rows_of
 from jaxdyn.identify.sensors import Measured
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.inertia import pseudo_inertia
@@ -95,9 +96,9 @@ class Parameters(eqx.Module):
                 raise ValueError(
                     f"directions picks {name}, where a vector is zero: {vectors.tolist()}; name the others in rows="
                 )
-            across = np.stack([_across(axis) for axis in axes])
+            bases = np.stack([across(axis) for axis in axes])
             root = None if std is None else np.eye(2 * len(vectors)) / std
-            blocks.append(Directions(labels, leaf, tuple(index), *self._arrays(vectors, across, root)))
+            blocks.append(Directions(labels, leaf, tuple(index), *self._arrays(vectors, bases, root)))
         return self._with(blocks)
 
     def poses(self, where: Any, *, rows=None, std=None) -> "Parameters":
@@ -107,7 +108,7 @@ class Parameters(eqx.Module):
             if value.shape[-2:] != (4, 4):
                 raise ValueError(f"poses picks {name} of shape {value.shape}; pick poses (..., 4, 4)")
             poses = value.reshape(-1, 4, 4)
-            chosen, labels = _rows(self.given, name, len(poses), rows)
+            chosen, labels = rows_of(self.given, name, len(poses), rows)
             names = tuple(f"{label} {c}" for label in labels for c in ("vx", "vy", "vz", "wx", "wy", "wz"))
             root = None if std is None else np.eye(6 * len(chosen)) / std
             blocks.append(Poses(names, leaf, tuple(chosen), *self._arrays(poses[np.array(chosen)], root)))
@@ -137,7 +138,7 @@ class Parameters(eqx.Module):
         model, leaf, name = self._model()
         if metric is not None and metric not in METRICS:
             raise ValueError(f"metric is {metric!r}; take one of {METRICS}, or None")
-        chosen = None if bodies is None else _rows(self.given, name, model.nb, list(bodies))[0]
+        chosen = None if bodies is None else rows_of(self.given, name, model.nb, list(bodies))[0]
         one = np.ones(model.nv)
         chart, _ = make_chart(model, (), 0.01, shape, one, one, one, bodies=chosen)
         if chosen is not None and set(chosen) != set(chart.bodies):
@@ -242,7 +243,7 @@ class Parameters(eqx.Module):
 
     def _model(self) -> tuple[Model, int, str]:
         """The model of the system, the place of its inertias among the leaves, and their name."""
-        found = _models(self.given)
+        found = models_of(self.given)
         if len(found) != 1:
             raise ValueError(
                 f"inertias: a {type(self.given).__name__} with {len(found)} models of bodies; free numbers of other systems with "
@@ -257,7 +258,9 @@ class Parameters(eqx.Module):
         quadrics = np.zeros((len(chart.bodies), 4, 4))
         for body, (centre, semi_axes) in ellipsoids.items():
             if body not in model.body_names or model.body_names.index(body) not in chart.bodies:
-                raise ValueError(f"ellipsoids names {body!r}, which is no free body; they are {_free(model, chart)}")
+                raise ValueError(
+                    f"ellipsoids names {body!r}, which is no free body; they are {free_bodies(model, chart)}"
+                )
             k = chart.bodies.index(model.body_names.index(body))
             centre, inverse = np.asarray(centre, float), np.diag(1 / np.asarray(semi_axes, float) ** 2)
             quadrics[k, :3, :3], quadrics[k, :3, 3] = -inverse, inverse @ centre
@@ -273,7 +276,7 @@ class Parameters(eqx.Module):
         for block in self.blocks:
             if block.place != place:  # pyright: ignore[reportAttributeAccessIssue]
                 continue
-            taken = _taken(block)
+            taken = entries_taken(block)
             if index is None or taken is None or set(index) & set(taken):
                 raise ValueError(f"{argument} picks {name} a second time; pick every number once")
 
@@ -304,7 +307,7 @@ class Parameters(eqx.Module):
             value = leaves[leaf.place]
             if not eqx.is_inexact_array_like(value):
                 raise ValueError(f"{argument} picks {leaf.name}, which is {value!r} and no floating-point number")
-            if not twice and any(value is model.inertias for model in _models(self.given)):
+            if not twice and any(value is model.inertias for model in models_of(self.given)):
                 raise ValueError(
                     f"{argument} picks {leaf.name}, the inertias of bodies, of which few choices are physical; free them by "
                     "jd.identify.Parameters(system).inertias(...)"
@@ -320,7 +323,7 @@ class Parameters(eqx.Module):
         """Flat indices of the entries in some rows of a leaf, and their names."""
         indices = np.arange(value.size).reshape(value.shape)
         if rows is not None:
-            indices = indices[np.array(_rows(self.given, name, len(indices) if value.ndim else 0, rows)[0])]
+            indices = indices[np.array(rows_of(self.given, name, len(indices) if value.ndim else 0, rows)[0])]
         chosen = indices.reshape(-1).tolist()
         at = [np.unravel_index(i, value.shape) for i in chosen]
         return chosen, tuple(name + "".join(f"[{i}]" for i in index) for index in at)
@@ -343,7 +346,7 @@ class Parameters(eqx.Module):
                         f"bounded picks {name}, which is {origin.tolist()} and not between {lower} and {upper}; give bounds "
                         "that hold where the fit starts"
                     )
-            root = _root(std, covariance, origin.size, f"{kind} of {name}")
+            root = root_of(std, covariance, origin.size, f"{kind} of {name}")
             if mean is not None and root is None:
                 raise ValueError(f"{kind} of {name}: mean is given without std or covariance; give one of them")
             center = (
@@ -370,69 +373,3 @@ def picked(system: Any, positive=None, free=None) -> Parameters:
 
 def _scene(given) -> Scene:
     return given.scene if isinstance(given, Measured) else as_scene(given)
-
-
-def _models(system) -> list[Model]:
-    return [x for x in jax.tree.leaves(system, is_leaf=lambda x: isinstance(x, Model)) if isinstance(x, Model)]
-
-
-def _taken(block) -> tuple[int, ...] | None:
-    """Entries of its leaf that a block writes; None for all."""
-    if isinstance(block, Poses):
-        return tuple(16 * row + i for row in block.rows for i in range(16))
-    return getattr(block, "index", None)
-
-
-def _free(model: Model, chart) -> list[str]:
-    return [model.body_names[i] for i in chart.bodies]
-
-
-def _rows(system, name: str, count: int, rows) -> tuple[list[int], list[str]]:
-    """Indices of rows given by index or by the names of bodies or joints, and what to call them; all for None."""
-    models = _models(system)
-    sets: list[tuple[str, ...]] = []
-    if len(models) == 1:
-        model = models[0]
-        sets = [names for names in (model.body_names, model.joint_names) if len(names) == count]
-        if count == len(model.frame_names):
-            sets.append(model.frame_names)
-    if rows is None:
-        labels = sets[0] if sets else [str(i) for i in range(count)]
-        return list(range(count)), [f"{name}[{label}]" for label in labels]
-    rows = [rows] if isinstance(rows, (str, int)) else list(rows)
-    found = []
-    for row in rows:
-        place = next((names.index(row) for names in sets if row in names), None) if isinstance(row, str) else row
-        if not isinstance(place, (int, np.integer)) or not 0 <= place < count:
-            known = sorted({n for names in sets for n in names}) or f"0 to {count - 1}"
-            raise ValueError(f"rows names {row!r} of {name}, which has {count} rows: {known}")
-        found.append(int(place))
-    if len(set(found)) < len(found):
-        raise ValueError(f"rows of {name} is {rows}; name every row once")
-    return found, [f"{name}[{row}]" for row in rows]
-
-
-def _root(std, covariance, size: int, what: str) -> np.ndarray | None:
-    """A matrix R (size, size) with R^T R the inverse of the covariance; None without a prior."""
-    if std is None and covariance is None:
-        return None
-    if std is not None and covariance is not None:
-        raise ValueError(f"{what}: std and covariance are both given; give one of them")
-    if std is not None:
-        deviation = np.broadcast_to(np.asarray(std, float), (size,))
-        if not (deviation > 0).all():
-            raise ValueError(f"{what}: std is {std}; give positive numbers")
-        return np.diag(1 / deviation)
-    matrix = np.asarray(covariance, float)
-    if matrix.shape != (size, size) or not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] <= 0:
-        raise ValueError(
-            f"{what}: covariance has shape {matrix.shape}; give a positive definite matrix ({size}, {size})"
-        )
-    return np.linalg.inv(np.linalg.cholesky(matrix))
-
-
-def _across(axis: np.ndarray) -> np.ndarray:
-    """Two unit vectors across an axis, as the columns of (3, 2)."""
-    other = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    other = other / np.linalg.norm(other)
-    return np.stack([other, np.cross(axis, other) / np.linalg.norm(axis)], axis=1)
