@@ -100,7 +100,8 @@ def momentum_balance(scene, piece: Segments) -> Float[Array, " nv"]:
         return v @ C - g + tau + (0.0 if force is None else force)
 
     rate = jax.vmap(pushed)(piece.t, piece.q, piece.v, piece.tau)
-    momentum = [dynamics.mass_matrix(system, piece.q[i], piece.t[i]) @ piece.v[i] for i in (0, -1)]
+    t: Any = piece.t
+    momentum = [dynamics.mass_matrix(system, piece.q[i], t[i]) @ piece.v[i] for i in (0, -1)]
     return momentum[1] - momentum[0] - _integral(rate, piece.t)
 
 
@@ -116,9 +117,10 @@ def energy_balance(scene, piece: Segments) -> Float[Array, ""]:
         return jnp.sum(v * (tau if force is None else tau + force))
 
     work = _integral(jax.vmap(power)(piece.t, piece.q, piece.v, piece.tau), piece.t)
+    t: Any = piece.t
     energy = [
-        dynamics.kinetic_energy(system, piece.q[i], piece.v[i], piece.t[i])
-        + dynamics.potential_energy(system, piece.q[i], piece.t[i])
+        dynamics.kinetic_energy(system, piece.q[i], piece.v[i], t[i])
+        + dynamics.potential_energy(system, piece.q[i], t[i])
         for i in (0, -1)
     ]
     return energy[1] - energy[0] - work

@@ -230,7 +230,7 @@ class Parameters(eqx.Module):
     def _with(self, blocks: list[Block]) -> "Parameters":
         return Parameters(self.given, tuple(blocks))
 
-    def _arrays(self, *values):
+    def _arrays(self, *values) -> list[Any]:
         return [None if x is None else jnp.asarray(x, self.dtype) for x in values]
 
     def _named_leaves(self):

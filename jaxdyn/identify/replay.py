@@ -137,13 +137,14 @@ def simulation_options(substeps: int | None, simulation: dict) -> dict:
 
 def simulate_segment(
     scene: Scene, one: Segments, change: Float[Array, "2 nv"] | None, hold: str, options: dict, control: Any = None
-):
+) -> tuple[Any, ...]:
     """Motion (n, nq), (n, nv) of one segment from its first state, displaced by `change`; NaN from where it fails.
 
     Under its torques, or under a `control`, whose torques (n, nv) then come third. With constraints the first state is put on
     them.
     """
-    t, given = one.t, dict(options)
+    t: Any = one.t
+    given = dict(options)
     substeps = given.pop("substeps", None)
     if substeps is not None:
         shares = jnp.arange(substeps, dtype=t.dtype) / substeps

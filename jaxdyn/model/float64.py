@@ -5,6 +5,8 @@ digits before the model exists, and what is refused must be refused on numbers. 
 `jax.vmap`, `jax.jit`) go through the same formulas; what only their values could tell is then not refused.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,7 +124,7 @@ def inverse(pose: Values) -> Values:
     return pose_of(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
 
 
-def adjoint(pose: np.ndarray) -> np.ndarray:
+def adjoint(pose: Values) -> np.ndarray:
     """Ad = [[R, hat(p) R], [0, R]] (6, 6)."""
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = pose[:3, :3]
@@ -215,7 +217,8 @@ def about_com(parameters: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, centre of mass (3,), rotational inertia about it (3, 3). A massless body has its centre at the origin."""
     mass, first = parameters[0], parameters[1:4]
     com = first / mass if mass != 0 else np.zeros(3)
-    return float(mass), com, rotational_inertia(parameters) - (com @ first * np.eye(3) - np.outer(com, first))
+    about_origin: Any = rotational_inertia(parameters)
+    return float(mass), com, about_origin - (com @ first * np.eye(3) - np.outer(com, first))
 
 
 def spatial_inertia(parameters: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import numpy_for
+from jaxdyn.compile import numpy_for as _numpy_for
 from jaxdyn.lie import so3
 
 # Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
@@ -189,7 +189,7 @@ def point_mass(mass, position=(0.0, 0.0, 0.0)) -> Array | np.ndarray:
 
 def displaced(parameters, position, rotation=None) -> Array | np.ndarray:
     """Parameters (10,) of the same body placed at `position` (3,), turned by `rotation` (3, 3), in a new frame."""
-    xp = numpy_for(parameters, position, rotation)
+    xp = _numpy_for(parameters, position, rotation)
     turned = xp.eye(3) if rotation is None else xp.asarray(rotation, float)
     upper = xp.concatenate([turned, xp.asarray(position, float)[:, None]], axis=1)
     pose = jnp.concatenate([jnp.asarray(upper, float), jnp.eye(4)[3:]])
@@ -197,5 +197,5 @@ def displaced(parameters, position, rotation=None) -> Array | np.ndarray:
 
 
 def _centred(mass, moments) -> Array | np.ndarray:
-    xp = numpy_for(mass, moments)
+    xp = _numpy_for(mass, moments)
     return xp.asarray([mass, 0.0, 0.0, 0.0, moments[0], 0.0, moments[1], 0.0, 0.0, moments[2]], float)
