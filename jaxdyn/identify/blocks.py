@@ -65,7 +65,8 @@ class Numbers(Block):
         if self.kind == "positive":
             return self.origin * jnp.exp(y)
         if self.kind == "bounded":
-            low, span = self.lower, self.upper - self.lower  # pyright: ignore[reportOperatorIssue]
+            low: Any = self.lower
+            span = self.upper - low
             share = (self.origin - low) / span
             return low + span * jax.nn.sigmoid(jnp.log(share) - jnp.log1p(-share) + y)
         return self.origin + self.unit * y
@@ -76,7 +77,8 @@ class Numbers(Block):
     def residual(self, y, leaves):
         if self.root is None:
             return super().residual(y, leaves)
-        return self.root @ (self.values(y, leaves) - self.mean)
+        mean: Any = self.mean
+        return self.root @ (self.values(y, leaves) - mean)
 
 
 class Poses(Block):

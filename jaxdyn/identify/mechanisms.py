@@ -19,7 +19,7 @@ from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import as_scene
 
 
-def observed_columns(system: Any, observed: Sequence[str | int]) -> tuple[int, ...]:
+def observed_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
     """Places in v of joints by name, or of the coordinates of a system without bodies by index.
 
     **Raises:** ValueError for those that do not exist.

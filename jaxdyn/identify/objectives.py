@@ -68,8 +68,8 @@ class Objective(eqx.Module):
         options = dict(self.options)
         if self.error == "trajectory":
             law = SampledTorque(piece.t + measured.delay, piece.tau, self.hold)
-            motion = simulate_segment(scene, piece, start, self.hold, options, control=law)[:2]
-            return jnp.concatenate([self._seen(e) for e in motion_errors(system, piece, *motion, scale)], axis=1)
+            q, v, _ = simulate_segment(scene, piece, start, self.hold, options, control=law)
+            return jnp.concatenate([self._seen(e) for e in motion_errors(system, piece, q, v, scale)], axis=1)
         q, v, tau = simulate_segment(scene, piece, start, self.hold, options, control=self.control)
         errors = [*motion_errors(system, piece, q, v, scale[:2]), (tau - piece.tau) / scale[2][None]]
         return jnp.concatenate([self._seen(error) for error in errors], axis=1)

@@ -151,7 +151,8 @@ def _flat_loss(y, args):
 
     def errors(one, change):
         change = None if change is None else change * scale
-        return motion_errors(model, one, *simulate_segment(scene, one, change, problem.hold, problem.options), scale)
+        q, v = simulate_segment(scene, one, change, problem.hold, problem.options)
+        return motion_errors(model, one, q, v, scale)
 
     found_errors = jax.vmap(errors)(data, found.start)
     return sum(jnp.mean(error**2) for error in found_errors) + problem.prior * chart.divergence(found.point.theta)
