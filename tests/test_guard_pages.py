@@ -8,6 +8,8 @@ import sys
 import numpy as np
 import pytest
 
+from jaxdyn.compile.code import varying_first
+
 PAGE = mmap.PAGESIZE
 
 # In a process of its own, which a kernel that goes beyond its buffers would end.
@@ -62,10 +64,10 @@ def called_between_guards(address: int, program, uniform, samples: int) -> None:
     """Call a kernel with random numbers, its buffers at the end of their pages and then at the beginning."""
     kernel = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(address)
     rng = np.random.default_rng(0)
-    same = [*uniform, *[False] * len(program.outputs)]
+    inputs = [(program.inputs[i], uniform[i]) for i in varying_first(uniform)]
     for at_end in (True, False):
         pointers, held = [], []
-        for array, is_same in zip((*program.inputs, *program.outputs), same, strict=True):
+        for array, is_same in (*inputs, *((output, False) for output in program.outputs)):
             count = array.size * (1 if is_same else samples)
             size = count * array.dtype.itemsize
             place, memory = _guarded(size, at_end)

@@ -9,7 +9,6 @@ import pytest
 from jaxdyn import identify, inertia
 from jaxdyn.identify.condensed import block_slices, condensed_rows
 from jaxdyn.identify.logs import as_measured
-from jaxdyn.identify.low_pass import coefficients, low_pass
 from jaxdyn.identify.one_fit import eliminate
 from jaxdyn.identify.regression import condense, condense_model
 from jaxdyn.identify.robot import huber_weights
@@ -198,23 +197,6 @@ def test_friction_goes_through_the_filter_of_the_log(truth):
     np.testing.assert_allclose(as_measured(log, log.v)[50:-50], log.v[50:-50], atol=2e-3)
     column = np.tanh(raw.v / 0.01)
     assert as_measured(raw, column) is column
-
-
-def test_low_pass_is_that_of_scipy():
-    """Butterworth coefficients, and both passes over steps, ramps and noise, of one column and of several."""
-    from scipy.signal import butter, filtfilt
-
-    noise = np.random.default_rng(0).normal(size=(900, 2, 3)) + np.linspace(5, 9, 900)[:, None, None]
-    noise[300:] -= 20
-    for order, cutoff in ((4, 8.0), (4, 100.0), (2, 30.0)):
-        b, a = butter(order, 2 * cutoff / 250.0)
-        ours = coefficients(cutoff, 250.0, order)
-        np.testing.assert_allclose(ours[0], b, rtol=1e-9)  # zeros and poles are multiplied out in another order
-        np.testing.assert_allclose(ours[1], a, rtol=1e-12)
-        for x in (noise, noise[:40, 0, 0]):
-            np.testing.assert_allclose(low_pass(x, cutoff, 250.0, order), filtfilt(b, a, x, axis=0), atol=1e-8)
-    with pytest.raises(ValueError, match="15 samples are too few"):
-        low_pass(noise[:15], 8.0, 250.0)
 
 
 def test_choice_by_cross_validation(truth):
@@ -489,9 +471,11 @@ def test_whiteness_of_known_noise():
     x = np.stack([noise, slow, np.zeros(n)], axis=1)
     found = identify.whiteness(identify.Log(t, x, tau=x), x)
     # The sum of the correlation up to its first zero has a standard error of some per cent.
-    assert found.lasting[0] == pytest.approx(0.01, rel=0.1) and found.worth[0] == pytest.approx(n, rel=0.1)
-    assert found.lasting[1] == pytest.approx(0.19, rel=0.15)
-    assert found.lasting[2] == pytest.approx(0.01)
+    assert found.correlation_time[0] == pytest.approx(0.01, rel=0.1) and found.effective_samples[0] == pytest.approx(
+        n, rel=0.1
+    )
+    assert found.correlation_time[1] == pytest.approx(0.19, rel=0.15)
+    assert found.correlation_time[2] == pytest.approx(0.01)
 
 
 # --- excitation -------------------------------------------------------------------------------------------------------

@@ -75,9 +75,9 @@ def _told_text(findings: Findings) -> str:
     labels = coordinate_labels(findings.model)[0]
     first = findings.tests[0]
     lasting = ", ".join(
-        f"{label} {short(float(x), 2)}" for label, x in zip(labels, first.whiteness.lasting, strict=True)
+        f"{label} {short(float(x), 2)}" for label, x in zip(labels, first.whiteness.correlation_time, strict=True)
     )
-    worst = round(float(first.whiteness.worth.min()))
+    worst = round(float(first.whiteness.effective_samples.min()))
     return (
         f"What the logs tell: {findings.told.summary()}\n"
         f"Errors on {first.name} last (s): {lasting}; its {len(first.log)} samples are worth {worst} independent ones or more"

@@ -191,28 +191,39 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
     else:
         for i, (row, output) in enumerate(zip(body.results(), program.outputs, strict=True)):
             e.store_array(rows[count + i], kind_of(output.dtype), row)
-    pointers = []
-    for at, i in enumerate([*varying_first(uniform), *range(count, len(arrays))]):
-        pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {at}", f"  %a{i} = load ptr, ptr %p{i}"]
     # Arguments that are not read are not in the code, but the handler checks their sizes: they are part of what is hashed.
     sizes = " ".join(
         f"{'same' if i < count and uniform[i] else 'each'}:{x.size}x{x.dtype}" for i, x in enumerate(arrays)
     )
+    return framed(e, f"{count} {sizes}", uniform, len(program.outputs), body.allocated())
+
+
+def framed(
+    e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocated: Sequence[str], last_block: str = "block"
+) -> str:
+    """The text of a whole kernel around the lines that `e` holds for the W samples from %base on; they end in `last_block`.
+
+    `uniform` says which arguments are the same for all samples; so many `outputs` follow them. `title` is a comment on top, and
+    part of what is hashed.
+    """
+    pointers = []
+    for at, i in enumerate([*varying_first(uniform), *range(len(uniform), len(uniform) + outputs)]):
+        pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {at}", f"  %a{i} = load ptr, ptr %p{i}"]
     return "\n".join(
         [
-            f"; {count} {sizes}",
+            f"; {title}",
             "define void @kernel(ptr %data, i64 %n, i64 %begin, i64 %end) #0 {",
             "entry:",
-            *body.allocated(),
+            *allocated,
             *pointers,
             *e.entry,
             "  %last = sub i64 %n, 1",
             "  %some = icmp ult i64 %begin, %end",
             "  br i1 %some, label %block, label %done",
             "block:",
-            "  %base = phi i64 [ %begin, %entry ], [ %next, %block ]",
+            f"  %base = phi i64 [ %begin, %entry ], [ %next, %{last_block} ]",
             *e.lines,
-            f"  %next = add i64 %base, {width}",
+            f"  %next = add i64 %base, {e.width}",
             "  %more = icmp ult i64 %next, %end",
             "  br i1 %more, label %block, label %done",
             "done:",

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.code import ATTRIBUTES, Body, bytes_of, varying_first
+from jaxdyn.compile.code import Body, bytes_of, framed
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import Array, kind_of
 
@@ -63,34 +63,9 @@ class _LoopText:
             e.store_array(self.lanes[self.results + k], kind, values)
         if loop.row is not None:
             e.store(self.lanes[self.saved_after], 0, "i4", e.load_at("%saved", 0, "i4"))
-        pointers = []
-        for at, i in enumerate([*varying_first(self.uniform[: self.results]), *range(self.results, len(self.arrays))]):
-            pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {at}", f"  %a{i} = load ptr, ptr %p{i}"]
-        return "\n".join(
-            [
-                f"; {loop.digest} {self.uniform}",
-                "define void @kernel(ptr %data, i64 %n, i64 %begin, i64 %end) #0 {",
-                "entry:",
-                *turn.allocated(),
-                *self.allocated,
-                *pointers,
-                *e.entry,
-                "  %last = sub i64 %n, 1",
-                "  %some = icmp ult i64 %begin, %end",
-                "  br i1 %some, label %block, label %done",
-                "block:",
-                "  %base = phi i64 [ %begin, %entry ], [ %next, %out ]",
-                *e.lines,
-                f"  %next = add i64 %base, {self.width}",
-                "  %again = icmp ult i64 %next, %end",
-                "  br i1 %again, label %block, label %done",
-                "done:",
-                "  ret void",
-                "}",
-                *e.declared.values(),
-                *ATTRIBUTES,
-            ]
-        )
+        title = f"{loop.digest} {self.uniform}"
+        allocated = [*turn.allocated(), *self.allocated]
+        return framed(e, title, self.uniform[: self.results], len(loop.outputs), allocated, last_block="out")
 
     # --- arguments ---
 

@@ -55,18 +55,14 @@ class Code:
     def __init__(self, text: str, stored: bool = True):
         initialize()
         self.key = key_of(text)
-        found = _read(self.key) if stored else None
-        machine = target_machine()
-        module = llvm.parse_assembly("" if found else text)
-        module.triple = llvm.get_process_triple()
-        module.data_layout = str(machine.target_data)
-        if not found:
-            _optimize(module, machine)
-        self.engine = llvm.create_mcjit_compiler(module, machine)
-        if found:
-            self.engine.add_object_file(llvm.ObjectFileRef.from_data(found))
-        elif stored:
-            self.engine.set_object_cache(lambda _, code: _write(self.key, bytes(code)))
+        code = _read(self.key) if stored else None
+        if code is None:
+            code = _compiled(text)
+            if stored:
+                _write(self.key, code)
+        # The engine is given the object file alone: it would keep the text that it compiles for as long as it lives.
+        self.engine = llvm.create_mcjit_compiler(_module("", machine := target_machine()), machine)
+        self.engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         self.engine.finalize_object()
 
     def address(self, name: str) -> int:
@@ -78,11 +74,22 @@ class Code:
         llvm.add_symbol(symbol, self.address(name))
 
 
-def _optimize(module, machine) -> None:
+def _module(text: str, machine):
+    module = llvm.parse_assembly(text)
+    module.triple = llvm.get_process_triple()
+    module.data_layout = str(machine.target_data)
+    return module
+
+
+def _compiled(text: str) -> bytes:
+    """The object file of a kernel."""
+    machine = target_machine()
+    module = _module(text, machine)
     options = llvm.create_pipeline_tuning_options(speed_level=1)
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
     builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
+    return machine.emit_object(module)
 
 
 # --- files ---

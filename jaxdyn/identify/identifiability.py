@@ -94,10 +94,10 @@ def _words(direction: np.ndarray, names: Sequence[str]) -> str:
 
 
 class Whiteness(NamedTuple):
-    """Of a residual (n, nv): how long errors of each torque last (s), and how many independent samples they are worth (nv,)."""
+    """Of a residual (n, nv): correlation time (s) of each torque, and how many independent samples it is worth (nv,)."""
 
-    lasting: np.ndarray
-    worth: np.ndarray
+    correlation_time: np.ndarray
+    effective_samples: np.ndarray
 
 
 def whiteness(log: Log, residual: np.ndarray) -> Whiteness:

@@ -8,7 +8,6 @@ import jax.core
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.low_pass import low_pass
 from jaxdyn.model.tree import Model
 
 
@@ -138,6 +137,8 @@ def from_raw(
 
     Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
     """
+    from scipy.signal import butter, filtfilt
+
     raw = Log(t, q, tau=tau, joint_names=joint_names)
     t = np.asarray(raw.t, np.float64)
     q = np.asarray(raw.q, np.float64)
@@ -163,12 +164,14 @@ def from_raw(
             f"period of cutoff={cutoff} Hz; cut the log there or lower the cut-off"
         )
     grid = np.linspace(t[0], t[-1], n)
+    # scipy's annotations leave open what `output` gives.
+    numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
 
     def uniform(x):
         return np.stack([np.interp(grid, t, column) for column in x.T], axis=1)
 
     def low(x):
-        return low_pass(x, cutoff, rate, order)
+        return filtfilt(numerator, denominator, x, axis=0)
 
     q = low(uniform(q))
     v = low(np.gradient(q, grid, axis=0))
@@ -188,7 +191,10 @@ def as_measured(log: Log, columns: np.ndarray, order: int = 4) -> np.ndarray:
     shortest = 3 * (order + 1) + 1
     if log.cutoff is None or not log.cutoff < 0.45 * rate or len(log) < shortest or not columns.size:
         return columns
-    return low_pass(columns, log.cutoff, rate, order)
+    from scipy.signal import butter, filtfilt
+
+    numerator, denominator = butter(order, 2 * log.cutoff / rate, output="ba")  # pyright: ignore
+    return filtfilt(numerator, denominator, columns, axis=0)
 
 
 def _as_array(value):

@@ -194,8 +194,8 @@ def _errors(one: Judged) -> dict[str, Any]:
         "rms_by_joint": one.rms.tolist(),
         "nominal_percent": torque_error(one.nominal, one.log.tau),
         "samples": len(one.log),
-        "error_lasts_seconds": one.whiteness.lasting.tolist(),
-        "worth_independent_samples": one.whiteness.worth.tolist(),
+        "error_lasts_seconds": one.whiteness.correlation_time.tolist(),
+        "worth_independent_samples": one.whiteness.effective_samples.tolist(),
     }
 
 
