@@ -13,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.kinds import components
+from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Numbers, pose_leaf
 
 
@@ -133,17 +135,15 @@ def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
         raise ValueError(f"places is {places!r}; give {{finger: (point, normal)}}")
     contacts = []
     for finger, place in places.items():
-        if not isinstance(place, (tuple, list)) or [np.shape(x) for x in place] != [(3,), (3,)]:
+        parts = [numpy_for(x).asarray(x, float) for x in place] if isinstance(place, (tuple, list)) else []
+        if [x.shape for x in parts] != [(3,), (3,)]:
             raise ValueError(f"places[{finger!r}] is {place!r}; give (point (3,), normal (3,))")
-        point, normal = (np.asarray(x, float) for x in place)
-        length = np.linalg.norm(normal)
-        if not (np.isfinite(length) and length > 0):
+        point, normal = parts
+        if is_concrete(normal) and not (np.isfinite(normal).all() and normal.any()):
             raise ValueError(f"places[{finger!r}]: normal is {normal.tolist()}; give a direction into the object")
-        normal = normal / length
-        across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-        across = across / np.linalg.norm(across)
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = np.stack([across, np.cross(normal, across), normal], 1), point
+        xp, normal = numpy_for(normal), f64.unit(normal, f"places[{finger!r}]: normal")
+        across = f64.unit(xp.cross(normal, xp.eye(3)[xp.argmin(xp.abs(normal))]), "across")
+        pose = f64.pose_of(xp.stack([across, xp.cross(normal, across), normal], 1), point)
         contacts.append(contact(kind, finger, pose))
     return contacts
 

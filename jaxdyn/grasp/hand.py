@@ -12,8 +12,8 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint
-from jaxdyn.model.inertia import spatial_inertia
 from jaxdyn.model.joining import joined
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
@@ -141,7 +141,7 @@ def _check_object(model: Model, name: str) -> None:
         raise ValueError(f"there are no fingers beside the object {name!r}; pass their models")
     if is_concrete(model.inertias):
         moved = {"free": range(6), "planar": (0, 1, 5)}.get(top.kinds[body], ())
-        matrix = np.asarray(spatial_inertia(model.inertias[body]), float)[np.ix_(moved, moved)]
+        matrix = f64.spatial_inertia(np.asarray(model.inertias, float)[body])[np.ix_(moved, moved)]
         if len(moved) and not (least := np.linalg.eigvalsh(matrix)[0]) > 0:
             raise ValueError(
                 f"inertia of the object {name!r} is not positive definite: the least eigenvalue of its spatial inertia is "

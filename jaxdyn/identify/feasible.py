@@ -16,6 +16,7 @@ from jaxdyn.identify.condensed import Condensed, condensed_rows
 from jaxdyn.identify.friction import TERMS, check_terms
 from jaxdyn.identify.logs import Log, as_logs, as_measured, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
+from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.regression import check_weights, condense_model, noise_level
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.threads import on_one_thread
@@ -119,11 +120,10 @@ def fit_torques(
             start,
             (problem, point),
             method=method,
-            steps=steps,
             learning_rate=learning_rate,
             tolerance=tolerance,
             scaling=lambda y: _whitening(problem, unflatten(y)),
-            callback=report,
+            watch=Watch(steps, report),
         )
         point = unflatten(y)
     fitted, friction = chart.fitted(model, chart.settled(point))

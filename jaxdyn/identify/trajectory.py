@@ -16,6 +16,7 @@ from jaxdyn.identify.divided import shared_out, summed
 from jaxdyn.identify.friction import check_terms
 from jaxdyn.identify.logs import Log, as_logs, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
+from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.regression import regressor
 from jaxdyn.identify.replay import (
     Segments,
@@ -131,11 +132,10 @@ def fit_trajectory(
         y0,
         (problem, unknowns),
         method=method,
-        steps=steps,
         learning_rate=learning_rate,
         tolerance=tolerance,
         scaling=lambda y: _scaling(problem, unflatten(y).point, (q, v, a), y.size),
-        callback=report,
+        watch=Watch(steps, report),
     )
     fitted, friction = chart.fitted(model, chart.settled(unflatten(y).point))
     name = method if isinstance(method, str) else type(method).__name__
@@ -173,8 +173,8 @@ def _flat_loss(y, args):
 
         def errors(one, change):
             change = None if change is None else change * problem.scale
-            motion = simulate_segment(scene, one, change, problem.hold, problem.options)
-            return motion_errors(model, one, *motion, problem.scale)
+            q, v = simulate_segment(scene, one, change, problem.hold, problem.options)
+            return motion_errors(model, one, q, v, problem.scale)
 
         return sum(jnp.sum(error**2) for error in jax.vmap(errors)(data, start)) / whole
 

@@ -136,7 +136,7 @@ def _links(edge: Edge, place: np.ndarray) -> list[Link]:
     joint = edge.joint
     if joint is None or joint.kind == "fixed":
         return []
-    anchor = (f64.inverse(place) @ joint.pose)[:3, 3]
+    anchor = np.asarray(f64.inverse(place) @ joint.pose)[:3, 3]
     kind, sign = _KINDS[joint.kind], -1.0 if edge.backwards else 1.0
     if kind == "spherical":
         return [Link(joint.name, kind, np.zeros(3), anchor, 0.0, {})]
@@ -152,7 +152,7 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
     element, what = file.links[link][0], f"link {link!r}"
     inertial = element.find("inertial")
     if inertial is None:
-        return f64.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what)
+        return np.asarray(f64.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what))
     if (inertial.get("auto") or "").strip().lower() in ("1", "true"):
         raise file.fault(
             inertial,
@@ -165,7 +165,7 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
     mass = file.number(inertial, "mass", 1.0, what)
     try:
         about_com = (mass, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        return f64.move_inertia(file.raw_pose(inertial, what), f64.inertia_numbers(about_com, what))
+        return np.asarray(f64.move_inertia(file.raw_pose(inertial, what), f64.inertia_numbers(about_com, what)))
     except ValueError as error:
         raise error if str(error).startswith(file.path) else file.fault(inertial, str(error)) from error
 

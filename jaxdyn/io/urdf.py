@@ -170,7 +170,7 @@ def _add_joint(
     name = joint.child
     pose, parent, axis, turn = joint.origin, joint.parent, _Z, np.eye(4)
     if kind in SCREW_KINDS or kind == "planar":
-        axis = f64.unit(joint.axis, f"joint {joint.name!r}: axis")
+        axis = np.asarray(f64.unit(joint.axis, f"joint {joint.name!r}: axis"))
     if kind == "planar":
         turn, axis = f64.turn_from_z(axis), _Z
     if joint.name in locked:
@@ -206,10 +206,10 @@ def _inertia(urdf: _Description, link: str) -> np.ndarray:
     # A missing <mass> or <inertia> inside <inertial> is none at all.
     parts = (inertial.mass or 0.0, np.zeros(3), np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia)
     try:
-        parameters = f64.inertia_numbers(parts, f"link {link!r}")
+        parameters = np.asarray(f64.inertia_numbers(parts, f"link {link!r}"))
     except ValueError as error:
         raise ValueError(f"{urdf.places[f'link {link}']}: {error}") from error
-    return parameters if inertial.origin is None else f64.move_inertia(inertial.origin, parameters)
+    return parameters if inertial.origin is None else np.asarray(f64.move_inertia(inertial.origin, parameters))
 
 
 def _locked(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:

@@ -98,7 +98,7 @@ class XmlFile:
             return f64.joint_pose("free", np.zeros(6), np.concatenate([values[:3], values[6:], values[3:6]]))
         values = self.numbers(pose, 6, what)
         turn = np.deg2rad(values[3:]) if (pose.get("degrees") or "").lower() in ("1", "true") else values[3:]
-        return f64.pose_matrix((values[:3], turn), what)
+        return np.asarray(f64.pose_matrix((values[:3], turn), what))
 
     def number(self, element, tag: str, default: float, what: str, *, finite: bool = True) -> float:
         """A number in a child element `tag` (a path), or the default where there is none or it is empty."""

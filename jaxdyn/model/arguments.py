@@ -149,7 +149,7 @@ def check_shapes(model, **arguments) -> tuple[Any, ...]:
 
 
 def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
-    """A pose as an array leaf; arrays (4, 4) of jax are taken as they are, so that they can be traced."""
+    """A pose as an array leaf; its numbers may be traced, and arrays (4, 4) of jax are taken as they are."""
     if isinstance(pose, jax.Array) and pose.shape == (4, 4):
         return pose
     if isinstance(pose, jax.Array) and pose.shape == (3,):

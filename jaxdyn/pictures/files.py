@@ -90,7 +90,7 @@ def _urdf(file: XmlFile) -> Shapes:
             pose = np.eye(4)
             if origin is not None:
                 xyz, rpy = (_attribute(file, origin, key, 3, what, np.zeros(3)) for key in ("xyz", "rpy"))
-                pose = f64.pose_matrix((xyz, rpy), what)
+                pose = np.asarray(f64.pose_matrix((xyz, rpy), what))
             material = visual.find("material")
             rgba = None if material is None else _rgba(file, material) or materials.get(material.get("name"))
             color, opacity = (None, 1.0) if rgba is None else (rgba[:3], rgba[3])
