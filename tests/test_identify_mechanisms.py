@@ -34,7 +34,7 @@ def test_a_four_bar_is_completed_from_its_crank():
         jd.identify.completed(scene.system, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
 
 
-def found(scene, log, parameters, observed, **options):
+def computed(scene, log, parameters, observed, **options):
     options = {"horizon": 20, "substeps": 2, "tolerance": 1e-8, "steps": 15} | options
     return jd.identify.fit_parameters(scene, log, parameters, observed=observed, **options)
 
@@ -58,7 +58,7 @@ def test_a_four_bar_by_its_crank_alone():
     wrong = jd.scenes.four_bar(masses=(1.0, 2.0, 2.5))
     log = jd.identify.completed(wrong, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
     tree = jd.identify.Parameters(wrong).inertias(["coupler"], shape="mass", metric=None)
-    fit = found(wrong, log, tree, ["1"])
+    fit = computed(wrong, log, tree, ["1"])
     np.testing.assert_allclose(fit.system.system.inertias[1, 0], 3.0, rtol=1e-5)
     assert fit.result == "converged" and np.isfinite(fit.deviation).all()
 
@@ -73,7 +73,7 @@ def test_a_redundant_manipulator_by_its_base_joints():
     log = jd.identify.completed(wrong, T, measured, tau, q[0])
     np.testing.assert_allclose(log.q, q, atol=1e-6)
     tree = jd.identify.Parameters(wrong).inertias(shape="mass", metric=None)
-    fit = found(wrong, log, tree, ["a1", "b1", "c1"])
+    fit = computed(wrong, log, tree, ["a1", "b1", "c1"])
     # Which masses make the same motion the log leaves open; it is that of equal ones of 1 kg.
     before = jd.identify.parameter_error(wrong, log, horizon=20, substeps=2)
     after = jd.identify.parameter_error(fit.system, log, horizon=20, substeps=2)
@@ -91,7 +91,7 @@ def test_a_rolling_disk_by_its_two_angles():
     parameters = jd.identify.Parameters(wrong).positive(
         lambda s: [s.system.parameters["steer"], s.system.parameters["roll"]]
     )
-    fit = found(wrong, log, parameters, [2, 3])
+    fit = computed(wrong, log, parameters, [2, 3])
     np.testing.assert_allclose(fit.values, [0.125, 0.25], rtol=1e-6)
 
 
@@ -106,7 +106,7 @@ def test_a_hand_by_its_fingers_alone():
     log = jd.identify.completed(wrong, T, {name: (q[:, i], v[:, i]) for i, name in enumerate(names)}, tau, q[0])
     np.testing.assert_allclose(log.q, q, atol=1e-7)
     tree = jd.identify.Parameters(wrong).inertias(["bar"], shape="mass", metric=None)
-    fit = found(wrong, log, tree, names)
+    fit = computed(wrong, log, tree, names)
     np.testing.assert_allclose(fit.system.system.inertias[-1, 0], 0.5, rtol=1e-4)
 
 

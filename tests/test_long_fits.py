@@ -146,8 +146,8 @@ def test_many_starts_reach_what_one_does_not():
     alone = jd.identify.fit_parameters(far, recorded(), **options)
     many = jd.identify.fit_parameters(far, recorded(), starts=128, spread=1.0, **options)
     assert many.history[-1] < 1e-2 * alone.history[-1]
-    found = many.system.parameters
-    np.testing.assert_allclose([abs(found["size"]), abs(found["rate"])], [1.0, 3.0], rtol=0.02)
+    computed = many.system.parameters
+    np.testing.assert_allclose([abs(computed["size"]), abs(computed["rate"])], [1.0, 3.0], rtol=0.02)
 
 
 def root_push(q, v, t, p):

@@ -73,17 +73,17 @@ def test_every_point_is_a_system_that_can_exist():
             np.testing.assert_allclose(got, want, atol=1e-15)
     for seed in range(5):
         y = jax.random.normal(jax.random.key(seed), (points.size,))
-        found = points.system(y).system
-        assert all(jd.inertia.is_feasible(ten) for ten in found.inertias)
-        np.testing.assert_allclose(found.inertias[:, 0].sum(), 5.0, rtol=1e-14)
-        np.testing.assert_array_equal(found.inertias[0], model.inertias[0])
-        R = np.asarray(found.home[1, :3, :3])
+        computed = points.system(y).system
+        assert all(jd.inertia.is_feasible(ten) for ten in computed.inertias)
+        np.testing.assert_allclose(computed.inertias[:, 0].sum(), 5.0, rtol=1e-14)
+        np.testing.assert_array_equal(computed.inertias[0], model.inertias[0])
+        R = np.asarray(computed.home[1, :3, :3])
         np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-14)
-        np.testing.assert_array_equal(found.home[0], model.home[0])
-        np.testing.assert_allclose(found.frame_poses[2], found.home[1])
-        np.testing.assert_allclose(np.linalg.norm(found.gravity), 9.81, rtol=1e-14)
-        np.testing.assert_allclose(np.linalg.norm(found.screws[:, 3:], axis=1), 1, rtol=1e-14)
-        assert (np.abs(found.lower) < 2).all()
+        np.testing.assert_array_equal(computed.home[0], model.home[0])
+        np.testing.assert_allclose(computed.frame_poses[2], computed.home[1])
+        np.testing.assert_allclose(np.linalg.norm(computed.gravity), 9.81, rtol=1e-14)
+        np.testing.assert_allclose(np.linalg.norm(computed.screws[:, 3:], axis=1), 1, rtol=1e-14)
+        assert (np.abs(computed.lower) < 2).all()
         assert min(float(x) for x in jax.tree.leaves(points.system(y).forces[0])[0]) > 0
     assert len(points.names) == points.values(points.start).size
     assert points.names[0] == "system.inertias[link1] m"
@@ -211,9 +211,9 @@ def test_geometry_gravity_and_sensors_are_found_together(log):
         .directions(lambda m: m.scene.system.gravity)
     )
     fit = jd.identify.fit_parameters(measured, recorded, points, error="torque", tolerance=1e-12, noise=1e-6)
-    found = dict(zip(fit.names, fit.values, strict=True))
-    np.testing.assert_allclose([found[f"torque_gain[{i}]"] for i in range(3)], gain, rtol=2e-2)
+    computed = dict(zip(fit.names, fit.values, strict=True))
+    np.testing.assert_allclose([computed[f"torque_gain[{i}]"] for i in range(3)], gain, rtol=2e-2)
     # Torques between samples are taken as linear, which is what is left.
-    np.testing.assert_allclose(found["delay"], delay, atol=1e-3)
+    np.testing.assert_allclose(computed["delay"], delay, atol=1e-3)
     assert fit.history[-1] < 1e-4 * fit.history[0] and fit.result == "converged"
     assert fit.error(recorded) < 5

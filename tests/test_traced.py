@@ -53,13 +53,13 @@ def weigh(tree):
 def quantities(scene, q, v):
     """All that a scene's equations are made of, at a state."""
     system = scene.system
-    found: list = [jd.mass_matrix(system, q), jd.bias_force(system, q, v)]
+    computed: list = [jd.mass_matrix(system, q), jd.bias_force(system, q, v)]
     if not any(isinstance(force, unilateral.WithModes) for force in scene.forces):
-        found.append(scene.applied_force(q, v, 0.3))
+        computed.append(scene.applied_force(q, v, 0.3))
     if scene.constraints:
         rows = base.rows(scene, q, v, 0.3)
-        found += [jax.tree.leaves(rows), base.position_residual(scene, q, 0.3)]
-    return weigh(found)
+        computed += [jax.tree.leaves(rows), base.position_residual(scene, q, 0.3)]
+    return weigh(computed)
 
 
 def check_slopes(function, at, seed=0, step=1e-4, rtol=1e-7):

@@ -155,13 +155,13 @@ class Inertias(Block):
         return y.reshape(len(self.chart.bodies), -1)
 
     def _inertias(self, y):
-        found = self.chart.inertias(self._theta(y))
+        inertias = self.chart.inertias(self._theta(y))
         if self.total is None:
-            return found
+            return inertias
         free = np.array(self.chart.bodies)
-        own = jnp.sum(found[free, 0])
-        ratio = (self.total - (jnp.sum(found[:, 0]) - own)) / own
-        return jnp.where(np.isin(np.arange(len(found)), free)[:, None], ratio * found, found)
+        own = jnp.sum(inertias[free, 0])
+        ratio = (self.total - (jnp.sum(inertias[:, 0]) - own)) / own
+        return jnp.where(np.isin(np.arange(len(inertias)), free)[:, None], ratio * inertias, inertias)
 
     def values(self, y, leaves):
         free = self._inertias(y)[np.array(self.chart.bodies)]
@@ -182,8 +182,8 @@ class Inertias(Block):
             P = jnp.einsum("bij,bjk,blk,bml->bim", factors, U, U, factors)
             P0 = jnp.einsum("bij,bkj->bik", factors, factors)
             now, nominal = (jnp.einsum("bij,bji->b", x, self.ellipsoids) for x in (P, P0))
-            held = nominal > 0
-            share = jnp.where(held, now, 1.0) / jnp.where(held, nominal, 1.0)
+            has_mass = nominal > 0
+            share = jnp.where(has_mass, now, 1.0) / jnp.where(has_mass, nominal, 1.0)
             parts.append(jnp.sqrt(self.weight) * barrier_residual(jnp.log(share)))
         return jnp.concatenate(parts)
 

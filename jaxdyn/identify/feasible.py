@@ -191,8 +191,8 @@ def newton(model: Model, problem: Problem, point: Coordinates, steps: int, toler
             callback(step, loss, there.fitted(model, at)[0])
 
     resolution = float(jnp.finfo(problem.R.dtype).eps)
-    found = interior.newton(host, np.asarray(point.s), steps, tolerance, watch, resolution)
-    return *placed(chart, found.origin, found.s), found.history, found.result
+    optimum = interior.newton(host, np.asarray(point.s), steps, tolerance, watch, resolution)
+    return *placed(chart, optimum.origin, optimum.s), optimum.history, optimum.result
 
 
 def placed(chart: Chart, origin: np.ndarray, s: np.ndarray) -> tuple[Chart, Coordinates]:
@@ -208,8 +208,8 @@ def _whitening(problem: Problem, point: Coordinates):
     """S with S S^T the inverse of the Gauss-Newton Hessian of the loss."""
     y, unflatten = ravel_pytree(point)
     rows = problem.R @ jax.jacfwd(lambda y: problem.chart.parameters(unflatten(y)))(y)
-    bent = jax.hessian(lambda y: problem.chart.divergence(unflatten(y).theta))(y)
-    values, vectors = jnp.linalg.eigh(rows.T @ rows + problem.prior * (bent + bent.T) / 2)
+    curvature = jax.hessian(lambda y: problem.chart.divergence(unflatten(y).theta))(y)
+    values, vectors = jnp.linalg.eigh(rows.T @ rows + problem.prior * (curvature + curvature.T) / 2)
     # Terms that the log does not show have no curvature, and far from the nominal bodies that of the prior can be negative.
     return vectors / jnp.sqrt(jnp.maximum(values, problem.prior))[None, :]
 

@@ -57,13 +57,13 @@ class Linear(NamedTuple):
         dy = -np.linalg.solve(hessian + size * np.eye(len(hessian)), gradient)
         return dy, self.by_starts + float(dy @ (size * dy - gradient))
 
-    def moved(self, found: Unknowns, dy: np.ndarray) -> Unknowns:
+    def moved(self, estimate: Unknowns, dy: np.ndarray) -> Unknowns:
         """The unknowns after a step."""
-        dtype, start = found.y.dtype, found.start
+        dtype, start = estimate.y.dtype, estimate.start
         if start is not None:
             change = jnp.asarray(self.offset + self.gain @ dy, dtype)
             start = start - change.reshape(start.shape)
-        return Unknowns(found.y + jnp.asarray(dy, dtype), start)
+        return Unknowns(estimate.y + jnp.asarray(dy, dtype), start)
 
 
 def linear(errors, by_y, by_start) -> Linear:
@@ -87,9 +87,9 @@ def linear(errors, by_y, by_start) -> Linear:
 
 
 def gauss_newton(
-    linearise: Callable[[Unknowns], Linear], found: Unknowns, *, tolerance: float, watch: Watch
+    linearise: Callable[[Unknowns], Linear], estimate: Unknowns, *, tolerance: float, watch: Watch
 ) -> tuple[Unknowns, Linear, np.ndarray, str]:
-    """Minimise the sum of squared errors from `found`, or from where the watch's checkpoint says.
+    """Minimise the sum of squared errors from `estimate`, or from where the watch's checkpoint says.
 
     A step is damped the more, the more often steps in a row failed to lower the loss; where it is not finite, too.
 
@@ -105,39 +105,39 @@ def gauss_newton(
         raise ValueError(
             f"steps={watch.steps}, tolerance={tolerance}; steps must be positive and tolerance not negative"
         )
-    rounding = float(jnp.finfo(found.y.dtype).eps)
+    rounding = float(jnp.finfo(estimate.y.dtype).eps)
     history, damping, kept = [], _DAMPING, watch.load()
     if kept is not None:
-        found = Unknowns(jnp.asarray(kept["y"]), None if found.start is None else jnp.asarray(kept["start"]))
+        estimate = Unknowns(jnp.asarray(kept["y"]), None if estimate.start is None else jnp.asarray(kept["start"]))
         # The point's own loss comes again, with the same bits.
         history, damping = kept["history"][:-1].tolist(), float(kept["damping"])
-    here = linearise(found)
+    here = linearise(estimate)
 
     def state():
-        kept = {"y": found.y, "damping": np.float64(damping), "history": np.array(history)}
-        return kept if found.start is None else kept | {"start": found.start}
+        kept = {"y": estimate.y, "damping": np.float64(damping), "history": np.array(history)}
+        return kept if estimate.start is None else kept | {"start": estimate.start}
 
     while True:
         history.append(here.loss)
-        goes_on = watch.goes_on(len(history) - 1, here.loss, found, state)
+        goes_on = watch.goes_on(len(history) - 1, here.loss, estimate, state)
         if not here.finite:
-            return found, here, np.array(history), "not_finite"
+            return estimate, here, np.array(history), "not_finite"
         if here.loss <= (10 * rounding) ** 2:
-            return found, here, np.array(history), "converged"
+            return estimate, here, np.array(history), "converged"
         if not goes_on:
-            return found, here, np.array(history), "stopped"
+            return estimate, here, np.array(history), "stopped"
         if len(history) > watch.steps:
-            return found, here, np.array(history), "max_steps"
+            return estimate, here, np.array(history), "max_steps"
         while True:
             dy, fall = here.step(damping)
             if damping > _MOST_DAMPING or fall <= max(tolerance, 1e3 * rounding) * here.loss:
-                return found, here, np.array(history), "converged"
-            trial = here.moved(found, dy)
+                return estimate, here, np.array(history), "converged"
+            trial = here.moved(estimate, dy)
             there = linearise(trial)
             if there.finite and there.loss < here.loss:
                 break
             damping *= 10
-        found, here, damping = trial, there, max(damping / 10, _LEAST_DAMPING)
+        estimate, here, damping = trial, there, max(damping / 10, _LEAST_DAMPING)
 
 
 def with_prior(data: Linear, residual, rows, weight: float) -> Linear:

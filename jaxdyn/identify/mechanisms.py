@@ -30,12 +30,12 @@ def observed_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
     """
     if isinstance(system, Model):
         return tuple(int(i) for i in columns_in_v(system, observed))
-    found = tuple(observed)
-    if not all(isinstance(i, int) and 0 <= i < system.nv for i in found) or len(set(found)) < len(found):
+    columns = tuple(observed)
+    if not all(isinstance(i, int) and 0 <= i < system.nv for i in columns) or len(set(columns)) < len(columns):
         raise ValueError(
-            f"{list(found)} are no coordinates of a {type(system).__name__}; give indices below {system.nv}"
+            f"{list(columns)} are no coordinates of a {type(system).__name__}; give indices below {system.nv}"
         )
-    return found  # pyright: ignore[reportReturnType]
+    return columns  # pyright: ignore[reportReturnType]
 
 
 def completed(scene: Any, t, measured: dict[Any, Any], tau, guess) -> Log:
@@ -87,18 +87,18 @@ def completed(scene: Any, t, measured: dict[Any, Any], tau, guess) -> Log:
         at, rate, time = sample
         start = near.at[np.array(places)].set(at)
         hold = {name: at[i] for i, name in enumerate(names)} if exact else None
-        found = assemble(scene, start, None, time, hold=hold, throw=False)
+        assembly = assemble(scene, start, None, time, hold=hold, throw=False)
 
-        def nearer(_, found):
-            A = rows(scene, found.q, jnp.zeros_like(found.v), time).A[holonomic]
-            change = least_squares(A, jnp.zeros_like(A[:, 0]), at - found.q[np.array(places)])
-            return assemble(scene, displace(system, found.q, change), None, time, throw=False)
+        def nearer(_, assembly):
+            A = rows(scene, assembly.q, jnp.zeros_like(assembly.v), time).A[holonomic]
+            change = least_squares(A, jnp.zeros_like(A[:, 0]), at - assembly.q[np.array(places)])
+            return assemble(scene, displace(system, assembly.q, change), None, time, throw=False)
 
         if not exact and len(holonomic):
-            found = lax.fori_loop(0, _ROUNDS, nearer, found)
-        here = rows(scene, found.q, jnp.zeros_like(found.v), time)
+            assembly = lax.fori_loop(0, _ROUNDS, nearer, assembly)
+        here = rows(scene, assembly.q, jnp.zeros_like(assembly.v), time)
         v = least_squares(here.A, -here.velocity, rate)
-        return found.q, (found.q, v, found.result == RESULTS.successful)
+        return assembly.q, (assembly.q, v, assembly.result == RESULTS.successful)
 
     _, (q, v, good) = jax.jit(lambda *samples: lax.scan(follow, guess, samples))(
         positions, velocities, jnp.asarray(t, dtype)

@@ -82,10 +82,10 @@ def minimise(
                     break
                 update, state = _update(optimizer, path.size * gradient, state, z)
                 if searching:
-                    found = _line_search(path.evaluate, z, value, gradient, update)
-                    if found is None:  # no decrease that rounding lets one see
+                    decrease = _line_search(path.evaluate, z, value, gradient, update)
+                    if decrease is None:  # no decrease that rounding lets one see
                         break
-                    z, value, gradient = found
+                    z, value, gradient = decrease
                 else:
                     z = z + update
                     value, gradient = path.evaluate(z)
@@ -139,9 +139,9 @@ def _begin(loss: Callable, args, center, scaling):
     """
     path = _Path(loss, args, center, scaling)
     value, gradient = path.evaluate(jnp.zeros_like(center))
-    way = jnp.sqrt(gradient @ gradient)
-    way = jnp.where((way > 0) & jnp.isfinite(way), way, jnp.ones_like(way))
-    units = way * jnp.minimum(1, 1 / (way * jnp.linalg.norm(scaling, axis=0)))
+    slope = jnp.sqrt(gradient @ gradient)
+    slope = jnp.where((slope > 0) & jnp.isfinite(slope), slope, jnp.ones_like(slope))
+    units = slope * jnp.minimum(1, 1 / (slope * jnp.linalg.norm(scaling, axis=0)))
     gradient = gradient * units
     length = jnp.sqrt(gradient @ gradient)
     good = (length > 0) & jnp.isfinite(length)
@@ -158,19 +158,19 @@ def _line_search(evaluate: Callable, z, value, gradient, direction):
     slope = float(gradient @ direction)
     if not slope < 0:  # rounding has spoilt the curvature pairs
         direction, slope = -gradient, -float(gradient @ gradient)
-    low, high, length, found = 0.0, np.inf, 1.0, None
+    low, high, length, decrease = 0.0, np.inf, 1.0, None
     for _ in range(40):
         point = z + length * direction
         trial, trial_gradient = evaluate(point)
         if not float(trial) <= float(value) + _DECREASE * length * slope:  # NaN too
             high = length
         else:
-            found = (point, trial, trial_gradient) if float(trial) < float(value) else found
+            decrease = (point, trial, trial_gradient) if float(trial) < float(value) else decrease
             if float(trial_gradient @ direction) >= _FLATTER * slope:
                 break
             low = length
         length = 2 * length if high == np.inf else (low + high) / 2
-    return found
+    return decrease
 
 
 @functools.lru_cache

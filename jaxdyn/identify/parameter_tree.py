@@ -198,14 +198,14 @@ class Parameters(eqx.Module):
 
     def _walk(self, y, visit: Callable):
         leaves, structure = jax.tree.flatten(self.given)
-        begin, found = 0, []
+        begin, visited = 0, []
         for block in self.blocks:
             part = y[begin : begin + block.size]
             begin += block.size
             leaves[block.place] = jnp.asarray(leaves[block.place])  # pyright: ignore[reportAttributeAccessIssue]
-            found.append(visit(block, part, leaves))
+            visited.append(visit(block, part, leaves))
             block.write(part, leaves)
-        return jax.tree.unflatten(structure, leaves), found
+        return jax.tree.unflatten(structure, leaves), visited
 
     def system(self, y: Float[Array, " p"]) -> Any:
         """What was given, with the numbers of y."""
@@ -243,16 +243,16 @@ class Parameters(eqx.Module):
 
     def _model(self) -> tuple[Model, int, str]:
         """The model of the system, the place of its inertias among the leaves, and their name."""
-        found = models_of(self.given)
-        if len(found) != 1:
+        models = models_of(self.given)
+        if len(models) != 1:
             raise ValueError(
-                f"inertias: a {type(self.given).__name__} with {len(found)} models of bodies; free numbers of other systems with "
-                "positive= and free="
+                f"inertias: a {type(self.given).__name__} with {len(models)} models of bodies; free numbers of other systems "
+                "with positive= and free="
             )
         leaves, names, _ = self._named_leaves()
-        place = next(i for i, leaf in enumerate(leaves) if leaf is found[0].inertias)
+        place = next(i for i, leaf in enumerate(leaves) if leaf is models[0].inertias)
         self._refuse_twice(place, names[place], "inertias")
-        return found[0], place, names[place]
+        return models[0], place, names[place]
 
     def _quadrics(self, model: Model, chart, ellipsoids: Mapping[str, tuple]) -> np.ndarray:
         quadrics = np.zeros((len(chart.bodies), 4, 4))
@@ -292,18 +292,18 @@ class Parameters(eqx.Module):
         if not callable(where):
             raise ValueError(f"{argument} is {where!r}; pass a function that picks leaves, {example}")
         try:
-            found = jax.tree.leaves(where(marked))
+            entries = jax.tree.leaves(where(marked))
         except (AttributeError, IndexError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{argument} picks nothing of this {kind} ({type(error).__name__}: {error}); {example}, of whole leaves"
             ) from error
-        strange = [leaf for leaf in found if not isinstance(leaf, _Leaf)]
-        if strange or not found:
+        strange = [leaf for leaf in entries if not isinstance(leaf, _Leaf)]
+        if strange or not entries:
             raise ValueError(
                 f"{argument} picks {strange[0] if strange else 'nothing'!r}, which is no leaf of this {kind}; {example}"
             )
         picked = []
-        for leaf in found:
+        for leaf in entries:
             value = leaves[leaf.place]
             if not eqx.is_inexact_array_like(value):
                 raise ValueError(f"{argument} picks {leaf.name}, which is {value!r} and no floating-point number")

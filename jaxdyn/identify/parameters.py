@@ -161,12 +161,14 @@ def fit_parameters(
     key = checkpoint_at(
         checkpoint, (gathered(problem), unknowns, str(method), learning_rate, tolerance, seed), every, resume
     )
-    report = None if callback is None else (lambda step, value, found: callback(step, value, tree.system(found.y)))
+    report = (
+        None if callback is None else (lambda step, value, estimate: callback(step, value, tree.system(estimate.y)))
+    )
     watch = Watch(int(steps), report, checkpoint=key, show=progress, seconds=seconds)
-    found, end, history, result = _minimised(problem, unknowns, method, watch, learning_rate, tolerance)
-    values, slopes = (np.asarray(x, np.float64) for x in values_and_slopes(tree, found.y))
+    estimate, end, history, result = _minimised(problem, unknowns, method, watch, learning_rate, tolerance)
+    values, slopes = (np.asarray(x, np.float64) for x in values_and_slopes(tree, estimate.y))
     return ParameterFit(
-        system=tree.system(found.y),
+        system=tree.system(estimate.y),
         nominal=system,
         names=tree.names,
         values=values,
@@ -177,14 +179,14 @@ def fit_parameters(
         method=f"{error} fit by {method if isinstance(method, str) else type(method).__name__}",
         cause=None
         if result != "not_finite"
-        else cause_of(problem, found if watch.failed is None else watch.failed, logs),
+        else cause_of(problem, estimate if watch.failed is None else watch.failed, logs),
     )
 
 
 def _minimised(problem: Problem, unknowns: Unknowns, method, watch: Watch, learning_rate, tolerance):
     """Unknowns, the errors near them (None where no Jacobian was taken), history and result."""
     if isinstance(method, str) and method == _GAUSS_NEWTON:
-        return gauss_newton(lambda found: linearised(problem, found), unknowns, tolerance=tolerance, watch=watch)
+        return gauss_newton(lambda estimate: linearised(problem, estimate), unknowns, tolerance=tolerance, watch=watch)
     z0, unflatten = ravel_pytree(unknowns)
     own = watch.callback
     if own is not None:
@@ -193,9 +195,9 @@ def _minimised(problem: Problem, unknowns: Unknowns, method, watch: Watch, learn
         z, history, result = stepwise(
             errors_of, z0, (problem, unknowns), method=method, tolerance=tolerance, watch=watch
         )
-        found = unflatten(z)
+        estimate = unflatten(z)
         watch.failed = None if watch.failed is None else unflatten(watch.failed)
-        return found, linearised(problem, found), history, result
+        return estimate, linearised(problem, estimate), history, result
     z, history, result = minimise(
         loss_of,
         z0,
@@ -211,16 +213,16 @@ def _minimised(problem: Problem, unknowns: Unknowns, method, watch: Watch, learn
     return unflatten(z), None, history, result
 
 
-def linearised(problem: Problem, found: Unknowns) -> Linear:
+def linearised(problem: Problem, estimate: Unknowns) -> Linear:
     """The errors near a point, those of the data and of the prior."""
-    parts = slopes_of(problem, found)
-    if found.start is None:
+    parts = slopes_of(problem, estimate)
+    if estimate.start is None:
         errors = jnp.concatenate([errors.reshape(1, -1) for errors, _, _ in parts], axis=1)
-        rows = jnp.concatenate([rows.reshape(1, -1, found.y.size) for _, rows, _ in parts], axis=1)
+        rows = jnp.concatenate([rows.reshape(1, -1, estimate.y.size) for _, rows, _ in parts], axis=1)
         data = linear(errors, rows, None)
     else:
         data = linear(*parts[0])
-    return with_prior(data, *prior_slopes(problem.tree, found.y), problem.prior_weight)
+    return with_prior(data, *prior_slopes(problem.tree, estimate.y), problem.prior_weight)
 
 
 def _tree(system, parameters, positive, free) -> Parameters:

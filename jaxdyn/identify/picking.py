@@ -37,16 +37,16 @@ def rows_of(system, name: str, count: int, rows) -> tuple[list[int], list[str]]:
         labels = sets[0] if sets else [str(i) for i in range(count)]
         return list(range(count)), [f"{name}[{label}]" for label in labels]
     rows = [rows] if isinstance(rows, (str, int)) else list(rows)
-    found = []
+    indices = []
     for row in rows:
         place = next((names.index(row) for names in sets if row in names), None) if isinstance(row, str) else row
         if not isinstance(place, (int, np.integer)) or not 0 <= place < count:
             known = sorted({n for names in sets for n in names}) or f"0 to {count - 1}"
             raise ValueError(f"rows names {row!r} of {name}, which has {count} rows: {known}")
-        found.append(int(place))
-    if len(set(found)) < len(found):
+        indices.append(int(place))
+    if len(set(indices)) < len(indices):
         raise ValueError(f"rows of {name} is {rows}; name every row once")
-    return found, [f"{name}[{row}]" for row in rows]
+    return indices, [f"{name}[{row}]" for row in rows]
 
 
 def root_of(std, covariance, size: int, what: str) -> np.ndarray | None:

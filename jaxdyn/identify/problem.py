@@ -127,7 +127,7 @@ def prior_errors(problem: Problem, y) -> Float[Array, " k"]:
 def errors_of(z, args) -> Float[Array, " n"]:
     """All errors, those of the prior behind those of the data, at the flat unknowns."""
     problem, unknowns = args
-    found = ravel_pytree(unknowns)[1](z)
+    estimate = ravel_pytree(unknowns)[1](z)
     (rest, batches), divisor, parts = _apart(problem), problem.divisor, []
 
     def rows(shared, pieces):
@@ -135,14 +135,14 @@ def errors_of(z, args) -> Float[Array, " n"]:
         return jax.vmap(partial(piece_errors, problem, divisor, y))(*pieces)
 
     for batch, mesh in zip(batches, problem.meshes, strict=True):
-        parts.append(mapped(rows, mesh)((rest, found.y), (found.start, batch)).reshape(-1))
-    return jnp.concatenate([*parts, prior_errors(problem, found.y).astype(z.dtype)])
+        parts.append(mapped(rows, mesh)((rest, estimate.y), (estimate.start, batch)).reshape(-1))
+    return jnp.concatenate([*parts, prior_errors(problem, estimate.y).astype(z.dtype)])
 
 
 def loss_of(z, args) -> Float[Array, ""]:
     """Sum of the squares of all errors at the flat unknowns, for reverse mode."""
     problem, unknowns = args
-    found = ravel_pytree(unknowns)[1](z)
+    estimate = ravel_pytree(unknowns)[1](z)
     (rest, batches), divisor = _apart(problem), problem.divisor
 
     def squares(searched, known):
@@ -150,9 +150,9 @@ def loss_of(z, args) -> Float[Array, ""]:
         errors = jax.vmap(partial(piece_errors, problem, divisor, y))(start, pieces)
         return jnp.sum(errors * errors)
 
-    loss = jnp.sum(prior_errors(problem, found.y) ** 2).astype(z.dtype)
+    loss = jnp.sum(prior_errors(problem, estimate.y) ** 2).astype(z.dtype)
     for batch, mesh in zip(batches, problem.meshes, strict=True):
-        loss = loss + summed(squares, mesh)((found.y, found.start), (rest, batch))
+        loss = loss + summed(squares, mesh)((estimate.y, estimate.start), (rest, batch))
     return loss
 
 
@@ -166,7 +166,7 @@ def forward(problem: Problem) -> Problem:
 
 
 @eqx.filter_jit
-def slopes_of(problem: Problem, found: Unknowns):
+def slopes_of(problem: Problem, estimate: Unknowns):
     """For each batch errors (pieces, n), their Jacobians by y (pieces, n, p) and by each piece's own start (pieces, n, 2 nv)
     or None."""
     (rest, batches), divisor = _apart(forward(problem)), problem.divisor
@@ -183,8 +183,8 @@ def slopes_of(problem: Problem, found: Unknowns):
 
     parts = []
     for batch, mesh in zip(batches, problem.meshes, strict=True):
-        slopes, errors = mapped(rows, mesh)((rest, found.y), (found.start, batch))
-        by_y, by_start = (slopes, None) if found.start is None else (slopes[0], slopes[1].reshape(*errors.shape, -1))
+        slopes, errors = mapped(rows, mesh)((rest, estimate.y), (estimate.start, batch))
+        by_y, by_start = (slopes, None) if estimate.start is None else (slopes[0], slopes[1].reshape(*errors.shape, -1))
         parts.append((errors, by_y, by_start))
     return parts
 
@@ -201,21 +201,21 @@ def values_and_slopes(tree: Parameters, y):
     return tree.values(y), jax.jacfwd(tree.values)(y)
 
 
-def cause_of(problem: Problem, found: Unknowns, logs: Sequence[Log]) -> str | None:
+def cause_of(problem: Problem, estimate: Unknowns, logs: Sequence[Log]) -> str | None:
     """Where errors or slopes are not finite, in words: the log, the sample, the coordinate, and the parameters that do it.
 
     A parameter is named when the errors are finite with it where it started, all others as they are.
     """
     problem = gathered(problem)
     samples, before = _first_samples(problem, logs), 0
-    slopes = slopes_of(problem, found)
+    slopes = slopes_of(problem, estimate)
     for batch, (_, by_y, _) in zip(problem.batches, slopes, strict=True):
-        errors = np.asarray(_errors_at(problem, batch, found.y, found.start))
+        errors = np.asarray(_errors_at(problem, batch, estimate.y, estimate.start))
         bad = ~np.isfinite(errors)
         if bad.any():
             piece, row, column = (int(i) for i in np.argwhere(bad)[0])
             log, first = samples[before + piece]
-            culprits = _culprits(problem, batch, found)
+            culprits = _culprits(problem, batch, estimate)
             moved = f"; finite with {' or '.join(culprits)} where it started" if culprits else ""
             return f"errors of log {log + 1} are not finite from sample {first + row} on, error {column}{moved}"
         bad = ~np.isfinite(np.asarray(by_y))
@@ -227,7 +227,7 @@ def cause_of(problem: Problem, found: Unknowns, logs: Sequence[Log]) -> str | No
                 f"{_name_of(problem.tree, parameter)}"
             )
         before += batch.t.shape[0]
-    residual = np.asarray(problem.tree.residual(found.y))
+    residual = np.asarray(problem.tree.residual(estimate.y))
     return None if np.isfinite(residual).all() else "the prior's residuals are not finite"
 
 
@@ -236,12 +236,12 @@ def _first_samples(problem: Problem, logs: Sequence[Log]) -> list[tuple[int, int
     # Pieces of one sample are all samples; others share their ends.
     length = problem.batches[0].t.shape[1]
     whole = len(problem.batches) > 1 or (problem.objective.error == "torque" and length > 1)
-    found = []
+    samples = []
     for k, log in enumerate(logs):
         size = len(log) if whole else max(length - 1, 1)
         count = 1 if whole else len(log) if length == 1 else (len(log) - 1) // size
-        found += [(k, i * size) for i in range(count)]
-    return found
+        samples += [(k, i * size) for i in range(count)]
+    return samples
 
 
 @eqx.filter_jit
@@ -250,11 +250,11 @@ def _errors_at(problem: Problem, batch: Segments, y, start):
     return jax.vmap(partial(piece_errors, rest, problem.divisor, y))(start, batch)
 
 
-def _culprits(problem: Problem, batch: Segments, found: Unknowns) -> list[str]:
+def _culprits(problem: Problem, batch: Segments, estimate: Unknowns) -> list[str]:
     names = []
-    for i in range(found.y.size):
-        if float(found.y[i]) != 0:
-            errors = _errors_at(problem, batch, found.y.at[i].set(0.0), found.start)
+    for i in range(estimate.y.size):
+        if float(estimate.y[i]) != 0:
+            errors = _errors_at(problem, batch, estimate.y.at[i].set(0.0), estimate.start)
             if bool(jnp.isfinite(errors).all()):
                 names.append(_name_of(problem.tree, i))
     return names

@@ -221,8 +221,8 @@ def motion_errors(system: Any, one: Segments, q: Float[Array, "n nq"], v: Float[
 @eqx.filter_jit
 def motion_scale(system: Any, data: Segments) -> Float[Array, "2 nv"]:
     """Root mean square of each coordinate's way from the first sample, and of its velocity; the largest at rest."""
-    way = jax.vmap(jax.vmap(lambda q: displacement(system, data.q[0, 0], q)))(data.q)
-    return jnp.stack([moving_scale(jnp.sqrt(jnp.mean(x**2, axis=(0, 1)))) for x in (way, data.v)])
+    path = jax.vmap(jax.vmap(lambda q: displacement(system, data.q[0, 0], q)))(data.q)
+    return jnp.stack([moving_scale(jnp.sqrt(jnp.mean(x**2, axis=(0, 1)))) for x in (path, data.v)])
 
 
 def moving_scale(scale: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -27,13 +27,13 @@ def best_start(problem: Problem, unknowns: Unknowns, starts: int, spread: float,
     far = spread * jax.random.normal(jax.random.key(seed), (starts, y.size), y.dtype)
     points = y[None] + far.at[0].set(0.0)
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        found, losses = _improved(forward(problem), unknowns, points)
+        candidates, losses = _improved(forward(problem), unknowns, points)
     losses = np.where(np.isfinite(np.asarray(losses)), np.asarray(losses), np.inf)
     if not np.isfinite(losses).any():
         raise ValueError(
             f"none of {starts} starts has finite errors; give a smaller spread (now {spread}), or a shorter horizon"
         )
-    return jax.tree.map(lambda x: x[int(np.argmin(losses))], found)
+    return jax.tree.map(lambda x: x[int(np.argmin(losses))], candidates)
 
 
 @eqx.filter_jit

@@ -159,7 +159,7 @@ def _signals(log: Log):
 def _flat_loss(y, args):
     problem, unknowns = args
     _, unflatten = ravel_pytree(unknowns)
-    found = unflatten(y)
+    estimate = unflatten(y)
     chart, data = problem.chart, problem.data
     whole = data.v.size
     # Everything but the segments is known to all devices.
@@ -178,8 +178,8 @@ def _flat_loss(y, args):
 
         return sum(jnp.sum(error**2) for error in jax.vmap(errors)(data, start)) / whole
 
-    error = summed(squares, problem.mesh)((found.point, found.start), (rest, data))
-    return error + problem.prior * chart.divergence(found.point.theta)
+    error = summed(squares, problem.mesh)((estimate.point, estimate.start), (rest, data))
+    return error + problem.prior * chart.divergence(estimate.point.theta)
 
 
 def _scaling(problem: _Problem, point: Coordinates, signals, size: int) -> Float[Array, "n n"]:

@@ -228,8 +228,8 @@ class ModelBuilder:
         values = [couplings[pair] for pair in topology.couplings]
         leaves["coupling_values"] = _rows(values, (2,)) if couplings else None
         stored: dict[str, Any] = {key: self._leaf(value) for key, value in leaves.items()}
-        held = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
-        return Model(**stored, topology=topology, fixed_joints=held)
+        fixed_joints = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
+        return Model(**stored, topology=topology, fixed_joints=fixed_joints)
 
     def _leaf(self, value) -> jax.Array | None:
         if value is None or not is_concrete(value):
@@ -430,8 +430,8 @@ def _check_regular(topology: Topology, home, screws, inertias, armature) -> None
     neutral = [joint_neutral(kind) for kind in topology.kinds]
     if not f64.idle_joints(topology, home, screws, inertias, armature, neutral):
         return
-    anywhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
-    if not (idle := f64.idle_joints(topology, home, screws, inertias, armature, anywhere)):
+    elsewhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
+    if not (idle := f64.idle_joints(topology, home, screws, inertias, armature, elsewhere)):
         return
     names = [topology.joint_names[i] for i in sorted(idle)]
     i, alone = next(iter(idle.items()))

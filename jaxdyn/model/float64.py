@@ -182,10 +182,10 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
         [[0, h - f, c - g, d - b], [h - f, 0, b + d, c + g], [c - g, b + d, 0, f + h], [d - b, c + g, f + h, 0]]
     )
     k = int(np.argmax(squares))
-    found = products[k].copy()
-    found[k] = squares[k]
-    found = found / np.linalg.norm(found)
-    return found if found[0] >= 0 else -found
+    quat = products[k].copy()
+    quat[k] = squares[k]
+    quat = quat / np.linalg.norm(quat)
+    return quat if quat[0] >= 0 else -quat
 
 
 def motion_subspace(kind: str, screw: np.ndarray) -> np.ndarray:

@@ -52,10 +52,10 @@ def _joint_angles(pose, links, height):
     wrist = pose[:3, 3] - links[2] * pose[:3, 0]
     base = f64.pose_of(np.eye(3), (0.0, 0.0, height))
     angles, _ = _spatial_finger(base, links[:2], wrist, wrist + xp.asarray([0.0, 0.0, 0.1]), np.zeros(3))
-    yaw, lift = angles[0], angles[1] + angles[2]
+    yaw, elevation = angles[0], angles[1] + angles[2]
     up = xp.asarray([0.0, 0.0, 1.0])
     ahead = xp.stack([xp.cos(yaw), xp.sin(yaw), 0 * yaw])
-    forearm = xp.cos(lift) * ahead + xp.sin(lift) * up
+    forearm = xp.cos(elevation) * ahead + xp.sin(elevation) * up
     left = xp.cross(up, ahead)
     turn = xp.stack([forearm, left, xp.cross(forearm, left)]) @ pose[:3, :3]
     # Of a roll a, a pitch b about -y and a roll c: the first row and column have b and one of the rolls each.
@@ -78,11 +78,11 @@ def _sphere_arm_start(
     _check_contact(contact)
     if contact == "rolling" and is_concrete(slide, spin) and (np.any(slide) or spin):
         raise ValueError(f"slide is {slide}, spin is {spin}; a rolling contact has neither, leave them out")
-    found = montana(*_surfaces(radius, tip_radius), jnp.asarray(eta, float))
-    g_of = numpy_for(found.g_of).asarray(found.g_of)
+    kinematics = montana(*_surfaces(radius, tip_radius), jnp.asarray(eta, float))
+    g_of = numpy_for(kinematics.g_of).asarray(kinematics.g_of)
     pose = f64.pose_of(g_of[:3, :3], g_of[:3, 3] + numpy_for(center).asarray(center, float))
     q = jnp.asarray(_joint_angles(pose, links, height))
-    twist = se3.Ad_apply(found.finger.pose, jnp.asarray([*slide, 0.0, *rolling, spin], float))
+    twist = se3.Ad_apply(kinematics.finger.pose, jnp.asarray([*slide, 0.0, *rolling, spin], float))
     arm = _six_joints(links, _MASSES, height, tip_radius, 0.0)
     return q, jnp.linalg.solve(body_jacobian(arm, q, "tip"), twist)
 

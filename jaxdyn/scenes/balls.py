@@ -109,5 +109,5 @@ def bowling_ball(*, mass=6.35, radius=0.10795, moment=0.0296, friction=0.12, gra
     """
     builder = ModelBuilder("bowling ball", gravity=(0.0, 0.0, -gravity))
     builder.add_body("ball", None, "free", (mass, (0.0, 0.0, 0.0), (moment, moment, moment)))
-    held = Holonomic(_Height(radius), name="lane")
-    return Scene(builder.build(), (held,), (_Sliding(friction * mass * gravity, radius),))
+    lane = Holonomic(_Height(radius), name="lane")
+    return Scene(builder.build(), (lane,), (_Sliding(friction * mass * gravity, radius),))

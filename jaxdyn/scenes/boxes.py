@@ -91,8 +91,8 @@ def _cube_start(
     for name, (point, _) in _PLACES.items():
         joints, offset = _chain(model, name)
         target = position + size / 2 * rotation @ np.asarray(point)
-        found = _reached(model, joints, offset, np.array([angles[i] for i in joints]), target)
-        place, jacobian = _tip(model, joints, offset, found)
+        reached = _reached(model, joints, offset, np.array([angles[i] for i in joints]), target)
+        place, jacobian = _tip(model, joints, offset, reached)
         if is_concrete(target) and not np.linalg.norm(target - place) < 1e-12:
             raise ValueError(
                 f"size is {size}, position {position.tolist()}, turned {list(turned)}: {name} cannot reach its place on the "
@@ -101,7 +101,7 @@ def _cube_start(
         velocity = _carried(position, rotation @ twist[:3], rotation @ twist[3:], target)
         moving = _least(jacobian, velocity)
         for k, i in enumerate(joints):
-            angles[i], rates[i] = found[k], moving[k]
+            angles[i], rates[i] = reached[k], moving[k]
     # The cube's joint comes last: its name does.
     return jnp.asarray([*angles, *position, *quaternion]), jnp.asarray([*rates, *twist])
 

@@ -130,9 +130,9 @@ def _disk_start(
         along = turned[:, 1]
         point = xp.asarray([*center, 0.0]) + side * radius * turned[:, 0]
         # The knee is at the distance of the first link from the base, on the line of the face.
-        way = point - base
-        reach = way @ along
-        knee = point - (reach - xp.sqrt(reach**2 - way @ way + links[0] ** 2)) * along
+        to_point = point - base
+        reach = to_point @ along
+        knee = point - (reach - xp.sqrt(reach**2 - to_point @ to_point + links[0] ** 2)) * along
         fingers.append((base, knee, knee + links[1] * along, point))
     return _planar_state(fingers, center, 0.0, velocity)
 

@@ -24,16 +24,16 @@ def _circles(center, radius, other, reach):
     """The intersection of two circles that lies to the left of the way from the first centre to the second."""
     xp = numpy_for(center, radius, other, reach)
     center, other = xp.asarray(center, float), xp.asarray(other, float)
-    way = other - center
-    apart = xp.sqrt(way @ way)
-    along = (radius**2 - reach**2 + apart**2) / (2 * apart)
+    direction = other - center
+    distance = xp.sqrt(direction @ direction)
+    along = (radius**2 - reach**2 + distance**2) / (2 * distance)
     square = radius**2 - along**2
     if is_concrete(square) and square < 0:
-        raise ValueError(f"lengths {radius} and {reach} do not close over {apart:.6g}; no such configuration exists")
-    way = way / apart
+        raise ValueError(f"lengths {radius} and {reach} do not close over {distance:.6g}; no such configuration exists")
+    direction = direction / distance
     # Traced lengths that do not close give the nearest configuration, at which constraints are open.
     height = xp.sqrt(square) if xp is np else jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-    return center + along * way + height * xp.stack([-way[1], way[0]])
+    return center + along * direction + height * xp.stack([-direction[1], direction[0]])
 
 
 def _across(length, angle):
@@ -148,8 +148,8 @@ def _parallel_start(point=(0.1, 0.05), velocity=(0.3, -0.2), length=1.0, bases=_
     q, v = [], []
     for base, elbow in zip(bases, elbows, strict=True):
         a = _circles(base, length, point, length) if elbow > 0 else _circles(point, length, base, length)
-        ways = a - xp.asarray(base, float), xp.asarray(point, float) - a
-        first, second = (xp.arctan2(*way[::-1]) for way in ways)
+        vectors = a - xp.asarray(base, float), xp.asarray(point, float) - a
+        first, second = (xp.arctan2(*vector[::-1]) for vector in vectors)
         rates = _solved(_across(length, first), _across(length, second), velocity)
         q += [first, second - first]
         v += [rates[0], rates[1] - rates[0]]

@@ -50,8 +50,8 @@ def _held(base, links, tip_axes, point, normal, velocity):
     center = point + xp.max(tip_axes) * normal
     if xp is np:
         for _ in range(_ROUNDS):
-            center, found = around(center)
-        return found
+            center, turn = around(center)
+        return turn
     # The derivatives of each round are those of the round before, shrunk: the loop is differentiated as it is.
     center = jax.lax.scan(lambda at, _: (around(at)[0], None), center, None, length=_ROUNDS - 1)[0]
     return around(center)[1]

@@ -89,8 +89,8 @@ def bicycle(
 
 
 def _drive_start(speed=0.5, yaw_rate=0.4, radius=0.1, half_track=0.25):
-    apart = yaw_rate * half_track
-    spins = [(speed - apart) / radius, (speed + apart) / radius]
+    speed_difference = yaw_rate * half_track
+    spins = [(speed - speed_difference) / radius, (speed + speed_difference) / radius]
     return jnp.zeros(5), jnp.asarray([speed, 0.0, yaw_rate, *spins])
 
 
@@ -129,8 +129,13 @@ def differential_drive(*, mass=8.0, moment=0.3, offset=0.05, wheel_mass=0.5, rad
 def _car_start(speed=2.0, steer=0.2, steer_rate=0.0, radius=0.15, half_track=0.4, wheel_base=1.2):
     xp = numpy_for(steer)
     yaw_rate = speed * xp.tan(steer) / wheel_base
-    apart = yaw_rate * half_track
-    spins = [(speed - apart) / radius, (speed + apart) / radius, steer_rate, speed / xp.cos(steer) / radius]
+    speed_difference = yaw_rate * half_track
+    spins = [
+        (speed - speed_difference) / radius,
+        (speed + speed_difference) / radius,
+        steer_rate,
+        speed / xp.cos(steer) / radius,
+    ]
     return jnp.asarray([0.0, 0.0, 0.0, 0.0, 0.0, steer, 0.0]), jnp.asarray([speed, 0.0, yaw_rate, *spins])
 
 
