@@ -142,16 +142,16 @@ def main(argv=None) -> None:
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     start = jnp.asarray([0.2, -0.1, 0.15, 0.1, 0.3])  # of `jd.scenes.sphere_arm.start`
-    moves = np.random.default_rng(0).uniform(-0.1, 0.1, (max(options.arms, options.peers), 5))
-    goals, rows = start + jnp.asarray(moves), {}
+    steps = np.random.default_rng(0).uniform(-0.1, 0.1, (max(options.arms, options.peers), 5))
+    goals, rows = start + jnp.asarray(steps), {}
     goals, peers = goals[: options.arms], goals[: options.peers]
-    for name, batch, found in (
+    for name, batch, computed in (
         ("jaxdyn", goals, rigid(goals, options.seconds, options.gradient) if options.arms else None),
         ("MJX", peers, soft(peers, options.seconds) if options.peers else None),
     ):
-        if found is None:
+        if computed is None:
             continue
-        seconds, error, gap = found
+        seconds, error, gap = computed
         rows[name] = {
             "arms": len(batch),
             "seconds": seconds,

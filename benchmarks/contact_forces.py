@@ -120,12 +120,12 @@ def main(argv=None):
     calls, built = ours(*data)
     others = peers(*data)
     for kind in ("pyramids", "cones"):
-        found = calls[f"jaxdyn, {kind}"]()
-        solved = int(np.sum(np.asarray(found.result == jd.contact.RESULTS.successful)))
-        print(f"{kind}: {solved} of {options.batch} solved, at most {int(found.steps.max())} steps")
+        computed = calls[f"jaxdyn, {kind}"]()
+        solved = int(np.sum(np.asarray(computed.result == jd.contact.RESULTS.successful)))
+        print(f"{kind}: {solved} of {options.batch} solved, at most {int(computed.steps.max())} steps")
         for name, call in others.items():
             if name.endswith(kind):
-                error = np.abs(np.asarray(found.x) - np.array(call())).max()
+                error = np.abs(np.asarray(computed.x) - np.array(call())).max()
                 print(f"{kind}: forces differ from those of {name.split(',')[0]} by at most {error:.1e} N")
     calls |= others
     times = timing.interleaved(calls, options.rounds)

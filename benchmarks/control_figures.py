@@ -237,8 +237,8 @@ def parallel_manipulator():
             rate = jax.jvp(point, (q,), (v,))[1] - jax.jvp(target, (0.0,), (1.0,))[1]
             promised = decayed(np.asarray(ts), errors[0], rate)
             against(left, ts, errors, promised, "xy", "|error of the point| (m)")
-    apart = float(jnp.abs(sizes[0].q - sizes[1].q).max())
-    print(f"  motions with and without the internal part differ by {apart:.2g} rad")
+    difference = float(jnp.abs(sizes[0].q - sizes[1].q).max())
+    print(f"  motions with and without the internal part differ by {difference:.2g} rad")
     right.set(xlabel="t (s)", title="size of the three torques (N m)")
     right.legend(fontsize=8)
     return figure
@@ -363,9 +363,9 @@ def tuning():
     rule = optax.adam(0.2)
     state, history = rule.init(gains), []
     for _ in range(30):
-        value, found = slope(gains)
+        value, computed = slope(gains)
         history.append([float(value), *np.exp(gains)])
-        step, state = rule.update(found, state)
+        step, state = rule.update(computed, state)
         gains = gains + step
     history = np.array(history)
     figure, left, right = pair()

@@ -31,7 +31,7 @@ def acceleration(scene, q, v):
 def programs(batch: int) -> dict:
     """Compiled programs, their arguments and their operations, by formulation and by how the numbers come."""
     angles, rates = (jnp.asarray(x) for x in np.random.default_rng(0).normal(size=(2, batch, 2)))
-    found = {}
+    computed = {}
     for name in FORMULATIONS:
         scene = jd.scenes.double_pendulum(formulation=name)
         start = lambda a, r, name=name: jd.scenes.double_pendulum.start(formulation=name, angles=a, rates=r)  # noqa: E731
@@ -41,10 +41,10 @@ def programs(batch: int) -> dict:
         known = lambda q, v, scene=scene: acceleration(scene, q, v)  # noqa: E731
         one = [x[0] for x in state]
         batched = jax.jit(jax.vmap(known)).lower(*state).compile()
-        found[name, "known"] = batched, state, operations(known, *one)
+        computed[name, "known"] = batched, state, operations(known, *one)
         batched = jax.jit(jax.vmap(given, (None, 0, 0))).lower(numbers, *state).compile()
-        found[name, "given"] = batched, (numbers, *state), operations(given, numbers, *one)
-    return found
+        computed[name, "given"] = batched, (numbers, *state), operations(given, numbers, *one)
+    return computed
 
 
 def main() -> None:

@@ -213,9 +213,9 @@ def against_inverse_dynamics(rows):
     lines = []
     for robot, batch, dtype in dict.fromkeys(key[:3] for key in best):
         base = best.get((robot, batch, dtype, "inverse dynamics"))
-        found = [best.get((robot, batch, dtype, name)) for name in KINEMATICS]
-        if base is not None and any(found):
-            cells = ["" if x is None else f"{x / base:.2f}" for x in found]
+        computed = [best.get((robot, batch, dtype, name)) for name in KINEMATICS]
+        if base is not None and any(computed):
+            cells = ["" if x is None else f"{x / base:.2f}" for x in computed]
             lines.append(f"| {robot} | {batch} | {dtype} | {' | '.join(cells)} |")
     return lines
 
@@ -236,7 +236,7 @@ def in_loops(name, batch, calls, rounds):
     threads = min(THREADS, batch)
     q_, v_, tau_ = (np.asfortranarray(np.asarray(x, float).T) for x in (q_pin, v, tau))
     alone, scanned = (jax.jit(f).lower(model, q, v, tau).compile() for f in (several, repeated))
-    found = timing.interleaved(
+    computed = timing.interleaved(
         {
             "alone": lambda: jax.block_until_ready(alone(model, q, v, tau)),
             "in a scan": lambda: jax.block_until_ready(scanned(model, q, v, tau)),
@@ -245,7 +245,7 @@ def in_loops(name, batch, calls, rounds):
         rounds,
     )
     per = {"alone": batch, "in a scan": batch * calls, "pin": batch}
-    times = {key: {kind: 1e6 * found[key][kind] / per[key] for kind in ("best", "median")} for key in per}
+    times = {key: {kind: 1e6 * computed[key][kind] / per[key] for kind in ("best", "median")} for key in per}
     row = {"robot": name, "batch": batch, "calls": calls, "threads": threads, "us": times}
     print(loop_line(row), flush=True)
     return row
@@ -389,7 +389,7 @@ def write(report, options, inverse):
     ):
         text = re.sub(
             r"(<!-- benchmark:begin -->\n).*(<!-- benchmark:end -->)",
-            lambda found, parts=parts: found[1] + "\n\n".join(x for x in parts if x) + "\n" + found[2],
+            lambda computed, parts=parts: computed[1] + "\n\n".join(x for x in parts if x) + "\n" + computed[2],
             path.read_text(),
             flags=re.DOTALL,
         )

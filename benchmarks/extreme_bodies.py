@@ -75,19 +75,19 @@ def masses(dtypes, gradient):
         here = jd.robots.chain(6, dtype=dtype)
         here = here.replace(inertias=here.inertias * mass[:, None])
         q, v = jnp.asarray(_Q, dtype), jnp.asarray(_V, dtype)
-        found = jnp.stack([form(here, q, v, jnp.zeros_like(v)) for form in FORMS])
+        computed = jnp.stack([form(here, q, v, jnp.zeros_like(v)) for form in FORMS])
         coded = jd.constrained_dynamics(jd.Scene(here), q, v)
-        return Outcome((found, coded.acceleration), x, coded.result._value, x)
+        return Outcome((computed, coded.acceleration), x, coded.result._value, x)
 
     outcomes = study(run, jnp.asarray(SERIES), dtypes, False).outcomes
     # What the ratio costs, but no more than leaves two digits.
     allowed = {d: np.minimum(1000 * np.finfo(d).eps * np.maximum(RATIOS, 1.0), 1e-2) for d in dtypes}
     labels = [f"tip {r:.0e} kg" for r in RATIOS]
     plain, coded = {}, {}
-    for dtype, found in outcomes.items():
+    for dtype, computed in outcomes.items():
         fine = jnp.full(len(labels), jd.RESULTS.successful._value)
-        plain[dtype] = Outcome(found.end[0][:-1], found.residual[:-1], fine, found.value[:-1])
-        coded[dtype] = found._replace(end=found.end[1])
+        plain[dtype] = Outcome(computed.end[0][:-1], computed.residual[:-1], fine, computed.value[:-1])
+        coded[dtype] = computed._replace(end=computed.end[1])
     none = dict.fromkeys(dtypes)
     options = {"residual": False, "advice": MASSES}
     rows = table(
@@ -112,8 +112,8 @@ def mass_motion(dtypes, gradient):
         here = here.replace(inertias=here.inertias * mass[:, None])
         q, v = jnp.asarray(_Q, dtype).at[0].add(x), jnp.asarray(_V, dtype)
         ts = span * jnp.asarray([0.0, 0.5, 1.0], dtype)
-        found = jd.simulate(here, q, v, ts, outputs=("energy",), max_steps=1024)
-        return outcome(found, end=(found.energy[1:] - found.energy[0]) / (9.81 * jnp.sum(mass)))
+        solution = jd.simulate(here, q, v, ts, outputs=("energy",), max_steps=1024)
+        return outcome(solution, end=(solution.energy[1:] - solution.energy[0]) / (9.81 * jnp.sum(mass)))
 
     studied = study(run, (jnp.asarray(SERIES), jnp.asarray(spans)), dtypes, gradient)
     labels = [f"tip {r:.0e} kg" for r in RATIOS] + ["tip 0 kg"]
@@ -144,9 +144,9 @@ def links(dtypes, gradient, counts=LINKS):
                 q = 0.3 * jnp.cos(jnp.arange(count, dtype=dtype))
                 v = 0.1 * jnp.sin(jnp.arange(count, dtype=dtype)) * point + x
                 ts = jnp.asarray([0.0, 0.02], dtype)
-                found = jd.simulate(model, q, v, ts, stepsize=0.001, max_steps=32, outputs=("energy",))
+                solution = jd.simulate(model, q, v, ts, stepsize=0.001, max_steps=32, outputs=("energy",))
                 mass = jnp.sum(model.inertias[:, 0])
-                return outcome(found, end=(found.energy[1:] - found.energy[0]) / (9.81 * mass))
+                return outcome(solution, end=(solution.energy[1:] - solution.energy[0]) / (9.81 * mass))
 
             studied = study(run, jnp.ones(1), dtypes, gradient)
             name = f"{'chain' if branching == 1 else 'tree'} of {count}"
@@ -194,9 +194,9 @@ def twins(dtypes, gradient):
         )
         q, v = jnp.asarray([0.3, 0.2, -0.4], dtype), jnp.asarray([0.5, -0.3, 0.8], dtype).at[0].add(x)
         ts = jnp.asarray([0.0, 0.5], dtype)
-        found = jd.simulate(model, q * unit, v * unit, ts, stepsize=stepsize, max_steps=512)
-        end = jnp.concatenate([found.q[-1] / unit, found.v[-1] / unit])
-        return outcome(found, end=end, value=jnp.sum(end))
+        solution = jd.simulate(model, q * unit, v * unit, ts, stepsize=stepsize, max_steps=512)
+        end = jnp.concatenate([solution.q[-1] / unit, solution.v[-1] / unit])
+        return outcome(solution, end=end, value=jnp.sum(end))
 
     points = tuple(jnp.asarray(x) for x in np.array(twins).T)
     labels = [f"{length:.0e} m, {mass:.0e} kg" for length, mass in twins]

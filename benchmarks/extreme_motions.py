@@ -24,10 +24,10 @@ def rates(dtypes, gradient):
         dtype = factor.dtype
         ts = jnp.asarray([0.0, 5.0, 10.0], dtype) / factor
         v = start.astype(dtype).at[0].add(x) * factor
-        found = jd.simulate(as_dtype(base, dtype), q.astype(dtype), v, ts)
-        quaternion = found.q[-1] * jnp.sign(jnp.sum(found.q[-1] * turned.astype(dtype)))
-        end = jnp.concatenate([quaternion, found.v[-1] / factor])
-        return outcome(found, end=end, value=jnp.sum(end))
+        solution = jd.simulate(as_dtype(base, dtype), q.astype(dtype), v, ts)
+        quaternion = solution.q[-1] * jnp.sign(jnp.sum(solution.q[-1] * turned.astype(dtype)))
+        end = jnp.concatenate([quaternion, solution.v[-1] / factor])
+        return outcome(solution, end=end, value=jnp.sum(end))
 
     studied = study(run, jnp.asarray(factors), dtypes, gradient)
     exact = np.tile(np.concatenate([reference.q[-1], reference.v[-1]]), (len(factors), 1))
@@ -45,9 +45,9 @@ def turns(dtypes, gradient):
         model = jd.robots.chain(2, dtype=dtype)
         q = jnp.asarray([0.5, -0.3], dtype) + 2 * jnp.pi * turned
         v = jnp.asarray([0.2, 0.4], dtype).at[0].add(x)
-        found = jd.simulate(model, q, v, jnp.asarray([0.0, 1.0], dtype))
-        end = jnp.concatenate([found.q[-1] - 2 * jnp.pi * turned, found.v[-1]])
-        return outcome(found, end=end, value=jnp.sum(end))
+        solution = jd.simulate(model, q, v, jnp.asarray([0.0, 1.0], dtype))
+        end = jnp.concatenate([solution.q[-1] - 2 * jnp.pi * turned, solution.v[-1]])
+        return outcome(solution, end=end, value=jnp.sum(end))
 
     studied = study(run, jnp.asarray(count), dtypes, gradient)
     exact = np.tile(np.asarray(studied.outcomes["float64"].end)[0], (len(count), 1))
@@ -69,9 +69,9 @@ def gravity(dtypes, gradient):
         clock = jnp.sqrt(jnp.where(factor == 0, jnp.ones_like(factor), factor))
         scene = as_dtype(jd.scenes.pendulum_in_plane(gravity=9.81 * factor), dtype)
         q, v = q0.astype(dtype), v0.astype(dtype) + clock * x * jnp.asarray([0.0, 1.0], dtype)
-        found = jd.simulate(scene, q, v, jnp.asarray([0.0, 2.0], dtype) / clock, outputs=("constraint_residual",))
-        end = jnp.concatenate([found.q[-1], found.v[-1] / clock])
-        return outcome(found, end=end, value=jnp.sum(end), residual=jnp.max(found.constraint_residual[:, 0]))
+        solution = jd.simulate(scene, q, v, jnp.asarray([0.0, 2.0], dtype) / clock, outputs=("constraint_residual",))
+        end = jnp.concatenate([solution.q[-1], solution.v[-1] / clock])
+        return outcome(solution, end=end, value=jnp.sum(end), residual=jnp.max(solution.constraint_residual[:, 0]))
 
     studied = study(run, jnp.asarray(factors), dtypes, gradient)
     swung = np.concatenate([reference.q[-1], reference.v[-1]])
@@ -119,8 +119,8 @@ def run_oscillator(rate, damping, solver, count):
     system = jd.ExplicitSystem(_unit_mass, _acceleration, 1, parameters=(rate, damping))
     ts = jnp.asarray([0.0, count / 2, count], rate.dtype)
     start = jnp.zeros(1, rate.dtype), jnp.ones(1, rate.dtype)
-    found = jd.simulate(system, *start, ts, solver=solver, stepsize=1.0, max_steps=count + 8)
-    return jnp.hypot(rate * found.q[1:, 0], found.v[1:, 0]), found
+    solution = jd.simulate(system, *start, ts, solver=solver, stepsize=1.0, max_steps=count + 8)
+    return jnp.hypot(rate * solution.q[1:, 0], solution.v[1:, 0]), solution
 
 
 @case
@@ -134,8 +134,8 @@ def steps(dtypes, gradient, solvers=None):
 
         def run(point, x, solver=solver):
             rate, damping = point
-            sizes, found = run_oscillator(rate, damping, solver, count)
-            return Outcome(sizes, x, found.result._value, x)
+            sizes, computed = run_oscillator(rate, damping, solver, count)
+            return Outcome(sizes, x, computed.result._value, x)
 
         points = [np.concatenate([0 * near[0], near[1]]), np.concatenate([near[0], 0 * near[1]])]
         studied = study(run, tuple(jnp.asarray(x) for x in points), dtypes, False)
@@ -172,8 +172,8 @@ def beyond(dtypes, gradient):
     limit = stability_limits(None)[1]
 
     def run(rate, x):
-        sizes, found = run_oscillator(rate, 0 * rate, None, 2000)
-        return Outcome(jnp.minimum(sizes[1], jnp.full_like(rate, 1e30)), x, found.result._value, x)
+        sizes, computed = run_oscillator(rate, 0 * rate, None, 2000)
+        return Outcome(jnp.minimum(sizes[1], jnp.full_like(rate, 1e30)), x, computed.result._value, x)
 
     studied = study(run, jnp.asarray(factors * limit), dtypes, False)
     labels = [f"{f} of the limit" for f in factors]
@@ -213,8 +213,8 @@ def chaos(dtypes, gradient):
             )
 
         def state(x):
-            found = motion(x)
-            return jnp.concatenate([found.q, found.v], 1), found
+            computed = motion(x)
+            return jnp.concatenate([computed.q, computed.v], 1), computed
 
         one = jnp.ones((), dtype)
         return lambda x: jax.jvp(state, (x,), (one,), has_aux=True)
@@ -223,19 +223,26 @@ def chaos(dtypes, gradient):
     tight = quick(jax.vmap(run("float64", 1e-13)))(jnp.asarray([0.0, 1e-10]))
     states, tangent, _ = (np.asarray(x) if i < 2 else x for i, x in enumerate(tight))
     stretch = np.linalg.norm(tangent[0], axis=1)
-    apart = np.linalg.norm(states[1] - states[0], axis=1) / 1e-10
+    difference = np.linalg.norm(states[1] - states[0], axis=1) / 1e-10
     small = stretch * 1e-10 < 1e-3
-    rows = [_grown("two starts 1e-10 apart", "float64", apart, stretch, small, 1.0, 0.1, "successful")]
-    loose, _, found = quick(jax.vmap(run("float64", 1e-8)))(jnp.zeros(1))
+    rows = [_grown("two starts 1e-10 apart", "float64", difference, stretch, small, 1.0, 0.1, "successful")]
+    loose, _, computed = quick(jax.vmap(run("float64", 1e-8)))(jnp.zeros(1))
     error = np.linalg.norm(np.asarray(loose)[0] - states[0], axis=1)
     rows.append(
         _grown(
-            "rtol 1e-8", "float64", error, stretch, stretch * 1e-7 < 0.1, 1e-8, 100.0, name_of(found.result._value[0])
+            "rtol 1e-8",
+            "float64",
+            error,
+            stretch,
+            stretch * 1e-7 < 0.1,
+            1e-8,
+            100.0,
+            name_of(computed.result._value[0]),
         )
     )
-    rows.append(_kept("rtol 1e-8", "float64", found, 1e-6))
+    rows.append(_kept("rtol 1e-8", "float64", computed, 1e-6))
     if "float32" in dtypes:
-        single, _, found = quick(jax.vmap(run("float32", 1e-6)))(jnp.zeros(1, jnp.float32))
+        single, _, computed = quick(jax.vmap(run("float32", 1e-6)))(jnp.zeros(1, jnp.float32))
         error = np.linalg.norm(np.asarray(single, float)[0] - states[0], axis=1)
         rows.append(
             _grown(
@@ -246,10 +253,10 @@ def chaos(dtypes, gradient):
                 stretch * 1e-5 < 0.1,
                 1e-6,
                 100.0,
-                name_of(found.result._value[0]),
+                name_of(computed.result._value[0]),
             )
         )
-        rows.append(_kept("rtol 1e-6", "float32", found, 1e-3))
+        rows.append(_kept("rtol 1e-6", "float32", computed, 1e-3))
     return rows
 
 
@@ -274,8 +281,8 @@ def _grown(what, dtype, error, stretch, small, unit, allowed, code):
     )
 
 
-def _kept(what, dtype, found, allowed):
-    energy, code = np.asarray(found.energy[0], float), name_of(found.result._value[0])
+def _kept(what, dtype, computed, allowed):
+    energy, code = np.asarray(computed.energy[0], float), name_of(computed.result._value[0])
     drift = float(np.abs(energy - energy[0]).max() / (2 * 9.81))
     return Row(
         "chaos", f"{what}, 20 s", dtype, drift, allowed, "energy", None, bool(np.isnan(drift)), code, None, True, CHAOS
@@ -295,9 +302,9 @@ def million(dtypes, gradient, count=1_000_000):
                 as_dtype(base, q.dtype), q, v, ts, stepsize=0.01, max_steps=2 * count, outputs=("energy",)
             )
         )
-        found = program(*(jnp.asarray(x, dtype) for x in (*start, ts)))
-        code = name_of(found.result._value)
-        q, v, energy = (np.asarray(x, float) for x in (found.q, found.v, found.energy))
+        computed = program(*(jnp.asarray(x, dtype) for x in (*start, ts)))
+        code = name_of(computed.result._value)
+        q, v, energy = (np.asarray(x, float) for x in (computed.q, computed.v, computed.energy))
         signs = np.sign(np.sum(q * reference.q, 1, keepdims=True))
         checks = {
             "state": np.maximum(np.abs(q * signs - reference.q).max(1), np.abs(v - reference.v).max(1)),

@@ -38,10 +38,10 @@ def flat(dtypes, gradient, runs=FALLS):
             v = v0.astype(dtype) * (point + x)
             at = jnp.asarray(ts, dtype)
             options = {"method": method, "stepsize": stepsize, "rtol": tolerance, "atol": tolerance, "max_steps": 4096}
-            found = jd.simulate(
+            solution = jd.simulate(
                 as_dtype(base, dtype), q0.astype(dtype), v, at, outputs=("constraint_residual",), **options
             )
-            return outcome(found, residual=jnp.max(found.constraint_residual[:, 0]))
+            return outcome(solution, residual=jnp.max(solution.constraint_residual[:, 0]))
 
         # Gradients of one window by the default method tell enough, and compile for minutes.
         # Tolerances that float32 does not know are raised there.
@@ -103,8 +103,8 @@ def _held_by_planes(point, x, rank_tol):
     push = _Push(jnp.stack([1.0 + x, across, jnp.ones((), dtype)]))
     zero, ts, method = jnp.zeros(3, dtype), jnp.asarray([0.0, 1.0], dtype), jd.Projected(rank_tol=rank_tol)
     options = {"control": push, "method": method, "max_steps": 256, "outputs": ("constraint_residual",)}
-    found = jd.simulate(scene, zero, zero, ts, **options)
-    return outcome(found, end=found.q[-1], value=jnp.sum(found.q[-1] + found.v[-1]))
+    solution = jd.simulate(scene, zero, zero, ts, **options)
+    return outcome(solution, end=solution.q[-1], value=jnp.sum(solution.q[-1] + solution.v[-1]))
 
 
 class _Push(eqx.Module):
@@ -128,7 +128,7 @@ def bases(dtypes, gradient):
 
             def run(point, x, method=method, stepsize=stepsize):
                 dtype = point.dtype
-                found = jd.simulate(
+                solution = jd.simulate(
                     as_dtype(base, dtype),
                     q0.astype(dtype),
                     v0.astype(dtype) * (point + x),
@@ -139,7 +139,7 @@ def bases(dtypes, gradient):
                     max_steps=2048,
                     throw=False,
                 )
-                return outcome(found)
+                return outcome(solution)
 
             studied = study(run, jnp.ones(1), dtypes, gradient)
             label = f"{name}, {'adaptive' if stepsize is None else 'fixed'}"
@@ -162,10 +162,10 @@ def grasps(dtypes, gradient):
         grasp = eqx.tree_at(lambda g: [c.pose for c in g.constraints], grasp, poses)
         q = jnp.concatenate([points.reshape(-1), jnp.asarray([0, 0, 0, 1, 0, 0, 0], dtype)])
         tau = jnp.asarray(_PUSH, dtype)
-        found = jd.grasp.object_dynamics(grasp, q, jnp.zeros(6, dtype), tau + x)
-        inside = jd.grasp.internal_forces(grasp, q, found.contact_forces)
+        dynamics = jd.grasp.object_dynamics(grasp, q, jnp.zeros(6, dtype), tau + x)
+        inside = jd.grasp.internal_forces(grasp, q, dynamics.contact_forces)
         moved = jnp.max(jnp.abs(jd.grasp.grasp_map(grasp, q) @ inside))
-        return Outcome(found.rate, moved, found.result._value, jnp.sum(found.rate) + jnp.sum(inside))
+        return Outcome(dynamics.rate, moved, dynamics.result._value, jnp.sum(dynamics.rate) + jnp.sum(inside))
 
     def reach(near, x):
         dtype = near.dtype
@@ -174,9 +174,9 @@ def grasps(dtypes, gradient):
         q = q.astype(dtype).at[1].set(near)
         V = jnp.asarray([0.1, 0.2, -0.1], dtype) * near
         tau = 0.1 * jnp.cos(jnp.arange(hand.nv, dtype=dtype)) + x
-        found = jd.grasp.object_dynamics(hand, q, V, tau)
-        other = jd.constrained_dynamics(hand, q, found.velocity, tau)
-        return Outcome(found.acceleration - other.acceleration, x, found.result._value, jnp.sum(found.rate))
+        dynamics = jd.grasp.object_dynamics(hand, q, V, tau)
+        other = jd.constrained_dynamics(hand, q, dynamics.velocity, tau)
+        return Outcome(dynamics.acceleration - other.acceleration, x, dynamics.result._value, jnp.sum(dynamics.rate))
 
     studied = study(hold, jnp.asarray(nearness), dtypes, gradient)
     labels = [f"three points {n:.0e} rad from a line" for n in nearness]
@@ -254,10 +254,10 @@ def starts(dtypes, gradient):
         if assembled:
             state = jd.assemble(scene, q, v)
             q, v, code = state.q, state.v, state.result
-        found = jd.simulate(
+        solution = jd.simulate(
             scene, q, v, jnp.asarray(ts, dtype), outputs=("constraint_residual", "energy"), max_steps=512
         )
-        result = outcome(found, end=(found.energy[1:] - found.energy[0]) / 50.0)
+        result = outcome(solution, end=(solution.energy[1:] - solution.energy[0]) / 50.0)
         if code is None:
             return result
         good = code == constrained.RESULTS.successful

@@ -145,8 +145,8 @@ def study(run: Callable, points, dtypes: Sequence[str] = DTYPES, gradient: bool 
         at = as_dtype(points, dtype)
 
         def value(x, point):
-            found = run(point, x)
-            return found.value, found
+            computed = run(point, x)
+            return computed.value, computed
 
         if not gradient:
             outcomes[dtype] = quick(jax.vmap(lambda p, d=dtype: run(p, jnp.zeros((), d))))(at)
@@ -154,20 +154,20 @@ def study(run: Callable, points, dtypes: Sequence[str] = DTYPES, gradient: bool 
             continue
         lanes = jnp.asarray(_LANES * step if dtype == "float64" else _LANES[:1], dtype)
         both = jax.vmap(jax.vmap(jax.value_and_grad(value, has_aux=True), (0, None)), (None, 0))
-        (_, found), slope = quick(both)(lanes, at)
-        outcomes[dtype] = jax.tree.map(lambda x: x[:, 0], found)
+        (_, computed), slope = quick(both)(lanes, at)
+        outcomes[dtype] = jax.tree.map(lambda x: x[:, 0], computed)
         gradients[dtype] = np.asarray(slope[:, 0], float)
         if dtype == "float64":
-            quotient = np.asarray(found.value, float) @ _WEIGHTS / step
+            quotient = np.asarray(computed.value, float) @ _WEIGHTS / step
     return Study(outcomes, gradients, quotient)
 
 
-def digits_of(found: float, want: float) -> float:
+def digits_of(computed: float, want: float) -> float:
     """Correct digits, at most 16."""
-    if not (np.isfinite(found) and np.isfinite(want)):
+    if not (np.isfinite(computed) and np.isfinite(want)):
         return math.nan
-    apart = abs(found - want) / max(abs(want), 1e-12)
-    return 16.0 if apart == 0 else min(16.0, -math.log10(apart))
+    difference = abs(computed - want) / max(abs(want), 1e-12)
+    return 16.0 if difference == 0 else min(16.0, -math.log10(difference))
 
 
 def table(
@@ -193,8 +193,8 @@ def table(
     rows = []
     exact = np.asarray(exact, float)
     wanted = studied.quotient if wanted is None else wanted
-    for dtype, found in studied.outcomes.items():
-        end, count = np.asarray(found.end, float), len(labels)
+    for dtype, computed in studied.outcomes.items():
+        end, count = np.asarray(computed.end, float), len(labels)
         bounds = np.broadcast_to(allowed[dtype], (count,))
         for i, label in enumerate(labels):
             scale = np.abs(exact[i]).max() if size is None else np.broadcast_to(size, (count,))[i]
@@ -208,9 +208,9 @@ def table(
                     float(np.abs(end[i] - exact[i]).max() / (scale or 1.0)),
                     float(bounds[i]),
                     against,
-                    float(found.residual[i]) if residual else None,
+                    float(computed.residual[i]) if residual else None,
                     bool(np.isnan(end[i]).any()),
-                    name_of(found.code[i], results),
+                    name_of(computed.code[i], results),
                     digits,
                     slope is None or bool(np.isfinite(slope[i])),
                     advice,

@@ -41,7 +41,7 @@ PACKAGES = ("mujoco", "brax", "dm_control", "gymnasium", "gymnasium_robotics", "
 AGREED = 1e-9
 CLOSED = 1e-10
 RANK_TOL, MOST_STEPS = 1e-5, 1000
-MOST = 100  # degrees of freedom; beyond that the files at hand repeat one humanoid
+MAX_FREEDOMS = 100  # degrees of freedom; beyond that the files at hand repeat one humanoid
 SHOWN = ("mass", "frames", "M", "bias", "acceleration", "passive", "actuation", "rows")
 
 
@@ -52,22 +52,22 @@ def folders(given: list[str]) -> list[Path]:
             raise ValueError(f"no folders: {', '.join(missing)}; give folders that hold MJCF, SDF or URDF files")
         return [Path(name) for name in given]
     specs = (importlib.util.find_spec(name) for name in PACKAGES)
-    found = [Path(spec.submodule_search_locations[0]) for spec in specs if spec and spec.submodule_search_locations]
+    computed = [Path(spec.submodule_search_locations[0]) for spec in specs if spec and spec.submodule_search_locations]
     try:
         data = distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")
     except PackageNotFoundError:
-        return found
-    return [*found, Path(str(data))]
+        return computed
+    return [*computed, Path(str(data))]
 
 
 def files(roots: list[Path], suffix: str, text: bytes) -> list[tuple[str, Path]]:
     """Files of a suffix that hold the text, each with a name short enough for a table."""
-    found = []
+    rows = []
     for root in roots:
         for path in sorted(root.rglob(f"*{suffix}")):
             if text in path.read_bytes():
-                found.append((f"{root.name}/{path.relative_to(root)}", path))
-    return found
+                rows.append((f"{root.name}/{path.relative_to(root)}", path))
+    return rows
 
 
 def quietly(make, *arguments, **options):
@@ -98,10 +98,10 @@ def compare(path: Path, m) -> tuple[dict[str, float], str]:
     except ValueError as error:
         return {}, str(error).removeprefix(f"{path}: ")
     errors = quietly(agreement, path, scene)
-    apart = [line for line in scene.not_taken if line.startswith(APART)]
-    if apart:
+    difference = [line for line in scene.not_taken if line.startswith(APART)]
+    if difference:
         errors = {name: errors[name] for name in ("mass", "frames", "passive")}
-    return errors, "; ".join(apart)
+    return errors, "; ".join(difference)
 
 
 def mjcf(roots: list[Path], match: str) -> int:
@@ -117,7 +117,7 @@ def mjcf(roots: list[Path], match: str) -> int:
             m = quietly(mujoco.MjModel.from_xml_path, str(path))
         except ValueError:
             continue  # fragments that others include, and files whose meshes other packages hold
-        if not 0 < m.nv <= MOST:
+        if not 0 < m.nv <= MAX_FREEDOMS:
             continue
         if (key := fingerprint(m)) in seen:
             twins += 1
@@ -143,12 +143,12 @@ def mjcf(roots: list[Path], match: str) -> int:
 
 def candidates(roots: list[Path], written: Path, only_written: bool) -> list[tuple[str, Path]]:
     """Files that may hold loops: those that this script writes, MJCF with equalities, SDF, URDF with a YAML file beside it."""
-    found = [(f"written/{path.name}", path) for path in linkages.write(written, 4)]
+    computed = [(f"written/{path.name}", path) for path in linkages.write(written, 4)]
     if only_written:
-        return found
-    found += files(roots, ".sdf", b"<sdf")
-    found += files(roots, ".xml", b"<mujoco")
-    return found + [one for one in files(roots, ".urdf", b"<robot") if one[1].with_suffix(".yaml").exists()]
+        return computed
+    computed += files(roots, ".sdf", b"<sdf")
+    computed += files(roots, ".xml", b"<mujoco")
+    return computed + [one for one in files(roots, ".urdf", b"<robot") if one[1].with_suffix(".yaml").exists()]
 
 
 def motion_of(name: str, path: Path, html: Path, duration: float) -> tuple[str, ...]:

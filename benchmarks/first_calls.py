@@ -31,10 +31,10 @@ def robot(file: str, floating: bool, lock: tuple[str, ...]):
 
     import jaxdyn as jd
 
-    found = importlib.util.find_spec("pinocchio")  # beside which the files lie; it is not imported
-    if found is None or found.origin is None:
+    computed = importlib.util.find_spec("pinocchio")  # beside which the files lie; it is not imported
+    if computed is None or computed.origin is None:
         raise SystemExit("pinocchio and example-robot-data are not installed")
-    path = Path(found.origin).parents[4] / "share/example-robot-data/robots" / file
+    path = Path(computed.origin).parents[4] / "share/example-robot-data/robots" / file
     model = jd.load_urdf(path, floating_base=floating, lock=lock)
     return model, jd.neutral(model), jnp.full(model.nv, 0.1), jnp.zeros(model.nv)
 
@@ -197,7 +197,7 @@ def main(argv=None) -> None:
             with tempfile.TemporaryDirectory() as cache:
                 cold.append(elsewhere(case, cache))
                 warm.append(elsewhere(case, cache))
-        first, again = ({step: min(x[step] for x in found) for step in STEPS} for found in (cold, warm))
+        first, again = ({step: min(x[step] for x in computed) for step in STEPS} for computed in (cold, warm))
         rows.append({"case": case, "first process": first, "second process": again})
         cells = [f"{first[step]:.3g}" for step in STEPS] + [f"{again['first call']:.3g}"]
         print(f"| {CASES[case][0]} | {' | '.join(cells)} |", flush=True)

@@ -118,9 +118,9 @@ def launches(text: str) -> dict:
             computations[name] = []
             entry = name if head.group(1) else entry
             continue
-        found = re.match(r"\s+(?:ROOT )?%?[\w.\-]+ = (?:\(.*?\)|\S+) ([\w\-]+)\(", re.sub(r"/\*.*?\*/", "", line))
-        if found and name:
-            computations[name].append((found.group(1), line))
+        computed = re.match(r"\s+(?:ROOT )?%?[\w.\-]+ = (?:\(.*?\)|\S+) ([\w\-]+)\(", re.sub(r"/\*.*?\*/", "", line))
+        if computed and name:
+            computations[name].append((computed.group(1), line))
 
     def walk(name: str) -> Counter:
         count: Counter = Counter()
@@ -141,8 +141,8 @@ def launches(text: str) -> dict:
                 count["once"] += 1
         return count
 
-    found = walk(entry)
-    return {key: found[key] for key in ("once", "each turn", "libraries", "callbacks")}
+    computed = walk(entry)
+    return {key: computed[key] for key in ("once", "each turn", "libraries", "callbacks")}
 
 
 def count(names, batches, steps: int, wanted: str) -> None:
@@ -158,8 +158,8 @@ def count(names, batches, steps: int, wanted: str) -> None:
             for batch in batches if wanted in label else ():
                 args = [jax.ShapeDtypeStruct((batch, n), jnp.float32) for n in sizes]
                 before = time.perf_counter()
-                found = launches(compiled_text(jax.vmap(function), *args))
-                row = [name, label, batch, *found.values(), f"{time.perf_counter() - before:.0f}"]
+                computed = launches(compiled_text(jax.vmap(function), *args))
+                row = [name, label, batch, *computed.values(), f"{time.perf_counter() - before:.0f}"]
                 print("| " + " | ".join(map(str, row)) + " |", flush=True)
 
 

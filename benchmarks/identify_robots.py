@@ -95,8 +95,8 @@ def case(name, model, train, test, halves=None) -> dict:
         print(f"{name:22} {kind:14} {error:7.2f} %   {cells}   {note}", flush=True)
         return {"percent": error, "percent_by_joint": dict(zip(names, by_joint.tolist(), strict=True)), "note": note}
 
-    found = {"unconstrained": row("unconstrained", identify.least_squares(model, train).torques(test))}
-    found["plain"] = row("plain", identify.fit_torques(model, train).torques(test))
+    computed = {"unconstrained": row("unconstrained", identify.least_squares(model, train).torques(test))}
+    computed["plain"] = row("plain", identify.fit_torques(model, train).torques(test))
     start, cpu = time.perf_counter(), time.process_time()
     fit = identify.fit_robot(model, train)
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
@@ -104,13 +104,13 @@ def case(name, model, train, test, halves=None) -> dict:
     extra = "; ".join(f"{term} {','.join(names[j][-1] for j in joints)}" for term, joints in setting.extra)
     note = f"v_s {setting.v_s:g}, prior {setting.prior:g}, loss {setting.robust}, {extra}; "
     note += f"{len(fit.choice.trials)} settings, {seconds:.0f} s"
-    found["chosen"] = row("chosen", fit.fit.torques(test), note) | {"seconds": seconds, "cpu": cpu}
+    computed["chosen"] = row("chosen", fit.fit.torques(test), note) | {"seconds": seconds, "cpu": cpu}
     if halves is not None:
         z = z_scores(model, fit, halves)
-        found["rms_z"], found["beyond_2"] = float(np.sqrt(np.mean(z**2))), float(np.mean(np.abs(z) > 2))
-        share = 100 * found["beyond_2"]
-        print(f"{name:22} {len(z)} base parameters of two parts: rms z {found['rms_z']:.2f}, {share:.0f} % beyond 2")
-    return found
+        computed["rms_z"], computed["beyond_2"] = float(np.sqrt(np.mean(z**2))), float(np.mean(np.abs(z) > 2))
+        share = 100 * computed["beyond_2"]
+        print(f"{name:22} {len(z)} base parameters of two parts: rms z {computed['rms_z']:.2f}, {share:.0f} % beyond 2")
+    return computed
 
 
 def main() -> None:
@@ -123,14 +123,14 @@ def main() -> None:
     arm, (a, b, c) = kuka(), (kuka_log(options.data, name, options.cutoff) for name in "ABC")
     model, log = panda(), recorded(options.data)
     train, test = identify.split(log, 0.7)
-    found = {
+    computed = {
         "KUKA A + B -> C": case("KUKA A + B -> C", arm, [a, b], c, (a, b)),
         "KUKA A -> C": case("KUKA A -> C", arm, [a], c, identify.split(a, 0.5)),
         "Franka 70 % -> 30 %": case("Franka 70 % -> 30 %", model, [train], test, identify.split(train, 0.5)),
     }
     if options.out:
         options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(found, indent=1))
+        options.out.write_text(json.dumps(computed, indent=1))
 
 
 if __name__ == "__main__":

@@ -22,16 +22,16 @@ def forward_dynamics(model) -> dict[str, Callable]:
     """`f(q, v, tau) -> a` by name of each installed peer that can read the model; none for a floating base."""
     if any(kind not in ("revolute", "prismatic") for kind in model.topology.kinds):
         return {}
-    found = {}
+    computed = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.urdf"
         jd.save_urdf(model, path)
         for name, load in (("frax", _frax), ("MJX", _mjx)):
             try:
-                found[name] = load(path)
+                computed[name] = load(path)
             except ImportError:
                 print(f"{name} is not installed")
-    return found
+    return computed
 
 
 def _frax(path):

@@ -69,11 +69,11 @@ def peer(source, qs, tau):
     data, held = source.createData(), pin.StdVec_RigidConstraintData()
     held.extend([one.createData() for one in contacts])
     pin.initConstraintDynamics(source, data, contacts, held)
-    settings, still = pin.ProximalSettings(1e-12, 0.0, 1), np.zeros(source.nv)
+    settings, at_rest = pin.ProximalSettings(1e-12, 0.0, 1), np.zeros(source.nv)
 
     def call():
         return [
-            pin.constraintDynamics(source, data, q, still, pushed, contacts, held, settings).copy()
+            pin.constraintDynamics(source, data, q, at_rest, pushed, contacts, held, settings).copy()
             for q, pushed in zip(qs, tau, strict=True)
         ]
 
@@ -93,14 +93,14 @@ def main(argv=None) -> None:
     scene = jd.Scene(model, [one.hold(model, jnp.asarray(q)) for one in feet])
     qs, vs, tau = states(model, q, options.batch)
     inputs = [jnp.asarray(x) for x in (qs, vs, tau)]
-    still = jnp.zeros(model.nv)
+    at_rest = jnp.zeros(model.nv)
 
     def accelerations(q, v, tau):
         return jd.constrained_dynamics(scene, q, v, tau).acceleration
 
     def program(q, v, tau):
-        found = jd.underactuated_inverse_dynamics(model, q, v, still, feet)
-        return found.tau, found.forces, found.success
+        computed = jd.underactuated_inverse_dynamics(model, q, v, at_rest, feet)
+        return computed.tau, computed.forces, computed.success
 
     ours = jax.jit(jax.vmap(accelerations))
     there = peer(source, *to_pinocchio(model, source, qs, tau))
@@ -117,8 +117,8 @@ def main(argv=None) -> None:
     }
     times = timing.interleaved(calls, options.rounds)
     cores, rows = len(os.sched_getaffinity(0)), {}
-    for name, found in times.items():
-        rows[name] = [found[key] / options.batch * 1e6 for key in ("best", "median")]
+    for name, computed in times.items():
+        rows[name] = [computed[key] / options.batch * 1e6 for key in ("best", "median")]
         print(f"{name:32s} {rows[name][0]:8.2f} us a sample, best ({rows[name][1]:.2f} median)")
     ours_us, there_us = rows["constrained_dynamics"], rows["constraintDynamics"]
     print(

@@ -51,10 +51,10 @@ def main(argv=None) -> None:
         for batch in options.batch
         for count in COUNTS
     }
-    found = timing.interleaved({place: run for place, (run, _, _) in made.items()}, options.rounds)
+    times = timing.interleaved({place: run for place, (run, _, _) in made.items()}, options.rounds)
     rows = []
     for kind, batch in dict.fromkeys(place[:2] for place in made):
-        best = [1e6 * found[kind, batch, count]["best"] / batch for count in COUNTS]
+        best = [1e6 * times[kind, batch, count]["best"] / batch for count in COUNTS]
         power = float(np.polyfit(np.log(COUNTS), np.log(best), 1)[0])
         rows.append(
             {

@@ -31,7 +31,7 @@ SCENES = {
 SAVES = 2001
 
 
-class Way(NamedTuple):
+class Integration(NamedTuple):
     """One way to integrate: its name, the options of `simulate`, and the numbers for which it is run by their names."""
 
     name: str
@@ -39,12 +39,16 @@ class Way(NamedTuple):
     numbers: dict[str, dict[str, float]]
 
 
-def ways(step: float) -> list[Way]:
+def integrations(step: float) -> list[Integration]:
     """Variational steps, RK4 steps (four evaluations to about eight in a variational step), and tolerances."""
     steps = {f"{h:g} s": {"stepsize": h} for h in (step, step / 2, step / 4)}
     halves = {f"{h:g} s": {"stepsize": h} for h in (step / 2, step / 4, step / 8)}
     tolerances = {f"{tol:g}": {"rtol": tol, "atol": tol} for tol in (1e-6, 1e-8, 1e-10)}
-    return [Way("variational", {"method": "variational"}, steps), Way("RK4", {}, halves), Way("Dopri8", {}, tolerances)]
+    return [
+        Integration("variational", {"method": "variational"}, steps),
+        Integration("RK4", {}, halves),
+        Integration("Dopri8", {}, tolerances),
+    ]
 
 
 def measure(name: str, length: float) -> Iterator[dict]:
@@ -53,13 +57,13 @@ def measure(name: str, length: float) -> Iterator[dict]:
     duration, step = SCENES[name]
     ts = jnp.linspace(0.0, length * duration, SAVES)
     outputs = ("energy", "constraint_residual") if scene.constraints else ("energy",)
-    for way in ways(step):
+    for integration in integrations(step):
 
-        def run(q, v, numbers, options=way.options):
+        def run(q, v, numbers, options=integration.options):
             return jd.simulate(scene, q, v, ts, outputs=outputs, max_steps=2**24, throw=False, **options, **numbers)
 
-        compiled = jax.jit(run).lower(q, v, next(iter(way.numbers.values()))).compile()
-        for label, numbers in way.numbers.items():
+        compiled = jax.jit(run).lower(q, v, next(iter(integration.numbers.values()))).compile()
+        for label, numbers in integration.numbers.items():
             start = time.perf_counter()
             motion = jax.block_until_ready(compiled(q, v, numbers))
             seconds = time.perf_counter() - start
@@ -68,7 +72,7 @@ def measure(name: str, length: float) -> Iterator[dict]:
             error = np.abs(energy - energy[0]) / np.nanmax(kinetic)
             yield {
                 "scene": name,
-                "run": f"{way.name}, {label}",
+                "run": f"{integration.name}, {label}",
                 "first": float(error[:tenth].max()),
                 "last": float(error[-tenth:].max()),
                 "residual": float(motion.constraint_residual.max()) if scene.constraints else None,

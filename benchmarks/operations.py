@@ -22,13 +22,13 @@ class Operations(NamedTuple):
 
 def operations(function: Callable, *args) -> Operations | None:
     """Of the kernels that function(*args) calls outside of branches; None where it calls none, as without llvmlite."""
-    found: dict[str, int] = {}
+    computed: dict[str, int] = {}
     for program in _programs(jax.make_jaxpr(function)(*args).jaxpr):
         for op, count in program.inlined().counts().items():
-            found[op] = found.get(op, 0) + count
-    if not found:
+            computed[op] = computed.get(op, 0) + count
+    if not computed:
         return None
-    counted = {op: count for op, count in found.items() if op not in _NOT_COUNTED}
+    counted = {op: count for op, count in computed.items() if op not in _NOT_COUNTED}
     functions = sum(count for op, count in counted.items() if op in _FUNCTIONS)
     return Operations(sum(counted.values()), functions, counted.get("div", 0))
 

@@ -33,8 +33,8 @@ def rk4(acceleration, q, v, tau, steps: int):
     stages = jnp.array([[0.0, 1.0], [0.5, 2.0], [0.5, 2.0], [1.0, 1.0]])
 
     def step(_, state):
-        def stage(found, at):
-            rate, total = found
+        def stage(computed, at):
+            rate, total = computed
             here = [x + DT * at[0] * slope for x, slope in zip(state, rate, strict=True)]
             rate = [here[1], acceleration(*here, tau)]
             return (rate, [x + at[1] * slope for x, slope in zip(total, rate, strict=True)]), None
@@ -70,8 +70,8 @@ def with_mujoco(model, q, v, tau, steps: int):
 
     def call():
         with rollout.Rollout(nthread=len(data)) as runner:
-            found, _ = runner.rollout(source, data, states, control, control_spec=kind, nstep=steps)
-        return found[:, -1, 1 : 1 + model.nq]
+            computed, _ = runner.rollout(source, data, states, control, control_spec=kind, nstep=steps)
+        return computed[:, -1, 1 : 1 + model.nq]
 
     return call
 
@@ -151,9 +151,9 @@ def main() -> None:
         for peer, call in calls.items():
             before = time.perf_counter()
             first[peer] = call()
-            apart = np.abs(first[peer] - first["jaxdyn"][: len(first[peer])]).max()
+            difference = np.abs(first[peer] - first["jaxdyn"][: len(first[peer])]).max()
             print(
-                f"  {peer}: {time.perf_counter() - before:.2g} s, last positions at most {apart:.1e} from ours",
+                f"  {peer}: {time.perf_counter() - before:.2g} s, last positions at most {difference:.1e} from ours",
                 flush=True,
             )
         times = timing.interleaved(calls, args.rounds, least=0.0)

@@ -75,8 +75,8 @@ def pairs() -> list[tuple[str, Rung, Rung]]:
     z, mixed = ((0.0, 0.0, 1.0),) * 3, ((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (0.0, 0.8, -0.6))
     down = (0.0, -9.81, 0.0)
 
-    def rung(name, found):
-        return Rung(name, *found)
+    def rung(name, computed):
+        return Rung(name, *computed)
 
     single = {"joints": ("spherical",), "axes": (z[0],)}
     free = {"joints": ("free",), "axes": (z[0],)}
@@ -158,8 +158,10 @@ def measure(rungs: list[Rung], batch: int, steps: int, rounds: int) -> list[dict
     for i, (rung, (counted, _)) in enumerate(zip(rungs, made, strict=True)):
         row: dict[str, Any] = {"scene": rung.name, "operations": None if counted is None else counted.all}
         for kind in ("acceleration", "projection", "simulation") if steps else ("acceleration",):
-            found = times.get((i, kind))
-            row[f"{kind} us"] = None if found is None else [1e6 * found[key] / batch for key in ("best", "median")]
+            computed = times.get((i, kind))
+            row[f"{kind} us"] = (
+                None if computed is None else [1e6 * computed[key] / batch for key in ("best", "median")]
+            )
         rows.append(row)
     return rows
 

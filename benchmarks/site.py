@@ -31,12 +31,12 @@ def katex(folder: Path) -> str:
     if npm is None:
         return "npm is not installed"
     with tempfile.TemporaryDirectory() as scratch:
-        found = subprocess.run(
+        ended = subprocess.run(
             [npm, "pack", f"katex@{KATEX}", "--silent"], cwd=scratch, capture_output=True, text=True, check=False
         )
         packed = list(Path(scratch).glob("katex-*.tgz"))
-        if found.returncode or not packed:
-            return f"npm could not fetch it: {' '.join(found.stderr.split())[:200]}"
+        if ended.returncode or not packed:
+            return f"npm could not fetch it: {' '.join(ended.stderr.split())[:200]}"
         with tarfile.open(packed[0]) as archive:
             archive.extractall(scratch, filter="data")
         dist = Path(scratch) / "package" / "dist"

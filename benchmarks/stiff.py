@@ -228,10 +228,10 @@ def program(case: Case, solver, dtype=float, **options) -> Callable:
         if dtype is not float:
             scene, control = jax.tree.map(lambda x: x.astype(dtype), (scene, control))
         tolerances = {"rtol": tolerance, "atol": tolerance, "throw": False}
-        found = jd.simulate(
+        solution = jd.simulate(
             scene, q0, v0, case.ts, control=control, solver=solver, adjoint="forward", **tolerances, **options
         )
-        return found.q, (found.stats["num_steps"], found.success, found.result._value)
+        return solution.q, (solution.stats["num_steps"], solution.success, solution.result._value)
 
     def both(stiffness, tolerance):
         log = jnp.log(stiffness.astype(dtype))
@@ -278,9 +278,9 @@ def table(case: Case) -> str:
     for name in ("decay", "frequency"):
         lines += [f"| {name} at the start | " + " | ".join(f"{float(getattr(r, name)):.0e}" for r in rates) + " | |"]
     for name, run in runs.items():
-        found = run(1e-8)
-        error, off = (np.abs(a - b).max((1, 2)) / case.size for a, b in zip(found[:2], (q, slope), strict=True))
-        steps, success, codes = found[2:]
+        computed = run(1e-8)
+        error, off = (np.abs(a - b).max((1, 2)) / case.size for a, b in zip(computed[:2], (q, slope), strict=True))
+        steps, success, codes = computed[2:]
         cells = [
             f"{n}, {e:.0e}" if ok else f"`{name_of(code)}` ({n})"
             for n, e, ok, code in zip(steps, error, success, codes, strict=True)

@@ -56,13 +56,13 @@ print("smoke test passed with jax", jax.__version__)
 
 def seconds_to_import(python: Path, name: str, folder: Path) -> float:
     """Best of five fresh processes, s of the processor."""
-    found = []
+    rows = []
     for _ in range(5):
         began = os.times()
         subprocess.run([python, "-I", "-c", f"import {name}"], cwd=folder, check=True)
         ended = os.times()
-        found.append(ended.children_user + ended.children_system - began.children_user - began.children_system)
-    return min(found)
+        rows.append(ended.children_user + ended.children_system - began.children_user - began.children_system)
+    return min(rows)
 
 
 def main(argv=None) -> int:

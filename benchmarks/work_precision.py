@@ -1,6 +1,6 @@
 """Error against run time beside other tools, all timed in turn within one loop, and who lies below our front.
 
-    python -m benchmarks.work_precision [SCENE ...] [--batch 1 1024] [--way projected:Dopri8] [--rounds 20] [--full]
+    python -m benchmarks.work_precision [SCENE ...] [--batch 1 1024] [--integrator projected:Dopri8] [--rounds 20] [--full]
         [--out out/work_precision]
 
 The page is that of `jaxdyn report`, with the peers of `benchmarks.peers` as dashed lines on scenes that they can do. A run
@@ -26,11 +26,11 @@ from jaxdyn.reports.page import figure
 SCENES = ("andrews", "car_axis", "windows_40", "free_body", "rolling_disk")
 
 
-def plots(found: Report) -> list[tuple[Record, ...]]:
+def plots(computed: Report) -> list[tuple[Record, ...]]:
     """Records by scene, dtype and batch, with peers that have no batched call brought over from one trajectory."""
-    cores, made = found.head["machine"]["cores"], []
-    for scene in found.scenes:
-        records = found.of(scene)
+    cores, made = computed.head["machine"]["cores"], []
+    for scene in computed.scenes:
+        records = computed.of(scene)
         for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
             group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
             if batch > 1:
@@ -77,12 +77,12 @@ def verdict(records: Iterable[Record]) -> tuple[list[list[str]], list[str]]:
     return rows, lines
 
 
-def draw(found: Report, directory: Path) -> None:
+def draw(computed: Report, directory: Path) -> None:
     """An image of each plot, `SCENE_BATCH.png`."""
     directory.mkdir(parents=True, exist_ok=True)
-    for group in plots(found):
+    for group in plots(computed):
         scene, batch = group[0].scene, group[0].batch
-        drawn = figure(f"{found.scenes[scene].text}: {batch} at once", found.scenes[scene], group)
+        drawn = figure(f"{computed.scenes[scene].text}: {batch} at once", computed.scenes[scene], group)
         if drawn is not None:
             drawn.savefig(directory / f"{scene}_{batch}.png", dpi=110)
 
@@ -92,7 +92,7 @@ def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", default=[], metavar="SCENE")
     parser.add_argument("--batch", nargs="+", type=int, default=(1,))
-    parser.add_argument("--way", nargs="+", help="method:solver in place of the usual ones")
+    parser.add_argument("--integrator", nargs="+", help="method:solver in place of the usual ones")
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--out", default=str(timing.OUT / "work_precision"))
@@ -103,21 +103,21 @@ def main(argv=None) -> None:
     def say(line):
         print(line, flush=True)
 
-    found = report(
+    measured = report(
         options.scenes or (None if options.full else SCENES),
         full=options.full,
         dtypes=("float64",),
         batches=tuple(options.batch),
-        ways=None if options.way is None else [tuple(way.split(":")) for way in options.way],
+        integrators=None if options.integrator is None else [tuple(pair.split(":")) for pair in options.integrator],
         rounds=options.rounds,
         out=options.out,
         peers=peers.Peers(say),
         echo=say,
     )
-    print(f"\n{found.table()}\n\nWritten to {options.out}/report.html\n")
+    print(f"\n{measured.table()}\n\nWritten to {options.out}/report.html\n")
     if options.figures:
-        draw(found, options.figures)
-    judged = [verdict(group) for group in plots(found)]
+        draw(measured, options.figures)
+    judged = [verdict(group) for group in plots(measured)]
     print("Time relative to the best peer, at an error of")
     header = ["scene", "batch", "peers that take", "points below", *(f"{x:.0e}" for x in TARGETS)]
     print(table(header, [row for rows, _ in judged for row in rows]))

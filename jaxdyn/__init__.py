@@ -36,6 +36,8 @@ from jaxdyn.contact.unilateral import gap_contact as gap_contact
 from jaxdyn.contact.unilateral import ground_contact as ground_contact
 from jaxdyn.control.legs import LeggedDynamics as LeggedDynamics
 from jaxdyn.control.legs import underactuated_inverse_dynamics as underactuated_inverse_dynamics
+from jaxdyn.dynamics.base_twists import base_twists as base_twists
+from jaxdyn.dynamics.base_twists import link_adjoints as link_adjoints
 from jaxdyn.dynamics.centroidal import center_of_mass as center_of_mass
 from jaxdyn.dynamics.centroidal import centroidal_momentum as centroidal_momentum
 from jaxdyn.dynamics.centroidal import centroidal_momentum_matrix as centroidal_momentum_matrix

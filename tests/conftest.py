@@ -20,6 +20,10 @@ from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).resolve().parent.parent
 
+# Compiling is most of what tests do: XLA compiles fast and runs slowly here (see `quick` in pinocchio_bridge), unless its flags
+# are given. `make test-all` gives none, so that every test also runs as a user's program does.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -40,6 +44,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("jaxdyn")
     group.addoption("--data", type=Path, default=ROOT.parent / "shared" / "data", help="directory of recorded data")
     group.addoption("--all-robots", action="store_true", help="run the robot tests on every robot, not on a few")
+    group.addoption(
+        "--cpu-times", type=Path, metavar="FILE", help="append the processor time (s) of each test to this file"
+    )
     group.addoption("--compilation", choices=("auto", "plain"), help="run all tests in this mode of jaxdyn.compilation")
 
 
@@ -61,6 +68,17 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 _CACHE = pytest.StashKey[str]()
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Processor time of a test, its fixtures and the processes that it starts: on a busy machine wall time says little."""
+    path, start = item.config.getoption("--cpu-times"), os.times()
+    yield
+    if path is not None:
+        seconds = sum(os.times()[:4]) - sum(start[:4])
+        with path.open("a") as file:  # one short line at a time, from each worker
+            file.write(f"{seconds:.2f} {item.nodeid}\n")
 
 
 @pytest.fixture(params=["auto", "plain"])

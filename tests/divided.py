@@ -39,11 +39,11 @@ def compare(name, function, *args):
     program = jax.jit(function).lower(*args).compile()
     divided, whole = program(*args), jax.jit(function)(*jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), args))
     leaves = [*zip(jax.tree.leaves(divided), jax.tree.leaves(whole), strict=True)]
-    apart = max(float(np.max(np.abs(np.asarray(a) - b) / (1 + np.abs(b)))) for a, b in leaves)
+    difference = max(float(np.max(np.abs(np.asarray(a) - b) / (1 + np.abs(b)))) for a, b in leaves)
     shards = len({str(shard.index) for shard in leaves[0][0].addressable_shards})
     kernels = program.as_text().count('custom_call_target="jaxdyn_kernel"')
-    found = {"name": name, "apart": apart, "calls": exchanged(program), "shards": shards, "kernels": kernels}
-    print(json.dumps(found))
+    computed = {"name": name, "apart": difference, "calls": exchanged(program), "shards": shards, "kernels": kernels}
+    print(json.dumps(computed))
 
 
 def dynamics(q, v, tau):
@@ -171,7 +171,7 @@ def compare_fits(*names):
         many = fits[name](devices=jax.devices())
         minimise._evaluate = evaluate
         calls = exchanged(programs.pop().compiled) if programs else {}
-        history = [np.asarray(found.history).tolist() for found in (one, many)]
+        history = [np.asarray(computed.history).tolist() for computed in (one, many)]
         print(json.dumps({"name": name, "calls": calls, "history": history}))
 
 

@@ -158,18 +158,18 @@ def agreement(path, scene: jd.LoadedScene) -> dict[str, float]:
         model = scene.system
         q = jd.integrate(model, start, 0.7 * step)
         forces = [force for force in scene.forces if not isinstance(force, jd.CoulombFriction)]
-        found = {
+        computed = {
             "M": jd.mass_matrix(model, q),
             "bias": jd.bias_force(model, q, v),
             "acceleration": jd.forward_dynamics(model, q, v, tau),
             "passive": sum((force(model, q, v, 0.0) for force in forces), jnp.zeros(model.nv)),
         }
         if scene.actuators is not None:
-            found["actuation"] = scene.actuators(model, q, v, control)
+            computed["actuation"] = scene.actuators(model, q, v, control)
         rows = jd.constraint_jacobian(scene, start) if scene.constraints else None
-        return q, jd.forward_kinematics(model, q), found, rows
+        return q, jd.forward_kinematics(model, q), computed, rows
 
-    q, poses, found, rows = ours(scene, start, step, v, tau, jnp.asarray(control))
+    q, poses, computed, rows = ours(scene, start, step, v, tau, jnp.asarray(control))
     theirs = dict(zip(("M", "bias", "acceleration"), oracle.dynamics(q, v, tau), strict=True))
     frames = [model.frame_names.index(name) for name in oracle.bodies[1:]]
     bodies = np.concatenate([np.asarray(poses), np.eye(4)[None]])[np.array(model.topology.frame_bodies)[frames]]
@@ -183,7 +183,7 @@ def agreement(path, scene: jd.LoadedScene) -> dict[str, float]:
         theirs["actuation"] = oracle.actuation(q, v, dict(zip(drives.names, control, strict=True)))
     # A bias of nothing but rounding, of a hinge that is upright, is compared with forces of a thousandth of M.
     floors = {"bias": 1e-3 * np.abs(theirs["M"]).max(initial=0.0)}
-    errors |= {name: error(value, theirs[name], floors.get(name, 0.0)) for name, value in found.items()}
+    errors |= {name: error(value, theirs[name], floors.get(name, 0.0)) for name, value in computed.items()}
     if rows is not None:
         errors["rows"] = error(row_space(rows), row_space(oracle.equality_rows(start)[0]))
     return errors

@@ -75,10 +75,10 @@ def test_allegro_hand_holds_the_cube_in_motion(hand):
     grasp, place, q = hand
     law = jd.control.GraspForce(grasp, q[place], 100.0, 20.0, preload=2.0, damping=10.0)
     ts, rest = jnp.linspace(0.0, 0.1, 3), jnp.zeros(grasp.nv)
-    found = jd.simulate(
+    solution = jd.simulate(
         grasp, q, rest, ts, control=law, stepsize=0.01, outputs=("contact_margins", "constraint_residual")
     )
-    assert bool(found.success)
-    assert_close(found.q[-1, place], q[place], 1e-8)
-    assert min(float(margin.min()) for margin in found.contact_margins.values()) > 0.1
-    assert float(found.constraint_residual.max()) < 1e-11
+    assert bool(solution.success)
+    assert_close(solution.q[-1, place], q[place], 1e-8)
+    assert min(float(margin.min()) for margin in solution.contact_margins.values()) > 0.1
+    assert float(solution.constraint_residual.max()) < 1e-11

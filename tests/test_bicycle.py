@@ -110,9 +110,9 @@ def test_matrices(linear):
 
 def test_eigenvalues(linear):
     """All four modes at rest and at ten speeds, from J itself."""
-    found = np.sort_complex(np.linalg.eigvals(linear["J"]))
-    np.testing.assert_allclose(found[0], AT_REST, atol=1e-9)
-    for values, (castering, capsize, real, imaginary) in zip(found[1:], MODES, strict=True):
+    computed = np.sort_complex(np.linalg.eigvals(linear["J"]))
+    np.testing.assert_allclose(computed[0], AT_REST, atol=1e-9)
+    for values, (castering, capsize, real, imaginary) in zip(computed[1:], MODES, strict=True):
         weave = real + 1j * imaginary
         np.testing.assert_allclose(
             values, [castering, *np.sort_complex([capsize, weave, weave.conjugate()])], atol=1e-9
@@ -167,15 +167,15 @@ def test_nonlinear_motion_after_a_push(linear):
         options = {"stepsize": 0.02, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
         return simulate(scene, q, v, ts, **options)
 
-    found = run(jnp.asarray(0.5))
-    assert bool(found.success) and float(found.constraint_residual.max()) <= 1e-12
-    np.testing.assert_allclose(found.energy, found.energy[0], rtol=1e-11)
-    assert np.abs(found.q[:, 8]).max() > 0.05  # it steers
+    computed = run(jnp.asarray(0.5))
+    assert bool(computed.success) and float(computed.constraint_residual.max()) <= 1e-12
+    np.testing.assert_allclose(computed.energy, computed.energy[0], rtol=1e-11)
+    assert np.abs(computed.q[:, 8]).max() > 0.05  # it steers
     push = 1e-5
-    found = run(jnp.asarray(push))
+    computed = run(jnp.asarray(push))
     M, damp = linear["M"], 4.6 * linear["C1"]
     stiff = GRAVITY * linear["K0"] + 4.6**2 * linear["K2"]
     J = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(M, stiff), -np.linalg.solve(M, damp)]])
     want = np.stack([expm(t * J) @ [0.0, 0.0, push, 0.0] for t in ts])
-    np.testing.assert_allclose(found.v[:, [ROLL, STEER]], want[:, 2:], atol=1e-6 * push)  # what is left is cubic
-    np.testing.assert_allclose(found.q[:, 8], want[:, 1], atol=1e-6 * push)
+    np.testing.assert_allclose(computed.v[:, [ROLL, STEER]], want[:, 2:], atol=1e-6 * push)  # what is left is cubic
+    np.testing.assert_allclose(computed.q[:, 8], want[:, 1], atol=1e-6 * push)

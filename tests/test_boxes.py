@@ -125,8 +125,8 @@ def test_forces_at_the_corners_exist_until_the_box_lets_go(size, mu, slips):
     for shift, inside in ((-1e-6, True), (1e-6, False)):
         fx, fz, ty = closed_form(size)[2](angle + shift)
         wanted = np.array([fx, 0, fz, 0, ty, 0])
-        found = linprog(np.zeros(16), A_eq=generators, b_eq=wanted, bounds=(0, None))
-        assert (found.status == 0) is inside
+        computed = linprog(np.zeros(16), A_eq=generators, b_eq=wanted, bounds=(0, None))
+        assert (computed.status == 0) is inside
         assert (float(cone.margin(jnp.asarray(wanted))) > 0) is inside
 
 
@@ -136,7 +136,7 @@ def test_the_motion_ends_where_the_box_slips_or_tips(size, mu):
     """The time of the closed form, and the code."""
     _, time, _ = end(size, mu)
     scene, (q, v) = scenes.box_on_table(size=size, mu=mu), scenes.box_on_table.start(size=size)
-    found = jd.simulate(scene, q, v, jnp.linspace(0.0, 8.0, 6), rtol=1e-10, atol=1e-10, throw=False)
-    assert bool(found.result == jd.RESULTS.contact_lost)
-    np.testing.assert_allclose(found.stats["time_reached"], time, atol=1e-6)
-    assert int(found.stats["lost_contact"]) == 0
+    solution = jd.simulate(scene, q, v, jnp.linspace(0.0, 8.0, 6), rtol=1e-10, atol=1e-10, throw=False)
+    assert bool(solution.result == jd.RESULTS.contact_lost)
+    np.testing.assert_allclose(solution.stats["time_reached"], time, atol=1e-6)
+    assert int(solution.stats["lost_contact"]) == 0

@@ -270,12 +270,12 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     text = capsys.readouterr().out
     assert text.index("torque error:") < text.index("feasible fit of")
     assert "quadratic" in text and "chosen over" not in text
-    found = json.loads(report.read_text())
-    assert set(found["test_logs"]) == {"C.csv"} and set(found["train_logs"]) == {"A.csv", "B.csv"}
-    errors = found["test_logs"]["C.csv"]
+    computed = json.loads(report.read_text())
+    assert set(computed["test_logs"]) == {"C.csv"} and set(computed["train_logs"]) == {"A.csv", "B.csv"}
+    errors = computed["test_logs"]["C.csv"]
     assert len(errors["percent_by_joint"]) == truth.nv and errors["percent"] < 2 < 10 < errors["nominal_percent"]
-    assert found["samples"] == {"train": 752, "test": 301, "final": 752}
-    assert {row["from"] for row in found["parameters"].values() if "from" in row} <= {"data", "prior", "bound"}
+    assert computed["samples"] == {"train": 752, "test": 301, "final": 752}
+    assert {row["from"] for row in computed["parameters"].values() if "from" in row} <= {"data", "prior", "bound"}
     assert jd.inertia_report(jd.load_urdf(out)) == []
     # Nothing outside of the page: names of XML are the only addresses.
     text = page.read_text()
@@ -305,11 +305,11 @@ def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys):
     file.write_text("".join(f"{name} = {json.dumps(value)}\n" for name, value in options.items()))
     assert main(["identify", str(file), "--prior", "1"]) == 0
     assert "v_s 0.02, prior 1, loss squares" in capsys.readouterr().out
-    found = json.loads((tmp_path / "fitted.json").read_text())
+    computed = json.loads((tmp_path / "fitted.json").read_text())
     torques = joint_torques(tmp_path / "fitted.urdf")
-    assert [torques[name]["offset"] for name in truth.joint_names] == found["friction"]["offset"]
+    assert [torques[name]["offset"] for name in truth.joint_names] == computed["friction"]["offset"]
     assert {torques[name]["v_s"] for name in truth.joint_names} == {0.02}
-    assert [torques[name]["quadratic"] for name in truth.joint_names] == found["extra_terms"]["quadratic"]
+    assert [torques[name]["quadratic"] for name in truth.joint_names] == computed["extra_terms"]["quadratic"]
     read = pinocchio.buildModelFromUrdf(str(tmp_path / "fitted.urdf"))
     fitted = jd.load_urdf(tmp_path / "fitted.urdf")
     np.testing.assert_allclose(read.friction, fitted.friction, rtol=1e-12)
@@ -358,9 +358,9 @@ def test_identify_a_payload(arm, tmp_path, capsys):
     args += ["--terms", "viscous", "coulomb", "--v-s", "0.01", "--prior", "1", "--robust", "none"]
     assert main(args) == 0
     assert f"Payload on {truth.body_names[-1]}" in capsys.readouterr().out
-    found = json.loads(report.read_text())["payload"]
+    computed = json.loads(report.read_text())["payload"]
     # A slider carries it: the mass is told.
-    assert abs(found["mass"] - 0.7) < 0.01 and found["percent"] < 0.2 * found["percent_without"]
+    assert abs(computed["mass"] - 0.7) < 0.01 and computed["percent"] < 0.2 * computed["percent_without"]
     assert main([*args, "--payload-body", "foot"]) == 2
     assert "the bodies are" in capsys.readouterr().err
 

@@ -49,9 +49,9 @@ def native(function, *known):
     return lambda *args: backend.run(lambda _, *args: function(*args), known, *args, otherwise=refused)
 
 
-def assert_same(found, wanted, tolerance=1e-13):
-    assert jax.tree.structure(found) == jax.tree.structure(wanted)
-    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+def assert_same(computed, wanted, tolerance=1e-13):
+    assert jax.tree.structure(computed) == jax.tree.structure(wanted)
+    for x, y in zip(jax.tree.leaves(computed), jax.tree.leaves(wanted), strict=True):
         assert x.dtype == y.dtype and x.shape == y.shape, (x.dtype, x.shape, y.dtype, y.shape)
         scale = 1 + np.max(np.abs(np.nan_to_num(np.asarray(y, float), posinf=0, neginf=0)), initial=0.0)
         np.testing.assert_allclose(np.asarray(x, float), np.asarray(y, float), rtol=tolerance, atol=tolerance * scale)
@@ -62,8 +62,8 @@ def check(function, *args, tolerance=1e-13):
     wanted = quick(jax.vmap(function))(*args)
     assert_same(jax.jit(jax.vmap(native(function)))(*args), wanted, tolerance)
     first = [x[0] for x in args]
-    found = target.call(numbers_of(function, *first), [np.asarray(x) for x in first])
-    assert_same(found, jax.tree.leaves(jax.tree.map(lambda x: x[0], wanted)), tolerance)
+    computed = target.call(numbers_of(function, *first), [np.asarray(x) for x in first])
+    assert_same(computed, jax.tree.leaves(jax.tree.map(lambda x: x[0], wanted)), tolerance)
 
 
 def normal(*shape, dtype=jnp.float64):
@@ -105,9 +105,9 @@ def test_known_numbers_that_compare_equal_are_kept_apart():
         return whole, signed, turns, (1.0 / jnp.where(x > 5, x, 0.0), 1.0 / jnp.where(x > 5, x, -0.0))
 
     x = jnp.array([-1.0, 2.0])
-    found, wanted = jax.jit(native(function))(x), jax.jit(function)(x)
-    assert_same(found, wanted)
-    np.testing.assert_array_equal(*(np.signbit(y[1]) for y in (found, wanted)))
+    computed, wanted = jax.jit(native(function))(x), jax.jit(function)(x)
+    assert_same(computed, wanted)
+    np.testing.assert_array_equal(*(np.signbit(y[1]) for y in (computed, wanted)))
 
 
 def test_a_program_says_what_it_is():
@@ -257,22 +257,22 @@ def test_triangular_solves(dtype):
     T = normal(3, 3, 3, dtype=dtype) / 4 + 2 * jnp.eye(3, dtype=dtype)[None]
 
     def function(T, b):
-        found = []
+        rows = []
         for k in range(16):
             left, lower, turned, unit = (bool(k >> i & 1) for i in range(4))
-            found.append(
+            rows.append(
                 lax.linalg.triangular_solve(
                     T, b if left else b.T, left_side=left, lower=lower, transpose_a=turned, unit_diagonal=unit
                 )
             )
-        return found
+        return rows
 
     check(function, T, normal(3, 3, 2, dtype=dtype), tolerance=1e-13 if dtype == jnp.float64 else 1e-5)
 
 
 def test_a_matrix_that_is_not_definite_has_no_factor():
-    found = jax.jit(native(lambda a: jnp.linalg.cholesky(a)))(jnp.diag(jnp.array([1.0, -1.0, 2.0])))
-    assert np.isnan(np.diag(found)).any()
+    computed = jax.jit(native(lambda a: jnp.linalg.cholesky(a)))(jnp.diag(jnp.array([1.0, -1.0, 2.0])))
+    assert np.isnan(np.diag(computed)).any()
 
 
 def test_rounding_of_halves():
@@ -338,9 +338,9 @@ def test_what_is_not_numbers_runs_as_it_is(name, caplog, monkeypatch):
         return function(x)
 
     with caplog.at_level(logging.WARNING, "jaxdyn"):
-        found = jax.jit(lambda x: backend.run(named, (), x))(x)
+        computed = jax.jit(lambda x: backend.run(named, (), x))(x)
         jax.jit(lambda x: backend.run(named, (), 2 * x))(x)
-    assert_same(found, function(x), 1e-12)
+    assert_same(computed, function(x), 1e-12)
     if name == "random":
         return  # jax may compute it with numbers
     assert reason in caplog.text and caplog.text.count("runs on JAX's own operations") == 1
@@ -364,9 +364,9 @@ def test_what_happens_elsewhere_happens_in_every_call():
 
 def test_another_way_is_taken_without_a_word(caplog):
     with caplog.at_level(logging.WARNING, "jaxdyn"):
-        found = backend.run(lambda _, x: jnp.sort(x), (), normal(3), otherwise=lambda _, x: jnp.zeros(3))
+        computed = backend.run(lambda _, x: jnp.sort(x), (), normal(3), otherwise=lambda _, x: jnp.zeros(3))
         most = backend.run(lambda _, x: jnp.sin(x) * x, (), normal(3), otherwise=lambda _, x: jnp.ones(3), most=4)
-    assert not found.any() and most.all() and not caplog.records
+    assert not computed.any() and most.all() and not caplog.records
 
 
 # --- derivatives ---
@@ -408,9 +408,9 @@ def test_derivatives_of_every_function():
     x, step = jnp.asarray(RNG.uniform(0.1, 0.9, 2)), normal(2)
     plain = _all_of(_smooth)
     wanted = quick(lambda x, step: _transforms(plain, x, step))
-    found = jax.jit(lambda x, step: _transforms(native(plain), x, step))
+    computed = jax.jit(lambda x, step: _transforms(native(plain), x, step))
     # Second derivatives of the solution with a factor: some hundred roundings. A cast to float32 and back moves by its rounding.
-    assert_same(found(x, step), wanted(x, step), 1e-11)
+    assert_same(computed(x, step), wanted(x, step), 1e-11)
 
 
 def test_derivatives_of_operations():
@@ -433,14 +433,14 @@ def test_derivatives_of_operations():
     names += ("dynamic update", "cond", "for", "solve", "barrier", "linear solve", "inner")
 
     def plain(x):
-        found = []
+        computed = []
         for name in names:
             leaves = [y for y in jax.tree.leaves(OPERATIONS[name](x)) if jnp.issubdtype(y.dtype, jnp.floating)]
-            found.append(sum(jnp.sum(jnp.sin(y + 0.1)) for y in leaves))
-        return jnp.stack(found)
+            computed.append(sum(jnp.sum(jnp.sin(y + 0.1)) for y in leaves))
+        return jnp.stack(computed)
 
-    found, wanted = jax.jit(jax.jacrev(native(plain)))(x), quick(jax.jacrev(plain))(x)
-    for name, one, other in zip(names, found, wanted, strict=True):
+    computed, wanted = jax.jit(jax.jacrev(native(plain)))(x), quick(jax.jacrev(plain))(x)
+    for name, one, other in zip(names, computed, wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-11, err_msg=name)
 
 
@@ -517,8 +517,8 @@ def test_batches(samples):
     """Arguments with and without a batch, along other axes than the first."""
     x, n, flag = normal(3, samples), jnp.asarray(4, jnp.int32), jnp.arange(samples) % 3 == 0
     axes = (1, None, 0)
-    found = jax.jit(jax.vmap(MIXED, axes))(x, n, flag)
-    assert_same(found, quick(jax.vmap(partial(_mixed, FACTORS), axes))(x, n, flag))
+    computed = jax.jit(jax.vmap(MIXED, axes))(x, n, flag)
+    assert_same(computed, quick(jax.vmap(partial(_mixed, FACTORS), axes))(x, n, flag))
 
 
 def test_nested_batches():
@@ -546,8 +546,8 @@ def test_gradients_of_batches_sum_over_what_samples_share():
     def plain(x, y):
         return jnp.sin(x) * y + y**2
 
-    found = jax.jit(jax.grad(total(native(plain)), (0, 1)))(x, y)
-    assert_same(found, jax.grad(total(plain), (0, 1))(x, y))
+    gradient = jax.jit(jax.grad(total(native(plain)), (0, 1)))(x, y)
+    assert_same(gradient, jax.grad(total(plain), (0, 1))(x, y))
     per_sample = jax.vmap(jax.grad(lambda x, y: jnp.sum(native(plain)(x, y)), (0, 1)), (0, None))
     wanted = jax.vmap(jax.grad(lambda x, y: jnp.sum(plain(x, y)), (0, 1)), (0, None))
     assert_same(jax.jit(per_sample)(x, y), wanted(x, y))
@@ -609,8 +609,8 @@ def test_known_leaves_are_compiled_in_and_traced_ones_are_arguments():
     given = jax.make_jaxpr(run)(tree, x).eqns
     given = next(eqn for eqn in given if eqn.primitive.name == "jaxdyn_kernel").params["program"]
     assert (len(known.inputs), known.cost) == (1, 3) and (len(given.inputs), given.cost) == (3, 6)
-    for found in (jax.jit(run)(tree, x), jax.jit(lambda x: run(tree, x))(x), run(tree, x)):
-        np.testing.assert_allclose(found, 2 * x, rtol=1e-15)
+    for computed in (jax.jit(run)(tree, x), jax.jit(lambda x: run(tree, x))(x), run(tree, x)):
+        np.testing.assert_allclose(computed, 2 * x, rtol=1e-15)
     half = jax.jit(lambda b, x: run({"a": 2.0, "b": b}, x))(3.0, x)
     np.testing.assert_allclose(half, 2 * x + 3, rtol=1e-15)
     many = {"a": jnp.arange(4.0), "b": jnp.ones(4)}
@@ -663,12 +663,12 @@ def test_models_known_and_given_move_alike():
     """A mechanism compiled in, and as an argument: kernels of fewer and of more operations, the same accelerations."""
     model = jd.robots.chain(3)
     q, v, tau = normal(3), normal(3), normal(3)
-    found = jax.jit(lambda q, v, tau: jd.forward_dynamics(model, q, v, tau))(q, v, tau)
+    acceleration = jax.jit(lambda q, v, tau: jd.forward_dynamics(model, q, v, tau))(q, v, tau)
     given = jax.jit(jd.forward_dynamics)(model, q, v, tau)
-    assert_same(given, found, 1e-12)
+    assert_same(given, acceleration, 1e-12)
     with jd.compilation("plain"):
         plain = quick(lambda q, v, tau: jd.forward_dynamics(model, q, v, tau))(q, v, tau)
-    assert_same(found, plain, 1e-11)
+    assert_same(acceleration, plain, 1e-11)
 
     def program_of(function, *args):
         return next(e for e in jax.make_jaxpr(function)(*args).eqns if "kernel" in e.primitive.name).params["program"]
@@ -710,18 +710,18 @@ def test_compute_gives_known_numbers_while_a_program_is_traced():
         return {"y": tree[0] * tree[1] + jnp.sin(x), "n": jnp.arange(2), "large": x.sum() > 0.5}
 
     wanted = {"y": 2 * tree[1] + np.sin(x), "n": np.arange(2), "large": np.asarray(True)}
-    found = []
+    rows = []
 
     def traced(z):
-        found.append(compute(scaled, tree, x))
+        rows.append(compute(scaled, tree, x))
         return z
 
     jax.jit(traced)(1.0)
-    found += [compute(scaled, tree, x), compute(scaled, tree, jnp.asarray(x), given=True)]
+    rows += [compute(scaled, tree, x), compute(scaled, tree, jnp.asarray(x), given=True)]
     with jd.compilation("plain"):
-        found.append(compute(scaled, tree, x))
-    found.append(compute(lambda tree, x: scaled(tree, jnp.sort(x)[::-1]), tree, x))  # no program of numbers
-    for numbers in found:
+        rows.append(compute(scaled, tree, x))
+    rows.append(compute(lambda tree, x: scaled(tree, jnp.sort(x)[::-1]), tree, x))  # no program of numbers
+    for numbers in rows:
         assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(numbers))
         assert_same(numbers, wanted)
 
@@ -731,8 +731,8 @@ def test_a_call_without_xla_is_that_within():
         return jnp.outer(x, x), n + 1, x > 0, jnp.asarray(2.0)
 
     x, n = normal(3), jnp.asarray(4)
-    found = target.call(numbers_of(function, x, n), [np.asarray(x), np.asarray(n)])
-    for a, b in zip(found, jax.jit(native(function))(x, n), strict=True):
+    computed = target.call(numbers_of(function, x, n), [np.asarray(x), np.asarray(n)])
+    for a, b in zip(computed, jax.jit(native(function))(x, n), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
 
@@ -843,8 +843,8 @@ def test_operations_of_jax_are_the_same_numbers():
     """What is lowered on other devices than a CPU, with operations of every kind."""
     batch = jnp.asarray(RNG.uniform(0.1, 0.9, (2, 2)))
     made = numbers_of(_all_of(_smooth), batch[0])
-    found = quick(partial(kernel.as_operations, program=made))(batch)[0]
-    assert_same(found, quick(jax.vmap(_all_of(_smooth)))(batch), 1e-12)
+    computed = quick(partial(kernel.as_operations, program=made))(batch)[0]
+    assert_same(computed, quick(jax.vmap(_all_of(_smooth)))(batch), 1e-12)
     args = mixed_args()
     parts = kernel.as_operations(*(x.reshape(-1) for x in args), program=numbers_of(partial(_mixed, FACTORS), *args))
     wanted = jax.tree.leaves(_mixed(FACTORS, *args))
@@ -864,7 +864,7 @@ def test_another_device_gets_operations():
 def test_threads_give_the_same_bits():
     """Four threads of Python that trace, compile and call at once, and chunks of a batch on XLA's threads and on one."""
     q = normal(2000, 3)
-    found, failed = [None] * 4, []
+    computed, failed = [None] * 4, []
     start = threading.Barrier(4)
 
     def work(k):
@@ -872,7 +872,7 @@ def test_threads_give_the_same_bits():
             start.wait()
             for _ in range(3):
                 run = jax.jit(jax.vmap(native(lambda x: jnp.sin(x) @ jnp.cos(x[::-1]) + x**3)))
-                found[k] = np.asarray(run(q))
+                computed[k] = np.asarray(run(q))
         except BaseException as error:
             failed.append(error)
 
@@ -887,7 +887,7 @@ def test_threads_give_the_same_bits():
         work_alone = jax.jit(jax.vmap(native(lambda x: jnp.sin(x) @ jnp.cos(x[::-1]) + x**3)))(q)
     finally:
         target.set_threads(None)
-    for numbers in found:
+    for numbers in computed:
         np.testing.assert_array_equal(numbers, work_alone)
 
 
@@ -960,8 +960,8 @@ def test_exported_programs_of_a_batch_of_any_size():
     exported = jax.export.export(run, disabled_checks=allowed)(batch, batch)
     for n in (1, 3):
         q = jnp.linspace(0.1, 0.9, 2 * n).reshape(n, 2)
-        for found, known in zip(exported.call(q, q[::-1]), run(q, q[::-1]), strict=True):
-            np.testing.assert_allclose(found, known, rtol=1e-13, atol=1e-13)
+        for computed, known in zip(exported.call(q, q[::-1]), run(q, q[::-1]), strict=True):
+            np.testing.assert_allclose(computed, known, rtol=1e-13, atol=1e-13)
 
 
 def test_without_jit_kernels_are_still_compiled():
@@ -973,8 +973,8 @@ def test_without_jit_kernels_are_still_compiled():
 
     known = results()
     with jax.disable_jit():
-        found = results()
-    for x, y in zip(found, known, strict=True):
+        computed = results()
+    for x, y in zip(computed, known, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-13)
 
 
@@ -997,9 +997,9 @@ def test_threads_that_call_a_kernel_for_the_first_time_share_its_code(monkeypatc
     run = jax.jit(native(lambda x: jnp.cos(x) * 5.4321)).lower(jnp.ones(3)).compile()
     assert not made
     with concurrent.futures.ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(lambda k: run(jnp.full(3, float(k))), range(8)))
+        computed = list(pool.map(lambda k: run(jnp.full(3, float(k))), range(8)))
     assert len(made) == 1
-    for k, x in enumerate(found):
+    for k, x in enumerate(computed):
         assert_same(x, jnp.cos(jnp.full(3, float(k))) * 5.4321)
 
 
@@ -1027,9 +1027,9 @@ def test_a_batch_on_two_devices():
     f = jax.vmap(native(lambda x: jnp.cumsum(jnp.sin(x))))
     wanted = jnp.cumsum(jnp.sin(q), 1)
     mapped = jax.jit(jax.shard_map(f, mesh=mesh, in_specs=jax.P("batch"), out_specs=jax.P("batch")))
-    found = mapped(jax.device_put(q, spread))
-    assert len(found.devices()) == 2
-    assert_same(found, wanted)
+    computed = mapped(jax.device_put(q, spread))
+    assert len(computed.devices()) == 2
+    assert_same(computed, wanted)
     assert_same(jax.jit(f)(jax.device_put(q, spread)), wanted)
 
 

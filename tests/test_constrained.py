@@ -61,14 +61,16 @@ def solved(tree):
 
     @quick
     def compute(scene, q, guess, tau):
-        found = assemble(scene, q, guess)
-        q, v = found.q, found.v
+        assembly = assemble(scene, q, guess)
+        q, v = assembly.q, assembly.v
         row = rows(scene, q, v, 0.0)
-        ranked = constrained_dynamics(scene, q, v, tau)
+        ranked, schur, by_range = (
+            constrained_dynamics(scene, q, v, tau, method=method) for method in ("rank_aware", "schur", "range_space")
+        )
         return {
             "q": q,
             "v": v,
-            "residual": found.residual,
+            "residual": assembly.residual,
             "A": row.A,
             "gamma": row.gamma,
             "M": mass_matrix(scene.system, q),
@@ -79,10 +81,10 @@ def solved(tree):
             "lam": ranked.multipliers,
             "rank": ranked.rank,
             "result": ranked.result == RESULTS.successful,
-            "schur": constrained_dynamics(scene, q, v, tau, method="schur").acceleration,
-            "schur lam": constrained_dynamics(scene, q, v, tau, method="schur").multipliers,
-            "range": constrained_dynamics(scene, q, v, tau, method="range_space").acceleration,
-            "range lam": constrained_dynamics(scene, q, v, tau, method="range_space").multipliers,
+            "schur": schur.acceleration,
+            "schur lam": schur.multipliers,
+            "range": by_range.acceleration,
+            "range lam": by_range.multipliers,
             "P_T": projections(scene, q).P_T,
             "S": second_fundamental_form(scene, q, v),
             "wrenches": constraint_wrenches(scene, q, ranked.multipliers),
@@ -159,10 +161,10 @@ def test_range_space_forms_no_mass_matrix(tree):
     shapes = {}
     for method in ("schur", "range_space"):
         with jd.compilation("plain"):
-            found = jax.make_jaxpr(lambda q, v, m=method: constrained_dynamics(few, q, v, method=m).acceleration)(
+            dynamics = jax.make_jaxpr(lambda q, v, m=method: constrained_dynamics(few, q, v, method=m).acceleration)(
                 *tree[1:3]
             )
-        shapes[method] = factorised(found.jaxpr)
+        shapes[method] = factorised(dynamics.jaxpr)
     count = layout(few)[-1].end
     assert shapes == {"schur": {(n, n), (count, count)}, "range_space": {(count, count)}} and count < n
     broken = Scene(few.system, few.constraints * 2)
@@ -172,13 +174,13 @@ def test_range_space_forms_no_mass_matrix(tree):
 
 def factorised(jaxpr) -> set:
     """Shapes of all matrices that a program factorises by Cholesky."""
-    found = set()
+    computed = set()
     for equation in jaxpr.eqns:
         if equation.primitive.name == "cholesky":
-            found.add(equation.invars[0].aval.shape[-2:])
+            computed.add(equation.invars[0].aval.shape[-2:])
         for inner in jaxprs_in_params(equation.params):
-            found |= factorised(inner)
-    return found
+            computed |= factorised(inner)
+    return computed
 
 
 def test_lemmas_of_the_projections(solved):
@@ -217,7 +219,7 @@ def test_forces_by_name_are_those_of_the_wrenches(solved, tree):
 
 def relative_twists(scene, q, v):
     """Twist of frame B against frame A, in A, by differences of Jacobians along v."""
-    found = {}
+    computed = {}
     for constraint in scene.constraints:
 
         def relative(s, constraint=constraint):
@@ -229,10 +231,10 @@ def relative_twists(scene, q, v):
 
         pose, rate = jax.jvp(relative, (jnp.zeros(()),), (jnp.ones(()),))
         spatial = rate @ jnp.linalg.inv(pose)
-        found[constraint.name] = jnp.concatenate(
+        computed[constraint.name] = jnp.concatenate(
             [spatial[:3, 3], jnp.stack([spatial[2, 1], spatial[0, 2], spatial[1, 0]])]
         )
-    return found
+    return computed
 
 
 def test_dependent_rows_give_the_same_motion_and_the_least_multipliers():
@@ -259,8 +261,8 @@ def test_rows_without_a_solution_are_reported():
     q, v = jnp.zeros(2), jnp.ones(2)
     system = LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 2)
     rest, move = Pfaffian(lambda q, t: jnp.eye(2)[:1]), Pfaffian(lambda q, t: jnp.eye(2)[:1], lambda q, t: t[None])
-    found = constrained_dynamics(Scene(system, (rest, move)), q, v)
-    assert bool(found.result == RESULTS.contradictory_rows) and int(found.rank) == 1
+    dynamics = constrained_dynamics(Scene(system, (rest, move)), q, v)
+    assert bool(dynamics.result == RESULTS.contradictory_rows) and int(dynamics.rank) == 1
 
 
 def differences(function, direction, h=1e-3):
@@ -277,8 +279,8 @@ def test_derivatives_in_states_and_masses_where_rows_depend():
     def value(x):
         scale = jnp.ones((3, 1)) + x[6] * jnp.asarray([[0.0], [0.0], [1.0]])
         model = scene.system.replace(inertias=scene.system.inertias * scale)
-        found = constrained_dynamics(Scene(model, scene.constraints), q + x[:3], v + x[3:6])
-        return jnp.sum(found.acceleration * jnp.asarray([1.0, -0.3, 0.7])) + jnp.sum(found.multipliers**2)
+        dynamics = constrained_dynamics(Scene(model, scene.constraints), q + x[:3], v + x[3:6])
+        return jnp.sum(dynamics.acceleration * jnp.asarray([1.0, -0.3, 0.7])) + jnp.sum(dynamics.multipliers**2)
 
     direction = jnp.asarray(np.random.default_rng(0).normal(size=7))
     slope = quick(jax.grad(value))(jnp.zeros(7))
@@ -296,8 +298,8 @@ def test_second_derivatives_where_rows_depend():
     def value(x, scene, method):
         return jnp.sum(constrained_dynamics(scene, x[:3], x[3:], method=method).acceleration ** 2)
 
-    x, still = jnp.concatenate([q, v]), jnp.concatenate([q, 0 * v])
-    for at in (x, still):
+    x, at_rest = jnp.concatenate([q, v]), jnp.concatenate([q, 0 * v])
+    for at in (x, at_rest):
         one, other, direct = (
             quick(jax.hessian(lambda x, s=s, m=m: value(x, s, m)))(at)
             for s, m in ((once, "rank_aware"), (twice, "rank_aware"), (once, "schur"))
@@ -334,24 +336,24 @@ def test_printed_numbers():
     """Planar pendulum of EQUATIONS section 6, Andrews' mechanism at its start, the coin's contact force."""
     angle, rate, mass, length = 0.5, 1.7, 0.7, 1.2
     q, v = scenes.pendulum_in_plane.start(length=length, angle=angle, rate=rate)
-    found = constrained_dynamics(scenes.pendulum_in_plane(mass=mass, length=length), q, v)
-    np.testing.assert_allclose(found.multipliers, -7.04496621, rtol=1e-9)
-    np.testing.assert_allclose(-length * found.multipliers, 8.45395945, rtol=1e-9)
+    dynamics = constrained_dynamics(scenes.pendulum_in_plane(mass=mass, length=length), q, v)
+    np.testing.assert_allclose(dynamics.multipliers, -7.04496621, rtol=1e-9)
+    np.testing.assert_allclose(-length * dynamics.multipliers, 8.45395945, rtol=1e-9)
 
     q, v = scenes.andrews.start()
-    found = quick(lambda scene: constrained_dynamics(scene, q, v))(scenes.andrews())
+    dynamics = quick(lambda scene: constrained_dynamics(scene, q, v))(scenes.andrews())
     want = [14222.4439199541138705911625887, -10666.8329399655854029433719415, 0, 0, 0, 0, 0]
-    np.testing.assert_allclose(found.acceleration, want, rtol=1e-11, atol=1e-8)
+    np.testing.assert_allclose(dynamics.acceleration, want, rtol=1e-11, atol=1e-8)
     # Printed multipliers stand on the left.
     want = [-98.5668703962410896057654982170, 6.12268834425566265503114393122, 0, 0, 0, 0]
-    np.testing.assert_allclose(found.multipliers, want, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(dynamics.multipliers, want, rtol=1e-11, atol=1e-11)
 
     q, v = scenes.rolling_coin.start()
-    found = quick(lambda scene: constrained_dynamics(scene, q, v))(scenes.rolling_coin())
-    normal, forward, across = found.multipliers
+    dynamics = quick(lambda scene: constrained_dynamics(scene, q, v))(scenes.rolling_coin())
+    normal, forward, across = dynamics.multipliers
     np.testing.assert_allclose([normal, abs(across)], [2.990088, 0.174144017028], rtol=1e-10)
     assert abs(forward) < 1e-12
-    centripetal = found.acceleration[:3] + jnp.cross(v[3:], v[:3])
+    centripetal = dynamics.acceleration[:3] + jnp.cross(v[3:], v[:3])
     np.testing.assert_allclose(jnp.linalg.norm(centripetal), 0.174144017028 / 0.3048, rtol=1e-10)
 
 
@@ -362,8 +364,8 @@ def test_spherical_pendulum_by_projection():
     scene = scenes.spherical_pendulum(length=r)
     assert_close(projections(scene, q).P_T, np.eye(3) - np.outer(q, q) / r**2, 1e-14)
     assert_close(second_fundamental_form(scene, q, v), -(v @ v) / r**2 * q, 1e-14)
-    found = constrained_dynamics(scene, q, v)
-    assert_close(found.multipliers, [(9.81 * q[2] - v @ v) / r**2], 1e-14)
+    dynamics = constrained_dynamics(scene, q, v)
+    assert_close(dynamics.multipliers, [(9.81 * q[2] - v @ v) / r**2], 1e-14)
 
     def place(angles):
         return r * jnp.stack(
@@ -383,19 +385,19 @@ def test_spherical_pendulum_by_projection():
         return jax.jvp(place, (angles,), (speeds,))[1]
 
     _, want = jax.jvp(velocity, (angles, speeds), (speeds, jnp.asarray(accelerations)))
-    assert_close(found.acceleration, want, 1e-13)
+    assert_close(dynamics.acceleration, want, 1e-13)
 
 
 def test_rolling_disk_with_torques():
     """I1 thetadd = tau_theta, (I2 + m rho^2) phidd = tau_phi, multipliers m d/dt (rho phidot (cos, sin))."""
     scene = scenes.rolling_disk(mass=2.0, radius=0.5, steer_inertia=0.125, roll_inertia=0.25)
     q, v = scenes.rolling_disk.start(heading=0.7, steering=1.3, rolling=2.0)
-    found = constrained_dynamics(scene, q, v, jnp.asarray([0.0, 0.0, 0.3, 0.9]))
+    dynamics = constrained_dynamics(scene, q, v, jnp.asarray([0.0, 0.0, 0.3, 0.9]))
     turn, roll = 0.3 / 0.125, 0.9 / (0.25 + 2.0 * 0.25)
     c, s = np.cos(0.7), np.sin(0.7)
     forward = 0.5 * np.array([roll * c - 1.3 * 2.0 * s, roll * s + 1.3 * 2.0 * c])
-    assert_close(found.acceleration, [*forward, turn, roll], 1e-13)
-    assert_close(found.multipliers, 2.0 * forward, 1e-13)
+    assert_close(dynamics.acceleration, [*forward, turn, roll], 1e-13)
+    assert_close(dynamics.multipliers, 2.0 * forward, 1e-13)
 
 
 def test_assemble_finds_the_nearest_configuration():
@@ -405,13 +407,13 @@ def test_assemble_finds_the_nearest_configuration():
 
     @quick
     def solve(guess, rate):
-        found = assemble(scene, guess, rate)
-        before, after = (mass_matrix(scene.system, x) for x in (guess, found.q))
-        pull = before @ difference(scene.system, guess, found.q)
-        return found, pull, after @ (found.v - rate), rows(scene, found.q, found.v, 0.0).A
+        computed = assemble(scene, guess, rate)
+        before, after = (mass_matrix(scene.system, x) for x in (guess, computed.q))
+        pull = before @ difference(scene.system, guess, computed.q)
+        return computed, pull, after @ (computed.v - rate), rows(scene, computed.q, computed.v, 0.0).A
 
-    found, pull, change, row = solve(guess, rate)
-    assert float(found.residual.max()) < 1e-13
+    computed, pull, change, row = solve(guess, rate)
+    assert float(computed.residual.max()) < 1e-13
     # A stationary point: M (q - guess) is a combination of the rows.
     left = pull - row.T @ np.linalg.lstsq(np.asarray(row.T), np.asarray(pull), rcond=None)[0]
     np.testing.assert_allclose(left, 0, atol=1e-6)  # Newton's last steps, to close the loop, are not taken along it
@@ -444,12 +446,12 @@ def test_assembling_with_a_joint_held():
     scene, (q, v) = scenes.four_bar(), scenes.four_bar.start()
     names = scene.system.joint_names
     wanted = float(q[0]) + 0.2
-    found = assemble(scene, q, v, hold={names[0]: wanted})
-    np.testing.assert_allclose(found.q[0], wanted, atol=1e-12)
-    np.testing.assert_allclose(residuals(scene, found.q, found.v), 0, atol=1e-12)
-    assert float(jnp.max(jnp.abs(found.v))) > 0.1
-    again = assemble(scene, found.q, found.v)
-    np.testing.assert_allclose(again.q, found.q, atol=1e-12)
+    assembly = assemble(scene, q, v, hold={names[0]: wanted})
+    np.testing.assert_allclose(assembly.q[0], wanted, atol=1e-12)
+    np.testing.assert_allclose(residuals(scene, assembly.q, assembly.v), 0, atol=1e-12)
+    assert float(jnp.max(jnp.abs(assembly.v))) > 0.1
+    again = assemble(scene, assembly.q, assembly.v)
+    np.testing.assert_allclose(again.q, assembly.q, atol=1e-12)
     with pytest.raises(ValueError, match="'elbow9' is not in model"):
         assemble(scene, q, hold={"elbow9": 0.1})
     with pytest.raises(ValueError, match=r"not assembled: .*nor are they from 3 configurations"):
@@ -460,10 +462,10 @@ def test_assembling_from_a_bad_guess():
     """Stretched out, the loop's equations do not say to which side it closes; a configuration beside it does."""
     scene, straight = scenes.four_bar(), jnp.zeros(3)
     assert not bool(assemble(scene, straight, guesses=1, throw=False).success)
-    found = assemble(scene, straight)
-    assert found.guesses == 2
-    np.testing.assert_allclose(residuals(scene, found.q, found.v), 0, atol=1e-12)
-    np.testing.assert_array_equal(found.q, assemble(scene, straight).q)
+    assembly = assemble(scene, straight)
+    assert assembly.guesses == 2
+    np.testing.assert_allclose(residuals(scene, assembly.q, assembly.v), 0, atol=1e-12)
+    np.testing.assert_array_equal(assembly.q, assemble(scene, straight).q)
     with pytest.raises(ValueError, match="guesses is 0"):
         assemble(scene, straight, guesses=0)
 
@@ -477,15 +479,15 @@ def test_assembling_from_afar_is_differentiable(in_plane):
     guess, weights = q + jnp.asarray([0.5, -0.3, 0.4]), jnp.asarray([0.3, -1.0, 0.5])
     step = jnp.asarray([0.2, 0.5, -0.7, 1.0])
 
-    def found(x):
+    def computed(x):
         model = scene.system.replace(home=scene.system.home.at[2, 0, 3].add(x[3]))
         return jnp.vdot(weights, assemble(Scene(model, scene.constraints), guess + x[:3]).q)
 
     def along(x):
-        return jax.jvp(found, (x,), (step,))[1]
+        return jax.jvp(computed, (x,), (step,))[1]
 
     def everything(x):
-        return found(x), along(x), jnp.vdot(jax.grad(found)(x), step), jax.jvp(along, (x,), (step,))[1]
+        return computed(x), along(x), jnp.vdot(jax.grad(computed)(x), step), jax.jvp(along, (x,), (step,))[1]
 
     h = 1e-4
     places = h * jnp.stack([-step, jnp.zeros(4), step])
@@ -527,11 +529,11 @@ def test_a_wheel_built_from_bodies_moves_as_the_disk_in_coordinates():
     scene = Scene(builder.build(), (wheel,))
     q, v = jnp.asarray([0.1, 0.2, 0.7, 0.3]), jnp.asarray([rho * 2.0, 0.0, 1.3, 2.0])
     solve = quick(lambda scene, q, v, tau: (residuals(scene, q, v), constrained_dynamics(scene, q, v, tau)))
-    error, found = solve(scene, q, v, jnp.asarray([0.0, 0.0, 0.3, 0.9]))
+    error, computed = solve(scene, q, v, jnp.asarray([0.0, 0.0, 0.3, 0.9]))
     assert float(error.max()) < 1e-14
     turn, rolling = 0.3 / steer, 0.9 / (roll + mass * rho**2)
-    assert_close(found.acceleration, [rho * rolling, 0.0, turn, rolling], 1e-12)
-    assert_close(found.multipliers[1:], [mass * rho * 2.0 * 1.3], 1e-12)
+    assert_close(computed.acceleration, [rho * rolling, 0.0, turn, rolling], 1e-12)
+    assert_close(computed.multipliers[1:], [mass * rho * 2.0 * 1.3], 1e-12)
 
 
 def test_locked_joints_and_float32():
@@ -541,10 +543,10 @@ def test_locked_joints_and_float32():
     locked = Scene(model, (lock_joint("2", float(q[1])), lock_joint("3", float(q[2]))))
     v = jnp.asarray([1.0, 0.0, 0.0])
     solve = quick(lambda scene, q, v: constrained_dynamics(scene, q, v))
-    found = solve(locked, q, v)
+    solution = solve(locked, q, v)
     M, h = quick(lambda q, v: (mass_matrix(model, q), bias_force(model, q, v)))(q, v)
-    assert_close(found.acceleration, [-h[0] / M[0, 0], 0.0, 0.0], 1e-13)
+    assert_close(solution.acceleration, [-h[0] / M[0, 0], 0.0, 0.0], 1e-13)
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, locked)
     low = solve(single, q.astype(jnp.float32), v.astype(jnp.float32))
     assert low.acceleration.dtype == low.multipliers.dtype == jnp.float32
-    assert_close(low.acceleration, found.acceleration, 1e-5)
+    assert_close(low.acceleration, solution.acceleration, 1e-5)

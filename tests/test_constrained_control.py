@@ -51,9 +51,9 @@ def test_motion_and_force_on_a_sphere(pendulum, ki):
     """Errors by the closed form; the force is the wanted one at every moment."""
     scene, q0, v0 = pendulum
     law = jd.control.HybridForce(scene, first_two, circle, KP, KD, force=lambda t: PRESS + jnp.sin(t), ki=ki)
-    found = jd.simulate(scene, q0, v0, TS, control=law, stepsize=0.005, outputs=("multipliers",))
-    assert_decays(TS, found.q[:, :2] - jax.vmap(circle)(TS), start_rate=start_rate(first_two, circle, q0, v0))
-    np.testing.assert_allclose(found.multipliers[:, 0], 2.0 + np.sin(TS), rtol=1e-10)
+    solution = jd.simulate(scene, q0, v0, TS, control=law, stepsize=0.005, outputs=("multipliers",))
+    assert_decays(TS, solution.q[:, :2] - jax.vmap(circle)(TS), start_rate=start_rate(first_two, circle, q0, v0))
+    np.testing.assert_allclose(solution.multipliers[:, 0], 2.0 + np.sin(TS), rtol=1e-10)
 
 
 def test_wrong_mass_shifts_the_force_by_the_stated_error(pendulum):
@@ -75,15 +75,15 @@ def test_integral_action_takes_a_force_error_away():
     model = scenes.spherical_pendulum(mass=1.6)
     law = jd.control.HybridForce(model, first_two, jnp.zeros(2), KP, KD, force=PRESS, ki=4.0)
     outputs = ("multipliers", "control_state", "torque")
-    found = jd.simulate(plant, q0, v0, TS, control=law, stepsize=0.005, outputs=outputs)
-    np.testing.assert_allclose(found.q, np.tile(q0, (TS.size, 1)), atol=1e-12)
-    error = found.multipliers[:, 0] - PRESS[0]
+    solution = jd.simulate(plant, q0, v0, TS, control=law, stepsize=0.005, outputs=outputs)
+    np.testing.assert_allclose(solution.q, np.tile(q0, (TS.size, 1)), atol=1e-12)
+    error = solution.multipliers[:, 0] - PRESS[0]
     np.testing.assert_allclose(error, 0.3 * 9.81 * np.exp(-4.0 * TS), atol=1e-7)  # of RK4's steps
     fitted = np.polyfit(TS, np.log(error), 1)[0]
     np.testing.assert_allclose(fitted, -4.0, rtol=0.01)
-    np.testing.assert_allclose(found.control_state[:, 0], 0.3 * 9.81 * (1 - np.exp(-4.0 * TS)) / 4.0, atol=1e-7)
-    again = jax.vmap(law)(found.q, found.v, TS, found.control_state)
-    np.testing.assert_allclose(found.torque, again, atol=1e-12)
+    np.testing.assert_allclose(solution.control_state[:, 0], 0.3 * 9.81 * (1 - np.exp(-4.0 * TS)) / 4.0, atol=1e-7)
+    again = jax.vmap(law)(solution.q, solution.v, TS, solution.control_state)
+    np.testing.assert_allclose(solution.torque, again, atol=1e-12)
 
 
 def test_velocities_of_a_rolling_disk():
@@ -99,10 +99,10 @@ def test_velocities_of_a_rolling_disk():
 
     kp, force = np.array([3.0, 5.0]), jnp.asarray([0.7, -0.4])
     law = jd.control.HybridForce(scene, rates, target, kp, of="velocity", force=force, ki=2.0)
-    found = jd.simulate(scene, q0, v0, TS, control=law, stepsize=0.005, outputs=("multipliers",))
-    errors = np.asarray(found.v[:, 2:] - jax.vmap(target)(TS))
+    solution = jd.simulate(scene, q0, v0, TS, control=law, stepsize=0.005, outputs=("multipliers",))
+    errors = np.asarray(solution.v[:, 2:] - jax.vmap(target)(TS))
     np.testing.assert_allclose(errors, errors[0] * np.exp(-np.outer(TS, kp)), atol=1e-8)
-    np.testing.assert_allclose(found.multipliers, np.tile(force, (TS.size, 1)), atol=1e-10)
+    np.testing.assert_allclose(solution.multipliers, np.tile(force, (TS.size, 1)), atol=1e-10)
 
 
 def test_three_motors_of_a_parallel_manipulator():
@@ -132,9 +132,9 @@ def test_three_motors_of_a_parallel_manipulator():
     tau, moved, full, P_w, J, bend, place = compute(q, v)
     rate = jax.jvp(target, (0.3,), (1.0,))[1]
     wanted = -target(0.3) - KD * (J @ v - rate) - KP * (place - target(0.3))
-    for x, found in zip(tau, moved, strict=True):
+    for x, computed in zip(tau, moved, strict=True):
         assert not np.asarray(x)[[1, 3, 5]].any()
-        np.testing.assert_allclose(J @ found.acceleration + bend, wanted, rtol=1e-9)
+        np.testing.assert_allclose(J @ computed.acceleration + bend, wanted, rtol=1e-9)
     shortest = np.linalg.pinv(np.asarray(P_w)[:, motors], rcond=1e-9) @ np.asarray(P_w @ full)
     np.testing.assert_allclose(tau[0][np.array(motors)], shortest, rtol=1e-9)
     assert np.abs(tau[1] - tau[0]).max() > 0.01
@@ -147,14 +147,14 @@ def test_gauge_invariant_law_decays_as_its_gain_says(pendulum):
     scene, q0, v0 = pendulum
     p, k = 2.0, 3.0
     law = jd.control.GaugeInvariant(scene, first_two, circle, p, k, force=PRESS, ki=1.0)
-    found = jd.simulate(scene, q0, v0, TS, control=law, stepsize=0.01, outputs=("multipliers",))
+    solution = jd.simulate(scene, q0, v0, TS, control=law, stepsize=0.01, outputs=("multipliers",))
     moved = jax.vmap(jax.jacfwd(circle))(TS)
-    slow = found.v[:, :2] - moved + p * (found.q[:, :2] - jax.vmap(circle)(TS))
+    slow = solution.v[:, :2] - moved + p * (solution.q[:, :2] - jax.vmap(circle)(TS))
     # On the sphere a velocity (x', y') of the first two coordinates is one of z' = -(x x' + y y')/z.
-    up = -jnp.sum(found.q[:, :2] * slow, 1) / found.q[:, 2]
+    up = -jnp.sum(solution.q[:, :2] * slow, 1) / solution.q[:, 2]
     size = jnp.sqrt(1.3 * (jnp.sum(slow**2, 1) + up**2))
     np.testing.assert_allclose(size, size[0] * np.exp(-k * TS), rtol=1e-6)
-    np.testing.assert_allclose(found.multipliers, np.tile(PRESS, (TS.size, 1)), atol=1e-9)
+    np.testing.assert_allclose(solution.multipliers, np.tile(PRESS, (TS.size, 1)), atol=1e-9)
 
 
 def test_geometric_and_gauge_invariant_laws_are_equal_for_matched_gains(pendulum, torques):
@@ -170,10 +170,10 @@ def test_geometric_and_gauge_invariant_laws_are_equal_for_matched_gains(pendulum
     slow = v[:2] - jax.jacfwd(circle)(0.3) + p * (q[:2] - circle(0.3))
     turning = jax.jvp(motion, (q,), (v,))[1]
     # M = 1.3 and C = 0, of which the part along the sphere.
-    apart = 1.3 * turning @ slow
-    apart = apart - q * (q @ apart) / (q @ q)
-    np.testing.assert_allclose(hybrid - gauge, apart, atol=1e-10)
-    assert np.abs(apart).max() > 0.01
+    difference = 1.3 * turning @ slow
+    difference = difference - q * (q @ difference) / (q @ q)
+    np.testing.assert_allclose(hybrid - gauge, difference, atol=1e-10)
+    assert np.abs(difference).max() > 0.01
     v = motion(q) @ (jax.jacfwd(circle)(0.3) - p * (q[:2] - circle(0.3)))
     np.testing.assert_allclose(*both(q, v, 0.3), atol=1e-10)
 
@@ -230,8 +230,8 @@ def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
     scene, reach = pendulum[0], jnp.asarray([1.5, 0.0])
     q0, v0 = jnp.asarray([0.6, 0.0, -0.8]), jnp.zeros(3)
     law = jd.control.HybridForce(scene, first_two, reach, KP, KD, least_regularity=0.1)
-    found = jd.simulate(scene, q0, v0, TS, control=law, throw=False)
-    assert found.result == jd.RESULTS.control_singular and not bool(found.success)
+    solution = jd.simulate(scene, q0, v0, TS, control=law, throw=False)
+    assert solution.result == jd.RESULTS.control_singular and not bool(solution.success)
     # The row of x is at the angle to the sphere's normal whose sine is |z|.
     np.testing.assert_allclose(law.regularity(q0, v0), 0.8, rtol=1e-12)
 
@@ -239,8 +239,8 @@ def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
         return 1.5 + decayed(np.array([t]), np.array([-0.9]), np.zeros(1))[0, 0] - np.sqrt(1 - 0.1**2)
 
     time = brentq(beside, 0.0, 2.0, xtol=1e-14)
-    np.testing.assert_allclose(found.stats["time_reached"], time, rtol=1e-7)
-    assert np.isfinite(found.q[TS < time]).all() and np.isnan(found.q[TS > time]).all()
+    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-7)
+    assert np.isfinite(solution.q[TS < time]).all() and np.isnan(solution.q[TS > time]).all()
     with pytest.raises(RuntimeError, match=r"lose rank.*least_regularity"):
         jd.simulate(scene, q0, v0, TS, control=law)
 
@@ -273,20 +273,20 @@ def test_arm_on_a_sphere(contact):
             scene, task, goal, 4.0, of="velocity", force=jnp.asarray([5.0, 0.3, -0.2, 0.01]), ki=2.0
         )
     ts = TS[:11]
-    found = jd.simulate(scene, q0, v0, ts, control=law, stepsize=0.01, outputs=("multipliers",))
+    solution = jd.simulate(scene, q0, v0, ts, control=law, stepsize=0.01, outputs=("multipliers",))
     lam = np.asarray(law.wanted_force(q0, 0.0))
-    np.testing.assert_allclose(found.multipliers, np.tile(lam, (ts.size, 1)), atol=1e-7)
+    np.testing.assert_allclose(solution.multipliers, np.tile(lam, (ts.size, 1)), atol=1e-7)
     if contact == "frictionless":
-        errors = np.asarray(jax.vmap(lambda q: task(q) - goal)(found.q))
+        errors = np.asarray(jax.vmap(lambda q: task(q) - goal)(solution.q))
         rate = jax.jvp(task, (q0,), (v0,))[1]
         np.testing.assert_allclose(
             errors, decayed(np.asarray(ts), errors[0], np.asarray(rate)), atol=1e-6
         )  # RK4, 10 ms
     else:
-        errors = np.asarray(jax.vmap(lambda q, v: task(q, v) - goal)(found.q, found.v))
+        errors = np.asarray(jax.vmap(lambda q, v: task(q, v) - goal)(solution.q, solution.v))
         np.testing.assert_allclose(errors, errors[0] * np.exp(-4.0 * np.asarray(ts))[:, None], atol=1e-6)
     # The contact that the documents' kinematics see: the distance of the centres.
-    pose = jax.vmap(lambda q: jd.frame_pose(model, q, "tip"))(found.q)
+    pose = jax.vmap(lambda q: jd.frame_pose(model, q, "tip"))(solution.q)
     gap = np.linalg.norm(np.asarray(pose)[:, :3, 3] - np.array([0.5, 0.0, 0.0]), axis=1)
     at = montana(Sphere(0.15, poles="y"), Sphere(0.03), jnp.asarray([0.2, -0.1, 0.15, 0.1, 0.3]))
     np.testing.assert_allclose(gap, np.linalg.norm(at.g_of[:3, 3]), atol=1e-9)

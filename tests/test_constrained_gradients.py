@@ -69,18 +69,18 @@ def final(x, method="projected", adjoint=None):
     """q and v at the end, (6,)."""
     scene, q, v = mechanism(x)
     control = jax.tree_util.Partial(torque, x[6:])
-    found = simulate(scene, q, v, TS, control=control, method=method, stepsize=0.01, adjoint=adjoint)
-    return jnp.concatenate([found.q[-1], found.v[-1]])
+    solution = simulate(scene, q, v, TS, control=control, method=method, stepsize=0.01, adjoint=adjoint)
+    return jnp.concatenate([solution.q[-1], solution.v[-1]])
 
 
 @pytest.fixture(scope="module")
 def slopes():
     """Jacobians (6, 8) by method: in reverse mode, which compiles slowly, for one, in forward mode for the others."""
-    found = {}
+    computed = {}
     for name, method in METHODS.items():
         mode, adjoint = (jax.jacrev, "reverse") if name == "projected" else (jax.jacfwd, "forward")
-        found[name] = quick(mode(lambda x, m=method, a=adjoint: final(x, m, a)))(jnp.zeros(8))
-    return found
+        computed[name] = quick(mode(lambda x, m=method, a=adjoint: final(x, m, a)))(jnp.zeros(8))
+    return computed
 
 
 def differences(run, count, h=1e-3):
@@ -113,9 +113,9 @@ def test_a_thousand_mechanisms_of_different_lengths():
 
     def run(x):
         scene, q, v = mechanism(x)
-        found = simulate(scene, q, v, TS, stepsize=0.01, outputs=("constraint_residual", "energy"))
-        q, v = found.q[-1], found.v[-1]
-        return q, v, found.success, found.constraint_residual.max(), closed(1.0 + x[2], 2.5 + x[3], q[0], v[0])
+        solution = simulate(scene, q, v, TS, stepsize=0.01, outputs=("constraint_residual", "energy"))
+        q, v = solution.q[-1], solution.v[-1]
+        return q, v, solution.success, solution.constraint_residual.max(), closed(1.0 + x[2], 2.5 + x[3], q[0], v[0])
 
     q, v, success, residual, (q_closed, v_closed) = quick(jax.vmap(run))(jnp.asarray(changes))
     assert np.asarray(success).all() and float(residual.max()) < 1e-12
@@ -136,8 +136,8 @@ def test_derivatives_of_a_mechanism_of_bodies(method):
     def final(x):
         model = base.system.replace(inertias=base.system.inertias.at[1].multiply(1.0 + x[0]))
         scene = Scene(model, base.constraints)
-        found = simulate(scene, q, v * (1.0 + x[1]), TS, stepsize=0.02, method=method)
-        return jnp.concatenate([found.q[-1], found.v[-1]])
+        solution = simulate(scene, q, v * (1.0 + x[1]), TS, stepsize=0.02, method=method)
+        return jnp.concatenate([solution.q[-1], solution.v[-1]])
 
     slope = quick(jax.jacrev(final))(jnp.zeros(2))
     want = differences(quick(jax.vmap(final)), 2)

@@ -54,33 +54,33 @@ def solved(request):
     scene = mechanism(request.param)
     q, v, tau = random_states(scene.system, 3, 1)[:3]
 
-    def found(q, v, tau):
+    def computed(q, v, tau):
         return constrained_dynamics(scene, q, v, tau), constrained_dynamics(scene, q, v, tau, method="range_space")
 
     def wanted(q, v, tau):
         row = rows(scene, q, v)
         return dense(scene, q, v, tau), mass_matrix(scene.system, q), bias_force(scene.system, q, v), row.A, row.gamma
 
-    assert has_kernel(jax.vmap(found), q, v, tau)
-    numbers = quick(jax.vmap(found))(q, v, tau)
+    assert has_kernel(jax.vmap(computed), q, v, tau)
+    numbers = quick(jax.vmap(computed))(q, v, tau)
     with jd.compilation("plain"):
-        assert not has_kernel(jax.vmap(found), q, v, tau)
+        assert not has_kernel(jax.vmap(computed), q, v, tau)
         return scene, tau, numbers, quick(jax.vmap(wanted))(q, v, tau)
 
 
 def test_accelerations_and_multipliers_are_those_of_the_dense_solve(solved):
     _, _, numbers, (want, *_) = solved
-    for found in numbers:
+    for computed in numbers:
         # The rows' matrix squares the condition number of the rows, 1e3 at worst here.
-        assert_close(found.acceleration, want.acceleration, 1e-9)
-        assert_close(found.multipliers, want.multipliers, 1e-9)
-        assert found.rank.tolist() == want.rank.tolist() == [want.multipliers.shape[1]] * 3
+        assert_close(computed.acceleration, want.acceleration, 1e-9)
+        assert_close(computed.multipliers, want.multipliers, 1e-9)
+        assert computed.rank.tolist() == want.rank.tolist() == [want.multipliers.shape[1]] * 3
 
 
 def test_equations_of_motion_and_rows_hold(solved):
-    _, tau, (found, _), (_, *equations) = solved
+    _, tau, (computed, _), (_, *equations) = solved
     M, h, A, gamma = (np.asarray(x) for x in equations)
-    a, lam = np.asarray(found.acceleration), np.asarray(found.multipliers)
+    a, lam = np.asarray(computed.acceleration), np.asarray(computed.multipliers)
     pushed = np.einsum("nij,ni->nj", A, lam)
     assert_close(np.einsum("nij,nj->ni", M, a) + h, np.asarray(tau) + pushed, 1e-9)
     assert_close(np.einsum("nij,nj->ni", A, a), gamma, 1e-9)
@@ -100,8 +100,8 @@ def test_derivatives_are_those_of_the_dense_solve(method):
         first, *others = scene.constraints
         pose, q = first.pose_a @ se3.exp(twist), integrate(scene.system, q0, dq)
         first = type(first)(first.name, first.joint, first.body_a, first.body_b, first.in_plane, pose, first.pose_b)
-        found = solve(Scene(scene.system.replace(inertias=inertias), (first, *others)), q, v, tau)
-        return jnp.vdot(weights[0], found.acceleration) + jnp.vdot(weights[1], found.multipliers)
+        computed = solve(Scene(scene.system.replace(inertias=inertias), (first, *others)), q, v, tau)
+        return jnp.vdot(weights[0], computed.acceleration) + jnp.vdot(weights[1], computed.multipliers)
 
     at = scene.system.inertias, jnp.zeros(6), jnp.zeros(scene.nv), v, tau
     steps = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in at)
@@ -114,10 +114,10 @@ def test_derivatives_are_those_of_the_dense_solve(method):
             )
         )(*at)
 
-    found = jax.tree.leaves(derivatives(lambda *x: constrained_dynamics(*x, method=method)))
+    computed = jax.tree.leaves(derivatives(lambda *x: constrained_dynamics(*x, method=method)))
     with jd.compilation("plain"):
         want = jax.tree.leaves(derivatives(dense))
-    for x, y in zip(found, want, strict=True):
+    for x, y in zip(computed, want, strict=True):
         assert_close(x, y, 1e-8)  # derivatives of the dense solve lose the square of the rows' condition number
 
 
@@ -137,12 +137,12 @@ def test_a_singular_sample_is_solved_with_its_rank():
     scene, q, v0 = two_windows()
 
     def run(q):
-        found = constrained_dynamics(scene, q, v0, jnp.zeros(5))
-        return found.acceleration, found.multipliers, found.rank
+        computed = constrained_dynamics(scene, q, v0, jnp.zeros(5))
+        return computed.acceleration, computed.multipliers, computed.rank
 
     def wanted(q):
-        found = dense(scene, q, v0, jnp.zeros(5))
-        return found.acceleration, found.multipliers, found.rank
+        computed = dense(scene, q, v0, jnp.zeros(5))
+        return computed.acceleration, computed.multipliers, computed.rank
 
     program = jax.jit(jax.vmap(run))
     schur = jax.jit(jax.vmap(lambda q: constrained_dynamics(scene, q, v0, jnp.zeros(5), method="schur").acceleration))
@@ -166,8 +166,8 @@ def test_a_sample_is_not_changed_by_a_singular_one_beside_it():
     @jax.jit
     @jax.vmap
     def run(q):
-        found = constrained_dynamics(scene, q, v0, jnp.zeros(5))
-        return found.acceleration, found.multipliers, project_state(scene, q, v0, jnp.asarray(0.0))
+        dynamics = constrained_dynamics(scene, q, v0, jnp.zeros(5))
+        return dynamics.acceleration, dynamics.multipliers, project_state(scene, q, v0, jnp.asarray(0.0))
 
     others = np.array([0, 2, 3])
     for x, y in zip(jax.tree.leaves(run(q)), jax.tree.leaves(run(q.at[1].set(FLAT))), strict=True):
@@ -182,10 +182,10 @@ def test_gradients_beside_a_singular_sample():
         one = jax.grad(lambda q, tau: jnp.sum(turn * solve(scene, q, v0, tau).acceleration), (0, 1))
         return jax.jit(lambda: jax.vmap(one, (0, None))(q, jnp.zeros(5)))()
 
-    found = pulled(constrained_dynamics)
+    computed = pulled(constrained_dynamics)
     with jd.compilation("plain"):
         want = pulled(dense)
-    for x, y in zip(found, want, strict=True):
+    for x, y in zip(computed, want, strict=True):
         assert_close(x[others], y[others], 1e-9)  # through normal equations the condition number is lost twice
         assert np.isfinite(np.asarray(x)).all()
 
@@ -197,15 +197,15 @@ def test_residuals_of_open_loops(name):
     states = [random_states(scene.system, 2, k) for k in range(3)]
     q, v = (jnp.stack([jnp.asarray(state[i]) for state in states]) for i in range(2))
 
-    def found():
+    def computed():
         def one(q, v):
             return residuals(scene, q, v), jax.jacfwd(lambda v: residuals(scene, q, v))(v), consistent(scene, q, v, 0.0)
 
         return jax.jit(jax.vmap(jax.vmap(one)))(q, v)
 
-    by_kernels = found()
+    by_kernels = computed()
     with jd.compilation("plain"):
-        plain = found()
+        plain = computed()
     for x, y in zip(by_kernels, plain, strict=True):
         assert_close(x, y, 1e-12)
     assert not np.any(plain[2])
@@ -238,11 +238,11 @@ def test_systems_of_equations(name):
         return dynamics(tau), slope, jax.jacrev(lambda tau: dynamics(tau).acceleration)(tau) @ along
 
     assert has_kernel(dynamics, tau)
-    found, *slopes = jax.jit(everything)(tau)
+    computed, *slopes = jax.jit(everything)(tau)
     with jd.compilation("plain"):
         three = jnp.stack([tau, tau + along, tau - along])
         wanted = quick(jax.vmap(lambda tau: dense(scene, q, v, tau, t)))(three)
-    for x, y in ((found.acceleration, wanted.acceleration[0]), (found.multipliers, wanted.multipliers[0])):
+    for x, y in ((computed.acceleration, wanted.acceleration[0]), (computed.multipliers, wanted.multipliers[0])):
         np.testing.assert_allclose(x, y, atol=1e-10 * (1 + float(jnp.abs(y).max())), rtol=0)
     change = (wanted.acceleration[1] - wanted.acceleration[2]) / 2  # linear in tau
     for x in slopes:
@@ -253,13 +253,13 @@ def test_dependent_rows_are_left_to_the_careful_way():
     """A row that is given twice: the kernel's pivots say so, and the multipliers are those of least norm."""
     scene, q, v = at_start("rolling_disk")
     twice = jd.Scene(scene.system, (*scene.constraints, *scene.constraints[:1]))
-    found = jax.jit(lambda q, v: constrained_dynamics(twice, q, v))(q, v)
+    dynamics = jax.jit(lambda q, v: constrained_dynamics(twice, q, v))(q, v)
     once = jax.jit(lambda q, v: constrained_dynamics(scene, q, v))(q, v)
     wanted = dense(twice, q, v, 0 * v)
-    assert int(found.rank) == 2
-    np.testing.assert_allclose(found.acceleration, wanted.acceleration, atol=1e-10)
-    np.testing.assert_allclose(found.multipliers, wanted.multipliers, atol=1e-10)
-    np.testing.assert_allclose(found.acceleration, once.acceleration, atol=1e-10)
+    assert int(dynamics.rank) == 2
+    np.testing.assert_allclose(dynamics.acceleration, wanted.acceleration, atol=1e-10)
+    np.testing.assert_allclose(dynamics.multipliers, wanted.multipliers, atol=1e-10)
+    np.testing.assert_allclose(dynamics.acceleration, once.acceleration, atol=1e-10)
 
 
 heard: list = []
@@ -279,7 +279,7 @@ def test_forces_with_effects_have_them_in_every_call():
     run = jax.jit(lambda q, v: constrained_dynamics(loud, q, v))
     assert not heard and "jaxdyn_kernel" in run.lower(q, v).as_text()  # the rest runs in one
     for speed in (1.0, 2.0):
-        found = run(q, v.at[0].set(speed))
+        computed = run(q, v.at[0].set(speed))
     jax.effects_barrier()
     assert sorted(map(str, heard)) == ["1.0", "2.0", "again", "again"]
-    assert bool(jnp.isfinite(found.acceleration).all())
+    assert bool(jnp.isfinite(computed.acceleration).all())

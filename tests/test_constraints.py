@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import inertia, se3
 from jaxdyn.constraints import (
     Holonomic,
@@ -19,7 +20,7 @@ from jaxdyn.constraints import (
     rolling_sphere,
     rolling_wheel,
 )
-from jaxdyn.constraints.base import constraint_jacobian, layout, position_residual, rows, velocity_residual
+from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, position_residual, rows, velocity_residual
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.tree import configuration_rate, difference, integrate
@@ -128,7 +129,7 @@ def test_rows_and_gamma_are_rates_along_the_motion(pair, state, everything):
     def along(name):
         return fourth_order(lambda s: np.asarray(evaluate(moved(pair, q, v, s), v, t + s)[name]), h)
 
-    held = np.concatenate([np.arange(p.start, p.slip) for p in places])
+    held = np.concatenate([np.arange(p.start, p.nonholonomic) for p in places])
     assert_close(here["psi"][held], along("phi"), 1e-8)  # error h^4 of the differences
     assert_close(here["gamma"], -along("psi"), 1e-8)
 
@@ -152,13 +153,13 @@ def test_loops_remove_what_the_joint_removes_and_nothing_else(pair, state, every
     T_a = np.asarray(forward_kinematics(pair, q)[0])
     T_b = T_a @ pose_a @ relative @ np.linalg.inv(pose_b)
     step = difference(pair, q, q.at[7:14].set(jnp.asarray([*T_b[:3, 3], *quaternion(T_b[:3, :3])])))
-    found = evaluate(integrate(pair, q, step), jnp.zeros(pair.nv), 0.0)
-    held = [p for p in places if p.slip > p.start]
-    first = sum(p.slip - p.start for p in held[: held.index(place)])
+    computed = evaluate(integrate(pair, q, step), jnp.zeros(pair.nv), 0.0)
+    held = [p for p in places if p.nonholonomic > p.start]
+    first = sum(p.nonholonomic - p.start for p in held[: held.index(place)])
     count = place.end - place.start
     assert count == 6 - len(free)
-    np.testing.assert_allclose(found["phi"][first : first + count], 0, atol=1e-13)
-    A = np.asarray(found["A"][place.start : place.end])
+    np.testing.assert_allclose(computed["phi"][first : first + count], 0, atol=1e-13)
+    A = np.asarray(computed["A"][place.start : place.end])
     Ad = np.asarray(se3.Ad(jnp.asarray(pose_b)))
     for twist in free:
         velocity = np.zeros(pair.nv)
@@ -196,7 +197,7 @@ def test_rolling_rows_are_velocities_of_the_touching_points(pair, state, everyth
     def check(name, point, normal, directions, body, ground):
         place = next(p for p in places if p.name == name)
         relative = velocity(body, point) - velocity(ground, point)
-        got = psi[place.slip : place.end][: len(directions)]
+        got = psi[place.nonholonomic : place.end][: len(directions)]
         np.testing.assert_allclose(got, directions @ relative, atol=1e-8)  # error h^4 of the differences
         # Slip directions are an orthonormal part of the tangent plane.
         np.testing.assert_allclose(directions @ normal, 0, atol=1e-13)
@@ -240,8 +241,8 @@ def test_couplings_of_a_model_become_gears():
         builder.add_body(name, None, "revolute", inertia.box(1.0, (1, 1, 1)))
     builder.add_coupling("q_joint", "p_joint", -2.0, 0.3)
     model = builder.build()
-    found = quick(lambda q: position_residual(Scene(model, model_couplings(model)), q))(jnp.asarray([0.5, 0.7]))
-    assert_close(found, [0.7 + 2.0 * 0.5 - 0.3], 1e-15)
+    computed = quick(lambda q: position_residual(Scene(model, model_couplings(model)), q))(jnp.asarray([0.5, 0.7]))
+    assert_close(computed, [0.7 + 2.0 * 0.5 - 0.3], 1e-15)
 
 
 def test_quaternion_rates_enter_rows_on_the_manifold(pair, state):
@@ -286,3 +287,17 @@ def test_names_and_refusals(pair):
     for message, make in made.items():
         with pytest.raises(ValueError, match=message):
             make()
+
+
+def test_former_names_are_taken_with_a_warning():
+    """`slip` of a constraint of one's own is its residual of velocities."""
+    with pytest.warns(DeprecationWarning, match="Mine.slip is called `velocity` now"):
+
+        class Mine(Constraint):
+            name: str = "mine"
+
+            def slip(self, system, q, v, t):
+                return v[:1] - 2.0 * v[1:2]
+
+    system = jd.MetricSystem(lambda q: jnp.eye(2), 2)
+    np.testing.assert_array_equal(jd.constraint_jacobian(jd.Scene(system, (Mine(),)), jnp.zeros(2)), [[1.0, -2.0]])

@@ -43,7 +43,7 @@ def by_edges(G, generators):
     size = generators.shape[0]
     W = np.concatenate([G[:, i : i + size] @ generators for i in range(0, G.shape[1], size)], 1)
     n = W.shape[1]
-    found = linprog(
+    computed = linprog(
         np.append(np.zeros(n), -1),
         np.concatenate([-np.eye(n), np.ones((n, 1))], 1),
         np.zeros(n),
@@ -51,7 +51,7 @@ def by_edges(G, generators):
         np.append(np.zeros(len(W)), 1.0),
         bounds=(None, None),
     )
-    return found.status == 0 and found.x[-1] > 1e-9 and np.linalg.matrix_rank(W, 1e-9) == len(W)
+    return computed.status == 0 and computed.x[-1] > 1e-9 and np.linalg.matrix_rank(W, 1e-9) == len(W)
 
 
 def three(radius=0.1):
@@ -71,26 +71,26 @@ ANTIPODAL = [[0.1, 0, 0], [-0.1, 0, 0]], [[-1.0, 0, 0], [1.0, 0, 0]]
 
 
 def test_two_soft_fingers_that_oppose_each_other_close():
-    found = force_closure(grasp(*ANTIPODAL, "soft-finger"), [SOFT] * 2)
-    assert found.closed and found.rank == 6
+    computed = force_closure(grasp(*ANTIPODAL, "soft-finger"), [SOFT] * 2)
+    assert computed.closed and computed.rank == 6
     # They press with half a newton each; the torque that they may exert is the tighter margin, 0.02 m x 0.5 N.
-    np.testing.assert_allclose(found.margin, 0.01, atol=1e-9)
-    np.testing.assert_allclose(found.forces, [0, 0, 0.5, 0] * 2, atol=1e-7)
+    np.testing.assert_allclose(computed.margin, 0.01, atol=1e-9)
+    np.testing.assert_allclose(computed.forces, [0, 0, 0.5, 0] * 2, atol=1e-7)
 
 
 def test_two_hard_fingers_do_not_resist_a_torque_about_their_line():
-    found = force_closure(grasp(*ANTIPODAL, "hard-finger"), [HARD] * 2)
-    assert not found.closed and found.rank == 5 and found.margin == 0
-    np.testing.assert_allclose(np.abs(found.direction), [0, 0, 0, 1, 0, 0], atol=1e-12)
+    computed = force_closure(grasp(*ANTIPODAL, "hard-finger"), [HARD] * 2)
+    assert not computed.closed and computed.rank == 5 and computed.margin == 0
+    np.testing.assert_allclose(np.abs(computed.direction), [0, 0, 0, 1, 0, 0], atol=1e-12)
 
 
 def test_three_hard_fingers_close_by_a_third_of_their_friction():
     G = grasp(*three(), "hard-finger")
-    found = force_closure(G, [HARD] * 3)
-    assert found.closed
+    computed = force_closure(G, [HARD] * 3)
+    assert computed.closed
     # By symmetry each presses with a third of a newton along its normal.
-    np.testing.assert_allclose(found.margin, 0.5 / 3, atol=1e-9)
-    np.testing.assert_allclose(G @ found.forces, 0, atol=1e-9)
+    np.testing.assert_allclose(computed.margin, 0.5 / 3, atol=1e-9)
+    np.testing.assert_allclose(G @ computed.forces, 0, atol=1e-9)
     # Without friction their lines lie in a plane and meet in a point: what they resist are forces in that plane.
     smooth = force_closure(G, [friction_cone("hard-finger", 0.0)] * 3)
     assert not smooth.closed and smooth.rank == 2
@@ -116,17 +116,17 @@ def test_seven_points_without_friction_close_and_six_do_not():
     cone = friction_cone("frictionless")
     G = grasp(points, normals, "frictionless")
     assert not force_closure(G[:, :6], [cone] * 6).closed
-    found = force_closure(G, [cone] * 7)
-    assert found.closed == by_edges(G, np.ones((1, 1)))
+    computed = force_closure(G, [cone] * 7)
+    assert computed.closed == by_edges(G, np.ones((1, 1)))
 
 
 def test_planar_grasps():
     # Wrenches (fx, fy, tz) of two fingers with friction that oppose each other along x.
     G = np.array([[0, 1, 0, -1], [1, 0, -1, 0], [-0.1, 0, -0.1, 0]])
     cone = friction_cone("hard-finger", 0.4, in_plane=True)
-    found = force_closure(G, [cone] * 2)
-    assert found.closed
-    np.testing.assert_allclose(found.margin, 0.2, atol=1e-9)
+    computed = force_closure(G, [cone] * 2)
+    assert computed.closed
+    np.testing.assert_allclose(computed.margin, 0.2, atol=1e-9)
     assert not force_closure(np.abs(G), [cone] * 2).closed
 
 

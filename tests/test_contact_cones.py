@@ -116,12 +116,12 @@ def test_triangle_agrees_with_a_linear_program():
 
 def test_rectangle_is_differentiable_in_its_sizes():
     wrench = jnp.array([0.1, -0.2, 1.0, 0.01, 0.02, 0.03])
-    found = quick(jax.jacfwd(lambda s: wrench_cone(s[0], s[1], s[2]) @ wrench))(jnp.array([X, Y, MU]))
+    jacobian = quick(jax.jacfwd(lambda s: wrench_cone(s[0], s[1], s[2]) @ wrench))(jnp.array([X, Y, MU]))
     step = 1e-6
     at = quick(jax.vmap(lambda s: wrench_cone(s[0], s[1], s[2]) @ wrench))
     sizes = jnp.array([X, Y, MU])[None] + step * jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
     high, low = np.split(np.asarray(at(sizes)), 2)
-    np.testing.assert_allclose(found.T, (high - low) / (2 * step), atol=1e-9)
+    np.testing.assert_allclose(jacobian.T, (high - low) / (2 * step), atol=1e-9)
 
 
 @pytest.mark.parametrize("kind, gamma", [("hard-finger", None), ("soft-finger", 0.02)])
@@ -161,13 +161,13 @@ def test_margins_are_smooth_and_on_the_safe_side():
 
     @quick
     @jax.vmap
-    def found(f):
+    def computed(f):
         step = 1e-5 * jnp.eye(4)
         differences = (jax.vmap(soft)(f[None] + step) - jax.vmap(soft)(f[None] - step)) / 2e-5
         second = jax.hessian(cone.margin)(f), jax.hessian(soft)(f)
         return cone.margin(f), soft(f), jax.grad(cone.margin)(f), jax.grad(soft)(f), differences, second
 
-    exact, smooth, kinked, gradient, differences, second = found(forces)
+    exact, smooth, kinked, gradient, differences, second = computed(forces)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((kinked, second)))
     assert (exact - smoothing * (1 + np.log(3)) <= smooth).all() and (smooth <= exact).all()
     np.testing.assert_allclose(gradient, differences, atol=1e-6)
@@ -176,8 +176,8 @@ def test_margins_are_smooth_and_on_the_safe_side():
 def test_margins_batch_and_keep_the_dtype():
     cone = friction_cone("hard-finger", jnp.float32(0.5))
     forces = jnp.ones((3, 3), jnp.float32)
-    found = jax.jit(jax.vmap(lambda f: cone.margin(f, 1e-3)))(forces)
-    assert found.dtype == jnp.float32 and found.shape == (3,)
+    computed = jax.jit(jax.vmap(lambda f: cone.margin(f, 1e-3)))(forces)
+    assert computed.dtype == jnp.float32 and computed.shape == (3,)
     slope = jax.grad(lambda mu: friction_cone("hard-finger", mu).margin(jnp.array([0.1, 0.2, 3.0])))(0.5)
     np.testing.assert_allclose(slope, 3.0)
 

@@ -23,10 +23,10 @@ def held_ball():
 
 def test_optimal_forces_hold_the_ball():
     hand, G = held_ball()
-    found = quick(lambda G, w: optimal_forces(G, w, [CONE] * 3, preload=0.2))(G, -WEIGHT)
-    assert bool(found.result == RESULTS.successful)
-    np.testing.assert_allclose(G @ found.x, -WEIGHT, atol=1e-12)
-    told = contact_forces(hand, found.x, CONE)
+    computed = quick(lambda G, w: optimal_forces(G, w, [CONE] * 3, preload=0.2))(G, -WEIGHT)
+    assert bool(computed.result == RESULTS.successful)
+    np.testing.assert_allclose(G @ computed.x, -WEIGHT, atol=1e-12)
+    told = contact_forces(hand, computed.x, CONE)
     assert list(told.forces) == ["tip1", "tip2", "tip3"]
     # Three equal fingers, each with a third of the weight as friction: mu f_n - w / 3 = 0.2 N at the least force.
     normal = (0.2 + 0.4 * 9.81 / 3) / 0.8
@@ -48,7 +48,7 @@ def test_optimal_forces_hold_the_ball():
             {"type": "ineq", "fun": lambda f: f[2::3]},
         ],
     )
-    np.testing.assert_allclose(found.x, other.x, atol=1e-6)
+    np.testing.assert_allclose(computed.x, other.x, atol=1e-6)
 
 
 def test_optimal_forces_are_differentiable_in_friction_and_wrench():

@@ -33,14 +33,14 @@ def test_contact_coordinates_are_the_inverse_of_the_pose(pair):
         # The finger moves by V_of = Ad V_c, and lifts along its own normal.
         lifted = at.g_of @ moved @ se3.exp(jnp.asarray([0, 0, -0.01, 0, 0, 0])) @ se3.inverse(moved)
         velocity = se3.Ad_apply(moved, twist)
-        found = jd.contact.contact_coordinates
-        again, rate = jax.jvp(lambda s: found(*surfaces, at.g_of @ se3.exp(s * velocity)), (0.0,), (1.0,))
-        return again, found(*surfaces, lifted), rate, at.forward @ twist
+        computed = jd.contact.contact_coordinates
+        again, rate = jax.jvp(lambda s: computed(*surfaces, at.g_of @ se3.exp(s * velocity)), (0.0,), (1.0,))
+        return again, computed(*surfaces, lifted), rate, at.forward @ twist
 
     twist = jnp.asarray([0.2, -0.1, 0.0, 0.4, 0.3, 0.5])
-    again, apart, rate, want = compute(ETA, twist)
+    again, difference, rate, want = compute(ETA, twist)
     np.testing.assert_allclose(again, ETA, atol=1e-12)
-    np.testing.assert_allclose(apart, ETA, atol=1e-12)
+    np.testing.assert_allclose(difference, ETA, atol=1e-12)
     np.testing.assert_allclose(rate, want, atol=1e-10)
 
 
@@ -128,13 +128,13 @@ def test_contact_coordinates_of_the_whole_arm_follow():
     q, v = scenes.sphere_arm.start(rolling=(0.0, 0.0))
     task, place = task_of(scene), ETA + jnp.asarray([0.05, -0.04, 0.1, -0.05, 0.1])
     law = jd.control.HybridForce(scene, task, place, KP, KD, force=jnp.asarray([5.0]), ki=2.0)
-    found = jd.simulate(scene, q, v, TS, control=law, stepsize=0.02, outputs=("multipliers",))
-    errors = np.asarray(jax.vmap(lambda q: task(q) - place)(found.q))
+    solution = jd.simulate(scene, q, v, TS, control=law, stepsize=0.02, outputs=("multipliers",))
+    errors = np.asarray(jax.vmap(lambda q: task(q) - place)(solution.q))
     exact = decayed(np.asarray(TS), errors[0], np.zeros(5))
     np.testing.assert_allclose(errors, exact, atol=1e-6)  # of RK4's steps of 20 ms
     slopes = [np.polyfit(TS[-6:], np.log(np.abs(e[-6:])), 1)[0] for e in (errors, exact)]
     np.testing.assert_allclose(*slopes, rtol=0.01)
-    np.testing.assert_allclose(found.multipliers[:, 0], 5.0, atol=1e-7)
+    np.testing.assert_allclose(solution.multipliers[:, 0], 5.0, atol=1e-7)
 
 
 @pytest.mark.slow
@@ -145,11 +145,11 @@ def test_rates_of_a_tip_that_rolls_follow():
     task, lam = task_of(scene), jnp.asarray([5.0, 0.3, -0.2, 0.01])
     target = jnp.asarray([0.05, -0.04])
     law = jd.control.HybridForce(scene, task.rolling, target, 4.0, of="velocity", force=lam, ki=2.0)
-    found = jd.simulate(scene, q, v, TS, control=law, stepsize=0.02, outputs=("multipliers",))
-    errors = np.asarray(jax.vmap(task.rolling)(found.q, found.v)) - np.asarray(target)
+    solution = jd.simulate(scene, q, v, TS, control=law, stepsize=0.02, outputs=("multipliers",))
+    errors = np.asarray(jax.vmap(task.rolling)(solution.q, solution.v)) - np.asarray(target)
     np.testing.assert_allclose(errors, errors[0] * np.exp(-4.0 * np.asarray(TS))[:, None], atol=1e-6)
     np.testing.assert_allclose(np.polyfit(TS[:8], np.log(np.abs(errors[:8])), 1)[0], -4.0, rtol=0.01)
-    np.testing.assert_allclose(found.multipliers, np.tile(lam, (TS.size, 1)), atol=1e-7)
+    np.testing.assert_allclose(solution.multipliers, np.tile(lam, (TS.size, 1)), atol=1e-7)
 
 
 def test_what_does_not_fit_is_refused():

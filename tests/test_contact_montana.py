@@ -56,14 +56,14 @@ def sphere_J_c(R, r, eta):
 @pytest.mark.parametrize("poles", ["x", "y", "z"])
 def test_sphere_has_its_closed_form(poles):
     R, alpha = 0.3, jnp.array([0.4, -0.9])
-    found = surface_geometry(Sphere(R, poles), alpha)
-    np.testing.assert_allclose(found.metric, np.diag([R, R * np.cos(0.4)]), atol=1e-14)
-    np.testing.assert_allclose(found.curvature, np.eye(2) / R, atol=1e-13)
-    np.testing.assert_allclose(found.torsion, [0, -np.tan(0.4) / R], atol=1e-13)
-    np.testing.assert_allclose(found.frame[:, 2], found.point / R, atol=1e-14)
-    np.testing.assert_allclose(found.frame.T @ found.frame, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose(Sphere(R, poles).coordinates(found.point), alpha, atol=1e-14)
-    assert np.linalg.det(found.frame) > 0 and bool(found.regular)
+    computed = surface_geometry(Sphere(R, poles), alpha)
+    np.testing.assert_allclose(computed.metric, np.diag([R, R * np.cos(0.4)]), atol=1e-14)
+    np.testing.assert_allclose(computed.curvature, np.eye(2) / R, atol=1e-13)
+    np.testing.assert_allclose(computed.torsion, [0, -np.tan(0.4) / R], atol=1e-13)
+    np.testing.assert_allclose(computed.frame[:, 2], computed.point / R, atol=1e-14)
+    np.testing.assert_allclose(computed.frame.T @ computed.frame, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(Sphere(R, poles).coordinates(computed.point), alpha, atol=1e-14)
+    assert np.linalg.det(computed.frame) > 0 and bool(computed.regular)
 
 
 def test_plane_and_cylinder_have_their_closed_forms():
@@ -82,15 +82,15 @@ def test_ellipsoid_has_its_gaussian_and_mean_curvature():
     # Goldman (2005), curvature of implicit surfaces: with h the distance of the tangent plane from the centre.
     a, b, c = 0.1, 0.2, 0.15
     for alpha in ([0.3, 0.2], [-0.8, 2.0], [1.1, -1.0]):
-        found = surface_geometry(EGG, jnp.array(alpha))
-        x, y, z = found.point
+        computed = surface_geometry(EGG, jnp.array(alpha))
+        x, y, z = computed.point
         assert abs(x**2 / a**2 + y**2 / b**2 + z**2 / c**2 - 1) < 1e-14
         h = 1 / np.sqrt(x**2 / a**4 + y**2 / b**4 + z**2 / c**4)
         gauss = h**4 / (a * b * c) ** 2
         mean = h**3 * (a**2 + b**2 + c**2 - x**2 - y**2 - z**2) / (2 * (a * b * c) ** 2)
-        np.testing.assert_allclose(np.linalg.det(found.curvature), gauss, rtol=1e-12)
-        np.testing.assert_allclose(np.trace(found.curvature) / 2, mean, rtol=1e-12)
-        np.testing.assert_allclose(found.curvature, found.curvature.T, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.det(computed.curvature), gauss, rtol=1e-12)
+        np.testing.assert_allclose(np.trace(computed.curvature) / 2, mean, rtol=1e-12)
+        np.testing.assert_allclose(computed.curvature, computed.curvature.T, atol=1e-12)
 
 
 def test_flipping_turns_the_normal_and_the_curvature():
@@ -102,18 +102,18 @@ def test_flipping_turns_the_normal_and_the_curvature():
 
 
 def test_sphere_on_sphere_is_the_closed_form():
-    found = montana(*PAIRS["sphere on sphere"], ETA)
-    np.testing.assert_allclose(found.J_c, sphere_J_c(0.1, 0.02, np.asarray(ETA)), atol=1e-13)
+    kinematics = montana(*PAIRS["sphere on sphere"], ETA)
+    np.testing.assert_allclose(kinematics.J_c, sphere_J_c(0.1, 0.02, np.asarray(ETA)), atol=1e-13)
     # Rolling with angular velocity w, the contact runs over each sphere at w R r / (R + r).
-    rates = found.rolling @ jnp.array([0.6, -0.8])
+    rates = kinematics.rolling @ jnp.array([0.6, -0.8])
     for i, (R, alpha) in enumerate(((0.1, ETA[:2]), (0.02, ETA[2:4]))):
         speed = np.hypot(R * rates[2 * i], R * np.cos(alpha[0]) * rates[2 * i + 1])
         np.testing.assert_allclose(speed, 0.1 * 0.02 / 0.12, rtol=1e-12)
 
 
 def test_ball_on_a_plane_rolls_by_its_radius():
-    found = montana(Plane(), Sphere(0.1), ETA)
-    np.testing.assert_allclose(jnp.linalg.norm((found.rolling @ jnp.array([0.6, -0.8]))[:2]), 0.1, rtol=1e-12)
+    kinematics = montana(Plane(), Sphere(0.1), ETA)
+    np.testing.assert_allclose(jnp.linalg.norm((kinematics.rolling @ jnp.array([0.6, -0.8]))[:2]), 0.1, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", PAIRS)
@@ -126,16 +126,16 @@ def test_twists_are_those_of_the_relative_pose(name):
         twists = jnp.stack([se3.vee(se3.inverse(pose) @ rates[..., i]) for i in range(5)], 1)
         return montana(o, f, eta), pose, twists
 
-    found, pose, twists = both(ETA)
-    np.testing.assert_allclose(found.g_of, pose, atol=1e-14)
-    np.testing.assert_allclose(found.J_F, twists, atol=1e-12)
+    computed, pose, twists = both(ETA)
+    np.testing.assert_allclose(computed.g_of, pose, atol=1e-14)
+    np.testing.assert_allclose(computed.J_F, twists, atol=1e-12)
     # The forward form is the inverse on twists that keep contact.
-    np.testing.assert_allclose(found.forward @ found.J_c, np.eye(5), atol=1e-12)
-    np.testing.assert_allclose(found.J_c @ found.forward, np.diag([1, 1, 0, 1, 1, 1]), atol=1e-12)
-    assert bool(found.strict)
+    np.testing.assert_allclose(computed.forward @ computed.J_c, np.eye(5), atol=1e-12)
+    np.testing.assert_allclose(computed.J_c @ computed.forward, np.diag([1, 1, 0, 1, 1, 1]), atol=1e-12)
+    assert bool(computed.strict)
     # The points and normals that touch are the same, seen from both bodies.
-    np.testing.assert_allclose(pose[:3, :3] @ found.finger.point + pose[:3, 3], found.object.point, atol=1e-14)
-    np.testing.assert_allclose(pose[:3, :3] @ found.finger.frame[:, 2], -found.object.frame[:, 2], atol=1e-14)
+    np.testing.assert_allclose(pose[:3, :3] @ computed.finger.point + pose[:3, 3], computed.object.point, atol=1e-14)
+    np.testing.assert_allclose(pose[:3, :3] @ computed.finger.frame[:, 2], -computed.object.frame[:, 2], atol=1e-14)
 
 
 def test_derivatives_of_the_pose_are_its_differences():
@@ -171,8 +171,8 @@ def test_rolling_returns_without_slip_and_spin():
     etas, poses = (np.asarray(x) for x in path(ETA))
     for i in (2, 40, 76):
         rate = (poses[i - 2] - 8 * poses[i - 1] + 8 * poses[i + 1] - poses[i + 2]) / (12 * 0.005)
-        found = montana(o, f, jnp.asarray(etas[i]))
-        twist = se3.Ad_inv_apply(found.finger.pose, se3.vee(jnp.asarray(np.linalg.inv(poses[i]) @ rate)))
+        kinematics = montana(o, f, jnp.asarray(etas[i]))
+        twist = se3.Ad_inv_apply(kinematics.finger.pose, se3.vee(jnp.asarray(np.linalg.inv(poses[i]) @ rate)))
         # Fourth-order differences of steps of 5 ms: errors of order 1e-8 of the rates of the pose.
         np.testing.assert_allclose(twist, [0, 0, 0, *omega(0.005 * i), 0], atol=1e-6)
 
@@ -194,9 +194,9 @@ def test_batches_compile_and_differentiate_in_the_shape():
 def test_where_a_chart_ends_traced_numbers_are_finite_and_told():
     ball = Sphere(0.1)
     pole = jnp.array([jnp.pi / 2, 0.0])
-    found = quick(lambda a: surface_geometry(ball, a))(pole)
-    assert not bool(found.regular)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    computed = quick(lambda a: surface_geometry(ball, a))(pole)
+    assert not bool(computed.regular)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(computed))
     flat = quick(lambda e: montana(Plane(), Plane(), e))(ETA)
     assert not bool(flat.strict) and np.isfinite(flat.forward).all()
     assert float(ball.chart_margin(pole)) < 1e-12 and float(Plane().chart_margin(pole)) == np.inf
@@ -206,9 +206,9 @@ def test_where_a_chart_ends_traced_numbers_are_finite_and_told():
 
 
 def test_float32_stays_float32():
-    found = montana(Sphere(jnp.float32(0.1)), Sphere(jnp.float32(0.02)), ETA.astype(jnp.float32))
-    assert found.J_c.dtype == jnp.float32 == found.forward.dtype
-    np.testing.assert_allclose(found.J_c, sphere_J_c(0.1, 0.02, np.asarray(ETA)), atol=2e-5)
+    kinematics = montana(Sphere(jnp.float32(0.1)), Sphere(jnp.float32(0.02)), ETA.astype(jnp.float32))
+    assert kinematics.J_c.dtype == jnp.float32 == kinematics.forward.dtype
+    np.testing.assert_allclose(kinematics.J_c, sphere_J_c(0.1, 0.02, np.asarray(ETA)), atol=2e-5)
 
 
 BAD = [

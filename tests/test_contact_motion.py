@@ -84,18 +84,18 @@ def test_forces_and_margins_are_those_of_newton(motions):
 def test_a_run_that_may_go_on_reports_negative_margins():
     rates = RATES[SLIPS]
     options = {"control": push(rates), "stepsize": 0.11, "outputs": WORDS}
-    found = jd.simulate(block(), *STILL, TIMES, contacts="report", **options)
-    assert found.success and "lost_contact" not in found.stats
+    solution = jd.simulate(block(), *STILL, TIMES, contacts="report", **options)
+    assert solution.success and "lost_contact" not in solution.stats
     wanted = MU * MASS * GRAVITY - rates[0] * TIMES
-    np.testing.assert_allclose(found.contact_margins["table"], wanted, atol=1e-12)
+    np.testing.assert_allclose(solution.contact_margins["table"], wanted, atol=1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [{}, {"method": "reduced"}, {"method": "variational", "stepsize": 0.01}])
 def test_every_method_finds_the_time(how):
     """Steps of all kinds, while the block turns under the force, which turns with it."""
-    found = jd.simulate(block(), *SPIN, TIMES, control=push([0.0, 30.0]), throw=False, **how)
-    assert found.result == jd.RESULTS.contact_lost
+    solution = jd.simulate(block(), *SPIN, TIMES, control=push([0.0, 30.0]), throw=False, **how)
+    assert solution.result == jd.RESULTS.contact_lost
     weight = MASS * GRAVITY
 
     def margin(t):
@@ -103,7 +103,7 @@ def test_every_method_finds_the_time(how):
         return MU * (weight * np.cos(angle) - 30.0 * t) - weight * np.sin(angle)
 
     # The allowance for rounding, and the tolerance of the variational step's equations.
-    np.testing.assert_allclose(found.stats["time_reached"], brentq(margin, 0.0, 1.0, xtol=1e-14), rtol=1e-7)
+    np.testing.assert_allclose(solution.stats["time_reached"], brentq(margin, 0.0, 1.0, xtol=1e-14), rtol=1e-7)
 
 
 @pytest.mark.slow

@@ -41,11 +41,12 @@ def one(Q, q, G, h, A, b, S, c):
 many = quick(jax.vmap(one))
 
 
-def largest_residual(data, found):
+def largest_residual(data, computed):
     """Largest violation of the conditions of optimality, of numbers of order one to ten."""
     Q, q, G, h, A, b, S, c = (np.asarray(x) for x in data)
     x, z, y, w = (
-        np.asarray(v) for v in (found.x, found.multipliers, found.equality_multipliers, found.cone_multipliers[0])
+        np.asarray(v)
+        for v in (computed.x, computed.multipliers, computed.equality_multipliers, computed.cone_multipliers[0])
     )
     scale = 1 + abs(q).max(1)
     slack, cone = h - np.einsum("bmn,bn->bm", G, x), c - np.einsum("bkdn,bn->bkd", S, x)
@@ -56,29 +57,29 @@ def largest_residual(data, found):
     wrong += [
         abs(slack * z),
         abs((cone * w).sum(-1)),
-        abs(slack - found.slack),
-        abs(cone - found.cone_slack[0]).max(-1),
+        abs(slack - computed.slack),
+        abs(cone - computed.cone_slack[0]).max(-1),
     ]
     return max((part.max(1) / scale).max() for part in wrong)
 
 
 def test_conditions_of_optimality_hold():
     data = problems(200, 1)
-    found = many(*data)
-    assert (found.result == RESULTS.successful).all()
+    computed = many(*data)
+    assert (computed.result == RESULTS.successful).all()
     # The last Newton steps leave rounding, times lengths of rows of ten and multipliers of a hundred.
-    assert largest_residual(data, found) < 1e-10
+    assert largest_residual(data, computed) < 1e-10
     # All kinds of ends occur: cones left alone, on their boundary, at their apex; rows active or not.
-    size, slack = (np.asarray(x)[..., 0] for x in (found.cone_multipliers[0], found.cone_slack[0]))
+    size, slack = (np.asarray(x)[..., 0] for x in (computed.cone_multipliers[0], computed.cone_slack[0]))
     for case in (size < 1e-9, (size > 1e-3) & (slack > 1e-3)):
         assert case.sum() > 20
-    assert (np.asarray(found.multipliers) > 1e-3).sum() > 100
+    assert (np.asarray(computed.multipliers) > 1e-3).sum() > 100
 
 
 def test_agrees_with_clarabel():
     clarabel, sparse = pytest.importorskip("clarabel"), pytest.importorskip("scipy.sparse")
     data = problems(200, 1)
-    found = np.asarray(many(*data).x)
+    computed = np.asarray(many(*data).x)
     settings = clarabel.DefaultSettings()
     settings.verbose, settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = False, 1e-12, 1e-12, 1e-12
     kinds = [clarabel.ZeroConeT(2), clarabel.NonnegativeConeT(ROWS), *[clarabel.SecondOrderConeT(3)] * CONES]
@@ -88,39 +89,41 @@ def test_agrees_with_clarabel():
         level = np.concatenate([b[:2], h, c.ravel()])
         other = clarabel.DefaultSolver(sparse.csc_matrix(np.triu(Q)), q, rows, level, kinds, settings).solve()
         # Clarabel's own conditions of optimality are met to about 1e-8, and x is as sensitive as Q is ill-conditioned.
-        np.testing.assert_allclose(found[i], other.x, atol=2e-5)
-        assert abs(found[i] @ Q @ found[i] / 2 + q @ found[i] - other.obj_val) < 1e-7 * (1 + abs(other.obj_val))
+        np.testing.assert_allclose(computed[i], other.x, atol=2e-5)
+        assert abs(computed[i] @ Q @ computed[i] / 2 + q @ computed[i] - other.obj_val) < 1e-7 * (
+            1 + abs(other.obj_val)
+        )
 
 
 def test_agrees_with_quadprog():
     quadprog = pytest.importorskip("quadprog")
     data = problems(200, 2, cones=False)
-    found = many(*data)
-    assert (found.result == RESULTS.successful).all()
+    computed = many(*data)
+    assert (computed.result == RESULTS.successful).all()
     for i in range(200):
         Q, q, G, h, A, b, _, _ = (np.array(x[i]) for x in data)
         rows = np.concatenate([A[:2], -G]).T.copy()
         other = quadprog.solve_qp(Q, -q, rows, np.concatenate([b[:2], -h]), 2)
-        np.testing.assert_allclose(found.x[i], other[0], rtol=1e-9, atol=1e-10)
-        np.testing.assert_allclose(found.multipliers[i], other[4][2:], rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(computed.x[i], other[0], rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(computed.multipliers[i], other[4][2:], rtol=1e-7, atol=1e-8)
 
 
 def test_infeasible_lanes_are_told_and_leave_the_others_alone():
     data = problems(200, 3, cones=False, feasible=False)
-    found = many(*data)
+    computed = many(*data)
     is_feasible = []
     for i in range(200):
         _, _, G, h, A, b, _, _ = (np.asarray(x[i]) for x in data)
         is_feasible.append(linprog(np.zeros(N), G, h, A[:2], b[:2], bounds=(None, None)).status == 0)
     is_feasible = np.array(is_feasible)
     assert 10 < is_feasible.sum() < 190
-    np.testing.assert_array_equal(found.result == RESULTS.successful, is_feasible)
-    np.testing.assert_array_equal(found.result == RESULTS.infeasible, ~is_feasible)
-    assert np.isfinite(found.x).all()
+    np.testing.assert_array_equal(computed.result == RESULTS.successful, is_feasible)
+    np.testing.assert_array_equal(computed.result == RESULTS.infeasible, ~is_feasible)
+    assert np.isfinite(computed.x).all()
     # Contradicting equality rows, and a matrix that is not positive definite, in single lanes of a batch.
     Q, q, G, h, A, b, S, c = problems(3, 4)
-    found = many(Q.at[1].multiply(-1), q, G, h, A, b.at[2, 2].add(1.0), S, c)
-    assert [str(found.result == code) for code in (RESULTS.successful, RESULTS.indefinite, RESULTS.infeasible)] == [
+    computed = many(Q.at[1].multiply(-1), q, G, h, A, b.at[2, 2].add(1.0), S, c)
+    assert [str(computed.result == code) for code in (RESULTS.successful, RESULTS.indefinite, RESULTS.infeasible)] == [
         str(np.arange(3) == i) for i in range(3)
     ]
 
@@ -145,8 +148,8 @@ def test_derivatives_are_those_of_differences():
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9)
 
     def at(step):
-        found = many(*(x + step * d for x, d in zip(data, change, strict=True)))
-        return np.sum(weights * found.x, 1)
+        computed = many(*(x + step * d for x, d in zip(data, change, strict=True)))
+        return np.sum(weights * computed.x, 1)
 
     def difference(step):
         return (8 * (at(step) - at(-step)) - at(2 * step) + at(-2 * step)) / (12 * step)
@@ -192,9 +195,9 @@ def test_projections_in_closed_form():
 def test_float32():
     target = jnp.array([2.0, -0.5, 0.3], jnp.float32)
     unit = jnp.eye(3, dtype=jnp.float32)
-    found = quick(solve_qp)(unit, -target, jnp.concatenate([unit, -unit]), jnp.ones(6, jnp.float32))
-    assert found.x.dtype == jnp.float32 and bool(found.result == RESULTS.successful)
-    np.testing.assert_allclose(found.x, [1, -0.5, 0.3], atol=1e-5)
+    solution = quick(solve_qp)(unit, -target, jnp.concatenate([unit, -unit]), jnp.ones(6, jnp.float32))
+    assert solution.x.dtype == jnp.float32 and bool(solution.result == RESULTS.successful)
+    np.testing.assert_allclose(solution.x, [1, -0.5, 0.3], atol=1e-5)
 
 
 @pytest.mark.slow
@@ -232,8 +235,8 @@ def test_known_zeros_of_rows_cost_nothing():
     known, given = (lambda Q, q: solve_qp(Q, q, rows, h)), (lambda Q, q, G: solve_qp(Q, q, G, h))
     if all_operations := operations(given, Q[0], q[0], rows):
         assert operations(known, Q[0], q[0]) < 0.5 * all_operations
-    found = quick(jax.vmap(known))(Q, q)
-    np.testing.assert_allclose(found.x, quick(jax.vmap(given))(Q, q, jnp.asarray(G)).x, atol=1e-9)
+    computed = quick(jax.vmap(known))(Q, q)
+    np.testing.assert_allclose(computed.x, quick(jax.vmap(given))(Q, q, jnp.asarray(G)).x, atol=1e-9)
 
 
 def quadruped(count, seed):
@@ -267,8 +270,8 @@ def test_no_lane_of_ten_thousand_stalls():
     Q, q, G, h, S, c = quadruped(10_000, 6)
     flat = jax.jit(jax.vmap(lambda *data: solve_qp(*data, tol=1e-9)))(Q, q, G, h)
     round_ = jax.jit(jax.vmap(lambda Q, q, S, c: solve_qp(Q, q, cones=[(S, c)], tol=1e-9)))(Q, q, S, c)
-    for found in (flat, round_):
-        assert (found.result == RESULTS.successful).all()
+    for computed in (flat, round_):
+        assert (computed.result == RESULTS.successful).all()
     for i in range(200):
         other = quadprog.solve_qp(np.array(Q[i]), -np.array(q[i]), -np.array(G[i]).T.copy(), -np.array(h[i]), 0)[0]
         np.testing.assert_allclose(flat.x[i], other, atol=1e-8)

@@ -49,8 +49,8 @@ def test_computed_torque_decays_as_the_gains_say(arm):
     """Against the closed form, with forces of the scene compensated; the slow rate fitted to 1 %."""
     scene = jd.Scene(arm, forces=(jd.JointDamping(0.4),))
     law = jd.control.ComputedTorque(scene, wave, KP, KD)
-    found = jd.simulate(scene, Q0, V0, TS, control=law, stepsize=0.005)
-    errors = np.asarray(found.q - jax.vmap(wave)(TS))
+    solution = jd.simulate(scene, Q0, V0, TS, control=law, stepsize=0.005)
+    errors = np.asarray(solution.q - jax.vmap(wave)(TS))
     rate = V0 - jax.jvp(wave, (0.0,), (1.0,))[1]
     assert_decays(TS, errors, start_rate=rate)
     # What is left of the fast root after a second is taken out by fitting both.
@@ -76,8 +76,8 @@ def test_computed_torque_of_a_free_body_turns_it_to_its_target():
     target = jd.integrate(body, jd.neutral(body), jnp.asarray([0.1, 0.2, 0.3, 0.5, -0.4, 1.2]))
     q0, v0 = jd.neutral(body), jnp.asarray([0.1, 0.0, -0.2, 0.4, 0.3, -0.1])
     law = jd.control.ComputedTorque(body, target, KP, KD)
-    found = jd.simulate(body, q0, v0, TS, control=law, stepsize=0.005)
-    errors = jax.vmap(lambda q: jd.difference(body, target, q))(found.q)
+    solution = jd.simulate(body, q0, v0, TS, control=law, stepsize=0.005)
+    errors = jax.vmap(lambda q: jd.difference(body, target, q))(solution.q)
     moved = jax.jvp(lambda q: jd.difference(body, target, q), (q0,), (jd.configuration_rate(body, q0, v0),))[1]
     assert_decays(TS, errors, start_rate=moved)
 
@@ -95,9 +95,9 @@ def test_operational_space_decays_as_the_gains_say(long_arm, task):
         return near[:3, :3] @ jd.so3.exp(0.2 * jnp.stack([jnp.sin(t), t, jnp.cos(t)]))
 
     law = jd.control.OperationalSpace(long_arm, frame, target, KP, KD, task=task, damping=2.0)
-    found = jd.simulate(long_arm, q0, v0, TS, control=law, stepsize=0.005)
+    solution = jd.simulate(long_arm, q0, v0, TS, control=law, stepsize=0.005)
     error = FrameError(as_target(target), frame, task)
-    errors = jax.vmap(lambda q, t: error.position(long_arm, q, t))(found.q, TS)
+    errors = jax.vmap(lambda q, t: error.position(long_arm, q, t))(solution.q, TS)
     moving = jd.configuration_rate(long_arm, q0, v0), 1.0
     rate = jax.jvp(lambda q, t: error.position(long_arm, q, t), (q0, 0.0), moving)[1]
     assert_decays(TS, errors, start_rate=rate)
@@ -133,8 +133,8 @@ def test_stiffness_yields_and_dissipates(arm):
     q, rest = q0 + 0.1, jnp.zeros(3)
     error = jd.frame_pose(arm, q, frame)[:3, 3] - target
     push = jd.ExternalWrench(frame, jnp.concatenate([K * error, rest]))
-    still = jd.forward_dynamics(arm, q, rest, law(q, rest) + push(arm, q, rest, 0.0))
-    np.testing.assert_allclose(still, rest, atol=1e-9)  # forces of 50 N on links of 0.1 kg m^2
+    at_rest = jd.forward_dynamics(arm, q, rest, law(q, rest) + push(arm, q, rest, 0.0))
+    np.testing.assert_allclose(at_rest, rest, atol=1e-9)  # forces of 50 N on links of 0.1 kg m^2
 
     v = jnp.asarray([0.3, -0.2, 0.5])
     J = jax.jacfwd(lambda q: jd.frame_pose(arm, q, frame)[:3, 3])(q)
@@ -150,8 +150,8 @@ def test_gains_are_leaves(arm):
 
     def missed(kp, kd):
         law = jd.control.ComputedTorque(arm, wave, kp, kd)
-        found = jd.simulate(arm, Q0, V0, TS[:3], control=law, stepsize=0.02)
-        return jnp.sum((found.q[-1] - wave(TS[2])) ** 2)
+        solution = jd.simulate(arm, Q0, V0, TS[:3], control=law, stepsize=0.02)
+        return jnp.sum((solution.q[-1] - wave(TS[2])) ** 2)
 
     both = jax.jit(jax.vmap(jax.value_and_grad(missed, argnums=(0, 1))))
     kp, kd = jnp.asarray([6.0, 9.0]), jnp.asarray([5.0, 7.0])

@@ -65,10 +65,10 @@ def test_a_controllers_state_is_integrated_with_the_motion():
 
     def end(gain):
         given = {"control": Integral(gain), "stepsize": 0.01, "outputs": ("control_state", "torque")}
-        found = jd.simulate(mass, jnp.ones(1), jnp.zeros(1), TS, **given)
-        return found.q[-1, 0], found
+        computed = jd.simulate(mass, jnp.ones(1), jnp.zeros(1), TS, **given)
+        return computed.q[-1, 0], computed
 
-    (last, found), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(jnp.asarray(2.0))
+    (last, computed), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(jnp.asarray(2.0))
 
     def closed(g):
         """x = sum c_i exp(s_i t) with x, xd, xdd = 1, 0, 0 at the start."""
@@ -79,13 +79,13 @@ def test_a_controllers_state_is_integrated_with_the_motion():
         ).real
 
     x, integral = closed(2.0)
-    np.testing.assert_allclose(found.q[:, 0], x, atol=1e-9)  # RK4's steps of 10 ms
-    np.testing.assert_allclose(found.control_state["sum"][:, 0], integral, atol=1e-9)
-    np.testing.assert_allclose(found.torque, -2.0 * found.control_state["sum"], atol=1e-14)
+    np.testing.assert_allclose(computed.q[:, 0], x, atol=1e-9)  # RK4's steps of 10 ms
+    np.testing.assert_allclose(computed.control_state["sum"][:, 0], integral, atol=1e-9)
+    np.testing.assert_allclose(computed.torque, -2.0 * computed.control_state["sum"], atol=1e-14)
     step = 1e-4
     change = (closed(2.0 + step)[0][-1] - closed(2.0 - step)[0][-1]) / (2 * step)
     np.testing.assert_allclose(slope, change, rtol=1e-6)  # differences, and RK4's steps
-    assert last == found.q[-1, 0]
+    assert last == computed.q[-1, 0]
 
 
 def test_adaptive_steps_integrate_a_state_as_fixed_ones_do():
@@ -109,13 +109,13 @@ def test_feedback_of_the_multipliers_is_solved():
     scene = scenes.spherical_pendulum()
     q0, v0 = scenes.spherical_pendulum.start()
     law = Feedback(scene, jnp.asarray(0.8))
-    found = jd.simulate(scene, q0, v0, TS, control=law, outputs=("multipliers", "torque"), stepsize=0.01)
+    solution = jd.simulate(scene, q0, v0, TS, control=law, outputs=("multipliers", "torque"), stepsize=0.01)
     again = jax.vmap(lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).multipliers)(
-        found.q, found.v, found.torque
+        solution.q, solution.v, solution.torque
     )
-    np.testing.assert_allclose(found.multipliers, again, rtol=1e-10)
-    told = jax.vmap(lambda q, v, lam: law(q, v, 0.0, None, lam))(found.q, found.v, found.multipliers)
-    np.testing.assert_allclose(found.torque, told, rtol=1e-10)
+    np.testing.assert_allclose(solution.multipliers, again, rtol=1e-10)
+    told = jax.vmap(lambda q, v, lam: law(q, v, 0.0, None, lam))(solution.q, solution.v, solution.multipliers)
+    np.testing.assert_allclose(solution.torque, told, rtol=1e-10)
 
 
 def digital(q, v, t, state):
@@ -130,7 +130,7 @@ def test_a_sampled_law_equals_a_loop_by_hand(arm):
     start = {"sum": jnp.zeros(2)}
     given = {"stepsize": step, "outputs": ("torque", "control_state")}
     law = jd.Sampled(digital, start, period)
-    found = jd.simulate(arm, Q0, V0, TS, control=law, **given)
+    solution = jd.simulate(arm, Q0, V0, TS, control=law, **given)
     between = jd.simulate(arm, Q0, V0, jnp.concatenate([TS[:1], TS[1:] - period / 2]), control=law, **given)
 
     def classical(state, tau):
@@ -153,8 +153,8 @@ def test_a_sampled_law_equals_a_loop_by_hand(arm):
     _, (q, v, tau, total) = jax.jit(
         lambda: jax.lax.scan(one, (jnp.stack([Q0, V0]), start), period * jnp.arange(10.0))
     )()
-    np.testing.assert_allclose(found.q[1:], q[1::2], atol=1e-10)
-    np.testing.assert_allclose(found.v[1:], v[1::2], atol=1e-10)
+    np.testing.assert_allclose(solution.q[1:], q[1::2], atol=1e-10)
+    np.testing.assert_allclose(solution.v[1:], v[1::2], atol=1e-10)
     np.testing.assert_allclose(between.torque[1:], tau[1::2], atol=1e-10)
     np.testing.assert_allclose(between.control_state["sum"][1:], total[1::2], atol=1e-10)
 
@@ -175,12 +175,12 @@ def test_a_law_without_a_state_is_sampled(arm):
     """With a short period it comes to the continuous law, in proportion to the period."""
     law = jd.control.ComputedTorque(arm, jnp.zeros(2), 6.0, 5.0)
     want = jd.simulate(arm, Q0, V0, TS, control=law, stepsize=0.01).q
-    apart = [
+    difference = [
         np.abs(jd.simulate(arm, Q0, V0, TS, control=jd.Sampled(law, None, p), stepsize=0.005).q - want).max()
         for p in (0.01, 0.005)
     ]
-    assert 1e-6 < apart[1] < apart[0] < 0.01
-    np.testing.assert_allclose(apart[0] / apart[1], 2.0, rtol=0.05)
+    assert 1e-6 < difference[1] < difference[0] < 0.01
+    np.testing.assert_allclose(difference[0] / difference[1], 2.0, rtol=0.05)
 
 
 def changing(q, v, t, state):
@@ -221,6 +221,6 @@ def nowhere(q, v, t):
 
 
 def test_a_control_that_returns_nan_ends_with_a_code(arm):
-    found = jd.simulate(arm, Q0, V0, TS, control=nowhere, stepsize=0.05, throw=False)
-    assert found.result == jd.RESULTS.nonfinite_state
-    assert not bool(found.success)
+    solution = jd.simulate(arm, Q0, V0, TS, control=nowhere, stepsize=0.05, throw=False)
+    assert solution.result == jd.RESULTS.nonfinite_state
+    assert not bool(solution.success)

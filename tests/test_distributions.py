@@ -27,12 +27,12 @@ def test_growth_of_known_distributions():
     assert involutive(scenes.rolling_disk(), place).ranks == (2, 3, 4)
     assert not involutive(scenes.rolling_disk(), place).value
     edge = Pfaffian(lambda q, t: jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0.0 * t]))
-    found = involutive(Scene(free(3), (edge,)), place[:3])
-    assert found.ranks == (2, 3) and not found.value
+    computed = involutive(Scene(free(3), (edge,)), place[:3])
+    assert computed.ranks == (2, 3) and not computed.value
     # d(x y) = 0 times a factor that hides it, as a Pfaffian row.
     hidden = Pfaffian(lambda q, t: jnp.exp(q[2]) * jnp.stack([q[1], q[0], 0.0 * t]))
-    found = involutive(Scene(free(3), (hidden,)), place[:3])
-    assert found.ranks == (2, 2) and found.value
+    computed = involutive(Scene(free(3), (hidden,)), place[:3])
+    assert computed.ranks == (2, 2) and computed.value
     gear = Pfaffian(lambda q, t: jnp.stack([1.0 + 0 * t, -2.5 + 0 * t, 0 * t]))
     assert involutive(Scene(free(3), (gear,)), place[:3]).value
     assert involutive(scenes.spherical_pendulum(), scenes.spherical_pendulum.start()[0]).ranks == (2, 2)
@@ -53,14 +53,14 @@ def test_mixed_rows_count_the_holonomic_ones():
         tied = edge + level  # the rows only span the two forms
         return jnp.stack([tied, level - 0.5 * edge])
 
-    found = involutive(Scene(free(5), (Pfaffian(row),)), jnp.asarray([0.1, 0.2, 0.5, 0.8, -0.3]))
-    assert found.ranks == (3, 4, 4) and not found.value
+    computed = involutive(Scene(free(5), (Pfaffian(row),)), jnp.asarray([0.1, 0.2, 0.5, 0.8, -0.3]))
+    assert computed.ranks == (3, 4, 4) and not computed.value
     # A holonomic row added to the disk: it cannot climb, x^2 + y^2 = const. The growth stops one short.
     disk = scenes.rolling_disk()
     round_ = Holonomic(lambda q, t: q[0] ** 2 + q[1] ** 2 - 1.0)
     both = Scene(disk.system, (*disk.constraints, round_))
-    found = involutive(both, jnp.asarray([0.6, 0.8, 0.3, 0.1]))
-    assert found.ranks[0] == 1 and found.value  # one direction is left, and one field is always integrable
+    computed = involutive(both, jnp.asarray([0.6, 0.8, 0.3, 0.1]))
+    assert computed.ranks[0] == 1 and computed.value  # one direction is left, and one field is always integrable
 
 
 def test_prescribed_slip_is_part_of_the_test():
@@ -84,8 +84,8 @@ def test_bodies_on_a_manifold():
 @pytest.mark.slow
 def test_growth_of_the_leaning_coin():
     """Three rows, of which the height is holonomic; growth 3, 4, 5 (that of the disk and the lean)."""
-    found = involutive(scenes.rolling_coin(), scenes.rolling_coin.start()[0])
-    assert found.ranks == (3, 4, 5) and not found.value
+    computed = involutive(scenes.rolling_coin(), scenes.rolling_coin.start()[0])
+    assert computed.ranks == (3, 4, 5) and not computed.value
 
 
 def test_involutive_refuses():
@@ -99,14 +99,14 @@ def test_spurious_terms_of_the_printed_example():
     """L = (r1'^2 + r2'^2 + s'^2)/2, s' = -r1 r2' (EQUATIONS section 6): numbers by hand, right and wrong."""
     scene = Scene(free(3), (Pfaffian(lambda q, t: jnp.stack([0 * t, q[0], 1.0 + 0 * t])),))
     q, nu = jnp.asarray([0.7, -0.4, 0.2]), jnp.asarray([1.1, 0.6])
-    found = spurious_terms(scene, q, nu, independent=(0, 1))
+    terms = spurious_terms(scene, q, nu, independent=(0, 1))
     r1, (d1, d2) = 0.7, (1.1, 0.6)
-    assert_close(found.mass_matrix, np.diag([1.0, 1 + r1**2]), 1e-14)
-    assert_close(found.bias_force, [0.0, r1 * d1 * d2], 1e-14)
-    assert_close(found.wrong_bias_force, [-r1 * d2**2, 2 * r1 * d1 * d2], 1e-14)
-    assert_close(found.terms, [r1 * d2**2, -r1 * d1 * d2], 1e-14)
-    assert_close(found.acceleration, [0.0, -r1 * d1 * d2 / (1 + r1**2)], 1e-14)
-    assert_close(found.wrong_acceleration, [r1 * d2**2, -2 * r1 * d1 * d2 / (1 + r1**2)], 1e-14)
+    assert_close(terms.mass_matrix, np.diag([1.0, 1 + r1**2]), 1e-14)
+    assert_close(terms.bias_force, [0.0, r1 * d1 * d2], 1e-14)
+    assert_close(terms.wrong_bias_force, [-r1 * d2**2, 2 * r1 * d1 * d2], 1e-14)
+    assert_close(terms.terms, [r1 * d2**2, -r1 * d1 * d2], 1e-14)
+    assert_close(terms.acceleration, [0.0, -r1 * d1 * d2 / (1 + r1**2)], 1e-14)
+    assert_close(terms.wrong_acceleration, [r1 * d2**2, -2 * r1 * d1 * d2 / (1 + r1**2)], 1e-14)
 
 
 def sleigh(q, v):
@@ -129,34 +129,34 @@ def test_spurious_terms_of_the_sleigh():
     theta, u, w = 0.5, 0.8, 1.3
     c, s = np.cos(theta), np.sin(theta)
     q, tau = jnp.asarray([0.2, -0.1, theta]), jnp.asarray([0.1, 0.3, -0.2])
-    found = spurious_terms(scene, q, jnp.asarray([u * c, w]), independent=(0, 2))
+    terms = spurious_terms(scene, q, jnp.asarray([u * c, w]), independent=(0, 2))
     # x' = u cos(th): x'' = u' cos(th) - u w sin(th).
     rates = 0.3 * w**2, -0.3 * u * w / (0.5 + 0.09)
-    assert_close(found.acceleration, [rates[0] * c - u * w * s, rates[1]], 1e-12)
+    assert_close(terms.acceleration, [rates[0] * c - u * w * s, rates[1]], 1e-12)
     # a = (-tan, 0): a_x' - 0 = -sec^2 w;   -(da_x/dth) x' = sec^2 x'.
     p = u * s + 0.3 * c * w
-    assert_close(found.terms, [-p * w / c**2, p * u * c / c**2], 1e-12)
-    assert_close(found.bias_force - found.wrong_bias_force, found.terms, 1e-12)
-    assert np.abs(found.acceleration - found.wrong_acceleration).max() > 0.5
+    assert_close(terms.terms, [-p * w / c**2, p * u * c / c**2], 1e-12)
+    assert_close(terms.bias_force - terms.wrong_bias_force, terms.terms, 1e-12)
+    assert np.abs(terms.acceleration - terms.wrong_acceleration).max() > 0.5
     pushed = spurious_terms(scene, q, jnp.asarray([u * c, w]), tau, independent=(0, 2))
     want = quick(lambda q, nu: reduced_dynamics(scene, q, nu, tau, basis=(0, 2)).nu_rate)(q, jnp.asarray([u * c, w]))
     assert_close(pushed.acceleration, want, 1e-12)
     # What is spurious does no work: the wrong equations conserve the energy too, which is why they look right.
-    assert abs(found.terms @ np.array([u * c, w])) < 1e-12
+    assert abs(terms.terms @ np.array([u * c, w])) < 1e-12
 
 
 def test_no_spurious_terms():
     """Integrable rows, s = h(r), allow the substitution; so does, by accident, the upright disk."""
     curved = Pfaffian(lambda q, t: jnp.stack([jnp.cos(q[0]) * q[1], jnp.sin(q[0]), 1.0 + 0 * t]))  # d(q1 sin q0 + q2)
-    found = spurious_terms(
+    terms = spurious_terms(
         Scene(free(3), (curved,)), jnp.asarray([0.7, -0.4, 0.2]), jnp.asarray([1.1, 0.6]), independent=(0, 1)
     )
-    assert np.abs(found.bias_force).max() > 0.1
-    np.testing.assert_allclose(found.terms, 0, atol=1e-15)
-    assert_close(found.wrong_acceleration, found.acceleration, 1e-13)
+    assert np.abs(terms.bias_force).max() > 0.1
+    np.testing.assert_allclose(terms.terms, 0, atol=1e-15)
+    assert_close(terms.wrong_acceleration, terms.acceleration, 1e-13)
     q, v = scenes.rolling_disk.start(heading=0.7)
-    found = spurious_terms(scenes.rolling_disk(), q, v[2:], independent=(2, 3))
-    np.testing.assert_allclose(found.terms, 0, atol=1e-15)
+    terms = spurious_terms(scenes.rolling_disk(), q, v[2:], independent=(2, 3))
+    np.testing.assert_allclose(terms.terms, 0, atol=1e-15)
 
 
 def test_spurious_terms_refuse():

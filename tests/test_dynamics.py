@@ -287,23 +287,23 @@ def test_agrees_with_mujoco(first):
 def _in_other_frames(model, seed):
     """The same mechanism described in displaced body frames (screw joints only)."""
     rng = np.random.default_rng(seed)
-    moves = np.tile(np.eye(4), (model.nb, 1, 1))
-    moves[:, :3, :3] = Rotation.from_rotvec(rng.normal(size=(model.nb, 3))).as_matrix()
-    moves[:, :3, 3] = rng.normal(size=(model.nb, 3))
-    back = np.linalg.inv(moves)
+    transforms = np.tile(np.eye(4), (model.nb, 1, 1))
+    transforms[:, :3, :3] = Rotation.from_rotvec(rng.normal(size=(model.nb, 3))).as_matrix()
+    transforms[:, :3, 3] = rng.normal(size=(model.nb, 3))
+    back = np.linalg.inv(transforms)
     outer = np.stack([np.eye(4) if p < 0 else back[p] for p in model.topology.parents])
     own = np.array(model.topology.frame_bodies)
     return model.replace(
-        home=jnp.asarray(outer @ np.asarray(model.home) @ moves),
-        screws=quick(jax.vmap(se3.Ad_inv_apply))(jnp.asarray(moves), model.screws),
+        home=jnp.asarray(outer @ np.asarray(model.home) @ transforms),
+        screws=quick(jax.vmap(se3.Ad_inv_apply))(jnp.asarray(transforms), model.screws),
         inertias=quick(jax.vmap(transform_inertia))(jnp.asarray(back), model.inertias),
         frame_poses=jnp.asarray(back[own] @ np.asarray(model.frame_poses)),
-    ), moves
+    ), transforms
 
 
 def test_frames_of_description_do_not_matter():
     model = random_tree(51, ["helical", "prismatic", "helical", "helical", "helical", "prismatic"])
-    other, moves = _in_other_frames(model, 0)
+    other, transforms = _in_other_frames(model, 0)
     world = np.eye(4)
     world[:3, :3], world[:3, 3] = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), [3, -4, 5]
     turned_home = np.array(model.home)
@@ -313,7 +313,7 @@ def test_frames_of_description_do_not_matter():
     )
     q, v, a, tau, external = random_states(model, 5, 3)
     want = PROGRAM(model, q, v, a, tau, external)
-    carried = quick(jax.vmap(jax.vmap(se3.AdT_apply), (None, 0)))(jnp.asarray(moves), external)
+    carried = quick(jax.vmap(jax.vmap(se3.AdT_apply), (None, 0)))(jnp.asarray(transforms), external)
     invariant = ("mass_matrix", "coriolis", "gravity_force", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
     by_other, by_turned = PROGRAM(other, q, v, a, tau, carried), PROGRAM(turned, q, v, a, tau, external)
     for got in (by_other, by_turned):

@@ -10,16 +10,14 @@ from pinocchio_bridge import assert_close, quick, random_states, random_tree
 from jaxdyn import inertia, scenes
 from jaxdyn.constraints import Holonomic
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
-from jaxdyn.dynamics import recursions
-from jaxdyn.dynamics import scans as looped
-from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.dynamics import recursions, scans, world_frame
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem
 
-FORMS = {"matrices": matrix_form.forward_dynamics, "recursion": recursions.aba, "loops": looped.forward_dynamics}
+FORMS = {"matrices": world_frame.forward_dynamics, "recursion": recursions.aba, "loops": scans.forward_dynamics}
 
 
 _programs = quick(lambda model, *states: [form(model, *states) for form in FORMS.values()])
@@ -123,15 +121,15 @@ def test_rows_that_nearly_depend_on_each_other(angle):
     lines = jnp.asarray([[0.0, 1.0], [np.sin(angle), np.cos(angle)]])
     scene = Scene(system, (Holonomic(jax.tree_util.Partial(lambda lines, q, t: lines @ q, lines), name="lines"),))
     push = jnp.asarray([1.0, 2.0])
-    found = constrained_dynamics(scene, jnp.zeros(2), jnp.zeros(2), push)
-    assert found.result == RESULTS.successful
+    dynamics = constrained_dynamics(scene, jnp.zeros(2), jnp.zeros(2), push)
+    assert dynamics.result == RESULTS.successful
     if angle > 1e-8:
-        assert int(found.rank) == 2
-        assert jnp.abs(found.acceleration).max() < 1e-14 / angle  # the crossing is known to eps / angle
+        assert int(dynamics.rank) == 2
+        assert jnp.abs(dynamics.acceleration).max() < 1e-14 / angle  # the crossing is known to eps / angle
     if angle < 1e-9:
-        assert int(found.rank) == 1
-        assert_close(found.acceleration, [1.0, 0.0], 1e-11)
-    assert jnp.isfinite(found.multipliers).all()
+        assert int(dynamics.rank) == 1
+        assert_close(dynamics.acceleration, [1.0, 0.0], 1e-11)
+    assert jnp.isfinite(dynamics.multipliers).all()
 
 
 @pytest.mark.parametrize("violation", [1e-12, 1e-9, 1e-5, 1e-1])
@@ -144,5 +142,5 @@ def test_a_start_off_the_constraint(violation):
         with pytest.raises(ValueError, match=r"not on the constraints: .* open by"):
             simulate(scene, q, v, jnp.asarray([0.0, 0.1]))
     else:
-        found = simulate(scene, q, v, jnp.asarray([0.0, 0.1]), outputs=("constraint_residual",))
-        assert found.constraint_residual[-1].max() < 1e-14
+        solution = simulate(scene, q, v, jnp.asarray([0.0, 0.1]), outputs=("constraint_residual",))
+        assert solution.constraint_residual[-1].max() < 1e-14

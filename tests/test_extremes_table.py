@@ -59,8 +59,8 @@ def test_the_longest_stable_step():
 
 def test_beyond_the_longest_stable_step():
     """Steps that are too long are refused before the state overflows, and then too."""
-    found = verdicts(CASES["beyond"](ONE, False))
-    assert found == {
+    computed = verdicts(CASES["beyond"](ONE, False))
+    assert computed == {
         ("0.5 of the limit", "float64"): "coarse_steps",
         ("0.99 of the limit", "float64"): "coarse_steps",
         ("1.01 of the limit", "float64"): "coarse_steps",
@@ -69,9 +69,9 @@ def test_beyond_the_longest_stable_step():
     }
     # It overflows after about 1100 of 2000 steps; what was kept at 1000 is the last that is known.
     rate = 1.1 * stability_limits(None)[1]
-    _, found = extremes.quick(lambda rate: run_oscillator(rate, 0 * rate, None, 2000))(jnp.asarray(rate))
-    assert float(found.stats["time_reached"]) == 1000.0
-    np.testing.assert_array_equal(np.isnan(found.q[:, 0]), [False, False, True])
+    _, computed = extremes.quick(lambda rate: run_oscillator(rate, 0 * rate, None, 2000))(jnp.asarray(rate))
+    assert float(computed.stats["time_reached"]) == 1000.0
+    np.testing.assert_array_equal(np.isnan(computed.q[:, 0]), [False, False, True])
 
 
 def test_too_many_turns_are_refused_by_name():
@@ -147,10 +147,10 @@ def test_a_small_loop_that_is_open_is_refused():
 
 @pytest.mark.slow
 def test_through_the_flat_position():
-    found = verdicts(CASES["flat"](BOTH, False, runs=((1, "projected", None, 1e-8), (1, "projected", 0.005, 1e-8))))
+    computed = verdicts(CASES["flat"](BOTH, False, runs=((1, "projected", None, 1e-8), (1, "projected", 0.005, 1e-8))))
     # In float32 rounding decides whether a step ends in the flat position, which ends the run with a code.
-    assert found.pop(("1 window, projected, adaptive", "float32"), None) in (None, "dt_min_reached")
-    assert found == {}
+    assert computed.pop(("1 window, projected, adaptive", "float32"), None) in (None, "dt_min_reached")
+    assert computed == {}
 
 
 @pytest.mark.slow
@@ -161,11 +161,11 @@ def test_motion_passes_singular_positions_at_any_tolerance():
 
     @jax.vmap
     def run(tolerance):
-        found = simulate(scene, q, v, ts, rtol=tolerance, atol=tolerance, throw=False, max_steps=4096)
-        return found.q, found.success, found.stats["num_steps"]
+        computed = simulate(scene, q, v, ts, rtol=tolerance, atol=tolerance, throw=False, max_steps=4096)
+        return computed.q, computed.success, computed.stats["num_steps"]
 
-    found, successful, steps = map(np.asarray, jax.jit(run)(tolerances))
-    error = np.abs(found - references.windows(np.asarray(ts), 2).q).max((1, 2))
+    computed, successful, steps = map(np.asarray, jax.jit(run)(tolerances))
+    error = np.abs(computed - references.windows(np.asarray(ts), 2).q).max((1, 2))
     # The error of the tolerance is 40 of it at most, of rounding 1e-10. Steps chosen by an error estimate with its part normal
     # to the constraints end there: 11 of 64 were wrong by more than 1, and 14 refused if the projection counts as an error.
     assert (error[successful] < 100 * np.asarray(tolerances)[successful] + 1e-10).all()
@@ -183,12 +183,12 @@ def test_motions_through_many_singular_positions():
     want = references.windows(times, 2).q[place.reshape(256, 6)]
 
     def run(q, v, tolerance):
-        found = simulate(scene, q, v, ts, rtol=tolerance, atol=tolerance, throw=False, max_steps=2048)
-        return found.q, found.success
+        computed = simulate(scene, q, v, ts, rtol=tolerance, atol=tolerance, throw=False, max_steps=2048)
+        return computed.q, computed.success
 
     program = jax.jit(jax.vmap(run, (0, 0, None)))
     # A step that ends at a distance d from such a position carries the rounding over d^2 on: 4e-7 in one of them at 1e-10.
     for tolerance, worst in ((1e-6, 2e-3), (1e-8, 2e-5), (1e-10, 1e-6)):
-        found, successful = map(np.asarray, program(start.q, start.v, tolerance))
+        computed, successful = map(np.asarray, program(start.q, start.v, tolerance))
         assert successful.sum() >= 255
-        assert np.abs(np.sin((found - want) / 2))[successful].max() < worst
+        assert np.abs(np.sin((computed - want) / 2))[successful].max() < worst

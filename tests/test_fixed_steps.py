@@ -33,8 +33,8 @@ def test_steps_that_are_too_long_are_refused(name):
 
     def run(rate):
         scene = jd.Scene(model, forces=(jd.JointSpring(rate**2),))
-        found = jd.simulate(scene, jnp.ones(1), jnp.zeros(1), ts, solver=SOLVERS[name], stepsize=0.01, throw=False)
-        return found.q[:, 0], found.result
+        solution = jd.simulate(scene, jnp.ones(1), jnp.zeros(1), ts, solver=SOLVERS[name], stepsize=0.01, throw=False)
+        return solution.q[:, 0], solution.result
 
     rates = np.geomspace(0.5, 500.0, 61)
     q, result = quick(jax.vmap(run))(jnp.asarray(rates))
@@ -54,15 +54,15 @@ def test_stiff_decay_within_the_limit_is_right():
     def run(rate):
         scene = jd.Scene(model, forces=(jd.JointDamping(rate),))
         ts = np.linspace(0.0, 1.0, 3)
-        found = jd.simulate(scene, jnp.zeros(1), jnp.full(1, 1e-3), ts, stepsize=0.01, throw=False)
-        return found.q[-1, 0] * rate / 1e-3, found.result
+        solution = jd.simulate(scene, jnp.zeros(1), jnp.full(1, 1e-3), ts, stepsize=0.01, throw=False)
+        return solution.q[-1, 0] * rate / 1e-3, solution.result
 
     rates = jnp.asarray([50.0, 300.0, 1000.0])
-    ways, result = quick(jax.vmap(run))(rates)
+    solutions, result = quick(jax.vmap(run))(rates)
     fine, coarse = codes(result)
     np.testing.assert_array_equal(fine, [True, False, False])
     np.testing.assert_array_equal(coarse, [False, True, True])
-    assert abs(ways[0] - 1) < 1e-3
+    assert abs(solutions[0] - 1) < 1e-3
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
@@ -108,8 +108,8 @@ def test_reduced_and_projected_steps_are_watched():
     for method in ("projected", "reduced"):
 
         def run(h, method=method):
-            found = jd.simulate(scene, q, v, [0.0, 1.2], method=method, stepsize=h, throw=False, max_steps=256)
-            return found.result
+            solution = jd.simulate(scene, q, v, [0.0, 1.2], method=method, stepsize=h, throw=False, max_steps=256)
+            return solution.result
 
         fine, _ = codes(quick(jax.vmap(run))(jnp.asarray([0.01, 0.6])))
         np.testing.assert_array_equal(fine, [True, False], err_msg=method)

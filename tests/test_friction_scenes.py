@@ -73,9 +73,9 @@ def test_link_thrown_onto_a_disk(mu, names):
     np.testing.assert_allclose(motion.events.time[: len(names)], times[1:], rtol=0, atol=1e-10)
     x, y, turn = np.asarray(motion.v)[:, :3].T  # in the axes of the disk
     angle = np.asarray(motion.q[:, 2])
-    found = np.stack([np.cos(angle) * x - np.sin(angle) * y, turn, motion.v[:, 3]], 1)
+    computed = np.stack([np.cos(angle) * x - np.sin(angle) * y, turn, motion.v[:, 3]], 1)
     want = np.stack([np.interp(TS, times, states[:, i]) for i in range(3)], 1)
-    np.testing.assert_allclose(found, want, atol=1e-8)
+    np.testing.assert_allclose(computed, want, atol=1e-8)
     # Places: trapezoids of velocities that are linear between the events.
     fine = np.unique(np.concatenate([np.asarray(TS), times]))
     speeds = np.stack([np.interp(fine, times, states[:, i]) for i in range(3)], 1)
@@ -88,7 +88,7 @@ def test_link_thrown_onto_a_disk(mu, names):
 def test_tilted_link_slides_as_the_immersion_says():
     """Erratum E57: accelerations of the bodies with both contacts sliding are those of four coordinates under friction."""
     mu, tilt = (0.3, 0.1), 0.3
-    scene, still = scenes.rough_disk_and_link(friction=mu), jnp.asarray([0.4, 0.2, -0.1, 0.3])
+    scene, at_rest = scenes.rough_disk_and_link(friction=mu), jnp.asarray([0.4, 0.2, -0.1, 0.3])
 
     def both(s):
         """The two bodies from the four coordinates (z1, theta, y1, th2)."""
@@ -104,7 +104,7 @@ def test_tilted_link_slides_as_the_immersion_says():
         return jax.scipy.linalg.block_diag(*blocks)
 
     place = jnp.asarray([0.1, 0.0, -0.2, tilt])
-    q, rate = jax.jvp(both, (place,), (still,))
+    q, rate = jax.jvp(both, (place,), (at_rest,))
     v = axes(q) @ rate
     outputs = ("acceleration", "contact_forces")
     motion = jd.simulate(scene, q, v, jnp.asarray([0.0, 1e-4]), outputs=outputs, **TIGHT)
@@ -118,11 +118,11 @@ def test_tilted_link_slides_as_the_immersion_says():
     slip = (top - d[3:5] - d[5] * np.array([-arm[1], arm[0]])) @ t
     f = -mu[0] * normal[0] * np.sign(slip), mu[1] * normal[1] * np.sign(d[0] + d[2])
     pushed = scenes.disk_and_link(masses=MASSES, moments=MOMENTS, friction=f)
-    wanted = jd.forward_dynamics(pushed.system, place, still, pushed.applied_force(place, still))
-    found = motion.acceleration[0]
+    wanted = jd.forward_dynamics(pushed.system, place, at_rest, pushed.applied_force(place, at_rest))
+    computed = motion.acceleration[0]
     # The second derivative of the six along the four's, in the bodies' axes.
-    _, bend = jax.jvp(lambda s, u: axes(both(s)) @ jax.jvp(both, (s,), (u,))[1], (place, still), (still, wanted))
-    np.testing.assert_allclose(found, bend, atol=1e-8)
+    _, bend = jax.jvp(lambda s, u: axes(both(s)) @ jax.jvp(both, (s,), (u,))[1], (place, at_rest), (at_rest, wanted))
+    np.testing.assert_allclose(computed, bend, atol=1e-8)
 
 
 def moreau(T, dt, q, u):
@@ -209,8 +209,8 @@ def test_gradient_of_a_bounce_and_its_end():
         left = end - fall
         return e * G * fall * left - G * left**2 / 2
 
-    found = jax.jit(jax.grad(height, (0, 1)))(0.8, 1.0)
-    np.testing.assert_allclose(found, jax.grad(closed, (0, 1))(0.8, 1.0), rtol=1e-8)
+    gradient = jax.jit(jax.grad(height, (0, 1)))(0.8, 1.0)
+    np.testing.assert_allclose(gradient, jax.grad(closed, (0, 1))(0.8, 1.0), rtol=1e-8)
     assert bounce(0.9, most=16, end=30.0).result == jd.RESULTS.too_many_events
     rests = bounce(0.3, most=64, end=5.0)
     assert rests.success and abs(float(rests.q[-1, 0])) < 1e-9 and float(rests.v[-1, 0]) == 0

@@ -140,10 +140,10 @@ def test_bodies_with_dependent_rows():
     """A pendulum with its rod listed three times; the sleigh, a body whose velocity is not dq/dt. Eager calls."""
     scene, (q, v) = scenes.spherical_pendulum(), scenes.spherical_pendulum.start()
     scene = Scene(scene.system, scene.constraints * 3)
-    found, want = gauge_invariant(scene, q, v), quick(lambda q, v: constrained_dynamics(scene, q, v))(q, v)
-    assert found.V2.shape == (3, 2) and bool(found.result == RESULTS.successful)
-    assert_close(found.acceleration, want.acceleration, 1e-10)
-    assert_close(found.multipliers, want.multipliers, 1e-10)
+    computed, want = gauge_invariant(scene, q, v), quick(lambda q, v: constrained_dynamics(scene, q, v))(q, v)
+    assert computed.V2.shape == (3, 2) and bool(computed.result == RESULTS.successful)
+    assert_close(computed.acceleration, want.acceleration, 1e-10)
+    assert_close(computed.multipliers, want.multipliers, 1e-10)
     wrong = quick(lambda q, v: gauge_invariant(scene, q, v, dof=1).result == RESULTS.singular_basis)
     assert bool(wrong(q, v))
     with pytest.raises(ValueError, match=r"3 constraint rows leave no freedom of nv = 3: .* give dof"):
@@ -151,11 +151,11 @@ def test_bodies_with_dependent_rows():
     with pytest.raises(ValueError, match=r"rotation has shape \(2, 2\), expected \(3, 3\)"):
         gauge_invariant(scene, q, v, rotation=jnp.eye(2), dof=1)
     sleigh, (q, v) = scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start()
-    found = gauge_invariant(sleigh, q, v)
+    computed = gauge_invariant(sleigh, q, v)
     a, m, moment = 0.3, 1.0, 0.5
     want = [a * v[2] ** 2, 0.0, -m * a * v[0] * v[2] / (moment + m * a**2)]
-    assert_close(found.acceleration, want, 1e-12)
-    assert_close(found.Lambda @ found.W.T, constraint_jacobian(sleigh, q), 1e-13)
+    assert_close(computed.acceleration, want, 1e-12)
+    assert_close(computed.Lambda @ computed.W.T, constraint_jacobian(sleigh, q), 1e-13)
 
 
 def test_derivatives_and_float32(state):
@@ -168,7 +168,7 @@ def test_derivatives_and_float32(state):
     assert_close(*slopes, 1e-10)
     disk, (q, v) = scenes.rolling_disk(), scenes.rolling_disk.start(heading=0.3)
     low = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, (disk, q, v))
-    found = quick(gauge_invariant)(*low)
-    assert found.acceleration.dtype == found.Gamma_r.dtype == jnp.float32
+    computed = quick(gauge_invariant)(*low)
+    assert computed.acceleration.dtype == computed.Gamma_r.dtype == jnp.float32
     exact = quick(lambda q, v: constrained_dynamics(disk, q, v).acceleration)(q, v)
-    np.testing.assert_allclose(found.acceleration, exact, atol=1e-5)
+    np.testing.assert_allclose(computed.acceleration, exact, atol=1e-5)

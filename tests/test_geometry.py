@@ -114,10 +114,10 @@ def test_surfaces_have_their_curvature():
     }
     u, w = jnp.asarray([0.3, 1.1]), jnp.asarray([-0.8, 0.4])
     q = jnp.asarray(np.random.default_rng(2).uniform(0.5, 1.4, (20, 2)))
-    found = quick(
+    computed = quick(
         jax.vmap(lambda q: {n: (geometry.sectional_curvature(m, q, u, w), k(q)) for n, (m, k) in metrics.items()})
     )(q)
-    for name, (got, want) in found.items():
+    for name, (got, want) in computed.items():
         assert_close(got, want, 1e-11, name)
     s, c = np.sin(q[0, 0]), np.cos(q[0, 0])
     symbols = np.zeros((2, 2, 2))
@@ -286,11 +286,11 @@ def test_geodesic_of_the_sphere_is_a_great_circle():
     """Simulated, in float64; and the acceleration in float32."""
     q0, v0, ts = jnp.asarray([1.1, 0.3]), jnp.asarray([0.4, 0.9]), jnp.asarray([0.0, 0.5, 1.0])
     system = MetricSystem(pull_back(lambda x: jnp.eye(3), sphere), 2)
-    found = simulate(system, q0, v0, ts, rtol=1e-11, atol=1e-11)
+    solution = simulate(system, q0, v0, ts, rtol=1e-11, atol=1e-11)
     x, speed = jax.jvp(sphere, (q0,), (v0,))
     rate = jnp.sqrt(jnp.sum(speed * speed)) / 1.7
     circle = jnp.cos(rate * ts)[:, None] * x[None] + jnp.sin(rate * ts)[:, None] * (speed / rate)[None]
-    assert_close(jax.vmap(sphere)(found.q), circle, 1e-9)  # the tolerance of the steps, times their number
+    assert_close(jax.vmap(sphere)(solution.q), circle, 1e-9)  # the tolerance of the steps, times their number
     half = quick(lambda q, v: dynamics.forward_dynamics(system, q, v, 0 * v))(
         *(x.astype(jnp.float32) for x in (q0, v0))
     )

@@ -72,9 +72,9 @@ def test_sines_of_polynomials(dtype):
     """To a unit and a half in the last place of one, within ten turns and at numbers that are none."""
     x = np.concatenate([np.linspace(-63.0, 63.0, 4001), np.arange(-40, 41) * np.pi / 4]).astype(dtype)
     exact = x.astype(np.longdouble)
-    for found, want in ((sine(jnp.asarray(x)), np.sin(exact)), (cosine(jnp.asarray(x)), np.cos(exact))):
-        assert found.dtype == dtype
-        assert np.abs(np.asarray(found) - want).max() < 1.5 * np.finfo(dtype).eps
+    for computed, want in ((sine(jnp.asarray(x)), np.sin(exact)), (cosine(jnp.asarray(x)), np.cos(exact))):
+        assert computed.dtype == dtype
+        assert np.abs(np.asarray(computed) - want).max() < 1.5 * np.finfo(dtype).eps
     odd = jnp.asarray([0.0, jnp.inf, -jnp.inf, jnp.nan], dtype)
     assert float(sine(odd)[0]) == 0.0 and float(cosine(odd)[0]) == 1.0
     assert np.isnan(np.asarray(sine(odd)))[1:].all() and np.isnan(np.asarray(cosine(odd)))[1:].all()

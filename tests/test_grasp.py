@@ -69,49 +69,57 @@ def solved(name):
             "internal": internal_forces(grasp, q, lam),
         }
 
-    found = compute(q, v, tau)
-    return {"grasp": grasp, "q": q, "v": v, "tau": tau, "hands": hands, "objects": objects, "compute": compute} | found
+    computed = compute(q, v, tau)
+    return {
+        "grasp": grasp,
+        "q": q,
+        "v": v,
+        "tau": tau,
+        "hands": hands,
+        "objects": objects,
+        "compute": compute,
+    } | computed
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_reduced_equations_are_those_with_multipliers(name):
     """Accelerations and contact forces of (6.21)-(6.25) against the saddle-point solve."""
     at = solved(name)
-    found, full = at["object"], at["full"]
-    assert bool(found.result == RESULTS.successful)
+    computed, full = at["object"], at["full"]
+    assert bool(computed.result == RESULTS.successful)
     assert int(full.rank) == len(at["hands"])
-    assert_close(found.velocity, at["v"], 1e-13)  # J_h thetadot = G^T V
-    assert_close(found.acceleration, full.acceleration, 1e-10)
-    assert_close(found.rate, full.acceleration[at["objects"]], 1e-10)
-    assert_close(found.contact_forces, full.multipliers, 1e-10)
-    by_contact = found.by_contact()
+    assert_close(computed.velocity, at["v"], 1e-13)  # J_h thetadot = G^T V
+    assert_close(computed.acceleration, full.acceleration, 1e-10)
+    assert_close(computed.rate, full.acceleration[at["objects"]], 1e-10)
+    assert_close(computed.contact_forces, full.multipliers, 1e-10)
+    by_contact = computed.by_contact()
     assert list(by_contact) == [place.name for place in full.layout]
-    assert_close(np.concatenate(list(by_contact.values())), found.contact_forces, 0)
+    assert_close(np.concatenate(list(by_contact.values())), computed.contact_forces, 0)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_effective_dynamics(name):
     """dM~/dt = C~ + C~^T along the motion (lemma 6.1); energies and powers are those of the whole mechanism."""
     at = solved(name)
-    found, V = at["object"], at["v"][at["objects"]]
+    computed, V = at["object"], at["v"][at["objects"]]
     N = np.zeros((at["grasp"].nv, len(at["objects"])))
     N[at["objects"]], N[at["hands"]] = np.eye(len(at["objects"])), np.linalg.solve(at["Jh"], at["G"].T)
-    assert_close(found.mass_matrix, N.T @ at["mass"] @ N, 1e-12)
+    assert_close(computed.mass_matrix, N.T @ at["mass"] @ N, 1e-12)
     # Differences of sixth order: truncation 1e-15 and rounding 1e-13 of the rate.
     step, move = 2e-3, quick(lambda v: integrate(at["grasp"].system, at["q"], v))
     mass = [
         np.asarray(at["compute"](move(k * step * at["v"]), at["v"], at["tau"])["object"].mass_matrix) for k in STENCIL
     ]
     rate = sum(weight * M for weight, M in zip(WEIGHTS, mass, strict=True)) / step
-    assert np.linalg.eigvalsh(np.asarray(found.mass_matrix)).min() > 0
-    skew = rate - 2 * found.coriolis_matrix
-    assert float(jnp.abs(found.coriolis_matrix).max()) > 1e-3
+    assert np.linalg.eigvalsh(np.asarray(computed.mass_matrix)).min() > 0
+    skew = rate - 2 * computed.coriolis_matrix
+    assert float(jnp.abs(computed.coriolis_matrix).max()) > 1e-3
     np.testing.assert_allclose(skew + skew.T, 0, atol=1e-10 * np.abs(rate).max())
-    assert_close(0.5 * V @ found.mass_matrix @ V, at["kinetic"], 1e-12)
-    assert_close(found.gravity_force @ V, at["potential"], 1e-12)
-    assert_close(found.force @ V, at["tau"] @ at["v"], 1e-12)
-    left = found.mass_matrix @ found.rate + found.coriolis_matrix @ V + found.gravity_force
-    assert_close(left, found.force, 1e-11)
+    assert_close(0.5 * V @ computed.mass_matrix @ V, at["kinetic"], 1e-12)
+    assert_close(computed.gravity_force @ V, at["potential"], 1e-12)
+    assert_close(computed.force @ V, at["tau"] @ at["v"], 1e-12)
+    left = computed.mass_matrix @ computed.rate + computed.coriolis_matrix @ V + computed.gravity_force
+    assert_close(left, computed.force, 1e-11)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -301,8 +309,8 @@ def test_motion_reduced_and_with_multipliers(name):
     compute, objects, free = at["compute"], at["objects"], np.zeros(at["grasp"].nv)
 
     def reduced(t, y):
-        found = compute(y[:count], padded(y[count:]), at["tau"])["object"]
-        return np.concatenate([rate_of(y[:count], np.array(found.velocity)), found.rate])
+        computed = compute(y[:count], padded(y[count:]), at["tau"])["object"]
+        return np.concatenate([rate_of(y[:count], np.array(computed.velocity)), computed.rate])
 
     def padded(V):
         v = free.copy()
@@ -310,8 +318,8 @@ def test_motion_reduced_and_with_multipliers(name):
         return v
 
     def full(t, y):
-        found = compute(y[:count], y[count:], at["tau"])["full"]
-        return np.concatenate([rate_of(y[:count], y[count:]), found.acceleration])
+        computed = compute(y[:count], y[count:], at["tau"])["full"]
+        return np.concatenate([rate_of(y[:count], y[count:]), computed.acceleration])
 
     q, v = np.asarray(at["q"]), np.asarray(at["v"])
     options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12}
@@ -344,8 +352,8 @@ def test_rolling_in_a_plane_is_a_differential():
 @pytest.mark.slow
 def test_rolling_disk_is_integrable():
     """In a plane rolling is holonomic, although its rows are not written so."""
-    found = involutive(scenes.hand_with_disk(), scenes.hand_with_disk.start()[0])
-    assert found.value and found.ranks == (3, 3)
+    computed = involutive(scenes.hand_with_disk(), scenes.hand_with_disk.start()[0])
+    assert computed.value and computed.ranks == (3, 3)
 
 
 def steady(q, v, t):
@@ -368,8 +376,8 @@ def simulated(grasp, q, v, methods):
 def test_rolling_ball_is_not_integrable_and_moves():
     """Brackets reach all that the three gaps allow, 15 - 3."""
     grasp, (q, v) = scenes.hand_rolling_ball(), scenes.hand_rolling_ball.start()
-    found = involutive(grasp, q)
-    assert not found.value and found.ranks == (6, 12)
+    computed = involutive(grasp, q)
+    assert not computed.value and computed.ranks == (6, 12)
     simulated(grasp, q, v, [Reduced(grasp.object_velocities)])
 
 
@@ -394,14 +402,14 @@ def test_batch_of_grasps_with_different_links():
     batch = jax.tree.map(lambda *x: jnp.stack(x), *rows)
     solve = lambda grasp, q, v: object_dynamics(grasp, q, v[4:])  # noqa: E731
     one, many = quick(solve), quick(jax.vmap(solve))
-    loop, found = [one(*row) for row in rows], many(*batch)
+    loop, computed = [one(*row) for row in rows], many(*batch)
     for name in ("acceleration", "contact_forces", "mass_matrix"):
-        assert_close(getattr(found, name), np.stack([getattr(x, name) for x in loop]), 1e-12)
-    assert float(jnp.ptp(found.mass_matrix, axis=0).max()) > 1e-2
+        assert_close(getattr(computed, name), np.stack([getattr(x, name) for x in loop]), 1e-12)
+    assert float(jnp.ptp(computed.mass_matrix, axis=0).max()) > 1e-2
     single = jax.tree.map(lambda x: x.astype(jnp.float32), batch)
     rough = many(*single)
     assert rough.acceleration.dtype == rough.contact_forces.dtype == jnp.float32
-    assert_close(rough.acceleration, found.acceleration, 1e-4)
+    assert_close(rough.acceleration, computed.acceleration, 1e-4)
 
 
 @pytest.mark.slow
@@ -429,9 +437,9 @@ def test_gradients_through_the_reduced_motion():
 def test_singular_hand_jacobian_gives_a_code():
     """A finger that is stretched out cannot follow the object."""
     at = solved("hand_with_bar")
-    found = at["compute"](at["q"].at[1].set(0.0), at["v"], at["tau"])["object"]
-    assert bool(found.result == RESULTS.singular_basis)
-    assert all(bool(jnp.isfinite(x).all()) for x in (found.acceleration, found.contact_forces))
+    computed = at["compute"](at["q"].at[1].set(0.0), at["v"], at["tau"])["object"]
+    assert bool(computed.result == RESULTS.singular_basis)
+    assert all(bool(jnp.isfinite(x).all()) for x in (computed.acceleration, computed.contact_forces))
 
 
 def test_refusals():

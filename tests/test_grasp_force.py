@@ -26,9 +26,9 @@ def test_ball_follows_and_forces_stay_in_their_cones(ball):
     """Every error by the closed form; the internal force is the preload; margins are positive all the way."""
     grasp, q, v, _, law = ball
     outputs = ("contact_forces", "contact_margins", "multipliers", "torque")
-    found = jd.simulate(grasp, q, v, TS, control=law, stepsize=0.02, outputs=outputs)
-    assert bool(found.result == jd.RESULTS.successful)
-    errors = np.asarray(jax.vmap(lambda q: law.error.position(grasp.system, q, 0.0))(found.q))
+    solution = jd.simulate(grasp, q, v, TS, control=law, stepsize=0.02, outputs=outputs)
+    assert bool(solution.result == jd.RESULTS.successful)
+    errors = np.asarray(jax.vmap(lambda q: law.error.position(grasp.system, q, 0.0))(solution.q))
     assert np.abs(errors[0]).max() > 0.1
     # RK4's steps of 20 ms.
     assert_close(errors, decayed(np.asarray(TS), errors[0], np.zeros(6), KP, KD), 1e-5)
@@ -37,11 +37,13 @@ def test_ball_follows_and_forces_stay_in_their_cones(ball):
     slopes = [np.polyfit(TS[-6:], np.log(np.linalg.norm(e[-6:], axis=1)), 1)[0] for e in (errors, exact)]
     np.testing.assert_allclose(*slopes, rtol=0.01)
     squeeze = 4.0 * jd.grasp.normal_forces(grasp)
-    internal = jax.jit(jax.vmap(lambda q, lam: jd.grasp.internal_forces(grasp, q, lam)))(found.q, found.multipliers)
+    internal = jax.jit(jax.vmap(lambda q, lam: jd.grasp.internal_forces(grasp, q, lam)))(
+        solution.q, solution.multipliers
+    )
     assert_close(internal, np.tile(squeeze, (TS.size, 1)), 1e-9)
-    assert min(float(margin.min()) for margin in found.contact_margins.values()) > 1.0
-    assert all(force.shape == (TS.size, 3) for force in found.contact_forces.values())
-    assert_close(found.torque[:, 9:], np.zeros((TS.size, 6)), 0)
+    assert min(float(margin.min()) for margin in solution.contact_margins.values()) > 1.0
+    assert all(force.shape == (TS.size, 3) for force in solution.contact_forces.values())
+    assert_close(solution.torque[:, 9:], np.zeros((TS.size, 6)), 0)
 
 
 @pytest.mark.slow
@@ -74,8 +76,8 @@ def test_integral_action_takes_the_error_of_the_internal_force_away():
     ends = []
     for ki in (None, 4.0):
         law = jd.control.GraspForce(model, q[4:], 400.0, 40.0, preload=10.0, ki=ki)
-        found = jd.simulate(plant, q, v, TS, control=law, stepsize=0.01, outputs=("multipliers",))
-        internal = jd.grasp.internal_forces(plant, found.q[-1], found.multipliers[-1])
+        solution = jd.simulate(plant, q, v, TS, control=law, stepsize=0.01, outputs=("multipliers",))
+        internal = jd.grasp.internal_forces(plant, solution.q[-1], solution.multipliers[-1])
         ends.append(np.abs(np.asarray(internal) - 10.0 * jd.grasp.normal_forces(plant)).max())
     assert ends[0] > 0.1
     assert ends[1] < 0.02 * ends[0]

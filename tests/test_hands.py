@@ -75,16 +75,16 @@ def family(hand):
 @quick
 def solved(grasp, motions, q, nu, tau):
     """The equations in (w, u), those with multipliers, and the rate of M~ along the motion."""
-    found = hand_dynamics(grasp, q, nu, tau, motions=motions)
-    along = (jd.configuration_rate(grasp.system, q, found.velocity),)
+    dynamics = hand_dynamics(grasp, q, nu, tau, motions=motions)
+    along = (jd.configuration_rate(grasp.system, q, dynamics.velocity),)
     rate = jax.jvp(lambda q: hand_dynamics(grasp, q, nu, tau, motions=motions).mass_matrix, (q,), along)[1]
     return {
-        "hand": found,
+        "hand": dynamics,
         "rate": rate,
-        "full": jd.constrained_dynamics(grasp, q, found.velocity, tau),
+        "full": jd.constrained_dynamics(grasp, q, dynamics.velocity, tau),
         "mass": jd.mass_matrix(grasp.system, q),
         "A": jd.constraint_jacobian(grasp, q),
-        "kinetic": jd.kinetic_energy(grasp.system, q, found.velocity),
+        "kinetic": jd.kinetic_energy(grasp.system, q, dynamics.velocity),
         "potential": jax.jvp(lambda q: jd.potential_energy(grasp.system, q), (q,), along)[1],
     }
 
@@ -97,28 +97,28 @@ def test_equations_of_any_hand_are_those_with_multipliers(hand):
         motions = hand_motions(grasp, q)
         assert (motions.object.shape[1], motions.internal.shape[1]) == HANDS[hand][1]
         at = jax.tree.map(np.asarray, solved(grasp, motions, q, nu, tau))
-        found, A, N = at["hand"], at["A"], at["hand"].basis
-        assert bool(found.result == jd.RESULTS.successful)
+        computed, A, N = at["hand"], at["A"], at["hand"].basis
+        assert bool(computed.result == jd.RESULTS.successful)
         # N spans the velocities that the contacts leave, and no more.
         assert N.shape[1] == null_space(A, rcond=1e-10).shape[1] == np.linalg.matrix_rank(N)
         np.testing.assert_allclose(A @ N, 0, atol=1e-11 * np.abs(A).max() * np.abs(N).max())
         # N M~^-1 N^T is the inverse of M in the directions of the motion, from the saddle-point matrix.
         saddle = np.block([[at["mass"], A.T], [A, np.zeros((len(A), len(A)))]])
         inverse = np.linalg.pinv(saddle, rcond=1e-13)[: len(N), : len(N)]
-        assert_close(N @ np.linalg.solve(found.mass_matrix, N.T), inverse, 1e-10)
-        assert_close(found.velocity, N @ nu, 1e-13)
-        assert_close(found.acceleration, at["full"].acceleration, 1e-10)
-        assert_close(found.contact_forces, at["full"].multipliers, 1e-9)
-        skew = at["rate"] - 2 * found.coriolis_matrix
-        assert np.abs(found.coriolis_matrix).max() > 1e-2
+        assert_close(N @ np.linalg.solve(computed.mass_matrix, N.T), inverse, 1e-10)
+        assert_close(computed.velocity, N @ nu, 1e-13)
+        assert_close(computed.acceleration, at["full"].acceleration, 1e-10)
+        assert_close(computed.contact_forces, at["full"].multipliers, 1e-9)
+        skew = at["rate"] - 2 * computed.coriolis_matrix
+        assert np.abs(computed.coriolis_matrix).max() > 1e-2
         np.testing.assert_allclose(skew + skew.T, 0, atol=1e-10 * np.abs(at["rate"]).max())
-        assert np.linalg.eigvalsh(found.mass_matrix).min() > 0
-        assert_close(0.5 * nu @ found.mass_matrix @ nu, at["kinetic"], 1e-11)
-        assert_close(found.gravity_force @ nu, at["potential"], 1e-11)
-        assert_close(found.force @ nu, tau @ found.velocity, 1e-11)
-        assert_close(found.input_map, N[:-6].T, 0)
-        pushed = found.input_map @ tau[:-6] + N[-6:].T @ tau[-6:]
-        assert_close(pushed, found.force, 1e-11)
+        assert np.linalg.eigvalsh(computed.mass_matrix).min() > 0
+        assert_close(0.5 * nu @ computed.mass_matrix @ nu, at["kinetic"], 1e-11)
+        assert_close(computed.gravity_force @ nu, at["potential"], 1e-11)
+        assert_close(computed.force @ nu, tau @ computed.velocity, 1e-11)
+        assert_close(computed.input_map, N[:-6].T, 0)
+        pushed = computed.input_map @ tau[:-6] + N[-6:].T @ tau[-6:]
+        assert_close(pushed, computed.force, 1e-11)
 
 
 @pytest.mark.slow
@@ -189,8 +189,8 @@ def test_a_hand_holds_its_ball_within_cones():
     G, Jh = (np.asarray(f(grasp, q)) for f in (jd.grasp.grasp_map, jd.grasp.hand_jacobian))
     for mu, forces, torques in zip((0.5, 0.8), many.contact_forces, many.torques, strict=True):
         np.testing.assert_allclose(G @ forces, weight, atol=1e-7)
-        found = jd.grasp.contact_forces(grasp, forces, jd.contact.friction_cone("hard-finger", mu))
-        np.testing.assert_allclose(found.margin, 0.1, atol=1e-6)  # as little as is allowed
+        computed = jd.grasp.contact_forces(grasp, forces, jd.contact.friction_cone("hard-finger", mu))
+        np.testing.assert_allclose(computed.margin, 0.1, atol=1e-6)  # as little as is allowed
         assert_close(torques, Jh.T @ forces, 1e-12)
     assert bool(many.success.all())
     size = lambda mu: jnp.sum(held(mu).contact_forces ** 2)  # noqa: E731
@@ -207,9 +207,9 @@ def test_a_hand_holds_its_ball_within_cones():
 def test_force_closure_of_a_hand():
     """Three hard fingers resist every wrench; two do not turn a bar's like about the line between them."""
     grasp, q, _, _ = gripped()
-    found = jd.grasp.force_closure(grasp, q, required=True)
-    assert found.closed and found.margin > 0.1
-    np.testing.assert_allclose(jd.grasp.grasp_map(grasp, q) @ found.forces, 0, atol=1e-9)
+    computed = jd.grasp.force_closure(grasp, q, required=True)
+    assert computed.closed and computed.margin > 0.1
+    np.testing.assert_allclose(jd.grasp.grasp_map(grasp, q) @ computed.forces, 0, atol=1e-9)
     contacts = [one for one in grasp.constraints[:2]]
     two = Grasp(grasp.system, "ball", contacts, cones=grasp.cones)
     with pytest.raises(ValueError, match=r"\['tip1', 'tip2'\] on 'ball' have no force closure: the wrench"):

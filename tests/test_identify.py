@@ -554,7 +554,7 @@ def test_trajectory_fit_of_noisy_states(arm):
     nominal = planar_arm(1.5, 0.5)
     fit = identify.fit_trajectory(nominal, log, ("viscous",), horizon=25, initial="free", substeps=2)
     base = identify.base_parameters(arm)
-    true, found, old = (base.values(model.inertias) for model in (arm, fit.model, nominal))
-    assert np.linalg.norm(found - true) < 0.03 * np.linalg.norm(old - true)
+    true, computed, old = (base.values(model.inertias) for model in (arm, fit.model, nominal))
+    assert np.linalg.norm(computed - true) < 0.03 * np.linalg.norm(old - true)
     assert np.abs(fit.friction.viscous).max() < 0.01
     assert max(identify.trajectory_error(fit.model, simulated_log(arm), fit.friction, substeps=2)) < 2

@@ -277,9 +277,9 @@ def coverage(noises, count, size=0.05):
         x[20:] = [0.3, 0.2, 0.4, 0.3, 0.1, -0.2, 0.05, 0.02]
         bare = motion(seed)
         log = measured(model, bare, x, size * noises(seed, len(bare)))
-        found = identify.fit_robot(nominal, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals
-        off = np.abs(found.base.values - found.combinations.values(x))
-        inside.append(off <= found.factor * found.base.std)
+        fit = identify.fit_robot(nominal, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals
+        off = np.abs(fit.base.values - fit.combinations.values(x))
+        inside.append(off <= fit.factor * fit.base.std)
     return np.mean(inside)
 
 
@@ -307,20 +307,18 @@ def test_intervals_cover_for_many_arms(noises):
 
 def test_what_no_data_touch_is_from_the_prior(truth):
     model = arm()
-    found = identify.fit_robot(
+    fit = identify.fit_robot(
         model, measured(model, motion(1), truth, noise=0.05), v_s=0.01, prior=1.0, robust=None
     ).intervals
-    sources = dict(zip(found.parameters.names, found.parameters.sources, strict=True))
+    sources = dict(zip(fit.parameters.names, fit.parameters.sources, strict=True))
     assert sources["a.Ixx"] == sources["b.Izz"] == "prior"  # the arm moves in a plane
     assert sources["b_joint.viscous"] == sources["b_joint.coulomb"] == "data"
-    base = dict(zip(found.base.names, found.base.sources, strict=True))
+    base = dict(zip(fit.base.names, fit.base.sources, strict=True))
     assert base["b.mcz"] == "data"
     no_friction = measured(model, motion(1), truth * np.repeat([1, 0, 1], [20, 4, 4]), noise=0.05)
-    found = identify.fit_robot(
-        model, no_friction, identify.TERMS, v_s=0.01, prior=1.0, robust=None
-    ).intervals.parameters
-    at_bound = found.values[20:24] == 0
-    assert np.isnan(found.std[20:24][at_bound]).all() and np.isfinite(found.std[20:24][~at_bound]).all()
+    fit = identify.fit_robot(model, no_friction, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals.parameters
+    at_bound = fit.values[20:24] == 0
+    assert np.isnan(fit.std[20:24][at_bound]).all() and np.isfinite(fit.std[20:24][~at_bound]).all()
 
 
 def test_two_halves_agree_within_their_intervals(truth):
@@ -404,13 +402,13 @@ def test_payload_is_what_loaded_logs_differ_by(truth):
     x[10:20] += held
     unloaded = [measured(model, motion(seed), truth, noise=0.02, seed=seed) for seed in (1, 2)]
     loaded = measured(model, motion(3), x, noise=0.02, seed=3)
-    found = identify.fit_payload(nominal, unloaded, loaded, terms=identify.TERMS, v_s=0.01, prior=1.0, robust=None)
-    assert found.body == "b" and found.error < 0.5 * found.without
+    fit = identify.fit_payload(nominal, unloaded, loaded, terms=identify.TERMS, v_s=0.01, prior=1.0, robust=None)
+    assert fit.body == "b" and fit.error < 0.5 * fit.without
     # A planar arm shows m x, m z and the inertia about its axis alone, and not the mass without them.
     seen = [1, 3, 6]
-    assert np.all(np.abs(found.inertia - held)[seen] <= found.factor * found.std[seen] + 1e-3)
-    assert np.abs(found.inertia - held)[seen].max() < 0.03
-    assert inertia.is_feasible(found.inertia)
+    assert np.all(np.abs(fit.inertia - held)[seen] <= fit.factor * fit.std[seen] + 1e-3)
+    assert np.abs(fit.inertia - held)[seen].max() < 0.03
+    assert inertia.is_feasible(fit.inertia)
     with pytest.raises(ValueError, match=r"body is 'hand'; the bodies are a, b"):
         identify.fit_payload(nominal, unloaded, loaded, "hand")
 
@@ -469,13 +467,13 @@ def test_whiteness_of_known_noise():
         slow[i] = r * slow[i - 1] + noise[i]
     t = 0.01 * np.arange(n)
     x = np.stack([noise, slow, np.zeros(n)], axis=1)
-    found = identify.whiteness(identify.Log(t, x, tau=x), x)
+    computed = identify.whiteness(identify.Log(t, x, tau=x), x)
     # The sum of the correlation up to its first zero has a standard error of some per cent.
-    assert found.correlation_time[0] == pytest.approx(0.01, rel=0.1) and found.effective_samples[0] == pytest.approx(
-        n, rel=0.1
-    )
-    assert found.correlation_time[1] == pytest.approx(0.19, rel=0.15)
-    assert found.correlation_time[2] == pytest.approx(0.01)
+    assert computed.correlation_time[0] == pytest.approx(0.01, rel=0.1) and computed.effective_samples[
+        0
+    ] == pytest.approx(n, rel=0.1)
+    assert computed.correlation_time[1] == pytest.approx(0.19, rel=0.15)
+    assert computed.correlation_time[2] == pytest.approx(0.01)
 
 
 # --- excitation -------------------------------------------------------------------------------------------------------
@@ -485,10 +483,10 @@ def test_exciting_motion_tells_more_within_its_limits():
     """Rest at both ends, all limits kept on a fine grid, torques by inverse dynamics; better condition than where it began."""
     model = arm().replace(lower=np.array([-1.0, -0.5]), upper=np.array([1.0, 2.0]), velocity_limit=np.array([2.0, 3.0]))
     model = model.replace(effort_limit=np.array([25.0, 9.0]))
-    found = identify.exciting_motion(model, period=4.0, harmonics=3, steps=60, starts=2)
-    assert found.condition < 0.9 * found.start_condition and found.logdet > 1
-    assert max(found.used.values()) <= 1 and found.history[-1] < found.history[0]
-    log = found.log(rate=250.0, periods=2)
+    computed = identify.exciting_motion(model, period=4.0, harmonics=3, steps=60, starts=2)
+    assert computed.condition < 0.9 * computed.start_condition and computed.logdet > 1
+    assert max(computed.used.values()) <= 1 and computed.history[-1] < computed.history[0]
+    log = computed.log(rate=250.0, periods=2)
     assert len(log) == 2001 and log.joint_names == model.joint_names
     middle, half = np.array([0.0, 0.75]), 0.9 * np.array([1.0, 1.25])
     assert np.all(np.abs(log.q - middle) <= half * (1 + 1e-3))  # peaks may lie between the samples that were looked at
@@ -497,7 +495,7 @@ def test_exciting_motion_tells_more_within_its_limits():
     np.testing.assert_allclose(log.v[[0, 1000, 2000]], 0, atol=1e-12)
     np.testing.assert_allclose(log.q[:1000], log.q[1000:2000], atol=1e-10)
     told = identify.identifiability(model, measured(model, log), v_s=0.1)
-    assert told.rank == len(told.base) and told.condition == pytest.approx(found.condition, rel=0.15)
+    assert told.rank == len(told.base) and told.condition == pytest.approx(computed.condition, rel=0.15)
     tau = identify.regressor(model, log.q, log.v, log.a)[:, :, :20] @ np.asarray(model.inertias).reshape(-1)
     np.testing.assert_allclose(log.tau, tau, atol=1e-10)
 
@@ -505,8 +503,8 @@ def test_exciting_motion_tells_more_within_its_limits():
 @pytest.mark.slow
 def test_exciting_motion_of_the_best_condition():
     model = arm().replace(effort_limit=np.array([25.0, 9.0]))
-    found = identify.exciting_motion(model, period=4.0, harmonics=3, objective="condition", steps=60, starts=2)
-    assert found.condition < found.start_condition
+    computed = identify.exciting_motion(model, period=4.0, harmonics=3, objective="condition", steps=60, starts=2)
+    assert computed.condition < computed.start_condition
 
 
 def test_exciting_motion_says_no():

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from pinocchio_bridge import quick
 
 import jaxdyn as jd
 from jaxdyn.cli.common import output_path
@@ -35,6 +36,7 @@ OF_BODIES = {
     "generalized_force": (jd.generalized_force, Q, WRENCH),
     "integrate": (jd.integrate, Q, V),
     "jacobian_dot_v": (lambda m, q, v: jd.jacobian_dot_v(m, q, v, BODY), Q, V),
+    "link_adjoints": (jd.link_adjoints, Q),
     "mass_matrix_derivative": (jd.mass_matrix_derivative, Q),
     "mass_matrix_sqrt": (jd.mass_matrix_sqrt, Q),
     "newton_euler_matrices": (lambda m, q, v: jd.newton_euler_matrices(m, q, v).V, Q, V),
@@ -94,8 +96,8 @@ def as_users_have_it():
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
-def same(found, wanted):
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+def same(computed, wanted):
+    for a, b in zip(jax.tree.leaves(computed), jax.tree.leaves(wanted), strict=True):
         assert np.asarray(a).dtype == np.asarray(b).dtype
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
@@ -247,21 +249,21 @@ def test_no_success_with_rows_that_are_not_finite():
     """A force that is infinite where the motion ends enters no step; what is reported of it counts."""
     late = lambda system, q, v, t: jnp.where(t >= 0.2, jnp.inf, 0.0) * jnp.ones(2)  # noqa: E731
     scene = jd.Scene(ARM, forces=(late,))
-    found = jd.simulate(scene, [0.1, 0.2], [0, 0], [0, 0.2], stepsize=0.01, outputs=("acceleration",), throw=False)
-    assert not found.success
+    solution = jd.simulate(scene, [0.1, 0.2], [0, 0], [0, 0.2], stepsize=0.01, outputs=("acceleration",), throw=False)
+    assert not solution.success
 
 
 def test_one_enumeration_of_results():
-    found = [
+    solution = [
         jd.assemble(CHAIN, Q),
         jd.constrained_dynamics(CHAIN, Q, V),
         jd.reduced_dynamics(CHAIN, Q, NU, basis=(0,)),
         jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 0.1], stepsize=0.1),
     ]
-    assert all(one.result == jd.RESULTS.successful and one.success for one in found)
-    assert "successful" in str(found[0].result) and "<>" not in str(found[3].result)
+    assert all(one.result == jd.RESULTS.successful and one.success for one in solution)
+    assert "successful" in str(solution[0].result) and "<>" not in str(solution[3].result)
     stopped = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 9.0], max_steps=1, throw=False)
-    assert stopped.result == jd.RESULTS.max_steps_reached != found[1].result and not stopped.success
+    assert stopped.result == jd.RESULTS.max_steps_reached != solution[1].result and not stopped.success
 
 
 def test_every_code_of_diffrax_has_its_name():
@@ -274,8 +276,8 @@ def test_models_scenes_and_solutions_print_as_short_text():
     assert text.splitlines()[0] == "Model 'chain 2': 2 bodies, nq = 2, nv = 2, float64"
     assert all(name in text for name in (*ARM.body_names, *ARM.joint_names, "revolute", "0 1 0"))
     assert "(Gear): 1 holonomic row" in str(CHAIN) and str(jd.Scene(PLANE)) == "Scene of MetricSystem: nq = 2, nv = 2"
-    found = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 0.1], stepsize=0.05, outputs=("energy",))
-    assert str(found) == (
+    solution = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 0.1], stepsize=0.05, outputs=("energy",))
+    assert str(solution) == (
         "Solution: successful, t = 0 to 0.1 s of 0.1 s\n  RK4: 2 steps, 0 rejected\n  2 rows of q (1), v (1), energy"
     )
     seen = []
@@ -322,3 +324,66 @@ def test_other_faults_of_a_urdf(tmp_path):
         loaded(path, '<!DOCTYPE robot [\n<!ENTITY x "b">]>' + ROBOT.replace('link="b"', 'link="&x;"'))
     with pytest.warns(UserWarning, match=r"a.urdf:1: link 'b': a principal moment of inertia is negative \(-0.1 kg"):
         loaded(path, ROBOT.replace('ixx="1"', 'ixx="-0.1"'))
+
+
+def _free_and_ball():
+    builder = jd.ModelBuilder("free and ball")
+    builder.add_body("base", joint="free", inertia=jd.inertia.box(1.0, (0.3, 0.2, 0.1)))
+    builder.add_body("arm", parent="base", joint="spherical", inertia=jd.inertia.box(0.5, (0.1, 0.1, 0.4)))
+    return builder.build()
+
+
+def test_quaternions_stand_for_their_direction():
+    """Of any length, in functions and under jit: those of the unit quaternion, with no derivative along the length."""
+    model = _free_and_ball()
+    q = jax.random.normal(jax.random.key(0), (model.nq,))
+    v, tau = jax.random.normal(jax.random.key(1), (2, model.nv))
+    scale = jnp.ones(model.nq).at[3:7].set(3.0).at[7:11].set(0.2)
+    unit = jd.normalize(model, q)
+    scene = jd.Scene(model, (jd.distance("arm", (0.1, 0, 0.2), None, (2.0, 0, 0), 1.0),))
+
+    def values(q):
+        return (
+            jd.forward_kinematics(model, q),
+            jd.mass_matrix(model, q),
+            jd.forward_dynamics(model, q, v, tau),
+            jd.integrate(model, q, v),
+            jd.difference(model, unit, q),
+            jd.constraint_jacobian(scene, q),
+            jd.potential_energy(model, q),
+        )
+
+    compiled = quick(values)
+    same(compiled(unit), compiled(unit * scale))
+    same(values(unit), values(unit * scale))
+    rate = quick(lambda q: jd.configuration_rate(model, q, v))
+    np.testing.assert_allclose(rate(unit * scale)[3:], (rate(unit) * scale)[3:], rtol=1e-12)
+    along = (unit * scale).at[:3].set(0.0)
+    slopes = quick(lambda q: jax.jvp(values, (q,), (along,))[1])(unit * scale)
+    assert all(np.abs(x).max() < 1e-12 for x in jax.tree.leaves(slopes))
+
+
+@pytest.mark.parametrize("modes", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["smooth", "events"])
+def test_motions_start_from_unit_quaternions(modes):
+    """Others are refused where they are known, and end with a code where they are traced, beside lanes that go on."""
+    model = jd.ModelBuilder("ball").add_body("ball", joint="spherical", inertia=jd.inertia.box(1.0, (1, 2, 3))).build()
+    scene = jd.Scene(model, forces=(jd.DryFriction(0.3, normal=1.0, along=0),) if modes else ())
+    starts = jnp.asarray([[1.0, 0, 0, 0], [2.0, 0, 0, 0], [1.0002, 0, 0, 0], [0.0, 0, 0, 0], [jnp.nan, 0, 0, 0]])
+    v0, options = jnp.asarray([1.0, 0.2, 0.1]), {"throw": False} | ({} if modes else {"stepsize": 0.05})
+    with pytest.raises(ValueError, match="length 2 at joint 'ball_joint', expected 1; divide it by its length"):
+        jd.simulate(scene, starts[1], v0, [0.0, 0.1], **options)
+    run = jax.jit(jax.vmap(lambda q: jd.simulate(scene, q, v0, [0.0, 0.1], **options)))
+    computed = run(starts)
+    codes = ["successful", "unnormalized_start", "successful", "nonfinite_start", "nonfinite_start"]
+    for i, code in enumerate(codes):
+        assert bool((computed.result == getattr(jd.RESULTS, code))[i]), code
+    np.testing.assert_allclose(computed.q[2], computed.q[0], rtol=1e-12)
+    assert np.isnan(computed.q[1]).all()
+
+
+def test_codes_of_a_batch_print_as_words():
+    """`RESULTS[...]` of one sample is its sentence, of a batch the sentences of all lanes; the same enumeration everywhere."""
+    lanes = jax.vmap(lambda q: jd.constrained_dynamics(CHAIN, q, jnp.zeros(2)))(jnp.zeros((3, 2)))
+    assert jd.RESULTS[lanes.result] == "['successful' 'successful' 'successful']" and lanes.success.all()
+    one = jd.constrained_dynamics(CHAIN, jnp.zeros(2), jnp.zeros(2))
+    assert jd.RESULTS[one.result] == "successful" and "successful" in str(one.result)

@@ -33,8 +33,8 @@ def test_joined_models_move_side_by_side(states):
     @quick
     def compute(model, q, v, tau):
         frames = jnp.stack([jd.frame_pose(model, q, name) for name in model.frame_names])
-        found = jd.mass_matrix(model, q), jd.bias_force(model, q, v), jd.forward_dynamics(model, q, v, tau), frames
-        return *found, jd.kinetic_energy(model, q, v), jd.integrate(model, q, v, 0.3)
+        mass = jd.mass_matrix(model, q), jd.bias_force(model, q, v), jd.forward_dynamics(model, q, v, tau), frames
+        return *mass, jd.kinetic_energy(model, q, v), jd.integrate(model, q, v, 0.3)
 
     left, right = compute(LEFT, *states[0]), compute(alone, *states[1])
     M, h, a, frames, energy, moved = compute(both, *(jnp.concatenate(parts) for parts in zip(*states, strict=True)))
@@ -147,8 +147,8 @@ def saddle_point(scene, q, v):
         gamma.append(pin.getFrameAcceleration(model, data, frame, pin.LOCAL).vector)
     A, gamma = np.concatenate(A), np.concatenate(gamma)
     m = len(A)
-    found = np.linalg.solve(np.block([[M, -A.T], [A, np.zeros((m, m))]]), np.concatenate([-h, gamma]))
-    return A, found[: model.nv], found[model.nv :]
+    solution = np.linalg.solve(np.block([[M, -A.T], [A, np.zeros((m, m))]]), np.concatenate([-h, gamma]))
+    return A, solution[: model.nv], solution[model.nv :]
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
@@ -159,8 +159,8 @@ def test_arms_lift_a_plate_together(count):
 
     @quick
     def compute(q, v):
-        found = jd.constrained_dynamics(scene, q, v)
-        return jd.constraint_jacobian(scene, q), found.acceleration, found.multipliers, found.rank
+        dynamics = jd.constrained_dynamics(scene, q, v)
+        return jd.constraint_jacobian(scene, q), dynamics.acceleration, dynamics.multipliers, dynamics.rank
 
     A, a, lam, rank = compute(q, v)
     rows, acceleration, multipliers = saddle_point(scene, q, v)
@@ -186,8 +186,8 @@ def test_lifting_in_motion():
     ts, ends = jnp.array([0.0, 0.05, 0.1]), []
     for method in ("projected", "reduced"):
         options = {"stepsize": 0.01, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
-        found = quick(lambda q, v, method=method: jd.simulate(scene, q, v, ts, method=method, **options))(q, v)  # noqa: B023
-        assert bool(found.success) and float(found.constraint_residual.max()) < 1e-12
-        np.testing.assert_allclose(found.energy, found.energy[0], rtol=1e-9)
-        ends.append(found.q)
+        solution = quick(lambda q, v, method=method: jd.simulate(scene, q, v, ts, method=method, **options))(q, v)  # noqa: B023
+        assert bool(solution.success) and float(solution.constraint_residual.max()) < 1e-12
+        np.testing.assert_allclose(solution.energy, solution.energy[0], rtol=1e-9)
+        ends.append(solution.q)
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)

@@ -84,20 +84,20 @@ def first_pages(q, v, a):
     C = matrix([[-bs * v[1], -bs * (v[0] + v[1])], [bs * v[0], 0.0]])
     c1, c12 = jnp.cos(q[0]), jnp.cos(q[0] + q[1])
     rate = jax.jvp(lambda q: dynamics.mass_matrix(arm, q), (q,), (v,))[1]
-    found = dynamics.coriolis_matrix(arm, q, v)
+    computed = dynamics.coriolis_matrix(arm, q, v)
     return pairs | {
         "arm M": (
             dynamics.mass_matrix(arm, q),
             matrix([[alpha + 2 * beta * c2, delta + beta * c2], [delta + beta * c2, delta]]),
         ),
         "arm symbols": (dynamics.christoffel_symbols(arm, q), gamma),
-        "arm C": (found, C),
-        "arm skew": (rate - 2 * found, bs * (2 * v[0] + v[1]) * jnp.asarray([[0.0, 1.0], [-1.0, 0.0]])),
+        "arm C": (computed, C),
+        "arm skew": (rate - 2 * computed, bs * (2 * v[0] + v[1]) * jnp.asarray([[0.0, 1.0], [-1.0, 0.0]])),
         "arm N": (
             dynamics.gravity_force(arm, q),
             G * jnp.stack([m1 * r1 * c1 + m2 * (l1 * c1 + r2 * c12), m2 * r2 * c12]),
         ),
-        "arm h": (dynamics.bias_force(arm, q, v), found @ v + dynamics.gravity_force(arm, q)),
+        "arm h": (dynamics.bias_force(arm, q, v), computed @ v + dynamics.gravity_force(arm, q)),
     }
 
 
@@ -152,7 +152,7 @@ def spatial_arm(q, v, a):
         return [(R, R @ J[:3], R @ J[3:]) for R, J in zip(turned, jacobians, strict=True)]
 
     links, rates = jax.jvp(in_space, (q,), (v,))
-    found = [jnp.concatenate([R.T @ Jt, R.T @ JR]) for R, Jt, JR in links]
+    computed = [jnp.concatenate([R.T @ Jt, R.T @ JR]) for R, Jt, JR in links]
     by_links, bias, weight = jnp.zeros((3, 3)), jnp.zeros(3), jnp.zeros(3)
     in_space_axes, in_body_axes, pushed, wrenches = jnp.zeros((3, 3)), jnp.zeros((3, 3)), jnp.zeros(3), []
     for i, ((R, Jt, JR), (R_rate, Jt_rate, JR_rate)) in enumerate(zip(links, rates, strict=True)):
@@ -178,9 +178,9 @@ def spatial_arm(q, v, a):
     mass_matrix, gravity = dynamics.mass_matrix(model, q), dynamics.gravity_force(model, q)
     coriolis = dynamics.bias_force(model, q, v) - gravity
     pairs = {
-        "J1": (found[0], jnp.zeros((6, 3)).at[5, 0].set(1.0)),
-        "J2": (found[1], J2),
-        "J3": (found[2], J3),
+        "J1": (computed[0], jnp.zeros((6, 3)).at[5, 0].set(1.0)),
+        "J2": (computed[1], J2),
+        "J3": (computed[2], J3),
         "M": (mass_matrix, M),
         "M by link Jacobians": (by_links, M),
         "symbols": (dynamics.christoffel_symbols(model, q), gamma),
@@ -289,13 +289,13 @@ def test_double_pendulum_in_four_formulations():
     @quick
     @jax.vmap
     def both(angles, rates, a):
-        found, energies = [], []
+        rows, energies = [], []
         for name, scene in built.items():
             q, v = scenes.double_pendulum.start(formulation=name, angles=angles, rates=rates)
             got = constrained_dynamics(scene, q, v).acceleration
             theta = got[0]
             phi = got[0] + got[1] if name == "model" else got[-1]
-            found.append(jnp.stack([theta, phi]))
+            rows.append(jnp.stack([theta, phi]))
             kinetic, potential = (
                 dynamics.kinetic_energy(scene.system, q, v),
                 dynamics.potential_energy(scene.system, q),
@@ -311,7 +311,7 @@ def test_double_pendulum_in_four_formulations():
         gamma = gamma.at[1, 1, 1].set(-(m2**2) * l1**2 * l2**2 * c * s / D)
         pull = G * jnp.stack([(m1 + m2) * l1 * jnp.sin(angles[0]), m2 * l2 * jnp.sin(angles[1])])
         turning = m2 * l1 * l2 * s * jnp.stack([rates[1] ** 2, -(rates[0] ** 2)])
-        pairs = {f"acceleration by {name}": (other, found[0]) for name, other in zip(built, found, strict=True)}
+        pairs = {f"acceleration by {name}": (other, rows[0]) for name, other in zip(built, rows, strict=True)}
         pairs |= {f"energy by {name}": (other, energies[0]) for name, other in zip(built, energies, strict=True)}
         # The first link by its angle, the second by its angle and its end: the metric of the separate bodies is singular.
         ends = lambda s: jnp.append(s, l1 * hanging(s[0]) + l2 * hanging(s[1]))  # noqa: E731
@@ -382,7 +382,7 @@ def test_disk_and_link_in_contact():
         disk, link = reaction_force(scene, q, v)
         nu, u = link[1] / c, disk[1] + link[1]
         zero = jnp.zeros(())
-        (z1, height, _), (y1, y2, _) = scene.system.place(q, zero)
+        (z1, height, _), (y1, y2, _) = scene.system.configurations(q, zero)
         return {
             "touching": (jnp.stack([(y1 - z1) * s + (y2 - height) * c, height]), jnp.ones(2)),
             "along": ((y1 - z1) * c - (y2 - height) * s, -along),
@@ -398,8 +398,8 @@ def test_disk_and_link_in_contact():
 def test_pendulum_has_the_elliptic_motion():
     """Problem A01 of the IFToMM benchmark library, from rest at 90 degrees."""
     q0, v0 = scenes.pendulum.start()
-    found = simulate(scenes.pendulum(), q0, v0, jnp.asarray([0.0, 1.0, 5.0, 9.99]), rtol=1e-12, atol=1e-12)
-    x, y = jnp.sin(found.q[1:, 0]), -jnp.cos(found.q[1:, 0])
+    solution = simulate(scenes.pendulum(), q0, v0, jnp.asarray([0.0, 1.0, 5.0, 9.99]), rtol=1e-12, atol=1e-12)
+    x, y = jnp.sin(solution.q[1:, 0]), -jnp.cos(solution.q[1:, 0])
     assert_close(x, [0.986291751131875319, -0.942305435043757335, -0.316436469913032291], 1e-9)  # steps add up
     assert_close(y, [-0.165010853125541169, -0.334754338414000581, -0.948613704575776519], 1e-9)
 
@@ -408,9 +408,9 @@ def test_block_slides_until_it_stops():
     """It stops after v0 / (mu g), v0^2 / (2 mu g) further on; slid the other way it is the mirror image."""
     stop = 2.0 / (0.3 * G)
     q0, v0 = scenes.sliding_block.start(velocity=2.0)
-    found = simulate(scenes.sliding_block(mass=1.7), q0, v0, jnp.asarray([0.0, stop]), stepsize=stop / 2)
-    assert_close(found.q[-1], [2.0**2 / (2 * 0.3 * G)], 1e-13)  # the method is exact for a parabola
-    assert_close(found.v[-1], [0.0], 1e-13)
+    solution = simulate(scenes.sliding_block(mass=1.7), q0, v0, jnp.asarray([0.0, stop]), stepsize=stop / 2)
+    assert_close(solution.q[-1], [2.0**2 / (2 * 0.3 * G)], 1e-13)  # the method is exact for a parabola
+    assert_close(solution.v[-1], [0.0], 1e-13)
     assert_close(scenes.sliding_block(mass=1.7, direction=-1).applied_force(q0, -v0), [0.3 * 1.7 * G], 1e-15)
 
 
@@ -419,10 +419,10 @@ def test_a_block_that_has_stopped_gains_no_energy():
     stop, h = 2.0 / (0.3 * G), 1e-3
     scene, (q0, v0) = scenes.sliding_block(), scenes.sliding_block.start(velocity=2.0)
     ts = jnp.asarray([0.0, 3 * stop])
-    found = simulate(scene, q0, v0, ts, throw=False, max_steps=500)
-    assert not bool(found.success) and abs(float(found.stats["time_reached"]) - stop) < 1e-3
-    found = simulate(scene, q0, v0, ts, stepsize=h, throw=False)
-    assert abs(float(found.v[-1, 0])) < 0.3 * G * h and abs(float(found.q[-1, 0]) - 4 / (0.6 * G)) < 2 * h
+    solution = simulate(scene, q0, v0, ts, throw=False, max_steps=500)
+    assert not bool(solution.success) and abs(float(solution.stats["time_reached"]) - stop) < 1e-3
+    solution = simulate(scene, q0, v0, ts, stepsize=h, throw=False)
+    assert abs(float(solution.v[-1, 0])) < 0.3 * G * h and abs(float(solution.q[-1, 0]) - 4 / (0.6 * G)) < 2 * h
     assert_close(scene.applied_force(q0, -v0), [0.3 * G], 1e-15)
 
 
@@ -433,8 +433,8 @@ def test_trajectories_are_differentiated_by_parameters_of_the_lagrangian():
     def end(p):
         scene = scenes.double_pendulum(masses=(p[0], p[1]), length=p[2], reaches=(p[3], p[4]), gravity=p[5])
         q0, v0 = scenes.double_pendulum.start()
-        found = simulate(scene, q0, v0, jnp.asarray([0.0, 0.5]), stepsize=0.025)
-        return jnp.sum(jnp.asarray([1.0, -0.7]) * found.q[-1]) + found.v[-1, 0]
+        solution = simulate(scene, q0, v0, jnp.asarray([0.0, 0.5]), stepsize=0.025)
+        return jnp.sum(jnp.asarray([1.0, -0.7]) * solution.q[-1]) + solution.v[-1, 0]
 
     step = 1e-5 * np.eye(6)
     ahead, behind = quick(jax.vmap(end))(jnp.concatenate([at[None] + step, at[None] - step])).reshape(2, 6)
@@ -496,10 +496,10 @@ def test_inertia_of_a_box_and_its_change_of_frame():
     pose = se3.exp(jnp.asarray([0.3, -0.2, 0.5, 0.4, 1.1, -0.6]))
     centred, moved = (scenes.free_box(mass=mass, size=(l, w, h), frame=frame).system for frame in (None, pose))
     q, V = scenes.free_box.start(velocity=(0.3, -1.0, 0.4))
-    found = quick(
+    computed = quick(
         lambda q, V: [(dynamics.mass_matrix(m, q), dynamics.kinetic_energy(m, q, V)) for m in (centred, moved)]
     )
-    ((at_centre, energy), (away, other)), Ad = found(q, V), se3.Ad(pose)
+    ((at_centre, energy), (away, other)), Ad = computed(q, V), se3.Ad(pose)
     assert_close(at_centre, M, 1e-15)
     assert_close(energy, mass * V[:3] @ V[:3] / 2 + V[3:] @ (moments * V[3:]) / 2, 1e-14)
     assert_close(away, Ad.T @ M @ Ad, 1e-13)

@@ -84,13 +84,13 @@ def test_inverse_dynamics_agrees_with_pinocchio(file):
     feet, q = feet_of(file), crouched(model, file)
     rng = np.random.default_rng(0)
     v, a = (jnp.asarray(x) for x in 0.1 * rng.normal(size=(2, model.nv)))
-    found = quick(lambda q, v, a: jd.underactuated_inverse_dynamics(model, q, v, a, feet))(q, v, a)
-    assert bool(found.success)
-    assert np.asarray(found.margins).min() > -1e-6  # the tolerance of the quadratic program, forces of some 100 N
+    legged = quick(lambda q, v, a: jd.underactuated_inverse_dynamics(model, q, v, a, feet))(q, v, a)
+    assert bool(legged.success)
+    assert np.asarray(legged.margins).min() > -1e-6  # the tolerance of the quadratic program, forces of some 100 N
     there, data = bridge.q_to_pinocchio(q), source.createData()
     pin.framesForwardKinematics(source, data, there)
     wrenches = [pin.Force.Zero() for _ in range(source.njoints)]
-    for one, force in zip(feet, found.by_foot().values(), strict=True):
+    for one, force in zip(feet, legged.by_foot().values(), strict=True):
         frame = source.frames[source.getFrameId(one.frame, pin.FrameType.BODY)]
         placed = data.oMf[source.getFrameId(one.frame, pin.FrameType.BODY)]
         wrench = np.zeros(6)
@@ -99,8 +99,8 @@ def test_inverse_dynamics_agrees_with_pinocchio(file):
             wrench[:3] = placed.rotation.T @ wrench[:3]
         wrenches[frame.parentJoint] += frame.placement.act(pin.Force(wrench))
     want = pin.rnea(source, data, there, np.asarray(v), np.asarray(a), wrenches)
-    assert_close(found.tau, want, 1e-9)
-    assert not np.asarray(found.tau)[:6].any()
+    assert_close(legged.tau, want, 1e-9)
+    assert not np.asarray(legged.tau)[:6].any()
 
 
 @pytest.mark.parametrize("file", CASES)
@@ -111,7 +111,7 @@ def test_standing_agrees_with_pinocchios_constraint_dynamics(file):
     rng = np.random.default_rng(1)
     tau = jnp.asarray(rng.normal(size=model.nv)).at[:6].set(0.0)
     scene = jd.Scene(model, [one.hold(model, q) for one in feet])
-    found = quick(lambda q, tau: jd.constrained_dynamics(scene, q, jnp.zeros(model.nv), tau))(q, tau)
+    dynamics = quick(lambda q, tau: jd.constrained_dynamics(scene, q, jnp.zeros(model.nv), tau))(q, tau)
 
     there, data = bridge.q_to_pinocchio(q), source.createData()
     pin.framesForwardKinematics(source, data, there)
@@ -128,13 +128,13 @@ def test_standing_agrees_with_pinocchios_constraint_dynamics(file):
         source, data, there, np.zeros(model.nv), np.asarray(tau), contacts, datas, settings
     ).copy()
     # Contacts of both feet of a standing biped are rigid: cond(M) amplifies rounding.
-    assert_close(found.acceleration, want, 1e-8 if ROBOTS[file][1] else 1e-9)
+    assert_close(dynamics.acceleration, want, 1e-8 if ROBOTS[file][1] else 1e-9)
     pushed = sum(
         pin.getFrameJacobian(source, data, source.getFrameId(one.frame, pin.FrameType.BODY), pin.LOCAL).T
         @ _local_wrench(source, contact, part, one)
         for one, contact, part in zip(feet, contacts, datas, strict=True)
     )
-    scene_force = np.asarray(jd.constraint_jacobian(scene, q)).T @ np.asarray(found.multipliers)
+    scene_force = np.asarray(jd.constraint_jacobian(scene, q)).T @ np.asarray(dynamics.multipliers)
     assert_close(scene_force, pushed, 1e-8 if ROBOTS[file][1] else 1e-9)
 
 
@@ -147,18 +147,18 @@ def _local_wrench(source, contact, data, one):
 def test_solo_stands_with_forces_in_its_cones(solo):
     """The torques of the program, applied: the held robot does not move, and the multipliers are the program's forces."""
     model, _, _, q, feet = solo
-    still = jnp.zeros(model.nv)
+    at_rest = jnp.zeros(model.nv)
     scene = jd.Scene(model, [one.hold(model, q) for one in feet])
 
     @quick
     def stand(q):
-        wanted = jd.underactuated_inverse_dynamics(model, q, still, still, feet, preload=0.5)
-        return wanted, jd.constrained_dynamics(scene, q, still, wanted.tau)
+        wanted = jd.underactuated_inverse_dynamics(model, q, at_rest, at_rest, feet, preload=0.5)
+        return wanted, jd.constrained_dynamics(scene, q, at_rest, wanted.tau)
 
-    wanted, found = stand(q)
+    wanted, computed = stand(q)
     assert bool(wanted.success) and wanted.margins.min() > 0.5 - 1e-6
-    np.testing.assert_allclose(found.acceleration, 0.0, atol=1e-8)
-    np.testing.assert_allclose(found.multipliers, wanted.forces, atol=1e-7)
+    np.testing.assert_allclose(computed.acceleration, 0.0, atol=1e-8)
+    np.testing.assert_allclose(computed.multipliers, wanted.forces, atol=1e-7)
     weight = float(model.inertias[:, 0].sum()) * 9.81
     np.testing.assert_allclose(sum(f[2] for f in wanted.by_foot().values()), weight, rtol=1e-7)
 
@@ -166,34 +166,34 @@ def test_solo_stands_with_forces_in_its_cones(solo):
 def test_what_the_feet_cannot_carry_has_a_code(solo):
     """A wanted fall faster than free fall asks feet to pull; a limit on torques that is too low."""
     model, _, _, q, feet = solo
-    still, down = jnp.zeros(model.nv), jnp.zeros(model.nv).at[2].set(-15.0)
-    solve = quick(lambda a, limit: jd.underactuated_inverse_dynamics(model, q, still, a, feet, effort_limit=limit))
-    assert bool(solve(still, 10.0).success)
-    for a, limit in ((down, 10.0), (still, 0.01)):
-        found = solve(a, limit)
-        assert found.result == jd.contact.RESULTS.infeasible
-    missing = quick(lambda a: jd.control.missing_wrench(model, q, still, a, feet))
+    at_rest, down = jnp.zeros(model.nv), jnp.zeros(model.nv).at[2].set(-15.0)
+    solve = quick(lambda a, limit: jd.underactuated_inverse_dynamics(model, q, at_rest, a, feet, effort_limit=limit))
+    assert bool(solve(at_rest, 10.0).success)
+    for a, limit in ((down, 10.0), (at_rest, 0.01)):
+        solution = solve(a, limit)
+        assert solution.result == jd.contact.RESULTS.infeasible
+    missing = quick(lambda a: jd.control.missing_wrench(model, q, at_rest, a, feet))
     # Feet cannot pull: what is left is what the base needs, but for torques that no normal force could change.
     mass = float(model.inertias[:, 0].sum())
     np.testing.assert_allclose(missing(down)[2], mass * (9.81 - 15.0), rtol=1e-5)
     # The weight is 24 N, and the regularisation 1e-6.
-    np.testing.assert_allclose(missing(still), 0.0, atol=1e-4)
-    limited = solve(still, 0.9)
+    np.testing.assert_allclose(missing(at_rest), 0.0, atol=1e-4)
+    limited = solve(at_rest, 0.9)
     assert bool(limited.success) and np.abs(limited.tau).max() < 0.9 + 1e-6
-    flying = jd.underactuated_inverse_dynamics(model, q, still, still, [])
+    flying = jd.underactuated_inverse_dynamics(model, q, at_rest, at_rest, [])
     assert flying.result == jd.contact.RESULTS.infeasible
 
 
 def test_forces_are_differentiable(solo):
     """Gradients in the acceleration and in friction against differences, forces on the boundary of their cones."""
     model, _, _, q, _ = solo
-    names, still = ROBOTS["solo12.urdf"][0], jnp.zeros(model.nv)
+    names, at_rest = ROBOTS["solo12.urdf"][0], jnp.zeros(model.nv)
     push = jnp.zeros(model.nv).at[0].set(3.0)
 
     def torque(mu, scale):
         feet = [jd.control.foot(name, jd.contact.friction_cone("hard-finger", mu=mu)) for name in names]
-        found = jd.underactuated_inverse_dynamics(model, q, still, scale * push, feet)
-        return jnp.sum(found.tau**2)
+        legged = jd.underactuated_inverse_dynamics(model, q, at_rest, scale * push, feet)
+        return jnp.sum(legged.tau**2)
 
     value = quick(torque)
     slopes = quick(jax.grad(torque, argnums=(0, 1)))(0.35, 1.0)

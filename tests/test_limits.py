@@ -42,13 +42,13 @@ def test_lanes_end_at_their_own_times(cart):
     """From -v: down and back up again, or through the lower limit; q(t) = v t + t^2 / 4."""
     speeds = jnp.array([[0.0], [-0.9], [-1.2], [0.5]])
     run = jax.jit(jax.vmap(lambda v: jd.simulate(cart, jnp.zeros(1), v, TS, control=push, limits="stop")))
-    found = run(speeds)
+    computed = run(speeds)
     v = np.asarray(speeds)[:, 0]
     upper, lower = 2 * (-v + np.sqrt(v**2 + 1)), -2 * v[2] - 2 * np.sqrt(v[2] ** 2 - 1)
     times = np.where(np.arange(4) == 2, lower, upper)
     ends = times < 3.0
-    assert ends.tolist() == (found.result == jd.RESULTS.joint_limit_passed).tolist() == [True, False, True, True]
-    np.testing.assert_allclose(found.stats["time_reached"][ends], times[ends], rtol=1e-7)
+    assert ends.tolist() == (computed.result == jd.RESULTS.joint_limit_passed).tolist() == [True, False, True, True]
+    np.testing.assert_allclose(computed.stats["time_reached"][ends], times[ends], rtol=1e-7)
 
 
 def test_a_motion_that_goes_on_tells(cart):

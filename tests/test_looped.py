@@ -8,8 +8,7 @@ import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree, to_pinocchio
 
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.dynamics import scans as looped
-from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.dynamics import scans, world_frame
 from jaxdyn.model.robots import chain as planar_chain
 from jaxdyn.model.robots import random_tree as chain
 
@@ -21,8 +20,8 @@ def test_joints_of_every_kind():
     q, v, a, tau, _ = random_states(model, 3, 0)
 
     def both(q, v, a, tau):
-        ours = looped.inverse_dynamics(model, q, v, a), looped.forward_dynamics(model, q, v, tau)
-        return ours, (matrix_form.inverse_dynamics(model, q, v, a), matrix_form.forward_dynamics(model, q, v, tau))
+        ours = scans.inverse_dynamics(model, q, v, a), scans.forward_dynamics(model, q, v, tau)
+        return ours, (world_frame.inverse_dynamics(model, q, v, a), world_frame.forward_dynamics(model, q, v, tau))
 
     for x, y in zip(*quick(jax.vmap(both))(q, v, a, tau), strict=True):
         assert_close(x, y, 1e-11)
@@ -43,8 +42,8 @@ def test_derivatives():
         at = v, tau, model.inertias
         return jax.grad(value, (0, 1, 2))(*at), jax.jvp(value, at, steps)
 
-    found, want = quick(lambda: (of(looped), of(matrix_form)))()
-    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+    computed, want = quick(lambda: (of(scans), of(world_frame)))()
+    for x, y in zip(jax.tree.leaves(computed), jax.tree.leaves(want), strict=True):
         assert_close(x, y, 1e-9)  # M is factored in two ways
 
 
@@ -80,7 +79,7 @@ def test_long_chains(count, links):
     run = jax.jit(jax.vmap(lambda *state: dynamics.forward_dynamics(model, *state)))
     assert ("jaxdyn_kernel" in run.lower(q, v, tau).as_text()) == (links <= dynamics.MAX_BODIES)
     by_matrices = quick(
-        jax.vmap(lambda *x: (matrix_form.forward_dynamics(model, *x), matrix_form.mass_matrix(model, x[0])))
+        jax.vmap(lambda *x: (world_frame.forward_dynamics(model, *x), world_frame.mass_matrix(model, x[0])))
     )
     want, masses = by_matrices(q, v, tau)
     # Solving with M amplifies rounding by its condition number, which grows as the fourth power of the number of links.

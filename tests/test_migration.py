@@ -25,9 +25,9 @@ ARM = """<mujoco><option gravity="0 0 -9.81"/><worldbody>
 def rows(section: str) -> list[tuple[str, str]]:
     """The two calls of each row of a section's table."""
     text = re.split(r"\n## ", PAGE.partition(f"## {section}\n")[2])[0]
-    found = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", text, flags=re.MULTILINE)
-    assert len(found) == len(re.findall(r"^\|", text, flags=re.MULTILINE)) - 2, "a row that is not read"
-    return found
+    matches = re.findall(r"^\| `([^`]+)` \| `([^`]+)` \|$", text, flags=re.MULTILINE)
+    assert len(matches) == len(re.findall(r"^\|", text, flags=re.MULTILINE)) - 2, "a row that is not read"
+    return matches
 
 
 def agree(section: str, theirs: dict, ours: dict, rtol: float) -> None:

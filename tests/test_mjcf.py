@@ -305,6 +305,6 @@ def test_a_loop_of_a_file_assembles_from_a_rough_guess(tmp_path):
     rest = '<equality><connect body1="rod" body2="rocker" anchor="0.8 0 0"/></equality>'
     scene = silent(of_body(tmp_path, bars, rest))
     q = scene.starts["reference"].q + jnp.array([0.3, -0.2, 0.1])
-    found = jd.assemble(scene, q)
-    assert found.residual.max() < 1e-12
-    assert np.abs(found.q - scene.starts["reference"].q).max() > 0.1
+    assembly = jd.assemble(scene, q)
+    assert assembly.residual.max() < 1e-12
+    assert np.abs(assembly.q - scene.starts["reference"].q).max() > 0.1

@@ -119,14 +119,14 @@ def top(module: str) -> str:
 
 def reachable(module: str) -> dict[str, str]:
     """Every module that `module` imports, directly or through others, each with the module that imports it."""
-    found: dict[str, str] = {}
+    computed: dict[str, str] = {}
     stack = [module]
     while stack:
         current = stack.pop()
-        for used in USES[current] - found.keys():
-            found[used] = current
+        for used in USES[current] - computed.keys():
+            computed[used] = current
             stack.append(used)
-    return found
+    return computed
 
 
 def name_of(tree: ast.AST) -> str:

@@ -61,15 +61,15 @@ GROUPS = "contact control geometry grasp identify inertia plot robots scenes se2
 
 def exports() -> dict[str, object]:
     """All that users call, by the name that they write: the names of jaxdyn, and those of its groups."""
-    found = {f"jd.{name}": x for name, x in vars(jd).items() if not name.startswith("_") and not inspect.ismodule(x)}
+    computed = {f"jd.{name}": x for name, x in vars(jd).items() if not name.startswith("_") and not inspect.ismodule(x)}
     for group in GROUPS:
         room = getattr(jd, group)
         # A group that is one module exports what is written in it, a package what it re-exports.
         own = "jaxdyn" if hasattr(room, "__path__") else room.__name__
         for name, x in vars(room).items():
             if not name.startswith("_") and getattr(x, "__module__", "").startswith(own):
-                found[f"jd.{group}.{name}"] = x
-    return found
+                computed[f"jd.{group}.{name}"] = x
+    return computed
 
 
 def test_every_export_is_described():

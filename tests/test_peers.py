@@ -33,14 +33,14 @@ def accelerations(name, q, v, t=0.0):
     drift = np.asarray(jax.jvp(lambda q, t: moving(q, v, t), (q, t), (v, jnp.ones(())))[1])
     rows = len(J)
     K = np.block([[M, -J.T], [J, np.zeros((rows, rows))]])
-    found = np.linalg.lstsq(K, np.concatenate([f, -drift]))[0]
-    return found[: len(v)], found[len(v) :]
+    computed = np.linalg.lstsq(K, np.concatenate([f, -drift]))[0]
+    return computed[: len(v)], computed[len(v) :]
 
 
 def test_andrews_by_hand_has_the_printed_accelerations():
     q, v = (np.asarray(x) for x in jd.scenes.andrews.start())
-    found, multipliers = accelerations("andrews", q, v)
-    np.testing.assert_allclose(found, ANDREWS, rtol=1e-10, atol=1e-8)
+    computed, multipliers = accelerations("andrews", q, v)
+    np.testing.assert_allclose(computed, ANDREWS, rtol=1e-10, atol=1e-8)
     # They stand on the left as printed.
     np.testing.assert_allclose(-multipliers[:2], (98.5668703962410896, -6.12268834425566265), rtol=1e-11)
 
@@ -57,26 +57,26 @@ def test_windows_by_hand_turn_as_a_pendulum(count):
     """th'' = g G sin th/I for the uprights, and the couplers stay level."""
     angle, turn, name = 0.7, -1.3, {2: "windows", 40: "windows_40"}[count]
     uprights = np.arange(2 * count + 1) % 2 == 0
-    found, _ = accelerations(name, np.where(uprights, angle, 0.0), np.where(uprights, turn, 0.0))
+    computed, _ = accelerations(name, np.where(uprights, angle, 0.0), np.where(uprights, turn, 0.0))
     inertia, weight = (count + 1) / 3 + count, 9.81 * ((count + 1) / 2 + count)
-    np.testing.assert_allclose(found, np.where(uprights, weight / inertia * np.sin(angle), 0.0), atol=1e-10)
+    np.testing.assert_allclose(computed, np.where(uprights, weight / inertia * np.sin(angle), 0.0), atol=1e-10)
 
 
 def test_disk_by_hand_rolls_on_a_circle():
     """The centre at 1 m/s turns at 1 rad/s; friction is mass times that."""
     q, v = (np.asarray(x) for x in jd.scenes.rolling_disk.start(heading=0.4))
-    found, multipliers = accelerations("rolling_disk", q, v)
+    computed, multipliers = accelerations("rolling_disk", q, v)
     want = np.array([-np.sin(0.4), np.cos(0.4)])
-    np.testing.assert_allclose(found, [*want, 0.0, 0.0], atol=1e-13)
+    np.testing.assert_allclose(computed, [*want, 0.0, 0.0], atol=1e-13)
     np.testing.assert_allclose(multipliers, 2.0 * want, atol=1e-13)
 
 
 def test_four_bar_by_hand_is_that_of_pinocchio():
     equations, twin = EQUATIONS["four_bar"](), TWINS["four_bar"]()
     q, v = (np.asarray(x) for x in jd.scenes.four_bar.start())
-    found, _ = accelerations("four_bar", *equations.there(q, v))
+    computed, _ = accelerations("four_bar", *equations.there(q, v))
     want = slope(twin)(0.0, np.concatenate(twin.there(q, v)))[3:]
-    np.testing.assert_allclose(equations.back(np.zeros(3), found)[1], want, rtol=1e-10)
+    np.testing.assert_allclose(equations.back(np.zeros(3), computed)[1], want, rtol=1e-10)
 
 
 @pytest.mark.parametrize("name", sorted(EQUATIONS))
@@ -108,5 +108,5 @@ def test_andrews_of_bodies_for_pinocchio_and_mujoco():
 def test_peers_that_are_missing_are_named():
     lines = []
     peers = Peers(lines.append, ("no_such_peer",))
-    assert peers.found == []
+    assert peers.modules == []
     assert "without the peer no_such_peer" in lines[0]

@@ -72,9 +72,9 @@ def test_solids_of_inertia_have_that_inertia(moments):
     model = jd.ModelBuilder("one").add_body("body", joint="spherical", inertia=inertia).build()
     (solid,) = [shape for shape in inferred.completed(jd.Scene(model), Shapes()) if shape.kind != "capsule"]
     vertices, faces = solid.triangles()
-    found = inertia_of(vertices - com, faces, mass)
+    computed = inertia_of(vertices - com, faces, mass)
     # Round solids are polygons of 24 sides.
-    np.testing.assert_allclose(found, inertia[2], atol=(1e-12 if solid.kind == "box" else 0.03) * max(moments))
+    np.testing.assert_allclose(computed, inertia[2], atol=(1e-12 if solid.kind == "box" else 0.03) * max(moments))
 
 
 @pytest.mark.parametrize("name", WITH_BODIES)
@@ -237,15 +237,15 @@ def test_marks_and_forces_of_a_loop(turning):
     np.testing.assert_array_equal(force.places, mark.b)
     rows = np.asarray(jd.constraint_jacobian(scene, solution.q[0, 0]))
     dq = 1e-6 * np.random.default_rng(0).normal(size=scene.nv)
-    found = []
+    computed = []
     for sign in (1.0, -1.0):
         poses = motion.poses_of(scene.system, (np.asarray(solution.q[0, 0]) + sign * dq)[None])
         places = [
             inferred.place_of(scene.system, poses, body) @ np.asarray(pose)
             for body, pose in scene.constraints[0].ends()
         ]
-        found.append(places[1][0, :3, 3] - places[0][0, :3, 3])
-    work = force.vectors[0, 0] @ (found[0] - found[1]) / 2
+        computed.append(places[1][0, :3, 3] - places[0][0, :3, 3])
+    work = force.vectors[0, 0] @ (computed[0] - computed[1]) / 2
     # A central difference over a step of 1e-6; the start closes the loop to rounding.
     assert work == pytest.approx(float(np.asarray(solution.multipliers[0, 0]) @ rows @ dq), rel=1e-6)
     # Torques are along the joints' axes, which are across the plane.
@@ -257,25 +257,25 @@ def test_marks_and_forces_of_a_loop(turning):
 def test_force_of_a_wheel_is_at_its_contact_and_as_newton_has_it():
     scene = jd.scenes.rolling_coin()
     q, v = jd.scenes.rolling_coin.start()
-    found = jd.constrained_dynamics(scene, q, v)
-    solution = solution_of(scene, q[None], [0.0], multipliers=found.multipliers[None])
+    dynamics = jd.constrained_dynamics(scene, q, v)
+    solution = solution_of(scene, q[None], [0.0], multipliers=dynamics.multipliers[None])
     moved = motion.motion_of(scene, solution)
     (force,), (mark,) = motion.forces(moved), motion.marks(moved)
     assert mark.kind == "contact"
     np.testing.assert_allclose(force.places[..., 2], 0.0, atol=1e-12)  # on the ground
     np.testing.assert_allclose(mark.axis[0, 0], [0, 0, 1.0], atol=1e-12)
     # The ground is all that touches the coin: the force that its motion asks for.
-    asked = np.asarray(jd.inverse_dynamics(scene.system, q, v, found.acceleration))[:3]
+    asked = np.asarray(jd.inverse_dynamics(scene.system, q, v, dynamics.acceleration))[:3]
     np.testing.assert_allclose(force.vectors[0, 0], moved.poses[0, 0, 0, :3, :3] @ asked, atol=1e-10)
 
 
 def test_friction_cones_are_where_their_forces_are():
     """Apex at the contact, axis along the force of a unit normal multiplier, the slope of the cone, and its sides."""
     scene, q = jd.scenes.hand_with_ball(mu=0.6), jd.scenes.hand_with_ball.start()[0]
-    found = motion.cones(motion.motion_of(scene, q))
-    assert [cone.name for cone in found] == ["tip1", "tip2", "tip3"]
+    computed = motion.cones(motion.motion_of(scene, q))
+    assert [cone.name for cone in computed] == ["tip1", "tip2", "tip3"]
     ball = np.asarray(jd.frame_pose(scene.system, q, "ball"))
-    for cone, one in zip(found, scene.constraints, strict=True):
+    for cone, one in zip(computed, scene.constraints, strict=True):
         frame = ball @ np.asarray(one.pose)
         np.testing.assert_allclose(cone.apex[0, 0], frame[:3, 3], atol=1e-12)
         np.testing.assert_allclose(cone.axis[0, 0], frame[:3, 2], atol=1e-12)
@@ -407,9 +407,9 @@ def test_page_is_one_small_file_with_the_whole_motion(page, turning, capsys):
     # Positions of a body over time are those of the kinematics, of the solid motion and of the ghost.
     for n in (0, 1):
         name = f"/motion{n}/{scene.system.body_names[-1]}"
-        found = [(t, m["position"]) for t, m in messages if m["type"] == "SetPositionMessage" and m["name"] == name]
+        computed = [(t, m["position"]) for t, m in messages if m["type"] == "SetPositionMessage" and m["name"] == name]
         last = jd.forward_kinematics(scene.system, solution.q[n, -1])[-1]
-        np.testing.assert_allclose(found[-1][1], last[:3, 3], atol=1e-12)
+        np.testing.assert_allclose(computed[-1][1], last[:3, 3], atol=1e-12)
     kinds = {m["type"] for _, m in messages}
     assert {"MeshMessage", "ArrowMessage", "GridMessage", "SetCameraPositionMessage"} <= kinds
     assert capsys.readouterr().out == ""

@@ -53,13 +53,13 @@ ALL = dict(energy=(), power=(), work=(), acceleration=(2,), torque=(2,), constra
 
 
 def test_names_and_units_of_coordinates(arm, floating):
-    found = columns_of(arm)
-    assert found.q == found.v == ("shoulder", "lift")
-    assert (found.q_units, found.force_units) == (("rad", "m"), ("N m", "N"))
-    found = columns_of(floating)
-    assert found.q == ("root.x", "root.y", "root.z", "root.qw", "root.qx", "root.qy", "root.qz", "hip")
-    assert found.v == ("root.vx", "root.vy", "root.vz", "root.wx", "root.wy", "root.wz", "hip")
-    assert found.v_units == ("m/s",) * 3 + ("rad/s",) * 4 and found.a_units[0] == "m/s^2"
+    computed = columns_of(arm)
+    assert computed.q == computed.v == ("shoulder", "lift")
+    assert (computed.q_units, computed.force_units) == (("rad", "m"), ("N m", "N"))
+    computed = columns_of(floating)
+    assert computed.q == ("root.x", "root.y", "root.z", "root.qw", "root.qx", "root.qy", "root.qz", "hip")
+    assert computed.v == ("root.vx", "root.vy", "root.vz", "root.wx", "root.wy", "root.wz", "hip")
+    assert computed.v_units == ("m/s",) * 3 + ("rad/s",) * 4 and computed.a_units[0] == "m/s^2"
     assert columns_of(jd.scenes.pendulum().system).q == ("q1",)
 
 

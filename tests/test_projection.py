@@ -45,10 +45,10 @@ def test_states_come_back_by_the_least_change(name, parameters):
     rank_tol = 1e-4 if name == "bennett" else None  # its rows depend on each other only where the loop is closed
 
     def both(q, v):
-        found = project_state(scene, q, v, zero, rank_tol)
+        computed = project_state(scene, q, v, zero, rank_tol)
         fixed = projection._in_fixed_steps(rank_tol, scene, q, v, zero, ())
-        M, A = mass_matrix(scene.system, found[0]), constraint_jacobian(scene, found[0])
-        return found, fixed, residuals(scene, *found), (M, A)
+        M, A = mass_matrix(scene.system, computed[0]), constraint_jacobian(scene, computed[0])
+        return computed, fixed, residuals(scene, *computed), (M, A)
 
     (place, speed), fixed, left, (M, A) = quick(jax.vmap(both))(q, v)
     assert float(jnp.max(left)) < 1e-14 * (1 + float(jnp.max(jnp.abs(speed))))
@@ -83,16 +83,16 @@ def test_errors_of_a_step_lose_what_the_projection_removes(name, parameters, mod
         by_derivative = jax.jvp(lambda q: jax.vmap(lambda *e: project_step(scene, q, v, zero, e))(*errors), (q,), (q,))
         return jax.vmap(step)(*errors), by_derivative, (mass_matrix(scene.system, q), constraint_jacobian(scene, q))
 
-    found, by_derivative, (M, A) = both(errors)
+    computed, by_derivative, (M, A) = both(errors)
     M, A = np.asarray(M), np.asarray(A)
     held = holonomic_rows(layout(scene))
     for place, (error, rows) in enumerate(zip(errors, (A[held], A), strict=True)):
         lift = np.linalg.solve(M, rows.T)
         want = np.asarray(error) - np.asarray(error) @ rows.T @ np.linalg.pinv(rows @ lift) @ lift.T
-        assert_close(found[2][place], want, 1e-12)
+        assert_close(computed[2][place], want, 1e-12)
         assert_close(by_derivative[0][2][place], want, 1e-12)
         assert not np.any(by_derivative[1][2][place])  # step lengths are not differentiated
-    assert_close(found[0], jnp.stack([q] * 3), 1e-14)
+    assert_close(computed[0], jnp.stack([q] * 3), 1e-14)
 
 
 def test_what_a_projection_leaves_open_is_an_error(mode):
@@ -173,10 +173,10 @@ def test_derivatives_are_those_of_the_steps():
             for way in (project_state, fixed)
         ]
     )
-    found, want = program(*at)
-    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+    computed, want = program(*at)
+    for x, y in zip(jax.tree.leaves(computed), jax.tree.leaves(want), strict=True):
         assert_close(x, y, 1e-12)
     # Differences of the values themselves, which end their steps earlier.
     move = jax.jit(lambda h: value(*(x + h * s for x, s in zip(at, steps, strict=True)), project_state))
     slope = (move(1e-5) - move(-1e-5)) / 2e-5
-    assert_close(found[1][1], slope, 1e-7)
+    assert_close(computed[1][1], slope, 1e-7)

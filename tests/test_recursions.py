@@ -294,8 +294,8 @@ def test_canonical_frames_are_the_home_poses():
     """The factors of the home poses, multiplied, are the home poses; a first child's begins along x."""
     for seed in range(3):
         model = random_tree(seed, ["revolute", "helical", "revolute", "prismatic", "revolute", "planar", "revolute"])
-        found = links.links_of(model)
-        chains = links.joint_transforms(found, neutral(model))
+        computed = links.links_of(model)
+        chains = links.joint_transforms(computed, neutral(model))
         first = set()
         for i, chain in enumerate(chains):
             pose = np.eye(4)
@@ -303,19 +303,19 @@ def test_canonical_frames_are_the_home_poses():
                 R = np.eye(3) if step.rotation is None else step.rotation.matrix(3)
                 r = np.zeros(3) if step.shift is None else step.shift
                 pose = pose @ np.block([[np.asarray(R), np.asarray(r)[:, None]], [np.zeros(3), np.ones(1)]])
-            assert_close(pose, found.frames.home[i], 1e-13)
+            assert_close(pose, computed.frames.home[i], 1e-13)
             parent = model.topology.parents[i]
             if parent >= 0 and parent not in first and model.topology.kinds[parent] != "planar":
-                assert found.frames.screws[i].phi == (1, 0) and found.frames.screws[i].e == 0
+                assert computed.frames.screws[i].phi == (1, 0) and computed.frames.screws[i].e == 0
             first.add(parent)
 
 
 def test_pose_in_a_link():
     model = random_tree(1, ["revolute", "helical"])
-    found = links.links_of(model)
+    computed = links.links_of(model)
     for body, pose in ((0, model.frame_poses[2]), (1, model.frame_poses[3]), (-1, model.frame_poses[2])):
-        R, p = links.pose_in_link(found, body, pose)
-        B = found.frames.placement[body] if body >= 0 else np.eye(4)
+        R, p = links.pose_in_link(computed, body, pose)
+        B = computed.frames.placement[body] if body >= 0 else np.eye(4)
         assert_close(B[:3, :3] @ R, pose[:3, :3], 1e-15)
         assert_close(B[:3, :3] @ p + B[:3, 3], pose[:3, 3], 1e-15)
 

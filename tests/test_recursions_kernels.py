@@ -30,13 +30,13 @@ def test_forward_dynamics_of_every_joint(dtype):
     wanted = quick(jax.vmap(partial(matrix_form.forward_dynamics, model)))(q, v, tau)
     run = partial(jd.forward_dynamics, model)
     size = 1e-10 if dtype == jnp.float64 else 4e-4  # 5 eps times the condition number of M, at most 642
-    for found in (
+    for computed in (
         jnp.stack([jax.jit(run)(*args) for args in zip(q, v, tau, strict=True)]),
         jax.jit(jax.vmap(run))(q, v, tau),
         jax.jit(jax.vmap(jax.vmap(run)))(*(x.reshape(2, 3, -1) for x in (q, v, tau))).reshape(6, -1),
     ):
-        assert found.dtype == dtype
-        np.testing.assert_allclose(found, wanted, atol=size * float(jnp.abs(wanted).max()), rtol=0)
+        assert computed.dtype == dtype
+        np.testing.assert_allclose(computed, wanted, atol=size * float(jnp.abs(wanted).max()), rtol=0)
 
 
 def test_inverse_dynamics_in_float32():
@@ -75,13 +75,13 @@ def test_every_quantity_in_both_modes():
             "poses": jd.forward_kinematics(model, q),
         }
 
-    found = quick(everything)(q, v, a, tau, wrenches)
+    computed = quick(everything)(q, v, a, tau, wrenches)
     with jd.compilation("plain"):
         wanted = quick(lambda *x: everything(*x))(q, v, a, tau, wrenches)
     for name, value in wanted.items():
-        for x, y in zip(jax.tree.leaves(found[name]), jax.tree.leaves(value), strict=True):
+        for x, y in zip(jax.tree.leaves(computed[name]), jax.tree.leaves(value), strict=True):
             assert_close(x, y, 1e-10, name)
-    assert_close(found["W W^T"], wanted["M"], 1e-11)
+    assert_close(computed["W W^T"], wanted["M"], 1e-11)
 
 
 def test_known_zeros_are_left_out():
@@ -146,7 +146,7 @@ def test_the_change_of_an_acceleration_is_that_of_its_numbers():
     wanted = quick(jax.jacfwd(partial(matrix_form.forward_dynamics, model), (0, 1, 2)))(q, v, tau)
     inside = quick(jax.jacfwd(partial(recursions.aba, model), (0, 1, 2)))(q, v, tau)
     for way in (jax.jacfwd, jax.jacrev):
-        found = jax.jit(way(partial(jd.forward_dynamics, model), (0, 1, 2)))(q, v, tau)
-        for x, y, z in zip(found, wanted, inside, strict=True):
+        computed = jax.jit(way(partial(jd.forward_dynamics, model), (0, 1, 2)))(q, v, tau)
+        for x, y, z in zip(computed, wanted, inside, strict=True):
             np.testing.assert_allclose(x, y, atol=1e-10 * float(jnp.abs(y).max()), rtol=0)
             np.testing.assert_allclose(x, z, atol=1e-10 * float(jnp.abs(z).max()), rtol=0)

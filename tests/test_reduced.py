@@ -125,12 +125,12 @@ def test_rolling_disk_in_two_velocities():
     rate = np.array(push) / [steer, roll + m * RHO**2]
     forward = RHO * np.array([rate[1] * c - 1.3 * 2.0 * s, rate[1] * s + 1.3 * 2.0 * c])
     solve = quick(lambda q, nu, tau: [reduced_dynamics(scene, q, nu, tau, basis=b) for b in ((2, 3), disk_basis)])
-    for found in solve(q, nu, tau):
-        assert_close(found.mass_matrix, np.diag([steer, roll + m * RHO**2]), 1e-14)
-        np.testing.assert_allclose(found.bias_force, 0, atol=1e-14)
-        assert_close(found.force, push, 1e-14)
-        assert_close(found.nu_rate, rate, 1e-13)
-        assert_close(found.acceleration, [*forward, *rate], 1e-13)
+    for computed in solve(q, nu, tau):
+        assert_close(computed.mass_matrix, np.diag([steer, roll + m * RHO**2]), 1e-14)
+        np.testing.assert_allclose(computed.bias_force, 0, atol=1e-14)
+        assert_close(computed.force, push, 1e-14)
+        assert_close(computed.nu_rate, rate, 1e-13)
+        assert_close(computed.acceleration, [*forward, *rate], 1e-13)
 
 
 def test_constraints_that_move_with_a_prescribed_slip():
@@ -165,12 +165,12 @@ def test_constraints_that_move_with_a_prescribed_slip():
         last = reduced_dynamics(scene, q, own, tau, t, basis=near)
         return one, other, last, constrained_dynamics(scene, q, one.velocity, tau, t).acceleration
 
-    *found, a = compute(q, nu, tau, t)
-    for reduced in found:
+    *computed, a = compute(q, nu, tau, t)
+    for reduced in computed:
         assert bool(reduced.result == RESULTS.successful)
         np.testing.assert_allclose(row(q, t) @ reduced.velocity, slip(q, t), rtol=1e-12)
         assert_close(reduced.acceleration, a, 1e-12)
-    assert_close(found[1].nu_rate, found[0].nu_rate, 1e-12)
+    assert_close(computed[1].nu_rate, computed[0].nu_rate, 1e-12)
 
 
 def test_orthonormal_basis_is_smooth_and_can_be_continued():
@@ -219,9 +219,9 @@ def test_a_singular_choice_is_reported():
     twice = Scene(scene.system, scene.constraints * 2)
     q = jnp.asarray([0.6, -0.8])
     for basis, nu in (((0,), 1.2), (tangent_basis(twice, q, dof=1), 1.5)):
-        found = quick(lambda q, nu, basis=basis: reduced_dynamics(twice, q, nu, basis=basis))(q, jnp.asarray([nu]))
-        speed = found.velocity @ found.velocity
-        assert_close(found.acceleration, jnp.asarray([0.0, -9.81]) - (speed + 9.81 * 0.8) * q, 1e-12)
+        dynamics = quick(lambda q, nu, basis=basis: reduced_dynamics(twice, q, nu, basis=basis))(q, jnp.asarray([nu]))
+        speed = dynamics.velocity @ dynamics.velocity
+        assert_close(dynamics.acceleration, jnp.asarray([0.0, -9.81]) - (speed + 9.81 * 0.8) * q, 1e-12)
         assert_close(speed, 1.5**2, 1e-12)
     disk, (q, v) = scenes.rolling_disk(), scenes.rolling_disk.start()
     with pytest.raises(ValueError, match=r"return 2 independent columns .* \(rank 1 of 2, largest"):
@@ -274,13 +274,13 @@ def test_derivatives_at_rest_and_float32():
     scene, (q, v) = scenes.rolling_disk(), scenes.rolling_disk.start(heading=0.4)
     low = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, (scene, q, v))
     for basis in ((2, 3), tangent_basis(scene, q)):
-        found = quick(lambda scene, q, nu, basis=basis: reduced_dynamics(scene, q, nu, basis=basis))(
+        dynamics = quick(lambda scene, q, nu, basis=basis: reduced_dynamics(scene, q, nu, basis=basis))(
             low[0], low[1], low[2][2:]
         )
-        assert found.acceleration.dtype == found.mass_matrix.dtype == jnp.float32
-        assert bool(found.result == RESULTS.successful)
-        exact = constrained_dynamics(scene, q, jnp.asarray(found.velocity, jnp.float64)).acceleration
-        np.testing.assert_allclose(found.acceleration, exact, atol=1e-5)
+        assert dynamics.acceleration.dtype == dynamics.mass_matrix.dtype == jnp.float32
+        assert bool(dynamics.result == RESULTS.successful)
+        exact = constrained_dynamics(scene, q, jnp.asarray(dynamics.velocity, jnp.float64)).acceleration
+        np.testing.assert_allclose(dynamics.acceleration, exact, atol=1e-5)
 
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-12}
@@ -305,15 +305,15 @@ def test_rolling_disk_with_torques_full_and_reduced():
     wanted = ("multipliers", "acceleration", "constraint_residual")
     full = moved(scene, state, ts, wanted, control=steering)
     for method in (Reduced((2, 3)), "reduced"):
-        found = moved(scene, state, ts, wanted, control=steering, method=method)
-        assert bool(found.success) and bool(full.success)
-        np.testing.assert_allclose(found.q, full.q, atol=1e-10)
-        np.testing.assert_allclose(found.v, full.v, atol=1e-10)
-        assert float(found.constraint_residual.max()) < 1e-13
-        (_, _, theta, _), (_, _, turn, roll), rate = found.q.T, found.v.T, found.acceleration[:, 3]
+        computed = moved(scene, state, ts, wanted, control=steering, method=method)
+        assert bool(computed.success) and bool(full.success)
+        np.testing.assert_allclose(computed.q, full.q, atol=1e-10)
+        np.testing.assert_allclose(computed.v, full.v, atol=1e-10)
+        assert float(computed.constraint_residual.max()) < 1e-13
+        (_, _, theta, _), (_, _, turn, roll), rate = computed.q.T, computed.v.T, computed.acceleration[:, 3]
         c, s = np.cos(theta), np.sin(theta)
         force = 2.0 * RHO * np.stack([rate * c - turn * roll * s, rate * s + turn * roll * c], 1)
-        np.testing.assert_allclose(found.multipliers, force, atol=1e-12)
+        np.testing.assert_allclose(computed.multipliers, force, atol=1e-12)
     # d/dt of the energy is the power of the two torques: rates by the decoupled equations of EQUATIONS section 6.
     q, v = np.asarray(full.q), np.asarray(full.v)
     torques = np.stack([steering(q[i], v[i], jnp.asarray(ts[i])) for i in range(6)])
@@ -322,24 +322,26 @@ def test_rolling_disk_with_torques_full_and_reduced():
 
 def test_sleigh_in_minimal_velocities():
     """tanh and sech: printed state at t = 10, v = (forward, sideways, yaw rate) with the yaw rate and speed kept."""
-    found = moved(scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start(), [0.0, 10.0], method="reduced")
-    assert bool(found.success)
-    np.testing.assert_allclose(found.q[-1], [-8.600842105481, -0.4306517115655, 3.570508149338], atol=1e-10)
-    np.testing.assert_allclose(found.v[-1], [1.169390226108, 0.0, 0.00670176830728], atol=1e-10)
+    computed = moved(scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start(), [0.0, 10.0], method="reduced")
+    assert bool(computed.success)
+    np.testing.assert_allclose(computed.q[-1], [-8.600842105481, -0.4306517115655, 3.570508149338], atol=1e-10)
+    np.testing.assert_allclose(computed.v[-1], [1.169390226108, 0.0, 0.00670176830728], atol=1e-10)
 
 
 def test_pendulum_in_one_velocity():
     """Holonomic rows: exact positions of problem A01 (elliptic functions), q on the constraint to rounding."""
-    found = moved(scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(), [0.0, 1.0, 5.0, 10.0], method="reduced")
-    assert bool(found.success)
-    assert float(found.constraint_residual.max()) < 1e-13
+    computed = moved(
+        scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(), [0.0, 1.0, 5.0, 10.0], method="reduced"
+    )
+    assert bool(computed.success)
+    assert float(computed.constraint_residual.max()) < 1e-13
     want = [
         [-1.0, 0.0],
         [0.986291751131875319, -0.165010853125541169],
         [-0.942305435043757335, -0.334754338414000581],
         [-0.27508746257611686, -0.961419205099125064],
     ]
-    np.testing.assert_allclose(found.q, want, atol=1e-10)
+    np.testing.assert_allclose(computed.q, want, atol=1e-10)
 
 
 @pytest.mark.slow
@@ -347,11 +349,11 @@ def test_four_bar_in_one_velocity():
     """A loop of bodies: the motion is that of the projected method, q stays on the constraints to rounding."""
     scene, state, ts = scenes.four_bar(), scenes.four_bar.start(rate=3.0), np.linspace(0.0, 1.0, 4)
     want = moved(scene, state, ts)
-    found = moved(scene, state, ts, method="reduced")
-    assert bool(found.success)
-    assert float(found.constraint_residual.max()) < 1e-12
-    np.testing.assert_allclose(found.q, want.q, atol=1e-10)
-    np.testing.assert_allclose(found.v, want.v, atol=1e-10)
+    computed = moved(scene, state, ts, method="reduced")
+    assert bool(computed.success)
+    assert float(computed.constraint_residual.max()) < 1e-12
+    np.testing.assert_allclose(computed.q, want.q, atol=1e-10)
+    np.testing.assert_allclose(computed.v, want.v, atol=1e-10)
 
 
 @pytest.mark.slow
@@ -364,12 +366,12 @@ def test_a_basis_that_becomes_singular_ends_the_run():
     level = np.interp(0.0, np.asarray(whole.q[:9, 1]), ts[:9])
     for stepsize, late in ((None, 1e-3), (0.01, 0.011)):
         run = quick(lambda step=stepsize: simulate(scene, *state, jnp.asarray(ts), method=Reduced((0,)), stepsize=step))
-        found = run()
-        assert bool(found.result == SIMULATION.singular_basis)
-        assert -5e-3 < float(found.stats["time_reached"]) - level < late + 5e-3  # `level` is interpolated linearly
+        computed = run()
+        assert bool(computed.result == SIMULATION.singular_basis)
+        assert -5e-3 < float(computed.stats["time_reached"]) - level < late + 5e-3  # `level` is interpolated linearly
         before = ts < level - 0.01
-        np.testing.assert_allclose(found.q[before], whole.q[before], atol=1e-6)
-        assert np.isnan(found.q[ts > level + 0.05]).all()
+        np.testing.assert_allclose(computed.q[before], whole.q[before], atol=1e-6)
+        assert np.isnan(computed.q[ts > level + 0.05]).all()
     with pytest.raises(RuntimeError, match=r"stopped at t = 0\.\d+ s of 1 s. The minimal velocities .* jd.Reduced\(\)"):
         simulate(scene, *state, ts, method=Reduced((0,)))
     with pytest.raises(
@@ -424,10 +426,10 @@ def test_without_constraints_it_is_the_dynamics_of_the_scene():
     model = robots.chain(3)
     scene = Scene(model, forces=(JointDamping(0.3),))
     q, v, tau = jnp.array([0.4, -0.9, 1.3]), jnp.array([1.1, 0.2, -0.7]), jnp.array([0.5, -0.2, 0.1])
-    found = quick(lambda q, v, tau: reduced_dynamics(scene, q, v, tau))(q, v, tau)
-    assert bool(found.success)
-    assert_close(found.mass_matrix, mass_matrix(model, q), 1e-13)
-    assert_close(found.bias_force, bias_force(model, q, v), 1e-12)
-    assert_close(found.acceleration, forward_dynamics(model, q, v, tau - 0.3 * v), 1e-12)
-    assert_close(found.nu_rate, found.acceleration, 1e-13)
-    assert_close(found.velocity, v, 1e-15)
+    dynamics = quick(lambda q, v, tau: reduced_dynamics(scene, q, v, tau))(q, v, tau)
+    assert bool(dynamics.success)
+    assert_close(dynamics.mass_matrix, mass_matrix(model, q), 1e-13)
+    assert_close(dynamics.bias_force, bias_force(model, q, v), 1e-12)
+    assert_close(dynamics.acceleration, forward_dynamics(model, q, v, tau - 0.3 * v), 1e-12)
+    assert_close(dynamics.nu_rate, dynamics.acceleration, 1e-13)
+    assert_close(dynamics.velocity, v, 1e-15)

@@ -86,6 +86,10 @@ q_object, ts = q0[grasp.system.topology.q_slices[-1]], jnp.linspace(0.0, 0.01, 2
     "frame_acceleration": ARM,
     "grasp.hand_dynamics": MOTIONS,
     "grasp.hand_motions": MOTIONS,
+    "identify.Measured": """
+scene = jd.Scene(model, forces=[jd.JointDamping([0.3, 0.3])])
+log = jd.identify.Log(log.t, log.q, log.v, log.a, log.tau / np.array([11.0, 8.5]))
+""",
     "involutive": "q = q_disk",
     "join": "arm, box = model, free",
     "model_couplings": "model = plain",

@@ -37,12 +37,12 @@ def test_samples_that_are_not_served_are_computed_again():
     x = 1 + jnp.arange(3.0)
     for flags in ([False] * 3, [False, True, False]):
         calls.clear()
-        found = jax.jit(jax.vmap(one))(x, ~jnp.asarray(flags))
+        computed = jax.jit(jax.vmap(one))(x, ~jnp.asarray(flags))
         jax.effects_barrier()
         sign = jnp.where(jnp.asarray(flags), -1.0, 1.0)
-        np.testing.assert_array_equal(found["matrix"], np.broadcast_to((sign * x)[:, None, None], (3, 2, 2)))
-        assert found["n"].tolist() == [7 if flag else 3 for flag in flags] and bool(calls) == any(flags)
-        assert found["n"].dtype == jnp.asarray(3).dtype
+        np.testing.assert_array_equal(computed["matrix"], np.broadcast_to((sign * x)[:, None, None], (3, 2, 2)))
+        assert computed["n"].tolist() == [7 if flag else 3 for flag in flags] and bool(calls) == any(flags)
+        assert computed["n"].dtype == jnp.asarray(3).dtype
     assert safe and all(safe) and not is_rank_safe()
     assert "callback" not in str(jax.make_jaxpr(lambda x: one(x, True))(1.0))
     alone = jax.jit(one)
@@ -51,12 +51,12 @@ def test_samples_that_are_not_served_are_computed_again():
 
 def _root(x, scale):
     """sqrt(scale x) that is computed another way where x is below 1."""
-    found = jnp.sqrt(scale * x), (jnp.asarray(0, jnp.int32),)
+    computed = jnp.sqrt(scale * x), (jnp.asarray(0, jnp.int32),)
 
     def careful(x, scale):
         return jnp.exp(0.5 * jnp.log(scale * x)), (jnp.asarray(1, jnp.int32),)
 
-    return repair_flagged(x < 1, careful, lambda x, scale: jnp.sqrt(scale * x), found, (x, scale))
+    return repair_flagged(x < 1, careful, lambda x, scale: jnp.sqrt(scale * x), computed, (x, scale))
 
 
 @pytest.mark.parametrize("nested", [False, True])
@@ -83,8 +83,8 @@ def test_samples_that_need_it_are_repaired(nested, few):
 def test_one_sample_is_repaired():
     for run in (_root, jax.jit(_root)):
         for x, way in ((0.25, 1), (4.0, 0)):
-            y, (found,) = run(jnp.asarray(x), jnp.asarray(1.0))
-            assert found == way
+            y, (computed,) = run(jnp.asarray(x), jnp.asarray(1.0))
+            assert computed == way
             assert_close(y, np.sqrt(x), 1e-15)
 
 
@@ -103,8 +103,8 @@ def test_arguments_of_both_batches_of_one_and_of_none():
     def nested(function):
         return jax.vmap(jax.vmap(function, (0, (None, 0, None))), (0, (0, None, None)))
 
-    found, want = jax.jit(nested(repaired))(x, (y, z, w)), nested(plain)(x, (y, z, w))
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+    computed, want = jax.jit(nested(repaired))(x, (y, z, w)), nested(plain)(x, (y, z, w))
+    for one, other in zip(jax.tree.leaves(computed), jax.tree.leaves(want), strict=True):
         assert_close(one, other, 1e-15)
     single = x[0, 0], (y[0], z[0], w)
     for one, other in zip(jax.tree.leaves(repaired(*single)), jax.tree.leaves(plain(*single)), strict=True):
@@ -116,11 +116,11 @@ def test_in_a_program_of_numbers_flagged_samples_are_no_numbers():
         return _root(x, 1.0)
 
     x = jnp.array([0.25, 4.0])
-    (found, (way,)), served = jax.jit(jax.vmap(lambda x: backend.run(root, (), x, served=True)))(x)
-    np.testing.assert_array_equal(found, [np.nan, 2.0])
+    (computed, (way,)), served = jax.jit(jax.vmap(lambda x: backend.run(root, (), x, served=True)))(x)
+    np.testing.assert_array_equal(computed, [np.nan, 2.0])
     assert way.tolist() == [0, 0]
     assert served.tolist() == [False, True]
     # Whoever does not ask gets no program, and whoever wants all samples right gets them.
     for run in (backend.run, backend.run_repaired):
-        found, _ = jax.jit(jax.vmap(lambda x, run=run: run(root, (), x)))(x)
-        np.testing.assert_array_equal(found, [0.5, 2.0])
+        computed, _ = jax.jit(jax.vmap(lambda x, run=run: run(root, (), x)))(x)
+        np.testing.assert_array_equal(computed, [0.5, 2.0])

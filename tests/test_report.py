@@ -48,13 +48,20 @@ MOMENTS = np.array([1.0, 2.0, 3.0])
 
 def test_references_start_where_the_scenes_do():
     for name, case in cases().items():
-        _, (q, v) = case.build()
         if case.reference is None:
             continue
+        _, (q, v) = case.build()
         reference = case.reference((q, v))
         assert reference.q.shape == (len(reference.ts), len(q)), name
         np.testing.assert_allclose(reference.q[0], q, atol=1e-14, err_msg=name)
         np.testing.assert_allclose(reference.v[0], v, atol=1e-14, err_msg=name)
+
+
+@pytest.mark.slow
+def test_every_case_builds():
+    for name, case in cases().items():
+        scene, (q, v) = case.build()
+        assert q.shape == (scene.nq,) and v.shape == (scene.nv,), name
 
 
 def test_the_report_knows_every_scene():
@@ -80,36 +87,36 @@ def test_closed_forms_solve_the_equations(name):
     """By scipy's DOP853."""
     form, rates = EQUATIONS[name]
     ts = np.linspace(0.0, 0.6, 4)
-    found = form(ts)
-    n = found.q.shape[1]
-    start = np.concatenate([found.q[0], found.v[0]])
+    computed = form(ts)
+    n = computed.q.shape[1]
+    start = np.concatenate([computed.q[0], computed.v[0]])
     solved = solve_ivp(lambda t, y: rates(y[:n], y[n:]), (0, 0.6), start, "DOP853", ts, rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(np.concatenate([found.q, found.v], 1), solved.y.T, atol=1e-10)
+    np.testing.assert_allclose(np.concatenate([computed.q, computed.v], 1), solved.y.T, atol=1e-10)
 
 
 def test_turning_closed_forms_solve_the_equations():
     """The ball that rolls down and the box that falls: one scalar equation each, places and turns by trigonometry."""
     ts = np.linspace(0.0, 1.0, 6)
-    found, pull = rolling_down(ts), 5 / 14 * 9.81
-    turned = Rotation.from_quat(np.roll(found.q[:, 3:], -1, 1))
+    computed, pull = rolling_down(ts), 5 / 14 * 9.81
+    turned = Rotation.from_quat(np.roll(computed.q[:, 3:], -1, 1))
     np.testing.assert_allclose(
         turned.as_rotvec()[1], [0.0, (0.5 * ts[1] + pull * ts[1] ** 2 / 2) / 0.1, 0.0], atol=1e-13
     )
-    np.testing.assert_allclose(turned.apply(found.v[:, :3]), np.outer(0.5 + pull * ts, [1, 0, 0]), atol=1e-13)
-    np.testing.assert_allclose(found.v[:, 4] * 0.1, 0.5 + pull * ts, atol=1e-14)
-    found, r = falling_table(ts), 0.145
+    np.testing.assert_allclose(turned.apply(computed.v[:, :3]), np.outer(0.5 + pull * ts, [1, 0, 0]), atol=1e-13)
+    np.testing.assert_allclose(computed.v[:, 4] * 0.1, 0.5 + pull * ts, atol=1e-14)
+    computed, r = falling_table(ts), 0.145
     moment = 20 * (1 + 0.05**2) / 12 + (0.2**2 + 0.24**2) / 12 + r**2
-    start = [found.q[0, 7], 0.0]
+    start = [computed.q[0, 7], 0.0]
     solved = solve_ivp(
         lambda t, y: [y[1], 9.81 * r * np.sin(y[0]) / moment], (0, 1), start, "DOP853", ts, rtol=1e-12, atol=1e-14
     )
-    np.testing.assert_allclose(found.q[:, 7], solved.y[0], atol=1e-11)
-    np.testing.assert_allclose(found.v[:, 6], solved.y[1], atol=1e-11)
-    turned = Rotation.from_quat(np.roll(found.q[:, 3:7], -1, 1))
-    np.testing.assert_allclose(turned.as_rotvec(), np.outer(found.q[:, 7], [0, 1, 0]), atol=1e-13)
-    np.testing.assert_allclose(found.q[:, :3], turned.apply([0, 0, r]), atol=1e-13)
+    np.testing.assert_allclose(computed.q[:, 7], solved.y[0], atol=1e-11)
+    np.testing.assert_allclose(computed.v[:, 6], solved.y[1], atol=1e-11)
+    turned = Rotation.from_quat(np.roll(computed.q[:, 3:7], -1, 1))
+    np.testing.assert_allclose(turned.as_rotvec(), np.outer(computed.q[:, 7], [0, 1, 0]), atol=1e-13)
+    np.testing.assert_allclose(computed.q[:, :3], turned.apply([0, 0, r]), atol=1e-13)
     np.testing.assert_allclose(
-        turned.apply(found.v[:, :3]), np.cross(found.v[:, 6:] * [0, 1, 0], found.q[:, :3]), atol=1e-13
+        turned.apply(computed.v[:, :3]), np.cross(computed.v[:, 6:] * [0, 1, 0], computed.q[:, :3]), atol=1e-13
     )
 
 
@@ -123,9 +130,9 @@ def test_plane_pendulum_has_the_printed_digits():
         (-0.316436469913032291, -0.948613704575776519),
         (-0.27508746257611686, -0.961419205099125064),
     ]
-    found = plane_pendulum(ts)
-    np.testing.assert_allclose(found.q, want, atol=1e-13)
-    energy = 0.5 * np.sum(found.v**2, 1) + 9.81 * found.q[:, 1]
+    computed = plane_pendulum(ts)
+    np.testing.assert_allclose(computed.q, want, atol=1e-13)
+    energy = 0.5 * np.sum(computed.v**2, 1) + 9.81 * computed.q[:, 1]
     np.testing.assert_allclose(energy, 0.0, atol=1e-13)
 
 
@@ -143,10 +150,10 @@ def test_free_top_has_the_printed_rates_and_turns_as_they_say():
         return np.concatenate([(turned @ np.cross(np.eye(3), w)).ravel(), np.cross(MOMENTS * w, w) / MOMENTS])
 
     for start, end in printed.items():
-        found = free_top(ts, start=start)
-        np.testing.assert_allclose(found.v[-1], end, atol=1e-12)
-        turned = Rotation.from_quat(np.roll(found.q, -1, 1)).as_matrix()
-        momentum = np.einsum("tij,tj->ti", turned, MOMENTS * found.v)
+        computed = free_top(ts, start=start)
+        np.testing.assert_allclose(computed.v[-1], end, atol=1e-12)
+        turned = Rotation.from_quat(np.roll(computed.q, -1, 1)).as_matrix()
+        momentum = np.einsum("tij,tj->ti", turned, MOMENTS * computed.v)
         np.testing.assert_allclose(momentum, np.tile(MOMENTS * start, (6, 1)), atol=1e-12)
         solved = solve_ivp(rate, (0, 20), [*np.eye(3).ravel(), *start], "DOP853", ts, rtol=1e-12, atol=1e-13)
         np.testing.assert_allclose(turned.reshape(6, 9), solved.y[:9].T, atol=1e-9)
@@ -163,12 +170,12 @@ def test_sphere_pendulum_against_angles():
 
     for turn in (1.0, 4.5):  # the start is the highest, then the lowest point
         h = np.sin(1.0) ** 2 * turn
-        found = sphere_pendulum(ts, turn=turn)
+        computed = sphere_pendulum(ts, turn=turn)
         theta, _, phi = solve_ivp(rate, (0, 10), [1.0, 0.0, 0.0], "DOP853", ts, rtol=1e-12, atol=1e-13).y
         want = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), -np.cos(theta)], 1)
-        np.testing.assert_allclose(found.q, want, atol=1e-9)
-        np.testing.assert_allclose(np.cross(found.q, found.v)[:, 2], h, atol=1e-12)
-        energy = 0.5 * np.sum(found.v**2, 1) + 9.81 * found.q[:, 2]
+        np.testing.assert_allclose(computed.q, want, atol=1e-9)
+        np.testing.assert_allclose(np.cross(computed.q, computed.v)[:, 2], h, atol=1e-12)
+        energy = 0.5 * np.sum(computed.v**2, 1) + 9.81 * computed.q[:, 2]
         np.testing.assert_allclose(energy, energy[0], atol=1e-12)
 
 
@@ -183,8 +190,8 @@ def test_sphere_pendulum_against_angles():
 )
 def test_windows_have_the_printed_digits(count, t, place, velocity):
     """Problem A02: place and velocity of the first top, 8 digits; and energy."""
-    found = windows(np.array([0.0, t]), count)
-    angle, turn = -found.q[-1, 0], -found.v[-1, 0]
+    computed = windows(np.array([0.0, t]), count)
+    angle, turn = -computed.q[-1, 0], -computed.v[-1, 0]
     top = np.array([np.sin(angle), np.cos(angle)])
     np.testing.assert_allclose(top, place, atol=2e-8)
     np.testing.assert_allclose(turn * np.array([top[1], -top[0]]), velocity, atol=2e-8)
@@ -194,30 +201,30 @@ def test_windows_have_the_printed_digits(count, t, place, velocity):
 
 def test_sleigh_and_coin_have_the_printed_digits():
     """Problems 3.4 and 3.10, where integrals and one turn of the circle are printed."""
-    found = sleigh(np.array([0.0, 1.0, 10.0]))
+    computed = sleigh(np.array([0.0, 1.0, 10.0]))
     want = [
         (0.3134115046418, 0.3477380366348, 1.356093732499),
         (-8.600842105481, -0.4306517115655, 3.570508149338),
     ]
-    np.testing.assert_allclose(found.q[1:], want, atol=2e-12)
-    np.testing.assert_allclose(found.v[1:, 0], (0.7547057324456, 1.169390226108), atol=1e-12)
-    np.testing.assert_allclose(found.v[1:, 2], (1.162929714574, 0.00670176830728), atol=1e-12)
+    np.testing.assert_allclose(computed.q[1:], want, atol=2e-12)
+    np.testing.assert_allclose(computed.v[1:, 0], (0.7547057324456, 1.169390226108), atol=1e-12)
+    np.testing.assert_allclose(computed.v[1:, 2], (1.162929714574, 0.00670176830728), atol=1e-12)
 
     period = 5.852173782956319
-    found = coin(np.array([0.0, period / 4, period]))
+    computed = coin(np.array([0.0, period / 4, period]))
     np.testing.assert_allclose(
-        found.q[[0, 2], :3], np.tile([0.0, 0.4956422128626671, found.q[0, 2]], (2, 1)), atol=1e-12
+        computed.q[[0, 2], :3], np.tile([0.0, 0.4956422128626671, computed.q[0, 2]], (2, 1)), atol=1e-12
     )
-    np.testing.assert_allclose(np.hypot(*found.q[:, :2].T), 0.4956422128626671, atol=1e-14)
+    np.testing.assert_allclose(np.hypot(*computed.q[:, :2].T), 0.4956422128626671, atol=1e-14)
 
 
 def test_integral_knows_its_error():
     ts = np.array([0.0, 1.0, 4.0])
-    found, error = integral(np.cos, ts, 1.0)
-    np.testing.assert_allclose(found, np.sin(ts), atol=1e-15)
+    computed, error = integral(np.cos, ts, 1.0)
+    np.testing.assert_allclose(computed, np.sin(ts), atol=1e-15)
     assert error < 1e-15
-    found, error = integral(lambda t: np.exp(-((6 * (t - 2)) ** 2)), ts, 4.0)  # too long for this one
-    assert 0.1 * abs(found[-1] - np.sqrt(np.pi) / 6) < error < 1e-2
+    computed, error = integral(lambda t: np.exp(-((6 * (t - 2)) ** 2)), ts, 4.0)  # too long for this one
+    assert 0.1 * abs(computed[-1] - np.sqrt(np.pi) / 6) < error < 1e-2
 
 
 def counting():
@@ -246,9 +253,9 @@ def test_evaluations_are_those_that_are_made(name, solver):
     counted = Scene(scene().system, scene().constraints, (force,))
     method = {"Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8, "RK4": RK4}[solver]()
     steps = {"stepsize": 0.05} if solver == "RK4" else {"rtol": 1e-6, "atol": 1e-6}
-    found = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, **steps)
+    solution = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, **steps)
     jax.effects_barrier()
-    assert len(calls) == evaluations(solver, int(found.stats["num_steps"]), scene(), chosen_method(scene(), "auto"))
+    assert len(calls) == evaluations(solver, int(solution.stats["num_steps"]), scene(), chosen_method(scene(), "auto"))
 
 
 def test_evaluations_of_implicit_methods_are_not_known():
@@ -293,11 +300,11 @@ def records(body, rungs):
 def test_records_hold_what_a_motion_says(body, rungs, records):
     """Errors, energy and counts of a rung, from its motion by numpy and scipy."""
     motion, record = rungs[0].motion(rungs[0].call()), records[0]
-    known, found = (
+    known, computed = (
         np.concatenate([Rotation.from_quat(np.roll(q, -1, 1)).as_matrix().reshape(len(q), 9), v], 1)
         for q, v in ((body.reference.q, body.reference.v), (motion.q, motion.v))
     )
-    error = np.max(np.abs(found - known) / (1 + np.abs(known)), 1)
+    error = np.max(np.abs(computed - known) / (1 + np.abs(known)), 1)
     np.testing.assert_allclose([record.error_path, record.error_end], [error.max(), error[-1]], rtol=1e-9)
     energy = 0.5 * np.sum(MOMENTS * motion.v**2, 1)
     np.testing.assert_allclose(record.energy_error, np.abs(energy - energy[0]).max(), rtol=1e-9)
@@ -371,9 +378,9 @@ def test_beaten_by_whom():
         "rough": made(1e-1, 0.5, source="peer"),
         "failed": made(None, 0.1, source="peer"),
     }
-    found = beaten_by([*ours, *peers.values()])
-    assert [r for r, _ in found] == [peers[name] for name in ("exact", "cheaper", "rough")]
-    assert [factor for _, factor in found] == pytest.approx([np.inf, 10**0.5, 2.0])
+    computed = beaten_by([*ours, *peers.values()])
+    assert [r for r, _ in computed] == [peers[name] for name in ("exact", "cheaper", "rough")]
+    assert [factor for _, factor in computed] == pytest.approx([np.inf, 10**0.5, 2.0])
     assert beaten_by(ours) == []
     with pytest.raises(ValueError, match="2 plots"):
         beaten_by([*ours, made(1e-3, 1.0, batch=2)])
@@ -382,11 +389,11 @@ def test_beaten_by_whom():
 def test_batches_above_the_largest_are_left_out(small, rungs, monkeypatch):
     lines = []
     monkeypatch.setattr(running, "cases", lambda: {"free_body": cases()["free_body"]._replace(largest=1)})
-    found = jd.report("free_body", rounds=1, batches=(1, 64), echo=lines.append)
-    assert {r.batch for r in found.records} == {1}
+    measured = jd.report("free_body", rounds=1, batches=(1, 64), echo=lines.append)
+    assert {r.batch for r in measured.records} == {1}
     assert "batches above 1 are left out" in lines[0]
-    found = jd.report("free_body", rounds=1, batches=(1, 4), ways=[("free", "Tsit5")])
-    assert {(r.batch, r.label) for r in found.records} == {(1, "free, Tsit5"), (4, "free, Tsit5")}
+    measured = jd.report("free_body", rounds=1, batches=(1, 4), integrators=[("free", "Tsit5")])
+    assert {(r.batch, r.label) for r in measured.records} == {(1, "free, Tsit5"), (4, "free, Tsit5")}
 
 
 def test_standings_compare_within_a_class():
@@ -404,10 +411,10 @@ def test_interleaved_drops_who_is_slow():
     def call(name):
         calls[name] += 1
 
-    found = interleaved({name: lambda name=name: call(name) for name in calls}, 5, least=0.0, most=-1.0)
-    assert found["slow"]["rounds"] == found["fast"]["rounds"] == 3
+    times = interleaved({name: lambda name=name: call(name) for name in calls}, 5, least=0.0, most=-1.0)
+    assert times["slow"]["rounds"] == times["fast"]["rounds"] == 3
     assert calls == {"slow": 5, "fast": 5}  # two to see how long it takes
-    assert found["slow"]["best"] <= found["slow"]["median"]
+    assert times["slow"]["best"] <= times["slow"]["median"]
 
 
 @pytest.fixture
@@ -422,10 +429,10 @@ def small(monkeypatch, body):
 
 def test_report_resumes_and_writes(small, body, rungs, tmp_path, capsys, monkeypatch):
     lines = []
-    found = jd.report("free_body", rounds=1, out=tmp_path, echo=lines.append)
+    measured = jd.report("free_body", rounds=1, out=tmp_path, echo=lines.append)
     assert small == ["free_body"]
     assert "about 0 s left" in lines[-1]
-    assert Report.from_json((tmp_path / "report.json").read_text()) == found
+    assert Report.from_json((tmp_path / "report.json").read_text()) == measured
     text = (tmp_path / "report.txt").read_text()
     assert "Free rigid body" in text
     assert "free, Tsit5" in text
@@ -440,16 +447,16 @@ def test_report_resumes_and_writes(small, body, rungs, tmp_path, capsys, monkeyp
         "time per trajectory",
         "energy error",
         "free, Tsit5",
-        found.head["machine"]["device"],
+        measured.head["machine"]["device"],
     ):
         assert words in page
 
     # A second call takes what is there, also after the last line was cut; another commit's records are refused.
-    assert jd.report("free_body", rounds=1, out=tmp_path) == found
+    assert jd.report("free_body", rounds=1, out=tmp_path) == measured
     assert small == ["free_body"]
     path = tmp_path / "records.jsonl"
     path.write_text(path.read_text() + '{"key": "cut')
-    assert jd.report("free_body", rounds=1, out=tmp_path).records == found.records
+    assert jd.report("free_body", rounds=1, out=tmp_path).records == measured.records
     assert len(path.read_text().splitlines()) == 2
     # So are records of other versions, and what is no record; peers make a group another one.
     command = ["report", "free_body", "--rounds", "1", "--out", str(tmp_path)]
@@ -486,17 +493,17 @@ def test_command(small, rungs, capsys):
         (["report", "free_body", "--batch", "0"], "batches"),
         (["report", "free_body", "--dtype", "float16"], "float16"),
         (["report", "free_body", "--rounds", "0"], "rounds"),
-        (["report", "free_body", "--way", "Dopri8"], "ways"),
-        (["report", "free_body", "--way", "free:Euler"], "Euler"),
+        (["report", "free_body", "--integrator", "Dopri8"], "integrators"),
+        (["report", "free_body", "--integrator", "free:Euler"], "Euler"),
         (["report", "four_bar", "free_body", "--way", "projected:Dopri8"], "free_body cannot take"),
-        (["report", "free_body", "--way", "fre:Dopri8"], "ways"),
+        (["report", "free_body", "--way", "fre:Dopri8"], "integrators"),
     ):
         assert main(wrong) == 2
         assert word in capsys.readouterr().err
     assert small == ["free_body"]
 
 
-@pytest.mark.parametrize("name", ["scenes", "dtypes", "batches", "ways"])
+@pytest.mark.parametrize("name", ["scenes", "dtypes", "batches", "integrators"])
 def test_empty_arguments_are_refused(name):
     with pytest.raises(ValueError, match=f"{name} is empty"):
         jd.report(**({"scenes": "free_body"} | {name: []}))
@@ -562,7 +569,7 @@ def test_printed_ends_are_as_printed():
     np.testing.assert_allclose(reference.q[-1, :5], q, rtol=1e-9)
     np.testing.assert_allclose(reference.v[-1, :5], rates, rtol=6e-8)
     # The chassis of the car axis has its length, and its speed along it is zero.
-    found = car_axis(cases()["car_axis"].build()[1])
-    (xl, yl, xr, yr), (vxl, vyl, vxr, vyr) = found.q[-1], found.v[-1]
+    computed = car_axis(cases()["car_axis"].build()[1])
+    (xl, yl, xr, yr), (vxl, vyl, vxr, vyr) = computed.q[-1], computed.v[-1]
     assert (xl - xr) ** 2 + (yl - yr) ** 2 == pytest.approx(1.0, abs=1e-14)
     assert (xl - xr) * (vxl - vxr) + (yl - yr) * (vyl - vyr) == pytest.approx(0.0, abs=1e-14)

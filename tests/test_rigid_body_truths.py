@@ -89,8 +89,8 @@ def rotations(quaternions):
 def test_jacobi(motions, row):
     ts, _, _, solution = motions
     start, period, end = (np.asarray(x) for x in EULER_TOP[row])
-    omega, found = jacobi(MOMENTS, start, ts)
-    np.testing.assert_allclose(found, period, rtol=2e-11)  # K(m) of the first row, where 1 - m = 4e-6
+    omega, computed = jacobi(MOMENTS, start, ts)
+    np.testing.assert_allclose(computed, period, rtol=2e-11)  # K(m) of the first row, where 1 - m = 4e-6
     # The unstable row multiplies errors by about 1e3 on the way to its first turn.
     np.testing.assert_allclose(omega[-1], end, rtol=0, atol=1e-11)
     for name, place in (("ball", slice(0, 3)), ("flyer", slice(6, 9))):

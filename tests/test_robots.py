@@ -120,8 +120,8 @@ def test_agrees_with_pinocchio(file, floating):
             assert_close(got[key][i], value, tolerance, key)
         # Free of that amplification: the acceleration found gives back the force, but for what the last digit of each
         # acceleration is worth, |M| |a| eps. Fingers of 1e-5 kg m^2 on a humanoid accelerate by 1e10 under 1 N m.
-        found = np.asarray(got["forward dynamics"][i])
-        missed, worth = mass @ found + want["bias"] - np.asarray(tau[i]), np.abs(mass) @ np.abs(found)
+        computed = np.asarray(got["forward dynamics"][i])
+        missed, worth = mass @ computed + want["bias"] - np.asarray(tau[i]), np.abs(mass) @ np.abs(computed)
         assert np.abs(missed).max() <= 1e-10 * np.abs(tau[i]).max() + 1e-14 * worth.max(), "residual of M a + h = tau"
 
 

@@ -85,7 +85,7 @@ def test_rows_and_rates_are_montanas(name):
     a, b = PAIRS[name]
     scene = two_bodies(a, b, spin=True)
     system = scene.system
-    found = montana(a, b, ETA)
+    kinematics = montana(a, b, ETA)
     object_pose = se3.exp(jnp.array([0.3, -0.2, 0.5, 0.2, -0.3, 0.1]))
     tip_pose = object_pose @ POSE_A @ relative_pose(a, b, ETA) @ se3.inverse(POSE_B)
     joints = jnp.concatenate([joints_of(object_pose), joints_of(tip_pose)])
@@ -93,7 +93,7 @@ def test_rows_and_rates_are_montanas(name):
     q = system.place(joints, near=ETA[None, :4] + 0.05)
     # V_c: twist of L_f against L_o; the object moves too, so that both sides are seen.
     V_c = jnp.array([0.02, -0.03, 0.0, 0.7, -0.4, 0.5])
-    to_tip = POSE_B @ found.finger.pose
+    to_tip = POSE_B @ kinematics.finger.pose
     tip_twist = se3.Ad_apply(to_tip, V_c) + se3.Ad_apply(se3.inverse(tip_pose) @ object_pose, TWIST)
     v = jnp.concatenate([TWIST, tip_twist])
 
@@ -106,7 +106,7 @@ def test_rows_and_rates_are_montanas(name):
 
     eta, eta_rate, A, A_rate_v, row = compute(q, v)
     np.testing.assert_allclose(eta, ETA, atol=1e-11)
-    np.testing.assert_allclose(eta_rate, found.forward @ V_c, atol=1e-10, rtol=1e-10)
+    np.testing.assert_allclose(eta_rate, kinematics.forward @ V_c, atol=1e-10, rtol=1e-10)
     np.testing.assert_allclose(row.A, A, atol=1e-13)
     # A a = gamma is A v = const differentiated.
     np.testing.assert_allclose(row.gamma, -A_rate_v, atol=1e-9 * float(jnp.abs(A_rate_v).max()))
@@ -196,15 +196,15 @@ def test_rolling_is_newton_eulers_equations_in_the_rates_of_rolling():
     """M V' - ad_V^T M V = G + A^T lam with V = J_F B (wx, wy): two rates and four forces, by one system of equations."""
     w = jnp.array([0.7, -0.4])
     scene, q, v = touching(EGG, TIP, ETA, jnp.array([0.0, 0.0, 0.0, *w, 0.0]), spin=True)
-    M, found = spatial_mass(), montana(EGG, TIP, ETA)
+    M, kinematics = spatial_mass(), montana(EGG, TIP, ETA)
 
     def to_twist(eta):
         at = montana(EGG, TIP, eta)
         return at.J_F @ at.rolling
 
-    J, J_rate = quick(lambda eta: jax.jvp(to_twist, (eta,), (found.rolling @ w,)))(ETA)
-    A = (np.asarray(se3.Ad(se3.inverse(found.finger.pose))))[[0, 1, 2, 5]]
-    fall, com = found.g_of[:3, :3].T @ scene.system.gravity * STONE[0], jnp.asarray(STONE[1])
+    J, J_rate = quick(lambda eta: jax.jvp(to_twist, (eta,), (kinematics.rolling @ w,)))(ETA)
+    A = (np.asarray(se3.Ad(se3.inverse(kinematics.finger.pose))))[[0, 1, 2, 5]]
+    fall, com = kinematics.g_of[:3, :3].T @ scene.system.gravity * STONE[0], jnp.asarray(STONE[1])
     weight = jnp.concatenate([fall, jnp.cross(com, fall)])
     turning = -se3.ad(v).T @ (M @ v)
     solved = np.linalg.solve(np.concatenate([M @ J, -A.T], 1), weight - turning - M @ (J_rate @ w))
@@ -248,12 +248,12 @@ def test_an_egg_keeps_its_energy_and_both_methods_agree():
     q, v = egg_start(scene, OMEGA)
     ts, ends = jnp.linspace(0.0, 5.0, 26), []
     for method in ("projected", "reduced"):
-        found = jd.simulate(
+        solution = jd.simulate(
             scene, q, v, ts, method=method, rtol=1e-11, atol=1e-11, outputs=("energy", "constraint_residual")
         )
-        assert float(found.constraint_residual.max()) < 1e-13
-        np.testing.assert_allclose(found.energy, found.energy[0], rtol=1e-9)
-        ends.append(found.q)
+        assert float(solution.constraint_residual.max()) < 1e-13
+        np.testing.assert_allclose(solution.energy, solution.energy[0], rtol=1e-9)
+        ends.append(solution.q)
     # It has turned over, past the poles of every chart.
     places = np.asarray(ends[0][:, 9:])
     assert (np.ptp(places, axis=0) > 1.5).all()
@@ -270,12 +270,12 @@ def test_an_egg_keeps_its_energy_and_both_methods_agree():
 def test_a_hand_rolls_an_egg_and_stays_in_touch():
     scene, (q, v) = scenes.hand_rolling_egg(gravity=0.0), scenes.hand_rolling_egg.start()
     outputs = ("energy", "constraint_residual", "contact_forces")
-    found = jd.simulate(scene, q, v, jnp.linspace(0.0, 5.0, 26), outputs=outputs, contacts="report")
-    assert found.contact_forces is not None and set(found.contact_forces) == {"finger1", "finger2", "finger3"}
-    assert float(found.constraint_residual.max()) < 1e-11
+    solution = jd.simulate(scene, q, v, jnp.linspace(0.0, 5.0, 26), outputs=outputs, contacts="report")
+    assert solution.contact_forces is not None and set(solution.contact_forces) == {"finger1", "finger2", "finger3"}
+    assert float(solution.constraint_residual.max()) < 1e-11
     # Tolerances of 1e-8 of coordinates of the order of 1; the energy is some 4e-4 J.
-    np.testing.assert_allclose(found.energy, found.energy[0], atol=1e-9)
-    eta = jax.vmap(scene.system.contact_coordinates)(found.q)
+    np.testing.assert_allclose(solution.energy, solution.energy[0], atol=1e-9)
+    eta = jax.vmap(scene.system.contact_coordinates)(solution.q)
     assert (np.abs(eta[-1, :, :4] - eta[0, :, :4]).max(1) > 0.1).all()
     # 9 rows on 15 velocities; the object's six are left.
     assert jd.grasp.hand_jacobian(scene, q).shape == (9, 9)
@@ -286,8 +286,8 @@ def test_motions_are_batched_and_have_derivatives_in_states_and_shapes():
     def end(axes, omega):
         scene = egg_on_plane(axes)
         options = {"stepsize": 0.02, "solver": diffrax.Dopri5(), "adjoint": "reverse"}
-        found = jd.simulate(scene, *egg_start(scene, omega, axes[2]), jnp.array([0.0, 0.1, 0.2]), **options)
-        return jnp.sum(found.q[-1] ** 2)
+        solution = jd.simulate(scene, *egg_start(scene, omega, axes[2]), jnp.array([0.0, 0.1, 0.2]), **options)
+        return jnp.sum(solution.q[-1] ** 2)
 
     step = 1e-4
     axes, omegas = step * jnp.eye(3, 3), step * jnp.eye(3)
@@ -313,9 +313,9 @@ def test_a_valley_that_becomes_too_narrow_ends_the_motion():
     q = scene.system.place(jnp.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]), near=[[0.0, 0.0, -0.5, 0.0]])
     v = jnp.array([1.2, 0.0, 0.0, 0.0, 4.0, 0.0])
     for options in ({}, {"stepsize": 0.005}):
-        found = jd.simulate(scene, q, v, jnp.linspace(0.0, 0.5, 51), throw=False, max_steps=2000, **options)
-        assert found.result == jd.RESULTS.no_single_contact, found.result
-        assert 0 < float(found.stats["time_reached"]) < 0.5 and np.isnan(found.q[-1]).all()
+        solution = jd.simulate(scene, q, v, jnp.linspace(0.0, 0.5, 51), throw=False, max_steps=2000, **options)
+        assert solution.result == jd.RESULTS.no_single_contact, solution.result
+        assert 0 < float(solution.stats["time_reached"]) < 0.5 and np.isnan(solution.q[-1]).all()
 
 
 @pytest.mark.slow

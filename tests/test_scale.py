@@ -45,8 +45,8 @@ def evaluated(out, samples=23, chunk=5, function=square, parameters=drawn, **opt
 
 def files(path):
     """All files of a store, but for the time of its making."""
-    found = {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
-    return {name: data for name, data in found.items() if not name.endswith("zarr.json")}
+    computed = {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    return {name: data for name, data in computed.items() if not name.endswith("zarr.json")}
 
 
 def arrays(path):
@@ -94,8 +94,10 @@ def test_rows_are_those_of_simulate_with_names_and_units(pendulums):
     assert run.success and run.codes == {"successful": 21} and run.computed == 21
 
     def one(q, c):
-        found = jd.simulate(build({"damping": c}), q, jnp.zeros(2), ts, stepsize=0.01, outputs=("energy",), throw=False)
-        return found.q, found.v, found.energy
+        solution = jd.simulate(
+            build({"damping": c}), q, jnp.zeros(2), ts, stepsize=0.01, outputs=("energy",), throw=False
+        )
+        return solution.q, solution.v, solution.energy
 
     q, v, energy = jax.jit(jax.vmap(one))(starts, damping)
     table = run.dataset()
@@ -163,8 +165,8 @@ def test_a_program_has_no_communication(pendulums):
     batch = members({"q0": starts, "p": damping}, None, None, 0)
 
     def one(_, row):
-        found = jd.simulate(build({"damping": row["p"]}), row["q0"], jnp.zeros(2), ts, stepsize=0.01, throw=False)
-        return {"q": found.q, "v": found.v}
+        solution = jd.simulate(build({"damping": row["p"]}), row["q0"], jnp.zeros(2), ts, stepsize=0.01, throw=False)
+        return {"q": solution.q, "v": solution.v}
 
     compiled = program.Program(one, batch, jax.local_devices(), 8, None)
     text = compiled.compiled.as_text()
@@ -570,28 +572,28 @@ def test_reductions_are_those_of_all_rows(tmp_path):
         "own": Extent(),
     }
     run = evaluated(tmp_path / "a.zarr", samples=433, chunk=64, reductions=reductions)
-    table, found = run.dataset(), run.reductions
+    table, computed = run.dataset(), run.reductions
     y, z = np.asarray(table.y), np.asarray(table.z)
-    np.testing.assert_allclose(found["y"]["mean"], y.mean(0), rtol=1e-14)
-    np.testing.assert_allclose(found["y"]["std"], y.std(0, ddof=1), rtol=1e-13)
-    inner = np.histogram(y[:, 1], found["sine"]["edges"])[0]
+    np.testing.assert_allclose(computed["y"]["mean"], y.mean(0), rtol=1e-14)
+    np.testing.assert_allclose(computed["y"]["std"], y.std(0, ddof=1), rtol=1e-13)
+    inner = np.histogram(y[:, 1], computed["sine"]["edges"])[0]
     inner[-1] -= (y[:, 1] == 0.95).sum()
-    np.testing.assert_array_equal(found["sine"]["counts"][1:-1], inner)
-    assert found["sine"]["counts"].sum() == 433
+    np.testing.assert_array_equal(computed["sine"]["counts"][1:-1], inner)
+    assert computed["sine"]["counts"].sum() == 433
     # A bin is 2.5e-4 wide; between neighbours of a sample of 433 lie 3e-3.
-    np.testing.assert_allclose(found["z"]["quantiles"], np.quantile(z, [0.1, 0.5, 0.9]), atol=5e-3)
+    np.testing.assert_allclose(computed["z"]["quantiles"], np.quantile(z, [0.1, 0.5, 0.9]), atol=5e-3)
     order = np.argsort(-z, kind="stable")
-    np.testing.assert_array_equal(found["worst"]["rollout"], order[:4])
-    np.testing.assert_array_equal(found["worst"]["value"], z[order[:4]])
-    np.testing.assert_array_equal(found["best"]["value"][:433], np.sort(z))
-    assert (found["best"]["rollout"][433:] == -1).all() and np.isnan(found["best"]["value"][433:]).all()
-    assert (found["own"]["least"], found["own"]["most"]) == (z.min(), z.max())
-    for name, parts in found.items():
+    np.testing.assert_array_equal(computed["worst"]["rollout"], order[:4])
+    np.testing.assert_array_equal(computed["worst"]["value"], z[order[:4]])
+    np.testing.assert_array_equal(computed["best"]["value"][:433], np.sort(z))
+    assert (computed["best"]["rollout"][433:] == -1).all() and np.isnan(computed["best"]["value"][433:]).all()
+    assert (computed["own"]["least"], computed["own"]["most"]) == (z.min(), z.max())
+    for name, parts in computed.items():
         for part, value in parts.items():
             np.testing.assert_array_equal(np.asarray(table[f"{name}_{part}"]), value)
     # Without rows the same, and no rows.
     bare = evaluated(tmp_path / "b.zarr", samples=433, chunk=64, reductions=reductions, rows=False)
-    np.testing.assert_equal(bare.reductions, found)
+    np.testing.assert_equal(bare.reductions, computed)
     assert "y" not in bare.dataset() and bare.codes == run.codes
 
 
@@ -599,10 +601,10 @@ def test_a_mean_of_large_numbers_does_not_cancel():
     values = 1e8 + np.random.default_rng(0).normal(size=(1000, 2))
     mean = jd.scale.Mean("y")
     parts = [mean.partial(part, np.arange(len(part))) for part in (values[:0], values[:3], values[3:700], values[700:])]
-    found = mean.merge({name: np.stack([part[name] for part in parts]) for name in parts[0]})
-    np.testing.assert_allclose(found["mean"], values.mean(0), rtol=1e-14)
+    computed = mean.merge({name: np.stack([part[name] for part in parts]) for name in parts[0]})
+    np.testing.assert_allclose(computed["mean"], values.mean(0), rtol=1e-14)
     # The last bit of 1e8 is 1.5e-8, which is that of the deviations too; sums of squares as they are would lose all digits.
-    np.testing.assert_allclose(found["std"], values.std(0, ddof=1), rtol=1.5e-8)
+    np.testing.assert_allclose(computed["std"], values.std(0, ddof=1), rtol=1.5e-8)
     none = mean.merge({name: part[None] for name, part in parts[0].items()})
     assert none["count"] == 0 and np.isnan(none["mean"]).all() and np.isnan(none["std"]).all()
 
@@ -610,8 +612,8 @@ def test_a_mean_of_large_numbers_does_not_cancel():
 def test_quantiles_outside_of_the_bins_are_not_made_up():
     quantiles = jd.scale.Quantiles("y", 0.0, 1.0, probabilities=(0.0, 0.2, 0.5, 1.0))
     part = quantiles.partial(np.array([-1.0, 0.25, 0.5, 0.75, 3.0]), np.arange(5))
-    found = quantiles.merge({"counts": part["counts"][None]})["quantiles"]
-    assert np.isnan(found[[0, 3]]).all() and abs(found[2] - 0.5) < 2e-3
+    computed = quantiles.merge({"counts": part["counts"][None]})["quantiles"]
+    assert np.isnan(computed[[0, 3]]).all() and abs(computed[2] - 0.5) < 2e-3
 
 
 # Costs and memory

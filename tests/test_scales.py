@@ -27,8 +27,8 @@ def slider_crank(scale):
 
 @quick
 def guessed(scene, q, v):
-    found = assemble(scene, q, v)
-    return found.q, found.v, found.success
+    assembly = assemble(scene, q, v)
+    return assembly.q, assembly.v, assembly.success
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +38,8 @@ def moved():
     def by(method):
         @quick
         def run(scene, q, v):
-            found = simulate(scene, q, v, TIMES, method=method, stepsize=0.01, throw=False)
-            return found.q[-1], found.result
+            solution = simulate(scene, q, v, TIMES, method=method, stepsize=0.01, throw=False)
+            return solution.q[-1], solution.result
 
         return run
 
@@ -50,10 +50,10 @@ def moved():
 def test_an_assembled_linkage_is_assembled_at_every_size(scale):
     q, v = scenes.four_bar.start()
     rough = q + jnp.asarray([0.0, 0.05, -0.05])
-    found, known = (guessed(four_bar(x), rough, v) for x in (scale, 1.0))
-    assert found[2]
-    np.testing.assert_allclose(found[0], known[0], atol=1e-12)
-    np.testing.assert_allclose(found[1], known[1], atol=1e-12)
+    computed, known = (guessed(four_bar(x), rough, v) for x in (scale, 1.0))
+    assert computed[2]
+    np.testing.assert_allclose(computed[0], known[0], atol=1e-12)
+    np.testing.assert_allclose(computed[1], known[1], atol=1e-12)
 
 
 @pytest.mark.parametrize("method", ["multipliers", "projected"])

@@ -29,8 +29,8 @@ def parallel():
 
     @quick
     def solve(taus):
-        found = jax.vmap(lambda tau: constrained_dynamics(scene, q, v, tau))(taus)
-        return found, residuals(scene, q, v), constraint_jacobian(scene, q), projections(scene, q).P_omega
+        dynamics = jax.vmap(lambda tau: constrained_dynamics(scene, q, v, tau))(taus)
+        return dynamics, residuals(scene, q, v), constraint_jacobian(scene, q), projections(scene, q).P_omega
 
     M, h, J, carried = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 2)), np.zeros(6)
     unit = mass * length**2
@@ -53,14 +53,14 @@ def test_parallel_manipulator(parallel):
     """Two equations for the carried point, J^T (M (J xdd + Jdot xd) + h) = J^T tau, with torques on all joints."""
     M, h, J, carried = (parallel[name] for name in ("M", "h", "J", "carried"))
     taus = np.random.default_rng(0).normal(size=(6, 6))
-    found, error, A, _ = parallel["solve"](jnp.asarray(taus))
+    computed, error, A, _ = parallel["solve"](jnp.asarray(taus))
     assert float(error.max()) < 1e-14
     assert_close(parallel["v"], J @ parallel["velocity"], 1e-13)
     point = np.linalg.solve(J.T @ M @ J, J.T @ (taus - h - M @ carried).T)
-    assert_close(found.acceleration, (J @ point).T + carried, 1e-11)
-    assert (np.asarray(found.rank) == 4).all()
+    assert_close(computed.acceleration, (J @ point).T + carried, 1e-11)
+    assert (np.asarray(computed.rank) == 4).all()
     np.testing.assert_allclose(A @ J, 0, atol=1e-13)
-    assert_close(A.T @ found.multipliers.T, (M @ found.acceleration.T + h[:, None] - taus.T), 1e-11)
+    assert_close(A.T @ computed.multipliers.T, (M @ computed.acceleration.T + h[:, None] - taus.T), 1e-11)
 
 
 def test_actuation_of_the_parallel_manipulator(parallel):
@@ -76,9 +76,9 @@ def test_actuation_of_the_parallel_manipulator(parallel):
     inner, inner_three = np.linalg.svd(J.T)[2][2:], np.zeros(6)
     inner_three[base] = np.linalg.svd(J.T[:, base])[2][2]
     taus = np.stack([all_joints, all_joints + inner[0], all_joints + inner[3], three, three + inner_three, np.zeros(6)])
-    found, *_ = parallel["solve"](jnp.asarray(taus))
-    assert_close(found.acceleration[:5], np.tile(wanted, (5, 1)), 1e-11)
-    lam = np.asarray(found.multipliers)
+    computed, *_ = parallel["solve"](jnp.asarray(taus))
+    assert_close(computed.acceleration[:5], np.tile(wanted, (5, 1)), 1e-11)
+    lam = np.asarray(computed.multipliers)
     assert np.linalg.norm(lam[[1, 2]] - lam[0], axis=1).min() > 0.1
     assert np.linalg.norm(lam[4] - lam[3]) > 0.1
     # The least torques: the same motion costs more with three motors, and more with internal forces.
@@ -113,16 +113,16 @@ def test_ring_of_bars():
         states.append((q, jnp.asarray([*(np.array([[c, s], [-s, c]]) @ speed), w[0], *np.diff(w)])))
         place = place + length * np.array([c, s])
         speed = speed + length * w[0] * np.array([-s, c])
-    error, found, _ = solve(*(jnp.stack(x) for x in zip(*states, strict=True)))
+    error, computed, _ = solve(*(jnp.stack(x) for x in zip(*states, strict=True)))
     assert float(error.max()) < 1e-14
-    a = np.asarray(found.acceleration)
+    a = np.asarray(computed.acceleration)
 
-    still = polygon[1][2] * np.array([-polygon[1][1], polygon[1][0], 0.0])
+    at_rest = polygon[1][2] * np.array([-polygon[1][1], polygon[1][0], 0.0])
     np.testing.assert_allclose(
-        a[0], [*(-still[:2] - rate**2 * np.asarray(polygon[0][:2]))[:2], *np.zeros(6)], atol=1e-12
+        a[0], [*(-at_rest[:2] - rate**2 * np.asarray(polygon[0][:2]))[:2], *np.zeros(6)], atol=1e-12
     )
     tension = mass * length / 4 / np.tan(np.pi / count) / np.sin(np.pi / count) * rate**2
-    np.testing.assert_allclose(np.linalg.norm(found.multipliers[0]), tension, rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(computed.multipliers[0]), tension, rtol=1e-12)
 
     turning = np.cumsum(a[1:, 2:], 1)
     assert_close(np.roll(turning[1], 1), turning[0], 1e-11)
@@ -187,11 +187,11 @@ def test_bennett_linkage():
     solve = quick(jax.vmap(lambda q, v: (residuals(scene, q, v), constrained_dynamics(scene, q, v))))
     cases = [(0.8, 1.0), (2.5, -0.7), (-1.2, 2.0)]
     starts = [scenes.bennett.start(angle=angle, rate=rate) for angle, rate in cases]
-    error, found = solve(*(jnp.stack(x) for x in zip(*starts, strict=True)))
+    error, computed = solve(*(jnp.stack(x) for x in zip(*starts, strict=True)))
     assert float(error.max()) < 1e-14
-    assert (np.asarray(found.rank) == 2).all() and found.multipliers.shape == (3, 5)
-    assert bool((found.result == RESULTS.successful).all())
-    for (angle, rate), a in zip(cases, np.asarray(found.acceleration), strict=True):
+    assert (np.asarray(computed.rank) == 2).all() and computed.multipliers.shape == (3, 5)
+    assert bool((computed.result == RESULTS.successful).all())
+    for (angle, rate), a in zip(cases, np.asarray(computed.acceleration), strict=True):
         first = oracle.acceleration(angle, rate)
         follower = oracle.angles(angle)[1]
         # q2' = -q1' sin q2/sin q1, differentiated.
@@ -216,12 +216,12 @@ def test_andrews_from_its_bodies():
         state = assemble(printed, q, v)
         q, v = state.q, state.v
         x, w = q[order], v[order]
-        found = []
+        rows = []
         for scene, place, rate in ((printed, q, v), (built, x, w)):
             energy = kinetic_energy(scene.system, place, rate)
             a = constrained_dynamics(scene, place, rate).acceleration
-            found.append((a, energy, residuals(scene, place, rate)))
-        return found, potential_energy(printed.system, q), built.forces[0].energy(built.system, x)
+            rows.append((a, energy, residuals(scene, place, rate)))
+        return rows, potential_energy(printed.system, q), built.forces[0].energy(built.system, x)
 
     rates = [1140.0, -1424.0, 11.0, 19.0, 0.6, -19.0, 0.3]
     for q, v in ((q0, v0), (jnp.asarray(rough), jnp.asarray(rates))):
@@ -311,12 +311,12 @@ def test_a01_pendulum_for_2000_seconds():
         options = {"stepsize": 0.02, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
         return simulate(scene, q, v, ts, max_steps=110_000, **options)
 
-    found = run()
+    computed = run()
     want = [
         [-1.0, 0.0],
         [-0.181513351427031385, -0.983388480334057505],
         [0.814603068589032152, -0.580018827836935462],
     ]
-    assert bool(found.success) and float(found.constraint_residual.max()) <= 1e-12
-    np.testing.assert_allclose(found.q, want, atol=1e-6)
-    np.testing.assert_allclose(found.energy, found.energy[0], atol=1e-9)
+    assert bool(computed.success) and float(computed.constraint_residual.max()) <= 1e-12
+    np.testing.assert_allclose(computed.q, want, atol=1e-6)
+    np.testing.assert_allclose(computed.energy, computed.energy[0], atol=1e-9)

@@ -22,17 +22,17 @@ def motion(scene, state, ts, stepsize):
         options = {"stepsize": stepsize, "solver": diffrax.Dopri8(), "outputs": ("constraint_residual",)}
         return simulate(scene, q, v, jnp.asarray(ts), **options)
 
-    found = run(*state)
-    assert bool(found.success) and float(found.constraint_residual.max()) <= 1e-12
-    return found
+    computed = run(*state)
+    assert bool(computed.success) and float(computed.constraint_residual.max()) <= 1e-12
+    return computed
 
 
 def solved(scene, state, tau):
     """Residuals and acceleration at a state."""
     compute = quick(lambda q, v, tau: (residuals(scene, q, v), constrained_dynamics(scene, q, v, tau)))
-    error, found = compute(*state, jnp.asarray(tau))
+    error, computed = compute(*state, jnp.asarray(tau))
     assert float(error.max()) < 1e-14
-    return found
+    return computed
 
 
 @pytest.mark.slow
@@ -63,10 +63,10 @@ def test_stability_of_the_upright_disk():
     rolling, spinning = np.sqrt(gravity / (3 * radius)), np.sqrt(4 * gravity / (5 * radius))
     factors = np.array([0.98, 1.0, 1.02])
     cases = [[0.0, 0.0, f * rolling, 0.0] for f in factors] + [[0.0, 0.0, 0.0, f * spinning] for f in factors]
-    found = np.asarray(quick(jax.vmap(motion_jacobian(scene, state, coordinates)))(jnp.asarray(cases)))
+    jacobian = np.asarray(quick(jax.vmap(motion_jacobian(scene, state, coordinates)))(jnp.asarray(cases)))
     level = gravity / radius
     want = np.concatenate([0.8 * level * (1 - factors**2), 0.8 * level * (1 - factors**2)])
-    for J, k in zip(found, want, strict=True):
+    for J, k in zip(jacobian, want, strict=True):
         np.testing.assert_allclose(np.poly(J), [1.0, 0.0, -k, 0.0, 0.0], atol=1e-10 * level)
 
 
@@ -75,30 +75,30 @@ def test_suslov():
     (one, two, three), product, start = (1.0, 1.5, 2.0), 0.4, (1.0, -0.5)
     scene = scenes.suslov(moments=(one, two, three), product=product)
     t = np.array([0.0, 1.0, 3.0, 10.0])
-    found = motion(scene, scenes.suslov.start(across=start[0], along=start[1]), t, 0.05)
+    computed = motion(scene, scenes.suslov.start(across=start[0], along=start[1]), t, 0.05)
     c = np.sqrt(start[1] ** 2 + one / two * start[0] ** 2)
     n = product * c / one
     u = n * t + np.arctanh(start[1] / c)
     want = np.stack([c * np.sqrt(two / one) / np.cosh(u), c * np.tanh(u), 0 * u], 1)
-    np.testing.assert_allclose(found.v, want, atol=1e-10)
+    np.testing.assert_allclose(computed.v, want, atol=1e-10)
 
 
 def test_accelerations_of_balls_on_planes():
     """5/7 of the acceleration of a body that slides, with the contact forces; and friction against the slip."""
     slope, pull = 0.4, 9.81 * np.sin(0.4)
     state = scenes.ball_on_incline.start(velocity=(0.1, 0.5))
-    found = solved(scenes.ball_on_incline(slope=slope, mass=1.4), state, np.zeros(6))
+    solution = solved(scenes.ball_on_incline(slope=slope, mass=1.4), state, np.zeros(6))
     across = np.cross(state[1][3:], state[1][:3])
-    assert_close(found.acceleration[:3] + across, [5 / 7 * pull, 0.0, 0.0], 1e-12)
-    assert_close(found.multipliers, 1.4 * np.array([9.81 * np.cos(slope), -2 / 7 * pull, 0.0]), 1e-12)
+    assert_close(solution.acceleration[:3] + across, [5 / 7 * pull, 0.0, 0.0], 1e-12)
+    assert_close(solution.multipliers, 1.4 * np.array([9.81 * np.cos(slope), -2 / 7 * pull, 0.0]), 1e-12)
 
     state = scenes.bowling_ball.start()
-    found = solved(scenes.bowling_ball(), state, np.zeros(6))
+    solution = solved(scenes.bowling_ball(), state, np.zeros(6))
     push, spin, _, _ = sliding()
     across = np.cross(state[1][3:], state[1][:3])
-    assert_close(found.acceleration[:3] + across, push, 1e-13)
-    assert_close(found.acceleration[3:], spin, 1e-13)
-    assert_close(found.multipliers, [6.35 * 9.8], 1e-13)
+    assert_close(solution.acceleration[:3] + across, push, 1e-13)
+    assert_close(solution.acceleration[3:], spin, 1e-13)
+    assert_close(solution.multipliers, [6.35 * 9.8], 1e-13)
 
 
 def sliding():
@@ -117,9 +117,9 @@ def test_ball_on_an_incline():
     slope = 0.02
     scene = scenes.ball_on_incline(slope=slope, radius=0.5)
     t = np.array([0.0, 2.0, 10.0])
-    found = motion(scene, scenes.ball_on_incline.start(radius=0.5, velocity=(0.1, 0.5)), t, 0.1)
+    computed = motion(scene, scenes.ball_on_incline.start(radius=0.5, velocity=(0.1, 0.5)), t, 0.1)
     want = np.stack([0.1 * t + 5 / 14 * 9.81 * np.sin(slope) * t**2, 0.5 * t, 0 * t + 0.5], 1)
-    np.testing.assert_allclose(found.q[:, :3], want, atol=1e-10)
+    np.testing.assert_allclose(computed.q[:, :3], want, atol=1e-10)
 
 
 @pytest.mark.slow
@@ -127,15 +127,15 @@ def test_bowling_ball_slides_until_it_rolls():
     """A parabola, with the turns of the ball, up to just before it rolls with the velocity that Drake gives."""
     push, spin, end, roll = sliding()
     t = end * np.array([0.0, 0.3, 0.99])
-    found = motion(scenes.bowling_ball(), scenes.bowling_ball.start(), t, 0.004)
+    computed = motion(scenes.bowling_ball(), scenes.bowling_ball.start(), t, 0.004)
     v0 = np.array([8.0, 0.0, 0.0])
     np.testing.assert_allclose(v0 + push * end, roll, atol=1e-13)
     want = v0[:2] * t[:, None] + 0.5 * push[:2] * t[:, None] ** 2
-    np.testing.assert_allclose(found.q[:, :2], want, atol=1e-10)
-    turned = np.asarray(jax.vmap(so3.quat_to_matrix)(found.q[:, 3:]))
-    np.testing.assert_allclose(np.einsum("tij,tj->ti", turned, found.v[:, :3]), v0 + push * t[:, None], atol=1e-10)
+    np.testing.assert_allclose(computed.q[:, :2], want, atol=1e-10)
+    turned = np.asarray(jax.vmap(so3.quat_to_matrix)(computed.q[:, 3:]))
+    np.testing.assert_allclose(np.einsum("tij,tj->ti", turned, computed.v[:, :3]), v0 + push * t[:, None], atol=1e-10)
     turning = np.array([-8 * np.pi, 0.0, 0.0]) + spin * t[:, None]
-    np.testing.assert_allclose(np.einsum("tij,tj->ti", turned, found.v[:, 3:]), turning, atol=1e-9)
+    np.testing.assert_allclose(np.einsum("tij,tj->ti", turned, computed.v[:, 3:]), turning, atol=1e-9)
 
 
 def by_hand(mass_matrix, bias, rows, q, v, tau):
@@ -209,9 +209,9 @@ def test_car():
 
     q, v = placed(scenes.car.start(speed=2.0, steer=0.3, steer_rate=0.5), (0.3, -0.2, 0.8))
     tau = np.array([0.0, 0.0, 0.0, 1.5, 2.0, 0.4, -0.7])
-    found = in_coordinates(q, v, solved(scenes.car(), (q, v), tau).acceleration)
-    assert_close(found[2], by_hand(mass_matrix, bias, rows, *found[:2], tau), 1e-11)
-    assert_close(rows(found[0]) @ found[1] + 1.0, np.ones(5), 1e-13)
+    solution = in_coordinates(q, v, solved(scenes.car(), (q, v), tau).acceleration)
+    assert_close(solution[2], by_hand(mass_matrix, bias, rows, *solution[:2], tau), 1e-11)
+    assert_close(rows(solution[0]) @ solution[1] + 1.0, np.ones(5), 1e-13)
     assert abs(2.0 / v[2] - l / np.tan(0.3)) < 1e-12  # radius of the circle
 
 
@@ -233,6 +233,6 @@ def test_snakeboard():
     start = scenes.snakeboard.start(speed=1.0, angles=(0.3, -0.2), rates=(0.4, -0.9), rotor_rate=2.0)
     q, v = placed(start, (0.3, -0.2, 0.8))
     tau = np.array([0.0, 0.0, 0.0, 0.3, -0.2, 1.1])
-    found = in_coordinates(q, v, solved(scenes.snakeboard(), (q, v), tau).acceleration)
-    assert_close(found[2], by_hand(lambda q: M, lambda q, v: np.zeros(6), rows, *found[:2], tau), 1e-11)
-    assert_close(rows(found[0]) @ found[1] + 1.0, np.ones(2), 1e-13)
+    solution = in_coordinates(q, v, solved(scenes.snakeboard(), (q, v), tau).acceleration)
+    assert_close(solution[2], by_hand(lambda q: M, lambda q, v: np.zeros(6), rows, *solution[:2], tau), 1e-11)
+    assert_close(rows(solution[0]) @ solution[1] + 1.0, np.ones(2), 1e-13)

@@ -57,9 +57,9 @@ def poses(scene, q) -> dict[str, np.ndarray]:
 def residual(scene, constraint, q) -> float:
     """Largest residual of a loop."""
     ends = zip(constraint.ends(), ({None: np.eye(4)} | poses(scene, q),) * 2, strict=True)
-    first, second = (found[body] @ np.asarray(pose) for (body, pose), found in ends)
+    first, second = (computed[body] @ np.asarray(pose) for (body, pose), computed in ends)
     relative = jnp.asarray(f64.inverse(first) @ second)
-    return float(np.abs(constraint.apart(relative[:3, :3], relative[:3, 3])).max())
+    return float(np.abs(constraint.pose_residual(relative[:3, :3], relative[:3, 3])).max())
 
 
 def same(a: jd.LoadedScene, b: jd.LoadedScene) -> None:
@@ -142,9 +142,9 @@ def test_nested_models_and_placement_frames(tmp_path):
     {joint("j", "arm", "tool::hand")}</model>"""
     scene = silent(write(tmp_path, text, "1.8"))
     assert scene.system.body_names == ("arm", "tool::hand")
-    found = poses(scene, jnp.zeros(2))
-    np.testing.assert_allclose(found["tool::tip"][:3, 3], [1, 0, 2], atol=1e-15)
-    np.testing.assert_allclose(found["tool::hand"][:3, 3], [1, 0, 1.5], atol=1e-15)
+    computed = poses(scene, jnp.zeros(2))
+    np.testing.assert_allclose(computed["tool::tip"][:3, 3], [1, 0, 2], atol=1e-15)
+    np.testing.assert_allclose(computed["tool::hand"][:3, 3], [1, 0, 1.5], atol=1e-15)
 
 
 def test_worlds_static_models_and_free_roots(tmp_path):
@@ -161,9 +161,9 @@ def test_worlds_static_models_and_free_roots(tmp_path):
         "root_joint": "free",
     }
     np.testing.assert_allclose(model.gravity, [0, 0, -3.7])
-    found = poses(scene, scene.starts["reference"].q)
+    computed = poses(scene, scene.starts["reference"].q)
     expected = f64.pose_matrix(((0, 0, 2), (0, 0, 0.5)), "") @ f64.pose_matrix((0.1, 0, 0), "")
-    np.testing.assert_allclose(found["ball::core"], expected, atol=1e-15)
+    np.testing.assert_allclose(computed["ball::core"], expected, atol=1e-15)
     # A link without <inertial> has the format's default.
     np.testing.assert_allclose(model.inertias[model.body_names.index("ball::core")], [1, 0, 0, 0, 1, 0, 1, 0, 0, 1])
     fixed = silent(path, floating_base=False)
@@ -219,7 +219,7 @@ def test_a_tree_that_runs_against_a_joint_keeps_its_angle(tmp_path):
     text = link("a") + link("b", TURNED) + joint("w", "world", "b") + joint("j", "a", "b", pose=anchor)
     scene = silent(write(tmp_path, f"<model name='m'>{text}</model>"))
     assert [scene.system.joint_names[p] for p in scene.system.topology.parents if p >= 0] == ["w"]
-    found = poses(scene, jnp.array([0.0, 0.4]))
+    computed = poses(scene, jnp.array([0.0, 0.4]))
     plain = silent(
         write(
             tmp_path,
@@ -229,7 +229,9 @@ def test_a_tree_that_runs_against_a_joint_keeps_its_angle(tmp_path):
         )
     )
     wanted = poses(plain, jnp.array([0.0, 0.4]))
-    np.testing.assert_allclose(f64.inverse(found["a"]) @ found["b"], f64.inverse(wanted["a"]) @ wanted["b"], atol=1e-14)
+    np.testing.assert_allclose(
+        f64.inverse(computed["a"]) @ computed["b"], f64.inverse(wanted["a"]) @ wanted["b"], atol=1e-14
+    )
 
 
 FOUR_BAR = (
@@ -312,8 +314,8 @@ def test_gearboxes_couple_the_angles_against_the_reference_body(tmp_path, flip, 
     (constraint,) = scene.constraints
     follows = -float(constraint.position(model, q, 0.0)[0])  # the gear's row is q_o - ratio q_i
     q = q.at[model.joint_names.index("o")].set(follows)
-    found = poses(scene, q)
-    angle = {name: np.arctan2(found[name][1, 0], found[name][0, 0]) for name in ("in", "out")}
+    computed = poses(scene, q)
+    angle = {name: np.arctan2(computed[name][1, 0], computed[name][0, 0]) for name in ("in", "out")}
     np.testing.assert_allclose(angle["out"], -0.25 * angle["in"], atol=1e-15)
     assert abs(abs(angle["in"]) - 0.8) < 1e-15
 
@@ -523,8 +525,8 @@ def check_cassie(path: Path, *, dynamics: bool = True) -> jd.LoadedScene:
     q = jnp.asarray(np.random.default_rng(0).normal(size=model.nv))
     exponentials = Exponentials(path, model)
     places, M, gravity = exponentials.dynamics(q)
-    found = poses(scene, q)
-    assert max(np.abs(found[name] - place).max() for name, place in places.items()) < 1e-13
+    computed = poses(scene, q)
+    assert max(np.abs(computed[name] - place).max() for name, place in places.items()) < 1e-13
     for name, (mass, com, moment) in exponentials.inertia.items():
         if name in model.body_names:
             expected = f64.inertia_numbers((mass, com, moment), name)
@@ -565,5 +567,5 @@ def test_cassies_loops_close_from_a_rough_guess(robots_dir, name):
     scene = silent(cassie(robots_dir, name))
     rough = jnp.asarray(0.1 * np.random.default_rng(0).normal(size=scene.nv))
     # Angles written with five digits leave rows that are dependent to 3e-7 in cassie.sdf: 1.5e-11 remains there.
-    found = jd.assemble(scene, jd.integrate(scene.system, scene.starts["reference"].q, rough), throw=False)
-    assert found.residual.max() < 1e-10
+    assembly = jd.assemble(scene, jd.integrate(scene.system, scene.starts["reference"].q, rough), throw=False)
+    assert assembly.residual.max() < 1e-10

@@ -43,22 +43,22 @@ EXCHANGED = {
 
 @pytest.mark.parametrize("name", EXCHANGED)
 def test_samples_exchange_nothing_and_a_fit_once(compared, name):
-    found = compared[name]
-    assert found["calls"] == EXCHANGED[name]
-    assert found["shards"] == (1 if name.startswith("fit") else 8)
-    assert found["kernels"] > 0
+    computed = compared[name]
+    assert computed["calls"] == EXCHANGED[name]
+    assert computed["shards"] == (1 if name.startswith("fit") else 8)
+    assert computed["kernels"] > 0
 
 
 def test_results_are_those_of_one_device(compared):
     assert len(compared) == len(EXCHANGED) + 1
-    assert max(found["apart"] for found in compared.values()) < 1e-12
+    assert max(computed["apart"] for computed in compared.values()) < 1e-12
 
 
 def test_singular_samples_are_looked_for_by_one_bit(compared):
     """Whether a sample of any device needs care is asked of all; what is gathered then stands in a branch."""
-    found = compared["four-bar"]
-    assert found["shards"] == 8
-    assert 1 <= found["calls"].get("all-reduce", 0) <= 3 and found["calls"].get("all-gather", 0) <= 1
+    computed = compared["four-bar"]
+    assert computed["shards"] == 8
+    assert 1 <= computed["calls"].get("all-reduce", 0) <= 3 and computed["calls"].get("all-gather", 0) <= 1
 
 
 @pytest.mark.slow
@@ -71,18 +71,18 @@ def test_a_divided_program_is_found_in_the_compilation_cache(tmp_path):
         "TF_CPP_MIN_LOG_LEVEL": "3",
     }
     for hits in (0, 1):
-        found, compared = _run("cached", **options)
-        assert found == hits
+        computed, compared = _run("cached", **options)
+        assert computed == hits
         assert compared["calls"] == {} and compared["apart"] < 1e-12
 
 
 def _check_fits(*names: str) -> None:
-    for found, name in zip(_run("fits", *names), names, strict=True):
-        one, many = found["history"]
+    for computed, name in zip(_run("fits", *names), names, strict=True):
+        one, many = computed["history"]
         assert many[-1] < 0.9 * many[0], name
         np.testing.assert_allclose(many, one, rtol=1e-9)
         # Gauss-Newton steps are taken by the host, which reads the slopes of all devices.
-        assert found["calls"] == ({} if name == "slopes" else ONCE), name
+        assert computed["calls"] == ({} if name == "slopes" else ONCE), name
 
 
 def test_a_fit_to_samples_of_two_logs_is_shared_among_devices():

@@ -89,8 +89,15 @@ def test_projected_solver_steps_on_the_manifold_and_evaluates_the_first_stage_an
             y1, error, dense, state, _ = solver.step(term, k * h, (k + 1) * h, y0, None, state, False)
             interpolation = solver.interpolation_cls(t0=jnp.asarray(k * h), t1=jnp.asarray((k + 1) * h), **dense)
             ends = [interpolation.evaluate(jnp.asarray(x)) for x in (k * h, (k + 1) * h)]
-            found = (y0, y1, error, jax.tree.map(lambda k: k[0] / h, dense["dense_info"]["k"]), dense["shift"], *ends)
-            out.append([y["x"] for y in found])
+            computed = (
+                y0,
+                y1,
+                error,
+                jax.tree.map(lambda k: k[0] / h, dense["dense_info"]["k"]),
+                dense["shift"],
+                *ends,
+            )
+            out.append([y["x"] for y in computed])
             y0 = y1
         return out
 
@@ -188,10 +195,10 @@ def test_panda_against_pinocchio_and_scipy():
     reference = solve_ivp(rate, (0, 1), x0, "DOP853", ts, rtol=1e-12, atol=1e-12).y.T
     scene = Scene(model, forces=(JointDamping(2.0),))
     control = Feedback(jnp.asarray(0.4), jnp.asarray(push))
-    found = simulate(scene, q0, v0, ts, control=control, rtol=1e-12, atol=1e-12)
+    solution = simulate(scene, q0, v0, ts, control=control, rtol=1e-12, atol=1e-12)
     scale = np.abs(reference[:, robot.nq :]).max()
-    np.testing.assert_allclose(found.q, reference[:, : robot.nq], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.v, reference[:, robot.nq :], rtol=0, atol=1e-9 * scale)
+    np.testing.assert_allclose(solution.q, reference[:, : robot.nq], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(solution.v, reference[:, robot.nq :], rtol=0, atol=1e-9 * scale)
 
 
 @pytest.fixture(scope="module")
@@ -229,8 +236,8 @@ def test_outputs_are_those_of_the_saved_states(driven, leg):
         return energy, jnp.sum(tau * v), forward_dynamics(leg, q, v, tau), frame_pose(leg, q, "foot")
 
     expected = direct(solution.q, solution.v, solution.ts)
-    found = solution.energy, solution.power, solution.acceleration, solution.poses["foot"]
-    for x, y in zip(found, expected, strict=True):
+    computed = solution.energy, solution.power, solution.acceleration, solution.poses["foot"]
+    for x, y in zip(computed, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-12)
     rate = (solution.v[:-4] - 8 * solution.v[1:-3] + 8 * solution.v[3:-1] - solution.v[4:]) / (12 * 0.005)
     scale = np.abs(solution.acceleration[102:]).max()
@@ -343,9 +350,9 @@ def test_continuous_adjoint(pendulum):
     """Its gradients are those of the exact motion, to the tolerance of the solution."""
     z = jnp.asarray([1.2, 0.7, -0.5, 0.1, 0.05, 0.3])
     tight = {"rtol": 1e-10, "atol": 1e-10}
-    found = quick(jax.grad(lambda z: swing(pendulum, z, adjoint="backsolve", **tight)))(z)
+    gradient = quick(jax.grad(lambda z: swing(pendulum, z, adjoint="backsolve", **tight)))(z)
     expected = quick(jax.grad(lambda z: swing(pendulum, z, **tight)))(z)
-    np.testing.assert_allclose(found, expected, rtol=1e-7)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-7)
 
 
 def lane(leg, q0, v0, mass, control):
@@ -421,7 +428,7 @@ def test_other_numbers_do_not_compile_anew(pendulum):
     assert len(traces) == 3 * count
 
 
-@pytest.mark.parametrize("name", ["four_bar", "rolling_disk"])
+@pytest.mark.parametrize("name", [pytest.param("four_bar", marks=pytest.mark.slow), "rolling_disk"])
 def test_numbers_that_are_compiled_in_change_nothing(name, monkeypatch):
     """The motion and the assembled start of the first scene of its shape are those of the program for any numbers."""
     scene, (q, v) = getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()
@@ -429,8 +436,8 @@ def test_numbers_that_are_compiled_in_change_nothing(name, monkeypatch):
     ts = jnp.linspace(0.0, 0.3, 4)
 
     def run():
-        found = jd.simulate(scene, q, v, ts, stepsize=0.01)
-        return found.q, found.v, jd.assemble(scene, q + 1e-3, v).q
+        solution = jd.simulate(scene, q, v, ts, stepsize=0.01)
+        return solution.q, solution.v, jd.assemble(scene, q + 1e-3, v).q
 
     with jd.compilation("general"):
         expected = run()
@@ -469,9 +476,9 @@ def test_failures_are_codes_or_errors(pendulum):
     assert 0.1 < reached < 4 and int(short.stats["num_steps"]) == 9
     with pytest.raises(RuntimeError, match=r"stopped at t = 0\.(29\d*|3) s.*minimum step size.*singular mass matrix"):
         simulate(pendulum, [1.0], [0.0], ts, control=control)
-    found = simulate(pendulum, [1.0], [0.0], ts, control=control, throw=False)
-    assert found.result == RESULTS.dt_min_reached
-    np.testing.assert_array_equal(np.isnan(found.v[:, 0]), [False, False, True, True])
+    solution = simulate(pendulum, [1.0], [0.0], ts, control=control, throw=False)
+    assert solution.result == RESULTS.dt_min_reached
+    np.testing.assert_array_equal(np.isnan(solution.v[:, 0]), [False, False, True, True])
     with pytest.raises(RuntimeError, match=r"became NaN or infinite.*smaller stepsize"):
         simulate(pendulum, [1.0], [0.0], ts, control=control, stepsize=0.05)
 
@@ -564,11 +571,11 @@ def test_quaternions_near_unit_length_are_normalised(leg):
 @pytest.mark.parametrize("name", ["free_body", pytest.param("rolling_coin", marks=pytest.mark.slow)])
 def test_methods_that_wrap_an_explicit_one(wrapped, name):
     """In local coordinates, and with errors by halved steps: the motion is that of Dopri8, with and without constraints."""
-    found = getattr(scenes, name)
-    state, ts = found.start(), jnp.linspace(0.0, 0.5, 3)
-    ways = [simulate(found(), *state, ts, solver=solver) for solver in (diffrax.Dopri8(), wrapped)]
-    assert_close(ways[1].q, ways[0].q, 1e-6)  # local errors of 1e-8 along the way
-    assert_close(ways[1].v, ways[0].v, 1e-6)
+    computed = getattr(scenes, name)
+    state, ts = computed.start(), jnp.linspace(0.0, 0.5, 3)
+    solutions = [simulate(computed(), *state, ts, solver=solver) for solver in (diffrax.Dopri8(), wrapped)]
+    assert_close(solutions[1].q, solutions[0].q, 1e-6)  # local errors of 1e-8 along the way
+    assert_close(solutions[1].v, solutions[0].v, 1e-6)
 
 
 def test_constraints_may_be_functions_that_hold_numbers_of_a_batch():

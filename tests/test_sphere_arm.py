@@ -37,7 +37,7 @@ def at_contact(eta):
 @pytest.fixture(scope="module")
 def solved():
     """What the library computes of both scenes at the start: rows, maps, projections, accelerations."""
-    found = {}
+    computed = {}
     for kind in KINDS:
         scene, (q, v) = light(kind), start(kind)
 
@@ -59,8 +59,8 @@ def solved():
                 "multipliers": forward.multipliers,
             }
 
-        found[kind] = {name: np.asarray(x) for name, x in compute(q, v, WRENCH).items()}
-    return found
+        computed[kind] = {name: np.asarray(x) for name, x in compute(q, v, WRENCH).items()}
+    return computed
 
 
 WRENCH = jnp.array([0.4, -1.2, 2.1, 0.03, -0.05, 0.02])
@@ -111,9 +111,9 @@ def newton_euler(J, J_rate, rates, rows, pose):
     turning = np.concatenate([np.cross(w, p), np.cross(w, h) + np.cross(v, p)])
     weight = np.concatenate([pose[:3, :3].T @ [0.0, 0.0, -9.81 * MASS], np.zeros(3)])
     right = WRENCH + weight - turning - inertia @ (J_rate @ rates)
-    found = np.linalg.solve(np.concatenate([inertia @ J, -rows.T], 1), right)
+    solution = np.linalg.solve(np.concatenate([inertia @ J, -rows.T], 1), right)
     n = J.shape[1]
-    return found[:n], J @ found[:n] + J_rate @ rates, found[n:]
+    return solution[:n], J @ solution[:n] + J_rate @ rates, solution[n:]
 
 
 def test_frictionless_motion_is_that_of_the_printed_equations(solved):
@@ -189,10 +189,10 @@ def motion(kind, method):
     scene, (q, v) = scenes.sphere_arm(contact=kind), start(kind)
     ts = jnp.array([0.0, 0.1, 0.2])
     options = {"stepsize": 0.01, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
-    found = quick(lambda q, v: jd.simulate(scene, q, v, ts, method=method, **options))(q, v)
-    assert bool(found.success) and float(found.constraint_residual.max()) < 1e-12
-    np.testing.assert_allclose(found.energy, found.energy[0], rtol=1e-9)
-    return found
+    solution = quick(lambda q, v: jd.simulate(scene, q, v, ts, method=method, **options))(q, v)
+    assert bool(solution.success) and float(solution.constraint_residual.max()) < 1e-12
+    np.testing.assert_allclose(solution.energy, solution.energy[0], rtol=1e-9)
+    return solution
 
 
 @pytest.mark.slow

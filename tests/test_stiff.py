@@ -42,11 +42,11 @@ def test_first_step_is_the_same_in_any_unit_of_time():
         # Without atol, which is not the same for m/s in all units of time; powers of two make the numbers the same.
         return jd.simulate(scene, *start, jnp.stack([0 * w, 10 / w]), atol=1e-30, throw=False)
 
-    found = run(2.0 ** np.array([0, 20, -20]))
-    assert found.success.all()
-    assert len({int(n) for n in found.stats["num_steps"]}) == 1
-    np.testing.assert_array_equal(found.stats["num_rejected_steps"], 0)
-    np.testing.assert_allclose(found.q[:, -1, 0], np.cos(10) + 0.5 * np.sin(10), rtol=1e-7)
+    computed = run(2.0 ** np.array([0, 20, -20]))
+    assert computed.success.all()
+    assert len({int(n) for n in computed.stats["num_steps"]}) == 1
+    np.testing.assert_array_equal(computed.stats["num_rejected_steps"], 0)
+    np.testing.assert_allclose(computed.q[:, -1, 0], np.cos(10) + 0.5 * np.sin(10), rtol=1e-7)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -115,8 +115,8 @@ def test_order_of_the_rosenbrock_method():
         return jnp.concatenate(jax.tree.leaves(ys), axis=1)
 
     exact = np.asarray(quick(lambda h: run(h, diffrax.Dopri8()))(1e-3))
-    found = np.asarray(quick(jax.vmap(run))(0.1 / 2.0 ** np.arange(4)))
-    for error in (np.abs(found[:, -1] - exact[-1]).max(1), np.abs(found - exact).max((1, 2))):
+    computed = np.asarray(quick(jax.vmap(run))(0.1 / 2.0 ** np.arange(4)))
+    for error in (np.abs(computed[:, -1] - exact[-1]).max(1), np.abs(computed - exact).max((1, 2))):
         assert np.log2(error[:-1] / error[1:]).min() > 4.7, error
 
 
@@ -172,8 +172,8 @@ def turned(ball, h, solver):
     """The state at two times from a fixed start, by steps of length h."""
     y0 = {"q": jnp.asarray([0.5, 0.5, -0.5, 0.5]), "v": jnp.asarray([1.0, 1.5, 2.0])}
     saveat = diffrax.SaveAt(ts=jnp.asarray([0.33, 1.0]))
-    found = diffrax.diffeqsolve(turning(ball), solver, 0.0, 1.0, h, y0, 0.2, saveat=saveat, max_steps=64)
-    return jnp.concatenate([found.ys["q"], found.ys["v"]], 1)
+    solution = diffrax.diffeqsolve(turning(ball), solver, 0.0, 1.0, h, y0, 0.2, saveat=saveat, max_steps=64)
+    return jnp.concatenate([solution.ys["q"], solution.ys["v"]], 1)
 
 
 @pytest.fixture(scope="module")
@@ -192,9 +192,9 @@ IMPLICIT = diffrax.Kvaerno3(root_finder=optimistix.Newton(1e-13, 1e-13))
 def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
     """The order is kept, at steps and between them, and quaternions are of unit length without a projection."""
     run = quick(jax.vmap(lambda h: turned(ball, h, jd.LieGroup(solver).fitted(ball))))
-    found = np.asarray(run(jnp.asarray([1 / 10, 1 / 20, 1 / 40])))
-    np.testing.assert_allclose(np.linalg.norm(found[..., :4], axis=-1), 1, rtol=1e-14)
-    error = np.abs(found - turned_exactly).max(2)
+    computed = np.asarray(run(jnp.asarray([1 / 10, 1 / 20, 1 / 40])))
+    np.testing.assert_allclose(np.linalg.norm(computed[..., :4], axis=-1), 1, rtol=1e-14)
+    error = np.abs(computed - turned_exactly).max(2)
     assert np.log2(error[:-1, 1] / error[1:, 1]).min() > order - 0.35, error
     # Between steps the error depends on where the point is in its step, so over both halvings.
     assert np.log2(error[0, 0] / error[2, 0]) / 2 > order - 0.8, error
@@ -238,8 +238,8 @@ def test_stiffness_is_that_of_the_linear_system(damping):
     np.testing.assert_allclose(
         jd.stiffness(scene, [0.3], [1.0])[:2], roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12
     )
-    found = jd.stiffness(jd.Scene(slider(2.0)), [0.0], [0.0], 0.0, lambda q, v, t: -200.0 * q - damping * v)
-    np.testing.assert_allclose(found[:2], roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12)
+    estimate = jd.stiffness(jd.Scene(slider(2.0)), [0.0], [0.0], 0.0, lambda q, v, t: -200.0 * q - damping * v)
+    np.testing.assert_allclose(estimate[:2], roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("damping", [0.0, 20.0, 400.0, 2e4])
@@ -266,9 +266,9 @@ def test_stiffness_on_constraints():
         builder.add_body(name, joint="prismatic", axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
     forces = (jd.JointSpring(1e4), jd.JointDamping(jnp.asarray([0.0, 5e3])))
     scene = jd.Scene(builder.build(), (jd.Pfaffian(two_to_one),), forces)
-    found = jd.stiffness(scene, [0.0, 0.0], [0.0, 0.0])
+    estimate = jd.stiffness(scene, [0.0, 0.0], [0.0, 0.0])
     # The constraint leaves two eigenvalues zero, which LAPACK gives to rounding of the largest: 1.5e3 times 2e-16.
-    np.testing.assert_allclose(found[:2], roots(1 + 4 * 3, 4 * 5e3, 5 * 1e4), rtol=1e-10, atol=1e-11)
+    np.testing.assert_allclose(estimate[:2], roots(1 + 4 * 3, 4 * 5e3, 5 * 1e4), rtol=1e-10, atol=1e-11)
     with pytest.raises(ValueError, match=r"q has shape \(1,\), expected \(2,\)"):
         jd.stiffness(scene, [0.0], [0.0, 0.0])
 
@@ -276,8 +276,8 @@ def test_stiffness_on_constraints():
 def test_stiffness_of_odd_states():
     """Nothing that moves, and forces that are not finite."""
     fixed = jd.ModelBuilder("fixed").add_body("base", joint="fixed").build()
-    found = jd.stiffness(fixed, jnp.zeros(0), jnp.zeros(0))
-    assert found.decay == 0 and found.frequency == 0 and found.explicit_step == np.inf
+    estimate = jd.stiffness(fixed, jnp.zeros(0), jnp.zeros(0))
+    assert estimate.decay == 0 and estimate.frequency == 0 and estimate.explicit_step == np.inf
     with pytest.raises(ValueError, match=r"not finite at q = \[nan\]"):
         jd.stiffness(jd.Scene(slider(), forces=(jd.JointSpring(np.nan),)), [np.nan], [0.0])
 
@@ -296,9 +296,9 @@ def test_default_solver_and_advice_follow_stiffness():
         return jd.simulate(scene, q0, v0, case.ts, control=control, max_steps=400, **options)
 
     for stiffness, solver in ((1e3, "Dopri8"), (1e9, "Rodas5P")):
-        found = run(stiffness)
-        assert found.solver == solver
-        np.testing.assert_allclose(found.q, case.exact(stiffness), rtol=0, atol=1e-10)
+        computed = run(stiffness)
+        assert computed.solver == solver
+        np.testing.assert_allclose(computed.q, case.exact(stiffness), rtol=0, atol=1e-10)
     with pytest.raises(
         RuntimeError, match=r"is stiff: the fastest decay is 1.18e\+05 1/s.*above 4.38e-05 s; pass solver=jd.Ro"
     ):
@@ -310,11 +310,11 @@ def test_implicit_explicit_split():
     k = 1e6
     scene = jd.Scene(slider(), forces=(jd.JointSpring(k), jd.JointDamping(4 * k**0.5)))
     times = np.array([0.0, 1e-3, 1e-2, 1.0])
-    found = quick(lambda q: jd.simulate(scene, q, jnp.zeros(1), times, solver=diffrax.KenCarp4()))(jnp.ones(1))
+    solution = quick(lambda q: jd.simulate(scene, q, jnp.zeros(1), times, solver=diffrax.KenCarp4()))(jnp.ones(1))
     rate = k**0.5 * (-2 + np.sqrt(3) * np.array([1, -1]))
     weights = np.linalg.solve([[1, 1], rate], [1, 0])
-    np.testing.assert_allclose(found.q[:, 0], np.exp(np.outer(times, rate)) @ weights, rtol=0, atol=1e-6)
-    assert found.success and found.solver == "KenCarp4" and found.stats["num_steps"] < 400
+    np.testing.assert_allclose(solution.q[:, 0], np.exp(np.outer(times, rate)) @ weights, rtol=0, atol=1e-6)
+    assert solution.success and solution.solver == "KenCarp4" and solution.stats["num_steps"] < 400
     with pytest.raises(ValueError, match="adjoint is 'backsolve', which KenCarp4 cannot serve"):
         jd.simulate(scene, [1.0], [0.0], times, solver=diffrax.KenCarp4(), adjoint="backsolve")
 
@@ -342,8 +342,8 @@ def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
     def end(log, adjoint=None):
         scene = jd.Scene(model, forces=(jd.JointSpring(jnp.exp(log)), jd.JointDamping(0.01)))
         options = {"solver": solver, "adjoint": adjoint, "max_steps": 1024, "throw": False}
-        found = jd.simulate(scene, jnp.asarray([2.5]), jnp.asarray([0.1]), ts, **options)
-        return jnp.sum(found.q * found.v), found.stats["num_steps"]
+        solution = jd.simulate(scene, jnp.asarray([2.5]), jnp.asarray([0.1]), ts, **options)
+        return jnp.sum(solution.q * solution.v), solution.stats["num_steps"]
 
     def forward(log):
         return jax.jvp(lambda x: end(x, "forward"), (log,), (jnp.ones_like(log),), has_aux=True)
@@ -366,9 +366,9 @@ def test_transient_at_the_start_in_single_precision():
     single, start, ts = jax.tree.map(
         lambda x: jnp.asarray(x, jnp.float32), (scene, (1.0, 50.0), np.linspace(0, 2.0, 3))
     )
-    found = jd.simulate(single, start[0][None], start[1][None], ts, solver=jd.Rodas5P())
-    assert found.q.dtype == jnp.float32
-    np.testing.assert_allclose(found.q[:, 0], np.exp([0.0, -1.0, -2.0]), rtol=0, atol=3e-5)
+    solution = jd.simulate(single, start[0][None], start[1][None], ts, solver=jd.Rodas5P())
+    assert solution.q.dtype == jnp.float32
+    np.testing.assert_allclose(solution.q[:, 0], np.exp([0.0, -1.0, -2.0]), rtol=0, atol=3e-5)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -394,9 +394,9 @@ def test_what_succeeds_is_right(name):
     q, _, _ = reference(case, runs["Rodas5P"], runs["Kvaerno5"])
     codes = {}
     for solver, run in runs.items():
-        found, _, _, success, code = run(1e-8)
+        computed, _, _, success, code = run(1e-8)
         codes[solver] = [name_of(x) for x in code]
-        assert np.abs(found - q).max((1, 2))[success].max() < 1e-6 * case.size
+        assert np.abs(computed - q).max((1, 2))[success].max() < 1e-6 * case.size
     assert codes["Dopri8" if name == "car_axis" else "Rodas5P"] == ["successful"] * len(case.values)
     assert codes["RK4, 1 ms"] == BY_RK4[name]
 

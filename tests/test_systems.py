@@ -93,13 +93,13 @@ def test_three_ways_to_give_one_arm_agree():
         2,
         potential=lambda q: -lagrangian(q, jnp.zeros(2), 0.0, PARAMETERS),
     )
-    found = [
+    computed = [
         everything(s, q, v, a) for s in (LagrangianSystem(lagrangian, 2, parameters=PARAMETERS), explicit, bodies())
     ]
-    for other in found[1:]:
-        for name, value in found[0].items():
+    for other in computed[1:]:
+        for name, value in computed[0].items():
             assert_close(other[name], value, 1e-13, name)
-    assert_close(found[0]["inverse_dynamics"], printed_mass(q) @ a + printed_coriolis(q, v) @ v + printed_gravity(q))
+    assert_close(computed[0]["inverse_dynamics"], printed_mass(q) @ a + printed_coriolis(q, v) @ v + printed_gravity(q))
 
 
 def test_coriolis_matrix_has_the_skew_property():
@@ -147,8 +147,8 @@ def test_small_systems_are_solved_without_lapack():
     whole = root @ root.T + np.eye(7)
     for n in (1, 2, 3, 6, 7):
         right = root[:n, :3]
-        found = solve_positive(jnp.asarray(whole[:n, :n]), jnp.asarray(right))
-        assert_close(found, np.linalg.solve(whole[:n, :n], right), 1e-13)
+        solution = solve_positive(jnp.asarray(whole[:n, :n]), jnp.asarray(right))
+        assert_close(solution, np.linalg.solve(whole[:n, :n], right), 1e-13)
     assert np.isnan(solve_positive(jnp.asarray([[1.0, 2.0], [2.0, 1.0]]), jnp.ones(2))).all()
     system, batch = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS), jnp.ones((3, 2))
     motion = jax.jit(jax.vmap(lambda q: dynamics.forward_dynamics(system, q, q, q)))

@@ -75,8 +75,8 @@ def test_rows_and_accelerations_are_pinocchios(tmp_path, kind):
     M, h = pin.crba(model, data, q), pin.rnea(model, data, q, 0 * tau, 0 * tau)
     M = np.triu(M) + np.triu(M, 1).T
     expected = free @ np.linalg.solve(free.T @ M @ free, free.T @ (tau - h))
-    found = jd.constrained_dynamics(scene, jnp.asarray(q), jnp.zeros(model.nv), jnp.asarray(tau)).acceleration
-    np.testing.assert_allclose(found, expected, atol=1e-10)
+    dynamics = jd.constrained_dynamics(scene, jnp.asarray(q), jnp.zeros(model.nv), jnp.asarray(tau)).acceleration
+    np.testing.assert_allclose(dynamics, expected, atol=1e-10)
 
 
 def test_a_6d_loop_closes_where_the_frames_coincide(tmp_path):

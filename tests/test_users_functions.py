@@ -77,10 +77,10 @@ def test_payload_is_a_body_welded_there():
     q, v = jnp.array([0.3, 0.7]), jnp.array([0.5, -0.4])
     force = jax.jit(lambda ten: jd.bias_force(bare.with_payload("hand", ten), q, v))
     scale = jnp.array([0.0, 1.0, 2.0])
-    found = jax.vmap(lambda s: force(s * carried))(scale)
-    assert_close(found[1], jd.bias_force(welded, q, v))
-    assert_close(found[2] - found[0], 2 * (found[1] - found[0]))
-    assert_close(jax.jacfwd(lambda s: force(s * carried))(0.3), found[1] - found[0])
+    computed = jax.vmap(lambda s: force(s * carried))(scale)
+    assert_close(computed[1], jd.bias_force(welded, q, v))
+    assert_close(computed[2] - computed[0], 2 * (computed[1] - computed[0]))
+    assert_close(jax.jacfwd(lambda s: force(s * carried))(0.3), computed[1] - computed[0])
 
 
 def test_payload_refuses(tree):
@@ -97,7 +97,7 @@ def test_wrench_through_joints_is_that_of_pinocchio(tree, mode):
     theirs, bridge = to_pinocchio(tree)
     data = theirs.createData()
     states = random_states(tree, 3, 0)
-    found = jax.jit(jax.vmap(lambda q, v, a, pull: jd.joint_wrench(tree, q, v, a, external=pull)))(
+    wrenches = jax.jit(jax.vmap(lambda q, v, a, pull: jd.joint_wrench(tree, q, v, a, external=pull)))(
         *states[:3], states[4]
     )
     for k in range(3):
@@ -108,7 +108,7 @@ def test_wrench_through_joints_is_that_of_pinocchio(tree, mode):
         )
         pin.rnea(theirs, data, bridge.q_to_pinocchio(q), v, a, outer)
         wanted = [o.actInv(f).vector for o, f in zip(offsets, list(data.f)[1:], strict=True)]
-        assert_close(found[k], wanted)
+        assert_close(wrenches[k], wanted)
 
 
 def test_part_of_the_wrench_along_the_joint_is_its_force(tree):
@@ -133,11 +133,11 @@ def test_wrenches_of_constraints_on_bodies(name):
     make = getattr(jd.scenes, name)
     scene = make()
     q, v = make.start()
-    found = jd.constrained_dynamics(scene, q, v)
-    pulls = jd.body_wrenches(scene, q, found.multipliers)
-    forces = sum(jd.constraint_forces(scene, q, found.multipliers).values())
+    dynamics = jd.constrained_dynamics(scene, q, v)
+    pulls = jd.body_wrenches(scene, q, dynamics.multipliers)
+    forces = sum(jd.constraint_forces(scene, q, dynamics.multipliers).values())
     assert_close(jd.generalized_force(scene.system, q, pulls), forces)
-    wrenches = jd.joint_wrench(scene.system, q, v, found.acceleration, external=pulls)
+    wrenches = jd.joint_wrench(scene.system, q, v, dynamics.acceleration, external=pulls)
     for i, place in enumerate(scene.system.topology.v_slices):
         own = jd.body_jacobian(scene.system, q, scene.system.body_names[i])[:, place]
         assert np.abs(own.T @ wrenches[i]).max() < 1e-9 * max(1.0, float(np.abs(wrenches).max()))

@@ -40,8 +40,8 @@ def advance(scene, q, p, h, v=None):
     v = jnp.ones(scene.nv) if v is None else v
     start = variational.begin(scene, q, v, jnp.asarray(0.0), None)
     start = start if p is None else start._replace(momentum=p)
-    found = variational.step(scene, q, v, start, jnp.asarray(0.0), h, scene.applied_force, None)
-    return found.q, found.carried.momentum, found.v, found.solved
+    computed = variational.step(scene, q, v, start, jnp.asarray(0.0), h, scene.applied_force, None)
+    return computed.q, computed.carried.momentum, computed.v, computed.solved
 
 
 def motions(scene, steps, outputs=("energy",)):
@@ -89,10 +89,10 @@ def test_order_two(name, runs):
     reference, end, _ = CLOSED[name]
     ts = np.linspace(0.0, 0.987 * end, 12)
     exact = reference(ts)
-    found = runs(name)(*getattr(scenes, name).start(), ts)
-    assert found.success.all()
+    computed = runs(name)(*getattr(scenes, name).start(), ts)
+    assert computed.success.all()
     errors = np.maximum(
-        np.abs(np.asarray(found.q) - exact.q).max((1, 2)), np.abs(np.asarray(found.v) - exact.v).max((1, 2))
+        np.abs(np.asarray(computed.q) - exact.q).max((1, 2)), np.abs(np.asarray(computed.v) - exact.v).max((1, 2))
     )
     # Where save points lie within the steps changes the dense output's share, of the order h^3.
     np.testing.assert_allclose(np.log2(errors[0] / errors[2]) / 2, 2.0, atol=0.07)
@@ -103,9 +103,9 @@ def test_energy_errors_do_not_grow(name, runs):
     """Over 500 coarse steps, 2000 fine ones: the second half is no worse than the first."""
     ts = np.linspace(0.0, 500 * CLOSED[name][2], 251)
     q, v = getattr(scenes, name).start()
-    found = runs(name)(q, v, ts)
-    assert found.success.all()
-    error = np.abs(np.asarray(found.energy) - np.asarray(found.energy)[:, :1])
+    computed = runs(name)(q, v, ts)
+    assert computed.success.all()
+    error = np.abs(np.asarray(computed.energy) - np.asarray(computed.energy)[:, :1])
     first, second = error[:, :125].max(1), error[:, 125:].max(1)
     assert (second < 1.05 * first).all()
     np.testing.assert_allclose(first[:-1] / first[1:], 4.0, rtol=0.1)
@@ -123,8 +123,8 @@ def test_momenta_are_conserved():
     @quick
     def run(q, v):
         def body(state, _):
-            found = variational.step(Scene(model), *state, 0.0, jnp.asarray(0.05), lambda *_: None, None)
-            return (found.q, found.v, found.carried), (total(found.q, found.v), found.solved)
+            computed = variational.step(Scene(model), *state, 0.0, jnp.asarray(0.05), lambda *_: None, None)
+            return (computed.q, computed.v, computed.carried), (total(computed.q, computed.v), computed.solved)
 
         start = variational.begin(Scene(model), q, v, 0.0, None)
         return total(q, v), jax.lax.scan(body, (q, v, start), length=400)[1]
@@ -215,16 +215,16 @@ def test_forces():
     system = LagrangianSystem(lambda q, v: 0.5 * v[0] ** 2, 1)
     k, c, v0, end = 4.0, 0.3, 0.7, 3.0
     run = motions(Scene(system, forces=(_Field(jnp.asarray(k)),)), [0.08, 0.04, 0.02], ("work", "energy"))
-    found = run(jnp.array([0.5]), jnp.array([v0]), [0.0, end])
+    computed = run(jnp.array([0.5]), jnp.array([v0]), [0.0, end])
     forced = np.linalg.solve([[k - 1, c], [-c, k - 1]], [1.0, 0.0])  # of cos t and sin t
     w = np.sqrt(k - c * c / 4)
     a = 0.5 - forced[0]
     b = (v0 - forced[1] + c / 2 * a) / w
     free = np.exp(-c * end / 2) * (a * np.cos(w * end) + b * np.sin(w * end))
-    errors = np.abs(np.asarray(found.q)[:, -1, 0] - free - forced @ [np.cos(end), np.sin(end)])
+    errors = np.abs(np.asarray(computed.q)[:, -1, 0] - free - forced @ [np.cos(end), np.sin(end)])
     np.testing.assert_allclose(np.log2(errors[:-1] / errors[1:]), 2.0, atol=0.05)
     # For a constant mass the midpoint's balance of energy is exact.
-    np.testing.assert_allclose(found.work[:, -1], found.energy[:, -1] - found.energy[:, 0], atol=1e-13)
+    np.testing.assert_allclose(computed.work[:, -1], computed.energy[:, -1] - computed.energy[:, 0], atol=1e-13)
 
 
 @pytest.mark.slow
@@ -280,10 +280,10 @@ def test_float32(runs):
     ts = jnp.linspace(0.0, 2.0, 12)
     outputs = ("energy", "constraint_residual")
     run = quick(lambda q, v: simulate(scene, q, v, ts, method="variational", stepsize=0.0025, outputs=outputs))
-    found = run(q, v)
-    assert found.success and found.q.dtype == found.v.dtype == found.energy.dtype == jnp.float32
-    np.testing.assert_allclose(found.q, runs("pendulum_in_plane")(q, v, ts).q[2], atol=2e-4)
-    assert float(found.constraint_residual.max()) < 1e-5  # |v| is 4 m/s, its rounding 5e-7
+    computed = run(q, v)
+    assert computed.success and computed.q.dtype == computed.v.dtype == computed.energy.dtype == jnp.float32
+    np.testing.assert_allclose(computed.q, runs("pendulum_in_plane")(q, v, ts).q[2], atol=2e-4)
+    assert float(computed.constraint_residual.max()) < 1e-5  # |v| is 4 m/s, its rounding 5e-7
 
 
 def test_bad_input_is_refused():
@@ -311,17 +311,17 @@ def test_a_step_that_cannot_be_solved_ends_the_run():
     q, v, ts = jnp.array([0.0, -1.0]), jnp.array([30.0, 0.0]), [0.0, 1.0, 2.0]
     with pytest.raises(RuntimeError, match=r"stopped at t = 0 s.*smaller stepsize"):
         simulate(scene, q, v, ts, method=Variational(), stepsize=0.5)
-    found = simulate(scene, q, v, ts, method="variational", stepsize=0.5, throw=False)
-    assert found.result == RESULTS.nonlinear_divergence and float(found.stats["time_reached"]) == 0.0
-    assert np.isnan(found.q[1:]).all() and np.isfinite(found.q[0]).all()
+    solution = simulate(scene, q, v, ts, method="variational", stepsize=0.5, throw=False)
+    assert solution.result == RESULTS.nonlinear_divergence and float(solution.stats["time_reached"]) == 0.0
+    assert np.isnan(solution.q[1:]).all() and np.isfinite(solution.q[0]).all()
 
     def push(q, v, t):
         return jnp.where(t > 0.75, 1e4, 0.0) * jnp.array([1.0, 0.0])
 
     ts = [0.0, 0.5, 0.75, 1.0]
-    found = simulate(scene, q, 0 * v, ts, method="variational", stepsize=0.125, control=push, throw=False)
-    assert found.result == RESULTS.nonlinear_divergence and float(found.stats["time_reached"]) == 0.75
-    np.testing.assert_array_equal(np.isnan(found.q[:, 0]), [False, False, False, True])
+    solution = simulate(scene, q, 0 * v, ts, method="variational", stepsize=0.125, control=push, throw=False)
+    assert solution.result == RESULTS.nonlinear_divergence and float(solution.stats["time_reached"]) == 0.75
+    np.testing.assert_array_equal(np.isnan(solution.q[:, 0]), [False, False, False, True])
 
 
 @pytest.mark.slow
@@ -340,9 +340,9 @@ def test_a_million_steps(name, stepsize, steps):
     scene, (q, v) = getattr(scenes, name)(), getattr(scenes, name).start()
     ts = np.linspace(0.0, steps * stepsize, 20001)
     outputs = ("energy", "constraint_residual") if scene.constraints else ("energy",)
-    found = simulate(scene, q, v, ts, method="variational", stepsize=stepsize, outputs=outputs)
-    error = np.abs(np.asarray(found.energy) - float(found.energy[0]))
+    solution = simulate(scene, q, v, ts, method="variational", stepsize=stepsize, outputs=outputs)
+    error = np.abs(np.asarray(solution.energy) - float(solution.energy[0]))
     print(name, error[:2001].max(), error[-2001:].max())
     assert error[-2001:].max() < 1.1 * error[:2001].max()
     if scene.constraints:
-        assert float(found.constraint_residual.max()) < 1e-12
+        assert float(solution.constraint_residual.max()) < 1e-12

@@ -56,8 +56,8 @@ def evaluated(biped):
     @quick
     def evaluate(law, q, v):
         wanted = law.dynamics(q, v)
-        found = jd.constrained_dynamics(jd.control.standing(model, q, feet), q, v, wanted.tau)
-        return wanted, found, law.acceleration(q, v), law.shortfall(q, v), law.missing_wrench(q, v)
+        dynamics = jd.constrained_dynamics(jd.control.standing(model, q, feet), q, v, wanted.tau)
+        return wanted, dynamics, law.acceleration(q, v), law.shortfall(q, v), law.missing_wrench(q, v)
 
     return evaluate
 
@@ -65,11 +65,11 @@ def evaluated(biped):
 def test_it_stands_still_at_its_target(biped, evaluated):
     """The held robot does not move, and the multipliers are the program's forces, which carry the weight."""
     model, q, _, _ = biped
-    wanted, found, _, _, missing = evaluated(law_of(biped, preload=1.0), q, jnp.zeros(model.nv))
+    wanted, computed, _, _, missing = evaluated(law_of(biped, preload=1.0), q, jnp.zeros(model.nv))
     assert bool(wanted.success) and np.asarray(wanted.margins).min() > 1.0 - 1e-6
     assert not np.asarray(wanted.tau)[np.array(BASE)].any()
-    np.testing.assert_allclose(found.acceleration, 0.0, atol=1e-8)
-    np.testing.assert_allclose(found.multipliers, wanted.forces, atol=1e-7)  # the tolerance of the program
+    np.testing.assert_allclose(computed.acceleration, 0.0, atol=1e-8)
+    np.testing.assert_allclose(computed.multipliers, wanted.forces, atol=1e-7)  # the tolerance of the program
     # Weight of 78 N, and a regularisation of 1e-6.
     np.testing.assert_allclose(missing, 0.0, atol=1e-3)
     np.testing.assert_allclose(sum(f[2] for f in wanted.by_foot().values()), 8.0 * 9.81, rtol=1e-7)
@@ -82,8 +82,8 @@ def test_the_wanted_acceleration_is_the_one_that_follows(biped, evaluated):
     J = np.asarray(jd.constraint_jacobian(scene, q))
     v = jnp.asarray((np.eye(model.nv) - np.linalg.pinv(J) @ J) @ [0.2, -0.1, 0.4, 0.0, 0.1, 0.0, -0.2])
     law = law_of(biped, (0.01, 0.0, -0.01))
-    wanted, found, a, short, _ = evaluated(law, q, v)
-    np.testing.assert_allclose(found.acceleration, a, rtol=1e-9, atol=1e-9)
+    wanted, computed, a, short, _ = evaluated(law, q, v)
+    np.testing.assert_allclose(computed.acceleration, a, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(short, 0.0, atol=1e-9)
 
     def rate(time):
@@ -95,14 +95,14 @@ def test_the_wanted_acceleration_is_the_one_that_follows(biped, evaluated):
     assert bool(wanted.success)
 
 
-def assert_follows(model, law, found):
+def assert_follows(model, law, computed):
     """The centre of mass by the closed form, its late rate to 1 %, and the base's attitude unchanged."""
-    errors = np.asarray(jax.vmap(lambda q: law.center.position(model, q, 0.0))(found.q))
+    errors = np.asarray(jax.vmap(lambda q: law.center.position(model, q, 0.0))(computed.q))
     exact = decayed(np.asarray(TS), errors[0], np.zeros(3))
     np.testing.assert_allclose(errors, exact, atol=1e-7)  # of RK4's steps of 20 ms
     slopes = [np.polyfit(TS[-6:], np.log(np.linalg.norm(e[-6:], axis=1)), 1)[0] for e in (errors, exact)]
     np.testing.assert_allclose(*slopes, rtol=0.01)
-    turned = jax.vmap(lambda q: law.turn.position(model, q, 0.0))(found.q)
+    turned = jax.vmap(lambda q: law.turn.position(model, q, 0.0))(computed.q)
     np.testing.assert_allclose(turned, 0.0, atol=1e-7)
 
 
@@ -114,17 +114,17 @@ def test_weight_is_shifted_as_the_gains_say(biped, evaluated):
     moved = jd.simulate(scene, q, jnp.zeros(model.nv), TS, control=law, stepsize=0.02, contacts="report")
     assert_follows(model, law, moved)
     for i in (3, 10):
-        wanted, found, *_ = evaluated(law, moved.q[i], moved.v[i])
+        wanted, computed, *_ = evaluated(law, moved.q[i], moved.v[i])
         assert bool(wanted.success) and np.asarray(wanted.margins).min() > 1.0 - 1e-6
         # The program's are on the plane to its tolerance, the multipliers of dependent rows exactly.
-        np.testing.assert_allclose(found.multipliers, wanted.forces, atol=1e-6)
+        np.testing.assert_allclose(computed.multipliers, wanted.forces, atol=1e-6)
 
 
 def test_what_the_feet_cannot_carry_has_a_code(biped, evaluated):
     """A jump sideways that needs more friction than there is: infeasible, with the wrench missing."""
     model, q, feet, _ = biped
-    law, still = law_of(biped, (2.0, 0.0, 0.0)), jnp.zeros(model.nv)
-    wanted, _, a, _, missing = evaluated(law, q, still)
+    law, at_rest = law_of(biped, (2.0, 0.0, 0.0)), jnp.zeros(model.nv)
+    wanted, _, a, _, missing = evaluated(law, q, at_rest)
     assert wanted.result == jd.contact.RESULTS.infeasible
     # 8 kg at 12 m/s^2 along x are more than mu times the weight; glued feet could do it, with the shortest forces.
     assert np.asarray(wanted.margins).min() < -1.0
@@ -132,16 +132,16 @@ def test_what_the_feet_cannot_carry_has_a_code(biped, evaluated):
     np.testing.assert_allclose(sums, 8.0 * np.asarray([KP * 2.0, 0.0, 9.81]), atol=1e-8)
     assert np.abs(wanted.forces).max() < 200.0
     assert float(missing[0]) > 1.0
-    np.testing.assert_allclose(missing, jd.control.missing_wrench(model, q, still, a, feet, passive=BASE), atol=1e-6)
+    np.testing.assert_allclose(missing, jd.control.missing_wrench(model, q, at_rest, a, feet, passive=BASE), atol=1e-6)
 
 
 @pytest.mark.slow
 def test_a_motion_that_the_feet_cannot_carry_ends(biped):
     """The jump sideways, simulated: a foot slips at the start."""
     model, q, feet, _ = biped
-    law, still = law_of(biped, (2.0, 0.0, 0.0)), jnp.zeros(model.nv)
+    law, at_rest = law_of(biped, (2.0, 0.0, 0.0)), jnp.zeros(model.nv)
     scene = jd.control.standing(model, q, feet)
-    lost = jd.simulate(scene, q, still, TS, control=law, stepsize=0.02, throw=False)
+    lost = jd.simulate(scene, q, at_rest, TS, control=law, stepsize=0.02, throw=False)
     assert lost.result == jd.RESULTS.contact_lost
 
 
@@ -149,9 +149,9 @@ def test_feet_come_first(biped, evaluated):
     """Straight legs cannot lift the trunk: the feet stay where they are, and the shortfall is what is asked for in vain."""
     model, q, feet, _ = biped
     straight = q.at[3:].set(0.0).at[1].set(0.4)
-    still = jnp.zeros(model.nv)
+    at_rest = jnp.zeros(model.nv)
     wanted, _, a, short, _ = evaluated(
-        law_of((model, straight, feet, jd.center_of_mass(model, straight)), (0, 0, 0.1)), straight, still
+        law_of((model, straight, feet, jd.center_of_mass(model, straight)), (0, 0, 0.1)), straight, at_rest
     )
     J = np.concatenate([one.jacobian(model, straight) for one in feet])
     np.testing.assert_allclose(J @ a, 0.0, atol=1e-9)
@@ -208,17 +208,17 @@ def test_real_robots_shift_their_weight(file):
     model, _, _ = both(file, True)
     q, feet = crouched(model, file), feet_of(file)
     attitude, center = jnp.eye(3), jd.center_of_mass(model, q)
-    still, scene = jnp.zeros(model.nv), jd.control.standing(model, q, feet)
+    at_rest, scene = jnp.zeros(model.nv), jd.control.standing(model, q, feet)
     options = {"orientation": attitude, "posture": q, "stiffness": 4.0, "damping": 4.0, "preload": 0.1}
 
     law = jd.control.WholeBody(model, feet, center, KP, KD, **options)
-    wanted = quick(lambda q: law.dynamics(q, still))(q)
-    found = quick(lambda tau: jd.constrained_dynamics(scene, q, still, tau))(wanted.tau)
+    wanted = quick(lambda q: law.dynamics(q, at_rest))(q)
+    computed = quick(lambda tau: jd.constrained_dynamics(scene, q, at_rest, tau))(wanted.tau)
     assert bool(wanted.success)
-    np.testing.assert_allclose(found.acceleration, 0.0, atol=1e-8)
+    np.testing.assert_allclose(computed.acceleration, 0.0, atol=1e-8)
 
     law = jd.control.WholeBody(model, feet, center + jnp.asarray([0.01, 0.02, -0.01]), KP, KD, **options)
     outputs = ("contact_margins", "multipliers")
-    found = jd.simulate(scene, q, still, TS, control=law, stepsize=0.02, outputs=outputs)
-    assert_follows(model, law, found)
-    assert min(float(x.min()) for x in found.contact_margins.values()) > 0.0
+    computed = jd.simulate(scene, q, at_rest, TS, control=law, stepsize=0.02, outputs=outputs)
+    assert_follows(model, law, computed)
+    assert min(float(x.min()) for x in computed.contact_margins.values()) > 0.0

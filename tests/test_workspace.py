@@ -23,13 +23,13 @@ def at():
 
     @quick
     def compute(q, v, tau):
-        found = jd.workspace_dynamics(ARM, "tip", q, v)
+        dynamics = jd.workspace_dynamics(ARM, "tip", q, v)
         near = jnp.stack([jd.integrate(ARM, q, k * step * v) for k in (-2.0, -1.0, 1.0, 2.0)])
         masses = jax.vmap(lambda q: jd.workspace_dynamics(ARM, "tip", q, v).mass_matrix)(near)
         rate = (masses[0] - 8 * masses[1] + 8 * masses[2] - masses[3]) / (12 * step)
         acceleration = jd.forward_dynamics(ARM, q, v, tau)
-        twist_rate = found.jacobian @ acceleration + jd.jacobian_dot_v(ARM, q, v, "tip")
-        return found, rate, twist_rate, jd.coriolis_matrix(ARM, q, v)
+        twist_rate = dynamics.jacobian @ acceleration + jd.jacobian_dot_v(ARM, q, v, "tip")
+        return dynamics, rate, twist_rate, jd.coriolis_matrix(ARM, q, v)
 
     return compute(Q, V, TAU)
 
@@ -51,37 +51,37 @@ def by_pinocchio():
 
 
 def test_square_jacobian_gives_the_printed_matrices(at, by_pinocchio):
-    found, _, _, C = at
+    computed, _, _, C = at
     M, Cv, N, J, drift = by_pinocchio
     back = np.linalg.inv(J)
     M_x = back.T @ M @ back
-    assert_close(found.jacobian, J)
-    assert_close(found.mass_matrix, M_x)
-    assert_close(found.gravity_force, back.T @ N)
-    assert_close(found.inverse, back)
-    assert_close(found.coriolis_force, back.T @ Cv - M_x @ drift)
+    assert_close(computed.jacobian, J)
+    assert_close(computed.mass_matrix, M_x)
+    assert_close(computed.gravity_force, back.T @ N)
+    assert_close(computed.inverse, back)
+    assert_close(computed.coriolis_force, back.T @ Cv - M_x @ drift)
     assert_close(
-        found.coriolis_matrix, back.T @ (np.asarray(C) @ back - M @ back @ np.asarray(found.jacobian_rate) @ back)
+        computed.coriolis_matrix, back.T @ (np.asarray(C) @ back - M @ back @ np.asarray(computed.jacobian_rate) @ back)
     )
-    assert_close(found.coriolis_matrix @ (J @ V), found.coriolis_force)
-    assert_close(found.jacobian_rate @ V, drift)
-    assert not bool(found.damped) and 0 < float(found.condition) < 1
+    assert_close(computed.coriolis_matrix @ (J @ V), computed.coriolis_force)
+    assert_close(computed.jacobian_rate @ V, drift)
+    assert not bool(computed.damped) and 0 < float(computed.condition) < 1
 
 
 def test_mass_rate_less_twice_coriolis_is_skew(at):
-    found, rate, _, _ = at
-    skew = rate - 2 * found.coriolis_matrix
+    computed, rate, _, _ = at
+    skew = rate - 2 * computed.coriolis_matrix
     # Fourth-order differences with steps of 1e-4 s.
     np.testing.assert_allclose(skew, -skew.T, atol=1e-8 * float(jnp.abs(rate).max()))
 
 
 def test_equation_of_motion_and_power(at):
-    found, _, twist_rate, _ = at
-    force = found.inverse.T @ TAU
-    assert_close(found.mass_matrix @ twist_rate + found.coriolis_force + found.gravity_force, force)
-    twist = found.jacobian @ V
+    computed, _, twist_rate, _ = at
+    force = computed.inverse.T @ TAU
+    assert_close(computed.mass_matrix @ twist_rate + computed.coriolis_force + computed.gravity_force, force)
+    twist = computed.jacobian @ V
     assert_close(force @ twist, TAU @ V)
-    assert_close(twist @ found.mass_matrix @ twist / 2, jd.kinetic_energy(ARM, Q, V))
+    assert_close(twist @ computed.mass_matrix @ twist / 2, jd.kinetic_energy(ARM, Q, V))
 
 
 def test_redundant_arm_moves_its_frame_with_the_least_energy():
@@ -91,25 +91,25 @@ def test_redundant_arm_moves_its_frame_with_the_least_energy():
 
     @quick
     def compute(q, v, tau):
-        found = jd.workspace_dynamics(arm, "iiwa_link_7", q, v, axes="world")
-        return found, jd.mass_matrix(arm, q), jd.bias_force(arm, q, v), jd.forward_dynamics(arm, q, v, tau)
+        computed = jd.workspace_dynamics(arm, "iiwa_link_7", q, v, axes="world")
+        return computed, jd.mass_matrix(arm, q), jd.bias_force(arm, q, v), jd.forward_dynamics(arm, q, v, tau)
 
-    found, M, h, a = compute(q, v, tau)
+    computed, M, h, a = compute(q, v, tau)
     model, _ = to_pinocchio(arm)
     data, frame = model.createData(), model.getFrameId("iiwa_link_7")
     J = pin.computeFrameJacobian(model, data, np.asarray(q), frame, pin.LOCAL_WORLD_ALIGNED)
     pin.forwardKinematics(model, data, np.asarray(q), np.asarray(v), np.zeros(7))
     drift = pin.getFrameClassicalAcceleration(model, data, frame, pin.LOCAL_WORLD_ALIGNED).vector
-    assert_close(found.jacobian, J)
-    assert_close(found.jacobian_rate @ v, drift)
+    assert_close(computed.jacobian, J)
+    assert_close(computed.jacobian_rate @ v, drift)
     Lambda = np.linalg.inv(J @ np.linalg.solve(M, J.T))
-    assert_close(found.mass_matrix, Lambda)
-    assert_close(found.jacobian @ found.inverse, np.eye(6))
+    assert_close(computed.mass_matrix, Lambda)
+    assert_close(computed.jacobian @ computed.inverse, np.eye(6))
     # Least energy: to what does not move the frame the motion is orthogonal.
     null = np.linalg.svd(J)[2][6:]
-    assert_close(null @ M @ found.inverse, np.zeros((1, 6)))
-    assert_close(found.coriolis_force + found.gravity_force, found.inverse.T @ h - Lambda @ drift)
-    assert_close(Lambda @ (J @ a + drift) + found.coriolis_force + found.gravity_force, found.inverse.T @ tau)
+    assert_close(null @ M @ computed.inverse, np.zeros((1, 6)))
+    assert_close(computed.coriolis_force + computed.gravity_force, computed.inverse.T @ h - Lambda @ drift)
+    assert_close(Lambda @ (J @ a + drift) + computed.coriolis_force + computed.gravity_force, computed.inverse.T @ tau)
 
 
 def elbow(angle):
@@ -126,23 +126,23 @@ def test_near_a_singularity_it_is_damped_and_says_so():
     v = jnp.array([0.3, -0.7])
 
     def heavy(angle):
-        found = jd.workspace_dynamics(arm, "tip", elbow(angle), v, axes="world", rows=(0, 1))
-        return jnp.sum(found.mass_matrix), found
+        computed = jd.workspace_dynamics(arm, "tip", elbow(angle), v, axes="world", rows=(0, 1))
+        return jnp.sum(computed.mass_matrix), computed
 
     angles = jnp.array([1.0, 0.1, 3e-4, 1e-4, 1e-9, 0.0])
-    (sizes, found), slopes = quick(jax.vmap(jax.value_and_grad(heavy, has_aux=True)))(angles)
+    (sizes, computed), slopes = quick(jax.vmap(jax.value_and_grad(heavy, has_aux=True)))(angles)
     for i, angle in enumerate(np.asarray(angles[:2])):
         c1, s1, c12, s12 = np.cos(0.4), np.sin(0.4), np.cos(0.4 + angle), np.sin(0.4 + angle)
         J = np.array([[-s1 - s12, -s12], [c1 + c12, c12]])
         off = 1 / 3 + np.cos(angle) / 2
         M = np.array([[5 / 3 + np.cos(angle), off], [off, 1 / 3]])
-        assert_close(found.mass_matrix[i], np.linalg.inv(J).T @ M @ np.linalg.inv(J))
-    assert found.damped.tolist() == [False, False, True, True, True, True]
-    assert float(found.condition[-1]) < 1e-15
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves((sizes, slopes, found)))
+        assert_close(computed.mass_matrix[i], np.linalg.inv(J).T @ M @ np.linalg.inv(J))
+    assert computed.damped.tolist() == [False, False, True, True, True, True]
+    assert float(computed.condition[-1]) < 1e-15
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((sizes, slopes, computed)))
     # Stretched, the force along the arm meets no motion, and of the damped masses the largest is 1/least or below that of S.
-    assert np.linalg.eigvalsh(np.asarray(found.mass_matrix[-1])).max() < 10 / 5e-7
-    assert np.linalg.eigvalsh(np.asarray(found.mass_matrix)).min() > 0
+    assert np.linalg.eigvalsh(np.asarray(computed.mass_matrix[-1])).max() < 10 / 5e-7
+    assert np.linalg.eigvalsh(np.asarray(computed.mass_matrix)).min() > 0
     # Across the edge where damping begins nothing jumps.
     edge = jnp.linspace(2e-4, 1.2e-3, 41)
     masses = quick(jax.vmap(lambda x: heavy(x)[0]))(edge)

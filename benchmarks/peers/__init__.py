@@ -34,10 +34,10 @@ class Peers:
     """
 
     def __init__(self, say: Callable[[str], object] = print, modules: Sequence[str] = MODULES):
-        self.say, self.found = say, []
+        self.say, self.modules = say, []
         for name in modules:
             try:
-                self.found.append(importlib.import_module(f"benchmarks.peers.{name}"))
+                self.modules.append(importlib.import_module(f"benchmarks.peers.{name}"))
             except ImportError as error:
                 say(f"without the peer {name}: {error}")
 
@@ -46,7 +46,7 @@ class Peers:
         if dtype != "float64":
             return []
         ladders: dict[tuple, list[Contestant]] = {}
-        for module in self.found:
+        for module in self.modules:
             for rung in module.contestants(prepared, starts):
                 ladders.setdefault((rung.source, rung.solver), []).append(rung)
         return [rung for ladder in ladders.values() for rung in self._affordable(ladder)]

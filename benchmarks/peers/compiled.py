@@ -34,12 +34,12 @@ LARGEST = 8
 
 def _matrix(rows) -> casadi.SX:
     """A sparse matrix; entries that are 0.0 are structural zeros."""
-    found = casadi.SX(len(rows), len(rows[0]))
+    computed = casadi.SX(len(rows), len(rows[0]))
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):
             if not isinstance(entry, float) or entry != 0.0:
-                found[i, j] = entry
-    return found
+                computed[i, j] = entry
+    return computed
 
 
 @functools.cache
@@ -126,12 +126,12 @@ def contestants(prepared, starts) -> list[Contestant]:
     q, v = equations.there(*starts[:2])
     states = np.concatenate([q, v], 1)
     # Derivatives of large systems through their sparse solution take CasADi minutes to build.
-    found = _cvodes(prepared, equations, states[0]) if len(states) == 1 and equations.nv <= 2 * LARGEST else []
+    computed = _cvodes(prepared, equations, states[0]) if len(states) == 1 and equations.nv <= 2 * LARGEST else []
     if COMPILER is None:
-        return found
+        return computed
     for solver, settings in (("Dopri8", TOLERANCES), ("RK4", steps_between(prepared, 3))):
-        found += [_in_c(prepared, equations, solver, setting, starts[2], states) for setting in settings]
-    return found
+        computed += [_in_c(prepared, equations, solver, setting, starts[2], states) for setting in settings]
+    return computed
 
 
 def _in_c(prepared, equations: Equations, solver: str, setting, times, states) -> Contestant:
@@ -139,8 +139,8 @@ def _in_c(prepared, equations: Equations, solver: str, setting, times, states) -
     options = {"steps": setting} if fixed else {"tolerance": setting}
     library(name)
 
-    def motion(found) -> Motion:
-        rows, fails, counts = found
+    def motion(computed) -> Motion:
+        rows, fails, counts = computed
         y = rows[0]
         good = fails == 0 and np.isfinite(rows).all()
         q, v = equations.back(y[:, : equations.nq], y[:, equations.nq :])

@@ -162,11 +162,11 @@ def windows(count=2) -> Equations:
         return [*f, 0.5 * GRAVITY * m.sin(q[-1])]
 
     def rows(m, t, q):
-        found = []
+        computed = []
         for i in range(0, size - 1, 2):
-            found.append(-m.sin(q[i]) + m.cos(q[i + 1]) + m.sin(q[i + 2]) - 1.0)
-            found.append(m.cos(q[i]) + m.sin(q[i + 1]) - m.cos(q[i + 2]))
-        return found
+            computed.append(-m.sin(q[i]) + m.cos(q[i + 1]) + m.sin(q[i + 2]) - 1.0)
+            computed.append(m.cos(q[i]) + m.sin(q[i + 1]) - m.cos(q[i + 2]))
+        return computed
 
     return Equations(
         size, size, mass, force, rows, **_absolute([None, *(i if i % 2 == 0 else None for i in range(size - 1))])

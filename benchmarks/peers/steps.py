@@ -73,8 +73,8 @@ def dop853(prepared, source: str, slope: Callable, start, back: Callable, method
             rows = [start, *(solver.integrate(t) for t in ts[1:])]
             return np.stack(rows), solver.successful(), calls
 
-        def motion(found) -> Motion:
-            rows, good, calls = found
+        def motion(computed) -> Motion:
+            rows, good, calls = computed
             return Motion(*back(rows), "successful" if good else "stopped", evaluations=calls)
 
         return Contestant(source, method, f"SciPy {scipy.__version__} dop853", tolerance, False, call, motion)
@@ -91,8 +91,8 @@ def lsoda(prepared, source: str, slope: Callable, start, back: Callable) -> list
             options = {"rtol": max(tolerance, 3e-14), "atol": tolerance, "mxstep": 10**6, "full_output": True}
             return odeint(slope, start, ts, tfirst=True, **options)
 
-        def motion(found) -> Motion:
-            rows, info = found
+        def motion(computed) -> Motion:
+            rows, info = computed
             result = "successful" if info["message"] == "Integration successful." else "stopped"
             return Motion(*back(rows), result, int(info["nst"][-1]), None, int(info["nfe"][-1]))
 

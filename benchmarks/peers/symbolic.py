@@ -51,30 +51,30 @@ def slope(name: str) -> Callable:
     closed = height == nv and not equations.rows and not equations.velocity_rows
 
     def once(t, y):
-        found = code(t, *y)
+        computed = code(t, *y)
         if closed:
-            return np.array(found)
+            return np.array(computed)
         flat = fixed.copy()
-        flat[varying] = found[nq:]
+        flat[varying] = computed[nq:]
         full = flat.reshape(height, height + 1)
-        return np.concatenate([found[:nq], np.linalg.solve(full[:, :-1], full[:, -1])[:nv]])
+        return np.concatenate([computed[:nq], np.linalg.solve(full[:, :-1], full[:, -1])[:nv]])
 
     def many(t, y):
-        found = np.stack(np.broadcast_arrays(*code(t, *y)))
+        computed = np.stack(np.broadcast_arrays(*code(t, *y)))
         if closed:
-            return found
+            return computed
         flat = np.tile(fixed, (y.shape[1], 1))
-        flat[:, varying] = found[nq:].T
+        flat[:, varying] = computed[nq:].T
         full = flat.reshape(-1, height, height + 1)
-        return np.concatenate([found[:nq], np.linalg.solve(full[..., :-1], full[..., -1:])[:, :nv, 0].T])
+        return np.concatenate([computed[:nq], np.linalg.solve(full[..., :-1], full[..., -1:])[:, :nv, 0].T])
 
     if closed and len(varying) < nv:  # accelerations that are constant
         place = [nq + varying.index(i * (nv + 1) + nv) if i * (nv + 1) + nv in varying else None for i in range(nv)]
 
         def filled(t, y):
-            found = code(t, *y)
-            rest = [0 * y[0] + fixed[i * (nv + 1) + nv] if k is None else found[k] for i, k in enumerate(place)]
-            return np.stack([*found[:nq], *rest])
+            computed = code(t, *y)
+            rest = [0 * y[0] + fixed[i * (nv + 1) + nv] if k is None else computed[k] for i, k in enumerate(place)]
+            return np.stack([*computed[:nq], *rest])
 
         return filled
     return lambda t, y: once(t, y) if y.ndim == 1 else many(t, y)

@@ -47,8 +47,8 @@ def contestants(prepared, starts) -> list[Contestant]:
     def contestant(between):
         call = lambda: jax.block_until_ready(run(q, v, between))  # noqa: E731
 
-        def motion(found) -> Motion:
-            rows = [np.concatenate([x[:1], np.asarray(y[0])]) for x, y in zip((q, v), found, strict=True)]
+        def motion(computed) -> Motion:
+            rows = [np.concatenate([x[:1], np.asarray(y[0])]) for x, y in zip((q, v), computed, strict=True)]
             steps = between * points
             return Motion(*twin.back(*rows), "successful", steps, 0, STAGES["RK4"] * steps)
 

@@ -116,8 +116,8 @@ def contestants(prepared, starts) -> Iterator[Contestant]:
             def call(model=model, pool=pool, data=data, state=state, between=between):
                 return pool.rollout(model, data, state, nstep=between * points)[0]
 
-            def motion(found, name=name, between=between, state=state) -> Motion:
-                rows = np.concatenate([state[0][None], found[0][between - 1 :: between]])
+            def motion(computed, name=name, between=between, state=state) -> Motion:
+                rows = np.concatenate([state[0][None], computed[0][between - 1 :: between]])
                 steps = between * points
                 there = twin.back(rows[:, 1 : 1 + nq], rows[:, 1 + nq : 1 + nq + nv])
                 # MuJoCo starts anew from its home when a state is not finite; its clock tells.

@@ -80,8 +80,8 @@ def contestants(prepared, starts) -> list[Contestant]:
     if len(states) == 1:
         rates = slope(twin)
         options = {"rungs": 2, "method": "joint angles"}
-        found = dop853(prepared, SOURCE, rates, states[0], back, "joint angles")
-        return found + rk4(prepared, SOURCE, rates, states[0], starts[2], back, **options)
+        computed = dop853(prepared, SOURCE, rates, states[0], back, "joint angles")
+        return computed + rk4(prepared, SOURCE, rates, states[0], starts[2], back, **options)
     # With one degree of freedom the rows of one number are taken for vectors there, and the call fails.
     if twin.scene.constraints or model.nq != model.nv or model.nv == 1:
         return []

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> None:
         None if value is None else per_coordinate(model, value, f"--{name}")
         for name, value in (("velocity", args.velocity), ("torque", args.torque))
     )
-    found = identify.exciting_motion(
+    motion = identify.exciting_motion(
         model,
         args.terms,
         period=args.period,
@@ -72,13 +72,13 @@ def run(args: argparse.Namespace) -> None:
         velocity=velocity,
         torque=torque,
     )
-    log = found.log(args.rate, args.periods)
+    log = motion.log(args.rate, args.periods)
     labels, units = coordinate_labels(model)
     print(
-        f"condition of the regressor {found.condition:.4g}, of a random motion within the same limits "
-        f"{found.start_condition:.4g}; log-det of the information larger by {found.logdet:.3g}"
+        f"condition of the regressor {motion.condition:.4g}, of a random motion within the same limits "
+        f"{motion.start_condition:.4g}; log-det of the information larger by {motion.logdet:.3g}"
     )
-    print("limits used: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in found.used.items()))
+    print("limits used: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in motion.used.items()))
     q, v, tau = (np.asarray(x) for x in (log.q, log.v, log.tau))
     extremes = [q.min(axis=0), q.max(axis=0), abs(v).max(axis=0), abs(tau).max(axis=0)]
     rows = [

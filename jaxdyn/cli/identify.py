@@ -257,8 +257,8 @@ def run(args: argparse.Namespace) -> None:
         payload = identify.fit_payload(model, logs, loaded, args.payload_body, robot=final)
         print(payload_text(payload))
     if json_path is not None:
-        found = content(findings, _asked(args)) | ({} if payload is None else {"payload": payload_content(payload)})
-        write_text(json_path, json.dumps(found, indent=2) + "\n")
+        report = content(findings, _asked(args)) | ({} if payload is None else {"payload": payload_content(payload)})
+        write_text(json_path, json.dumps(report, indent=2) + "\n")
         print(f"Wrote {json_path}.")
     if html is not None:
         from jaxdyn.reports.identification_page import page

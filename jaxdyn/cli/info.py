@@ -99,9 +99,9 @@ def constraint_lines(scene: LoadedScene) -> str:
     if scene.constraints:
         rows = []
         for one in scene.constraints:
-            held, slips = one.sizes(scene.system, q.dtype)
+            holonomic, nonholonomic = one.sizes(scene.system, q.dtype)
             gaps = [_gap(one, scene, start.q) for start in scene.starts.values()]
-            rows.append([one.name, type(one).__name__.lower(), str(held + slips), *gaps])
+            rows.append([one.name, type(one).__name__.lower(), str(holonomic + nonholonomic), *gaps])
         heads = ["constraint", "kind", "rows", *(f"gap at {name!r}" for name in list(scene.starts)[:4])]
         lines += [
             "Loops and couplings such as <mimic>, and how far each is open (m or rad)",
@@ -130,12 +130,12 @@ def constraint_lines(scene: LoadedScene) -> str:
 
 def _closed_near(scene: LoadedScene, q) -> list:
     """q and a few closed configurations around it: files like to put linkages flat."""
-    found, chance = [q], np.random.default_rng(0)
+    configurations, random = [q], np.random.default_rng(0)
     for _ in range(2 if scene.constraints else 0):
-        step = jnp.asarray(chance.uniform(-0.1, 0.1, scene.nv), q.dtype)
+        step = jnp.asarray(random.uniform(-0.1, 0.1, scene.nv), q.dtype)
         with contextlib.suppress(ValueError):  # not every configuration near by can be closed
-            found.append(assemble(scene, integrate(scene.system, q, step), guesses=1).q)
-    return found
+            configurations.append(assemble(scene, integrate(scene.system, q, step), guesses=1).q)
+    return configurations
 
 
 def _gap(constraint, scene: LoadedScene, q) -> str:

@@ -17,8 +17,8 @@ examples:
   jaxdyn report four_bar andrews --dtype float64 float32 --batch 1 256 --out out/report
   jaxdyn report --full --out out/report
 
-Without --full: the usual ways to integrate, four tolerances each, a quarter of a minute to two minutes a scene, of which
-most is compilation. With it: every sensible way, in both dtypes, alone and in batches, hours for all scenes; started again
+Without --full: the usual integrators, four tolerances each, a quarter of a minute to two minutes a scene, of which
+most is compilation. With it: every sensible integrator, in both dtypes, alone and in batches, hours for all scenes; started again
 with the same --out, it goes on where it stopped.
 
 output (--out DIR):
@@ -33,12 +33,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="names of scenes (see --list); all with --full")
     parser.add_argument("--list", action="store_true", help="print the scenes and leave")
-    parser.add_argument("--full", action="store_true", help="every sensible way to integrate; goes on where it stopped")
+    parser.add_argument(
+        "--full", action="store_true", help="every sensible method and solver; goes on where it stopped"
+    )
     parser.add_argument("--out", metavar="DIR", help="directory for the page, the data and the text")
     parser.add_argument("--dtype", nargs="+", metavar="T", help="float64, float32 (default: float64; both with --full)")
     parser.add_argument("--batch", nargs="+", type=int, metavar="N", help="trajectories at once (default: 1; 1 256)")
     parser.add_argument(
-        "--way", nargs="+", metavar="W", help="method:solver, e.g. projected:Dopri8, in place of the usual ones"
+        "--integrator",
+        "--way",
+        nargs="+",
+        metavar="I",
+        help="method:solver, e.g. projected:Dopri8, in place of the usual ones (--way: its former name)",
     )
     parser.add_argument("--rounds", type=int, default=20, metavar="N", help="timings of each run (default: 20)")
 
@@ -53,10 +59,16 @@ def run(args: argparse.Namespace) -> int:
     if not (args.scenes or args.full):
         raise ValueError(f"no scene is named; name one of {', '.join(known)}, or give --full for all")
     watch = Stopwatch()
-    ways = None if args.way is None else [tuple(way.split(":")) for way in args.way]
-    options = {"dtypes": args.dtype, "batches": args.batch, "ways": ways, "rounds": args.rounds, "out": args.out}
-    found = report(args.scenes or None, full=args.full, echo=lambda line: print(line, flush=True), **options)
-    print(f"\n{found.table()}\n\n{len(found.records)} runs in {watch}, compilation included.")
+    integrators = None if args.integrator is None else [tuple(pair.split(":")) for pair in args.integrator]
+    options = {
+        "dtypes": args.dtype,
+        "batches": args.batch,
+        "integrators": integrators,
+        "rounds": args.rounds,
+        "out": args.out,
+    }
+    result = report(args.scenes or None, full=args.full, echo=lambda line: print(line, flush=True), **options)
+    print(f"\n{result.table()}\n\n{len(result.records)} runs in {watch}, compilation included.")
     if args.out:
         print(f"Wrote {args.out}/report.html, .json and .txt.")
     return 0

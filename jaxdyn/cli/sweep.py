@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     if cost is not None and cost not in parameters:
         raise ValueError(f"{path}: cost is {cost!r}; name one of the parameters {', '.join(parameters)}")
     watch = Stopwatch()
-    found = scale.run(
+    result = scale.run(
         scene,
         states,
         draw,
@@ -131,8 +131,8 @@ def run(args: argparse.Namespace) -> int:
         progress=not args.quiet,
         **study.get("options", {}),
     )
-    print(f"{found}\nin {watch}, compilation included.")
-    return int(not found.success)
+    print(f"{result}\nin {watch}, compilation included.")
+    return int(not result.success)
 
 
 def drawing(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
@@ -158,11 +158,11 @@ def drawing(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
 
     def draw(key: Any) -> dict[str, Any]:
         keys = jax.random.split(key, max(1, len(drawn)))
-        found = {
+        values = {
             name: _DRAWS[kind](own, a, b, shape)
             for own, (name, (kind, a, b, shape)) in zip(keys, drawn.items(), strict=False)
         }
-        return found | {name: jnp.asarray(value) for name, value in known.items()}
+        return values | {name: jnp.asarray(value) for name, value in known.items()}
 
     return draw
 
@@ -215,8 +215,8 @@ def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[
             raise ValueError(f"{path}: parameters of a .urdf are q0 and v0, not {', '.join(sorted(unknown))}")
 
         def states(p: Mapping[str, Any]) -> tuple[Any, Any]:
-            still = jnp.zeros(model.nv)
-            return integrate(model, neutral(model), p.get("q0", still)), p.get("v0", still)
+            at_rest = jnp.zeros(model.nv)
+            return integrate(model, neutral(model), p.get("q0", at_rest)), p.get("v0", at_rest)
 
         return model, states
     if name not in scenes.names():

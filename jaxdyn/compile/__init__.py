@@ -21,6 +21,7 @@ from jaxdyn.compile.known import constant as constant
 from jaxdyn.compile.known import is_concrete as is_concrete
 from jaxdyn.compile.known import is_known as is_known
 from jaxdyn.compile.known import is_staged as is_staged
+from jaxdyn.compile.known import numpy_for as numpy_for
 from jaxdyn.compile.known import partition_traced as partition_traced
 from jaxdyn.compile.loops import Carry as Carry
 from jaxdyn.compile.loops import Given as Given

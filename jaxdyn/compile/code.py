@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program, kind_of
 
-LEAST_SHARED = 2000  # operations of a program of one sample, beside which those of a call do not count
+MIN_SHARED_OPERATIONS = 2000  # operations of a program of one sample, beside which those of a call do not count
 _ALIGNED = 64  # bytes
 ATTRIBUTES = (
     "attributes #0 = { nounwind }",
@@ -86,11 +86,11 @@ class Body:
             outputs.append((self._place(at), kind_of(array.dtype), array.size))
             at += bytes_of(array, self.e.width)
         _write_call(self.e, called, [*pointers, *(pointer for pointer, _, _ in outputs)])
-        needed, found, first = set(self.parts.get(i, ())), {}, 0
+        needed, results, first = set(self.parts.get(i, ())), {}, 0
         for pointer, kind, size in outputs:
-            found |= {first + k: self.e.load_at(pointer, k, kind) for k in range(size) if first + k in needed}
+            results |= {first + k: self.e.load_at(pointer, k, kind) for k in range(size) if first + k in needed}
             first += size
-        return found
+        return results
 
     def _passed_on(self, entries, array: Array) -> str | None:
         """The pointer to an input of this program that these entries are."""
@@ -151,7 +151,7 @@ def subprogram_ir(called: Program, width: int) -> str:
 
 def calls_itself(program: Program, width: int) -> bool:
     """Whether a kernel is a call of its program as a subprogram, whose code other kernels have too."""
-    return width == 1 and program.cost >= LEAST_SHARED and not program.subprograms
+    return width == 1 and program.cost >= MIN_SHARED_OPERATIONS and not program.subprograms
 
 
 def varying_first(uniform: Sequence[bool]) -> list[int]:

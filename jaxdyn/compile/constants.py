@@ -47,9 +47,9 @@ def computed(eqn, args) -> np.ndarray:
 def bound(eqn, args) -> np.ndarray:
     """The same by JAX itself."""
     with jax.ensure_compile_time_eval():
-        found = eqn.primitive.bind(*args, **eqn.params)
+        value = eqn.primitive.bind(*args, **eqn.params)
     if eqn.primitive.multiple_results:
         raise NotNumbers(eqn.primitive.name)
-    if jax.numpy.issubdtype(found.dtype, jax.dtypes.extended):
-        raise NotNumbers(f"an array of {found.dtype}")
-    return np.asarray(found)
+    if jax.numpy.issubdtype(value.dtype, jax.dtypes.extended):
+        raise NotNumbers(f"an array of {value.dtype}")
+    return np.asarray(value)

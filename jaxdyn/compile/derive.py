@@ -24,10 +24,10 @@ def tangent(program: Program, moving: Sequence[bool]) -> Program:
 
 def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
     program, graph = inlined(program), Graph()
-    arrays = [*program.inputs, *(x for x, moves in zip(program.inputs, moving, strict=True) if moves)]
+    arrays = [*program.inputs, *(x for x, varies in zip(program.inputs, moving, strict=True) if varies)]
     entries = [graph.inputs(place, array) for place, array in enumerate(arrays)]
     primal, steps = entries[: len(moving)], iter(entries[len(moving) :])
-    changes_in = [next(steps).ravel().tolist() if moves else None for moves in moving]
+    changes_in = [next(steps).ravel().tolist() if varies else None for varies in moving]
     values, _ = graph.replay(program, primal)
     changes: list = []
     for operation, value in zip(program.operations, values, strict=True):
@@ -38,13 +38,13 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
             continue
         given = [(0.0 if type(x) is Constant else changes[x]) for x in operation.args]
         operands = [x.value if type(x) is Constant else values[x] for x in operation.args]
-        moves = operation.kind in FLOATS and any(is_number(x) or x != 0 for x in given)
-        changes.append(_change(graph, operation.op, operation.kind, value, operands, given) if moves else 0.0)
-    found, outputs = [], [array for array in program.outputs if array.dtype.kind == "f"]
+        varies = operation.kind in FLOATS and any(is_number(x) or x != 0 for x in given)
+        changes.append(_change(graph, operation.op, operation.kind, value, operands, given) if varies else 0.0)
+    rows, outputs = [], [array for array in program.outputs if array.dtype.kind == "f"]
     for row, array in zip(program.results, program.outputs, strict=True):
         if array.dtype.kind == "f":
-            found.append(objects([0.0 if type(x) is Constant else changes[x] for x in row], array.shape))
-    return graph.finish(arrays, outputs, found, name=f"change of {program.name}")
+            rows.append(objects([0.0 if type(x) is Constant else changes[x] for x in row], array.shape))
+    return graph.finish(arrays, outputs, rows, name=f"change of {program.name}")
 
 
 def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
@@ -125,12 +125,12 @@ def transposed(program: Program, linear: Sequence[bool], given: Sequence[bool]) 
 
 def _transposed(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
     program, graph = inlined(program), Graph()
-    fixed = [array for array, moves in zip(program.inputs, linear, strict=True) if not moves]
+    fixed = [array for array, varies in zip(program.inputs, linear, strict=True) if not varies]
     arrays = [*fixed, *(array for array, is_given in zip(program.outputs, given, strict=True) if is_given)]
     entries = [graph.inputs(place, array) for place, array in enumerate(arrays)]
     operands = iter(entries[: len(fixed)])
     # The values of what is linear are not needed, and not made: their places hold None.
-    values = _values_of_the_fixed(graph, program, [None if moves else next(operands) for moves in linear])
+    values = _values_of_the_fixed(graph, program, [None if varies else next(operands) for varies in linear])
     bar: list = [0.0] * len(program.operations)
     cotangents = iter(entries[len(fixed) :])
     for row, is_given in zip(program.results, given, strict=True):
@@ -138,7 +138,7 @@ def _transposed(program: Program, linear: tuple[bool, ...], given: tuple[bool, .
             for place, entry in zip(row, next(cotangents).ravel().tolist(), strict=True):
                 if type(place) is not Constant:
                     bar[place] = graph.add(bar[place], entry)
-    found = [[0.0] * array.size if moves else None for array, moves in zip(program.inputs, linear, strict=True)]
+    sums = [[0.0] * array.size if varies else None for array, varies in zip(program.inputs, linear, strict=True)]
 
     def give(place, cotangent):
         if type(place) is not Constant and values[place] is None:
@@ -149,15 +149,15 @@ def _transposed(program: Program, linear: tuple[bool, ...], given: tuple[bool, .
             continue
         op, kind, args = program.operations[i]
         if op == "input":
-            row = found[args[0]]
+            row = sums[args[0]]
             assert row is not None
             row[args[1]] = bar[i]
         else:
             _give_back(graph, op, kind, args, values, bar[i], give, program)
     rows = [
         (objects(row, array.shape), array)
-        for row, array, moves in zip(found, program.inputs, linear, strict=True)
-        if moves and row is not None
+        for row, array, varies in zip(sums, program.inputs, linear, strict=True)
+        if varies and row is not None
     ]
     return graph.finish(arrays, [x[1] for x in rows], [x[0] for x in rows], name=f"transpose of {program.name}")
 

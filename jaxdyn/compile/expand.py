@@ -19,11 +19,11 @@ from jaxdyn.compile import matrices
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bound, computed, of_nothing
 from jaxdyn.compile.graph import Graph, Number, as_objects, objects
-from jaxdyn.compile.moves import AT_PLACES, MOVES, written
 from jaxdyn.compile.program import Array, NotNumbers, Program, kind_of
+from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS, written
 
 # A function of fewer operations is written where it is called.
-LEAST_CALLED = 300
+MIN_SUBPROGRAM_OPERATIONS = 300
 
 
 def expand(
@@ -31,8 +31,8 @@ def expand(
 ) -> tuple[Program, bool]:
     """The program of a jaxpr, and whether it has functions whose derivatives are given by rules of their own.
 
-    With `calls`, functions under `jax.jit` of at least `LEAST_CALLED` operations become subprograms. With `served`, there is
-    one more output: whether no number is flagged (see `flags`); without it none may be, unless `flags`.
+    With `calls`, functions under `jax.jit` of at least `MIN_SUBPROGRAM_OPERATIONS` operations become subprograms. With `served`,
+    there is one more output: whether no number is flagged (see `flags`); without it none may be, unless `flags`.
 
     **Raises:** `NotNumbers`, `TooLong`.
     """
@@ -45,13 +45,13 @@ def expand(
     expansion = _Expansion(graph, calls)
     entries = [graph.inputs(place, array) for place, array in enumerate(inputs)]
     with np.errstate(all="ignore"):  # known numbers may be none, as in branches that are not taken
-        found = expansion.evaluate(closed.jaxpr, closed.consts, entries)
+        results = expansion.evaluate(closed.jaxpr, closed.consts, entries)
     if expansion.flagged is not False and not (served or flags):
         raise NotNumbers("samples that need more care than a program of numbers takes")
     if served:
         outputs.append(_FLAG)
-        found.append(objects([graph.invert(expansion.flagged)], ()))
-    return graph.finish(inputs, outputs, [as_objects(x) for x in found], name=name), expansion.has_rules
+        results.append(objects([graph.invert(expansion.flagged)], ()))
+    return graph.finish(inputs, outputs, [as_objects(x) for x in results], name=name), expansion.has_rules
 
 
 _FLAG = Array((), np.dtype(bool))
@@ -93,8 +93,8 @@ class _Expansion:
         for eqn in jaxpr.eqns:
             if eqn.effects:
                 raise NotNumbers(f"{eqn.primitive.name} has side effects")
-            found = self.one(eqn, [read(x) for x in eqn.invars])
-            values.update(zip(eqn.outvars, found, strict=True))
+            results = self.one(eqn, [read(x) for x in eqn.invars])
+            values.update(zip(eqn.outvars, results, strict=True))
         return [read(x) for x in jaxpr.outvars]
 
     def closed(self, closed: ClosedJaxpr, args) -> list:
@@ -119,9 +119,9 @@ class _Expansion:
         known = all(x.dtype.kind != "O" for x in args)
         if name == "round" and params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
             return [bound(eqn, args) if known else self._rounded(args[0], out.dtype)]
-        if name in MOVES:
-            found = MOVES[name](params, args if known else [as_objects(x) for x in args], out)
-            return [x if known else as_objects(x) for x in found] if eqn.primitive.multiple_results else [found]
+        if name in REARRANGEMENTS:
+            results = REARRANGEMENTS[name](params, args if known else [as_objects(x) for x in args], out)
+            return [x if known else as_objects(x) for x in results] if eqn.primitive.multiple_results else [results]
         if known:
             return [computed(eqn, args)]
         if name in self.elementwise:
@@ -146,24 +146,24 @@ class _Expansion:
             inputs = [array for array, x in zip(inputs, known, strict=True) if x is None]
             entries = iter([graph.inputs(place, array) for place, array in enumerate(inputs)])
             expansion = _Expansion(graph, False)
-            found = expansion.closed(
+            results = expansion.closed(
                 inner, [next(entries) if x is None else y for x, y in zip(known, args, strict=True)]
             )
             outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]
-            found = [as_objects(x) for x in found]
+            results = [as_objects(x) for x in results]
             if expansion.flagged is not False:
                 outputs.append(_FLAG)
-                found.append(objects([expansion.flagged], ()))
-            self.called[key] = graph.finish(inputs, outputs, found)
+                results.append(objects([expansion.flagged], ()))
+            self.called[key] = graph.finish(inputs, outputs, results)
             self.has_rules |= expansion.has_rules
         program = self.called[key]
         given = [x for x, y in zip(args, known, strict=True) if y is None]
-        is_short = program.cost < LEAST_CALLED
-        found = self.graph.replay(program, given)[1] if is_short else self.graph.call(program, given)
+        is_short = program.cost < MIN_SUBPROGRAM_OPERATIONS
+        results = self.graph.replay(program, given)[1] if is_short else self.graph.call(program, given)
         count = len(inner.jaxpr.outvars)
-        for flagged in found[count:]:
+        for flagged in results[count:]:
             self.flagged = self.graph.either(self.flagged, flagged.item())
-        return found[:count]
+        return results[:count]
 
     def _reduced(self, name, array, axes, out):
         fold, count = self.reductions[name], math.prod(array.shape[i] for i in axes)
@@ -194,8 +194,8 @@ class _Expansion:
         kind = _kind(eqn.outvars[0].aval.dtype)
         for flag in flags:
             self.flagged = self.graph.either(self.flagged, flag)
-        found = [self.graph.select(flag, x, math.nan, kind) for flag, x in zip(flags, entries, strict=True)]
-        return [objects(found, args[1].shape)]
+        chosen = [self.graph.select(flag, x, math.nan, kind) for flag, x in zip(flags, entries, strict=True)]
+        return [objects(chosen, args[1].shape)]
 
     def _convert(self, params, args, eqn):
         if args[0].dtype.kind != "O":
@@ -218,10 +218,10 @@ class _Expansion:
             if all(x.dtype.kind != "O" for x in cases):
                 return [np.choose(which, cases)]
             cases = [as_objects(x) for x in cases]
-            found = np.where(which == 0, cases[0], cases[1])
+            chosen = np.where(which == 0, cases[0], cases[1])
             for i in range(2, len(cases)):
-                found = np.where(which == i, cases[i], found)
-            return [as_objects(found)]
+                chosen = np.where(which == i, cases[i], chosen)
+            return [as_objects(chosen)]
         if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
             raise NotNumbers("a choice between more than two")
         kind = _kind(out.dtype)
@@ -231,8 +231,8 @@ class _Expansion:
     def _clamp(self, params, args, eqn):
         low, x, high = (np.broadcast_to(as_objects(x), eqn.outvars[0].aval.shape).ravel().tolist() for x in args)
         pick = self.graph.function_of_two
-        found = [pick("min", pick("max", b, a), c) for a, b, c in zip(low, x, high, strict=True)]
-        return [objects(found, eqn.outvars[0].aval.shape)]
+        clamped = [pick("min", pick("max", b, a), c) for a, b, c in zip(low, x, high, strict=True)]
+        return [objects(clamped, eqn.outvars[0].aval.shape)]
 
     def _dot_general(self, params, args, eqn):
         a, b = args
@@ -264,11 +264,11 @@ class _Expansion:
         x = np.moveaxis(as_objects(args[0]), params["axis"], 0)
         order = range(x.shape[0])
         order = reversed(order) if params["reverse"] else order
-        found, total = np.empty(x.shape, object), None
+        sums, total = np.empty(x.shape, object), None
         for i in order:
             total = x[i] if total is None else self.elementwise["add"](total, x[i])
-            found[i] = total
-        return [np.moveaxis(found, 0, params["axis"])]
+            sums[i] = total
+        return [np.moveaxis(sums, 0, params["axis"])]
 
     def _scan(self, params, args, eqn):
         consts, carry = args[: params["num_consts"]], args[params["num_consts"] :][: params["num_carry"]]
@@ -276,9 +276,9 @@ class _Expansion:
         saved: list[list] = []
         length = params["length"]
         for i in reversed(range(length)) if params["reverse"] else range(length):
-            found = self.closed(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
-            carry = found[: params["num_carry"]]
-            saved.append(found[params["num_carry"] :])
+            results = self.closed(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
+            carry = results[: params["num_carry"]]
+            saved.append(results[params["num_carry"] :])
         if params["reverse"]:
             saved.reverse()
         outs = [x.aval for x in eqn.outvars[params["num_carry"] :]]
@@ -319,7 +319,7 @@ class _Expansion:
             raise NotNumbers(inner.name)
         shaped = [as_objects(x).reshape(array.shape) for x, array in zip(args, inner.inputs, strict=True)]
         self.has_rules |= inner.derivative is not None
-        if self.calls and inner.cost >= LEAST_CALLED and not inner.subprograms:
+        if self.calls and inner.cost >= MIN_SUBPROGRAM_OPERATIONS and not inner.subprograms:
             return [x.ravel() for x in self.graph.call(inner, shaped)]
         return [x.ravel() for x in self.graph.replay(inner, shaped)[1]]
 
@@ -335,9 +335,9 @@ class _Expansion:
         if not params["left_side"]:  # x a = b is a^T x^T = b^T
             a, b, lower = np.swapaxes(a, -1, -2), np.swapaxes(b, -1, -2), not lower
         pairs = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
-        found = [matrices.triangular_solve(self.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
-        found = np.stack(found).reshape(b.shape)
-        return [found if params["left_side"] else np.swapaxes(found, -1, -2)]
+        solutions = [matrices.triangular_solve(self.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
+        solutions = np.stack(solutions).reshape(b.shape)
+        return [solutions if params["left_side"] else np.swapaxes(solutions, -1, -2)]
 
 
 _INNER = {

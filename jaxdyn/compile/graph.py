@@ -86,13 +86,13 @@ class Graph:
         key = (op, kind, *args)
         if 0.0 in args:  # zeros of both signs are equal, and not the same
             key = (*key, tuple(type(x) is float and x == 0 and math.copysign(1.0, x) < 0 for x in args))
-        found = self.shared.get(key)
-        if found is None:
+        number = self.shared.get(key)
+        if number is None:
             if len(self.numbers) >= self.most_made:
                 raise TooLong(f"more than {self.most} operations")
-            found = self.shared[key] = Number(self, op, kind, args)
-            self.numbers.append(found)
-        return found
+            number = self.shared[key] = Number(self, op, kind, args)
+            self.numbers.append(number)
+        return number
 
     def inputs(self, place: int, array: Array) -> np.ndarray:
         """The entries of an argument."""

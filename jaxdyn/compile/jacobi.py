@@ -68,10 +68,10 @@ class PseudoInverse:
         U, s, Vt = jnp.linalg.svd(matrix, full_matrices=False)
         drop = s <= self.tolerance * s[..., :1]
         inverse = jnp.where(drop, jnp.zeros_like(s), 1 / jnp.where(drop, jnp.ones_like(s), s))
-        found = jnp.matmul(
+        entries = jnp.matmul(
             jnp.swapaxes(Vt, -1, -2) * inverse[..., None, :], jnp.swapaxes(U, -1, -2), precision="highest"
         )
-        return [found.reshape(*array.shape[:-1], self.columns * self.rows)]
+        return [entries.reshape(*array.shape[:-1], self.columns * self.rows)]
 
 
 @functools.lru_cache(maxsize=256)
@@ -167,10 +167,10 @@ def _kernel_ir(rows: int, columns: int, dtype, tolerance: float) -> str:
     w = _Writer(dtype)
     data, _, begin, end = w.function.args
     U, J, zero = w.buffer(n * m), w.buffer(m * m), w.integer(0)
-    given, found = (w.b.load(w.b.gep(data, [w.integer(i)], source_etype=POINTER), typ=POINTER) for i in range(2))
+    given, result = (w.b.load(w.b.gep(data, [w.integer(i)], source_etype=POINTER), typ=POINTER) for i in range(2))
     with w.loop(begin, end) as sample:
         matrix = w.at(given, (sample, n * m))
-        inverse = w.at(found, (sample, n * m))
+        inverse = w.at(result, (sample, n * m))
         # Columns of the matrix, or its rows where there are fewer of them, one after the other.
         of_column, of_row = (1, columns) if rows >= columns else (columns, 1)
         with w.loop(zero, w.integer(m)) as p:

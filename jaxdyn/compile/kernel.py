@@ -43,7 +43,7 @@ def run(
     most: int = mode.MAX_OPERATIONS,
     calls: bool = False,
     served: bool = False,
-    apart: bool = False,
+    own_program: bool = False,
 ) -> Any:
     """function(*static, tree, *args) by a kernel; by `otherwise` (default: the function itself) where there is none.
 
@@ -58,29 +58,29 @@ def run(
       are written once and called, which does for a function that is not differentiated.
     - `served`: whether to return a pair: what the function does, and whether this sample is one that a program of numbers can
       serve (see `flags`): True where every sample is, else a bool array ().
-    - `apart`: whether the function is a program of its own within another one too: its derivatives are then those of its
+    - `own_program`: whether the function is a program of its own within another one too: its derivatives are then those of its
       numbers, and a long one is called.
 
     **Returns:** what the function does.
     """
-    if mode.is_expanding() and not apart:
-        found = _inside(function, static, tree, args)
-        return (found, True) if served else found
+    if mode.is_expanding() and not own_program:
+        results = _inside(function, static, tree, args)
+        return (results, True) if served else results
 
     def by_jax():
-        found = (function if otherwise is None else otherwise)(*static, tree, *args)
-        return (found, True) if served else found
+        results = (function if otherwise is None else otherwise)(*static, tree, *args)
+        return (results, True) if served else results
 
     if mode.current() == "plain" or target is None:
         if target is None:
             mode.say_once("llvmlite is not installed, so functions run on JAX's own operations (pip install llvmlite)")
         return by_jax()
-    leaves, found = program_of(function, static, tree, args, tangent=tangent, most=most, calls=calls, served=served)
-    if isinstance(found, str):
+    leaves, expanded = program_of(function, static, tree, args, tangent=tangent, most=most, calls=calls, served=served)
+    if isinstance(expanded, str):
         if otherwise is None:
-            mode.say_once(f"{_name_of(function)} runs on JAX's own operations: {found}")
+            mode.say_once(f"{_name_of(function)} runs on JAX's own operations: {expanded}")
         return by_jax()
-    program, out_structure = found
+    program, out_structure = expanded
     results = kernel_p.bind(*(x.reshape(-1) if x.ndim != 1 else x for x in leaves), program=program, rows=0)
     shaped = [
         x if len(array.shape) == 1 else x.reshape(array.shape)
@@ -99,17 +99,17 @@ def compute(function: Callable, tree, *args, static: tuple = (), given: bool = F
     that takes the tree as an argument: it is the same kernel then.
     """
     leaves, structure = jax.tree.flatten(args)
-    apart, known = partition(tree, lambda leaf: given and isinstance(leaf, jax.Array))
-    leaves = [np.asarray(x) for x in (*apart, *leaves)]
+    inputs, known = partition(tree, lambda leaf: given and isinstance(leaf, jax.Array))
+    leaves = [np.asarray(x) for x in (*inputs, *leaves)]
     leaves = [x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) for x in leaves]
     if mode.current() != "plain" and target is not None:
         shapes = tuple((x.shape, x.dtype) for x in leaves)
-        found = _program(
-            function, static, known, len(apart), structure, shapes, None, mode.MAX_OPERATIONS, False, False
+        expanded = _program(
+            function, static, known, len(inputs), structure, shapes, None, mode.MAX_OPERATIONS, False, False
         )
-        if not isinstance(found, str):
+        if not isinstance(expanded, str):
             try:
-                return jax.tree.unflatten(found[1], target.call(found[0], leaves))
+                return jax.tree.unflatten(expanded[1], target.call(expanded[0], leaves))
             except target.Unsupported:
                 pass
     with jax.ensure_compile_time_eval():
@@ -200,7 +200,7 @@ def _by_rule(tangent: Callable, known: Known, count: int, structure, avals, serv
         def change(*leaves):
             primal, steps = leaves[: len(avals)], iter(leaves[len(avals) :])
             every: list = [None] * known.structure.num_leaves
-            given = [next(steps) if moves else None for moves in moving]
+            given = [next(steps) if varies else None for varies in moving]
             for place, step in zip(known.places, given[:count], strict=True):
                 every[place] = step
             args = jax.tree.unflatten(structure, primal[count:])
@@ -217,7 +217,7 @@ def _by_jax(flat: Callable, avals, served: bool):
     def derivative(moving):
         def change(*leaves):
             primal, steps = list(leaves[: len(avals)]), leaves[len(avals) :]
-            places = [i for i, moves in enumerate(moving) if moves]
+            places = [i for i, varies in enumerate(moving) if varies]
 
             def moved(*values):
                 here = list(primal)
@@ -234,7 +234,7 @@ def _by_jax(flat: Callable, avals, served: bool):
 
 def _expanded_change(change: Callable, avals, moving, served: bool) -> Program:
     """The change as a program; NaN at samples that are flagged, where whoever runs the function is told of them."""
-    steps = [aval for aval, moves in zip(avals, moving, strict=True) if moves]
+    steps = [aval for aval, varies in zip(avals, moving, strict=True) if varies]
     with mode.expanding():
         closed = jax.make_jaxpr(change)(*avals, *steps)
     return expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=served)[0]
@@ -303,16 +303,15 @@ def _transpose(cotangents, *operands, program, rows):
     linear = [ad.is_undefined_primal(x) for x in operands]
     given = [type(x) is not ad.Zero for x in cotangents]
     backwards = derive.transposed(program, linear, given)
-    fixed = [x for x, moves in zip(operands, linear, strict=True) if not moves]
-    found = iter(
-        kernel_p.bind(*fixed, *(x for x in cotangents if type(x) is not ad.Zero), program=backwards, rows=rows)
-    )
+    fixed = [x for x, varies in zip(operands, linear, strict=True) if not varies]
+    given = [x for x in cotangents if type(x) is not ad.Zero]
+    results = iter(kernel_p.bind(*fixed, *given, program=backwards, rows=rows))
     out = []
-    for x, moves in zip(operands, linear, strict=True):
-        if not moves:
+    for x, varies in zip(operands, linear, strict=True):
+        if not varies:
             out.append(None)
             continue
-        cotangent = next(found)  # of each sample, also of what all of them share
+        cotangent = next(results)  # of each sample, also of what all of them share
         shared = cotangent.ndim - len(x.aval.shape)
         out.append(jnp.sum(cotangent, axis=tuple(range(shared))) if shared else cotangent)
     return out

@@ -15,6 +15,11 @@ def is_concrete(*trees) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def numpy_for(*trees) -> Any:
+    """numpy where every leaf is known, so that results stay known inside of traces too; jax.numpy where one is traced."""
+    return np if is_concrete(*trees) else jnp
+
+
 def is_staged() -> bool:
     """Whether a program is being traced, so that operations on known numbers are traced too."""
     return isinstance(jnp.zeros(()), Tracer)

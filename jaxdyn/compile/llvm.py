@@ -192,12 +192,12 @@ class Emitter:
         odd, high = bit(bits, 1), bit(bits, 2)
         next_bits = self.put(f"add {self.type(whole)} {bits}, {self.constant(1, whole)}")
         next_high = bit(next_bits, 2)
-        found = []
+        signed = []
         for first, second, negative in ((sine, cosine, high), (cosine, sine, next_high)):
             value = self.put(f"select {flag} {odd}, {of} {second}, {of} {first}")
             minus = self.put(f"fneg {of} {value}")
-            found.append(self.put(f"select {flag} {negative}, {of} {minus}, {of} {value}"))
-        self.sines[x] = found[0], found[1]
+            signed.append(self.put(f"select {flag} {negative}, {of} {minus}, {of} {value}"))
+        self.sines[x] = signed[0], signed[1]
         return self.sines[x]
 
     # --- memory ---
@@ -209,11 +209,11 @@ class Emitter:
             at = self.put(f"add i64 %base, {lane}")
             inside = self.put(f"icmp ult i64 {at}, %last")
             index.append(self.put(f"select i1 {inside}, i64 {at}, i64 %last"))
-        found = {}
+        pointers = {}
         for place, size in zip(places, sizes, strict=True):
             offsets = [self.put(f"mul i64 {i}, {size}") for i in index]
-            found[place] = [self.put(f"getelementptr i8, ptr %a{place}, i64 {o}") for o in offsets]
-        return found
+            pointers[place] = [self.put(f"getelementptr i8, ptr %a{place}, i64 {o}") for o in offsets]
+        return pointers
 
     def load(self, rows: Sequence[str], entry: int, kind: str) -> str:
         """An entry of the rows of all lanes."""
@@ -279,11 +279,11 @@ class Emitter:
 
     def load_tile(self, rows: Sequence[str], entry: int, kind: str) -> list[str]:
         """W entries of the rows of all lanes, from one load of each row."""
-        of, found = self.type(kind), []
+        of, loaded = self.type(kind), []
         for row in rows:
             at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
-            found.append(self.put(f"load {of}, ptr {at}, align {_BYTES[kind]}"))
-        return self.transposed(found, kind)
+            loaded.append(self.put(f"load {of}, ptr {at}, align {_BYTES[kind]}"))
+        return self.transposed(loaded, kind)
 
     def store_tile(self, rows: Sequence[str], entry: int, kind: str, values: Sequence[str]) -> None:
         """Write W entries of the rows of all lanes, each row by one store."""

@@ -49,12 +49,12 @@ class _LoopText:
         e, loop = self.e, self.loop
         self._set_up()
         self._begin("turn")
-        self._find_rows()
+        self._set_table_rows()
         turn = Body(e, loop.turn, self._load, self._array)
-        found = [name for row in turn.results() for name in row]
-        more = self._taken(found)
+        results = [name for row in turn.results() for name in row]
+        more = self._store_state(results)
         if loop.row is not None:
-            self._rows(found)
+            self._rows(results)
         e.lines.append(f"  br i1 {self._any(more)}, label %turn, label %out")
         e.lines.append("out:")
         for k in range(loop.states):
@@ -108,10 +108,10 @@ class _LoopText:
             return self.e.load_for_all(place, entry, kind)
         return self.e.load(self.lanes[place], entry, kind)
 
-    def _find_rows(self) -> None:
+    def _set_table_rows(self) -> None:
         """Pointers to the rows of the tables that are read now."""
         e = self.e
-        self.found_rows: list[list[str]] = []
+        self.table_rows: list[list[str]] = []
         if not self.loop.reads:
             return
         places = self.first_state + self.loop.carry.state.places - self.loop.first_leaf
@@ -127,11 +127,11 @@ class _LoopText:
                 at = e.put(f"select i1 {is_inside}, i64 {at}, i64 0")
                 offset = e.put(f"mul i64 {at}, {size}")
                 pointers.append(e.put(f"getelementptr i8, ptr {self.lanes[table][lane]}, i64 {offset}"))
-            self.found_rows.append(pointers)
+            self.table_rows.append(pointers)
 
     def _load(self, place: int, entry: int, kind: str) -> str:
         if place >= self.end:
-            return self.e.load(self.found_rows[place - self.end], entry, kind)
+            return self.e.load(self.table_rows[place - self.end], entry, kind)
         if self._is_direct(place):
             return self._from_row(place, entry, kind)
         return self.e.load_at(self._slot(place), entry, kind)
@@ -139,34 +139,34 @@ class _LoopText:
     def _array(self, place: int) -> str | None:
         """An argument with the layout of a subprogram's, each entry with its lanes."""
         if place >= self.end:
-            return self.found_rows[place - self.end][0] if self.width == 1 else None
+            return self.table_rows[place - self.end][0] if self.width == 1 else None
         if self._is_direct(place):
             return self.lanes[place][0] if self.width == 1 else None
         return self._slot(place)
 
-    # --- what a turn found ---
+    # --- the results of a turn ---
 
-    def _taken(self, found: list[str]) -> str:
+    def _store_state(self, results: list[str]) -> str:
         """New states and records; which lanes go on."""
-        e, turn = self.e, self.loop.found
+        e, turn = self.e, self.loop.turn_places
         flag = e.type("b1")
-        take = self._both(self._one(found, turn.active), found[-1])
-        more = self._both(take, self._one(found, turn.more))
+        take = self._both(self._one(results, turn.active), results[-1])
+        more = self._both(take, self._one(results, turn.more))
         after = []
         for place, out in enumerate(jax.tree.leaves(turn.state), self.first_state):
             kind = kind_of(self.arrays[place].dtype)
             for k, i in enumerate(self.entries[out]):
                 old = e.load_at(self._slot(place), k, kind)
-                value = e.put(f"select {flag} {take}, {e.type(kind)} {found[i]}, {e.type(kind)} {old}")
+                value = e.put(f"select {flag} {take}, {e.type(kind)} {results[i]}, {e.type(kind)} {old}")
                 after.append((self._slot(place), k, kind, value))
         for value in after:
             e.store_at(*value)
         self.take = take
         for stride in sorted(set(self.loop.task.strides)):
-            self._record(found, self._one(found, turn.index), stride)
+            self._record(results, self._one(results, turn.index), stride)
         return more
 
-    def _record(self, found, index, stride: int) -> None:
+    def _record(self, results, index, stride: int) -> None:
         """Rows of the records of which one turn in so many is written."""
         e, strides = self.e, self.loop.task.strides
         for lane in range(self.width):
@@ -178,9 +178,9 @@ class _LoopText:
                 rest = e.put(f"urem i64 {turn}, {stride}")
                 is_one = e.put(f"and i1 {is_one}, {e.put(f'icmp eq i64 {rest}, 0')}")
             with_row = []
-            for r, out in enumerate(self.loop.found.written):
+            for r, out in enumerate(self.loop.turn_places.written):
                 if strides[r] == stride:
-                    with_row.append((self.records_after + r, [found[i] for i in self.entries[out]]))
+                    with_row.append((self.records_after + r, [results[i] for i in self.entries[out]]))
             self._write_if(is_one, lane, place, with_row)
 
     def _write_if(self, flag: str, lane: int, place: str, rows: list) -> None:
@@ -196,12 +196,12 @@ class _LoopText:
                 e.store_one(at, k, kind, self._lane(value, lane, kind))
         e.lines += [f"  br label %{on}", f"{on}:"]
 
-    def _rows(self, found: list[str]) -> None:
+    def _rows(self, results: list[str]) -> None:
         """Rows of times that have been passed, one for each lane at a time; ends where there are none."""
-        e, turn = self.e, self.loop.found.rows
+        e, turn = self.e, self.loop.turn_places.rows
         count = self.arrays[self.rows_after].shape[0]
         kind, flag = kind_of(self.arrays[self.times].dtype), e.type("b1")
-        until = self._one(found, turn.until)
+        until = self._one(results, turn.until)
         self._begin("rows")
         saved = e.load_at("%saved", 0, "i4")
         places, times = [], []
@@ -215,11 +215,11 @@ class _LoopText:
         time = self._vector(times, kind)
         some_left = e.put(f"icmp ult {e.type('i4')} {saved}, {e.constant(count, 'i4')}")
         is_passed = e.put(f"fcmp ole {e.type(kind)} {time}, {until}")
-        kept = self._both(self.take, self._one(found, turn.kept))
+        kept = self._both(self.take, self._one(results, turn.kept))
         passed = self._both(kept, self._both(some_left, is_passed))
         e.lines.append(f"  br i1 {self._any(passed)}, label %row, label %all.passed")
         e.lines.append("row:")
-        dense = [[found[i] for i in self.entries[out]] for out in jax.tree.leaves(turn.dense)]
+        dense = [[results[i] for i in self.entries[out]] for out in jax.tree.leaves(turn.dense)]
 
         def load(place, entry, kind):
             return time if place == 0 else dense[place - 1][entry]
@@ -240,8 +240,8 @@ class _LoopText:
         self.labels += 1
         return f"{name}{self.labels}"
 
-    def _one(self, found, out: int) -> str:
-        return found[self.entries[out][0]]
+    def _one(self, results, out: int) -> str:
+        return results[self.entries[out][0]]
 
     def _both(self, a: str, b: str) -> str:
         return self.e.put(f"and {self.e.type('b1')} {a}, {b}")

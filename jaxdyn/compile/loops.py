@@ -23,7 +23,7 @@ from jaxdyn.compile.sharding import varying_alike
 
 
 class Turn(NamedTuple):
-    """What a turn of the loop found.
+    """The results of a turn of the loop.
 
     - `state`: the next one. `active`: whether the sample took part; if not, its state stays as it is. `more`: whether it goes on.
     - `rows`: what decides about rows, if there are any. `index`: of the turn, from zero on; `written`: a row for each record.
@@ -93,18 +93,18 @@ def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[C
     given, carry = jax.tree.map(jnp.asarray, (given, carry))
     read = tuple(jnp.zeros(x.shape[1:], x.dtype) for x in given.tables)
     turn_args = constants, carry.state, read
-    leaves, found = program_of(task.turn, task.static, tree, turn_args, calls=True, served=True)
-    if isinstance(found, str):
+    leaves, expanded = program_of(task.turn, task.static, tree, turn_args, calls=True, served=True)
+    if isinstance(expanded, str):
         return None
-    program, structure = found
+    program, structure = expanded
     row = None
     if task.row is not None:
         turn = jax.tree.unflatten(structure, range(structure.num_leaves))
         dense = [jnp.zeros(*program.outputs[i]) for i in turn.rows.dense]
-        found = program_of(task.row, task.of_row, None, (jnp.zeros((), given.times.dtype), *dense))[1]
-        if isinstance(found, str):
+        expanded = program_of(task.row, task.of_row, None, (jnp.zeros((), given.times.dtype), *dense))[1]
+        if isinstance(expanded, str):
             return None
-        row = found[0]
+        row = expanded[0]
     traced, known = partition_traced(tree)
     loop = _loop(task, program, row, structure, known, len(traced), _Form.of((constants, given, carry)))
     leaves = leaves[: len(leaves) - len(read)]
@@ -142,7 +142,7 @@ class Loop:
 
     def __init__(self, task: Task, turn: Program, row, structure, known: Known, count: int, form: _Form):
         self.task, self.turn, self.row, self.known, self.count, self.form = task, turn, row, known, count, form
-        self.found: Turn = jax.tree.unflatten(structure, range(structure.num_leaves))
+        self.turn_places: Turn = jax.tree.unflatten(structure, range(structure.num_leaves))
         numbered = jax.tree.unflatten(form.structure, range(len(form.arrays)))
         self.given, self.carry = numbered[1:]
         self.states = len(jax.tree.leaves(self.carry.state))
@@ -168,7 +168,7 @@ class Loop:
         """As of a `Program`."""
         sizes = [(x.size, x.dtype.name) for x in (*self.inputs, *self.outputs)]
         row = None if self.row is None else self.row.digest
-        return f"loop {self.turn.digest} {row} {sizes} {self.task.strides} {self.found} {self.given}"
+        return f"loop {self.turn.digest} {row} {sizes} {self.task.strides} {self.turn_places} {self.given}"
 
     @property
     def cost(self) -> int:

@@ -55,14 +55,14 @@ class Code:
     def __init__(self, text: str, stored: bool = True):
         initialize()
         self.key = key_of(text)
-        code = _read(self.key) if stored else None
-        if code is None:
-            code = _compiled(text)
+        binary = _read(self.key) if stored else None
+        if binary is None:
+            binary = _compiled(text)
             if stored:
-                _write(self.key, code)
+                _write(self.key, binary)
         # The engine is given the object file alone: it would keep the text that it compiles for as long as it lives.
         self.engine = llvm.create_mcjit_compiler(_module("", machine := target_machine()), machine)
-        self.engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        self.engine.add_object_file(llvm.ObjectFileRef.from_data(binary))
         self.engine.finalize_object()
 
     def address(self, name: str) -> int:
@@ -119,10 +119,10 @@ def _path(key: bytes) -> Path:
 def _read(key: bytes) -> bytes | None:
     try:
         path = _path(key)
-        found = path.read_bytes()
+        binary = path.read_bytes()
     except (OSError, RuntimeError):  # a home that cannot be determined is a RuntimeError
         return None
-    code, checksum = found[:-_CHECKSUM_BYTES], found[-_CHECKSUM_BYTES:]
+    code, checksum = binary[:-_CHECKSUM_BYTES], binary[-_CHECKSUM_BYTES:]
     if hashlib.sha256(code).digest() != checksum:
         logger.warning("jaxdyn: %s is damaged and is built again", path)
         return None

@@ -88,10 +88,10 @@ class Program:
 
     def counts(self) -> dict[str, int]:
         """Number of operations of each kind."""
-        found: dict[str, int] = {}
+        counts_by_kind: dict[str, int] = {}
         for x in self.operations:
-            found[x.op] = found.get(x.op, 0) + 1
-        return found
+            counts_by_kind[x.op] = counts_by_kind.get(x.op, 0) + 1
+        return counts_by_kind
 
 
 COMPARISONS: dict[str, Callable] = {

@@ -24,7 +24,7 @@ from jaxdyn.compile.known import partition_traced
 from jaxdyn.compile.mode import is_expanding
 from jaxdyn.compile.sharding import varying_alike
 
-AT_ONCE = 32  # samples that are computed again together
+SAMPLES_AT_ONCE = 32  # samples that are computed again together
 
 _rank_safe: contextvars.ContextVar[bool] = contextvars.ContextVar("jaxdyn_rank_safe", default=False)
 
@@ -65,21 +65,21 @@ def rank_safe(function: Callable) -> Callable:
     return call
 
 
-def recompute_unless(served, again: Callable, found, args: tuple):
-    """`found`, or again(*args), traced `rank_safe`, where a sample is not served; in a batch a few of those at a time.
+def recompute_unless(served, again: Callable, values, args: tuple):
+    """`values`, or again(*args), traced `rank_safe`, where a sample is not served; in a batch a few of those at a time.
 
     `served` is True where every sample is, and `again` is not in the program then; else an array (). `again` depends on nothing
     traced but `args`. Without derivatives.
     """
-    return found if served is True else _one(rank_safe(again))(~served, found, args)
+    return values if served is True else _one(rank_safe(again))(~served, values, args)
 
 
-def repair_flagged(flag, careful: Callable, fast: Callable, found: tuple, args: tuple):
-    """`found` where the flag () is not set, else `careful(*args)`; in a batch only the samples that need it, a few at a time.
+def repair_flagged(flag, careful: Callable, fast: Callable, values: tuple, args: tuple):
+    """`values` where the flag () is not set, else `careful(*args)`; in a batch only the samples that need it, a few at a time.
 
     **Arguments:**
 
-    - `careful(*args)` -> what `found` is: a pair of pytrees, of which the first is differentiated. It depends on nothing traced
+    - `careful(*args)` -> what `values` is: a pair of pytrees, of which the first is differentiated. It depends on nothing traced
       but `args`.
     - `fast(*args)` -> found[0], whose derivatives serve where the flag is not set.
 
@@ -90,11 +90,11 @@ def repair_flagged(flag, careful: Callable, fast: Callable, found: tuple, args: 
     and the program knows it (`jaxdyn.compile.run(..., served=True)`).
     """
     if is_expanding():
-        return jax.tree.map(lambda x: unless(flag, x) if jnp.issubdtype(x.dtype, jnp.floating) else x, found)
+        return jax.tree.map(lambda x: unless(flag, x) if jnp.issubdtype(x.dtype, jnp.floating) else x, values)
 
     @jax.custom_jvp
-    def run(flag, found, args):
-        return _one(careful)(flag, found, args)
+    def run(flag, values, args):
+        return _one(careful)(flag, values, args)
 
     @run.defjvp
     def _(primals, tangents):
@@ -107,7 +107,7 @@ def repair_flagged(flag, careful: Callable, fast: Callable, found: tuple, args: 
         step = lax.cond(any_in_batch(flag), by(lambda *args: careful(*args)[0]), by(fast))
         return run(*primals), (step, plain_step)
 
-    return run(flag, lax.stop_gradient(found), args)
+    return run(flag, lax.stop_gradient(values), args)
 
 
 def run_repaired(function: Callable, tree, *args, static: tuple = ()):
@@ -115,9 +115,9 @@ def run_repaired(function: Callable, tree, *args, static: tuple = ()):
 
     **Arguments:** as of `run`. Only floats that the function returns are differentiated.
     """
-    found, served = run(function, tree, *args, static=static, served=True)
+    values, served = run(function, tree, *args, static=static, served=True)
     if served is True:
-        return found
+        return values
     traced, known = partition_traced(tree)
 
     def careful(traced, args):
@@ -128,20 +128,20 @@ def run_repaired(function: Callable, tree, *args, static: tuple = ()):
 
     # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
     careful = jax.checkpoint(careful, prevent_cse=False)
-    return repair_flagged(~served, careful, fast, (found, ()), (traced, args))[0]
+    return repair_flagged(~served, careful, fast, (values, ()), (traced, args))[0]
 
 
 def _one(careful: Callable):
     @custom_vmap
-    def one(flag, found, args):
-        return lax.cond(flag, lambda: _like(careful(*args), found), lambda: found)
+    def one(flag, values, args):
+        return lax.cond(flag, lambda: _like(careful(*args), values), lambda: values)
 
     @one.def_vmap
-    def _(size, batched, flag, found, args):
+    def _(size, batched, flag, values, args):
         leaves, structure = jax.tree.flatten(args)
         axes = [0 if varies else None for varies in jax.tree.leaves(batched[2])]
-        flag, found = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, found), tuple(batched[:2]))
-        fixed = _many(lambda *leaves: careful(*jax.tree.unflatten(structure, leaves)), axes)(flag, found, leaves)
+        flag, values = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, values), tuple(batched[:2]))
+        fixed = _many(lambda *leaves: careful(*jax.tree.unflatten(structure, leaves)), axes)(flag, values, leaves)
         return fixed, jax.tree.map(lambda _: True, fixed)
 
     def alike(*args):
@@ -154,39 +154,40 @@ def _one(careful: Callable):
 def _many(careful: Callable, axes: list):
     """The same for samples along the leading axis; `axes` says which of the arguments have it."""
 
-    def some(flag, found, args):
+    def some(flag, values, args):
         size = flag.shape[0]
-        count = min(AT_ONCE, size) if isinstance(size, int) else AT_ONCE  # `jax.export` has sizes without a number
+        # `jax.export` has sizes without a number.
+        count = min(SAMPLES_AT_ONCE, size) if isinstance(size, int) else SAMPLES_AT_ONCE
         places = jnp.nonzero(flag, size=size + count, fill_value=size)[0]
 
-        def mend(i, found):
+        def repair(i, values):
             here = lax.dynamic_slice_in_dim(places, i * count, count)
             taken = [x if axis is None else x.at[here].get(mode="clip") for x, axis in zip(args, axes, strict=True)]
-            new = _like(jax.vmap(careful, axes)(*taken), found)
-            return jax.tree.map(lambda old, new: old.at[here].set(new, mode="drop"), found, new)
+            new = _like(jax.vmap(careful, axes)(*taken), values)
+            return jax.tree.map(lambda old, new: old.at[here].set(new, mode="drop"), values, new)
 
-        return lax.fori_loop(0, (jnp.sum(flag) + count - 1) // count, mend, found)
+        return lax.fori_loop(0, (jnp.sum(flag) + count - 1) // count, repair, values)
 
     @custom_vmap
-    def many(flag, found, args):
+    def many(flag, values, args):
         # A branch, as to look for places takes longer than the dynamics, and XLA takes out of a loop what does not change.
-        return lax.cond(jnp.any(flag), some, lambda flag, found, args: found, flag, found, args)
+        return lax.cond(jnp.any(flag), some, lambda flag, values, args: values, flag, values, args)
 
     @many.def_vmap
-    def _(size, batched, flag, found, args):
-        flag, found = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, found), tuple(batched[:2]))
+    def _(size, batched, flag, values, args):
+        flag, values = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, values), tuple(batched[:2]))
         shape = flag.shape
         flat, over = _along_one_axis(args, axes, batched[2], shape)
-        flag, found = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (flag, found))
-        found = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), _many(careful, over)(flag, found, flat))
-        return found, jax.tree.map(lambda _: True, found)
+        flag, values = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (flag, values))
+        values = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), _many(careful, over)(flag, values, flat))
+        return values, jax.tree.map(lambda _: True, values)
 
     return many
 
 
-def _like(new, found):
-    """The same arrays with the dtypes of `found`, varying along the manual axes of meshes along which those do."""
-    return jax.tree.map(lambda x, y: varying_alike([jnp.asarray(x, y.dtype), y])[0], new, found)
+def _like(new, values):
+    """The same arrays with the dtypes of `values`, varying along the manual axes of meshes along which those do."""
+    return jax.tree.map(lambda x, y: varying_alike([jnp.asarray(x, y.dtype), y])[0], new, values)
 
 
 def _along_one_axis(args, axes, batched, shape):

@@ -74,8 +74,10 @@ def attributes(avals: Sequence, results: Sequence) -> dict | None:
         last = sdy.DimMappingAttr.get(factor_indices=[len(sizes) - 1])
         return sdy.TensorMappingAttr.get(dim_mappings=[*batch, last] if x.ndim > 1 else [last])
 
-    given, found = [axes(x) for x in avals], [axes(x) for x in results]
-    rule = sdy.OpShardingRuleAttr.get(factor_sizes=sizes, operand_mappings=given, result_mappings=found, is_custom=True)
+    given, results_axes = [axes(x) for x in avals], [axes(x) for x in results]
+    rule = sdy.OpShardingRuleAttr.get(
+        factor_sizes=sizes, operand_mappings=given, result_mappings=results_axes, is_custom=True
+    )
     return {
         "mhlo.frontend_attributes": mlir.ir_attribute({"num_batch_dims": str(len(lead))}),
         "sdy.sharding_rule": rule,

@@ -67,8 +67,8 @@ def set_threads(count: int | None) -> None:
 def interface_version() -> tuple[int, int]:
     """Version of the FFI of the jaxlib that is installed."""
     text = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
-    found = [re.search(rf"define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
-    major, minor = (-1 if x is None else int(x.group(1)) for x in found)
+    matches = [re.search(rf"define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
+    major, minor = (-1 if x is None else int(x.group(1)) for x in matches)
     return major, minor
 
 

@@ -18,7 +18,7 @@ from jaxdyn.constraints.rank import tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, openness, row_limits
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, check_state, or_zeros
 from jaxdyn.model.tree import Model, difference
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, as_scene
@@ -46,7 +46,7 @@ def assemble(
     scene: Scene,
     q: Float[Array, " nq"],
     v: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     hold: Mapping[str, Any] | None = None,
     guesses: int = 16,
@@ -83,21 +83,21 @@ def assemble(
         raise ValueError(f"guesses is {guesses!r}; give how many configurations to start from, at least 1")
     v = or_zeros(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
-    held = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
-    layout(held)  # refuses joints that do not exist
-    concrete = is_concrete(held, q, v, t)
-    found = _assemble(held, q, v, t, rank_tol, scene if hold else None)
-    if concrete and not bool(found.success):
-        found = _from_elsewhere(
-            found, guesses, lambda q: _assemble(held, q, v, t, rank_tol, scene if hold else None), held, q
+    locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
+    layout(locked)  # refuses joints that do not exist
+    concrete = is_concrete(locked, q, v, t)
+    assembly = _assemble(locked, q, v, t, rank_tol, scene if hold else None)
+    if concrete and not bool(assembly.success):
+        assembly = _from_elsewhere(
+            assembly, guesses, lambda q: _assemble(locked, q, v, t, rank_tol, scene if hold else None), locked, q
         )
-    if concrete and (throw is None or throw) and not bool(found.success):
-        left = open_constraints(held, found.q, found.v, t, _closed_to(q.dtype))
+    if concrete and (throw is None or throw) and not bool(assembly.success):
+        left = open_constraints(locked, assembly.q, assembly.v, t, _closed_to(q.dtype))
         tried = f" (nor are they from {guesses - 1} configurations around it)" if guesses > 1 else ""
         raise ValueError(f"not assembled: {left}{tried}; give a better guess")
     if throw and not concrete:
-        found = found.result.error_if(found, found.result != RESULTS.successful)
-    return found
+        assembly = assembly.result.error_if(assembly, assembly.result != RESULTS.successful)
+    return assembly
 
 
 def _closed_to(dtype) -> float:
@@ -105,8 +105,8 @@ def _closed_to(dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.7
 
 
-def _from_elsewhere(found: Assembly, guesses: int, assembled: Callable, scene: Scene, q) -> Assembly:
-    """The first success from configurations around q, or what was found at first."""
+def _from_elsewhere(assembly: Assembly, guesses: int, assembled: Callable, scene: Scene, q) -> Assembly:
+    """The first assembly that succeeds from configurations around q, or else the first one."""
     sizes, _ = coordinate_sizes(scene.system, q.dtype)
     chance = np.random.default_rng(0)
     for tried in range(1, guesses):
@@ -115,18 +115,18 @@ def _from_elsewhere(found: Assembly, guesses: int, assembled: Callable, scene: S
         other = assembled(displace(scene.system, q, step))
         if bool(other.success):
             return Assembly(other.q, other.v, other.residual, other.result, tried + 1)
-    return found
+    return assembly
 
 
 @specialized
-def _assemble(held, q, v, t, rank_tol, scene):
-    """The scene `held` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
-    if holonomic_rows(layout(held)).size:
-        q = _closed(Scene(held.system, held.constraints), q, t, rank_tol)
+def _assemble(locked, q, v, t, rank_tol, scene):
+    """The scene `locked` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
+    if holonomic_rows(layout(locked)).size:
+        q = _closed(Scene(locked.system, locked.constraints), q, t, rank_tol)
     limit, good = _closed_to(q.dtype), jnp.asarray(True)
     if scene is not None:
-        good = openness(held, q, _with_velocity(held, q, v, t, rank_tol), t, limit) <= 1.0
-    scene = held if scene is None else scene
+        good = openness(locked, q, _with_velocity(locked, q, v, t, rank_tol), t, limit) <= 1.0
+    scene = locked if scene is None else scene
     v = _with_velocity(scene, q, v, t, rank_tol)
     residual = _sizes(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
     good = good & (openness(scene, q, v, t, limit) <= 1.0)
@@ -152,7 +152,7 @@ def _closed(scene, q, t, rank_tol):
         place = lax.stop_gradient(solve(fixed, guess, frozen))
         e = difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
         moved = displace(scene.system, q, _stationary(scene, q, t, e, rank_tol))
-        # The way from guess to place and back again costs digits, which the place itself has not lost.
+        # Going from the guess to the solution and back again costs digits that the solution itself has.
         return retract(scene.system, place + (moved - lax.stop_gradient(moved)))
 
     def tangent(scene, q, t, steps):
@@ -214,13 +214,13 @@ def _stationary(scene, guess, t, e, rank_tol):
         matrix = jax.jacfwd(linear)(jnp.zeros_like(right))
         H, A = matrix[: scene.nv, : scene.nv], matrix[scene.nv :, : scene.nv]
         B = right_inverse(metric, A, rank_tol)
-        keep = jnp.eye(scene.nv, dtype=A.dtype) - _product(B, A)
+        null_projector = jnp.eye(scene.nv, dtype=A.dtype) - _product(B, A)
         along = _product(B, right[scene.nv :])
         left = right[: scene.nv] - _product(H, along)
         # Across the null space M stands in for H, so that the matrix is regular.
-        across = jnp.eye(scene.nv, dtype=A.dtype) - keep
-        whole = _product(keep.T, _product(H, keep)) + _product(across.T, _product(mass, across))
-        step = along + _product(keep, jnp.linalg.solve(whole, _product(keep.T, left)))
+        across = jnp.eye(scene.nv, dtype=A.dtype) - null_projector
+        whole = _product(null_projector.T, _product(H, null_projector)) + _product(across.T, _product(mass, across))
+        step = along + _product(null_projector, jnp.linalg.solve(whole, _product(null_projector.T, left)))
         return jnp.concatenate([step, _product(B.T, right[: scene.nv] - _product(H, step))])
 
     A = jax.jacrev(residual)(e)
@@ -270,9 +270,9 @@ def open_constraints(scene: Scene, q, v, t: Any = 0.0, relative: float = 0.0) ->
     """In words, which constraints are violated by more than `row_limits`, the worst first; for concrete states."""
     t = jnp.asarray(t, q.dtype)
     phi, psi, *limits = (np.asarray(x) for x in _residuals_and_limits(scene, q, v, t, relative))
-    found, first = [], 0
+    residuals, first = [], 0
     for constraint, place in zip(scene.constraints, layout(scene), strict=True):
-        count = place.slip - place.start
+        count = place.nonholonomic - place.start
         kind = type(constraint).__name__.lower()
         for values, most, rows, words in (
             (phi, limits[0], slice(first, first + count), "open by"),
@@ -280,10 +280,10 @@ def open_constraints(scene: Scene, q, v, t: Any = 0.0, relative: float = 0.0) ->
         ):
             if np.any(np.abs(values[rows]) > most[rows]):
                 size = float(np.max(np.abs(values[rows])))
-                found.append((size, f"{kind} {place.name!r} {words} {size:.3g}"))
+                residuals.append((size, f"{kind} {place.name!r} {words} {size:.3g}"))
         first += count
     # Those that print alike stay in the scene's order, whatever their rounding errors.
-    return ", ".join(text for _, text in sorted(found, key=lambda entry: -float(f"{entry[0]:.3g}"))[:6])
+    return ", ".join(text for _, text in sorted(residuals, key=lambda entry: -float(f"{entry[0]:.3g}"))[:6])
 
 
 @eqx.filter_jit

@@ -1,12 +1,13 @@
 """What a constraint is, and the rows of all constraints of a scene: A(q, t) v = b(q, t), A a = gamma.
 
-A constraint gives up to two functions: a residual phi(q, t) that is to be zero (holonomic part), and a slip velocity
-w(q, v, t), linear in v up to a term without v, that is to be zero (nonholonomic part). Everything else follows by
+A constraint gives up to two functions: a residual phi(q, t) that is to be zero (holonomic part), and a velocity
+residual w(q, v, t), linear in v up to a term without v, that is to be zero (nonholonomic part). Everything else follows by
 `jax.jvp` along the motion, on manifold-valued q too:
 
     psi(q, v, t) = (d/dt phi, w) = A v - b,   A = dpsi/dv,   gamma = -(d/dt psi at a = 0) = -(Adot v) + bdot.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import run
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import batch_hint, check_state, state_dtype
+from jaxdyn.model.arguments import Function, Numbers, batch_hint, check_state, state_dtype
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -28,21 +29,27 @@ class Constraint(eqx.Module):
 
     name: eqx.AbstractVar[str]
 
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        if "slip" in cls.__dict__:  # the method's name up to version 0.1
+            warnings.warn(f"{cls.__name__}.slip is called `velocity` now; rename it", DeprecationWarning, stacklevel=2)
+            cls.velocity = cls.__dict__["slip"]
+
     def position(self, system, q, t):
         """Residual phi(q, t) (nh,) of the holonomic part, or None when there is none."""
         return None
 
-    def slip(self, system, q, v, t):
+    def velocity(self, system, q, v, t):
         """Residual w(q, v, t) (np,) of the nonholonomic part, linear in v, or None when there is none."""
         return None
 
     def sizes(self, system, dtype) -> tuple[int, int]:
-        """Numbers of holonomic and of nonholonomic rows, found without computing anything."""
+        """Numbers of holonomic and of nonholonomic rows, from shapes alone."""
         q, v = (jax.ShapeDtypeStruct((n,), dtype) for n in (system.nq, system.nv))
         t = jax.ShapeDtypeStruct((), dtype)
-        held = eqx.filter_eval_shape(self.position, system, q, t)
-        free = eqx.filter_eval_shape(self.slip, system, q, v, t)
-        return 0 if held is None else held.shape[0], 0 if free is None else free.shape[0]
+        holonomic = eqx.filter_eval_shape(self.position, system, q, t)
+        nonholonomic = eqx.filter_eval_shape(self.velocity, system, q, v, t)
+        return 0 if holonomic is None else holonomic.shape[0], 0 if nonholonomic is None else nonholonomic.shape[0]
 
     def wrench_components(self) -> tuple[int, ...] | None:
         """Where the components of a contact's force (`jd.contact.wrench_basis`) stand among its multipliers, in their order.
@@ -87,7 +94,7 @@ class Holonomic(Constraint):
     with_system: bool = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
-    def __init__(self, phi, with_system: bool = False, name: str | None = None):
+    def __init__(self, phi: Function, with_system: bool = False, name: str | None = None):
         self.name = _own_name(name, phi, "holonomic")
         self.phi = as_pytree(phi, f"constraint {self.name!r}: phi")
         self.with_system = bool(with_system)
@@ -128,7 +135,7 @@ class Pfaffian(Constraint):
         self.b = None if b is None else as_pytree(b, f"constraint {self.name!r}: b")
         self.with_system = bool(with_system)
 
-    def slip(self, system, q, v, t):
+    def velocity(self, system, q, v, t):
         """A v - b, (n,)."""
         place = (system, q, t) if self.with_system else (q, t)
         rows = jnp.asarray(self.A(*place), q.dtype)
@@ -137,15 +144,15 @@ class Pfaffian(Constraint):
             raise ValueError(
                 f"constraint {self.name!r}: A returned shape {rows.shape}, expected (n, {v.shape[0]}) = (n, nv)"
             )
-        slip = _product(rows, v)
+        residual = _product(rows, v)
         if self.b is None:
-            return slip
+            return residual
         b = jnp.atleast_1d(jnp.asarray(self.b(*place), q.dtype))
-        if b.shape != slip.shape:
+        if b.shape != residual.shape:
             raise ValueError(
-                f"constraint {self.name!r}: b returned shape {b.shape}, expected {slip.shape} as A has rows"
+                f"constraint {self.name!r}: b returned shape {b.shape}, expected {residual.shape} as A has rows"
             )
-        return slip - b
+        return residual - b
 
 
 class Rows(NamedTuple):
@@ -165,7 +172,7 @@ class Layout(NamedTuple):
 
     name: str
     start: int
-    slip: int
+    nonholonomic: int
     end: int
 
 
@@ -196,15 +203,15 @@ def layout(scene: Scene) -> tuple[Layout, ...]:
 
 def holonomic_rows(places: Sequence[Layout]) -> np.ndarray:
     """Indices of the rows that are rates of a residual phi, in order."""
-    return np.concatenate([np.arange(place.start, place.slip) for place in places] or [np.zeros(0, int)])
+    return np.concatenate([np.arange(place.start, place.nonholonomic) for place in places] or [np.zeros(0, int)])
 
 
-def slip_rows(places: Sequence[Layout]) -> np.ndarray:
-    """Indices of the rows that are slip velocities, in order."""
-    return np.concatenate([np.arange(place.slip, place.end) for place in places] or [np.zeros(0, int)])
+def nonholonomic_rows(places: Sequence[Layout]) -> np.ndarray:
+    """Indices of the rows that are residuals of velocities and no rates of a phi, in order."""
+    return np.concatenate([np.arange(place.nonholonomic, place.end) for place in places] or [np.zeros(0, int)])
 
 
-def position_residual(scene: Scene, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nh"]:
+def position_residual(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, " nh"]:
     """phi(q, t) of all holonomic parts, stacked in the scene's order; (0,) when there are none."""
     return run(_position_residual, scene, q, jnp.asarray(t, q.dtype))
 
@@ -222,12 +229,12 @@ def velocity_residual(
 
 
 def _velocity_residual(scene: Scene, q, v, t):
-    found, rest, others = _split(scene, q, v, t)
+    values, rest, others = _split(scene, q, v, t)
     if rest:
         velocity = _by_functions(others, q, v, t)
         for i, place in zip(rest, layout(others), strict=True):
-            found[i] = (velocity[place.start : place.end],)
-    return jnp.concatenate([parts[-1] for parts in found])
+            values[i] = (velocity[place.start : place.end],)
+    return jnp.concatenate([parts[-1] for parts in values])
 
 
 def _by_functions(scene: Scene, q, v, t):
@@ -236,34 +243,34 @@ def _by_functions(scene: Scene, q, v, t):
     _, rates = jax.jvp(lambda q, t: _positions(scene, q, t), (q, t), motion)
     parts: list[Any] = []
     for constraint, rate in zip(scene.constraints, rates, strict=True):
-        parts += [part for part in (rate, constraint.slip(scene.system, q, v, t)) if part is not None]
+        parts += [part for part in (rate, constraint.velocity(scene.system, q, v, t)) if part is not None]
     return jnp.concatenate(parts)
 
 
-def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Rows:
+def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Rows:
     """A, gamma and A v - b of all constraints of the scene (see `Rows`)."""
     return run(_rows, scene, q, v, jnp.asarray(t, q.dtype))
 
 
 def _rows(scene: Scene, q, v, t) -> Rows:
-    found, rest, others = _split(scene, q, v, t)
+    blocks, rest, others = _split(scene, q, v, t)
     if rest:
         motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
         velocity, rate = jax.jvp(lambda q, t: _by_functions(others, q, v, t), (q, t), motion)
         A = _by_differentiation(others, q, t)
         for i, place in zip(rest, layout(others), strict=True):
             part = slice(place.start, place.end)
-            found[i] = A[part], -rate[part], velocity[part]
-    return Rows(*(jnp.concatenate(parts) for parts in zip(*found, strict=True)))
+            blocks[i] = A[part], -rate[part], velocity[part]
+    return Rows(*(jnp.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
-def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "nc nv"]:
+def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nc nv"]:
     """A(q, t) (nc, nv) of all constraints: admissible velocities satisfy A v = b, constraint forces are A^T lam.
 
     **Arguments:** `q` (nq,); `t`, s.
 
-    **Returns:** rows in the scene's order, those of a constraint's residual phi before those of its slip. A acts on the
-    velocity v, which is dq/dt only where nq = nv.
+    **Returns:** rows in the scene's order, those of a constraint's residual phi before those of its velocity residual w. A acts
+    on the velocity v, which is dq/dt only where nq = nv.
 
     **Raises:** ValueError for constraints that do not fit the system, and a scene without any.
 
@@ -277,24 +284,24 @@ def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> F
 
 
 def _jacobian(scene: Scene, q, t):
-    found, rest, others = _split(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
+    blocks, rest, others = _split(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
     if rest:
         A = _by_differentiation(others, q, t)
         for i, place in zip(rest, layout(others), strict=True):
-            found[i] = (A[place.start : place.end],)
-    return jnp.concatenate([parts[0] for parts in found])
+            blocks[i] = (A[place.start : place.end],)
+    return jnp.concatenate([parts[0] for parts in blocks])
 
 
 def _split(scene: Scene, q, v, t):
     """A, gamma and velocity of the constraints that give them themselves, which ones do not, and a scene of these."""
     layout(scene)  # refuses what is no constraint, and constraints that do not fit the system
-    found: list[Any] = [None] * len(scene.constraints)
+    results: list[Any] = [None] * len(scene.constraints)
     for places in _grouped(scene):
         members = [scene.constraints[i] for i in places]
         for i, value in zip(places, members[0].grouped_motion(members, scene.system, q, v, t), strict=True):
-            found[i] = value
-    rest = [i for i, value in enumerate(found) if value is None]
-    return found, rest, Scene(scene.system, tuple(scene.constraints[i] for i in rest))
+            results[i] = value
+    rest = [i for i, value in enumerate(results) if value is None]
+    return results, rest, Scene(scene.system, tuple(scene.constraints[i] for i in rest))
 
 
 def _by_differentiation(scene: Scene, q, t):
@@ -305,15 +312,15 @@ def _by_differentiation(scene: Scene, q, t):
 
 def _positions(scene: Scene, q, t) -> list:
     """phi of each constraint (None without a holonomic part), those of one group computed together."""
-    found: list[Any] = [None] * len(scene.constraints)
+    residuals: list[Any] = [None] * len(scene.constraints)
     for i, constraint in enumerate(scene.constraints):
         if constraint.group() is None:
-            found[i] = constraint.position(scene.system, q, t)
+            residuals[i] = constraint.position(scene.system, q, t)
     for places in _grouped(scene):
         members = [scene.constraints[i] for i in places]
         for i, value in zip(places, members[0].grouped_position(members, scene.system, q, t), strict=True):
-            found[i] = value
-    return found
+            residuals[i] = value
+    return residuals
 
 
 def _grouped(scene: Scene):

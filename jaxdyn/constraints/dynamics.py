@@ -22,7 +22,7 @@ from jaxdyn.constraints.rank import checked_tolerance, eps_of, least_pivot, pseu
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, check_state, or_zeros
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_factored
 from jaxdyn.systems.scene import Scene, as_scene, checked_force
@@ -67,6 +67,7 @@ class RESULTS(optimistix.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     no_single_contact = (
         "Surfaces that roll do not touch in one point any more: their relative curvature is not positive."
     )
+    unnormalized_start = "A quaternion of the initial state is not of unit length."
 
 
 # Of optimistix the message of this one is empty, which prints as nothing.
@@ -85,8 +86,10 @@ class Outcome(eqx.Module):
 class ConstrainedDynamics(Outcome):
     """Accelerations and constraint forces of a scene.
 
-    - `acceleration` (nv,); `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for
-      rows in m and N m for rows in rad.
+    - `acceleration` (nv,), the rate of v: of a free or spherical joint that of its body twist, in axes that turn with the body
+      (`jd.frame_acceleration` gives accelerations in world axes).
+    - `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for rows in m and N m for rows
+      in rad.
     - `rank` (): number of independent rows. `result`: one of `RESULTS`; `success`: whether it is `successful`.
     - `layout`: name and place of each constraint's rows.
     """
@@ -114,7 +117,7 @@ def constrained_dynamics(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     method: str = "rank_aware",
     rank_tol: float | None = None,
@@ -157,12 +160,12 @@ def constrained_dynamics(
         return _by_schur(scene, *state, method=method)
     if places[-1].end > scene.nv or is_rank_safe():
         return _by_rank(scene, *state, rank_tol)
-    found = run(_by_pivots, scene, *state, otherwise=_nothing)
-    if found is None and scene.forces:
+    solution = run(_by_pivots, scene, *state, otherwise=_nothing)
+    if solution is None and scene.forces:
         # Forces may be anything. The rest may be a program of numbers without them.
         bare = Scene(scene.system, scene.constraints)
         return constrained_dynamics(bare, q, v, applied(scene, q, v, tau, t), t, rank_tol=rank_tol)
-    return _by_rank(scene, *state, rank_tol) if found is None else _repaired(scene, found, state, rank_tol)
+    return _by_rank(scene, *state, rank_tol) if solution is None else _repaired(scene, solution, state, rank_tol)
 
 
 def _nothing(*_):
@@ -199,24 +202,24 @@ def _judged(scene: Scene, q, quality):
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
 
 
-def _repaired(scene: Scene, found, state, rank_tol) -> ConstrainedDynamics:
-    """`found` = (a, lam, quality of the rows), with the rank-aware solve for the samples whose rows it could not serve."""
-    a, lam, quality = found
+def _repaired(scene: Scene, solution, state, rank_tol) -> ConstrainedDynamics:
+    """`solution` = (a, lam, quality of the rows), with the rank-aware solve for samples whose pivots are too small."""
+    a, lam, quality = solution
     traced, known = partition_traced(scene)
 
-    def careful(traced, state):
+    def by_rank(traced, state):
         q, v, tau, t = state
-        found = _by_rank(known(traced), q, v, tau, t, rank_tol)
-        return (found.acceleration, found.multipliers), (found.rank, found.result)
+        solution = _by_rank(known(traced), q, v, tau, t, rank_tol)
+        return (solution.acceleration, solution.multipliers), (solution.rank, solution.result)
 
     def fast(traced, state):
         return run(_by_pivots, known(traced), *state)[:2]
 
     # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
-    careful = jax.checkpoint(careful, prevent_cse=False)
+    by_rank = jax.checkpoint(by_rank, prevent_cse=False)
     flag = ~(quality > least_pivot(state[0], rank_tol))
     start = (a, lam), _judged(scene, state[0], quality)
-    (a, lam), (rank, result) = repair_flagged(flag, careful, fast, start, (traced, state))
+    (a, lam), (rank, result) = repair_flagged(flag, by_rank, fast, start, (traced, state))
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
 
 
@@ -310,7 +313,9 @@ def _solve_delassus(delassus, wanted, nv: int):
     return solve_factored(factor, wanted), fine
 
 
-def projections(scene: Scene, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None) -> Projections:
+def projections(
+    scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
+) -> Projections:
     """Projections P_T = 1 - M^-1 A^T (A M^-1 A^T)^+ A of velocities and P_omega = P_T^T of forces.
 
     P_T is orthogonal in the metric M and keeps what satisfies A v = 0; P_omega removes every constraint force A^T lam.
@@ -338,7 +343,7 @@ def whitened_rows(scene: Scene, q, t):
 
 
 def second_fundamental_form(
-    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0, *, rank_tol: float | None = None
+    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0, *, rank_tol: float | None = None
 ) -> Float[Array, " nv"]:
     """S(v, v) = (1 - P_T)(a + M^-1 C v): the covariant acceleration that the constraints prescribe.
 

@@ -8,7 +8,8 @@ Campbell, Hausdorff). With D and H the first and second derivative of a residual
 
     velocity = D U,  gamma = -(D U' + H(U, U)),  A_k = D Ad(T_A)^-1 (S_k if k moves B, less S_k if it moves A).
 
-Coordinates that move both frames drop out of A exactly. A slip w(R, p, U), linear in U, has D = dw/dU and gamma = -dw/dt.
+Coordinates that move both frames drop out of A exactly. A velocity residual w(R, p, U), linear in U, has D = dw/dU and
+gamma = -dw/dt.
 """
 
 from collections.abc import Sequence
@@ -31,8 +32,8 @@ from jaxdyn.model.tree import Model
 def frames_on(model: Model, q, bodies: Sequence[str | None], poses, v=None) -> Carried:
     """Frames at the given poses (4, 4) in bodies or named frames (None: the world); with v, their twists too."""
     places, offsets = places_on(model, bodies, poses, q.dtype)
-    found = carried(model, q, places, v)
-    return found._replace(pose=_product(found.pose, offsets))
+    frames = carried(model, q, places, v)
+    return frames._replace(pose=_product(frames.pose, offsets))
 
 
 def places_on(model: Model, bodies: Sequence[str | None], poses, dtype) -> tuple[list[int], Float[Array, "n 4 4"]]:
@@ -53,15 +54,15 @@ def _both_frames(members, system, q, v=None) -> Carried:
 
 
 def _seen_from_a(frames: Carried):
-    """Rotations (n, 3, 3) and positions (n, 3) of frames B seen from frames A, and the way from tree to tree (n, 3).
+    """Rotations (n, 3, 3) and positions (n, 3) of frames B seen from frames A, and the displacement between their trees (n, 3).
 
     Positions are subtracted tree by tree: a robot far from the world's origin loses nothing.
     """
-    n = len(frames.moves) // 2
+    n = len(frames.velocity_mask) // 2
     turned = jnp.swapaxes(frames.pose[:n, :3, :3], 1, 2)
     across = frames.origin[n:] - frames.origin[:n]
-    apart = frames.pose[n:, :3, 3] - frames.pose[:n, :3, 3] + across
-    return _product(turned, frames.pose[n:, :3, :3]), _product(turned, apart[..., None])[..., 0], across
+    between = frames.pose[n:, :3, 3] - frames.pose[:n, :3, 3] + across
+    return _product(turned, frames.pose[n:, :3, :3]), _product(turned, between[..., None])[..., 0], across
 
 
 class Pair(Constraint):
@@ -78,11 +79,11 @@ class Pair(Constraint):
         """The constraint as it was given to the system, where its rows are known by a number alone."""
         return self
 
-    def apart(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Array | None:
+    def pose_residual(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Array | None:
         """Residual (nh,) of the holonomic part, or None without one."""
         return None
 
-    def sliding(self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]) -> Array | None:
+    def twist_residual(self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]) -> Array | None:
         """Residual (np,) of the nonholonomic part, linear in U, or None without one."""
         return None
 
@@ -90,8 +91,8 @@ class Pair(Constraint):
         """The constraint with what it reads from the system and from q itself, beside the poses of its frames."""
         return self
 
-    def likeness(self) -> tuple:
-        """Members of one class with equal likeness differ in numbers alone, and are one batch."""
+    def structure_key(self) -> tuple:
+        """Members of one class with equal keys differ in numbers alone; they are evaluated as one batch."""
         raise NotImplementedError
 
     def group(self):
@@ -102,10 +103,10 @@ class Pair(Constraint):
         """Residual of the holonomic part, (nh,)."""
         return self.grouped_position([self], system, q, t)[0]
 
-    def slip(self, system, q, v, t):
+    def velocity(self, system, q, v, t):
         """Residual of the nonholonomic part, (np,)."""
-        held, free = self.sizes(system, q.dtype)
-        return self.grouped_motion([self], system, q, v, t)[0][2][held:] if free else None
+        holonomic, nonholonomic = self.sizes(system, q.dtype)
+        return self.grouped_motion([self], system, q, v, t)[0][2][holonomic:] if nonholonomic else None
 
     def wrench(self, R, p, lam) -> Float[Array, "6"]:
         """Wrench (f, tau) (6,) on body B for the multipliers lam, at the origin and in the axes of frame A.
@@ -128,15 +129,15 @@ class Pair(Constraint):
 def _positions_of(members: tuple[Pair, ...], system, q) -> list:
     members = tuple(member.at(system, q) for member in members)
     rotation, position = relative_poses(members, system, q)
-    found: list = [None] * len(members)
+    residuals: list = [None] * len(members)
     for index, build, leaves in _batches(members):
         if members[index[0]].sizes(system, q.dtype)[0]:
-            values = jax.vmap(lambda leaves, R, p, build=build: build(leaves).apart(R, p))(
+            values = jax.vmap(lambda leaves, R, p, build=build: build(leaves).pose_residual(R, p))(
                 leaves, take(rotation, index), take(position, index)
             )
             for k, i in enumerate(index):
-                found[i] = values[k]
-    return found
+                residuals[i] = values[k]
+    return residuals
 
 
 def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
@@ -150,13 +151,13 @@ def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
     assert frames.twist is not None and frames.bias is not None
     twists = jnp.stack([frames.twist, frames.bias], axis=-1)
     moved_a, moved_b = _product(by_a, twists[:n]), _product(by_b, twists[n:])
-    apart = moved_b - moved_a
-    turning = apart[:, :, 1] - jax.vmap(se3.ad_apply)(moved_a[:, :, 0], moved_b[:, :, 0])
-    moves_a, moves_b = frames.moves[:n], frames.moves[n:]
-    sides = ((1, moves_b & ~moves_a, by_b), (-1, moves_a & ~moves_b, by_a))
-    found: list = [None] * n
+    relative = moved_b - moved_a
+    turning = relative[:, :, 1] - jax.vmap(se3.ad_apply)(moved_a[:, :, 0], moved_b[:, :, 0])
+    moved_by_a, moved_by_b = frames.velocity_mask[:n], frames.velocity_mask[n:]
+    sides = ((1, moved_by_b & ~moved_by_a, by_b), (-1, moved_by_a & ~moved_by_b, by_a))
+    motions: list = [None] * n
     for index, build, leaves in _batches(members):
-        at = [take(x, index) for x in (rotation, position, apart[:, :, 0], turning)]
+        at = [take(x, index) for x in (rotation, position, relative[:, :, 0], turning)]
         rates = jax.vmap(lambda leaves, *at, build=build: _rates(build(leaves), *at))
         D, gamma, velocity = rates(leaves, *at)
         columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
@@ -168,8 +169,8 @@ def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
             wide = jnp.zeros((*D.shape[:2], system.nv), q.dtype)
             columns = wide.at[:, :, frames.coordinates].set(columns)
         for k, i in enumerate(index):
-            found[i] = columns[k], gamma[k], velocity[k]
-    return found
+            motions[i] = columns[k], gamma[k], velocity[k]
+    return motions
 
 
 # A program that asks many times, as steps with projections do, traces each of these once. A nested `jit` would hide what is
@@ -195,21 +196,21 @@ def relative_motions(members, system, q, v):
 
 def each(members: Sequence[Pair], function, *rows) -> list:
     """function(member, row of each of `rows`) for every constraint, those that differ in numbers alone as one batch."""
-    found: list = [None] * len(members)
+    motions: list = [None] * len(members)
     for index, build, leaves in _batches(members):
         values = jax.vmap(lambda leaves, *at, build=build: function(build(leaves), *at))(
             leaves, *(take(x, index) for x in rows)
         )
         for k, i in enumerate(index):
-            found[i] = jax.tree.map(lambda x, k=k: x[k], values)
-    return found
+            motions[i] = jax.tree.map(lambda x, k=k: x[k], values)
+    return motions
 
 
 def _batches(members: Sequence[Pair]):
     """Members that differ in numbers alone: their indices, a function that makes one of them of its numbers, all numbers."""
     sets: dict = {}
     for i, member in enumerate(members):
-        sets.setdefault((type(member), member.likeness()), []).append(i)
+        sets.setdefault((type(member), member.structure_key()), []).append(i)
     for places in sets.values():
         structure = jax.tree.structure(members[places[0]])
         leaves = [jnp.stack(x) for x in zip(*(jax.tree.leaves(members[i]) for i in places), strict=True)]
@@ -230,10 +231,10 @@ def displaced(R, p, twist):
 def _directions(pair: Pair, R, p) -> Float[Array, "r 6"]:
     """Rows D (r, 6): the rates of the residuals are D U."""
     zero = jnp.zeros((6,), p.dtype)
-    held = jax.eval_shape(pair.apart, R, p)
-    parts = [] if held is None else [jax.jacfwd(lambda twist: pair.apart(*displaced(R, p, twist)))(zero)]
-    if jax.eval_shape(pair.sliding, R, p, zero) is not None:
-        parts.append(jax.jacfwd(lambda U: pair.sliding(R, p, U))(zero))
+    residual = jax.eval_shape(pair.pose_residual, R, p)
+    parts = [] if residual is None else [jax.jacfwd(lambda twist: pair.pose_residual(*displaced(R, p, twist)))(zero)]
+    if jax.eval_shape(pair.twist_residual, R, p, zero) is not None:
+        parts.append(jax.jacfwd(lambda U: pair.twist_residual(R, p, U))(zero))
     return jnp.concatenate(parts)
 
 
@@ -242,12 +243,12 @@ def _rates(pair: Pair, R, p, U, bend):
     zero = jnp.zeros((6,), U.dtype)
     D = _directions(pair, R, p)
     parts = []
-    if jax.eval_shape(pair.apart, R, p) is not None:
+    if jax.eval_shape(pair.pose_residual, R, p) is not None:
 
         def moved(twist):
-            return pair.apart(*displaced(R, p, twist))
+            return pair.pose_residual(*displaced(R, p, twist))
 
         parts.append(jax.jvp(lambda twist: jax.jvp(moved, (twist,), (U,))[1], (zero,), (U,))[1])
-    if jax.eval_shape(pair.sliding, R, p, U) is not None:
-        parts.append(jax.jvp(lambda twist: pair.sliding(*displaced(R, p, twist), U), (zero,), (U,))[1])
+    if jax.eval_shape(pair.twist_residual, R, p, U) is not None:
+        parts.append(jax.jvp(lambda twist: pair.twist_residual(*displaced(R, p, twist), U), (zero,), (U,))[1])
     return D, -(_product(D, bend) + jnp.concatenate(parts)), _product(D, U)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
-from jaxdyn.model.arguments import pose_leaf
+from jaxdyn.model.arguments import Numbers, pose_leaf
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_difference
 from jaxdyn.model.names import body_index
 from jaxdyn.model.tree import Model
@@ -109,20 +109,20 @@ class Loop(Pair):
         """As given."""
         return (self.body_a, self.pose_a), (self.body_b, self.pose_b)
 
-    def likeness(self):
+    def structure_key(self):
         """The joint."""
         return self.joint, self.in_plane
 
-    def apart(self, R, p):
+    def pose_residual(self, R, p):
         """Residual of the joint, (n,)."""
         return self.kind.residual(R, p)
 
 
 def loop(
     body_a: str | None,
-    pose_a,
+    pose_a: Numbers | None,
     body_b: str | None,
-    pose_b,
+    pose_b: Numbers | None,
     joint: str = "revolute",
     *,
     in_plane: bool = False,
@@ -191,18 +191,24 @@ class Distance(Pair):
         """As given."""
         return (self.body_a, self.pose_a), (self.body_b, self.pose_b)
 
-    def likeness(self):
+    def structure_key(self):
         """All are alike."""
         return ()
 
-    def apart(self, R, p):
+    def pose_residual(self, R, p):
         """(|p|^2 - length^2) / (2 length), (1,), m: smooth everywhere, and the change of length to first order."""
         length = self.length.astype(p.dtype)
         return ((jnp.sum(p**2) - length**2) / (2.0 * length))[None]
 
 
 def distance(
-    body_a: str | None, point_a, body_b: str | None, point_b, length: float, *, name: str | None = None
+    body_a: str | None,
+    point_a: Numbers | None,
+    body_b: str | None,
+    point_b: Numbers | None,
+    length: float,
+    *,
+    name: str | None = None,
 ) -> Distance:
     """Hold two points at a distance, as a massless rod with ball joints does.
 
@@ -249,7 +255,7 @@ class Gear(Constraint):
         return (q[starts[0]] - self.ratio.astype(q.dtype) * q[starts[1]] - self.offset.astype(q.dtype))[None]
 
 
-def gear(joint_a: str, joint_b: str, ratio, offset=0.0, *, name: str | None = None) -> Gear:
+def gear(joint_a: str, joint_b: str, ratio: Numbers, offset: Numbers = 0.0, *, name: str | None = None) -> Gear:
     """Couple two joints of one degree of freedom: q_a = ratio q_b + offset.
 
     A prismatic joint with a revolute one is a rack and pinion (ratio in m/rad) or the other way round.
@@ -286,7 +292,7 @@ class JointLock(Constraint):
         return joint_difference(system.topology.kinds[i], self.value.astype(q.dtype), q[system.topology.q_slices[i]])
 
 
-def lock_joint(joint: str, value=0.0, *, name: str | None = None) -> JointLock:
+def lock_joint(joint: str, value: Numbers = 0.0, *, name: str | None = None) -> JointLock:
     """Hold a joint at a value.
 
     **Arguments:** `joint`, its name; `value`, a number (rad or m) or all its coordinates (with a unit quaternion).

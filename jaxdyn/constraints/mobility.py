@@ -1,6 +1,4 @@
-"""How many ways a constrained mechanism can move."""
-
-from typing import Any
+"""The degrees of freedom of a constrained mechanism."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,12 +9,13 @@ from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import checked_tolerance, pseudo_inverse, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state
-from jaxdyn.systems.scene import as_scene
+from jaxdyn.model.arguments import Numbers, check_state
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import SceneLike
 
 
 def degrees_of_freedom(
-    scene: Any, q: Float[Array, " nq"], t=0.0, *, rank_tol: float | None = None
+    scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
 ) -> int | Int[Array, ""]:
     """Degrees of freedom at a configuration: nv minus the rank of the constraints' rows A(q, t).
 
@@ -48,7 +47,7 @@ def degrees_of_freedom(
     return scene.nv - int(rank) if is_concrete(rank) else scene.nv - rank
 
 
-def _scaled_rows(scene: Any, q, t) -> Float[Array, "nc nv"]:
+def _scaled_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     """Rows with distances in units of the mechanism's length, each scaled down to length 1."""
     sizes, length = coordinate_sizes(scene.system, q.dtype)
     A = constraint_jacobian(scene, q, t) * sizes[None]
@@ -56,7 +55,7 @@ def _scaled_rows(scene: Any, q, t) -> Float[Array, "nc nv"]:
     return A / jnp.maximum(jnp.linalg.norm(A, axis=1, keepdims=True), jnp.minimum(length, jnp.ones_like(length)))
 
 
-def nearly_dependent(scene: Any, q: Float[Array, " nq"], below: float = 1e-5) -> float | None:
+def nearly_dependent(scene: SceneLike, q: Float[Array, " nq"], below: float = 1e-5) -> float | None:
     """Largest singular value of the scaled rows, over the largest of all, that is neither rounding nor above `below`.
 
     None where there is none. Such rows say the same as others but for the digits that a file was written with: whether they
@@ -66,7 +65,7 @@ def nearly_dependent(scene: Any, q: Float[Array, " nq"], below: float = 1e-5) ->
     q, t = check_state(scene.system, q=q, t=0.0)
     if not layout(scene):
         return None
-    found = np.linalg.svd(np.asarray(_scaled_rows(scene, q, t), np.float64), compute_uv=False)
-    ratios = found / max(found.max(initial=0.0), np.finfo(float).tiny)
+    singular = np.linalg.svd(np.asarray(_scaled_rows(scene, q, t), np.float64), compute_uv=False)
+    ratios = singular / max(singular.max(initial=0.0), np.finfo(float).tiny)
     doubtful = ratios[(ratios > 64 * float(jnp.finfo(q.dtype).eps)) & (ratios < below)]
     return float(doubtful.max()) if doubtful.size else None

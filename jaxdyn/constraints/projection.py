@@ -60,8 +60,8 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
         def again(scene, q, v, t, *errors):
             return run_repaired(_in_fixed_steps, scene, q, v, t, errors, static=(rank_tol,))
 
-        found, moved = along(again, (scene, q, v, t, *errors), steps)
-        return found, jax.tree.map(jnp.zeros_like, found) if moved is None else moved
+        projected, moved = along(again, (scene, q, v, t, *errors), steps)
+        return projected, jax.tree.map(jnp.zeros_like, projected) if moved is None else moved
 
     errors = lax.stop_gradient(tuple(errors))
     return implicit(Scene(scene.system, scene.constraints), (q, v, t, *errors), project, tangent)
@@ -72,19 +72,19 @@ def _projected(scene: Scene, rank_tol, q, v, t, errors):
     q = retract(scene.system, q)
     if layout(scene)[-1].end > scene.nv or is_rank_safe():
         return _by_rank(scene, rank_tol, q, v, t, errors)
-    found = run(_by_pivots, scene, q, v, t, *errors, otherwise=lambda *_: None)
-    if found is None:
+    projected = run(_by_pivots, scene, q, v, t, *errors, otherwise=lambda *_: None)
+    if projected is None:
         return _by_rank(scene, rank_tol, q, v, t, errors)
-    place, speed, errors_left, more, quality = found
+    place, speed, errors_left, more, quality = projected
     if is_expanding():
         quality = jnp.where(more, jnp.nan, quality)
     else:
 
         def again(q, v, quality):
-            *found, pivots = run(_by_pivots, scene, q, v, t, *errors)
-            return *found, jnp.minimum(quality, pivots)
+            *projected, pivots = run(_by_pivots, scene, q, v, t, *errors)
+            return *projected, jnp.minimum(quality, pivots)
 
-        place, speed, errors_left, quality = _in_rounds(again, found)
+        place, speed, errors_left, quality = _in_rounds(again, projected)
     traced, known = partition_traced(scene)
 
     def careful(traced, q, v, t, errors):
@@ -96,8 +96,8 @@ def _projected(scene: Scene, rank_tol, q, v, t, errors):
     return repair_flagged(flag, careful, lambda *args: careful(*args)[0], start, (traced, q, v, t, errors))[0]
 
 
-def _in_rounds(again: Callable, found):
-    """`found` = (q, v, errors, whether to go on, anything), and again(q, v, anything) until that is not, `_MOST_ROUNDS` in
+def _in_rounds(again: Callable, first):
+    """`first` = (q, v, errors, whether to go on, anything), and again(q, v, anything) until that is not, `_MOST_ROUNDS` in
     all."""
 
     def step(state):
@@ -105,21 +105,21 @@ def _in_rounds(again: Callable, found):
         return count + 1, again(q, v, more)
 
     def unfinished(state):
-        count, found = state
-        return found[3] & (count < _MOST_ROUNDS)
+        count, projected = state
+        return projected[3] & (count < _MOST_ROUNDS)
 
-    q, v, errors, _, anything = lax.while_loop(unfinished, step, (1, tuple(found)))[1]
+    q, v, errors, _, anything = lax.while_loop(unfinished, step, (1, tuple(first)))[1]
     return q, v, errors, anything
 
 
 def _by_rank(scene: Scene, rank_tol, q, v, t, errors):
     """For rows that may depend on each other."""
-    held = holonomic_rows(layout(scene))
+    holonomic = holonomic_rows(layout(scene))
 
     def again(q, v, _):
         metric, Y = run(whitened_rows, scene, q, t)
         every = pseudo_inverse(Y, tolerance(rank_tol, Y))
-        some = every if held.size in (0, Y.shape[1]) else pseudo_inverse(Y[:, held], tolerance(rank_tol, Y))
+        some = every if holonomic.size in (0, Y.shape[1]) else pseudo_inverse(Y[:, holonomic], tolerance(rank_tol, Y))
         return *run(_moved_by_matrices, scene, q, v, t, errors, metric, every, some), ()
 
     return _in_rounds(again, again(q, v, ()))[:3]
@@ -136,7 +136,7 @@ def _moved_by_matrices(scene: Scene, q, v, t, errors, metric, every, some):
 
 def _by_pivots(scene: Scene, q, v, t, *errors):
     """q, v and errors after a few steps, whether a step more would help, and the ratio of the rows' pivots."""
-    held = holonomic_rows(layout(scene))
+    holonomic = holonomic_rows(layout(scene))
     metric, Y = whitened_rows(scene, q, t)
 
     def steps(Y):
@@ -145,9 +145,9 @@ def _by_pivots(scene: Scene, q, v, t, *errors):
 
     every, quality = steps(Y)
     some = every
-    if held.size not in (0, Y.shape[1]):
-        some, of_held = steps(Y[:, held])
-        quality = jnp.minimum(quality, of_held)
+    if holonomic.size not in (0, Y.shape[1]):
+        some, of_holonomic = steps(Y[:, holonomic])
+        quality = jnp.minimum(quality, of_holonomic)
     quality = jnp.where(metric.definite(), quality, jnp.nan)
     return *_moved(scene, q, v, t, errors, every, some), quality
 
@@ -157,9 +157,9 @@ def _moved(scene: Scene, q, v, t, errors, every: Callable, some: Callable):
 
     `every(r)` is the shortest step, in the metric M, that removes the residual r of all rows, `some(r)` of those on positions.
     """
-    held = holonomic_rows(layout(scene))
+    holonomic = holonomic_rows(layout(scene))
     position_left, is_open = jnp.zeros((), q.dtype), jnp.asarray(False)
-    if held.size:
+    if holonomic.size:
         q, position_left, is_open = _closed(scene, q, some, lambda place: position_residual(scene, place, t))
 
     def velocity_rows(v):
@@ -168,25 +168,25 @@ def _moved(scene: Scene, q, v, t, errors, every: Callable, some: Callable):
     v, velocity_left, is_slipping = _descend(v, every, velocity_rows, lambda v, step: v - step)
     if errors:
         A = constraint_jacobian(scene, q, t)
-        of_place = some if held.size else None
+        of_place = some if holonomic.size else None
         errors = _allowed(
             errors,
-            (of_place, partial(_product, A[held]), position_left),
+            (of_place, partial(_product, A[holonomic]), position_left),
             (every, partial(_product, A), velocity_left),
         )
     return q, v, errors, is_open | is_slipping
 
 
-def _allowed(errors: tuple, *ways) -> tuple:
+def _allowed(errors: tuple, *corrections) -> tuple:
     """Errors less the least change that removes what they add to the rows, and with what is left open.
 
-    A way is (step, rate of the rows along an error, distance left); its step is None for no rows.
+    A correction is (step, rate of the rows along an error, distance left); its step is None for no rows.
     """
 
     def allowed(error, step, rate, left):
         return error if step is None else enlarged(error - step(rate(error)), left)
 
-    return tuple(allowed(error, *way) for error, way in zip(errors, ways, strict=False))
+    return tuple(allowed(error, *correction) for error, correction in zip(errors, corrections, strict=False))
 
 
 def enlarged(error, by):
@@ -195,7 +195,7 @@ def enlarged(error, by):
 
 
 def _closed(scene: Scene, q, step, residual):
-    """q on the holonomic constraints, about how far it still is from them, and whether another step would bring it closer."""
+    """q on the holonomic constraints, an estimate of its distance from them, and whether another step would reduce it."""
 
     def move(place, change):
         return retract(scene.system, displace(scene.system, place, -change))
@@ -215,11 +215,11 @@ def _descend(x, step, residual, move):
         change = step(r)
         tried = move(x, change)
         left = residual(tried)
-        before, after, way = (jnp.max(jnp.abs(y)) for y in (r, left, change))
+        before, after, size = (jnp.max(jnp.abs(y)) for y in (r, left, change))
         falls = after < before
         # The next step is about this one times what it has left of the residual.
-        more = falls & (way * after > rounding * before)
-        away = jnp.where(falls, way * after / before, jnp.where(before > 0, way, jnp.zeros_like(way)))
+        more = falls & (size * after > rounding * before)
+        away = jnp.where(falls, size * after / before, jnp.where(before > 0, size, jnp.zeros_like(size)))
         return jnp.where(falls, tried, x), jnp.where(falls, left, r), more, away
 
     first = residual(x)
@@ -233,21 +233,21 @@ def _descend(x, step, residual, move):
 def _in_fixed_steps(rank_tol, scene: Scene, q, v, t, errors):
     """The same for derivatives, which are those of the steps as they are."""
     q = retract(scene.system, q)
-    held = holonomic_rows(layout(scene))
+    holonomic = holonomic_rows(layout(scene))
     B = correction(scene, q, t, rank_tol, holonomic=False)
-    B_held = B if held.size in (0, B.shape[1]) else correction(scene, q, t, rank_tol, holonomic=True)
-    apart = jnp.zeros((), q.dtype)
-    if held.size:
+    B_holonomic = B if holonomic.size in (0, B.shape[1]) else correction(scene, q, t, rank_tol, holonomic=True)
+    position_left = jnp.zeros((), q.dtype)
+    if holonomic.size:
 
         def move(place, _):
-            step = _product(B_held, position_residual(scene, place, t))
+            step = _product(B_holonomic, position_residual(scene, place, t))
             return displace(scene.system, place, -step), None
 
         moved, _ = lax.scan(move, q, None, length=_STEPS_DIFFERENTIATED)
         before, after = (position_residual(scene, x, t) for x in (q, moved))
         better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
         q = jnp.where(better, retract(scene.system, moved), q)
-        apart = jnp.max(jnp.abs(_product(B_held, jnp.where(better, after, before))))
+        position_left = jnp.max(jnp.abs(_product(B_holonomic, jnp.where(better, after, before))))
 
     def slow(v, _):
         return v - _product(B, velocity_residual(scene, q, v, t)), None
@@ -256,8 +256,14 @@ def _in_fixed_steps(rank_tol, scene: Scene, q, v, t, errors):
     before, after = (velocity_residual(scene, q, x, t) for x in (v, projected))
     better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
     if errors:
-        A, slip = constraint_jacobian(scene, q, t), jnp.max(jnp.abs(_product(B, jnp.where(better, after, before))))
-        of_place = partial(_product, B_held) if held.size else None
-        ways = (of_place, partial(_product, A[held]), apart), (partial(_product, B), partial(_product, A), slip)
-        errors = lax.stop_gradient(_allowed(errors, *ways))
+        A, velocity_left = (
+            constraint_jacobian(scene, q, t),
+            jnp.max(jnp.abs(_product(B, jnp.where(better, after, before)))),
+        )
+        of_place = partial(_product, B_holonomic) if holonomic.size else None
+        corrections = (
+            (of_place, partial(_product, A[holonomic]), position_left),
+            (partial(_product, B), partial(_product, A), velocity_left),
+        )
+        errors = lax.stop_gradient(_allowed(errors, *corrections))
     return q, jnp.where(better, projected, v), errors

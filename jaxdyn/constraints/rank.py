@@ -14,7 +14,7 @@ from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_factored
 
 # Operations of the normal equations up to which they are written out: LLVM takes 50 to 100 microseconds for each of them.
-_MOST_STRAIGHT = 10_000
+_MAX_ROWS_INLINE = 10_000
 
 
 def checked_tolerance(rank_tol: float | None) -> float | None:
@@ -37,7 +37,7 @@ def eps_of(like) -> float:
 
 
 def least_pivot(like, rank_tol: float | None) -> float:
-    """Ratio of the pivots of A M^-1 A^T above which the rows are independent whatever the rounding, and Cholesky serves."""
+    """Ratio of the pivots of A M^-1 A^T above which rounding cannot make the rows dependent, so that Cholesky is accurate."""
     return max(eps_of(like) ** 0.4, (100 * tolerance(rank_tol, like)) ** 2)
 
 
@@ -63,10 +63,10 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = Fa
     if is_expanding():  # which has no branches: other samples are computed again
         inverse, quality = _by_normal_equations(None, Y)
         return unless(~(quality > least_pivot(Y, rank_tol)), inverse)
-    found: Any = run(_by_normal_equations, None, Y, most=_MOST_STRAIGHT, otherwise=lambda *_: None)
-    if found is None:
+    inverse_and_quality: Any = run(_by_normal_equations, None, Y, most=_MAX_ROWS_INLINE, otherwise=lambda *_: None)
+    if inverse_and_quality is None:
         return pseudo_inverse_by_rotations(Y, rank_tol)
-    inverse, quality = found
+    inverse, quality = inverse_and_quality
     doubtful = any_in_batch(~(quality > least_pivot(Y, rank_tol)))
     return lax.cond(doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
 

@@ -7,12 +7,12 @@ from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.frames import Pair, places_on, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_shapes, check_state
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 
 
 def constraint_forces(
-    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t=0.0
+    scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t: Numbers = 0.0
 ) -> dict[str, Float[Array, " nv"]]:
     """Generalised force A_i^T lam_i of each constraint on the system, by name.
 
@@ -25,8 +25,8 @@ def constraint_forces(
     Source: EQUATIONS section 7, M a + h = tau + A^T lam.
 
     ```python
-    found = jd.constrained_dynamics(scene, q, v)
-    pushes = jd.constraint_forces(scene, q, found.multipliers)
+    dynamics = jd.constrained_dynamics(scene, q, v)
+    pushes = jd.constraint_forces(scene, q, dynamics.multipliers)
     ```
     """
     scene = as_scene(scene)
@@ -52,7 +52,7 @@ def constraint_wrenches(
 
     Source: EQUATIONS sections 3 (wrenches) and 7.
     """
-    scene, found = as_scene(scene), {}
+    scene, wrenches = as_scene(scene), {}
     (q,) = check_state(scene.system, q=q)
     places = layout(scene)
     multipliers = _checked_multipliers(multipliers, places[-1].end if places else 0, q.dtype)
@@ -60,8 +60,8 @@ def constraint_wrenches(
         if isinstance(constraint, Pair):
             constraint = constraint.at(scene.system, q)
             rotation, position = relative_poses([constraint], scene.system, q)
-            found[place.name] = constraint.wrench(rotation[0], position[0], multipliers[place.start : place.end])
-    return found
+            wrenches[place.name] = constraint.wrench(rotation[0], position[0], multipliers[place.start : place.end])
+    return wrenches
 
 
 def body_wrenches(scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"]) -> Float[Array, "nb 6"]:
@@ -80,19 +80,19 @@ def body_wrenches(scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array
     Source: EQUATIONS sections 3 (wrenches) and 7.
 
     ```python
-    found = jd.constrained_dynamics(scene, q, v)
-    pull = jd.body_wrenches(scene, q, found.multipliers)
-    bearings = jd.joint_wrench(scene.system, q, v, found.acceleration, external=pull)
+    dynamics = jd.constrained_dynamics(scene, q, v)
+    pull = jd.body_wrenches(scene, q, dynamics.multipliers)
+    bearings = jd.joint_wrench(scene.system, q, v, dynamics.acceleration, external=pull)
     ```
     """
     scene = as_scene(scene)
     (q,) = check_shapes(scene.system, q=q)
-    found = constraint_wrenches(scene, q, multipliers)
+    wrenches = constraint_wrenches(scene, q, multipliers)
     total = jnp.zeros((scene.system.nb, 6), q.dtype)
     for constraint, place in zip(scene.constraints, layout(scene), strict=True):
         if not isinstance(constraint, Pair):
             continue
-        constraint, wrench = constraint.at(scene.system, q), found[place.name]
+        constraint, wrench = constraint.at(scene.system, q), wrenches[place.name]
         rotation, position = relative_poses([constraint], scene.system, q)
         at_b = se3.AdT_apply(se3.from_parts(rotation[0], position[0]), wrench)
         ends = constraint.ends()

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.lie.so3 import _product, cross
-from jaxdyn.model.arguments import pose_leaf
+from jaxdyn.model.arguments import Numbers, pose_leaf
 
 
 class TouchingPoint(NamedTuple):
@@ -71,21 +71,21 @@ class Touching(Pair):
         slips = self.count
         return (*range(1, 1 + slips), 0, *((1 + slips,) if self.spin else ()))
 
-    def likeness(self):
+    def structure_key(self):
         """Which rows there are."""
         return self.contact, self.spin, self.count
 
-    def apart(self, R, p):
+    def pose_residual(self, R, p):
         """Gap between body and surface, (1,), m; None when the height is not constrained."""
         return self.touching(R, p).gap[None] if self.contact else None
 
-    def sliding(self, R, p, U):
+    def twist_residual(self, R, p, U):
         """Velocities of slipping (m/s), and of spinning (rad/s) where it is resisted."""
         touch = self.touching(R, p)
         if not self.count:
             return jnp.sum(touch.normal * U[3:])[None] if self.spin else None
-        found = _product(touch.directions, U[:3] + cross(U[3:], touch.point))
-        return jnp.concatenate([found, jnp.sum(touch.normal * U[3:])[None]]) if self.spin else found
+        slip = _product(touch.directions, U[:3] + cross(U[3:], touch.point))
+        return jnp.concatenate([slip, jnp.sum(touch.normal * U[3:])[None]]) if self.spin else slip
 
 
 def _unit(i, like):
@@ -130,7 +130,7 @@ class RollingWheel(Touching):
 
     def touching(self, R, p):
         axis, normal = R[:, 2], _unit(2, p)
-        # Down the wheel's plane; for a wheel that lies flat there is no lowest point and any direction serves.
+        # Down the wheel's plane; for a wheel that lies flat there is no lowest point, and any direction is right.
         down = unit_or(axis[2] * axis - normal, -R[:, 0])
         point = p + self.radius.astype(p.dtype) * down
         forward = unit_or(cross(axis, normal), R[:, 1])
@@ -140,10 +140,10 @@ class RollingWheel(Touching):
 
 def rolling_wheel(
     body: str,
-    pose,
-    radius,
+    pose: Numbers | None,
+    radius: Numbers,
     *,
-    plane=None,
+    plane: Numbers | None = None,
     plane_body: str | None = None,
     contact: bool = True,
     lateral: bool = True,
@@ -197,7 +197,13 @@ class KnifeEdge(Touching):
 
 
 def knife_edge(
-    body: str, pose=None, *, plane=None, plane_body: str | None = None, contact: bool = True, name: str | None = None
+    body: str,
+    pose: Numbers | None = None,
+    *,
+    plane: Numbers | None = None,
+    plane_body: str | None = None,
+    contact: bool = True,
+    name: str | None = None,
 ) -> KnifeEdge:
     """A blade (skate, sharp wheel without inertia) that slides along its x axis and not across.
 
@@ -233,7 +239,7 @@ class RollingSphere(Touching):
     spin: bool = eqx.field(static=True)
     count: int = eqx.field(static=True, default=2)
 
-    def likeness(self):
+    def structure_key(self):
         """Which rows there are, and on what."""
         return self.on, self.inside, self.contact, self.spin
 
@@ -255,13 +261,13 @@ class RollingSphere(Touching):
 
 def rolling_sphere(
     body: str,
-    center,
-    radius,
+    center: Numbers | None,
+    radius: Numbers,
     *,
     on: str = "plane",
     surface=None,
     surface_body: str | None = None,
-    surface_radius=None,
+    surface_radius: Numbers | None = None,
     inside: bool = False,
     slip: bool = False,
     spin: bool = False,

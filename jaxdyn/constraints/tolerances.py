@@ -80,6 +80,6 @@ def openness(scene: Scene, q, v, t, relative: float) -> Float[Array, ""]:
 def largest_ratio(relative: float, scene: Scene, q, v, t):
     """`openness` as a function of numbers."""
     limits = row_limits(scene, q, v, t, relative)
-    found = position_residual(scene, q, t), velocity_residual(scene, q, v, t)
-    ratios = jax.tree.map(lambda x, limit: jnp.abs(x) / limit, found, limits)
+    residuals = position_residual(scene, q, t), velocity_residual(scene, q, v, t)
+    ratios = jax.tree.map(lambda x, limit: jnp.abs(x) / limit, residuals, limits)
     return jnp.max(jnp.concatenate(ratios), initial=0.0)

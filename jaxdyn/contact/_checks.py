@@ -3,8 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
+
+from jaxdyn.compile import is_concrete
 
 
 def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[Array, "..."]:
@@ -13,10 +14,10 @@ def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[A
     **Raises:** ValueError for another shape, None in it meaning any size, and for known numbers that are not finite.
     """
     # Known numbers are looked at before they become part of a program that may be traced.
-    known = None if isinstance(value, Tracer) else np.asarray(value)
+    known = np.asarray(value) if is_concrete(value) else None
     if known is not None and known.dtype == object:
         raise ValueError(f"{what} is {value!r}; give numbers")
-    array = value if known is None or isinstance(value, jax.Array) else known
+    array = value if isinstance(value, jax.Array) else jnp.asarray(value) if known is None else known
     if like is not None:
         array = jnp.asarray(array, like)
     elif not jnp.issubdtype(array.dtype, jnp.floating):
@@ -38,7 +39,7 @@ def as_number(value, what: str, unit: str, *, zero: bool, like=None) -> Float[Ar
     **Raises:** ValueError for known numbers below that or not finite.
     """
     array = as_float(value, what, (), like)
-    if not isinstance(value, Tracer):
+    if is_concrete(value):
         number = float(np.asarray(value))
         if not (number >= 0 if zero else number > 0) or number == float("inf"):
             sign = "zero or a positive number" if zero else "a positive number"

@@ -126,8 +126,8 @@ def _start(pattern: Pattern, _, program: Program):
         least = jnp.min(jnp.stack([jnp.min(jordan.depth(v), initial=jnp.inf) for v in groups]))
         size = jnp.maximum(_largest(groups), 1)
         # Far enough from the boundary that the first steps are not cut short.
-        lift = jnp.where(least > 0.1 * size, 0, jnp.maximum(-least, 0) + size)
-        return _zip(lambda v: v + lift * jordan.identity(v), groups)
+        shift = jnp.where(least > 0.1 * size, 0, jnp.maximum(-least, 0) + size)
+        return _zip(lambda v: v + shift * jordan.identity(v), groups)
 
     point = Point(x, inside(slack), inside(_zip(lambda v: -v, slack)))
     return point, *_measured(program, point)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from jaxdyn.compile import is_concrete
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.cones import SIDES, FrictionCone, surface_cone
+from jaxdyn.model.arguments import Numbers
 
 _FIRST_FACES = 8
 _ROUNDS = 60
@@ -54,7 +55,7 @@ class _Rows(NamedTuple):
     kept: np.ndarray
 
 
-def force_closure(G, cones, *, faces: int | None = None, side="inscribed") -> ForceClosure:
+def force_closure(G: Numbers, cones, *, faces: int | None = None, side="inscribed") -> ForceClosure:
     """Whether the grasp with map G has force closure, with a margin, or with a wrench that it cannot resist.
 
     Round cones are taken as they are: a linear program (HiGHS) with faces around them is solved, and faces are added where
@@ -176,16 +177,16 @@ def _widest(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
     right = np.append(np.zeros(len(G)), 1.0)
     cost = np.append(np.zeros(G.shape[1]), -1.0)
     options = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
-    found = None
+    solution = None
     for _ in range(_ROUNDS):
         limits = np.concatenate([above, np.ones((len(above), 1))], 1)
-        found = linprog(cost, limits, np.zeros(len(limits)), equal, right, bounds=(None, None), options=options)
-        if found.status == 2:
+        solution = linprog(cost, limits, np.zeros(len(limits)), equal, right, bounds=(None, None), options=options)
+        if solution.status == 2:
             # No internal forces press at all: the normal force is a combination of the rows of G, n = G^T y.
             return -np.inf, np.zeros(G.shape[1]), np.linalg.lstsq(G.T, rows.normal, rcond=None)[0]
-        if found.status != 0:
-            raise RuntimeError(f"the linear program of force closure was not solved: {found.message}")
-        forces, upper = found.x[:-1], found.x[-1]
+        if solution.status != 0:
+            raise RuntimeError(f"the linear program of force closure was not solved: {solution.message}")
+        forces, upper = solution.x[:-1], solution.x[-1]
         seen = rows.second @ forces
         slopes = np.linalg.norm(seen[:, 1:], axis=1)
         margins = np.concatenate([-rows.linear @ forces, seen[:, 0] - slopes])
@@ -199,7 +200,7 @@ def _widest(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
     return (
         float(min(margins.min(), upper)) if upper > _LEAST else float(upper),
         forces,
-        -found.eqlin.marginals[: len(G)],
+        -solution.eqlin.marginals[: len(G)],
     )
 
 

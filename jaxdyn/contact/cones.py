@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.contact.kinds import components
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Numbers
 
 SIDES = ("inscribed", "circumscribed")
 
@@ -100,7 +101,7 @@ class FrictionCone(eqx.Module):
         along = jnp.zeros((faces, self.size), self.mu.dtype).at[:, 2].set(-shrink * self.mu)
         return jnp.concatenate([jnp.asarray(normals, self.mu.dtype) + along, linear])
 
-    def margins(self, force, smoothing=0.0) -> Float[Array, " k"]:
+    def margins(self, force, smoothing: Numbers = 0.0) -> Float[Array, " k"]:
         """How far the force is from violating each inequality, (j + k,): mu f_n - |(fx, fy)|, then -L f.
 
         Inside the cone all are positive, on its boundary the least is zero. Units are those of the rows: N for forces,
@@ -113,14 +114,14 @@ class FrictionCone(eqx.Module):
         **Raises:** ValueError for a force of another size.
         """
         force = as_float(force, "force", (self.size,))
-        found = []
+        cone_margins = []
         second = self.second_order_rows()
         if second.shape[0]:
             first, *rest = jnp.unstack(_product(second[0].astype(force.dtype), force))
-            found.append((first - _length(rest, smoothing))[None])
-        return jnp.concatenate([*found, -_product(self.linear_rows().astype(force.dtype), force)])
+            cone_margins.append((first - _length(rest, smoothing))[None])
+        return jnp.concatenate([*cone_margins, -_product(self.linear_rows().astype(force.dtype), force)])
 
-    def margin(self, force, smoothing=0.0) -> Float[Array, ""]:
+    def margin(self, force, smoothing: Numbers = 0.0) -> Float[Array, ""]:
         """Least of `margins`, () : positive inside the cone, zero on its boundary, infinite for a rigid contact.
 
         With `smoothing` > 0 it is -s log(sum exp(-margins / s)), smooth and at most the least margin, by no more than
@@ -154,7 +155,9 @@ def _length(parts, smoothing):
     return jnp.where(safe, jnp.sqrt(jnp.where(safe, square, jnp.ones_like(square))), jnp.zeros_like(square))
 
 
-def friction_cone(kind: str, mu=None, gamma=None, *, in_plane: bool = False) -> FrictionCone:
+def friction_cone(
+    kind: str, mu: Numbers | None = None, gamma: Numbers | None = None, *, in_plane: bool = False
+) -> FrictionCone:
     """The cone of forces that a contact of this kind can transmit (see `FrictionCone`).
 
     **Arguments:**

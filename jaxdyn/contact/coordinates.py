@@ -69,8 +69,8 @@ def _by_newton(surface_o: Surface, surface_f: Surface, R, p, places):
         steps = newton_steps(patch_at(surface_o, places[0]), patch_at(surface_f, places[1]), R, p)
         return surface_o.moved(places[0], steps.on_a), surface_f.moved(places[1], steps.on_b)
 
-    still = lax.stop_gradient((R, p))
-    places = lax.fori_loop(0, _ROUNDS, lambda _, places: stepped(*still, places), lax.stop_gradient(places))
+    constants = lax.stop_gradient((R, p))
+    places = lax.fori_loop(0, _ROUNDS, lambda _, places: stepped(*constants, places), lax.stop_gradient(places))
     for _ in range(_DIFFERENTIATED):
         places = stepped(R, p, places)
     return places

@@ -1,6 +1,6 @@
 """The force of each contact of a scene, and its margin from pulling and slipping, from the multipliers of the scene's rows."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import layout
 from jaxdyn.contact.cones import FrictionCone
-from jaxdyn.model.arguments import as_array, batch_hint, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, state_dtype
 from jaxdyn.systems.scene import Scene
 
 
@@ -34,7 +34,9 @@ class ConedContact(NamedTuple):
     cone: FrictionCone
 
 
-def contact_forces(scene: Scene, multipliers: Float[Array, " nc"], cones=None, smoothing: Any = 0.0) -> ContactForces:
+def contact_forces(
+    scene: Scene, multipliers: Float[Array, " nc"], cones=None, smoothing: Numbers = 0.0
+) -> ContactForces:
     """The force of each contact, and its margin in its friction cone.
 
     **Arguments:**
@@ -75,7 +77,7 @@ def coned_contacts(scene: Scene, cones=None) -> tuple[ConedContact, ...]:
     """
     places = layout(scene)
     chosen = _by_name(scene.cones if cones is None else cones, [place.name for place in places])
-    found = []
+    coned = []
     for constraint, place in zip(scene.constraints, places, strict=True):
         if place.name not in chosen:
             continue
@@ -90,8 +92,8 @@ def coned_contacts(scene: Scene, cones=None) -> tuple[ConedContact, ...]:
                 f"cone of contact {place.name!r} is of kind {cone.kind!r} with {cone.size} components, the contact has "
                 f"{len(order)}; give the cone of the contact's kind"
             )
-        found.append(ConedContact(place.name, place.start + np.array(order, int), cone))
-    return tuple(found)
+        coned.append(ConedContact(place.name, place.start + np.array(order, int), cone))
+    return tuple(coned)
 
 
 def _by_name(cones, names: list[str]) -> dict[str, FrictionCone]:

@@ -36,6 +36,7 @@ from jaxdyn.contact.surfaces import (
 )
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Numbers
 
 
 class ContactKinematics(eqx.Module):
@@ -73,7 +74,7 @@ def _checked(eta) -> Float[Array, "5"]:
     return as_float(eta, "eta", (5,))
 
 
-def relative_pose(surface_o: Surface, surface_f: Surface, eta) -> Float[Array, "4 4"]:
+def relative_pose(surface_o: Surface, surface_f: Surface, eta: Numbers) -> Float[Array, "4 4"]:
     """g_of (4, 4): pose of the finger's body frame in the object's when the surfaces touch at eta.
 
     **Arguments:** as of `montana`. **Raises:** as `montana`. Source: EQUATIONS section 8.
@@ -88,7 +89,7 @@ def _pose(geometry_o, geometry_f, psi):
     return _product(_product(geometry_o.pose, turn), se3.inverse(geometry_f.pose))
 
 
-def montana(surface_o: Surface, surface_f: Surface, eta) -> ContactKinematics:
+def montana(surface_o: Surface, surface_f: Surface, eta: Numbers) -> ContactKinematics:
     """Montana's equations of contact at eta: J_c, its inverse on vz = 0, and what they are made of.
 
     The forward form is, with Kt = R_psi K_o R_psi,
@@ -117,16 +118,16 @@ def montana(surface_o: Surface, surface_f: Surface, eta) -> ContactKinematics:
     eta = _checked(eta)
     for surface in (surface_o, surface_f):
         check_surface(surface)
-    found = _montana(surface_o, surface_f, eta)
-    check_regular(surface_o, eta[:2], found.object)
-    check_regular(surface_f, eta[2:4], found.finger)
-    if is_concrete(found.strict) and not bool(found.strict):
+    kinematics = _montana(surface_o, surface_f, eta)
+    check_regular(surface_o, eta[:2], kinematics.object)
+    check_regular(surface_f, eta[2:4], kinematics.finger)
+    if is_concrete(kinematics.strict) and not bool(kinematics.strict):
         raise ValueError(
-            f"eta is {np.asarray(eta).tolist()}, where the relative curvature {np.asarray(found.relative_curvature).tolist()} "
-            "is not positive definite; the surfaces do not touch in one point from outside, choose more convex ones or another "
-            "place"
+            f"eta is {np.asarray(eta).tolist()}, where the relative curvature "
+            f"{np.asarray(kinematics.relative_curvature).tolist()} is not positive definite; the surfaces do not touch in "
+            "one point from outside, choose more convex ones or another place"
         )
-    return found
+    return kinematics
 
 
 @compiled

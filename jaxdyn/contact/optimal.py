@@ -6,9 +6,19 @@ from jaxtyping import Array, Float
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.cones import FrictionCone
 from jaxdyn.contact.qp import QPSolution, solve_qp
+from jaxdyn.model.arguments import Numbers
 
 
-def optimal_forces(G, wrench, cones, *, preload=0.0, target=None, weights=None, tol: float | None = None) -> QPSolution:
+def optimal_forces(
+    G: Numbers,
+    wrench: Numbers,
+    cones,
+    *,
+    preload: Numbers = 0.0,
+    target: Numbers | None = None,
+    weights: Numbers | None = None,
+    tol: float | None = None,
+) -> QPSolution:
     """Contact forces f nearest to `target` with G f = wrench, and every margin of every cone at least `preload`.
 
         minimise (f - f0)^T diag(weights) (f - f0) / 2   with   G f = wrench,  margins(f) >= preload

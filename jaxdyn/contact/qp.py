@@ -20,6 +20,7 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact._interior_point import Point, Program, attached, solve
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Numbers
 from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
 
 
@@ -52,7 +53,18 @@ class QPSolution(eqx.Module):
     result: Any
 
 
-def solve_qp(Q, q, G=None, h=None, A=None, b=None, *, cones=(), tol: float | None = None, max_steps: int = 50):
+def solve_qp(
+    Q: Numbers,
+    q: Numbers,
+    G: Numbers | None = None,
+    h: Numbers | None = None,
+    A=None,
+    b=None,
+    *,
+    cones=(),
+    tol: float | None = None,
+    max_steps: int = 50,
+):
     """Minimise x^T Q x / 2 + q^T x with G x <= h, A x = b, and c - S x in second-order cones.
 
     An interior point, each step of it a kernel (see `compilation`): it compiles, batches (`jax.vmap`) and is

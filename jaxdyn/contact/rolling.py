@@ -12,7 +12,7 @@ from jaxdyn.constraints.rolling import Touching, TouchingPoint, tangents
 from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.contact.touching import Patch, Steps, newton_steps, patch_at
 from jaxdyn.lie.so3 import _product, cross
-from jaxdyn.model.arguments import pose_leaf
+from jaxdyn.model.arguments import Numbers, pose_leaf
 
 
 class RollingContact(Touching):
@@ -41,7 +41,7 @@ class RollingContact(Touching):
         size = self.shape_a.place_size
         return dataclasses.replace(self, places=(place[:size], place[size:]), about=None)
 
-    def likeness(self):
+    def structure_key(self):
         """Which rows there are, and on what kinds of surfaces."""
         return self.contact, self.spin, self.count, jax.tree.structure((self.shape_a, self.shape_b))
 
@@ -161,8 +161,8 @@ def rolling_contact(
     body_b: str | None,
     surface_b,
     *,
-    pose_a=None,
-    pose_b=None,
+    pose_a: Numbers | None = None,
+    pose_b: Numbers | None = None,
     spin: bool = False,
     slip: bool = False,
     contact: bool = True,

@@ -206,7 +206,7 @@ def _check_places(system: RollingModel, q, what: str, fix: str) -> None:
 @eqx.filter_jit
 def _searched(system: RollingModel, joints, near):
     rotations, positions = relative_poses(system.contacts, system, joints)
-    found = []
+    coordinates = []
     for i, contact in enumerate(system.contacts):
         R, p = rotations[i], positions[i]
         start = _between(contact, R, p) if near is None else _given(contact, near[i])
@@ -214,8 +214,8 @@ def _searched(system: RollingModel, joints, near):
         def improved(_, place, contact=contact, R=R, p=p):
             return contact.put(place).followed(R, p, 1)
 
-        found.append(lax.fori_loop(0, _STEPS_SEARCHED, improved, start))
-    return jnp.concatenate([joints, *found])
+        coordinates.append(lax.fori_loop(0, _STEPS_SEARCHED, improved, start))
+    return jnp.concatenate([joints, *coordinates])
 
 
 def _given(contact: RollingContact, alpha):

@@ -25,6 +25,7 @@ from jaxdyn.compile import compiled, is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.model.arguments import Function, Numbers
 from jaxdyn.systems.scene import as_pytree
 
 
@@ -102,7 +103,7 @@ class Ellipsoid(Surface):
     semi_axes: Float[Array, "3"]
     poles: str = eqx.field(static=True)
 
-    def __init__(self, semi_axes, poles: str = "z"):
+    def __init__(self, semi_axes: Numbers, poles: str = "z"):
         self.semi_axes = as_float(semi_axes, "semi_axes", (3,))
         if is_concrete(self.semi_axes) and not bool(jnp.all((self.semi_axes > 0) & jnp.isfinite(self.semi_axes))):
             raise ValueError(f"semi_axes is {np.asarray(self.semi_axes).tolist()}; give three positive lengths (m)")
@@ -159,7 +160,7 @@ class Sphere(Ellipsoid):
     **Raises:** ValueError for a radius that is not positive, and an unknown axis.
     """
 
-    def __init__(self, radius, poles: str = "z"):
+    def __init__(self, radius: Numbers, poles: str = "z"):
         radius = as_number(radius, "radius", "m", zero=False)
         self.semi_axes = jnp.stack([radius] * 3)
         self.poles = _checked_poles(poles)
@@ -178,7 +179,7 @@ class Cylinder(Surface):
 
     radius: Float[Array, ""]
 
-    def __init__(self, radius):
+    def __init__(self, radius: Numbers):
         self.radius = as_number(radius, "radius", "m", zero=False)
 
     def point(self, alpha):
@@ -213,7 +214,7 @@ class Parametrised(Surface):
     f: Callable
     flip: bool = eqx.field(static=True)
 
-    def __init__(self, f, flip: bool = False):
+    def __init__(self, f: Function, flip: bool = False):
         self.f = as_pytree(f, "surface: f")
         self.flip = bool(flip)
 
@@ -248,7 +249,7 @@ class SurfaceGeometry(eqx.Module):
         return jnp.concatenate([top, jnp.eye(4, dtype=top.dtype)[3:]])
 
 
-def surface_geometry(surface, alpha) -> SurfaceGeometry:
+def surface_geometry(surface, alpha: Numbers) -> SurfaceGeometry:
     """Gauss frame, metric, curvature and torsion of a surface at alpha, by differentiating its parametrisation.
 
     **Arguments:** `alpha` (2,): (u, v).

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint, Pfaffian
 from jaxdyn.constraints.rolling import RollingSphere
-from jaxdyn.model.arguments import as_array, pose_leaf
+from jaxdyn.model.arguments import Numbers, as_array, pose_leaf
 from jaxdyn.systems.scene import Scene, as_pytree
 
 
@@ -67,7 +67,16 @@ class DryFriction(WithModes):
     smoothing: Float[Array, "..."] | None
     name: str = eqx.field(static=True)
 
-    def __init__(self, coefficient, normal, along: Any = 0, *, static=None, smoothing=None, name: str = "friction"):
+    def __init__(
+        self,
+        coefficient: Numbers,
+        normal,
+        along: Any = 0,
+        *,
+        static: Numbers | None = None,
+        smoothing: Numbers | None = None,
+        name: str = "friction",
+    ):
         self.name = _checked_name(name, "DryFriction")
         self.coefficient, self.static = _coefficients(coefficient, static, f"DryFriction {name!r}")
         self.constraint = normal if isinstance(normal, str) else None
@@ -117,7 +126,15 @@ class UnilateralContact(WithModes):
     restitution: Float[Array, "..."]
     name: str = eqx.field(static=True)
 
-    def __init__(self, contact: Any, friction=0.0, *, static=None, restitution=0.0, name: str | None = None):
+    def __init__(
+        self,
+        contact: Any,
+        friction=0.0,
+        *,
+        static: Numbers | None = None,
+        restitution: Numbers = 0.0,
+        name: str | None = None,
+    ):
         if not (isinstance(contact, Constraint) and contact.wrench_components() is not None):
             raise ValueError(
                 f"UnilateralContact: contact is {contact!r}; give a constraint with a gap, as jd.rolling_sphere(...), or take "
@@ -135,13 +152,13 @@ class UnilateralContact(WithModes):
 
 def ground_contact(
     body: str,
-    point=None,
+    point: Numbers | None = None,
     friction=0.0,
     *,
-    static=None,
-    restitution=0.0,
-    radius=0.0,
-    plane=None,
+    static: Numbers | None = None,
+    restitution: Numbers = 0.0,
+    radius: Numbers = 0.0,
+    plane: Numbers | None = None,
     plane_body=None,
     name: str | None = None,
 ) -> UnilateralContact:
@@ -214,7 +231,7 @@ class _Coordinate(Constraint):
     index: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
-    def slip(self, system, q, v, t):
+    def velocity(self, system, q, v, t):
         if self.index >= v.shape[0]:
             raise ValueError(f"DryFriction {self.name!r}: along is {self.index}, but the system has nv = {v.shape[0]}")
         return v[self.index : self.index + 1]
@@ -232,13 +249,13 @@ class _Gap(Constraint):
         return ()
 
     def position(self, system, q, t):
-        found = jnp.asarray(self.gap(q, t), q.dtype)
-        if found.shape != ():
-            raise ValueError(f"contact {self.name!r}: gap returned shape {found.shape}; return one number (m), ()")
-        return found[None]
+        gap = jnp.asarray(self.gap(q, t), q.dtype)
+        if gap.shape != ():
+            raise ValueError(f"contact {self.name!r}: gap returned shape {gap.shape}; return one number (m), ()")
+        return gap[None]
 
-    def slip(self, system, q, v, t):
-        return None if self.along is None else Pfaffian(self.along, name=self.name).slip(system, q, v, t)
+    def velocity(self, system, q, v, t):
+        return None if self.along is None else Pfaffian(self.along, name=self.name).velocity(system, q, v, t)
 
 
 def _checked_name(name: Any, owner: str) -> str:
@@ -263,7 +280,7 @@ def _coefficients(sliding: Any, static: Any, owner: str):
 def _positive(value: Any, what: str):
     if value is None:
         return None
-    found = jnp.asarray(as_array(value, what), float)
-    if not isinstance(found, Tracer) and not (np.asarray(found) > 0).all():
+    number = jnp.asarray(as_array(value, what), float)
+    if not isinstance(number, Tracer) and not (np.asarray(number) > 0).all():
         raise ValueError(f"{what} is {value}; give a positive velocity (m/s), or None for friction that sticks")
-    return found
+    return number

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_concrete
 from jaxdyn.contact._checks import as_float, as_number
+from jaxdyn.model.arguments import Numbers
 
 # Signs of (Y, X) and of mu (tx, ty) in the rows that bound the torque about the normal, first from below, then from above.
 _YAW = (
@@ -24,7 +25,7 @@ _YAW = (
 )
 
 
-def wrench_cone(half_x, half_y, mu) -> Float[Array, "16 6"]:
+def wrench_cone(half_x: Numbers, half_y: Numbers, mu: Numbers) -> Float[Array, "16 6"]:
     """Wrench cone of a rectangle in contact: U (16, 6) with U w <= 0, in closed form.
 
     With X, Y the half sides and w = (f, tau) at the centre, in the axes of the surface, z the normal that presses:
@@ -63,7 +64,7 @@ def corner_wrenches(vertices: Float[np.ndarray, "n 2"], mu: float) -> Float[np.n
     return np.concatenate([np.concatenate([forces, np.cross(place, forces)], 1) for place in places]).T
 
 
-def wrench_cone_of_polygon(vertices, mu) -> Float[Array, "k 6"]:
+def wrench_cone_of_polygon(vertices: Numbers, mu: Numbers) -> Float[Array, "k 6"]:
     """Wrench cone of a convex polygon in contact: U (k, 6) with U w <= 0.
 
     It is the cone of the wrenches of forces at the corners, each within |fx|, |fy| <= mu fz; its facets are those of

@@ -23,6 +23,7 @@ from jaxdyn.constraints.dynamics import projections
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.control.errors import (
     RateError,
+    Target,
     TaskError,
     as_target,
     least_acceleration,
@@ -30,15 +31,15 @@ from jaxdyn.control.errors import (
     row_rank,
     wanted_rows,
 )
-from jaxdyn.control.gains import gain, non_negative, times
+from jaxdyn.control.gains import as_matrix, gain, non_negative, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.arguments import Function, Numbers, as_array, batch_hint, check_state
 from jaxdyn.reduction.gauge_invariant import gauge_invariant
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.scene import Scene, as_pytree
-from jaxdyn.systems.system import velocity_to_rate
+from jaxdyn.systems.system import SceneLike, velocity_to_rate
 
 
 class _ForceLoop(Controller):
@@ -61,13 +62,13 @@ class _ForceLoop(Controller):
         count = _count(self.scene)
         if self.force is None:
             return jnp.zeros((count,), q.dtype)
-        found = self.force(t)
-        if jnp.shape(found) != (count,):
+        force = self.force(t)
+        if jnp.shape(force) != (count,):
             raise ValueError(
-                f"force has shape {jnp.shape(found)}, expected {(count,)}, one per row of the constraints"
-                f"{batch_hint(found, (count,))}"
+                f"force has shape {jnp.shape(force)}, expected {(count,)}, one per row of the constraints"
+                f"{batch_hint(force, (count,))}"
             )
-        return jnp.asarray(found, q.dtype)
+        return jnp.asarray(force, q.dtype)
 
     def pressed(self, q, t, state) -> Float[Array, " nc"]:
         """-lam_d + KI z."""
@@ -117,15 +118,15 @@ class HybridForce(_ForceLoop):
 
     def __init__(
         self,
-        scene: Any,
-        task: Any,
-        target: Any,
-        kp: Any,
-        kd: Any = None,
+        scene: SceneLike,
+        task: Function,
+        target: Target,
+        kp: Numbers,
+        kd: Numbers | None = None,
         *,
         of: str = "position",
         force: Any = None,
-        ki: Any = None,
+        ki: Numbers | None = None,
         actuated: Any = None,
         internal: Any = None,
         least_regularity: Any = None,
@@ -181,10 +182,10 @@ class HybridForce(_ForceLoop):
         tau = torque_for(self.scene, q, v, self.acceleration(q, v, t), t)
         if self.actuated is None:
             return tau + _product(constraint_jacobian(self.scene, q, t).T, self.pressed(q, t, state))
-        keep, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)  # pyright: ignore[reportArgumentType]
-        by_motors = keep[:, motors]
-        inverse = pseudo_inverse(by_motors, tolerance(None, keep), True)
-        pushed = _product(inverse, _product(keep, tau))
+        P_omega, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)  # pyright: ignore[reportArgumentType]
+        by_motors = P_omega[:, motors]
+        inverse = pseudo_inverse(by_motors, tolerance(None, P_omega), True)
+        pushed = _product(inverse, _product(P_omega, tau))
         if self.internal is not None:
             internal = self.internal.astype(q.dtype)
             pushed = pushed + internal - _product(inverse, _product(by_motors, internal))
@@ -229,7 +230,17 @@ class GaugeInvariant(_ForceLoop):
     force: Callable | None
     ki: Array | None
 
-    def __init__(self, scene: Any, task: Any, target: Any, kp: Any, kd: Any, *, force: Any = None, ki: Any = None):
+    def __init__(
+        self,
+        scene: SceneLike,
+        task: Function,
+        target: Target,
+        kp: Numbers,
+        kd: Numbers,
+        *,
+        force: Any = None,
+        ki: Numbers | None = None,
+    ):
         self.scene = constrained(scene)
         self.error = TaskError(as_pytree(task, "task"), as_target(target))  # pyright: ignore[reportCallIssue]
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
@@ -239,6 +250,63 @@ class GaugeInvariant(_ForceLoop):
     def __call__(self, q, v, t=0.0, state=None, multipliers=None) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N."""
         scene, system, t = self.scene, self.scene.system, jnp.asarray(t, q.dtype)
+        J, along, change = self._reference_motion(q, v, t)
+        M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)  # pyright: ignore[reportArgumentType]
+        gauge = gauge_invariant(scene, q, v, None, t, dof=J.shape[1])  # pyright: ignore[reportArgumentType]
+        # W^T J (ed + Kp e), which lies along V2.
+        eps = _product(gauge.V2.T, _product(gauge.W.T, v - along))
+        push = _product(M, change) + _product(C, along)
+        push = push - _product(gauge.W, _product(gauge.V2, times(self.kd, eps, "kd")))
+        normal = _product(gauge.Gamma_o, gauge.reduced_velocity) + _product(gauge.Lambda_r.T, self.pressed(q, t, state))
+        # Of `push` the part of the motion, W V2 V2^T W^-1, in the place of which the normal one stands.
+        free = _product(gauge.V2, _product(gauge.V2.T, jnp.linalg.solve(gauge.W, push)))
+        tau = _product(gauge.W, free + _product(gauge.V1, normal))
+        potential, force = bias_force(system, q, v, t) - _product(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
+        return tau + potential if force is None else tau + potential - force
+
+    def composite_error(self, q, v, t=0.0) -> Float[Array, " nr"]:
+        """The composite error eps = B (ed + Kp e) = V2^T W^T (v - J (xd_d - Kp e)), (nr,), in sqrt(J).
+
+        |eps|^2 / 2 is the kinetic energy of the velocity error ed + Kp e. The components depend on the gauge, the norm not.
+
+        **Arguments:** `q` (nq,), `v` (nv,), on the constraints; `t`, s. **Raises:** as calls of the law.
+
+        Source: EQUATIONS section 9.
+        """
+        system = self.scene.system
+        q, v, t = check_state(system, q=q, v=v, t=t)
+        J, along, _ = self._reference_motion(q, v, t)
+        return _product(self._to_quasi_velocities(q, t, J.shape[1]), v - along)
+
+    def equivalent_gains(self, q, t=0.0) -> tuple[Float[Array, "nr nr"], Float[Array, "nr nr"]]:
+        """Gains (Kp', Kd') with which this law is  xdd_d - Kd' ed - Kp' e  in task coordinates, as `HybridForce` writes it:
+
+            Kp' = B^-1 Kd B Kp,   Kd' = Kp + B^-1 Kd B,   B = V2^T W^T J.
+
+        The two laws then differ by (Bdot + Gamma_r B)(ed + Kp e) alone, a Coriolis force of the composite error. For a number
+        Kd = k these are k Kp and Kp + k, whatever q.
+
+        **Arguments:** `q` (nq,), on the constraints; `t`, s.
+
+        **Returns:** (nr, nr) 1/s^2, and (nr, nr) 1/s. **Raises:** as calls of the law.
+
+        Source: EQUATIONS section 9.
+        """
+        q, t = check_state(self.scene.system, q=q, t=t)
+        J, _, _ = self._reference_motion(q, jnp.zeros((self.scene.nv,), q.dtype), t)
+        B = _product(self._to_quasi_velocities(q, t, J.shape[1]), J)
+        kp, kd = as_matrix(self.kp, B[0], "kp"), as_matrix(self.kd, B[0], "kd")
+        turned = jnp.linalg.solve(B, _product(kd, B))
+        return _product(turned, kp), kp + turned
+
+    def _to_quasi_velocities(self, q, t, m: int) -> Float[Array, "nr nv"]:
+        """V2^T W^T, which takes velocities to the m quasi velocities along the constraints."""
+        gauge = gauge_invariant(self.scene, q, jnp.zeros((self.scene.nv,), q.dtype), None, t, dof=m)
+        return _product(gauge.V2.T, gauge.W.T)
+
+    def _reference_motion(self, q, v, t):
+        """J (nv, nr), the velocity J s of the reference rates s = xd_d - Kp e, and its rate, (nv,) each."""
+        scene, system = self.scene, self.scene.system
         errors = Scene(system, (self.error,))
         m = self.error.sizes(system, q.dtype)[0]
         if m + _count(scene) < scene.nv:
@@ -261,19 +329,7 @@ class GaugeInvariant(_ForceLoop):
         J = inverse[:, -m:]
         s, sdot = jax.jvp(reference, (q, t), motion)
         along = _product(J, s)
-        change = _product(J, sdot) - _product(inverse, _product(turning, along))
-        M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)  # pyright: ignore[reportArgumentType]
-        gauge = gauge_invariant(scene, q, v, None, t, dof=m)  # pyright: ignore[reportArgumentType]
-        # W^T J (ed + Kp e), which lies along V2.
-        eps = _product(gauge.V2.T, _product(gauge.W.T, v - along))
-        push = _product(M, change) + _product(C, along)
-        push = push - _product(gauge.W, _product(gauge.V2, times(self.kd, eps, "kd")))
-        normal = _product(gauge.Gamma_o, gauge.reduced_velocity) + _product(gauge.Lambda_r.T, self.pressed(q, t, state))
-        # Of `push` the part of the motion, W V2 V2^T W^-1, in the place of which the normal one stands.
-        free = _product(gauge.V2, _product(gauge.V2.T, jnp.linalg.solve(gauge.W, push)))
-        tau = _product(gauge.W, free + _product(gauge.V1, normal))
-        potential, force = bias_force(system, q, v, t) - _product(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
-        return tau + potential if force is None else tau + potential - force
+        return J, along, _product(J, sdot) - _product(inverse, _product(turning, along))
 
 
 def constrained(scene: Any) -> Scene:
@@ -299,10 +355,16 @@ def _error(task: Any, target: Any, of: str, kd) -> Constraint:
 
 
 def _indices(actuated: Any, nv: int) -> tuple[int, ...]:
-    found = np.asarray(actuated, int)
-    if found.ndim != 1 or not found.size or found.min() < 0 or found.max() >= nv or np.unique(found).size < found.size:
+    indices = np.asarray(actuated, int)
+    if (
+        indices.ndim != 1
+        or not indices.size
+        or indices.min() < 0
+        or indices.max() >= nv
+        or np.unique(indices).size < indices.size
+    ):
         raise ValueError(f"actuated is {actuated!r}; give different indices of velocities from 0 to {nv - 1}")
-    return tuple(found.tolist())
+    return tuple(indices.tolist())
 
 
 def _count(scene: Scene) -> int:

@@ -10,7 +10,7 @@ so that  d2e/dt2 + Kd de/dt + Kp e = 0  and  dw/dt + Kp w = 0.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -24,12 +24,17 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import displacement
+
+if TYPE_CHECKING:
+    Target = Numbers | Callable[[Array], Any]
+else:
+    Target = Any  # `as_target` looks at it
 
 TASKS = {"position": (3,), "orientation": (3, 3), "pose": (4, 4)}
 
@@ -43,23 +48,23 @@ class Fixed(eqx.Module):
         return self.value
 
 
-def as_target(target: Any, name: str = "target") -> Callable:
+def as_target(target: Target, name: str = "target") -> Callable:
     """A target as a function of time: a function as it is, numbers as one that is constant.
 
     **Raises:** ValueError for what is neither.
     """
     if callable(target):
         return as_pytree(target, name)
-    found = as_array(target, name)
-    return Fixed(jnp.asarray(found, found.dtype if jnp.issubdtype(found.dtype, jnp.floating) else float))
+    array = as_array(target, name)
+    return Fixed(jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float))
 
 
 def placed(target: Callable, t, shape: tuple, like) -> Array:
     """A target at a time, in the dtype of `like`. **Raises:** ValueError for another shape."""
-    found = target(t)
-    if jnp.shape(found) != shape:
-        raise ValueError(f"target has shape {jnp.shape(found)}, expected {shape}{batch_hint(found, shape)}")
-    return jnp.asarray(found, like.dtype)
+    values = target(t)
+    if jnp.shape(values) != shape:
+        raise ValueError(f"target has shape {jnp.shape(values)}, expected {shape}{batch_hint(values, shape)}")
+    return jnp.asarray(values, like.dtype)
 
 
 class ConfigurationError(Constraint):
@@ -99,10 +104,10 @@ class TaskError(Constraint):
 
     def position(self, system, q, t):
         """task(q) - target(t)."""
-        found = jnp.asarray(self.task(q), q.dtype)
-        if found.ndim != 1:
-            raise ValueError(f"task returned shape {found.shape}; return a vector (m,){batch_hint(found, (1,))}")
-        return found - placed(self.target, t, found.shape, q)
+        value = jnp.asarray(self.task(q), q.dtype)
+        if value.ndim != 1:
+            raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
+        return value - placed(self.target, t, value.shape, q)
 
 
 class RateError(Constraint):
@@ -112,12 +117,12 @@ class RateError(Constraint):
     target: Callable
     name: str = eqx.field(static=True, default="rates")
 
-    def slip(self, system, q, v, t):
+    def velocity(self, system, q, v, t):
         """task(q, v) - target(t)."""
-        found = jnp.asarray(self.task(q, v), q.dtype)
-        if found.ndim != 1:
-            raise ValueError(f"task returned shape {found.shape}; return a vector (m,){batch_hint(found, (1,))}")
-        return found - placed(self.target, t, found.shape, q)
+        value = jnp.asarray(self.task(q, v), q.dtype)
+        if value.ndim != 1:
+            raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
+        return value - placed(self.target, t, value.shape, q)
 
 
 def frame_error(model: Any, frame: str, target: Any, task: str) -> FrameError:

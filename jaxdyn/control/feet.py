@@ -15,7 +15,7 @@ from jaxdyn.contact.kinds import wrench_basis
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array
+from jaxdyn.model.arguments import Numbers, as_array
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 
@@ -72,11 +72,11 @@ class Foot(eqx.Module):
         """
         local = self.pose if self.is_flat else self.pose.at[:3, :3].set(jnp.eye(3, dtype=self.pose.dtype))
         joint = "weld" if self.is_flat else "point"
-        held = loop(None, self.contact_pose(model, q), self.frame, local, joint, name=self.frame)
-        return HeldFoot(**{part.name: getattr(held, part.name) for part in dataclasses.fields(held)})
+        hold_loop = loop(None, self.contact_pose(model, q), self.frame, local, joint, name=self.frame)
+        return HeldFoot(**{part.name: getattr(hold_loop, part.name) for part in dataclasses.fields(hold_loop)})
 
 
-def foot(frame: str, cone: Any, *, pose: Any = None, ground: Any = None) -> Foot:
+def foot(frame: str, cone: Any, *, pose: Numbers | None = None, ground: Numbers | None = None) -> Foot:
     """A place on a body that touches the ground, and the cone of forces that it may take from it.
 
     **Arguments:**
@@ -94,15 +94,15 @@ def foot(frame: str, cone: Any, *, pose: Any = None, ground: Any = None) -> Foot
         raise ValueError(f"foot {frame!r}: cone is {cone!r}; give one in space from jd.contact.friction_cone(...)")
     if ground is not None and cone.kind in _FLAT:
         raise ValueError(f"foot {frame!r}: a flat foot stands in the axes of its pose; leave ground out")
-    found = as_array(np.eye(3) if ground is None else ground, f"foot {frame!r}: ground")
-    if found.shape != (3, 3):
-        raise ValueError(f"foot {frame!r}: ground has shape {found.shape}; give a rotation (3, 3)")
-    if not isinstance(found, Tracer):
-        known = np.asarray(found, float)
+    rotation = as_array(np.eye(3) if ground is None else ground, f"foot {frame!r}: ground")
+    if rotation.shape != (3, 3):
+        raise ValueError(f"foot {frame!r}: ground has shape {rotation.shape}; give a rotation (3, 3)")
+    if not isinstance(rotation, Tracer):
+        known = np.asarray(rotation, float)
         # Numbers as people write them, with some six digits.
         if np.abs(known @ known.T - np.eye(3)).max() > 1e-5 or np.linalg.det(known) < 0:
             raise ValueError(f"foot {frame!r}: ground is {known.tolist()}, which is no rotation; give orthogonal axes")
-    return Foot(frame, cone, pose_leaf(pose, f"foot {frame!r}: pose"), jnp.asarray(found, float))
+    return Foot(frame, cone, pose_leaf(pose, f"foot {frame!r}: pose"), jnp.asarray(rotation, float))
 
 
 def check_feet(model: Any, feet: Any) -> tuple[Foot, ...]:

@@ -17,17 +17,17 @@ def gain(value: Any, name: str) -> Array:
     **Raises:** ValueError, where the numbers are known, for a gain that is not positive definite: its symmetric part has
     an eigenvalue that is zero, negative or not finite.
     """
-    found = as_array(value, name)
-    if found.ndim > 2 or (found.ndim == 2 and found.shape[0] != found.shape[1]):
+    array = as_array(value, name)
+    if array.ndim > 2 or (array.ndim == 2 and array.shape[0] != array.shape[1]):
         raise ValueError(
-            f"{name} has shape {found.shape}; give a number, (n,) for a diagonal matrix, or a matrix (n, n)"
+            f"{name} has shape {array.shape}; give a number, (n,) for a diagonal matrix, or a matrix (n, n)"
         )
-    if not isinstance(found, Tracer):
-        known = np.asarray(found, float)
+    if not isinstance(array, Tracer):
+        known = np.asarray(array, float)
         least = np.linalg.eigvalsh((known + known.T) / 2).min() if _is_matrix(known) else known.min(initial=np.inf)
         if not (np.isfinite(known).all() and least > 0):
             raise ValueError(f"{name} is {known.tolist()}, which is not positive definite; give positive gains")
-    return jnp.asarray(found, found.dtype if jnp.issubdtype(found.dtype, jnp.floating) else float)
+    return jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float)
 
 
 def non_negative(value: Any, name: str) -> Array:
@@ -35,12 +35,12 @@ def non_negative(value: Any, name: str) -> Array:
 
     **Raises:** ValueError for another shape and, where it is known, for a negative number.
     """
-    found = as_array(value, name)
-    if found.ndim:
-        raise ValueError(f"{name} has shape {found.shape}; give one number{batch_hint(found, ())}")
-    if not isinstance(found, Tracer) and not 0 <= float(found) < np.inf:
-        raise ValueError(f"{name} is {float(found)}; give zero or a positive number")
-    return jnp.asarray(found, found.dtype if jnp.issubdtype(found.dtype, jnp.floating) else float)
+    number = as_array(value, name)
+    if number.ndim:
+        raise ValueError(f"{name} has shape {number.shape}; give one number{batch_hint(number, ())}")
+    if not isinstance(number, Tracer) and not 0 <= float(number) < np.inf:
+        raise ValueError(f"{name} is {float(number)}; give zero or a positive number")
+    return jnp.asarray(number, number.dtype if jnp.issubdtype(number.dtype, jnp.floating) else float)
 
 
 def times(gain: Array, error: Float[Array, " n"], name: str) -> Float[Array, " n"]:

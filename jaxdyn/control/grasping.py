@@ -19,14 +19,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
-from jaxdyn.control.errors import as_target, least_acceleration, row_rank, wanted_rows
+from jaxdyn.control.errors import Target, as_target, least_acceleration, row_rank, wanted_rows
 from jaxdyn.control.gains import gain, non_negative, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import velocity_rows
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import batch_hint
+from jaxdyn.model.arguments import Numbers, batch_hint
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.system import displacement
 
@@ -97,7 +97,15 @@ class GraspForce(Controller):
     damping: Array
 
     def __init__(
-        self, grasp: Any, target: Any, kp: Any, kd: Any, *, preload: Any = 0.0, ki: Any = None, damping: Any = 0.0
+        self,
+        grasp: Any,
+        target: Target,
+        kp: Numbers,
+        kd: Numbers,
+        *,
+        preload: Numbers = 0.0,
+        ki: Numbers | None = None,
+        damping: Numbers = 0.0,
     ):
         check_grasp(grasp)
         self.grasp = grasp

@@ -21,7 +21,7 @@ from jaxdyn.control.feet import check_feet
 from jaxdyn.control.gains import non_negative
 from jaxdyn.dynamics.quantities import inverse_dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.arguments import Numbers, check_shapes
 from jaxdyn.model.tree import Model
 
 
@@ -60,10 +60,10 @@ def underactuated_inverse_dynamics(
     contacts,
     *,
     passive: tuple[int, ...] | None = None,
-    preload: Any = 0.0,
-    torque_weight: Any = 1.0,
-    force_weight: Any = 1e-3,
-    effort_limit: Any = None,
+    preload: Numbers = 0.0,
+    torque_weight: Numbers = 1.0,
+    force_weight: Numbers = 1e-3,
+    effort_limit: Numbers | None = None,
     tol: float | None = None,
 ) -> LeggedDynamics:
     """Torques and contact forces that give the acceleration a, the forces inside their cones.
@@ -94,7 +94,7 @@ def underactuated_inverse_dynamics(
     ```python
     feet = [jd.control.foot(name, jd.contact.friction_cone("hard-finger", mu=0.6)) for name in ("FL", "FR", "HL", "HR")]
     still = jnp.zeros(model.nv)
-    found = jd.underactuated_inverse_dynamics(model, q, still, still, feet)
+    dynamics = jd.underactuated_inverse_dynamics(model, q, still, still, feet)
     ```
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
@@ -124,10 +124,10 @@ def underactuated_inverse_dynamics(
         bounds["G"] = jnp.concatenate([rows, -across.T, across.T])
         bounds["h"] = jnp.concatenate([levels, limit - needed[motors], limit + needed[motors]])
     linear = -torque_weight * _product(across, needed[motors])
-    found = solve_qp(Q, linear, A=along, b=needed[base], tol=tol, **bounds)
+    optimum = solve_qp(Q, linear, A=along, b=needed[base], tol=tol, **bounds)
     # What a program without a solution ends with grows without bound.
     shortest = _product(pseudo_inverse(along.T, tolerance(None, along)).T, needed[base])
-    forces = jnp.where(found.result == RESULTS.infeasible, shortest, found.x)  # pyright: ignore[reportArgumentType]
+    forces = jnp.where(optimum.result == RESULTS.infeasible, shortest, optimum.x)  # pyright: ignore[reportArgumentType]
     sizes = np.cumsum([one.size for one in feet])[:-1]
     margins = [one.cone.margin(f) for one, f in zip(feet, jnp.split(forces, sizes), strict=True)]
     tau = (needed - _product(J.T, forces)).at[base].set(0)
@@ -135,7 +135,7 @@ def underactuated_inverse_dynamics(
         tau=tau,
         forces=forces,
         margins=jnp.stack(margins),
-        result=found.result,
+        result=optimum.result,
         feet=tuple((one.frame, one.size) for one in feet),
     )
 
@@ -182,14 +182,14 @@ def passive_velocities(model: Model, passive: tuple[int, ...] | None) -> np.ndar
             for kind, part in zip(top.kinds, top.v_slices, strict=True)
             if kind == "free"
         ]
-        found = np.concatenate([*places, np.zeros(0, int)])
-        if not found.size:
+        indices = np.concatenate([*places, np.zeros(0, int)])
+        if not indices.size:
             raise ValueError(
                 f"model {model.name!r} has no free joint, so every velocity has a motor; take jd.inverse_dynamics, or name "
                 "the velocities without one in passive"
             )
-        return found
-    found = np.unique(np.asarray(passive, int))
-    if not found.size or found[0] < 0 or found[-1] >= model.nv:
+        return indices
+    indices = np.unique(np.asarray(passive, int))
+    if not indices.size or indices[0] < 0 or indices[-1] >= model.nv:
         raise ValueError(f"passive is {passive!r}; give indices of velocities from 0 to {model.nv - 1}")
-    return found
+    return indices

@@ -15,6 +15,7 @@ from jaxdyn.constraints.base import position_residual, rows
 from jaxdyn.control.errors import (
     ConfigurationError,
     FrameError,
+    Target,
     as_target,
     frame_error,
     least_acceleration,
@@ -23,10 +24,10 @@ from jaxdyn.control.errors import (
 from jaxdyn.control.gains import gain, non_negative, times
 from jaxdyn.dynamics.quantities import gravity_force, inverse_dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import state_dtype
+from jaxdyn.model.arguments import Numbers, state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import displacement
+from jaxdyn.systems.system import SceneLike, displacement
 
 
 class ComputedTorque(eqx.Module):
@@ -58,7 +59,7 @@ class ComputedTorque(eqx.Module):
     kp: Array
     kd: Array
 
-    def __init__(self, scene: Any, target: Any, kp: Any, kd: Any):
+    def __init__(self, scene: SceneLike, target: Target, kp: Numbers, kd: Numbers):
         self.scene = unconstrained(scene)
         self.target = as_target(target)
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
@@ -105,16 +106,16 @@ class OperationalSpace(eqx.Module):
 
     def __init__(
         self,
-        scene: Any,
+        scene: SceneLike,
         frame: str,
-        target: Any,
-        kp: Any,
-        kd: Any,
+        target: Target,
+        kp: Numbers,
+        kd: Numbers,
         *,
         task: str = "pose",
-        damping: Any = 1.0,
-        stiffness: Any = 0.0,
-        posture: Any = None,
+        damping: Numbers = 1.0,
+        stiffness: Numbers = 0.0,
+        posture: Numbers | None = None,
     ):
         self.scene = unconstrained(scene)
         self.error = frame_error(self.scene.system, frame, target, task)
@@ -165,12 +166,12 @@ class CartesianStiffness(eqx.Module):
         self,
         model: Any,
         frame: str,
-        target: Any,
-        stiffness: Any,
-        damping: Any,
+        target: Target,
+        stiffness: Numbers,
+        damping: Numbers,
         *,
         task: str = "pose",
-        joint_damping: Any = 0.0,
+        joint_damping: Numbers = 0.0,
     ):
         self.model = model
         self.error = frame_error(model, frame, target, task)

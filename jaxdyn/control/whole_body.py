@@ -24,6 +24,7 @@ from jaxdyn.control.gains import gain, non_negative
 from jaxdyn.control.legs import LeggedDynamics, missing_wrench, passive_velocities, underactuated_inverse_dynamics
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displacement
@@ -93,21 +94,21 @@ class WholeBody(eqx.Module):
         self,
         model: Any,
         contacts: Any,
-        com: Any,
-        kp: Any,
-        kd: Any,
+        com: Numbers,
+        kp: Numbers,
+        kd: Numbers,
         *,
-        orientation: Any = None,
+        orientation: Numbers | None = None,
         base: str | None = None,
-        turn_kp: Any = None,
-        turn_kd: Any = None,
-        posture: Any = None,
-        stiffness: Any = 0.0,
-        damping: Any = 1.0,
-        preload: Any = 0.0,
-        torque_weight: Any = 1.0,
-        force_weight: Any = 1e-3,
-        effort_limit: Any = None,
+        turn_kp: Numbers | None = None,
+        turn_kd: Numbers | None = None,
+        posture: Numbers | None = None,
+        stiffness: Numbers = 0.0,
+        damping: Numbers = 1.0,
+        preload: Numbers = 0.0,
+        torque_weight: Numbers = 1.0,
+        force_weight: Numbers = 1e-3,
+        effort_limit: Numbers | None = None,
         passive: Any = None,
     ):
         self.feet, self.model = check_feet(model, contacts), model

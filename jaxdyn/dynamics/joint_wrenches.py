@@ -46,7 +46,7 @@ def joint_wrench(
     Source: EQUATIONS section 4, the backward recursion of Newton and Euler; `data.f` of Pinocchio after `rnea` for body axes.
 
     ```python
-    weight = jd.joint_wrench(model, q, still, still, model.joint_names[0])  # what the base bears at rest
+    weight = jd.joint_wrench(model, q, zero, zero, model.joint_names[0])  # what the base bears at rest
     ```
     """
     if axes not in ("body", "world"):
@@ -57,8 +57,8 @@ def joint_wrench(
         return jnp.zeros((0, 6), q.dtype)
     function = _in_world if axes == "world" else _in_bodies
     given = (q, v, a) if external is None else (q, v, a, external)
-    found = function(model, *given) if model.nb > MAX_BODIES else run(function, model, *given)
-    return found if index is None else found[index]
+    wrenches = function(model, *given) if model.nb > MAX_BODIES else run(function, model, *given)
+    return wrenches if index is None else wrenches[index]
 
 
 def _in_bodies(model: Model, q, v, a, external=None):
@@ -68,6 +68,6 @@ def _in_bodies(model: Model, q, v, a, external=None):
 
 def _in_world(model: Model, q, v, a, external=None):
     frame = tree_frame(model, q)
-    found = jax.vmap(se3.AdT_apply)(frame.pose, joint_wrenches(model, frame, v, a, external))
+    wrenches = jax.vmap(se3.AdT_apply)(frame.pose, joint_wrenches(model, frame, v, a, external))
     turn = frame.pose[:, :3, :3]
-    return jnp.concatenate([_product(turn, found[:, :3, None]), _product(turn, found[:, 3:, None])], 1)[..., 0]
+    return jnp.concatenate([_product(turn, wrenches[:, :3, None]), _product(turn, wrenches[:, 3:, None])], 1)[..., 0]

@@ -87,9 +87,9 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     is_root = np.array([parent < 0 for parent in topology.parents], bool)
     origin = take(local[:, :3, 3], topology.roots)
     # A root's own translation is replaced by zero before the product, not subtracted after it.
-    keep = np.ones((topology.nb, 4, 4), bool)
-    keep[is_root, :3, 3] = False
-    pose = jnp.where(keep, local, jnp.zeros_like(local))
+    mask = np.ones((topology.nb, 4, 4), bool)
+    mask[is_root, :3, 3] = False
+    pose = jnp.where(mask, local, jnp.zeros_like(local))
     pose = _along_tree(topology, pose)
     subspace = jax.vmap(se3.Ad_apply)(take(pose, topology.dof_body), body_subspace(model))
     return TreeFrame(pose, origin, subspace)
@@ -101,10 +101,10 @@ def _along_tree(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array
     As operations on arrays by pointer jumping, in log2(depth) products of all bodies; as single numbers one product a body.
     """
     if is_expanding():
-        found: list = []
+        products: list = []
         for i, parent in enumerate(topology.parents):
-            found.append(pose[i] if parent < 0 else _product(found[parent], pose[i]))
-        return jnp.stack(found) if found else pose
+            products.append(pose[i] if parent < 0 else _product(products[parent], pose[i]))
+        return jnp.stack(products) if products else pose
     world = jnp.eye(4, dtype=pose.dtype)[None]
     for table in topology.jumps:
         pose = _product(jnp.concatenate([pose, world])[table], pose)
@@ -116,7 +116,7 @@ class Carried(NamedTuple):
 
     - `pose` (n, 4, 4): in the tree frame of the body that carries it; `origin` (n, 3): of that tree frame in the world.
     - `coordinates` (k,): velocity coordinates that move any of them; `subspace` (k, 6): their rows of `TreeFrame.subspace`.
-    - `moves` (n, k) of bool: which frame each of these coordinates moves.
+    - `velocity_mask` (n, k) of bool: which frame each of these coordinates moves.
     - `twist`, `bias` (n, 6): twist of each frame, as a twist of the fixed frame that now coincides with the tree frame, and
       its rate at a = 0; None when no velocity was given.
     """
@@ -125,7 +125,7 @@ class Carried(NamedTuple):
     origin: Float[Array, "n 3"]
     subspace: Float[Array, "k 6"]
     coordinates: np.ndarray
-    moves: np.ndarray
+    velocity_mask: np.ndarray
     twist: Float[Array, "n 6"] | None = None
     bias: Float[Array, "n 6"] | None = None
 
@@ -139,9 +139,9 @@ def carried(
     kept = np.flatnonzero(topology.ancestors[named].any(0)).tolist()
     if not kept:
         pose = jnp.broadcast_to(jnp.eye(4, dtype=q.dtype), (n, 4, 4))
-        none, still = np.zeros(0, int), None if v is None else jnp.zeros((n, 6), q.dtype)
+        none, at_rest = np.zeros(0, int), None if v is None else jnp.zeros((n, 6), q.dtype)
         nowhere = jnp.zeros((0, 6), q.dtype)
-        return Carried(pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), still, still)
+        return Carried(pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), at_rest, at_rest)
     coordinates = _places(topology.v_slices, kept)
     if len(kept) < model.nb:
         model, q = _pruned(model, kept), take(q, _places(topology.q_slices, kept))
@@ -149,15 +149,15 @@ def carried(
     index = np.array([kept.index(body) if body >= 0 else len(kept) for body in bodies])
     pose = jnp.concatenate([frame.pose, jnp.eye(4, dtype=q.dtype)[None]])
     origin = jnp.concatenate([frame.origin, jnp.zeros((1, 3), q.dtype)])
-    moves = np.concatenate([model.topology.dof_ancestors, np.zeros((1, model.nv), bool)])[index]
-    found = Carried(take(pose, index), take(origin, index), frame.subspace, coordinates, moves)
+    moved_by = np.concatenate([model.topology.dof_ancestors, np.zeros((1, model.nv), bool)])[index]
+    frames = Carried(take(pose, index), take(origin, index), frame.subspace, coordinates, moved_by)
     if v is None:
-        return found
+        return frames
     v = take(v, coordinates)
     rates = subspace_rate(model, frame, body_twists(model, frame, v))
     # One product gives the twists and their rates.
-    sums = _product(jnp.asarray(moves, q.dtype), jnp.concatenate([frame.subspace, rates], axis=1) * v[:, None])
-    return found._replace(twist=sums[:, :6], bias=sums[:, 6:])
+    sums = _product(jnp.asarray(moved_by, q.dtype), jnp.concatenate([frame.subspace, rates], axis=1) * v[:, None])
+    return frames._replace(twist=sums[:, :6], bias=sums[:, 6:])
 
 
 def _pruned(model: Model, kept: list[int]) -> Model:
@@ -256,8 +256,8 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
 
 def _pose_in_body(body: int, tree, q):
     model, offset = tree
-    found = carried(model, q, [body])
-    return _moved(_product(found.pose[0], offset), found.origin[0])
+    frames = carried(model, q, [body])
+    return _moved(_product(frames.pose[0], offset), frames.origin[0])
 
 
 def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -369,8 +369,8 @@ def named_frame(model: Model, name: str | None) -> tuple[int, Float[Array, "4 4"
 
 def _moving(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:
     """Rows of the coordinates that move a body, the others zero."""
-    moves = model.topology.dof_ancestors[body] if body >= 0 else np.zeros(model.nv, bool)
-    return jnp.where(moves[:, None], rows, jnp.zeros_like(rows))
+    on_path = model.topology.dof_ancestors[body] if body >= 0 else np.zeros(model.nv, bool)
+    return jnp.where(on_path[:, None], rows, jnp.zeros_like(rows))
 
 
 def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Array, rows: Array) -> Float[Array, "nv 6"]:

@@ -6,7 +6,7 @@ With A_i = Ad^-1 of the pose of link i in its parent, in block (i, parent(i)) of
     F = G^T (M Vdot + Pt^T F_t + ad_V^T M V),    tau = xi^T F
 
 (EQUATIONS section 4). This is the form to read, to teach and to check against: it costs O(nb^3). What users call runs
-on `matrix_form` or `recursive`, and shares with this module the joints' own transforms and screws alone.
+on `world_frame` or `recursions`, and shares with this module the joints' own transforms and screws alone.
 """
 
 import equinox as eqx

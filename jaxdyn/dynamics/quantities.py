@@ -18,18 +18,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import along, implicit, native, run
-from jaxdyn.dynamics import recursions
-from jaxdyn.dynamics import scans as looped
-from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.dynamics import recursions, scans, world_frame
 from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_shapes, check_state
+from jaxdyn.model.arguments import Numbers, check_shapes, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.system import System, symbols
 
 
-def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv"]:
+def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv"]:
     """Mass matrix M(q) = sum of J_i^T M_i J_i over the bodies + diag(armature), symmetric.
 
     **Arguments:** `q` (nq,).
@@ -42,11 +40,11 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[A
     if isinstance(model, System):
         return _of_system(model, "mass_matrix", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
-    return by_recursion(recursions.crba, matrix_form.mass_matrix, model, q)
+    return by_recursion(recursions.crba, world_frame.mass_matrix, model, q)
 
 
 def coriolis_matrix(
-    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0
+    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
 ) -> Float[Array, "nv nv"]:
     """Coriolis matrix C(q, v) with the skew property: C v are the Coriolis and centrifugal forces, dM/dt = C + C^T.
 
@@ -62,10 +60,10 @@ def coriolis_matrix(
     if isinstance(model, System):
         return _of_system(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
-    return by_recursion(matrix_form.coriolis_matrix, matrix_form.coriolis_matrix, model, q, v)
+    return by_recursion(world_frame.coriolis_matrix, world_frame.coriolis_matrix, model, q, v)
 
 
-def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, " nv"]:
+def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, " nv"]:
     """Generalised gravity force N(q) = +dV/dq along the velocity coordinates; it stands on the left, with M a.
 
     **Arguments:** `q` (nq,).
@@ -77,10 +75,12 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         return jnp.zeros((model.nv,), model.home.dtype)
-    return by_recursion(recursions.gravity_force, matrix_form.gravity_force, model, q)
+    return by_recursion(recursions.gravity_force, world_frame.gravity_force, model, q)
 
 
-def bias_force(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"]:
+def bias_force(
+    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
+) -> Float[Array, " nv"]:
     """Bias force h = C(q, v) v + N(q): what tau must be for zero acceleration a.
 
     **Arguments:** `q` (nq,); `v` (nv,).
@@ -98,7 +98,7 @@ def inverse_dynamics(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     a: Float[Array, " nv"],
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
@@ -124,7 +124,7 @@ def forward_dynamics(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     tau: Float[Array, " nv"],
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
@@ -133,8 +133,9 @@ def forward_dynamics(
     **Arguments:** `q` (nq,); `v` (nv,); `tau` (nv,), N m or N; `external` (nb, 6), wrench (f, tau) ON each body, at its
     frame's origin and in its axes (N, N m), or None.
 
-    **Returns:** (nv,), the rate of v. NaN when M is not positive definite, which a joint that moves no inertia causes;
-    the error grows with the condition number of M.
+    **Returns:** (nv,), the rate of v: of a free or spherical joint that of its body twist, in axes that turn with the body
+    (`frame_acceleration` gives accelerations in world axes). NaN when M is not positive definite, which a joint that moves
+    no inertia causes; the error grows with the condition number of M.
 
     **Raises:** ValueError, on concrete numbers, for a `System` without a motion here: M singular (its rank is named), a
     Lagrangian that is not finite, an immersion of too low a rank.
@@ -181,7 +182,7 @@ def by_recursion(recursion, matrices, model: Model, *args):
 
 
 def _inverse_dynamics(model: Model, q, v, a):
-    return (looped if model.nb > MAX_BODIES else matrix_form).inverse_dynamics(model, q, v, a)
+    return (scans if model.nb > MAX_BODIES else world_frame).inverse_dynamics(model, q, v, a)
 
 
 def _bias_force(model: Model, q, v):
@@ -190,7 +191,7 @@ def _bias_force(model: Model, q, v):
 
 def _solve_for_acceleration(model: Model, q, v, tau):
     """Forward dynamics where there is no kernel, differentiated by the implicit function theorem."""
-    form = looped if model.nb > _MAX_BODIES_IN_MATRICES else matrix_form
+    form = scans if model.nb > _MAX_BODIES_IN_MATRICES else world_frame
 
     def tangent(model, q, v, tau, steps):
         return form.forward_dynamics_tangent(
@@ -226,10 +227,12 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
     **Returns:** (nv,), N m or N; it stands on the right, with tau.
     """
     q, external = check_shapes(model, q=q, external=external)
-    return by_recursion(matrix_form.generalized_force, matrix_form.generalized_force, model, q, external)
+    return by_recursion(world_frame.generalized_force, world_frame.generalized_force, model, q, external)
 
 
-def kinetic_energy(model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, ""]:
+def kinetic_energy(
+    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
+) -> Float[Array, ""]:
     """Kinetic energy T = 1/2 sum of V_i . M_i V_i + 1/2 sum of armature v^2 = 1/2 v . M(q) v.
 
     **Arguments:** `q` (nq,); `v` (nv,).
@@ -249,7 +252,7 @@ def _kinetic_energy(model: Model, q, v):
     return energy if model.armature is None else energy + 0.5 * jnp.sum(model.armature * v * v)
 
 
-def potential_energy(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, ""]:
+def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, ""]:
     """Potential energy of gravity, V = -sum of m_i g . c_i with c_i the world position of each centre of mass.
 
     Zero height is the plane through the world's origin. Far from it the value is large, and small differences of it are
@@ -288,7 +291,7 @@ def torque_regressor(
     Source: Atkeson, An & Hollerbach (1986).
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
-    return by_recursion(matrix_form.torque_regressor, matrix_form.torque_regressor, model, q, v, a)
+    return by_recursion(world_frame.torque_regressor, world_frame.torque_regressor, model, q, v, a)
 
 
 def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
@@ -304,10 +307,10 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     """
     (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "mass_matrix_derivative")
-    return by_recursion(matrix_form.mass_matrix_derivative, matrix_form.mass_matrix_derivative, model, q)
+    return by_recursion(world_frame.mass_matrix_derivative, world_frame.mass_matrix_derivative, model, q)
 
 
-def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t=0.0) -> Float[Array, "nv nv nv"]:
+def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
     """Christoffel symbols of the first kind, Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i).
 
     The matrix C_ij = sum_k Gamma_ijk v_k has the same C v and C + C^T as `coriolis_matrix`.

@@ -82,8 +82,8 @@ def workspace_dynamics(
     a `least` outside of (0, 1).
 
     ```python
-    found = jd.workspace_dynamics(arm, "tip", q, v)
-    tau = found.jacobian.T @ (found.mass_matrix @ wanted + found.coriolis_force + found.gravity_force)
+    task = jd.workspace_dynamics(arm, "tip", q, v)
+    tau = task.jacobian.T @ (task.mass_matrix @ wanted + task.coriolis_force + task.gravity_force)
     ```
 
     Source: Khatib (1987), eqs 19-22 and 50; Murray, Li & Sastry (1994), eq. 4.33; EQUATIONS section 10.

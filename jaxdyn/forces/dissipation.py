@@ -1,4 +1,4 @@
-"""Forces that take energy away: Rayleigh's dissipation function, and Coulomb friction while it slides a given way."""
+"""Forces that take energy away: Rayleigh's dissipation function, and Coulomb friction for sliding in a given direction."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdyn.model.arguments import Function, Numbers
 from jaxdyn.systems.scene import as_pytree
 
 
@@ -26,7 +27,7 @@ class RayleighDissipation(eqx.Module):
 
     function: Callable
 
-    def __init__(self, function):
+    def __init__(self, function: Function):
         self.function = as_pytree(function, "RayleighDissipation: function")
 
     def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
@@ -67,7 +68,7 @@ class SlidingFriction(eqx.Module):
     direction: int = eqx.field(static=True)
     along: Any
 
-    def __init__(self, coefficient, normal, direction: int, along: Any = 0):
+    def __init__(self, coefficient: Numbers, normal, direction: int, along: Any = 0):
         if direction not in (1, -1):
             raise ValueError(
                 f"SlidingFriction: direction is {direction!r}; give the sign of the sliding velocity, 1 or -1"

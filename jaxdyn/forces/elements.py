@@ -205,13 +205,13 @@ class Drive(eqx.Module):
             for name, value in (("kp", self.kp), ("kd", self.kd), ("target_velocity", self.target_velocity))
         )
         error = -_displacement(system, self.target, q, places, "Drive: target")
-        effort = kp * error + kd * (rate - take(v, places.v))
+        command = kp * error + kd * (rate - take(v, places.v))
         if self.effort_limit is not None:
             limit = _sized(self.effort_limit, v, size, "Drive: effort_limit")
             bounded = jnp.isfinite(limit)
             safe = jnp.where(bounded, limit, jnp.ones_like(limit))  # keeps inf * 0 out of the gradient
-            effort = jnp.where(bounded, safe * jnp.tanh(effort / safe), effort)
-        return _spread(effort, places.v, system.nv)
+            command = jnp.where(bounded, safe * jnp.tanh(command / safe), command)
+        return _spread(command, places.v, system.nv)
 
 
 class ExternalWrench(eqx.Module):

@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxdyn.model.arguments import as_array
+from jaxdyn.model.arguments import Numbers, as_array
 from jaxdyn.model.tree import Model
 
 
@@ -34,7 +34,7 @@ class JointStops(eqx.Module):
     damping: Float[Array, ""]
     joints: tuple[str, ...] | None = eqx.field(static=True)
 
-    def __init__(self, stiffness: Any = 1e4, damping: Any = 0.0, joints: Any = None):
+    def __init__(self, stiffness: Numbers = 1e4, damping: Numbers = 0.0, joints: Any = None):
         self.stiffness = _number(stiffness, "JointStops: stiffness", least=0.0, strict=True)
         self.damping = _number(damping, "JointStops: damping", least=0.0, strict=False)
         self.joints = (joints,) if isinstance(joints, str) else joints if joints is None else tuple(joints)
@@ -64,17 +64,17 @@ class JointStops(eqx.Module):
             raise ValueError(
                 f"JointStops: joints {missing} are not in model {system.name!r}; it has {list(top.joint_names)}"
             )
-        found = []
+        places = []
         for name in names:
             i = top.joint_names.index(name)
             at_q, at_v = top.q_slices[i], top.v_slices[i]
             if at_q.stop - at_q.start == 1 and at_v.stop - at_v.start == 1:
-                found.append((at_q.start, at_v.start))
+                places.append((at_q.start, at_v.start))
             elif self.joints is not None:
                 raise ValueError(
                     f"JointStops: joint {name!r} is {top.kinds[i]!r}; stops are for joints of one coordinate"
                 )
-        return found
+        return places
 
 
 class EffortLimits(eqx.Module):
@@ -90,7 +90,7 @@ class EffortLimits(eqx.Module):
 
     limit: Float[Array, "..."] | None
 
-    def __init__(self, limit: Any = None):
+    def __init__(self, limit: Numbers | None = None):
         self.limit = None if limit is None else jnp.asarray(as_array(limit, "EffortLimits: limit"), float)
         if self.limit is not None and not isinstance(self.limit, Tracer) and not (np.asarray(self.limit) >= 0).all():
             raise ValueError(
@@ -114,12 +114,12 @@ class EffortLimits(eqx.Module):
 
 
 def _number(value: Any, what: str, least: float, strict: bool):
-    found = jnp.asarray(as_array(value, what), float)
-    fine = isinstance(found, Tracer) or (
-        found.shape == () and np.isfinite(found) and (found > least if strict else found >= least)
+    number = jnp.asarray(as_array(value, what), float)
+    fine = isinstance(number, Tracer) or (
+        number.shape == () and np.isfinite(number) and (number > least if strict else number >= least)
     )
     if not fine:
         raise ValueError(
             f"{what} is {value}; give one {'positive number' if strict else 'number that is not negative'}"
         )
-    return found
+    return number

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import is_known
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state
+from jaxdyn.model.arguments import Function, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
 from jaxdyn.systems.start import place_of
 from jaxdyn.systems.system import System, checked_size, rate_to_velocity
@@ -51,7 +51,7 @@ class PullBack(eqx.Module):
         return value
 
 
-def pull_back(field: Any, immersion: Any) -> PullBack:
+def pull_back(field: Function, immersion: Function) -> PullBack:
     """The pull-back of a covariant tensor by q = xi(s): J^T g J of a metric, J^T F of a one-form, V(xi(s)) of a function.
 
     **Arguments:**
@@ -87,22 +87,22 @@ class ImmersedSystem(System):
     moving: bool = eqx.field(static=True)
     joined: bool = eqx.field(static=True)
 
-    def place(self, s, t) -> tuple[Array, ...]:
+    def configurations(self, s, t) -> tuple[Array, ...]:
         """Configuration of each unit at s, each (nq,) of its system."""
-        found = self.immersion(s, t) if self.moving else self.immersion(s)
-        found = tuple(found) if self.joined else (found,)
-        sizes = [jnp.shape(q) for q in found]
+        positions = self.immersion(s, t) if self.moving else self.immersion(s)
+        positions = tuple(positions) if self.joined else (positions,)
+        sizes = [jnp.shape(q) for q in positions]
         wanted = [(unit.nq,) for unit in self.units]
         if sizes != wanted:
             raise ValueError(
                 f"xi returned shapes {sizes}, expected {wanted}: "
                 + ("one configuration for each of the systems" if self.joined else "the system's configuration")
             )
-        return tuple(jnp.asarray(q, s.dtype) for q in found)
+        return tuple(jnp.asarray(q, s.dtype) for q in positions)
 
     def velocities(self, s, v, t) -> tuple[Array, ...]:
         """Velocity of each unit at s and sdot = v, each (nv,) of its system."""
-        q, rates = self._pushed(self.place, s, t, v)
+        q, rates = self._pushed(self.configurations, s, t, v)
         return tuple(rate_to_velocity(*of) for of in zip(self.units, q, rates, strict=True))
 
     def _pushed(self, function, s, t, v):
@@ -113,7 +113,7 @@ class ImmersedSystem(System):
 
     def _columns(self, s, t):
         """J (nv, m) of each unit."""
-        q, push = jax.linearize(lambda s: self.place(s, t), s)
+        q, push = jax.linearize(lambda s: self.configurations(s, t), s)
         rates = jax.vmap(push)(jnp.eye(self.nq, dtype=s.dtype))
         columns = jax.vmap(lambda *rates: [rate_to_velocity(*of) for of in zip(self.units, q, rates, strict=True)])
         return q, [J.T for J in columns(*rates)]
@@ -156,12 +156,12 @@ class ImmersedSystem(System):
 
     def kinetic_energy(self, s, v, t):
         """Sum of the units' kinetic energies, (), J."""
-        placed = zip(self.units, self.place(s, t), self.velocities(s, v, t), strict=True)
+        placed = zip(self.units, self.configurations(s, t), self.velocities(s, v, t), strict=True)
         return _sum(dynamics.kinetic_energy(unit, q, w, t) for unit, q, w in placed)
 
     def potential_energy(self, s, t):
         """Sum of the units' potential energies, (), J."""
-        placed = zip(self.units, self.place(s, t), strict=True)
+        placed = zip(self.units, self.configurations(s, t), strict=True)
         return _sum(dynamics.potential_energy(unit, q, t) for unit, q in placed)
 
     def check_start(self, q, v, t) -> None:
@@ -182,20 +182,20 @@ class PulledForce(eqx.Module):
         total = [
             _sum(
                 [jnp.zeros_like(w)]
-                + [checked_force(f(unit, place, w, t), place, unit.nv, f"forces[{i}]") for i, f in enumerate(forces)]
+                + [checked_force(f(unit, q_unit, w, t), q_unit, unit.nv, f"forces[{i}]") for i, f in enumerate(forces)]
             )
-            for unit, forces, place, w in zip(system.units, self.forces, q, v, strict=True)
+            for unit, forces, q_unit, w in zip(system.units, self.forces, q, v, strict=True)
         ]
         if self.common is None:
             return total
-        found = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
-        return _added(total, found, "force")
+        common_forces = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
+        return _added(total, common_forces, "force")
 
     def __call__(self, system, s, v, t):
         if not isinstance(system, ImmersedSystem):
             raise ValueError(f"a pulled-back force needs its immersed system, not a {type(system).__name__}")
         _, pull = jax.vjp(lambda v: system.velocities(s, v, t), v)
-        return pull(tuple(self.on_units(system, system.place(s, t), system.velocities(s, v, t), t)))[0]
+        return pull(tuple(self.on_units(system, system.configurations(s, t), system.velocities(s, v, t), t)))[0]
 
 
 def constrain_by_immersion(system: Any, xi: Callable, nq: int, *, moving: bool = False, force: Any = None) -> Any:
@@ -250,7 +250,9 @@ def constrain_by_immersion(system: Any, xi: Callable, nq: int, *, moving: bool =
     return Scene(immersed, forces=(pulled,) if force is not None or any(forces) else ())
 
 
-def reaction_force(system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], force: Any = None, t: Any = 0.0) -> Any:
+def reaction_force(
+    system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], force: Any = None, t: Numbers = 0.0
+) -> Any:
     """Force R = M a + h - F with which an immersion holds its system, in the coordinates of the system; J^T R = 0.
 
     **Arguments:**
@@ -287,11 +289,11 @@ def reaction_force(system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], 
     return reactions if immersed.joined else reactions[0]
 
 
-def _added(total, found, argument: str) -> list[Array]:
+def _added(total, forces, argument: str) -> list[Array]:
     """Forces on each unit, and others that a user gave."""
-    if len(found) != len(total):
-        raise ValueError(f"{argument} has {len(found)} entries; give one for each of the {len(total)} systems")
-    return [f + checked_force(g, f, f.shape[0], argument) for f, g in zip(total, found, strict=True)]
+    if len(forces) != len(total):
+        raise ValueError(f"{argument} has {len(forces)} entries; give one for each of the {len(total)} systems")
+    return [f + checked_force(g, f, f.shape[0], argument) for f, g in zip(total, forces, strict=True)]
 
 
 def _sum(terms):
@@ -308,8 +310,8 @@ def _check_rank(J, s, t) -> None:
     sizes = np.linalg.svd(J, compute_uv=False) if np.isfinite(J).all() else np.full(1, np.nan)
     rank = int(np.sum(sizes > least * sizes.max(initial=0.0)))
     if rank < J.shape[1]:
-        place = f"s = {np.asarray(s).tolist()}" if t is None else place_of(s, t).replace("q =", "s =")
+        where = f"s = {np.asarray(s).tolist()}" if t is None else place_of(s, t).replace("q =", "s =")
         raise ValueError(
-            f"the immersion has rank {rank} at {place}, expected {J.shape[1]}, one for each coordinate; start elsewhere, "
+            f"the immersion has rank {rank} at {where}, expected {J.shape[1]}, one for each coordinate; start elsewhere, "
             "or take coordinates that are regular there"
         )

@@ -10,7 +10,7 @@ Newton's law in these terms: flat(nabla_v v) = F, with a one-form F. Source: EQU
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +27,13 @@ from jaxdyn.systems.system import System, symbols
 
 KINDS = ("first", "second")
 
+if TYPE_CHECKING:
+    Metric = Callable[..., Any] | Model | System | Scene
+else:
+    Metric = Any  # `_at` looks at it
 
-def flat(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+
+def flat(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
     """One-form of a vector, g(q) v: the momentum of a velocity, the force of an acceleration.
 
     **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
@@ -37,7 +42,7 @@ def flat(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Arr
     return _product(_at(metric)(q), v)
 
 
-def sharp(metric: Any, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " n"]:
+def sharp(metric: Metric, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " n"]:
     """Vector of a one-form, g(q)^-1 p: the inverse of `flat`.
 
     **Arguments:** `metric` as above; `q`, `p` (n,). **Returns:** (n,); NaN where g is not positive definite.
@@ -46,7 +51,7 @@ def sharp(metric: Any, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Ar
     return solve_positive(_at(metric)(q), p)
 
 
-def christoffel_symbols(metric: Any, q: Float[Array, " n"], kind: str = "second") -> Float[Array, "n n n"]:
+def christoffel_symbols(metric: Metric, q: Float[Array, " n"], kind: str = "second") -> Float[Array, "n n n"]:
     """Christoffel symbols: Gamma^i_jk ("second" kind) or Gamma_ijk = g_il Gamma^l_jk ("first"), the index i in front.
 
     **Arguments:** `metric` as above; `q` (n,).
@@ -63,7 +68,9 @@ def christoffel_symbols(metric: Any, q: Float[Array, " n"], kind: str = "second"
     return first if kind == "first" else solve_positive(g(q), first.reshape(q.shape[0], -1)).reshape(first.shape)
 
 
-def connection(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"]) -> Float[Array, " n"]:
+def connection(
+    metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"]
+) -> Float[Array, " n"]:
     """Gamma(v, w)^i = Gamma^i_jk v_j w_k, symmetric and bilinear in v and w; the symbols are not formed.
 
     **Arguments:** `metric` as above; `q`, `v`, `w` (n,). **Returns:** (n,).
@@ -77,7 +84,7 @@ def connection(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"], w: Flo
 
 
 def covariant_rate(
-    metric: Any, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"], rate: Float[Array, " n"]
+    metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"], rate: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """Covariant derivative along a curve, Dw/dt = dw/dt + Gamma(dq/dt, w), of a vector w(t) that is carried along.
 
@@ -90,7 +97,7 @@ def covariant_rate(
 
 
 def covariant_derivative(
-    metric: Any, field: Callable, q: Float[Array, " n"], v: Float[Array, " n"]
+    metric: Metric, field: Callable, q: Float[Array, " n"], v: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """Covariant derivative nabla_v X = dX(v) + Gamma(v, X) of a vector field X(q) -> (n,) in the direction v.
 
@@ -101,7 +108,7 @@ def covariant_derivative(
     return covariant_rate(metric, q, v, w, rate)
 
 
-def geodesic_acceleration(metric: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+def geodesic_acceleration(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
     """d2q/dt2 = -Gamma(v, v) of the geodesic through q with velocity v. `jd.MetricSystem(metric, n)` simulates it.
 
     **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
@@ -109,7 +116,7 @@ def geodesic_acceleration(metric: Any, q: Float[Array, " n"], v: Float[Array, " 
     return -connection(metric, q, v, v)
 
 
-def riemann_tensor(metric: Any, q: Float[Array, " n"]) -> Float[Array, "n n n n"]:
+def riemann_tensor(metric: Metric, q: Float[Array, " n"]) -> Float[Array, "n n n n"]:
     """Curvature tensor R^i_jkl, with R(u, w) z = nabla_u nabla_w z - nabla_w nabla_u z - nabla_[u,w] z:
 
         (R(u, w) z)^i = R^i_jkl z^j u^k w^l,
@@ -127,7 +134,7 @@ def riemann_tensor(metric: Any, q: Float[Array, " n"]) -> Float[Array, "n n n n"
 
 
 def sectional_curvature(
-    metric: Any, q: Float[Array, " n"], u: Float[Array, " n"], w: Float[Array, " n"]
+    metric: Metric, q: Float[Array, " n"], u: Float[Array, " n"], w: Float[Array, " n"]
 ) -> Float[Array, ""]:
     """Curvature <R(u, w) w, u> / (|u|^2 |w|^2 - <u, w>^2) of the plane of u and w: 1/r^2 on a sphere of radius r.
 

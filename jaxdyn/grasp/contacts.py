@@ -13,12 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.kinds import components
-from jaxdyn.model.arguments import pose_leaf
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import Numbers, pose_leaf
 
 
 class Contact(Pair):
@@ -55,17 +57,17 @@ class Contact(Pair):
         """The rows are the components themselves."""
         return tuple(range(len(self.components)))
 
-    def likeness(self):
+    def structure_key(self):
         """The kind of contact."""
         return self.kind, self.in_plane
 
-    def apart(self, R, p):
-        """Place, and where it is held attitude, of the contact frame seen from the fingertip, (n,), m and rad."""
+    def pose_residual(self, R, p):
+        """Position, and where the contact constrains it orientation, of the contact frame in the fingertip's, (n,), m and rad."""
         # The fingertip moves against the object as the object moves against the fingertip, with the other sign.
-        found = p if self.kind != "rigid" else jnp.concatenate([p, jnp.stack(attitude(R))])
-        return -found[np.array([i for i in self.components if i < found.shape[0]])]
+        residual = p if self.kind != "rigid" else jnp.concatenate([p, jnp.stack(attitude(R))])
+        return -residual[np.array([i for i in self.components if i < residual.shape[0]])]
 
-    def sliding(self, R, p, U):
+    def twist_residual(self, R, p, U):
         """Angular velocity of the object against the finger about the normal, (1,), rad/s, for a soft finger."""
         return -U[5:] if self._spins else None
 
@@ -73,9 +75,9 @@ class Contact(Pair):
 def contact(
     kind: str,
     finger: str | None,
-    pose,
+    pose: Numbers | None,
     *,
-    finger_pose=None,
+    finger_pose: Numbers | None = None,
     object: str | None = None,
     in_plane: bool = False,
     name: str | None = None,
@@ -131,21 +133,19 @@ def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
     """
     if not isinstance(places, dict) or not places:
         raise ValueError(f"places is {places!r}; give {{finger: (point, normal)}}")
-    found = []
+    contacts = []
     for finger, place in places.items():
-        if not isinstance(place, (tuple, list)) or [np.shape(x) for x in place] != [(3,), (3,)]:
+        parts = [numpy_for(x).asarray(x, float) for x in place] if isinstance(place, (tuple, list)) else []
+        if [x.shape for x in parts] != [(3,), (3,)]:
             raise ValueError(f"places[{finger!r}] is {place!r}; give (point (3,), normal (3,))")
-        point, normal = (np.asarray(x, float) for x in place)
-        length = np.linalg.norm(normal)
-        if not (np.isfinite(length) and length > 0):
+        point, normal = parts
+        if is_concrete(normal) and not (np.isfinite(normal).all() and normal.any()):
             raise ValueError(f"places[{finger!r}]: normal is {normal.tolist()}; give a direction into the object")
-        normal = normal / length
-        across = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-        across = across / np.linalg.norm(across)
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = np.stack([across, np.cross(normal, across), normal], 1), point
-        found.append(contact(kind, finger, pose))
-    return found
+        xp, normal = numpy_for(normal), f64.unit(normal, f"places[{finger!r}]: normal")
+        across = f64.unit(xp.cross(normal, xp.eye(3)[xp.argmin(xp.abs(normal))]), "across")
+        pose = f64.pose_of(xp.stack([across, xp.cross(normal, across), normal], 1), point)
+        contacts.append(contact(kind, finger, pose))
+    return contacts
 
 
 def on_object(constraint: Constraint, name: str) -> Constraint:

@@ -26,7 +26,7 @@ from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matr
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import least_quality
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -65,7 +65,11 @@ class ObjectDynamics(Outcome):
 
 
 def object_dynamics(
-    grasp: Grasp, q: Float[Array, " nq"], V: Float[Array, " no"], tau: Float[Array, " nv"] | None = None, t=0.0
+    grasp: Grasp,
+    q: Float[Array, " nq"],
+    V: Float[Array, " no"],
+    tau: Float[Array, " nv"] | None = None,
+    t: Numbers = 0.0,
 ) -> ObjectDynamics:
     """Equations of motion in the velocity of the object alone (see `ObjectDynamics`), and the contact forces.
 
@@ -104,7 +108,7 @@ def hand_dynamics(
     q: Float[Array, " nq"],
     nu: Float[Array, " nr"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     motions: HandMotions | None = None,
 ) -> ObjectDynamics:
@@ -131,8 +135,8 @@ def hand_dynamics(
 
     ```python
     motions = jd.grasp.hand_motions(grasp, q)
-    found = jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions)
-    found.acceleration, found.contact_forces
+    dynamics = jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions)
+    dynamics.acceleration, dynamics.contact_forces
     ```
 
     Source: Murray, Li & Sastry (1994), eqs 6.21-6.25 and the paragraphs on redundant and nonmanipulable grasps of section
@@ -172,8 +176,8 @@ def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     Ndot = jnp.zeros_like(N).at[hands].set(Xdot)
     whole = jnp.round(jnp.sum(inverse * Jh.T)) == hands.size
     condition = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
-    serves = whole & (condition * least_quality(q.dtype) < 1)
-    return _solved(grasp, q, V, tau, t, N, Ndot, serves, lambda left: -_product(inverse.T, left[hands]))
+    is_regular = whole & (condition * least_quality(q.dtype) < 1)
+    return _solved(grasp, q, V, tau, t, N, Ndot, is_regular, lambda left: -_product(inverse.T, left[hands]))
 
 
 @compiled
@@ -181,26 +185,26 @@ def _solve_motions(grasp: Grasp, motions: HandMotions, q, nu, tau, t) -> ObjectD
     place, push = jax.linearize(lambda q, t: motions.at(grasp, q, t), q, t)
     v = _product(place.N, nu)
     Ndot = push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)).N
-    serves = place.quality > least_quality(q.dtype)
+    is_regular = place.quality > least_quality(q.dtype)
     A = constraint_jacobian(grasp, q, t)
     inverse = pseudo_inverse(A, tolerance(None, A))
-    return _solved(grasp, q, nu, tau, t, place.N, Ndot, serves, lambda left: _product(inverse.T, left))
+    return _solved(grasp, q, nu, tau, t, place.N, Ndot, is_regular, lambda left: _product(inverse.T, left))
 
 
-def _solved(grasp: Grasp, q, nu, tau, t, N, Ndot, serves, multipliers) -> ObjectDynamics:
+def _solved(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multipliers) -> ObjectDynamics:
     """The equations in nu, v = N nu, and their solution; `multipliers` of A^T lam = M a + C v + g - tau (nv,)."""
     system, v = grasp.system, _product(N, nu)
     M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)
     gravity, force = gravity_force(system, q, t), applied(grasp, q, v, tau, t)
     mass = _product(N.T, _product(M, N))
     coriolis = _product(N.T, _product(C, N) + _product(M, Ndot))
-    held, driven = _product(N.T, gravity), _product(N.T, force)
+    gravity_part, force_part = _product(N.T, gravity), _product(N.T, force)
     factor = jnp.linalg.cholesky(mass)
-    rate = cho_solve((factor, True), driven - _product(coriolis, nu) - held)
+    rate = cho_solve((factor, True), force_part - _product(coriolis, nu) - gravity_part)
     a = _product(N, rate) + _product(Ndot, nu)
     lam = multipliers(_product(M, a) + _product(C, v) + gravity - force)
 
     result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
-    result = RESULTS.where(serves, result, RESULTS.singular_basis)
+    result = RESULTS.where(is_regular, result, RESULTS.singular_basis)
     push = N[velocity_rows(grasp)[0]].T
-    return ObjectDynamics(mass, coriolis, held, driven, push, rate, v, a, lam, N, result, layout(grasp))
+    return ObjectDynamics(mass, coriolis, gravity_part, force_part, push, rate, v, a, lam, N, result, layout(grasp))

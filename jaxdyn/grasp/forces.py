@@ -27,7 +27,7 @@ from jaxdyn.dynamics.quantities import gravity_force
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp, check_grasp, grasp_map, hand_jacobian
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
 from jaxdyn.reduction.bases import orthonormal, split_directions
 
 
@@ -57,7 +57,7 @@ class HandForces(eqx.Module):
 
 
 def internal_force_basis(
-    grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0, *, reference: Float[Array, "nc ni"] | None = None
+    grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0, *, reference: Float[Array, "nc ni"] | None = None
 ) -> Float[Array, "nc ni"]:
     """Orthonormal basis E (nc, ni) of the internal forces: G E = 0.
 
@@ -92,7 +92,7 @@ def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
     **Raises:** ValueError for a constraint of the grasp that has no normal force.
     """
     check_grasp(grasp)
-    found = np.zeros(layout(grasp)[-1].end)
+    forces = np.zeros(layout(grasp)[-1].end)
     for constraint, place in zip(grasp.constraints, layout(grasp), strict=True):
         order = constraint.wrench_components()
         if order is None:
@@ -101,12 +101,12 @@ def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
             normal = components(constraint.kind, constraint.in_plane, place.name).index(2)
         else:
             normal = {1: 0, 2: 1}.get(len(order), 2)
-        found[place.start + order[normal]] = 1.0
-    return found
+        forces[place.start + order[normal]] = 1.0
+    return forces
 
 
 def forces_for_wrench(
-    grasp: Grasp, q: Float[Array, " nq"], wrench: Float[Array, " no"], preload: Any = 0.0, t: Any = 0.0
+    grasp: Grasp, q: Float[Array, " nq"], wrench: Float[Array, " no"], preload: Numbers = 0.0, t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
     """Contact forces lam = G^+ F + (1 - G^+ G) lam_0 that exert the wrench F on the object, with a chosen internal force.
 
@@ -156,8 +156,8 @@ def hold(
     wrench: Float[Array, " no"] | None = None,
     *,
     cones: Any = None,
-    preload: Any = 0.0,
-    t: Any = 0.0,
+    preload: Numbers = 0.0,
+    t: Numbers = 0.0,
 ) -> HandForces:
     """Least contact forces within their cones that exert a wrench on the object, and the torques for them at rest.
 
@@ -177,8 +177,8 @@ def hold(
     **Raises:** ValueError for shapes that do not fit and for contacts without a cone.
 
     ```python
-    found = jd.grasp.hold(grasp, q, preload=0.5)
-    found.torques, found.by_contact()
+    forces = jd.grasp.hold(grasp, q, preload=0.5)
+    forces.torques, forces.by_contact()
     ```
 
     Source: Murray, Li & Sastry (1994), section 5.3; Boyd & Wegbreit (2007).
@@ -196,22 +196,22 @@ def hold(
     order = np.concatenate([contact.rows for contact in contacts])
     wrench = weight if wrench is None else wrench
     G = A[:, np.array(grasp.object_velocities, int)].T
-    found = optimal_forces(G[:, order], wrench, [contact.cone for contact in contacts], preload=preload)
-    forces = jnp.zeros((A.shape[0],), A.dtype).at[order].set(found.x)
+    optimum = optimal_forces(G[:, order], wrench, [contact.cone for contact in contacts], preload=preload)
+    forces = jnp.zeros((A.shape[0],), A.dtype).at[order].set(optimum.x)
     torques = -_product(A[:, np.array(grasp.hand_velocities, int)].T, forces)
-    return HandForces(forces, torques, found.result, layout(grasp))
+    return HandForces(forces, torques, optimum.result, layout(grasp))
 
 
 @compiled
 def _static(grasp: Grasp, q, t):
-    """The rows, and what holds the object still."""
-    still = jnp.zeros((grasp.nv,), q.dtype)
-    force = gravity_force(grasp.system, q, t) - applied(grasp, q, still, still, t)
+    """The rows, and the wrench of the contacts with the object at rest."""
+    at_rest = jnp.zeros((grasp.nv,), q.dtype)
+    force = gravity_force(grasp.system, q, t) - applied(grasp, q, at_rest, at_rest, t)
     return constraint_jacobian(grasp, q, t), force[np.array(grasp.object_velocities, int)]
 
 
 def force_closure(
-    grasp: Grasp, q: Float[Array, " nq"], *, cones: Any = None, t: Any = 0.0, required: bool = False
+    grasp: Grasp, q: Float[Array, " nq"], *, cones: Any = None, t: Numbers = 0.0, required: bool = False
 ) -> ForceClosure:
     """Whether the contacts of the grasp can resist every wrench on the object; see `jd.contact.force_closure`.
 
@@ -227,19 +227,21 @@ def force_closure(
     check_grasp(grasp)
     contacts = _every_cone(grasp, cones)
     order = np.concatenate([contact.rows for contact in contacts])
-    found = _closure(grasp_map(grasp, q, t)[:, order], [contact.cone for contact in contacts])
-    if required and not found.closed:
+    closure = _closure(grasp_map(grasp, q, t)[:, order], [contact.cone for contact in contacts])
+    if required and not closure.closed:
         raise ValueError(
             f"the contacts {[contact.name for contact in contacts]} on {grasp.object!r} have no force closure: the wrench "
-            f"{np.round(found.direction, 6).tolist()} on the object cannot be resisted; add contacts or friction, or place them "
-            "elsewhere"
+            f"{np.round(closure.direction, 6).tolist()} on the object cannot be resisted; add contacts or friction, or place "
+            "them elsewhere"
         )
     forces = np.zeros(order.size)
-    forces[order] = found.forces
-    return ForceClosure(found.closed, found.margin, forces, found.direction, found.rank)
+    forces[order] = closure.forces
+    return ForceClosure(closure.closed, closure.margin, forces, closure.direction, closure.rank)
 
 
-def joint_torques(grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Any = 0.0) -> Float[Array, " nh"]:
+def joint_torques(
+    grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Numbers = 0.0
+) -> Float[Array, " nh"]:
     """J_h^T lam (nh,): torques of the joints that exert the contact forces lam (nc,) at rest, without the fingers' weight.
 
     Source: Murray, Li & Sastry (1994), eq. 5.31; EQUATIONS section 10.
@@ -259,8 +261,8 @@ def _every_cone(grasp: Grasp, cones) -> tuple[ConedContact, ...]:
             f"the contacts {names} have no cones; give cones, as in jd.contact.friction_cone('hard-finger', mu=0.8), here "
             "or to the Grasp"
         )
-    found = coned_contacts(grasp, cones)
-    missing = [name for name in names if name not in {contact.name for contact in found}]
+    coned = coned_contacts(grasp, cones)
+    missing = [name for name in names if name not in {contact.name for contact in coned}]
     if missing:
         raise ValueError(f"contacts {missing} have no cone; give one for every contact of {names}")
-    return found
+    return coned

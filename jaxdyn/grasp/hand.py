@@ -1,7 +1,6 @@
 """A grasp: one model of the fingers and the object, with the contacts between them as constraints."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -13,8 +12,8 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint
-from jaxdyn.model.inertia import spatial_inertia
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint
 from jaxdyn.model.joining import joined
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
@@ -84,7 +83,7 @@ class Grasp(Scene):
         return tuple(i for i in range(self.nv) if i not in self.object_velocities)
 
 
-def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "nc nh"]:
+def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nc nh"]:
     """Hand Jacobian J_h (nc, nh): J_h thetadot are the velocities of the fingertips along the contacts' components.
 
     Source: Murray, Li & Sastry (1994), eq. 5.28; EQUATIONS section 10.
@@ -93,7 +92,7 @@ def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[A
     return -constraint_jacobian(grasp, q, t)[:, np.array(grasp.hand_velocities, int)]
 
 
-def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, "no nc"]:
+def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "no nc"]:
     """Grasp map G (no, nc): G lam is the generalised force of the contact forces lam on the object.
 
     For a free body it is the wrench (f, tau) at the origin and in the axes of the body frame, and
@@ -106,7 +105,7 @@ def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array
 
 
 def internal_forces(
-    grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Any = 0.0
+    grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
     """Part of contact forces that does not move the object: (1 - G^+ G) lam, with G lam_N = 0.
 
@@ -142,7 +141,7 @@ def _check_object(model: Model, name: str) -> None:
         raise ValueError(f"there are no fingers beside the object {name!r}; pass their models")
     if is_concrete(model.inertias):
         moved = {"free": range(6), "planar": (0, 1, 5)}.get(top.kinds[body], ())
-        matrix = np.asarray(spatial_inertia(model.inertias[body]), float)[np.ix_(moved, moved)]
+        matrix = f64.spatial_inertia(np.asarray(model.inertias, float)[body])[np.ix_(moved, moved)]
         if len(moved) and not (least := np.linalg.eigvalsh(matrix)[0]) > 0:
             raise ValueError(
                 f"inertia of the object {name!r} is not positive definite: the least eigenvalue of its spatial inertia is "

@@ -5,8 +5,6 @@ Joint velocities thetadot = X w, X = J_h^+ G^T H, are the shortest ones that giv
 wrenches X^T tau of one with the semi-axes sigma_i(X) in the same directions: the same principal directions are fast and weak.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
@@ -17,7 +15,7 @@ from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, check_state
+from jaxdyn.model.arguments import Numbers, as_array, check_state
 from jaxdyn.reduction.bases import least_quality, orthonormal
 
 
@@ -49,7 +47,7 @@ class Manipulability(eqx.Module):
 
 
 def manipulability(
-    grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0, *, length: Any = 1.0, motions: HandMotions | None = None
+    grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0, *, length: Numbers = 1.0, motions: HandMotions | None = None
 ) -> Manipulability:
     """Velocity and force ellipsoids of the object in the hand (see `Manipulability`).
 

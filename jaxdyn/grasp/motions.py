@@ -22,7 +22,7 @@ from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import eps_of, pseudo_inverse, tolerance
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state
+from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.reduction.bases import Basis, Parametrization, orthonormal, split_directions
 
 
@@ -31,9 +31,9 @@ class HandMotions(Basis):
 
     - `object` (no, nw): reference R_o of H = P R_o T^-1, with P = 1 - B^+ B, B = (1 - J_h J_h^+) G^T, and T the Cholesky
       factor of R_o^T P R_o. With nw = no it is H itself, the same at every place.
-    - `internal` (nh, nk): reference R_i of K, in the same way of 1 - J_h^+ J_h.
+    - `internal` (nh, nk): reference R_i of K, likewise of 1 - J_h^+ J_h.
 
-    H and K are as smooth as J_h and G wherever their ranks are constant: no signs or pivots are chosen on the way. It is a
+    H and K are as smooth as J_h and G wherever their ranks are constant: no signs or pivots are chosen. It is a
     basis for `jd.reduced_dynamics` and, around the place of its references, for `jd.Reduced`.
     """
 
@@ -86,7 +86,7 @@ class HandMotions(Basis):
 
 
 def hand_motions(
-    grasp: Grasp, q: Float[Array, " nq"], t: Any = 0.0, *, sizes: tuple[int, int] | None = None
+    grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0, *, sizes: tuple[int, int] | None = None
 ) -> HandMotions:
     """Bases of the object velocities that the fingers can follow and of the hand's internal motions, at q.
 
@@ -106,7 +106,7 @@ def hand_motions(
 
     ```python
     motions = jd.grasp.hand_motions(grasp, q)
-    found = jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions)
+    dynamics = jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions)
     ```
 
     Source: Murray, Li & Sastry (1994), section 6.3; EQUATIONS section 10.

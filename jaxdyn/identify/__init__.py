@@ -13,7 +13,10 @@ from jaxdyn.identify.intervals import Intervals as Intervals
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import from_raw as from_raw
 from jaxdyn.identify.logs import split as split
+from jaxdyn.identify.mechanisms import completed as completed
+from jaxdyn.identify.parameter_tree import Parameters as Parameters
 from jaxdyn.identify.parameters import fit_parameters as fit_parameters
+from jaxdyn.identify.parameters import parameter_error as parameter_error
 from jaxdyn.identify.payload import Payload as Payload
 from jaxdyn.identify.payload import fit_payload as fit_payload
 from jaxdyn.identify.regression import BaseParameters as BaseParameters
@@ -31,6 +34,7 @@ from jaxdyn.identify.result import Fit as Fit
 from jaxdyn.identify.result import ParameterFit as ParameterFit
 from jaxdyn.identify.robot import RobotFit as RobotFit
 from jaxdyn.identify.robot import fit_robot as fit_robot
+from jaxdyn.identify.sensors import Measured as Measured
 from jaxdyn.identify.torque_terms import EXTRA as EXTRA
 from jaxdyn.identify.torque_terms import TorqueTerm as TorqueTerm
 from jaxdyn.identify.trajectory import fit_trajectory as fit_trajectory

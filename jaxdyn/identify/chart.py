@@ -112,8 +112,12 @@ def check_bodies(model) -> None:
         )
 
 
-def make_chart(model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_scale) -> tuple[Chart, Coordinates]:
+def make_chart(
+    model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_scale, *, bodies=None
+) -> tuple[Chart, Coordinates]:
     """Chart around a model, and the point to start from: the model's own numbers, a tenth of a unit where it has none.
+
+    `bodies`: indices of those whose inertias can change, all that have mass by default.
 
     Units are a tenth of the torque, that torque over the velocity and over the acceleration (root mean squares, (nv,)).
 
@@ -125,7 +129,8 @@ def make_chart(model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_sca
         raise ValueError(f"inertia is {inertia!r}; take one of {INERTIA}")
     dtype = np.dtype(model.home.dtype)
     numbers = np.asarray(model.inertias, np.float64)
-    bodies = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()
+    massive = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()
+    bodies = massive if bodies is None else tuple(i for i in massive if i in tuple(bodies))
     matrices = [_pseudo_inertia(numbers[i]) for i in bodies]
     bad = [model.body_names[i] for i, P in zip(bodies, matrices, strict=True) if not _is_feasible(P, inertia)]
     if bad:

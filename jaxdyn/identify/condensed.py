@@ -160,7 +160,7 @@ def condense_blocks(
     triangles, samples, owners = [], [], []
     for which, part in block_slices([len(log) for log in logs], blocks):
         nv = logs[which].nv
-        found = [np.zeros((0, 0))] * nv
+        triangle_of_row = [np.zeros((0, 0))] * nv
         for start in range(part.start, part.stop, _SAMPLES):
             piece = slice(start, min(start + _SAMPLES, part.stop))
             log = logs[which][piece]
@@ -170,9 +170,9 @@ def condense_blocks(
             for j in range(nv):
                 table = np.concatenate([W[:, j, :shared], own[:, j, :, j], more[:, j], tau[:, j, None]], axis=1)
                 table = table if weights is None else table * weights[which][piece, j, None]
-                before = found[j] if found[j].size else np.zeros((0, table.shape[1]))
-                found[j] = np.asarray(np.linalg.qr(np.concatenate([before, table]), mode="r"))
-        triangles.append(found)
+                before = triangle_of_row[j] if triangle_of_row[j].size else np.zeros((0, table.shape[1]))
+                triangle_of_row[j] = np.asarray(np.linalg.qr(np.concatenate([before, table]), mode="r"))
+        triangles.append(triangle_of_row)
         samples.append(part.stop - part.start)
         owners.append(which)
     terms = triangles[0][0].shape[1] - 1 - shared

@@ -56,7 +56,7 @@ class _Limits(eqx.Module):
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
     speed: Float[Array, " n"]
-    effort: Float[Array, " n"]
+    torque_limit: Float[Array, " n"]
 
 
 class _Task(eqx.Module):
@@ -136,7 +136,7 @@ def exciting_motion(
     size = np.asarray(limits.upper - limits.lower) / 4
     columns = free_columns(model.nb, model.nv, terms)[base_parameters(model, terms).independent]
     times = jnp.asarray(np.arange(_SAMPLES) * period / _SAMPLES, dtype)
-    weights = 1 / limits.effort
+    weights = 1 / limits.torque_limit
     task = _Task(model, limits, times, jnp.ones(len(columns), dtype), weights, jnp.asarray(v_s, dtype))
 
     keys = jax.random.split(jax.random.key(seed), starts)
@@ -150,13 +150,19 @@ def exciting_motion(
     first = [float(_loss(_amplitudes(motion), motion, task, places, objective)) for motion in motions]
     motion = motions[int(np.argmin(np.where(np.isfinite(first), first, np.inf)))]
 
-    found, history = _descend(motion, task, places, objective, steps, learning_rate, callback)
-    found = _shrunk(found, task)
-    before, after = (np.asarray(_rows(m, task, places), np.float64) for m in (motion, found))
+    excitation, history = _descend(motion, task, places, objective, steps, learning_rate, callback)
+    excitation = _shrunk(excitation, task)
+    before, after = (np.asarray(_rows(m, task, places), np.float64) for m in (motion, excitation))
     scale = np.asarray(task.scale, np.float64)
     ratio = [np.linalg.slogdet((W / scale).T @ (W / scale))[1] for W in (before, after)]
     return Excitation(
-        found, model, _condition(after), _condition(before), float(ratio[1] - ratio[0]), history, _used(found, task)
+        excitation,
+        model,
+        _condition(after),
+        _condition(before),
+        float(ratio[1] - ratio[0]),
+        history,
+        _used(excitation, task),
     )
 
 
@@ -175,15 +181,15 @@ def _limits(model: Model, margin: float, velocity, torque) -> _Limits:
     upper = np.where(np.isfinite(upper), upper, lower + 2 * _TURN)
     middle, half = (lower + upper) / 2, margin * (upper - lower) / 2
     speed = margin * of(model.velocity_limit if velocity is None else velocity, _SPEED)
-    effort = margin * of(model.effort_limit if torque is None else torque, np.inf)
-    for name, value in (("velocity", speed), ("torque", effort), ("the range of positions", half)):
+    torque_limit = margin * of(model.effort_limit if torque is None else torque, np.inf)
+    for name, value in (("velocity", speed), ("torque", torque_limit), ("the range of positions", half)):
         if not np.all(value > 0):
             raise ValueError(f"{name} has limits {value.tolist()}; they must be positive")
     # Without limits of torque, what the robot needs to stand tells the size of its torques.
-    if not np.isfinite(effort).all():
+    if not np.isfinite(torque_limit).all():
         mass = float(np.asarray(model.inertias)[:, 0].sum())
-        effort = np.where(np.isfinite(effort), effort, 1e3 * max(mass, 1e-3))
-    arrays = (middle - half, middle + half, speed, effort)
+        torque_limit = np.where(np.isfinite(torque_limit), torque_limit, 1e3 * max(mass, 1e-3))
+    arrays = (middle - half, middle + half, speed, torque_limit)
     return _Limits(*(jnp.asarray(x, dtype) for x in arrays))
 
 
@@ -239,7 +245,7 @@ def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...
         (q - limits.upper[None]) / span,
         (limits.lower[None] - q) / span,
         jnp.abs(v) / limits.speed[None] - 1,
-        jnp.abs(tau) / limits.effort[None] - 1,
+        jnp.abs(tau) / limits.torque_limit[None] - 1,
     ]
     return value + 100 * sum(jnp.mean(jnp.maximum(x, 0) ** 2) for x in over)
 
@@ -285,7 +291,8 @@ def _used(motion: FourierMotion, task: _Task) -> dict[str, float]:
     times = jnp.asarray(np.arange(_CHECKED) * float(motion.period) / _CHECKED, task.times.dtype)
     q, v, _, tau = (np.asarray(x, np.float64) for x in _signals(motion, task.model, times))
     limits = [
-        np.asarray(x, np.float64) for x in (task.limits.lower, task.limits.upper, task.limits.speed, task.limits.effort)
+        np.asarray(x, np.float64)
+        for x in (task.limits.lower, task.limits.upper, task.limits.speed, task.limits.torque_limit)
     ]
     middle, half = (limits[0] + limits[1]) / 2, (limits[1] - limits[0]) / 2
     sizes = {

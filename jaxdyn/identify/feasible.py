@@ -16,6 +16,7 @@ from jaxdyn.identify.condensed import Condensed, condensed_rows
 from jaxdyn.identify.friction import TERMS, check_terms
 from jaxdyn.identify.logs import Log, as_logs, as_measured, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
+from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.regression import check_weights, condense_model, noise_level
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.threads import on_one_thread
@@ -119,11 +120,10 @@ def fit_torques(
             start,
             (problem, point),
             method=method,
-            steps=steps,
             learning_rate=learning_rate,
             tolerance=tolerance,
             scaling=lambda y: _whitening(problem, unflatten(y)),
-            callback=report,
+            watch=Watch(steps, report),
         )
         point = unflatten(y)
     fitted, friction = chart.fitted(model, chart.settled(point))
@@ -191,8 +191,8 @@ def newton(model: Model, problem: Problem, point: Coordinates, steps: int, toler
             callback(step, loss, there.fitted(model, at)[0])
 
     resolution = float(jnp.finfo(problem.R.dtype).eps)
-    found = interior.newton(host, np.asarray(point.s), steps, tolerance, watch, resolution)
-    return *placed(chart, found.origin, found.s), found.history, found.result
+    optimum = interior.newton(host, np.asarray(point.s), steps, tolerance, watch, resolution)
+    return *placed(chart, optimum.origin, optimum.s), optimum.history, optimum.result
 
 
 def placed(chart: Chart, origin: np.ndarray, s: np.ndarray) -> tuple[Chart, Coordinates]:
@@ -208,8 +208,8 @@ def _whitening(problem: Problem, point: Coordinates):
     """S with S S^T the inverse of the Gauss-Newton Hessian of the loss."""
     y, unflatten = ravel_pytree(point)
     rows = problem.R @ jax.jacfwd(lambda y: problem.chart.parameters(unflatten(y)))(y)
-    bent = jax.hessian(lambda y: problem.chart.divergence(unflatten(y).theta))(y)
-    values, vectors = jnp.linalg.eigh(rows.T @ rows + problem.prior * (bent + bent.T) / 2)
+    curvature = jax.hessian(lambda y: problem.chart.divergence(unflatten(y).theta))(y)
+    values, vectors = jnp.linalg.eigh(rows.T @ rows + problem.prior * (curvature + curvature.T) / 2)
     # Terms that the log does not show have no curvature, and far from the nominal bodies that of the prior can be negative.
     return vectors / jnp.sqrt(jnp.maximum(values, problem.prior))[None, :]
 

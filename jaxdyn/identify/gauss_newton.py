@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.regression import truncated
 
 # Damping of the first step, and its bounds, in shares of the largest curvature.
@@ -41,6 +42,8 @@ class Linear(NamedTuple):
     offset: Any = None
     gain: Any = None
     by_starts: float = 0.0  # what the starts alone would take from the loss
+    priors: int = 0  # how many of the errors, the last ones, are those of the prior
+    prior_weight: float = 1.0
 
     @property
     def finite(self) -> bool:
@@ -54,13 +57,13 @@ class Linear(NamedTuple):
         dy = -np.linalg.solve(hessian + size * np.eye(len(hessian)), gradient)
         return dy, self.by_starts + float(dy @ (size * dy - gradient))
 
-    def moved(self, found: Unknowns, dy: np.ndarray) -> Unknowns:
+    def moved(self, estimate: Unknowns, dy: np.ndarray) -> Unknowns:
         """The unknowns after a step."""
-        dtype, start = found.y.dtype, found.start
+        dtype, start = estimate.y.dtype, estimate.start
         if start is not None:
             change = jnp.asarray(self.offset + self.gain @ dy, dtype)
             start = start - change.reshape(start.shape)
-        return Unknowns(found.y + jnp.asarray(dy, dtype), start)
+        return Unknowns(estimate.y + jnp.asarray(dy, dtype), start)
 
 
 def linear(errors, by_y, by_start) -> Linear:
@@ -84,53 +87,96 @@ def linear(errors, by_y, by_start) -> Linear:
 
 
 def gauss_newton(
-    linearise: Callable[[Unknowns], Linear], found: Unknowns, *, steps: int, tolerance: float, callback: Callable
+    linearise: Callable[[Unknowns], Linear], estimate: Unknowns, *, tolerance: float, watch: Watch
 ) -> tuple[Unknowns, Linear, np.ndarray, str]:
-    """Minimise the sum of squared errors from `found`.
+    """Minimise the sum of squared errors from `estimate`, or from where the watch's checkpoint says.
 
     A step is damped the more, the more often steps in a row failed to lower the loss; where it is not finite, too.
 
-    **Arguments:** `steps`, the most steps; `tolerance`: it has converged when the next step promises to lower the loss by
-    less than this share of it; `callback(step, loss, unknowns)` is called at every point, the start included.
+    **Arguments:** `tolerance`: it has converged when the next step promises to lower the loss by less than this share of it;
+    `watch` is told of every point, the start included.
 
-    **Returns:** the unknowns; the errors near them; the loss at every point (steps + 1,); "converged", "max_steps", or
-    "not_finite" where the start is.
+    **Returns:** the unknowns; the errors near them; the loss at every point (steps + 1,); "converged", "max_steps",
+    "stopped", or "not_finite" where the start is.
 
     **Raises:** ValueError for numbers that are not positive.
     """
-    if not (steps > 0 and tolerance >= 0):
-        raise ValueError(f"steps={steps}, tolerance={tolerance}; steps must be positive and tolerance not negative")
-    rounding = float(jnp.finfo(found.y.dtype).eps)
-    here, history, damping = linearise(found), [], _DAMPING
+    if not (watch.steps > 0 and tolerance >= 0):
+        raise ValueError(
+            f"steps={watch.steps}, tolerance={tolerance}; steps must be positive and tolerance not negative"
+        )
+    rounding = float(jnp.finfo(estimate.y.dtype).eps)
+    history, damping, kept = [], _DAMPING, watch.load()
+    if kept is not None:
+        estimate = Unknowns(jnp.asarray(kept["y"]), None if estimate.start is None else jnp.asarray(kept["start"]))
+        # The point's own loss comes again, with the same bits.
+        history, damping = kept["history"][:-1].tolist(), float(kept["damping"])
+    here = linearise(estimate)
+
+    def state():
+        kept = {"y": estimate.y, "damping": np.float64(damping), "history": np.array(history)}
+        return kept if estimate.start is None else kept | {"start": estimate.start}
+
     while True:
         history.append(here.loss)
-        callback(len(history) - 1, here.loss, found)
+        goes_on = watch.goes_on(len(history) - 1, here.loss, estimate, state)
         if not here.finite:
-            return found, here, np.array(history), "not_finite"
+            return estimate, here, np.array(history), "not_finite"
         if here.loss <= (10 * rounding) ** 2:
-            return found, here, np.array(history), "converged"
-        if len(history) > steps:
-            return found, here, np.array(history), "max_steps"
+            return estimate, here, np.array(history), "converged"
+        if not goes_on:
+            return estimate, here, np.array(history), "stopped"
+        if len(history) > watch.steps:
+            return estimate, here, np.array(history), "max_steps"
         while True:
             dy, fall = here.step(damping)
             if damping > _MOST_DAMPING or fall <= max(tolerance, 1e3 * rounding) * here.loss:
-                return found, here, np.array(history), "converged"
-            trial = here.moved(found, dy)
+                return estimate, here, np.array(history), "converged"
+            trial = here.moved(estimate, dy)
             there = linearise(trial)
             if there.finite and there.loss < here.loss:
                 break
             damping *= 10
-        found, here, damping = trial, there, max(damping / 10, _LEAST_DAMPING)
+        estimate, here, damping = trial, there, max(damping / 10, _LEAST_DAMPING)
 
 
-def standard_deviation(end: Linear) -> np.ndarray:
-    """Standard deviations of y (p,) for independent errors of one size; infinite where they do not determine it.
+def with_prior(data: Linear, residual, rows, weight: float) -> Linear:
+    """The errors of the data and, behind them, those of the prior, whose squares count `weight` times."""
+    residual, rows = (weight**0.5 * np.asarray(x, np.float64) for x in (residual, rows))
+    return data._replace(
+        loss=data.loss + float(residual @ residual),
+        errors=np.concatenate([data.errors, residual]),
+        rows=np.concatenate([data.rows, rows]),
+        priors=len(residual),
+        prior_weight=weight,
+    )
 
-    NaN when the errors are not finite, or no more than the unknowns.
+
+def deviations(end: Linear, slopes: np.ndarray) -> np.ndarray:
+    """Standard deviations (m,) of numbers with the slopes (m, p) by y; infinite where neither data nor prior determine them.
+
+    Errors of the data count as independent ones of one size, which is theirs; those of the prior have the size it says. NaN when
+    the errors are not finite, or no more than the unknowns.
     """
     if not end.finite:
-        return np.full(end.rows.shape[-1], np.nan)
-    fit = truncated(end.rows, end.errors, _RANK_TOLERANCE)
-    spare = end.errors.size - fit.rank - (0 if end.offset is None else end.offset.size)
-    sigma = np.sqrt(end.loss / spare) if spare > 0 else np.nan
-    return np.where(fit.unknown, np.inf, sigma * np.sqrt(np.sum(fit.half**2, axis=1)))
+        return np.full(len(slopes), np.nan)
+    count = len(end.errors) - end.priors
+    data = end.rows[:count]
+    fit = truncated(data, end.errors[:count], _RANK_TOLERANCE)
+    spare = count - (0 if end.offset is None else end.offset.size) - (fit.rank if end.priors == 0 else 0)
+    if spare <= 0:
+        return np.full(len(slopes), np.nan)
+    square = max(float(np.sum(end.errors[:count] ** 2)), 1e-300) / spare
+    # The prior's rows were weighed by a noise that was assumed: here by the one that is seen.
+    rows = np.concatenate([data / square**0.5, end.rows[count:] / end.prior_weight**0.5])
+    size = np.linalg.norm(rows, axis=0)
+    size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
+    _, s, Vt = np.linalg.svd(np.linalg.qr(rows / size)[1], full_matrices=True)
+    rank = int(np.sum(s > _RANK_TOLERANCE * s.max(initial=0.0)))
+    unseen = np.isinf(size)
+    scaled = slopes / np.where(unseen, 1.0, size)
+    seen = np.where(unseen[None], 0.0, scaled)
+    idle = np.linalg.norm(seen @ Vt[rank:].T, axis=1) > 1e-6 * np.linalg.norm(seen, axis=1)
+    idle |= np.abs(scaled[:, unseen]).sum(axis=1) > 0
+    known = np.sqrt(np.sum((seen @ Vt[:rank].T / s[:rank]) ** 2, axis=1))
+    return np.where(idle, np.inf, known)

@@ -75,13 +75,13 @@ def intervals(
     jacobian, curvature, free = _local(data, setting, estimate)
     blocks, sigma = data.blocks, estimate.sigma
     slopes = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
-    bent = (data if curved is None else curved).blocks.grams(weights)
-    grams = np.einsum("pi,bpq,qj->bij", jacobian, bent, jacobian, optimize=True) / sigma**2
+    grams_of_curvature = (data if curved is None else curved).blocks.grams(weights)
+    grams = np.einsum("pi,bpq,qj->bij", jacobian, grams_of_curvature, jacobian, optimize=True) / sigma**2
     groups = block_groups(len(blocks))
     slopes, grams = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (slopes, grams))
-    moves, inverse = jackknife(grams, slopes, curvature)
+    changes, inverse = jackknife(grams, slopes, curvature)
     count = len(groups)
-    moves, pulled = jacobian @ moves, jacobian @ inverse @ _root(curvature) * np.sqrt(max(setting.prior, 1.0))
+    changes, pulled = jacobian @ changes, jacobian @ inverse @ _root(curvature) * np.sqrt(max(setting.prior, 1.0))
 
     nb, nv = model.nb, model.nv
     names = list(parameter_names(model))
@@ -91,18 +91,18 @@ def intervals(
     fitted = np.concatenate([free, np.zeros(blocks.size - len(free), bool)])
     fitted[data.places(setting.extra)] = True
     shown = np.flatnonzero(fitted | (np.arange(blocks.size) < data.basic))
-    parameters = _spread([names[i] for i in shown], estimate.x[shown], moves[shown], pulled[shown], fitted[shown])
+    parameters = _spread([names[i] for i in shown], estimate.x[shown], changes[shown], pulled[shown], fitted[shown])
 
     base = base_parameters(model, terms)
     columns = free_columns(nb, nv, terms)
     known = base.matrix @ fitted[columns].astype(float) != 0
-    a, b = base.matrix @ moves[columns], base.matrix @ pulled[columns]
+    a, b = base.matrix @ changes[columns], base.matrix @ pulled[columns]
     spread = _spread(base.names, base.values(estimate.x[columns]), a, b, known)
     return Intervals(parameters, spread, base, a @ a.T + b @ b.T, student(count - 1))
 
 
-def _spread(names, values, moves, pulled, fitted) -> Spread:
-    from_data, from_prior = np.sum(moves**2, axis=1), np.sum(pulled**2, axis=1)
+def _spread(names, values, changes, pulled, fitted) -> Spread:
+    from_data, from_prior = np.sum(changes**2, axis=1), np.sum(pulled**2, axis=1)
     total = from_data + from_prior
     share = np.where(total > 0, from_prior / np.where(total > 0, total, 1), 1.0)
     return Spread(tuple(names), np.asarray(values), np.where(fitted, np.sqrt(total), np.nan), share)
@@ -114,18 +114,18 @@ def _local(data: Data, setting: Setting, estimate: Estimate):
     slopes = linear.slopes_at(minimum.origin, minimum.s)
     count, size = len(minimum.origin), linear.count
     basis = STRETCHES[:size]
-    bent = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
+    prior_curvature = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
     bodies = count * size
-    moves = np.ones(slopes.shape[1], bool)
+    is_free = np.ones(slopes.shape[1], bool)
     # What is at its bound stays there.
-    moves[bodies:] = ~(linear.positive & (minimum.s.reshape(-1) == 0))
+    is_free[bodies:] = ~(linear.positive & (minimum.s.reshape(-1) == 0))
     places = data.places(setting.extra)
-    count = int(moves.sum())
+    count = int(is_free.sum())
     jacobian = np.zeros((data.blocks.size, count + len(places)))
-    jacobian[: data.basic, :count] = slopes[:, moves]
+    jacobian[: data.basic, :count] = slopes[:, is_free]
     jacobian[places, count + np.arange(len(places))] = 1.0
     curvature = np.zeros((jacobian.shape[1],) * 2)
-    curvature[:bodies, :bodies] = bent
+    curvature[:bodies, :bodies] = prior_curvature
     units = data.units.reshape(-1)[places - data.basic]
     curvature[count + np.arange(len(places)), count + np.arange(len(places))] = setting.prior / units**2
     return jacobian, curvature, np.any(jacobian[: data.basic] != 0, axis=1)

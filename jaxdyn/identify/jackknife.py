@@ -22,11 +22,11 @@ def jackknife(grams: np.ndarray, slopes: np.ndarray, curvature: np.ndarray) -> t
     H = grams.sum(axis=0) + curvature
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     scale = unit[:, None] * unit[None, :]
-    moves = np.stack(
+    changes = np.stack(
         [unit * (_inverse((H - gram) * scale) @ (unit * slope)) for gram, slope in zip(grams, slopes, strict=True)]
     )
     count = len(grams)
-    return (moves - moves.mean(axis=0)).T * np.sqrt((count - 1) / count), _inverse(H * scale) * scale
+    return (changes - changes.mean(axis=0)).T * np.sqrt((count - 1) / count), _inverse(H * scale) * scale
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxdyn.identify.progress import Watch
+
 METHODS = ("lbfgs", "adam")
 # Weak Wolfe conditions: enough decrease, and a slope that has flattened enough for a positive curvature pair.
 _DECREASE, _FLATTER = 1e-4, 0.9
@@ -18,7 +20,7 @@ _ROUND, _ADAM_ROUNDS = 20, 10
 
 
 def minimise(
-    loss: Callable, start, args, *, method, steps, learning_rate, tolerance, scaling: Callable, callback=None
+    loss: Callable, start, args, *, method, learning_rate, tolerance, scaling: Callable, watch: Watch
 ) -> tuple[Array, np.ndarray, str]:
     """Minimise `loss(y, args)` over y (n,) from `start`, in coordinates that follow the curvature.
 
@@ -28,15 +30,17 @@ def minimise(
     **Arguments:** `loss`, a function defined once (it is static: another one compiles again), its arrays in `args`;
     `scaling(y) -> (n, n)`, for a round that starts at y: S S^T is about the inverse of the Hessian there;
     `method`: "lbfgs", "adam", or an optax.GradientTransformation without a line search, which gets one round, since its
-    state and schedule are its own; `steps`, the most steps; `learning_rate` of adam, decaying to zero along a cosine in
+    state and schedule are its own; `learning_rate` of adam, decaying to zero along a cosine in
     every round; `tolerance`: lbfgs stops once a round has lowered the loss by less than this share of it;
-    `callback(step, loss, y)` is called at every point, the start included.
+    `watch` is told of every point, the start included, and says how many steps there are at most. From a checkpoint it goes
+    on to the same numbers.
 
-    **Returns:** the best y found; the loss at every point (steps + 1,); "converged", "max_steps" or "not_finite" (the
+    **Returns:** the best y found; the loss at every point (steps + 1,); "converged", "max_steps", "stopped" or "not_finite" (the
     loss or its gradient was not finite where a step led; the best y is a point before).
 
     **Raises:** ValueError for an unknown method or numbers that are not positive.
     """
+    steps = watch.steps
     if not (steps > 0 and learning_rate > 0 and tolerance >= 0):
         raise ValueError(f"steps={steps}, learning_rate={learning_rate}, tolerance={tolerance}; all must be positive")
     searching = isinstance(method, str) and method == "lbfgs"
@@ -44,19 +48,29 @@ def minimise(
     optimizer = _optimizer(method, length, float(learning_rate)) if isinstance(method, str) else method
     # optax mixes python and numpy numbers with arrays, which strict promotion refuses.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        best, lowest, history = jnp.asarray(start), np.inf, []
+        best, lowest, history, kept = jnp.asarray(start), np.inf, [], watch.load()
         while True:
-            path, value, gradient = _begin(loss, args, best, scaling(best))
-            before = lowest
-            z = jnp.zeros_like(best)
-            state = optimizer.init(z)
+            begin, before = 0, lowest
+            if kept is None:
+                path, value, gradient = _begin(loss, args, best, scaling(best))
+                z = jnp.zeros_like(best)
+                state = optimizer.init(z)
+            else:
+                best, lowest, before, begin, history, path, z, value, gradient, state = _restored(
+                    kept, loss, args, optimizer, best
+                )
+                kept = None
             # A round begins where the last one ended: the point is in the history already.
-            for step in range(length + 1):
+            for step in range(begin, length + 1):
                 if step > 0 or not history:
+                    now = (best, lowest, before, step, history, path, z, value, gradient, state)
                     history.append(float(value))
-                    if callback is not None:
-                        callback(len(history) - 1, history[-1], path.point(z))
+                    goes_on = watch.goes_on(len(history) - 1, history[-1], path.point(z), lambda now=now: _kept(*now))
+                    if not goes_on and np.isfinite(history[-1]):
+                        best = path.point(z) if history[-1] < lowest else best
+                        return best, np.array(history), "stopped"
                 if not (np.isfinite(float(value)) and bool(jnp.isfinite(gradient).all())):
+                    watch.failed = path.point(z)
                     return best, np.array(history), "not_finite"
                 if float(value) < lowest:
                     best, lowest = path.point(z), float(value)
@@ -68,15 +82,35 @@ def minimise(
                     break
                 update, state = _update(optimizer, path.size * gradient, state, z)
                 if searching:
-                    found = _line_search(path.evaluate, z, value, gradient, update)
-                    if found is None:  # no decrease that rounding lets one see
+                    decrease = _line_search(path.evaluate, z, value, gradient, update)
+                    if decrease is None:  # no decrease that rounding lets one see
                         break
-                    z, value, gradient = found
+                    z, value, gradient = decrease
                 else:
                     z = z + update
                     value, gradient = path.evaluate(z)
             if searching and before - lowest <= tolerance * lowest:
                 return best, np.array(history), "converged"
+
+
+def _kept(best, lowest, before, step, history, path, z, value, gradient, state) -> dict:
+    """What a checkpoint holds: the point, which is not in the history yet when it is read again."""
+    numbers = {"best": best, "lowest": np.float64(lowest), "before": np.float64(before), "step": np.int64(step)}
+    numbers |= {"history": np.array(history[:-1]), "z": z, "value": value, "gradient": gradient}
+    numbers |= {"center": path.center, "scaling": path.scaling, "size": path.size}
+    leaves = [leaf for leaf in jax.tree.leaves(state) if eqx.is_array(leaf)]
+    return numbers | {f"optimizer_{i:03d}": leaf for i, leaf in enumerate(leaves)}
+
+
+def _restored(kept, loss, args, optimizer, like):
+    """The arguments of `_kept` again."""
+    arrays = {name: jnp.asarray(x) for name, x in kept.items()}
+    path = _Path(loss, args, arrays["center"], arrays["scaling"], arrays["size"])
+    leaves, structure = jax.tree.flatten(optimizer.init(jnp.zeros_like(like)))
+    own = iter([arrays[name] for name in sorted(kept) if name.startswith("optimizer_")])
+    state = jax.tree.unflatten(structure, [next(own) if eqx.is_array(leaf) else leaf for leaf in leaves])
+    known = (float(kept["lowest"]), float(kept["before"]), int(kept["step"]), kept["history"].tolist())
+    return arrays["best"], *known, path, arrays["z"], arrays["value"], arrays["gradient"], state
 
 
 class _Path(NamedTuple):
@@ -105,9 +139,9 @@ def _begin(loss: Callable, args, center, scaling):
     """
     path = _Path(loss, args, center, scaling)
     value, gradient = path.evaluate(jnp.zeros_like(center))
-    way = jnp.sqrt(gradient @ gradient)
-    way = jnp.where((way > 0) & jnp.isfinite(way), way, jnp.ones_like(way))
-    units = way * jnp.minimum(1, 1 / (way * jnp.linalg.norm(scaling, axis=0)))
+    slope = jnp.sqrt(gradient @ gradient)
+    slope = jnp.where((slope > 0) & jnp.isfinite(slope), slope, jnp.ones_like(slope))
+    units = slope * jnp.minimum(1, 1 / (slope * jnp.linalg.norm(scaling, axis=0)))
     gradient = gradient * units
     length = jnp.sqrt(gradient @ gradient)
     good = (length > 0) & jnp.isfinite(length)
@@ -124,19 +158,19 @@ def _line_search(evaluate: Callable, z, value, gradient, direction):
     slope = float(gradient @ direction)
     if not slope < 0:  # rounding has spoilt the curvature pairs
         direction, slope = -gradient, -float(gradient @ gradient)
-    low, high, length, found = 0.0, np.inf, 1.0, None
+    low, high, length, decrease = 0.0, np.inf, 1.0, None
     for _ in range(40):
         point = z + length * direction
         trial, trial_gradient = evaluate(point)
         if not float(trial) <= float(value) + _DECREASE * length * slope:  # NaN too
             high = length
         else:
-            found = (point, trial, trial_gradient) if float(trial) < float(value) else found
+            decrease = (point, trial, trial_gradient) if float(trial) < float(value) else decrease
             if float(trial_gradient @ direction) >= _FLATTER * slope:
                 break
             low = length
         length = 2 * length if high == np.inf else (low + high) / 2
-    return found
+    return decrease
 
 
 @functools.lru_cache

@@ -148,7 +148,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows):
         raise ValueError(f"the payload's fit ended {result!r}; do the loaded logs move the robot?")
     payload = np.asarray(chart.inertias(point.theta), np.float64)[0]
 
-    found = robot(payload)
+    estimate = robot(payload)
     # In the coordinates of the chart, where the prior's curvature is known; it also holds what no log tells.
     stretch = np.asarray(jax.jacfwd(lambda theta: chart.inertias(theta)[0])(point.theta), np.float64).reshape(10, 10)
     basis = STRETCHES
@@ -159,7 +159,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows):
     spreads[:, kept, np.arange(count)] = 1
     spreads[1, own, count:] += stretch
     bare = np.zeros(blocks.size)
-    bare[kept] = found
+    bare[kept] = estimate
     holding = bare.copy()
     holding[own] += payload
     scores = np.stack([blocks.scores(x, weights) for x in (bare, holding)])
@@ -172,9 +172,9 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows):
     summed = [
         np.stack([np.sum([values[int(i)] for i in group], axis=0) for group in groups]) for values in (grams, slopes)
     ]
-    moves, inverse = jackknife(summed[0], summed[1], curvature)
+    changes, inverse = jackknife(summed[0], summed[1], curvature)
     root = np.linalg.cholesky(curvature[count:, count:])
-    from_data, from_prior = stretch @ moves[count:], stretch @ inverse[count:, count:] @ root
+    from_data, from_prior = stretch @ changes[count:], stretch @ inverse[count:, count:] @ root
     std = np.sqrt(np.sum(from_data**2, axis=1) + np.sum(from_prior**2, axis=1))
     return payload, std, student(len(groups) - 1)
 
@@ -192,7 +192,7 @@ def _errors(model: Model, robot: RobotFit, loaded: Sequence[Log], own: slice, pa
     change = np.zeros(10 * model.nb + 4 * model.nv)
     change[own] = payload
     measured, alone, both = [], [], []
-    held = eqx.tree_at(
+    with_payload = eqx.tree_at(
         lambda fit: fit.model.inertias,
         robot.fit,
         robot.fit.model.inertias.at[own.start // 10].add(jnp.asarray(payload)),
@@ -200,7 +200,7 @@ def _errors(model: Model, robot: RobotFit, loaded: Sequence[Log], own: slice, pa
     for log in loaded:
         measured.append(np.asarray(log.tau, np.float64))
         alone.append(robot.fit.torques(log))
-        both.append(held.torques(log))
+        both.append(with_payload.torques(log))
     size = np.linalg.norm(np.concatenate(measured))
     off = [100 * float(np.linalg.norm(np.concatenate(x) - np.concatenate(measured)) / size) for x in (both, alone)]
     return off[0], off[1]

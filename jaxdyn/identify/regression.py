@@ -69,8 +69,8 @@ def regressor(model: Model, q, v, a, *, v_s=0.01) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _moved(model, ways):
-    return jax.vmap(lambda way: integrate(model, neutral(model), way))(ways)
+def _moved(model, displacements):
+    return jax.vmap(lambda displacement: integrate(model, neutral(model), displacement))(displacements)
 
 
 @eqx.filter_jit
@@ -186,8 +186,8 @@ def base_parameters(model: Model, terms=(), *, v_s: float = 0.01, seed: int = 0)
     count = max(2 * p // max(model.nv, 1) + 1, 30)
     generator = np.random.default_rng(seed)
     # Away from the neutral configuration by up to about half a turn; limits do not matter to what is identifiable.
-    way, v, a = generator.normal(size=(3, count, model.nv))
-    q = _moved(model, jnp.asarray(2 * way, model.home.dtype))
+    displacement, v, a = generator.normal(size=(3, count, model.nv))
+    q = _moved(model, jnp.asarray(2 * displacement, model.home.dtype))
     W = regressor(model, q, v, a, v_s=v_s)[:, :, free_columns(model.nb, model.nv, terms)].reshape(-1, p)
     scale = np.linalg.norm(W, axis=0)
     # A column of rounding errors is zero too.
@@ -359,8 +359,8 @@ def _scatter(blocks: Blocks, x: np.ndarray, places, half: np.ndarray, weights) -
     slopes = blocks.scores(x, weights)[:, places] @ half
     grams = np.einsum("pi,bpq,qj->bij", half, blocks.grams(weights)[:, places][:, :, places], half, optimize=True)
     slopes, grams = (np.stack([part[group].sum(axis=0) for group in groups]) for part in (slopes, grams))
-    moves, _ = jackknife(grams, slopes, np.zeros((half.shape[1],) * 2))
-    return np.sqrt(np.sum((half @ moves) ** 2, axis=1)), student(len(groups) - 1)
+    changes, _ = jackknife(grams, slopes, np.zeros((half.shape[1],) * 2))
+    return np.sqrt(np.sum((half @ changes) ** 2, axis=1)), student(len(groups) - 1)
 
 
 def noise_level(condensed: Condensed, *, rcond: float = 1e-9) -> float:

@@ -1,5 +1,6 @@
 """Logs replayed: the motion under the measured torques, simulated in segments, and how far it is from the measured one."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.constraints.assembly import assemble
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model
@@ -32,6 +34,10 @@ class SampledTorque(eqx.Module):
     hold: str = eqx.field(static=True, default="linear")
 
     def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+        return self.at(t)
+
+    def at(self, t) -> Float[Array, " nv"]:
+        """Torque (nv,) at a time (s); before the first sample and behind the last one that of these."""
         last = self.t.shape[0] - 2
         i = jnp.clip(jnp.searchsorted(self.t, t, side="right") - 1, 0, last)
         if self.hold == "previous":
@@ -50,6 +56,7 @@ class Segments(eqx.Module):
     q: Float[Array, "*segments n nq"]
     v: Float[Array, "*segments n nv"]
     tau: Float[Array, "*segments n nv"]
+    a: Float[Array, "*segments n nv"] | None = None
 
 
 def segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: bool = True) -> Segments:
@@ -66,6 +73,8 @@ def segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: b
             f"horizon is None, which takes logs whole, and they have {lengths[0]} to {lengths[-1]} samples; give the steps "
             "of a segment"
         )
+    if any(one.a is None for one in logs):
+        logs = [dataclasses.replace(one, a=None) for one in logs]
     parts = [_segments(one, horizon, dtype, restart) for one in logs]
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
 
@@ -81,7 +90,8 @@ def _segments(log: Log, horizon: int | None, dtype, restart: bool) -> Segments:
     count = (len(log) - 1) // horizon
     rows = np.arange(count)[:, None] * horizon + np.arange(horizon + 1)
     t = np.asarray(log.t, np.float64)[rows]
-    parts = (t - t[:, :1] if restart else t, *(np.asarray(x)[rows] for x in (log.q, log.v, log.tau)))
+    parts = [t - t[:, :1] if restart else t, *(np.asarray(x)[rows] for x in (log.q, log.v, log.tau))]
+    parts += [] if log.a is None else [np.asarray(log.a)[rows]]
     return Segments(*(jnp.asarray(part, dtype) for part in parts))
 
 
@@ -168,9 +178,23 @@ def spaced(options: dict, data: Segments) -> dict:
     return {"max_steps": count + 1} | options | {"stepsize": float(np.ptp(t[0])) / (count - 0.5)}
 
 
-def simulate_segment(scene: Scene, one: Segments, change: Float[Array, "2 nv"] | None, hold: str, options: dict):
-    """Motion (n, nq), (n, nv) of one segment from its first state, displaced by `change`; NaN from where it fails."""
-    t, given = one.t, dict(options)
+def simulate_segment(
+    scene: Scene,
+    one: Segments,
+    change: Float[Array, "2 nv"] | None,
+    hold: str,
+    options: dict,
+    *,
+    control: Any = None,
+    outputs: tuple[str, ...] = (),
+) -> tuple[Any, ...]:
+    """Motion (n, nq), (n, nv) of one segment from its first state, displaced by `change`; NaN from where it fails.
+
+    Under its torques, or under a `control`. `outputs`: of `jd.simulate`, which come behind. With constraints the first state
+    is put on them.
+    """
+    t: Any = one.t
+    given = dict(options)
     substeps = given.pop("substeps", None)
     if substeps is not None:
         shares = jnp.arange(substeps, dtype=t.dtype) / substeps
@@ -180,8 +204,12 @@ def simulate_segment(scene: Scene, one: Segments, change: Float[Array, "2 nv"] |
     q0, v0 = one.q[0], one.v[0]
     if change is not None:
         q0, v0 = displace(scene.system, q0, change[0]), v0 + change[1]
-    motion = simulate(scene, q0, v0, t, control=SampledTorque(t, one.tau, hold), throw=False, **given)
-    return motion.q, motion.v
+    if scene.constraints:
+        state = assemble(scene, q0, v0, t[0], throw=False)
+        q0, v0 = state.q, state.v
+    control = SampledTorque(t, one.tau, hold) if control is None else control
+    motion = simulate(scene, q0, v0, t, control=control, outputs=outputs, throw=False, **given)
+    return motion.q, motion.v, *(getattr(motion, name) for name in outputs)
 
 
 def motion_errors(system: Any, one: Segments, q: Float[Array, "n nq"], v: Float[Array, "n nv"], scale):
@@ -190,10 +218,11 @@ def motion_errors(system: Any, one: Segments, q: Float[Array, "n nq"], v: Float[
     return far / scale[0][None], (v - one.v) / scale[1][None]
 
 
+@eqx.filter_jit
 def motion_scale(system: Any, data: Segments) -> Float[Array, "2 nv"]:
     """Root mean square of each coordinate's way from the first sample, and of its velocity; the largest at rest."""
-    way = jax.vmap(jax.vmap(lambda q: displacement(system, data.q[0, 0], q)))(data.q)
-    return jnp.stack([moving_scale(jnp.sqrt(jnp.mean(x**2, axis=(0, 1)))) for x in (way, data.v)])
+    path = jax.vmap(jax.vmap(lambda q: displacement(system, data.q[0, 0], q)))(data.q)
+    return jnp.stack([moving_scale(jnp.sqrt(jnp.mean(x**2, axis=(0, 1)))) for x in (path, data.v)])
 
 
 def moving_scale(scale: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -12,10 +12,11 @@ from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.friction import Friction
 from jaxdyn.identify.logs import Log, as_measured, check_log
 from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
+from jaxdyn.identify.sensors import Measured, with_sensors
 from jaxdyn.identify.torque_terms import ExtraTorque, coulomb_column
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.scene import Scene
 
 
 class AbstractFit(eqx.Module):
@@ -137,7 +138,8 @@ class ParameterFit(AbstractFit):
     - `names` (p,): where the fitted numbers stand, as one writes it after the system: "parameters['mass']".
     - `deviation` (p,): standard deviation of each, for independent noise of one size in all that was compared, in the
       fit's units; infinite for what the log does not determine. None where the method finds none.
-    - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps" or "not_finite".
+    - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps", "stopped" or "not_finite";
+      `cause` then says in which log, at which sample and by which parameters.
     """
 
     system: Any
@@ -149,11 +151,20 @@ class ParameterFit(AbstractFit):
     history: np.ndarray
     result: str = eqx.field(static=True)
     method: str = eqx.field(static=True)
+    cause: str | None = eqx.field(static=True, default=None)
 
     @property
     def scene(self) -> Scene:
         """The fitted scene; of a system, the scene of it alone."""
-        return as_scene(self.system)
+        return with_sensors(self.system).scene
+
+    def torques(self, log: Log) -> np.ndarray:
+        """Torques (n, nv) that the fitted system needs along a log, in the log's units: as its sensors would tell them."""
+        if not isinstance(self.system, Measured):
+            return super().torques(log)
+        measured = self.system
+        bias, gain = (np.asarray(x, np.float64) for x in (measured.torque_bias, measured.torque_gain))
+        return (super().torques(log) - bias) / gain
 
     @property
     def parameters(self) -> list[tuple[str, float, float, float]]:

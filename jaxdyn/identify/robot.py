@@ -122,10 +122,10 @@ def fit_robot(
     estimate = problem.refine(setting, fixed, rounds=_ROUNDS)
     data = problem.data(setting)
     fit = problem.result(setting, estimate, data)
-    found = intervals(model, data, setting, estimate, problem.weights, basic, problem.curved(setting))
+    spread = intervals(model, data, setting, estimate, problem.weights, basic, problem.curved(setting))
     used = dict(setting.extra)
     chosen = (*basic, *((term, used[term.name]) for term in extra if term.name in used))
-    return RobotFit(fit, problem.weights, Choice(setting, trials, by), found, chosen)
+    return RobotFit(fit, problem.weights, Choice(setting, trials, by), spread, chosen)
 
 
 class _Problem:
@@ -170,8 +170,8 @@ class _Problem:
         rest = np.setdiff1d(np.arange(len(blocks)), part)
         if key not in self._rows:
             self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
-        found = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
-        return self.data(setting._replace(robust=None)).blocks.squares(found.x, part).sum(axis=0)
+        fit = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
+        return self.data(setting._replace(robust=None)).blocks.squares(fit.x, part).sum(axis=0)
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
         """Fit some times over; after each but the last, update weights and loads."""

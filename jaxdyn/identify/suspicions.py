@@ -50,10 +50,10 @@ def suspicions(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
             "cent? N m are expected"
         )
     speed = _rms(np.asarray(log.v, np.float64))
-    still = [label for label, v in zip(labels, speed, strict=True) if not v > _STILL * speed.max(initial=0)]
-    if still:
+    unmoved = [label for label, v in zip(labels, speed, strict=True) if not v > _STILL * speed.max(initial=0)]
+    if unmoved:
         lines.append(
-            f"{', '.join(still)} stand still: their friction and rotor inertia stay near the file's, or mean nothing"
+            f"{', '.join(unmoved)} stand still: their friction and rotor inertia stay near the file's, or mean nothing"
         )
     return lines
 

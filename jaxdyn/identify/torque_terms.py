@@ -75,9 +75,9 @@ def _dahl(log, load, v_s):
     z = np.empty_like(q)
     z[0] = np.tanh(np.asarray(log.v)[0] / v_s)
     for i in range(1, len(q)):
-        way = q[i] - q[i - 1]
+        path = q[i] - q[i - 1]
         # The solution along a way in one direction.
-        z[i] = np.sign(way) + (z[i - 1] - np.sign(way)) * np.exp(-np.abs(way) / PRESLIDING)
+        z[i] = np.sign(path) + (z[i - 1] - np.sign(path)) * np.exp(-np.abs(path) / PRESLIDING)
     return z
 
 

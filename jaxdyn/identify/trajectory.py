@@ -16,6 +16,7 @@ from jaxdyn.identify.divided import shared_out, summed
 from jaxdyn.identify.friction import check_terms
 from jaxdyn.identify.logs import Log, as_logs, root_mean_square
 from jaxdyn.identify.minimise import METHODS, minimise
+from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.regression import regressor
 from jaxdyn.identify.replay import (
     Segments,
@@ -131,11 +132,10 @@ def fit_trajectory(
         y0,
         (problem, unknowns),
         method=method,
-        steps=steps,
         learning_rate=learning_rate,
         tolerance=tolerance,
         scaling=lambda y: _scaling(problem, unflatten(y).point, (q, v, a), y.size),
-        callback=report,
+        watch=Watch(steps, report),
     )
     fitted, friction = chart.fitted(model, chart.settled(unflatten(y).point))
     name = method if isinstance(method, str) else type(method).__name__
@@ -159,7 +159,7 @@ def _signals(log: Log):
 def _flat_loss(y, args):
     problem, unknowns = args
     _, unflatten = ravel_pytree(unknowns)
-    found = unflatten(y)
+    estimate = unflatten(y)
     chart, data = problem.chart, problem.data
     whole = data.v.size
     # Everything but the segments is known to all devices.
@@ -173,13 +173,13 @@ def _flat_loss(y, args):
 
         def errors(one, change):
             change = None if change is None else change * problem.scale
-            motion = simulate_segment(scene, one, change, problem.hold, problem.options)
-            return motion_errors(model, one, *motion, problem.scale)
+            q, v = simulate_segment(scene, one, change, problem.hold, problem.options)
+            return motion_errors(model, one, q, v, problem.scale)
 
         return sum(jnp.sum(error**2) for error in jax.vmap(errors)(data, start)) / whole
 
-    error = summed(squares, problem.mesh)((found.point, found.start), (rest, data))
-    return error + problem.prior * chart.divergence(found.point.theta)
+    error = summed(squares, problem.mesh)((estimate.point, estimate.start), (rest, data))
+    return error + problem.prior * chart.divergence(estimate.point.theta)
 
 
 def _scaling(problem: _Problem, point: Coordinates, signals, size: int) -> Float[Array, "n n"]:

@@ -17,7 +17,7 @@ from jaxdyn.io.mjcf import load_mjcf
 from jaxdyn.io.sdf import load_sdf
 from jaxdyn.io.urdf import urdf_model
 from jaxdyn.io.urdf_loops import closing, closures_of, motors_of
-from jaxdyn.model.arguments import as_path
+from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.tree import neutral
 
@@ -30,7 +30,7 @@ def load(
     *,
     floating_base: bool | None = None,
     loops: str | os.PathLike | bool | None = None,
-    dtype=None,
+    dtype: DType | None = None,
 ) -> LoadedScene:
     """The scene of a URDF, MJCF or SDF file, or of a robot by its name in the package robot_descriptions.
 
@@ -87,11 +87,11 @@ def load_urdf_scene(
 ) -> LoadedScene:
     """The scene of a URDF file: as `load` says, with the options of `load_urdf`."""
     closures = closures_of(path, loops)
-    held = lock if isinstance(lock, Mapping) else dict.fromkeys(lock)
+    locked = lock if isinstance(lock, Mapping) else dict.fromkeys(lock)
     model = urdf_model(
         path,
         floating_base=floating_base,
-        lock={**dict.fromkeys(closures.held), **held},
+        lock={**dict.fromkeys(closures.locked), **locked},
         mimic="couple",
         gravity=gravity,
         dtype=dtype,

@@ -80,13 +80,13 @@ class Actuators(eqx.Module):
             if site is not None:
                 rows = rows.at[i].set(self.wrenches[i].astype(q.dtype) @ body_jacobian(system, q, site))
         state = jnp.stack([jnp.ones_like(length), length, rows @ v], axis=1)
-        gain, bias, held, limits, effort = (
+        gain, bias, control_range, limits, force_range = (
             x.astype(q.dtype) for x in (self.gain, self.bias, self.control_range, self.force_range, self.effort_range)
         )
-        control = jnp.clip(jnp.asarray(control, q.dtype), held[:, 0], held[:, 1])
+        control = jnp.clip(jnp.asarray(control, q.dtype), control_range[:, 0], control_range[:, 1])
         force = jnp.sum(gain * state, 1) * control + jnp.sum(bias * state, 1)
         force = jnp.clip(force, limits[:, 0], limits[:, 1])
-        return jnp.clip(force @ rows, effort[:, 0], effort[:, 1])
+        return jnp.clip(force @ rows, force_range[:, 0], force_range[:, 1])
 
 
 class LoadedScene(Scene):

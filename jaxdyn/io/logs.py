@@ -6,13 +6,13 @@ import re
 import numpy as np
 
 from jaxdyn.identify.logs import Log
-from jaxdyn.model.arguments import as_path
+from jaxdyn.model.arguments import FilePath, as_path
 
 _SIGNALS = ("q", "v", "a", "tau")
 _NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit behind a column's name
 
 
-def read_log(path, *, joint_names=None, rename=None, rollout: int | None = None) -> Log:
+def read_log(path: FilePath, *, joint_names=None, rename=None, rollout: int | None = None) -> Log:
     """Read a log from a CSV file with one header line, or from an NPZ archive.
 
     Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1,
@@ -65,7 +65,7 @@ def _one_motion(columns: dict[str, np.ndarray], rollout: int | None, path) -> di
     return columns
 
 
-def write_log(path, log: Log) -> None:
+def write_log(path: FilePath, log: Log) -> None:
     """Write a log as CSV (every number at full precision) or NPZ, with columns as `read_log` reads them.
 
     Columns carry joint names when the log knows them and has one coordinate per joint, else numbers.
@@ -154,28 +154,28 @@ def _read_npz(path) -> dict[str, np.ndarray]:
 def _assemble(columns: dict[str, np.ndarray], joint_names) -> Log:
     if "t" not in columns:
         raise ValueError(f"missing column t; the file has {', '.join(columns) or 'none'}")
-    found = {signal: _signal_columns(columns, signal) for signal in _SIGNALS}
+    columns_of = {signal: _signal_columns(columns, signal) for signal in _SIGNALS}
     for signal in ("q", "tau"):
-        if not found[signal]:
+        if not columns_of[signal]:
             hint = "" if signal == "q" else ' (of simulate: outputs=("torque",))'
             raise ValueError(f"missing columns {signal}1, {signal}2, ...{hint}; the file has {', '.join(columns)}")
-    labels = list(found["tau"])
+    labels = list(columns_of["tau"])
     by_number = all(label.isdecimal() for label in labels)
     if not by_number:
         labels = list(joint_names) if joint_names is not None else labels
     missing = []
     arrays = {}
     for signal in _SIGNALS:
-        if not found[signal]:
+        if not columns_of[signal]:
             arrays[signal] = None
             continue
         # Numbered configurations may be longer than the torques (quaternions); their count is the largest number.
-        wanted = [str(i + 1) for i in range(max(map(int, found[signal])))] if by_number else labels
-        missing += [f"{signal}{'' if by_number else '_'}{label}" for label in wanted if label not in found[signal]]
-        arrays[signal] = [columns[found[signal][label]] for label in wanted if label in found[signal]]
+        wanted = [str(i + 1) for i in range(max(map(int, columns_of[signal])))] if by_number else labels
+        missing += [f"{signal}{'' if by_number else '_'}{label}" for label in wanted if label not in columns_of[signal]]
+        arrays[signal] = [columns[columns_of[signal][label]] for label in wanted if label in columns_of[signal]]
     if missing:
         raise ValueError(
-            f"missing columns {', '.join(missing)}; the file has {', '.join(columns)}{_mapping(found['tau'], labels)}"
+            f"missing columns {', '.join(missing)}; the file has {', '.join(columns)}{_mapping(columns_of['tau'], labels)}"
         )
     lengths = {len(column) for group in arrays.values() if group for column in group}
     if len(lengths) > 1:
@@ -199,10 +199,10 @@ def _renamed(columns: dict[str, np.ndarray], names) -> dict[str, np.ndarray]:
     return result
 
 
-def _mapping(found: dict[str, str], labels) -> str:
+def _mapping(columns: dict[str, str], labels) -> str:
     """The mapping that would do, where the file has as many joints of other names."""
-    others = [label for label in found if label not in labels]
-    wanted = [label for label in labels if label not in found]
+    others = [label for label in columns if label not in labels]
+    wanted = [label for label in labels if label not in columns]
     if not others or len(others) != len(wanted) or others[0].isdecimal():
         return ""
     pairs = " ".join(f"{theirs}={ours}" for theirs, ours in zip(others, wanted, strict=True))

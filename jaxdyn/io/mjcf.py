@@ -18,13 +18,13 @@ from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of
 from jaxdyn.io.mjcf_file import BALL, FREE, HINGE, SIZES, SLIDE, Compiled, compiled, library, named, pose_of
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import as_path
+from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.tree import Model
 
 
-def load_mjcf(path: str | os.PathLike, *, dtype=None) -> LoadedScene:
+def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedScene:
     """The scene of an MJCF file (MuJoCo's XML), compiled by the mujoco package.
 
     Taken are bodies with their inertias, joints (hinge, slide, ball, free; several on one body become a chain of

@@ -119,8 +119,8 @@ def named(mujoco, m, path: str) -> Compiled:
         code = getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
         return [mujoco.mj_id2name(m, code, i) or "" for i in range(count)]
 
-    def filled(found: list[str], default, taken: Names) -> list[str]:
-        given = [taken.new(name) if name else "" for name in found]  # the file's names first: none of them changes
+    def filled(raw: list[str], default, taken: Names) -> list[str]:
+        given = [taken.new(name) if name else "" for name in raw]  # the file's names first: none of them changes
         return [name or taken.new(default(i)) for i, name in enumerate(given)]
 
     def joint_default(j: int) -> str:

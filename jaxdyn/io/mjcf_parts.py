@@ -67,10 +67,10 @@ def _coupling(file: Compiled, model: Model, i: int, name: str) -> tuple[Constrai
             return gear(file.joints[first], file.joints[second], c[1], r[0] + c[0] - c[1] * r[1], name=name), ""
         rows = [{first: 1.0}, {second: 1.0}]
     else:
-        found = _row(file, first), _row(file, second) if second >= 0 else {}
-        if None in found:
+        joint_rows = _row(file, first), _row(file, second) if second >= 0 else {}
+        if None in joint_rows:
             return None, "equalities of spatial tendons"
-        rows = [row for row in found if row is not None]
+        rows = [row for row in joint_rows if row is not None]
         r = [m.tendon_length0[t] if t >= 0 else 0.0 for t in (first, second)]
     joints = list(dict.fromkeys(j for row in rows for j in row))
     values = [jnp.asarray([row.get(j, 0.0) for j in joints], float) for row in rows]
@@ -156,13 +156,13 @@ def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]
         return None, lines
     n = len(taken)
     moment, wrenches = np.zeros((n, model.nv)), np.zeros((n, 6))
-    places, effort = np.full(model.nv, -1), np.tile([-np.inf, np.inf], (model.nv, 1))
+    places, force_range = np.full(model.nv, -1), np.tile([-np.inf, np.inf], (model.nv, 1))
     for j in range(m.njnt):
         if m.jnt_type[j] in (SLIDE, HINGE):
             q, v = _places(file, model, j)
             places[v] = q
             if m.jnt_actfrclimited[j]:
-                effort[v] = m.jnt_actfrcrange[j]
+                force_range[v] = m.jnt_actfrcrange[j]
     sites: list[str | None] = [None] * n
     for k, i in enumerate(taken):
         kind, target, pull = m.actuator_trntype[i], int(m.actuator_trnid[i, 0]), m.actuator_gear[i]
@@ -173,7 +173,7 @@ def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]
         for joint, coefficient in row.items():
             moment[k, _places(file, model, joint)[1]] += pull[0] * coefficient
 
-    def held(limited, ranges, off: bool) -> np.ndarray:
+    def ranges_of(limited, ranges, off: bool) -> np.ndarray:
         return np.where((limited[taken] != 0)[:, None] & (not off), ranges[taken], [-np.inf, np.inf])
 
     no_gain = m.actuator_gaintype[taken] == int(file.mujoco.mjtGain.mjGAIN_FIXED)
@@ -186,9 +186,9 @@ def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]
         wrenches,
         gain,
         bias,
-        held(m.actuator_ctrllimited, m.actuator_ctrlrange, file.off("CLAMPCTRL")),
-        held(m.actuator_forcelimited, m.actuator_forcerange, False),
-        effort,
+        ranges_of(m.actuator_ctrllimited, m.actuator_ctrlrange, file.off("CLAMPCTRL")),
+        ranges_of(m.actuator_forcelimited, m.actuator_forcerange, False),
+        force_range,
     )
     names = tuple(file.actuators[i] for i in taken)
     leaves = (jnp.asarray(x, model.home.dtype) for x in numbers)

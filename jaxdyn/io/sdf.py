@@ -15,6 +15,7 @@ from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
 from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.names import body_index
@@ -28,7 +29,7 @@ _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
 _SKIPPED = ("collision", "sensor", "plugin", "battery", "particle_emitter", "projector", "audio_source")
 
 
-def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype=None) -> LoadedScene:
+def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DType | None = None) -> LoadedScene:
     """The scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.
 
     Taken are links with their inertias, all joints (of two axes as two joints, JOINT and JOINT_axis2), limits (as the
@@ -90,8 +91,10 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
     name = name or (file.world.get("name") if file.world is not None else "") or "mechanism"
     gravity: np.ndarray | tuple | None = GRAVITY
     if file.world is not None:
-        found = file.world.find("gravity")
-        gravity = np.array([0.0, 0.0, -9.8]) if found is None else file.numbers(found, 3, "the world")
+        gravity_element = file.world.find("gravity")
+        gravity = (
+            np.array([0.0, 0.0, -9.8]) if gravity_element is None else file.numbers(gravity_element, 3, "the world")
+        )
         gravity = gravity if gravity.any() else None
     builder = ModelBuilder(name, gravity=gravity, dtype=dtype)
     frames, names = Names(), Names()
@@ -133,7 +136,7 @@ def _links(edge: Edge, place: np.ndarray) -> list[Link]:
     joint = edge.joint
     if joint is None or joint.kind == "fixed":
         return []
-    anchor = (f64.inverse(place) @ joint.pose)[:3, 3]
+    anchor = np.asarray(f64.inverse(place) @ joint.pose)[:3, 3]
     kind, sign = _KINDS[joint.kind], -1.0 if edge.backwards else 1.0
     if kind == "spherical":
         return [Link(joint.name, kind, np.zeros(3), anchor, 0.0, {})]
@@ -149,7 +152,7 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
     element, what = file.links[link][0], f"link {link!r}"
     inertial = element.find("inertial")
     if inertial is None:
-        return f64.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what)
+        return np.asarray(f64.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what))
     if (inertial.get("auto") or "").strip().lower() in ("1", "true"):
         raise file.fault(
             inertial,
@@ -162,7 +165,7 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
     mass = file.number(inertial, "mass", 1.0, what)
     try:
         about_com = (mass, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        return f64.move_inertia(file.raw_pose(inertial, what), f64.inertia_numbers(about_com, what))
+        return np.asarray(f64.move_inertia(file.raw_pose(inertial, what), f64.inertia_numbers(about_com, what)))
     except ValueError as error:
         raise error if str(error).startswith(file.path) else file.fault(inertial, str(error)) from error
 
@@ -280,25 +283,25 @@ def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
 
 def _unused(file: SdfFile) -> list[str]:
     """What the file holds and the scene does not, apart from joints."""
-    found: dict[str, list[str]] = {}
+    unused: dict[str, list[str]] = {}
     for link, (element, _) in file.links.items():
         for tag in _SKIPPED:
             if element.find(tag) is not None:
-                found.setdefault(f"<{tag}> of links", []).append(link)
+                unused.setdefault(f"<{tag}> of links", []).append(link)
         if element.find("gravity") is not None and not file.flag(element, "gravity", f"link {link!r}"):
-            found.setdefault("links without gravity (it acts on them here)", []).append(link)
+            unused.setdefault("links without gravity (it acts on them here)", []).append(link)
         if file.flag(element, "kinematic", f"link {link!r}"):
-            found.setdefault("kinematic links", []).append(link)
+            unused.setdefault("kinematic links", []).append(link)
         if element.find("inertial/fluid_added_mass") is not None:
-            found.setdefault("fluid added mass of links", []).append(link)
+            unused.setdefault("fluid added mass of links", []).append(link)
     for joint, (element, _) in file.joints.items():
         if element.find("sensor") is not None:
-            found.setdefault("<sensor> of joints", []).append(joint)
+            unused.setdefault("<sensor> of joints", []).append(joint)
         if any(file.number(element, f"{tag}/initial_position", 0.0, f"joint {joint!r}") for tag in ("axis", "axis2")):
-            found.setdefault("initial position of joints", []).append(joint)
+            unused.setdefault("initial position of joints", []).append(joint)
     for model, scope in file.models.items():
         for tag in ("plugin", "gripper"):
             if scope.element.find(tag) is not None:
-                found.setdefault(f"<{tag}> of models", []).append(scope.element.get("name") or model)
-    lines = [line for reason, names in found.items() for line in listed(reason, names)]
+                unused.setdefault(f"<{tag}> of models", []).append(scope.element.get("name") or model)
+    lines = [line for reason, names in unused.items() for line in listed(reason, names)]
     return [*lines, *listed("includes", file.includes)]

@@ -133,12 +133,12 @@ class SdfFile(XmlFile):
             base = self.find(element.get("attached_to").strip(), scope, element)
         else:
             base = scope.frame
-        found = self.pose(base, stop, (*trail, name)) @ raw
+        placed = self.pose(base, stop, (*trail, name)) @ raw
         placement = (element.get("placement_frame") or "").strip() if name in self.models else ""
         if placement:
             inner = self.models[name]
-            found = found @ f64.inverse(self.pose(self.find(placement, inner, element), name))
-        return found
+            placed = placed @ f64.inverse(self.pose(self.find(placement, inner, element), name))
+        return placed
 
     def _entry(self, name: str) -> tuple[Any, Scope]:
         for known in (self.links, self.frames):
@@ -164,10 +164,10 @@ class SdfFile(XmlFile):
     def end(self, joint: str, which: str) -> str:
         """Full name of the frame that is a joint's "parent" or "child"."""
         element, scope = self.joints[joint]
-        found = element.find(which)
-        if found is None or not (found.text or "").strip():
+        child = element.find(which)
+        if child is None or not (child.text or "").strip():
             raise self.fault(element, f"joint {joint!r} has no <{which}>")
-        return self.find(found.text.strip(), scope, found)
+        return self.find(child.text.strip(), scope, child)
 
     def link_of(self, name: str, trail: tuple[str, ...] = ()) -> str | None:
         """The link that carries a frame, or None: the world, or a model that is static."""

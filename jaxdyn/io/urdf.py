@@ -15,6 +15,7 @@ from jaxdyn.io.loaded import warn_of_units
 from jaxdyn.io.urdf_check import JOINTS
 from jaxdyn.io.urdf_parts import Inertial, Joint, read_parts
 from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import DType, Numbers
 from jaxdyn.model.builder import GRAVITY, ModelBuilder, inertia_problems, unknown
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model
@@ -40,8 +41,8 @@ def load_urdf(
     floating_base: bool = False,
     lock: Iterable[str] | Mapping[str, Any] = (),
     mimic: str = "ignore",
-    gravity=GRAVITY,
-    dtype=None,
+    gravity: Numbers = GRAVITY,
+    dtype: DType | None = None,
 ) -> Model:
     """The mechanism of a URDF file. Meshes are not read.
 
@@ -99,17 +100,17 @@ def urdf_model(
         if kinds.get(name, "fixed") == "fixed":
             raise ValueError(f"{path}: {unknown('joint', name, kinds)}; a ball takes the place of a joint that moves")
         kinds[name] = "spherical"
-    held = _held({root_joint: "free", **kinds} if floating_base else kinds, lock, path)
+    locked = _locked({root_joint: "free", **kinds} if floating_base else kinds, lock, path)
     couplings = {name: joint.mimic for name, joint in urdf.joints.items() if joint.mimic and kinds[name] != "fixed"}
     if mimic == "error" and couplings:
         listed = ", ".join(f"{name} (follows {coupling.joint})" for name, coupling in couplings.items())
         raise ValueError(f"{path}: joints that follow others: {listed}; pass mimic='couple' or mimic='ignore'")
     if mimic == "couple":
-        couplings = _settle(couplings, kinds, held, urdf.places)
+        couplings = _settle(couplings, kinds, locked, urdf.places)
 
     builder = ModelBuilder(urdf.name, gravity=gravity, dtype=dtype)
-    free = floating_base and root_joint not in held
-    base = f64.joint_pose("free", np.zeros(6), held[root_joint]) if root_joint in held else None
+    free = floating_base and root_joint not in locked
+    base = f64.joint_pose("free", np.zeros(6), locked[root_joint]) if root_joint in locked else None
     inertia = _inertia(urdf, urdf.root)
     builder.add_body(urdf.root, None, "free" if free else "fixed", inertia, joint_name=root_joint, pose=base)
     stack = list(reversed(urdf.children[urdf.root]))
@@ -118,7 +119,7 @@ def urdf_model(
         stack.extend(reversed(urdf.children[joint.child]))
         inertia = _inertia(urdf, joint.child)
         try:
-            _add_joint(builder, joint, kinds[joint.name], inertia, urdf, held)
+            _add_joint(builder, joint, kinds[joint.name], inertia, urdf, locked)
         except ValueError as error:
             raise ValueError(f"{urdf.places[f'joint {joint.name}']}: {error}") from error
     if mimic == "couple":
@@ -164,17 +165,17 @@ def _warn_of_inertias(urdf: _Description) -> None:
 
 
 def _add_joint(
-    builder: ModelBuilder, joint: Joint, kind: str, inertia, urdf: _Description, held: dict[str, np.ndarray]
+    builder: ModelBuilder, joint: Joint, kind: str, inertia, urdf: _Description, locked: dict[str, np.ndarray]
 ) -> None:
     name = joint.child
     pose, parent, axis, turn = joint.origin, joint.parent, _Z, np.eye(4)
     if kind in SCREW_KINDS or kind == "planar":
-        axis = f64.unit(joint.axis, f"joint {joint.name!r}: axis")
+        axis = np.asarray(f64.unit(joint.axis, f"joint {joint.name!r}: axis"))
     if kind == "planar":
         turn, axis = f64.turn_from_z(axis), _Z
-    if joint.name in held:
+    if joint.name in locked:
         screw = np.concatenate([axis, np.zeros(3)] if kind == "prismatic" else [np.zeros(3), axis])
-        pose = pose @ turn @ f64.joint_pose(kind, screw, held[joint.name]) @ f64.inverse(turn)
+        pose = pose @ turn @ f64.joint_pose(kind, screw, locked[joint.name]) @ f64.inverse(turn)
         kind, axis, turn = "fixed", _Z, np.eye(4)
     leaves = {} if kind == "fixed" else _leaves(joint, kind)
     if not np.array_equal(turn, np.eye(4)):
@@ -205,35 +206,35 @@ def _inertia(urdf: _Description, link: str) -> np.ndarray:
     # A missing <mass> or <inertia> inside <inertial> is none at all.
     parts = (inertial.mass or 0.0, np.zeros(3), np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia)
     try:
-        parameters = f64.inertia_numbers(parts, f"link {link!r}")
+        parameters = np.asarray(f64.inertia_numbers(parts, f"link {link!r}"))
     except ValueError as error:
         raise ValueError(f"{urdf.places[f'link {link}']}: {error}") from error
-    return parameters if inertial.origin is None else f64.move_inertia(inertial.origin, parameters)
+    return parameters if inertial.origin is None else np.asarray(f64.move_inertia(inertial.origin, parameters))
 
 
-def _held(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:
-    """Coordinates at which each locked joint is held."""
+def _locked(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:
+    """The coordinates of each locked joint."""
     if isinstance(lock, str):
         raise ValueError(f"lock is {lock!r}; give a list of joint names or a mapping of name to value")
     values = dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(lock)
-    held = {}
+    locked = {}
     for name, value in values.items():
         if name not in kinds or kinds[name] == "fixed":
             fault = f"joint {name!r} is fixed already" if name in kinds else unknown("joint", name, kinds)
             raise ValueError(f"lock: {fault} in {path}; leave it out")
         nq = KINDS[kinds[name]].nq
         if value is None:
-            held[name] = joint_neutral(kinds[name])
+            locked[name] = joint_neutral(kinds[name])
             continue
         shapes = {(nq,): f"({nq},)"} | ({(): "a number"} if nq == 1 else {})
-        held[name] = f64.numbers(value, shapes, f"lock: value of joint {name!r}").reshape(nq)
-        if kinds[name] == "free" and not held[name][3:].any():
+        locked[name] = f64.numbers(value, shapes, f"lock: value of joint {name!r}").reshape(nq)
+        if kinds[name] == "free" and not locked[name][3:].any():
             raise ValueError(f"lock: value of joint {name!r} is {value!r}; its quaternion (qw, qx, qy, qz) is zero")
-    return held
+    return locked
 
 
-def _settle(couplings: dict, kinds: dict[str, str], held: dict[str, np.ndarray], places: dict[str, str]) -> dict:
-    """The couplings that are left once joints that follow held ones are held too (added to `held`)."""
+def _settle(couplings: dict, kinds: dict[str, str], locked: dict[str, np.ndarray], places: dict[str, str]) -> dict:
+    """The couplings that remain once joints coupled to locked ones are locked too (added to `locked`)."""
     left = dict(couplings)
     for name, coupling in couplings.items():
         where = places[f"joint {name}"]
@@ -249,17 +250,17 @@ def _settle(couplings: dict, kinds: dict[str, str], held: dict[str, np.ndarray],
     while not settled:
         settled = True
         for name, coupling in list(left.items()):
-            if coupling.joint not in held:
+            if coupling.joint not in locked:
                 continue
-            value = coupling.multiplier * held[coupling.joint] + coupling.offset
-            if not np.allclose(held.setdefault(name, value), value, rtol=1e-9, atol=1e-9):
+            value = coupling.multiplier * locked[coupling.joint] + coupling.offset
+            if not np.allclose(locked.setdefault(name, value), value, rtol=1e-9, atol=1e-9):
                 raise ValueError(
-                    f"lock: joint {name!r} is held at {held[name]}, but follows {coupling.joint!r} to {value}"
+                    f"lock: joint {name!r} is held at {locked[name]}, but follows {coupling.joint!r} to {value}"
                 )
             del left[name]
             settled = False
     for name, coupling in left.items():
-        if name in held:
+        if name in locked:
             raise ValueError(f"lock: joint {name!r} follows {coupling.joint!r}; lock that one instead")
     return left
 
@@ -284,18 +285,18 @@ def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str],
     roots = [name for name in links if name not in moved_by]
     if len(roots) > 1:
         raise ValueError(f"{path}: there are {len(roots)} root links: {', '.join(roots)}; join them by a joint")
-    # From every link the way to the parent leads to the root, unless it runs in a circle.
+    # From every link the chain of parents ends at the root, unless it is a circle.
     sound = set(roots)
     for start in links:
-        way, link = [], start
+        visited, link = [], start
         while link not in sound:
-            if link in way:
-                circle = way[way.index(link) :]
+            if link in visited:
+                circle = visited[visited.index(link) :]
                 where = places[f"joint {moved_by[link]}"]
                 raise ValueError(
                     f"{where}: the links {', '.join(circle)} form a cycle; a URDF is a tree, remove a joint"
                 )
-            way.append(link)
+            visited.append(link)
             link = joints[moved_by[link]].parent
-        sound.update(way)
+        sound.update(visited)
     return roots[0]

@@ -41,7 +41,7 @@ class Closures(NamedTuple):
     path: str
     pairs: tuple[tuple[str, str, str], ...] = ()
     balls: tuple[str, ...] = ()
-    held: tuple[str, ...] = ()
+    locked: tuple[str, ...] = ()
     motors: tuple[str, ...] = ()
     not_taken: tuple[str, ...] = ()
 

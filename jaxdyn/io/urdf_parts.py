@@ -91,11 +91,11 @@ _MIMIC = (("multiplier", "1"), ("offset", "0"))
 
 
 def _origin(element) -> np.ndarray | None:
-    found = element.find("origin")
-    if found is None:
+    origin = element.find("origin")
+    if origin is None:
         return None
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = f64.rotation_from_rpy(_vector(found, "rpy", "0 0 0")), _vector(found, "xyz", "0 0 0")
+    pose[:3, :3], pose[:3, 3] = f64.rotation_from_rpy(_vector(origin, "rpy", "0 0 0")), _vector(origin, "xyz", "0 0 0")
     return pose
 
 

@@ -98,21 +98,21 @@ class XmlFile:
             return f64.joint_pose("free", np.zeros(6), np.concatenate([values[:3], values[6:], values[3:6]]))
         values = self.numbers(pose, 6, what)
         turn = np.deg2rad(values[3:]) if (pose.get("degrees") or "").lower() in ("1", "true") else values[3:]
-        return f64.pose_matrix((values[:3], turn), what)
+        return np.asarray(f64.pose_matrix((values[:3], turn), what))
 
     def number(self, element, tag: str, default: float, what: str, *, finite: bool = True) -> float:
         """A number in a child element `tag` (a path), or the default where there is none or it is empty."""
-        found = None if element is None else element.find(tag)
-        if found is None or not (found.text or "").strip():
+        child = None if element is None else element.find(tag)
+        if child is None or not (child.text or "").strip():
             return default
-        if not finite and (found.text or "").strip().lower() in ("inf", "+inf", "-inf"):
-            return float(found.text or "")
-        return float(self.numbers(found, 1, what)[0])
+        if not finite and (child.text or "").strip().lower() in ("inf", "+inf", "-inf"):
+            return float(child.text or "")
+        return float(self.numbers(child, 1, what)[0])
 
     def flag(self, element, tag: str, what: str) -> bool:
         """A truth value in a child element, false where there is none."""
-        found = None if element is None else element.find(tag)
-        text = "" if found is None else (found.text or "").strip().lower()
+        child = None if element is None else element.find(tag)
+        text = "" if child is None else (child.text or "").strip().lower()
         if text not in ("", "0", "1", "true", "false"):
-            raise self.fault(found, f"<{tag}> of {what} is {text!r}; give true or false")
+            raise self.fault(child, f"<{tag}> of {what} is {text!r}; give true or false")
         return text in ("1", "true")

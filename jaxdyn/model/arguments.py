@@ -2,14 +2,14 @@
 
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_concrete
@@ -21,8 +21,13 @@ _OPTIONAL = ("a", "external")
 if TYPE_CHECKING:
     Numbers = ArrayLike | Sequence[Any]  # what `as_array` takes
     Given = Array  # what it returns, which may be an array of numpy
+    FilePath = str | os.PathLike[str]
+    DType = DTypeLike
+    Function = Callable[..., Any]
 else:
-    Numbers = Given = Any  # `as_array` looks at them, and its errors name the argument
+    Numbers = Given = FilePath = DType = Function = (
+        Any  # `as_array` and others look at them, and their errors name the argument
+    )
 
 
 def as_array(value: Any, name: str, dtype=None) -> Given:
@@ -82,10 +87,10 @@ def check_state(system, **arguments) -> tuple[Any, ...]:
     system that has none; for a Scene in the place of its system, and for what is no system.
     """
     check_system(system)
-    dtype, found = state_dtype(system, arguments.get("q")), []
+    dtype, arrays = state_dtype(system, arguments.get("q")), []
     for name, value in arguments.items():
         if value is None and name in _OPTIONAL:
-            found.append(None)
+            arrays.append(None)
             continue
         if name == "external" and not hasattr(system, "topology"):
             raise ValueError(
@@ -93,8 +98,8 @@ def check_state(system, **arguments) -> tuple[Any, ...]:
             )
         value = as_array(value, name, dtype)
         check_shape(system, name, value)
-        found.append(value)
-    return tuple(found)
+        arrays.append(value)
+    return tuple(arrays)
 
 
 def check_shape(system, name: str, value: Array | np.ndarray) -> None:
@@ -144,7 +149,7 @@ def check_shapes(model, **arguments) -> tuple[Any, ...]:
 
 
 def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
-    """A pose as an array leaf; arrays (4, 4) of jax are taken as they are, so that they can be traced."""
+    """A pose as an array leaf; its numbers may be traced, and arrays (4, 4) of jax are taken as they are."""
     if isinstance(pose, jax.Array) and pose.shape == (4, 4):
         return pose
     if isinstance(pose, jax.Array) and pose.shape == (3,):

@@ -1,7 +1,8 @@
 """Building mechanisms in code, and looking at and repairing their inertias.
 
 `ModelBuilder` collects bodies and joints; `build` merges what is fixed, puts the tree in order and returns a `Model`.
-All arithmetic of a build is float64 on concrete numbers; the result is stored in jax's default dtype.
+All arithmetic of a build is float64 on known numbers; the result is stored in jax's default dtype. Numbers may be traced: what
+decides the structure (names, kinds of joints, what is None) is known all the same.
 """
 
 import dataclasses
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
@@ -33,10 +35,10 @@ class _Body:
     parent: str | None
     kind: str
     joint_name: str
-    pose: np.ndarray
-    screw: np.ndarray
-    inertia: np.ndarray
-    leaves: dict[str, np.ndarray | None]
+    pose: f64.Values
+    screw: f64.Values
+    inertia: f64.Values
+    leaves: dict[str, f64.Values | None]
 
 
 class ModelBuilder:
@@ -48,12 +50,22 @@ class ModelBuilder:
     - `gravity`: gravitational acceleration (3,) in world axes, m/s^2; None leaves gravity out of all that is compiled.
     - `dtype`: floating-point type of the leaves; jax's default when None.
 
+    Every number of `add_body`, `add_frame`, `add_coupling` and of the gravity may be traced, so that `jax.grad` and `jax.vmap`
+    go through the construction. Names, kinds, and which numbers are given at all are structure and stay known. What
+    cannot be seen in traced numbers is not refused: an infeasible body, a zero axis or a mass matrix without inverse then shows
+    in results (NaN, or a result code of `simulate`).
+
     **Raises:** ValueError for a gravity that is not three finite numbers, and for float64 while jax runs in 32 bits.
 
     ```python
-    builder = ModelBuilder("pendulum")
-    builder.add_body("bob", joint="revolute", axis=(0, 1, 0), inertia=(1.0, (0, 0, -0.5), (0, 0, 0)))
-    model = builder.build()
+    def period(length):  # of a small swing
+        builder = ModelBuilder("pendulum")
+        builder.add_body("bob", joint="revolute", axis=(0, 1, 0), inertia=(1.0, (0, 0, -length), (0, 0, 0)))
+        model = builder.build()
+        stiffness = jax.jacfwd(lambda q: jd.gravity_force(model, q))(jnp.zeros(1))[0, 0]
+        return 2 * jnp.pi * jnp.sqrt(jd.mass_matrix(model, jnp.zeros(1))[0, 0] / stiffness)
+
+    jax.vmap(jax.grad(period))(jnp.array([0.5, 1.0, 2.0]))
     ```
     """
 
@@ -64,8 +76,8 @@ class ModelBuilder:
         self._dtype = _float_dtype(dtype)
         self._bodies: dict[str, _Body] = {}
         self._joints: dict[str, str] = {}  # joint name -> body name
-        self._frames: dict[str, tuple[str | None, np.ndarray]] = {}
-        self._couplings: dict[str, tuple[str, float, float]] = {}
+        self._frames: dict[str, tuple[str | None, f64.Values]] = {}
+        self._couplings: dict[str, tuple[str, f64.Values]] = {}
 
     def add_body(
         self,
@@ -132,7 +144,7 @@ class ModelBuilder:
             size = nq if key in ("lower", "upper") else nv
             leaves[key] = None if value is None else _joint_numbers(value, size, joint, key, what)
         low, high = leaves["lower"], leaves["upper"]
-        if low is not None and high is not None and np.any(low > high):
+        if low is not None and high is not None and is_concrete(low, high) and np.any(low > high):
             raise ValueError(f"{what}: lower limit {lower} is above upper limit {upper}; swap them")
         body = _Body(
             name,
@@ -179,7 +191,7 @@ class ModelBuilder:
                 raise ValueError(f"{what}: the joint would follow itself; leave one coupling out")
             followed = self._couplings[followed][0] if followed in self._couplings else None
         values = f64.numbers([multiplier, offset], {(2,): "two numbers"}, f"{what}: (multiplier, offset)")
-        self._couplings[joint] = (source, float(values[0]), float(values[1]))
+        self._couplings[joint] = (source, values)
         return self
 
     def build(self) -> Model:
@@ -191,12 +203,12 @@ class ModelBuilder:
         configuration: S^T I S = 0 with the composite or the articulated inertia I of what it carries.
         """
         moving, carriers, parents, home, inertias = self._merged()
-        others = [(carriers[b][0], name, carriers[b][1] @ pose) for name, (b, pose) in self._frames.items()]
+        others = [(carriers[b][0], name, _chained(carriers[b][1], pose)) for name, (b, pose) in self._frames.items()]
         fixed = [name for name, body in self._bodies.items() if body.kind == "fixed"]
         others += [(carriers[name][0], name, carriers[name][1]) for name in fixed]
         others.sort(key=lambda frame: frame[:2])
         index = {body.joint_name: i for i, body in enumerate(moving)}
-        couplings = {(index[joint], index[c[0]]): c[1:] for joint, c in self._couplings.items()}
+        couplings = {(index[joint], index[c[0]]): c[1] for joint, c in self._couplings.items()}
         topology = Topology(
             name=self._name,
             parents=tuple(parents),
@@ -207,18 +219,23 @@ class ModelBuilder:
             frame_bodies=tuple(range(len(moving))) + tuple(body for body, _, _ in others),
             couplings=tuple(sorted(couplings)),
         )
-        screws = np.array([body.screw for body in moving]).reshape(-1, 6)
+        screws = _rows([body.screw for body in moving], (6,))
         leaves = {key: _stacked(moving, key, size, 0.0) for key, size in _JOINT_LEAVES.items()}
         _check_regular(topology, home, screws, inertias, leaves["armature"])
         leaves |= {key: _stacked(moving, key, size, fill, always=True) for key, (size, fill) in _LIMITS.items()}
         leaves |= dict(home=home, screws=screws, inertias=inertias, gravity=self._gravity)
-        leaves["frame_poses"] = np.array([np.eye(4)] * len(moving) + [pose for *_, pose in others]).reshape(-1, 4, 4)
-        leaves["coupling_values"] = np.array([couplings[pair] for pair in topology.couplings]) if couplings else None
-        stored: dict[str, Any] = {
-            key: None if value is None else jnp.asarray(value, self._dtype) for key, value in leaves.items()
-        }
-        held = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
-        return Model(**stored, topology=topology, fixed_joints=held)
+        leaves["frame_poses"] = _rows([np.eye(4)] * len(moving) + [pose for *_, pose in others], (4, 4))
+        values = [couplings[pair] for pair in topology.couplings]
+        leaves["coupling_values"] = _rows(values, (2,)) if couplings else None
+        stored: dict[str, Any] = {key: self._leaf(value) for key, value in leaves.items()}
+        fixed_joints = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
+        return Model(**stored, topology=topology, fixed_joints=fixed_joints)
+
+    def _leaf(self, value) -> jax.Array | None:
+        if value is None or not is_concrete(value):
+            return None if value is None else value.astype(self._dtype)
+        with jax.ensure_compile_time_eval():  # within a trace, too, what is known stays known
+            return jnp.asarray(value, self._dtype)
 
     def _check_new(self, name, parent) -> None:
         if not isinstance(name, str) or not name:
@@ -234,13 +251,13 @@ class ModelBuilder:
         for body in sorted(self._bodies.values(), key=lambda body: body.joint_name, reverse=True):
             children.setdefault(body.parent, []).append(body)
         moving, parents, home, inertias = [], [], [], []
-        carriers: dict[str | None, tuple[int, np.ndarray]] = {None: (-1, np.eye(4))}
+        carriers: dict[str | None, tuple[int, f64.Values]] = {None: (-1, np.eye(4))}
         stack = list(children.get(None, ()))
         while stack:
             body = stack.pop()
             stack.extend(children.get(body.name, ()))
             carrier, pose = carriers[body.parent]
-            pose = pose @ body.pose
+            pose = _chained(pose, body.pose)
             if body.kind != "fixed":
                 parents.append(carrier)
                 home.append(pose)
@@ -250,8 +267,26 @@ class ModelBuilder:
                 continue
             carriers[body.name] = (carrier, pose)
             if carrier >= 0:
-                inertias[carrier] = inertias[carrier] + f64.move_inertia(pose, body.inertia)
-        return moving, carriers, parents, np.array(home).reshape(-1, 4, 4), np.array(inertias).reshape(-1, 10)
+                inertias[carrier] = _sum(inertias[carrier], f64.move_inertia(pose, body.inertia))
+        return moving, carriers, parents, _rows(home, (4, 4)), _rows(inertias, (10,))
+
+
+# One operand may be traced and the other one known, in float64.
+
+
+def _chained(first: f64.Values, second: f64.Values) -> f64.Values:
+    xp = numpy_for(first, second)
+    return xp.asarray(first, float) @ xp.asarray(second, float)
+
+
+def _sum(one: f64.Values, other: f64.Values) -> f64.Values:
+    xp = numpy_for(one, other)
+    return xp.asarray(one, float) + xp.asarray(other, float)
+
+
+def _rows(values, shape: tuple[int, ...]) -> f64.Values:
+    """Arrays of one shape as the rows of one, also where there are none."""
+    return numpy_for(values).asarray(values, float).reshape(-1, *shape)
 
 
 def inertia_report(model: Model) -> list[tuple[str, str]]:
@@ -320,7 +355,7 @@ def unknown(role: str, name, known) -> str:
     return f"{role} {name!r} is unknown" + (f" (did you mean {', '.join(near)}?)" if near else "")
 
 
-def _joint_numbers(value, size: int, kind: str, key: str, what: str) -> np.ndarray:
+def _joint_numbers(value, size: int, kind: str, key: str, what: str) -> f64.Values:
     if size == 0:
         raise ValueError(f"{what}: {key} is {value!r}, but the joint is fixed; leave it out")
     limit = key in _LIMITS
@@ -331,28 +366,38 @@ def _joint_numbers(value, size: int, kind: str, key: str, what: str) -> np.ndarr
     if size == 1 or key not in ("lower", "upper"):
         shapes = {(): "a number", **shapes}
     array = f64.numbers(value, shapes, f"{what}: {key}", finite=not limit)
-    if not limit and np.any(array < 0):
+    if not limit and is_concrete(array) and np.any(array < 0):
         raise ValueError(f"{what}: {key} is {value!r}; it must not be negative")
-    return np.broadcast_to(array, (size,))
+    return numpy_for(array).broadcast_to(array, (size,))
 
 
-def _screw(kind: str, axis, pitch, screw, what: str) -> np.ndarray:
+def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
     axis = f64.numbers(axis, {(3,): "(3,)"}, f"{what}: axis")
-    pitch = float(f64.numbers(pitch, {(): "a number"}, f"{what}: pitch"))
-    turned = not np.array_equal(axis, [0, 0, 1])
+    pitch = f64.numbers(pitch, {(): "a number"}, f"{what}: pitch")
+    turned = not is_concrete(axis) or not np.array_equal(axis, [0, 0, 1])
+    pitched = not is_concrete(pitch) or bool(pitch)
+    xp = numpy_for(axis, pitch, screw)
     if kind not in SCREW_KINDS:
-        if turned or pitch or screw is not None:
+        if turned or pitched or screw is not None:
             raise ValueError(f"{what}: a {kind} joint has no axis, pitch or screw; turn its pose instead")
         return np.zeros(6)
-    if pitch and kind != "helical":
+    if pitched and kind != "helical":
         raise ValueError(f"{what}: pitch is {pitch}, but the joint is {kind}; use joint='helical'")
     if screw is None:
         axis = f64.unit(axis, f"{what}: axis")
-        return np.concatenate([axis, np.zeros(3)]) if kind == "prismatic" else np.concatenate([pitch * axis, axis])
-    if turned or pitch:
+        axis = xp.asarray(axis, float)
+        return xp.concatenate([axis, xp.zeros(3)] if kind == "prismatic" else [xp.asarray(pitch, float) * axis, axis])
+    if turned or pitched:
         raise ValueError(f"{what}: screw is given together with axis or pitch; give one of them")
     screw = f64.numbers(screw, {(6,): "(v, omega) (6,)"}, f"{what}: screw")
     v, omega = screw[:3], screw[3:]
+    if not is_concrete(screw):
+        if kind != "helical":
+            raise ValueError(
+                f"{what}: screw is traced, and only its values say whether it is that of a {kind} joint; give axis=, or use "
+                "joint='helical', which takes any screw that turns"
+            )
+        return screw / jnp.sqrt(jnp.sum(omega * omega))
     size = np.linalg.norm(v if kind == "prismatic" else omega)
     if size == 0:
         part = "v" if kind == "prismatic" else "omega"
@@ -372,18 +417,21 @@ def _stacked(moving: list[_Body], key: str, size: str, fill: float, *, always: b
     if not always and all(value is None for value in values):
         return None
     sizes = [getattr(KINDS[body.kind], size) for body in moving]
-    parts = [np.full(n, fill) if value is None else value for value, n in zip(values, sizes, strict=True)]
-    return np.concatenate(parts) if parts else np.zeros(0)
+    xp = numpy_for(values)
+    parts = [xp.full(n, fill) if value is None else xp.asarray(value) for value, n in zip(values, sizes, strict=True)]
+    return xp.concatenate(parts) if parts else np.zeros(0)
 
 
 def _check_regular(topology: Topology, home, screws, inertias, armature) -> None:
+    if not is_concrete(home, screws, inertias, armature):
+        return
     # A mass matrix that is singular at one configuration is legitimate; at a random one too, it is so at all of them.
     rng = np.random.default_rng(0)
     neutral = [joint_neutral(kind) for kind in topology.kinds]
     if not f64.idle_joints(topology, home, screws, inertias, armature, neutral):
         return
-    anywhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
-    if not (idle := f64.idle_joints(topology, home, screws, inertias, armature, anywhere)):
+    elsewhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
+    if not (idle := f64.idle_joints(topology, home, screws, inertias, armature, elsewhere)):
         return
     names = [topology.joint_names[i] for i in sorted(idle)]
     i, alone = next(iter(idle.items()))

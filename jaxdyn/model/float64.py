@@ -1,11 +1,17 @@
-"""Rigid-body arithmetic on concrete numbers, in numpy and always in float64.
+"""Rigid-body arithmetic of a build: on known numbers in numpy and always in float64, on traced ones by JAX.
 
-Models are built here and not with the traced functions of `se3` and `inertia`: a chain of fixed links merged in float32
-would lose digits before the model exists, and what is refused must be refused on numbers.
+Models are built here and not with the functions of `se3` and `inertia`: a chain of fixed links merged in float32 would lose
+digits before the model exists, and what is refused must be refused on numbers. Numbers that are traced (by `jax.grad`,
+`jax.vmap`, `jax.jit`) go through the same formulas; what only their values could tell is then not refused.
 """
 
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
 
 _SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
@@ -14,43 +20,50 @@ _TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
 _ORTHONORMAL = 1e-6
 _V, _W = slice(0, 3), slice(3, 6)
 
+Values = np.ndarray | jax.Array
 
-def numbers(value, shapes: dict[tuple[int, ...], str], what: str, *, finite: bool = True) -> np.ndarray:
-    """`value` as a float64 array of one of the `shapes` (a description for each, used in the message).
 
-    **Raises:** ValueError naming `what` for another shape, what is not a number, NaN, and infinity when `finite`.
+def numbers(value, shapes: dict[tuple[int, ...], str], what: str, *, finite: bool = True) -> Values:
+    """`value` as an array of one of the `shapes` (a description for each, used in the message): float64, or traced.
+
+    **Raises:** ValueError naming `what` for another shape, what is not a number, and, when known, NaN and, when `finite`,
+    infinity.
     """
     expected = " or ".join(shapes.values())
+    known = is_concrete(value)
     try:
-        array = np.asarray(value, np.float64)
+        array = np.asarray(value, np.float64) if known else jnp.asarray(value, float)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what} is {value!r}, expected {expected}") from error
     if array.shape not in shapes:
         raise ValueError(f"{what} has shape {array.shape}, expected {expected}")
-    if not np.all(np.isfinite(array) | (~np.isnan(array) & (not finite))):
+    if known and not np.all(np.isfinite(array) | (~np.isnan(array) & (not finite))):
         raise ValueError(f"{what} is {array.tolist()}; every number must be finite")
     return array
 
 
-def unit(axis, what: str) -> np.ndarray:
+def unit(axis, what: str) -> Values:
     """A direction (3,) of length one. **Raises:** ValueError naming `what` for another shape, NaN or a zero vector."""
     axis = numbers(axis, {(3,): "(3,)"}, what)
+    if not is_concrete(axis):
+        return axis / jnp.sqrt(jnp.sum(axis * axis))
     if not axis.any():
         raise ValueError(f"{what} is {axis.tolist()}; give a direction other than zero")
     axis = axis / np.abs(axis).max()  # so that the squares of very short or long vectors neither vanish nor overflow
     return axis / np.linalg.norm(axis)
 
 
-def hat(vector: np.ndarray) -> np.ndarray:
+def hat(vector: Values) -> Values:
     """(3, 3) with hat(a) b = a x b."""
     x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return numpy_for(vector).array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def rotation_from_rpy(rpy) -> np.ndarray:
+def rotation_from_rpy(rpy) -> Values:
     """R = Rz(yaw) Ry(pitch) Rx(roll), the fixed-axis angles of URDF (rad)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    return np.array(
+    xp = numpy_for(rpy)
+    (cr, cp, cy), (sr, sp, sy) = xp.cos(rpy), xp.sin(rpy)
+    return xp.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
             [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
@@ -71,21 +84,31 @@ def rpy_from_rotation(rotation: np.ndarray) -> np.ndarray:
     return np.array([roll, pitch, yaw])
 
 
-def pose_matrix(pose, what: str) -> np.ndarray:
+def pose_of(rotation, position) -> Values:
+    """(4, 4) of a rotation (3, 3) and a position (3,), known or traced."""
+    xp = numpy_for(rotation, position)
+    rotation, position = xp.asarray(rotation, float), xp.asarray(position, float)
+    upper = xp.concatenate([rotation, position[:, None]], axis=1)
+    return xp.concatenate([upper, np.eye(4)[3:] if xp is np else jnp.eye(4)[3:]])
+
+
+def pose_matrix(pose, what: str) -> Values:
     """(4, 4) from None (identity), a (4, 4) matrix, a position (3,) or a pair (xyz, rpy).
 
-    **Raises:** ValueError naming `what` for another shape, NaN, a rotation that is not orthonormal, a reflection.
+    **Raises:** ValueError naming `what` for another shape and, when known, NaN, a rotation that is not orthonormal, a
+    reflection.
     """
-    matrix = np.eye(4)
     if pose is None:
-        return matrix
+        return np.eye(4)
     given = numbers(pose, {(4, 4): "a (4, 4) matrix", (3,): "a position (3,)", (2, 3): "a pair (xyz, rpy)"}, what)
     if given.shape == (3,):
-        matrix[:3, 3] = given
-        return matrix
+        return pose_of(np.eye(3), given)
     if given.shape == (2, 3):
-        matrix[:3, :3], matrix[:3, 3] = rotation_from_rpy(given[1]), given[0]
-        return matrix
+        # Of a pair whose angles are known only the position is traced.
+        turned = rotation_from_rpy(given[1] if not is_concrete(pose[1]) else np.asarray(pose[1], float))
+        return pose_of(turned, given[0])
+    if not is_concrete(given):
+        return given
     rotation = given[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > _ORTHONORMAL or np.linalg.det(rotation) < 0:
@@ -96,15 +119,12 @@ def pose_matrix(pose, what: str) -> np.ndarray:
     return given
 
 
-def inverse(pose: np.ndarray) -> np.ndarray:
+def inverse(pose: Values) -> Values:
     """Inverse of a motion (4, 4)."""
-    result = np.eye(4)
-    result[:3, :3] = pose[:3, :3].T
-    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return result
+    return pose_of(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
 
 
-def adjoint(pose: np.ndarray) -> np.ndarray:
+def adjoint(pose: Values) -> np.ndarray:
     """Ad = [[R, hat(p) R], [0, R]] (6, 6)."""
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = pose[:3, :3]
@@ -112,10 +132,12 @@ def adjoint(pose: np.ndarray) -> np.ndarray:
     return result
 
 
-def rotation_matrix(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation (3, 3) about a unit axis: 1 + sin(a) hat(n) + (1 - cos(a)) hat(n)^2."""
+def rotation_matrix(axis, angle) -> Values:
+    """Rotation (3, 3) about a unit axis (3,) by an angle (rad): 1 + sin(a) hat(n) + (1 - cos(a)) hat(n)^2."""
+    xp = numpy_for(axis, angle)
+    axis, angle = xp.asarray(axis, float), xp.asarray(angle, float)
     cross = hat(axis)
-    return np.eye(3) + np.sin(angle) * cross + 2 * np.sin(angle / 2) ** 2 * cross @ cross
+    return xp.eye(3) + xp.sin(angle) * cross + 2 * xp.sin(angle / 2) ** 2 * cross @ cross
 
 
 def turn_from_z(axis: np.ndarray) -> np.ndarray:
@@ -160,10 +182,10 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
         [[0, h - f, c - g, d - b], [h - f, 0, b + d, c + g], [c - g, b + d, 0, f + h], [d - b, c + g, f + h, 0]]
     )
     k = int(np.argmax(squares))
-    found = products[k].copy()
-    found[k] = squares[k]
-    found = found / np.linalg.norm(found)
-    return found if found[0] >= 0 else -found
+    quat = products[k].copy()
+    quat[k] = squares[k]
+    quat = quat / np.linalg.norm(quat)
+    return quat if quat[0] >= 0 else -quat
 
 
 def motion_subspace(kind: str, screw: np.ndarray) -> np.ndarray:
@@ -171,10 +193,11 @@ def motion_subspace(kind: str, screw: np.ndarray) -> np.ndarray:
     return screw[:, None] if kind in SCREW_KINDS else np.eye(6)[:, KINDS[kind].columns]
 
 
-def inertia_numbers(inertia, what: str) -> np.ndarray:
+def inertia_numbers(inertia, what: str) -> Values:
     """The ten inertial parameters from None (massless), (10,), or (mass, com, inertia about the com).
 
-    **Raises:** ValueError naming `what` for another shape, NaN, a negative mass or a matrix that is not symmetric.
+    **Raises:** ValueError naming `what` for another shape and, when known, NaN, a negative mass or a matrix that is not
+    symmetric.
     """
     if inertia is None:
         return np.zeros(10)
@@ -183,19 +206,21 @@ def inertia_numbers(inertia, what: str) -> np.ndarray:
         com = numbers(inertia[1], {(3,): "(3,)"}, f"{what}: centre of mass")
         shapes = {(3, 3): "(3, 3)", (3,): "principal moments (3,)"}
         at_com = numbers(inertia[2], shapes, f"{what}: rotational inertia")
-        at_com = np.diag(at_com) if at_com.ndim == 1 else at_com
-        if np.abs(at_com - at_com.T).max() > _ORTHONORMAL * np.abs(at_com).max():
+        at_com = numpy_for(at_com).diag(at_com) if at_com.ndim == 1 else at_com
+        if is_concrete(at_com) and np.abs(at_com - at_com.T).max() > _ORTHONORMAL * np.abs(at_com).max():
             raise ValueError(f"{what}: the rotational inertia {at_com.tolist()} is not symmetric")
-        about_origin = at_com + mass * (com @ com * np.eye(3) - np.outer(com, com))
-        parameters = np.concatenate([[mass], mass * com, about_origin[_TRIANGLE]])
+        xp = numpy_for(mass, com, at_com)
+        mass, com, at_com = (xp.asarray(x, float) for x in (mass, com, at_com))
+        about_origin = at_com + mass * (com @ com * xp.eye(3) - xp.outer(com, com))
+        parameters = xp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
     else:
         parameters = numbers(inertia, {(10,): "ten numbers (10,), (mass, com, inertia about the com) or None"}, what)
-    if parameters[0] < 0:
+    if is_concrete(parameters) and parameters[0] < 0:
         raise ValueError(f"{what}: the mass is {parameters[0]} kg; it must not be negative")
     return parameters
 
 
-def rotational_inertia(parameters: np.ndarray) -> np.ndarray:
+def rotational_inertia(parameters: Values) -> Values:
     """Rotational inertia (3, 3) about the frame's origin."""
     return parameters[4:][_SYMMETRIC]
 
@@ -204,7 +229,8 @@ def about_com(parameters: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Mass, centre of mass (3,), rotational inertia about it (3, 3). A massless body has its centre at the origin."""
     mass, first = parameters[0], parameters[1:4]
     com = first / mass if mass != 0 else np.zeros(3)
-    return float(mass), com, rotational_inertia(parameters) - (com @ first * np.eye(3) - np.outer(com, first))
+    about_origin: Any = rotational_inertia(parameters)
+    return float(mass), com, about_origin - (com @ first * np.eye(3) - np.outer(com, first))
 
 
 def spatial_inertia(parameters: np.ndarray) -> np.ndarray:
@@ -213,15 +239,17 @@ def spatial_inertia(parameters: np.ndarray) -> np.ndarray:
     return np.block([[parameters[0] * np.eye(3), -first], [first, rotational_inertia(parameters)]])
 
 
-def move_inertia(pose: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+def move_inertia(pose: Values, parameters: Values) -> Values:
     """The ten numbers in frame a of a body given in frame b; `pose` T_ab (`inertia.transform_inertia` in float64)."""
+    xp = numpy_for(pose, parameters)
+    pose, parameters = xp.asarray(pose, float), xp.asarray(parameters, float)
     rotation, shift = pose[:3, :3], pose[:3, 3]
     mass, first = parameters[0], rotation @ parameters[1:4]
     inertia = rotation @ rotational_inertia(parameters) @ rotation.T
-    ph = np.outer(shift, first)
+    ph = xp.outer(shift, first)
     scale = 2 * shift @ first + mass * shift @ shift
-    inertia = inertia + scale * np.eye(3) - ph - ph.T - mass * np.outer(shift, shift)
-    return np.concatenate([[mass], first + mass * shift, inertia[_TRIANGLE]])
+    inertia = inertia + scale * xp.eye(3) - ph - ph.T - mass * xp.outer(shift, shift)
+    return xp.concatenate([mass[None], first + mass * shift, inertia[_TRIANGLE]])
 
 
 def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import numpy_for as _numpy_for
 from jaxdyn.lie import so3
 
 # Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
@@ -149,50 +150,52 @@ def nearest_feasible(parameters, *, floor: float = 1e-6) -> np.ndarray:
     return np.asarray(parameters_from_pseudo(jnp.asarray(repaired)))
 
 
-def box(mass: float, size) -> np.ndarray:
+# Bodies of simple shapes. Their numbers may be traced; of known ones they are arrays of numpy, in float64.
+
+
+def box(mass, size) -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform box with edges `size` (3,) (m) about its centre (EQUATIONS section 1)."""
-    x, y, z = np.asarray(size, float)
-    return _centred(mass, mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y]))
+    x, y, z = (mass / 12 * edge**2 for edge in size)
+    return _centred(mass, (y + z, x + z, x + y))
 
 
-def sphere(mass: float, radius: float) -> np.ndarray:
+def sphere(mass, radius) -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform solid ball about its centre; kg, m."""
-    return _centred(mass, np.full(3, 0.4 * mass * radius**2))
+    return _centred(mass, (0.4 * mass * radius**2,) * 3)
 
 
-def ellipsoid(mass: float, semi_axes) -> np.ndarray:
+def ellipsoid(mass, semi_axes) -> Array | np.ndarray:
     """Inertial parameters (10,) of a solid ellipsoid about its centre; `semi_axes` (3,) along x, y, z in m."""
-    squares = np.asarray(semi_axes, float) ** 2
-    return _centred(mass, 0.2 * mass * (squares.sum() - squares))
+    x, y, z = (0.2 * mass * axis**2 for axis in semi_axes)
+    return _centred(mass, (y + z, x + z, x + y))
 
 
-def cylinder(mass: float, radius: float, length: float) -> np.ndarray:
+def cylinder(mass, radius, length) -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform solid cylinder along z about its centre, a disk for length 0; kg, m."""
     across = mass * (3 * radius**2 + length**2) / 12
-    return _centred(mass, np.array([across, across, 0.5 * mass * radius**2]))
+    return _centred(mass, (across, across, 0.5 * mass * radius**2))
 
 
-def rod(mass: float, length: float, axis: str = "x") -> np.ndarray:
+def rod(mass, length, axis: str = "x") -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform thin rod along an axis, "x", "y" or "z", about its centre; kg, m."""
-    moments = np.full(3, mass * length**2 / 12)
-    moments["xyz".index(axis)] = 0.0
-    return _centred(mass, moments)
+    along = "xyz".index(axis)
+    return _centred(mass, [0.0 if i == along else mass * length**2 / 12 for i in range(3)])
 
 
-def point_mass(mass: float, position=(0.0, 0.0, 0.0)) -> np.ndarray:
+def point_mass(mass, position=(0.0, 0.0, 0.0)) -> Array | np.ndarray:
     """Inertial parameters (10,) of a point mass (kg) at a position (3,) in the body frame (m)."""
-    position = np.asarray(position, float)
-    return displaced(_centred(mass, np.zeros(3)), position)
+    return displaced(_centred(mass, (0.0, 0.0, 0.0)), position)
 
 
-def displaced(parameters, position, rotation=None) -> np.ndarray:
-    """Concrete parameters of the same body placed at `position` (3,), turned by `rotation` (3, 3), in a new frame."""
-    pose = np.eye(4)
-    pose[:3, 3] = position
-    if rotation is not None:
-        pose[:3, :3] = rotation
-    return np.asarray(transform_inertia(jnp.asarray(pose), jnp.asarray(parameters, jnp.asarray(pose).dtype)))
+def displaced(parameters, position, rotation=None) -> Array | np.ndarray:
+    """Parameters (10,) of the same body placed at `position` (3,), turned by `rotation` (3, 3), in a new frame."""
+    xp = _numpy_for(parameters, position, rotation)
+    turned = xp.eye(3) if rotation is None else xp.asarray(rotation, float)
+    upper = xp.concatenate([turned, xp.asarray(position, float)[:, None]], axis=1)
+    pose = jnp.concatenate([jnp.asarray(upper, float), jnp.eye(4)[3:]])
+    return xp.asarray(transform_inertia(pose, jnp.asarray(parameters, float)))
 
 
-def _centred(mass, moments) -> np.ndarray:
-    return np.array([mass, 0, 0, 0, moments[0], 0, moments[1], 0, 0, moments[2]], float)
+def _centred(mass, moments) -> Array | np.ndarray:
+    xp = _numpy_for(mass, moments)
+    return xp.asarray([mass, 0.0, 0.0, 0.0, moments[0], 0.0, moments[1], 0.0, 0.0, moments[2]], float)

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import pose_leaf
+from jaxdyn.model.arguments import Numbers, pose_leaf
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, Topology
 
 
-def join(left: Any, right: Any, *, prefix: Any = ("", ""), pose: Any = None, name: str | None = None) -> Model:
+def join(
+    left: Any, right: Any, *, prefix: Any = ("", ""), pose: Numbers | None = None, name: str | None = None
+) -> Model:
     """Two models in one: their trees side by side, in one world and with one gravity.
 
     All names of bodies, joints and frames stay, behind their prefix. The coordinates of `left` come first in q and v, then
@@ -56,7 +58,7 @@ def _check_plain(model: Model) -> None:
         raise ValueError(f"model {model.name!r} is a {type(model).__name__}; join models before contacts are added")
 
 
-def renamed(model: Model, prefix: str) -> Model:
+def renamed(model: Model, prefix: Any) -> Model:
     """The model with a prefix before the names of all bodies, joints and frames."""
     top = model.topology
     names = {

@@ -167,8 +167,8 @@ def joint_rate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"]) -> F
 def joint_random(kind: str, key: Array, lower: Array, upper: Array, dtype) -> Float[Array, " nqj"]:
     """Random configuration: uniform between the limits for coordinates, uniform over rotations for quaternions."""
     if kind in ("spherical", "free"):
-        ends, spin = jax.random.split(key)
-        quat = so3.quat_normalize(jax.random.normal(spin, (4,), dtype))
+        ends, quat_key = jax.random.split(key)
+        quat = so3.quat_normalize(jax.random.normal(quat_key, (4,), dtype))
         if kind == "spherical":
             return quat
         place = jax.random.uniform(

@@ -54,11 +54,11 @@ def _label(constraint) -> str:
 
 def _rows(constraint, system) -> str:
     try:
-        held, slips = constraint.sizes(system, state_dtype(system))
+        holonomic, nonholonomic = constraint.sizes(system, state_dtype(system))
     except Exception:
         return "does not fit the system"
     return ", ".join(
-        f"{n} {kind} row{'s' * (n > 1)}" for n, kind in ((held, "holonomic"), (slips, "nonholonomic")) if n
+        f"{n} {kind} row{'s' * (n > 1)}" for n, kind in ((holonomic, "holonomic"), (nonholonomic, "nonholonomic")) if n
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import is_concrete, is_expanding
-from jaxdyn.model.arguments import as_array, batch_hint, check_shapes
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes
 from jaxdyn.model.inertia import inertial_parameters, transform_inertia
 from jaxdyn.model.joints import (
     KINDS,
@@ -264,7 +264,7 @@ def neutral(model: Model) -> Float[Array, " nq"]:
     return jnp.asarray(np.concatenate(parts) if parts else np.zeros(0), model.home.dtype)
 
 
-def integrate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], dt=1.0) -> Float[Array, " nq"]:
+def integrate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], dt: Numbers = 1.0) -> Float[Array, " nq"]:
     """Configuration reached from q after time dt at the constant body velocity v, on the joints' manifold.
 
     **Arguments:** `q` (nq,); `v` (nv,), body-fixed; `dt` in s.

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.constraints.base import layout
-from jaxdyn.model.arguments import as_array, as_path
+from jaxdyn.model.arguments import Numbers, as_array, as_path
 from jaxdyn.pictures.inferred import place_of
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, joint_axes, marks, motion_of
 from jaxdyn.pictures.solids import finer, simplified
 from jaxdyn.pictures.stage import AXIS, FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
+from jaxdyn.systems.system import SceneLike
 
 _MOST_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
 _SIDES = 24  # of a round cone
@@ -20,7 +21,7 @@ _LONGEST = 0.1  # side of a triangle, as a share of the mechanism's size: by its
 _LIGHT = np.array([0.4, -0.5, 0.77])
 
 
-def draw(scene, q, ax=None, *, shapes=None, multipliers=None) -> Any:
+def draw(scene: SceneLike, q: Numbers, ax=None, *, shapes=None, multipliers: Numbers | None = None) -> Any:
     """Draw a mechanism at a configuration: its bodies, joints with their axes, loops and contacts with their friction cones.
 
     **Arguments:**
@@ -46,16 +47,18 @@ def draw(scene, q, ax=None, *, shapes=None, multipliers=None) -> Any:
     motion = motion_of(scene, q)
     if multipliers is not None:
         count = places[-1].end if (places := layout(motion.scene)) else 0
-        found = np.asarray(as_array(multipliers, "multipliers"), float)
-        if found.shape != (count,):
-            raise ValueError(f"multipliers has shape {found.shape}, expected ({count},), one per row of the scene")
-        motion = motion._replace(multipliers=found[None, None])
+        lam = np.asarray(as_array(multipliers, "multipliers"), float)
+        if lam.shape != (count,):
+            raise ValueError(f"multipliers has shape {lam.shape}, expected ({count},), one per row of the scene")
+        motion = motion._replace(multipliers=lam[None, None])
     picture = _Picture(motion, shapes, ax)
     picture.show(0)
     return picture.ax
 
 
-def animate(scene, solution, path: str | os.PathLike, *, fps: int = 25, speed: float = 1.0, shapes=None) -> None:
+def animate(
+    scene: SceneLike, solution, path: str | os.PathLike, *, fps: int = 25, speed: float = 1.0, shapes=None
+) -> None:
     """Write a motion as an animated picture: GIF (by pillow, which matplotlib brings) or MP4 (by ffmpeg, where installed).
 
     **Arguments:** `scene`; `solution`, what `jd.simulate` returned, batched or not (at most four motions are drawn); `path`, a
@@ -210,10 +213,10 @@ def arrow_length(shown: list[Cone], size: float) -> float:
     return size * (CONE_HEIGHT if shown else 0.25)
 
 
-def scaled(found, length: float):
+def scaled(forces, length: float):
     """Each force with the factor (m/N or m/(N m)) that gives the largest of its kind the length (m)."""
     for kind in ("force", "torque"):
-        members = [force for force in found if force.kind == kind]
+        members = [force for force in forces if force.kind == kind]
         largest = max((float(np.linalg.norm(force.vectors, axis=-1).max()) for force in members), default=0.0)
         yield from ((force, length / largest) for force in members)
 

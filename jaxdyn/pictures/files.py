@@ -50,10 +50,10 @@ def shapes(path: str | os.PathLike) -> Shapes:
     readers = {"robot": _urdf, "mujoco": _mjcf, "sdf": _sdf}
     if file.root.tag not in readers:
         raise file.fault(file.root, f"the root element is <{file.root.tag}>; expected <robot>, <mujoco> or <sdf>")
-    found = readers[file.root.tag](file)
-    if found.missing:
-        warnings.warn(f"{path}: not drawn from the file: {'; '.join(found.missing)}", NotTakenWarning, stacklevel=2)
-    return found
+    drawn = readers[file.root.tag](file)
+    if drawn.missing:
+        warnings.warn(f"{path}: not drawn from the file: {'; '.join(drawn.missing)}", NotTakenWarning, stacklevel=2)
+    return drawn
 
 
 class _Meshes:
@@ -80,7 +80,7 @@ class _Meshes:
 
 
 def _urdf(file: XmlFile) -> Shapes:
-    meshes, found = _Meshes(file.path), []
+    meshes, shapes = _Meshes(file.path), []
     materials = {element.get("name"): rgba for element in file.root.iter("material") if (rgba := _rgba(file, element))}
     for link in file.root.findall("link"):
         frame = file.name(link, "the robot")
@@ -90,7 +90,7 @@ def _urdf(file: XmlFile) -> Shapes:
             pose = np.eye(4)
             if origin is not None:
                 xyz, rpy = (_attribute(file, origin, key, 3, what, np.zeros(3)) for key in ("xyz", "rpy"))
-                pose = f64.pose_matrix((xyz, rpy), what)
+                pose = np.asarray(f64.pose_matrix((xyz, rpy), what))
             material = visual.find("material")
             rgba = None if material is None else _rgba(file, material) or materials.get(material.get("name"))
             color, opacity = (None, 1.0) if rgba is None else (rgba[:3], rgba[3])
@@ -98,18 +98,18 @@ def _urdf(file: XmlFile) -> Shapes:
             for part in () if geometry is None else geometry:
                 get = lambda key, count, part=part, what=what: _attribute(file, part, key, count, what)  # noqa: E731
                 if part.tag == "box":
-                    found.append(Shape(frame, "box", tuple(get("size", 3)), pose, color, opacity))
+                    shapes.append(Shape(frame, "box", tuple(get("size", 3)), pose, color, opacity))
                 elif part.tag == "sphere":
-                    found.append(Shape(frame, "ellipsoid", (float(get("radius", 1)[0]),) * 3, pose, color, opacity))
+                    shapes.append(Shape(frame, "ellipsoid", (float(get("radius", 1)[0]),) * 3, pose, color, opacity))
                 elif part.tag in ("cylinder", "capsule"):
                     size = float(get("radius", 1)[0]), float(get("length", 1)[0])
-                    found.append(Shape(frame, part.tag, size, pose, color, opacity))
+                    shapes.append(Shape(frame, part.tag, size, pose, color, opacity))
                 elif part.tag == "mesh":
                     scale = _attribute(file, part, "scale", 3, what, np.ones(3))
-                    found += meshes.shapes(frame, part.get("filename") or "", scale, pose, color, opacity)
+                    shapes += meshes.shapes(frame, part.get("filename") or "", scale, pose, color, opacity)
                 else:
                     meshes.missing.append(f"<{part.tag}> of link {frame!r}")
-    return Shapes(found, meshes.missing)
+    return Shapes(shapes, meshes.missing)
 
 
 def _rgba(file: XmlFile, material) -> tuple[float, ...] | None:
@@ -131,7 +131,7 @@ def _attribute(file: XmlFile, element, key: str, count: int, what: str, default:
 
 
 def _sdf(file: XmlFile) -> Shapes:
-    scene, found = SdfFile(file.path), []
+    scene, shapes = SdfFile(file.path), []
     meshes = _Meshes(file.path)
     for frame, (link, _) in scene.links.items():
         for visual in link.findall("visual"):
@@ -148,28 +148,28 @@ def _sdf(file: XmlFile) -> Shapes:
                 if part.tag == "box":
                     size = part.find("size")
                     edges = np.ones(3) if size is None else scene.numbers(size, 3, what)
-                    found.append(Shape(frame, "box", tuple(edges), *options))
+                    shapes.append(Shape(frame, "box", tuple(edges), *options))
                 elif part.tag == "sphere":
-                    found.append(Shape(frame, "ellipsoid", (number("radius", 1.0),) * 3, *options))
+                    shapes.append(Shape(frame, "ellipsoid", (number("radius", 1.0),) * 3, *options))
                 elif part.tag in ("cylinder", "capsule"):
-                    found.append(Shape(frame, part.tag, (number("radius", 0.5), number("length", 1.0)), *options))
+                    shapes.append(Shape(frame, part.tag, (number("radius", 0.5), number("length", 1.0)), *options))
                 elif part.tag == "ellipsoid":
                     radii = part.find("radii")
-                    found.append(Shape(frame, "ellipsoid", tuple(scene.numbers(radii, 3, what)), *options))
+                    shapes.append(Shape(frame, "ellipsoid", tuple(scene.numbers(radii, 3, what)), *options))
                 elif part.tag == "mesh":
                     factors = part.find("scale")
                     scale = np.ones(3) if factors is None else scene.numbers(factors, 3, what)
-                    found += meshes.shapes(frame, scene.word(part, "uri"), scale, *options)
+                    shapes += meshes.shapes(frame, scene.word(part, "uri"), scale, *options)
                 elif part.tag not in ("empty", "plane"):
                     meshes.missing.append(f"<{part.tag}> of link {frame!r}")
-    return Shapes(found, meshes.missing)
+    return Shapes(shapes, meshes.missing)
 
 
 def _mjcf(file: XmlFile) -> Shapes:
     mujoco = library()
     m, gone = compiled(mujoco, file.path)
     bodies = named(mujoco, m, file.path).bodies
-    found = []
+    shapes = []
     for g in range(m.ngeom):
         kind = _MJCF_KINDS.get(int(m.geom_type[g]))
         if kind is None or m.geom_group[g] >= _SHOWN_GROUPS:
@@ -197,5 +197,5 @@ def _mjcf(file: XmlFile) -> Shapes:
             vertices = np.asarray(m.mesh_vert[start : start + count], float)
             start, count = m.mesh_faceadr[mesh], m.mesh_facenum[mesh]
             faces = np.asarray(m.mesh_face[start : start + count], int)
-        found.append(Shape(bodies[m.geom_bodyid[g]], kind, size, pose, color, rgba[3], vertices, faces))
-    return Shapes(found, gone)
+        shapes.append(Shape(bodies[m.geom_bodyid[g]], kind, size, pose, color, rgba[3], vertices, faces))
+    return Shapes(shapes, gone)

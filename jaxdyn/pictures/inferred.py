@@ -22,7 +22,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
-from jaxdyn.pictures.held import held_body, held_solids, see_through
+from jaxdyn.pictures.grasped import grasped_body, grasped_solids, see_through
 from jaxdyn.pictures.solids import Shape, Shapes, rod
 from jaxdyn.systems.scene import Scene
 
@@ -36,12 +36,12 @@ def completed(scene: Scene, shapes: Shapes) -> Shapes:
     """The solids given, and inferred ones for bodies with mass that have none. Also for all that rolls."""
     model = scene.system
     carried = {model.topology.frame_bodies[frame_index(model, name)] for name in shapes.frames()}
-    found = list(shapes)
+    drawn = list(shapes)
     size = extent(scene)
     thin = _THIN * size
     rolling, wheeled = _rolling(scene, carried)
-    held = held_body(scene)
-    found += [see_through(shape) if shape.frame == held and held is not None else shape for shape in rolling]
+    grasped = grasped_body(scene)
+    drawn += [see_through(shape) if shape.frame == grasped and grasped is not None else shape for shape in rolling]
     bare = [i for i in range(model.nb) if i not in carried]
     points = _joints_on(scene)
     whole = not shapes
@@ -51,11 +51,11 @@ def completed(scene: Scene, shapes: Shapes) -> Shapes:
         solid = _of_inertia(model, i, thin, i in wheeled)
         longest = max((rod.size[1] for rod in rods), default=_SHARE * size if whole and model.nb > 3 else 0.0)
         longest *= model.nb > 1  # one body alone is its solid
-        if isinstance(scene, Grasp) and model.body_names[i] == held:
-            found += held_solids(scene, solid, thin)
+        if isinstance(scene, Grasp) and model.body_names[i] == grasped:
+            drawn += grasped_solids(scene, solid, thin)
             continue
-        found += rods + [_or_mark(shape, longest, thin) for shape in solid]
-    return Shapes(found, shapes.missing)
+        drawn += rods + [_or_mark(shape, longest, thin) for shape in solid]
+    return Shapes(drawn, shapes.missing)
 
 
 def extent(scene: Scene) -> float:
@@ -190,11 +190,11 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
 
 def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
     """Wheels and balls of rolling constraints, and the bodies whose centre of mass lies in one of them."""
-    model, found, bodies = scene.system, [], set()
+    model, shapes, bodies = scene.system, [], set()
     for constraint in pairs(scene):
         if isinstance(constraint, RollingContact):
-            found += _surfaces(model, constraint, carried)
-            bodies |= {model.topology.frame_bodies[frame_index(model, shape.frame)] for shape in found if shape.frame}
+            shapes += _surfaces(model, constraint, carried)
+            bodies |= {model.topology.frame_bodies[frame_index(model, shape.frame)] for shape in shapes if shape.frame}
             continue
         if not isinstance(constraint, RollingWheel | RollingSphere):
             continue
@@ -204,9 +204,9 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
             continue
         pose, radius = np.asarray(constraint.pose, float), float(constraint.radius)
         if isinstance(constraint, RollingWheel):
-            found.append(Shape(constraint.body, "cylinder", (radius, 0.12 * radius), pose, source="constraint"))
+            shapes.append(Shape(constraint.body, "cylinder", (radius, 0.12 * radius), pose, source="constraint"))
         else:
-            found.append(Shape(constraint.body, "ellipsoid", (radius,) * 3, pose, source="constraint"))
+            shapes.append(Shape(constraint.body, "ellipsoid", (radius,) * 3, pose, source="constraint"))
         centre = (np.asarray(model.frame_poses[index], float) @ pose)[:3, 3]
         if body >= 0 and np.linalg.norm(f64.about_com(np.asarray(model.inertias[body], float))[1] - centre) < radius:
             bodies.add(body)
@@ -216,13 +216,13 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
             kind, size = ("ellipsoid", (float(reach),) * 3)
             if constraint.on == "cylinder":  # pyright: ignore[reportAttributeAccessIssue]
                 kind, size = "cylinder", (float(reach), 4 * float(reach))
-            found.append(Shape(constraint.surface_body, kind, size, surface, source="constraint"))
-    return found, bodies
+            shapes.append(Shape(constraint.surface_body, kind, size, surface, source="constraint"))
+    return shapes, bodies
 
 
 def _surfaces(model: Model, contact: RollingContact, carried: set[int]) -> list[Shape]:
     """The balls, ellipsoids and cylinders of two surfaces that roll on each other, one for each body."""
-    found = []
+    shapes = []
     for (frame, pose), shape in zip(contact.ends(), (contact.shape_a, contact.shape_b), strict=True):
         if frame is not None and model.topology.frame_bodies[frame_index(model, frame)] in carried:
             continue
@@ -232,5 +232,5 @@ def _surfaces(model: Model, contact: RollingContact, carried: set[int]) -> list[
             kind, size = "cylinder", (float(shape.radius), 4 * float(shape.radius))
         else:
             continue
-        found.append(Shape(frame, kind, size, np.asarray(pose, float), source="constraint"))
-    return found
+        shapes.append(Shape(frame, kind, size, np.asarray(pose, float), source="constraint"))
+    return shapes

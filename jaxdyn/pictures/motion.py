@@ -157,18 +157,18 @@ def _seen_from_a(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def marks(motion: Motion) -> list[Mark]:
     """Where the constraints between bodies hold."""
-    found = []
+    drawn = []
     for constraint in motion.scene.constraints:
         if not isinstance(constraint, Pair):
             continue
         a, b = _ends(motion, constraint)
         if isinstance(constraint, Loop | Distance):
             kind = "distance" if isinstance(constraint, Distance) else "loop"
-            found.append(Mark(constraint.name, kind, a[..., :3, 3], b[..., :3, 3], a[..., :3, 2]))
+            drawn.append(Mark(constraint.name, kind, a[..., :3, 3], b[..., :3, 3], a[..., :3, 2]))
             continue
         point, normal = _contact(motion, constraint, a, b)
-        found.append(Mark(constraint.name, "contact", point, point, normal))
-    return found
+        drawn.append(Mark(constraint.name, "contact", point, point, normal))
+    return drawn
 
 
 def _contact(motion: Motion, constraint: Pair, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -195,11 +195,11 @@ def _rows(motion: Motion, a: np.ndarray, b: np.ndarray) -> tuple[jax.Array, jax.
 
 def forces(motion: Motion) -> list[Force]:
     """Arrows of the constraint forces that the solution has, on frame B (a grasp: on the object), and of its joint torques."""
-    found = []
+    arrows = []
     if motion.multipliers is not None:
         for constraint, place in zip(motion.scene.constraints, layout(motion.scene), strict=True):
             if isinstance(constraint, Pair):
-                found.append(_force(motion, constraint, place.name, motion.multipliers[..., place.start : place.end]))
+                arrows.append(_force(motion, constraint, place.name, motion.multipliers[..., place.start : place.end]))
     if motion.torque is not None:
         model = motion.scene.system
         top = model.topology
@@ -211,8 +211,8 @@ def forces(motion: Motion) -> list[Force]:
             direction = motion.poses[:, :, i, :3, :3] @ axis
             size = motion.torque[:, :, top.v_slices[i]]
             word = "force" if kind == "prismatic" else "torque"
-            found.append(Force(top.joint_names[i], word, motion.poses[:, :, i, :3, 3], direction * size))
-    return [force for force in found if np.abs(force.vectors).max(initial=0.0) > 0]
+            arrows.append(Force(top.joint_names[i], word, motion.poses[:, :, i, :3, 3], direction * size))
+    return [force for force in arrows if np.abs(force.vectors).max(initial=0.0) > 0]
 
 
 def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray) -> Force:
@@ -229,9 +229,9 @@ def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray)
 
 def cones(motion: Motion) -> list[Cone]:
     """The friction cones of a scene's contacts, but those of surfaces, whose cones have six dimensions."""
-    scene, found = motion.scene, []
+    scene, drawn = motion.scene, []
     if scene.cones is None:
-        return found
+        return drawn
     places = {place.name: place for place in layout(scene)}
     constraints = dict(zip(places, scene.constraints, strict=True))
     for contact in coned_contacts(scene):
@@ -247,8 +247,8 @@ def cones(motion: Motion) -> list[Cone]:
 
         along = direction(normal)
         across = direction(first).vectors if cone.in_plane else None
-        found.append(Cone(contact.name, along.places, along.vectors, across, float(cone.mu)))
-    return found
+        drawn.append(Cone(contact.name, along.places, along.vectors, across, float(cone.mu)))
+    return drawn
 
 
 @eqx.filter_jit
@@ -258,12 +258,12 @@ def _wrenches(model: Model, constraint: Pair, R, p, q, lam):
 
 def joint_axes(motion: Motion) -> list[tuple[str, str, np.ndarray, np.ndarray | None]]:
     """Name, kind, place (n, nt, 3) and axis (n, nt, 3) (None without one) of each joint."""
-    model, found = motion.scene.system, []
+    model, axes = motion.scene.system, []
     for i, (name, kind) in enumerate(zip(model.joint_names, model.topology.kinds, strict=True)):
         axis = None
         if kind in SCREW_KINDS or kind == "planar":
             screw = np.asarray(model.screws[i], float)
             local = np.eye(3)[2] if kind == "planar" else screw[:3] if kind == "prismatic" else screw[3:]
             axis = motion.poses[:, :, i, :3, :3] @ local
-        found.append((name, kind, motion.poses[:, :, i, :3, 3], axis))
-    return found
+        axes.append((name, kind, motion.poses[:, :, i, :3, 3], axis))
+    return axes

@@ -23,6 +23,7 @@ from jaxdyn.pictures.inferred import place_of
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, marks, motion_of
 from jaxdyn.pictures.solids import Shapes, by_frame, joined, sharpened, simplified
 from jaxdyn.pictures.stage import FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
+from jaxdyn.systems.system import SceneLike
 
 MOST_BYTES = 2_000_000  # of a file
 _HOST = "127.0.0.1"
@@ -36,7 +37,7 @@ _PICTURES = 30  # a second
 
 
 def view(
-    scene, solution, *, shapes=None, port: int | None = None, browser: bool = True, block: bool | None = None
+    scene: SceneLike, solution, *, shapes=None, port: int | None = None, browser: bool = True, block: bool | None = None
 ) -> "Viewer":
     """Show a motion in the browser: a page on this machine with a slider over time and a button to play.
 
@@ -73,7 +74,7 @@ def view(
     return viewer
 
 
-def save_html(path: str | os.PathLike, scene, solution, *, shapes=None) -> None:
+def save_html(path: str | os.PathLike, scene: SceneLike, solution, *, shapes=None) -> None:
     """Write a motion as one HTML file under 2 MB that needs nothing else: no network, no Python.
 
     It plays in the browser as the page of `view` does. Meshes are simplified, and rows and trajectories left out, until it is
@@ -271,10 +272,10 @@ def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:
     for frame, _, opacity, members in by_frame(parts):
         parts_of = [shape.triangles() for shape in members]
         groups.append((frame, color_of(members[0], motion.scene.system), opacity, parts_of))
-    total = sum(len(vertices) for *_, found in groups for vertices, _ in found)
+    total = sum(len(vertices) for *_, meshes in groups for vertices, _ in meshes)
     share = min(1.0, most / max(total, 1))
-    for frame, color, opacity, found in groups:
-        small = [simplified(v, f, max(24, int(share * len(v)))) if share < 1 else (v, f) for v, f in found]
+    for frame, color, opacity, meshes in groups:
+        small = [simplified(v, f, max(24, int(share * len(v)))) if share < 1 else (v, f) for v, f in meshes]
         vertices, faces = sharpened(*joined(mesh for mesh in small if len(mesh[1])))
         yield frame, color, opacity, vertices.astype(np.float32), faces.astype(np.uint32)
 
@@ -328,7 +329,7 @@ def _stop(server) -> None:
 
 @contextlib.contextmanager
 def _recorded() -> Iterator[Any]:
-    """A server to record a page with; viser has no other way to one."""
+    """A server of which a page is recorded; viser records from a server alone."""
     server = _server(_free_port(None))
     try:
         yield server

@@ -58,14 +58,14 @@ def energy(scene, solution, ax=None) -> Any:
 
     **Raises:** ValueError for a solution without `energy`.
     """
-    found = _rows(_given(solution, "energy")[..., None], 1, "energy")[:, :, 0]
+    rows = _rows(_given(solution, "energy")[..., None], 1, "energy")[:, :, 0]
     ax = _axes(ax)
-    change = found - found[:, :1]
+    change = rows - rows[:, :1]
     _lines(ax, times(solution), change[..., None], ("E - E(0)",))
     if solution.work is not None:
         rest = change - np.asarray(solution.work).reshape(change.shape)
         _lines(ax, times(solution), rest[..., None], ("E - E(0) - work",), (RED,))
-    return _finished(ax, as_scene(scene), found, "energy (J)")
+    return _finished(ax, as_scene(scene), rows, "energy (J)")
 
 
 def residuals(scene, solution, ax=None) -> Any:
@@ -77,11 +77,11 @@ def residuals(scene, solution, ax=None) -> Any:
 
     **Raises:** ValueError for a solution without `constraint_residual`.
     """
-    found = _rows(_given(solution, "constraint_residual"), 2, "constraint_residual")
+    rows = _rows(_given(solution, "constraint_residual"), 2, "constraint_residual")
     ax = _axes(ax)
-    _lines(ax, times(solution), np.maximum(np.abs(found), _SMALLEST), ("|phi| (m, rad)", "|A v - b| (m/s, rad/s)"))
+    _lines(ax, times(solution), np.maximum(np.abs(rows), _SMALLEST), ("|phi| (m, rad)", "|A v - b| (m/s, rad/s)"))
     ax.set_yscale("log")
-    return _finished(ax, as_scene(scene), found, "largest residual (m, rad; m/s, rad/s)")
+    return _finished(ax, as_scene(scene), rows, "largest residual (m, rad; m/s, rad/s)")
 
 
 def forces(scene, solution, ax=None) -> Any:
@@ -119,7 +119,7 @@ def forces(scene, solution, ax=None) -> Any:
 
 
 def work_precision(records: Any, ax=None, *, error: str = "error_path", cost: str = "seconds_best") -> Any:
-    """Cost against error of several ways to integrate one scene: further left is more exact, further down is cheaper.
+    """Cost against error of several integrators on one scene: further left is more exact, further down is cheaper.
 
     **Arguments:**
 

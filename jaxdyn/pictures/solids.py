@@ -176,8 +176,8 @@ def simplified(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.n
         if len(count) <= most:
             centres = np.stack([np.bincount(index, vertices[:, k]) for k in range(3)], axis=1) / count[:, None]
             turned = index[faces]
-            keep = np.all(turned != np.roll(turned, 1, axis=1), axis=1)
-            return centres, turned[keep]
+            is_triangle = np.all(turned != np.roll(turned, 1, axis=1), axis=1)
+            return centres, turned[is_triangle]
         cells = int(cells * 0.8)
     return vertices, faces
 
@@ -195,20 +195,20 @@ def sharpened(vertices: np.ndarray, faces: np.ndarray, angle: float = 0.6) -> tu
     corners, normals = corners[sizes > 0], normals[sizes > 0] / sizes[sizes > 0, None]
     owners: dict[int, list[tuple[np.ndarray, int]]] = {}
     places: list[int] = []
-    found = np.zeros_like(corners)
+    indices = np.zeros_like(corners)
     least = np.cos(angle)
     for f, (corner, normal) in enumerate(zip(corners.tolist(), normals, strict=True)):
         for k, vertex in enumerate(corner):
             known = owners.setdefault(vertex, [])
             for other, index in known:
                 if other @ normal > least:
-                    found[f, k] = index
+                    indices[f, k] = index
                     break
             else:
                 known.append((normal, len(places)))
-                found[f, k] = len(places)
+                indices[f, k] = len(places)
                 places.append(int(first[vertex]))
-    return vertices[places], found
+    return vertices[places], indices
 
 
 def by_frame(shapes: Shapes) -> Iterator[tuple[str | None, tuple | None, float, list[Shape]]]:

@@ -18,14 +18,14 @@ from jaxdyn.compile import compiled, is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import batch_hint, check_state
+from jaxdyn.model.arguments import Numbers, batch_hint, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_factored, solve_lower
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
 
 class Parametrization(NamedTuple):
-    """v = N nu + v0 at one place: N (nv, nr), v0 (nv,), and `quality`, which vanishes where N does not serve.
+    """v = N nu + v0 at one place: N (nv, nr), v0 (nv,), and `quality`, which vanishes where N is singular.
 
     `quality` () is the reciprocal of a condition number, and 0 for an N that is not tangent to the constraints. Where
     the sign of a determinant is defined it bears that sign, so that passing a singular place shows.
@@ -51,14 +51,14 @@ class Basis(eqx.Module):
         """v = N nu + v0 and its rate Ndot nu + v0dot, by differentiation of `at`."""
 
         def velocity(q, t):
-            place = self.at(scene, q, t)
-            return _product(place.N, _fitting(nu, place.N)) + place.v0, place
+            parametrization = self.at(scene, q, t)
+            return _product(parametrization.N, _fitting(nu, parametrization.N)) + parametrization.v0, parametrization
 
         v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
         return Moving(v, push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t)), N, quality)
 
     def advice(self, scene: Scene, q, t) -> str:
-        """What to do where N does not serve, for concrete places."""
+        """What to do where N is singular, for concrete places."""
         raise NotImplementedError
 
 
@@ -139,8 +139,8 @@ class Orthonormal(Basis):
     """The orthonormal basis of ker A(q, t) that a reference R (nv, nr) gives: N = P R T^-1, with P = 1 - A^+ A.
 
     T is the Cholesky factor of R^T P R, so N is as smooth as A wherever the rank of A is constant and R^T P R regular: no
-    signs or pivots are chosen on the way, as a QR factorisation of A^T would. R = `tangent_basis` at one place serves
-    around it; to go on, take N(q) as the new R, which leaves N(q), and therefore nu, as they are.
+    signs or pivots are chosen, as a QR factorisation of A^T would. R = `tangent_basis` at one configuration is enough around it;
+    to go on, take N(q) as the new R, which leaves N(q), and therefore nu, as they are.
     """
 
     reference: Float[Array, "nv nr"]
@@ -173,13 +173,13 @@ class Orthonormal(Basis):
 
             Ndot nu = -A^+ B nu - P Adot^T L nu + N U nu,   U the upper triangle of Z + Z^T with half of its diagonal.
         """
-        place, A, inverse, factor = self._at(scene, q, t)
-        N = place.N
+        parametrization, A, inverse, factor = self._at(scene, q, t)
+        N = parametrization.N
         nu = _fitting(nu, N)
-        v = _product(N, nu) + place.v0
-        way = (q, t), (velocity_to_rate(scene.system, q, v), jnp.ones_like(t))
-        rate = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), *way)[1]
-        drift = jax.jvp(lambda q, t: self.at(scene, q, t).v0, *way)[1]
+        v = _product(N, nu) + parametrization.v0
+        along_motion = (q, t), (velocity_to_rate(scene.system, q, v), jnp.ones_like(t))
+        rate = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), *along_motion)[1]
+        drift = jax.jvp(lambda q, t: self.at(scene, q, t).v0, *along_motion)[1]
         turned, L = _product(rate, N), solve_lower(factor, _product(self.reference.astype(A.dtype).T, inverse)).T
         Z = _product(L.T, turned)
         Z = Z + Z.T
@@ -187,10 +187,10 @@ class Orthonormal(Basis):
         across = _product(rate.T, _product(L, nu))
         across = across - _product(inverse, _product(A, across))
         drift = drift - _product(inverse, _product(turned, nu)) - across + _product(N, _product(U, nu))
-        return Moving(v, drift, N, place.quality)
+        return Moving(v, drift, N, parametrization.quality)
 
     def advice(self, scene, q, t):
-        """A reference that serves here."""
+        """A reference R for which N is regular here."""
         rank = np.linalg.matrix_rank(np.asarray(constraint_jacobian_compiled(scene, q, t)), tol=1e-9)
         return f"take jd.tangent_basis(scene, q) for reference; the rows have rank {rank} of nv = {scene.nv}"
 
@@ -254,7 +254,7 @@ def _fitting(nu, N):
 
 
 def tangent_basis(
-    scene: Scene, q: Float[Array, " nq"], t: Any = 0.0, *, dof: int | None = None, rank_tol: float | None = None
+    scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0, *, dof: int | None = None, rank_tol: float | None = None
 ) -> Float[Array, "nv nr"]:
     """An orthonormal basis (nv, nr) of the velocities with A(q, t) v = 0, as a constant: a reference for `basis`.
 
@@ -270,8 +270,8 @@ def tangent_basis(
     if not layout(scene):
         raise ValueError("the scene has no constraints, so every velocity is tangent; add some")
     dof = freedoms(scene, q, t, dof, rank_tol)
-    keep, _ = _tangent_projection(scene, q, t, rank_tol)
-    return split_directions(keep)[:, scene.nv - dof :]
+    projector, _ = _tangent_projection(scene, q, t, rank_tol)
+    return split_directions(projector)[:, scene.nv - dof :]
 
 
 def freedoms(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None = None) -> int:
@@ -308,7 +308,7 @@ def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def independent_velocities(scene: Scene, q, t=0.0) -> tuple[int, ...]:
     """Indices of velocities that determine the others at a concrete place: those left by the pivots of A's columns."""
     A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
-    rest, found = A.copy(), []
+    rest, pivots = A.copy(), []
     for _ in range(min(A.shape)):
         sizes = np.linalg.norm(rest, axis=0)
         pivot = int(np.argmax(sizes))
@@ -316,8 +316,8 @@ def independent_velocities(scene: Scene, q, t=0.0) -> tuple[int, ...]:
             break
         along = rest[:, pivot] / sizes[pivot]
         rest = rest - np.outer(along, along @ rest)
-        found.append(pivot)
-    return tuple(i for i in range(scene.nv) if i not in found)
+        pivots.append(pivot)
+    return tuple(i for i in range(scene.nv) if i not in pivots)
 
 
 def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, ""], Float[Array, "k k"]]:
@@ -327,10 +327,10 @@ def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Floa
     return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots), factor
 
 
-def minimal_velocity(place: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
+def minimal_velocity(parametrization: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
     """nu (nr,) with N nu + v0 = v for an admissible v: its coefficients in the columns of N."""
-    factor = cholesky(_product(place.N.T, place.N))
-    return solve_factored(factor, _product(place.N.T, v - place.v0))
+    factor = cholesky(_product(parametrization.N.T, parametrization.N))
+    return solve_factored(factor, _product(parametrization.N.T, v - parametrization.v0))
 
 
 def least_quality(dtype) -> float:

@@ -27,7 +27,7 @@ from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import freedoms, orthonormal, split_directions
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import velocity_to_rate
@@ -69,7 +69,7 @@ def gauge_invariant(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     rotation: Float[Array, "n n"] | None = None,
     motion_rotation: Float[Array, "k k"] | None = None,
@@ -130,16 +130,16 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     wanted = rows(scene, q, v, t).gamma + _product(Lambda, _product(Wdot.T, v))
 
     back = pseudo_inverse(Lambda, tolerance(rank_tol, Lambda))
-    keep = unit - _product(back, Lambda)
-    reference = split_directions(keep)
-    V1, *_ = orthonormal(_product(unit - keep, reference[:, : scene.nv - dof]))
-    V2, *_ = orthonormal(_product(keep, reference[:, scene.nv - dof :]))
+    null_projector = unit - _product(back, Lambda)
+    reference = split_directions(null_projector)
+    V1, *_ = orthonormal(_product(unit - null_projector, reference[:, : scene.nv - dof]))
+    V2, *_ = orthonormal(_product(null_projector, reference[:, scene.nv - dof :]))
     V2 = V2 if motion_rotation is None else _product(V2, motion_rotation)
     Lambda_r = _product(Lambda, V1)
     # V1^T V2dot, from d/dt (Lam V2) = 0; Lam_r has independent columns and Lam_r^+ = V1^T Lam^+.
     leaning = -_product(_product(V1.T, back), _product(rate, V2))
     free = u - _product(Gamma, w)
-    change = _product(keep, free) + _product(back, wanted)
+    change = _product(null_projector, free) + _product(back, wanted)
     rank = jnp.round(jnp.sum(back * Lambda.T))
     result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)  # pyright: ignore[reportArgumentType]
     return GaugeInvariant(

@@ -14,7 +14,7 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.dynamics import tolerance
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, tangent_basis
 from jaxdyn.reduction.minimal import reduce
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -36,7 +36,7 @@ class Involutivity(NamedTuple):
 
 
 def involutive(
-    scene: Scene, q: Float[Array, " nq"], t=0.0, *, dof: int | None = None, rank_tol: float | None = None
+    scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0, *, dof: int | None = None, rank_tol: float | None = None
 ) -> Involutivity:
     """Whether the velocities that the constraints allow can be integrated to surfaces: Frobenius's test at a place.
 
@@ -69,8 +69,10 @@ def involutive(
     reference = tangent_basis(scene, q, t, dof=dof, rank_tol=rank_tol)
     count, limit = reference.shape[1], tolerance(rank_tol, q)
     # Brackets stay tangent to the holonomic constraints.
-    held = np.asarray(constraint_jacobian_compiled(scene, q, t))[holonomic_rows(layout(scene))]
-    most = scene.nv - (int(np.linalg.matrix_rank(held, tol=1e-9 * np.abs(held).max())) if held.size else 0)
+    A_holonomic = np.asarray(constraint_jacobian_compiled(scene, q, t))[holonomic_rows(layout(scene))]
+    most = scene.nv - (
+        int(np.linalg.matrix_rank(A_holonomic, tol=1e-9 * np.abs(A_holonomic).max())) if A_holonomic.size else 0
+    )
     # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
     # bracketed with the others and spans nothing itself.
     levels: tuple[tuple[tuple[int, int], ...], ...] = ()
@@ -109,8 +111,8 @@ def _fields(scene, reference, q, t, levels):
     @jax.jit
     def generators(x):
         q, t = x[:-1], x[-1]
-        found = Orthonormal(reference).at(scene, q, t)
-        rates = jax.vmap(lambda v: velocity_to_rate(scene.system, q, v))(jnp.concatenate([found.N.T, found.v0[None]]))
+        frame = Orthonormal(reference).at(scene, q, t)
+        rates = jax.vmap(lambda v: velocity_to_rate(scene.system, q, v))(jnp.concatenate([frame.N.T, frame.v0[None]]))
         times = jnp.zeros((rates.shape[0], 1), q.dtype).at[-1].set(1.0)
         return jnp.concatenate([rates, times], 1)
 
@@ -155,7 +157,7 @@ def spurious_terms(
     q: Float[Array, " nq"],
     nu: Float[Array, " nr"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     independent: Sequence[int],
 ) -> SpuriousTerms:
@@ -187,13 +189,13 @@ def spurious_terms(
     choice = as_basis(tuple(independent), scene)
     if not isinstance(choice, Independent) or nu.shape != (choice.size(scene),):
         raise ValueError(f"nu has shape {nu.shape}, expected {(choice.size(scene),)} = (nr,){batch_hint(nu, (1,))}")
-    found, depends = _substituted(scene, choice, q, nu, tau, t)
+    terms, depends = _substituted(scene, choice, q, nu, tau, t)
     if is_concrete(depends) and float(depends) > 1e-9:
         raise ValueError(
             f"L or the rows depend on the eliminated coordinates (by {float(depends):.3g}), or the rows prescribe a slip; "
             "choose other independent velocities, or use jd.reduced_dynamics"
         )
-    return found
+    return terms
 
 
 @compiled
@@ -222,8 +224,8 @@ def _substituted(scene, choice: Independent, q, nu, tau, t):
     # How much anything changes with s, at this velocity.
     forms = jax.jacfwd(lambda s: constraint_jacobian(scene, q.at[rest].set(s), t))(q[rest])
     pull = jax.grad(lambda s: _lagrangian(scene.system, q.at[rest].set(s), right.velocity, t))(q[rest])
-    slip = velocity_residual(scene, q, jnp.zeros_like(q), t)
-    return value, jnp.max(jnp.abs(jnp.concatenate([forms.ravel(), pull, slip])))
+    residual = velocity_residual(scene, q, jnp.zeros_like(q), t)
+    return value, jnp.max(jnp.abs(jnp.concatenate([forms.ravel(), pull, residual])))
 
 
 def _lagrangian(system, q, v, t):

@@ -19,7 +19,7 @@ from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import Basis, Moving, Whole, as_basis, least_quality, moving
 from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
 from jaxdyn.systems.scene import Scene, as_scene
@@ -49,7 +49,7 @@ def reduced_dynamics(
     q: Float[Array, " nq"],
     nu: Float[Array, " nr"],
     tau: Float[Array, " nv"] | None = None,
-    t=0.0,
+    t: Numbers = 0.0,
     *,
     basis: Any = None,
 ) -> ReducedDynamics:
@@ -86,11 +86,11 @@ def reduced_dynamics(
     size = choice.size(scene)
     if size is not None and nu.shape != (size,):
         raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns{batch_hint(nu, (1,))}")
-    found = _reduce_compiled(scene, choice, q, nu, tau, t)
-    singular = found.result == RESULTS.singular_basis
+    dynamics = _reduce_compiled(scene, choice, q, nu, tau, t)
+    singular = dynamics.result == RESULTS.singular_basis
     if is_concrete(singular) and bool(singular):
         raise ValueError(f"basis does not serve at this q: {choice.advice(scene, q, t)}")
-    return found
+    return dynamics
 
 
 def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
@@ -103,17 +103,17 @@ def _reduce(given: tuple[Scene, Basis], q, nu, tau, t) -> ReducedDynamics:
     return solve_reduced(scene, moving(scene, choice, q, nu, t), q, tau, t)
 
 
-def solve_reduced(scene: Scene, place: Moving, q, tau, t) -> ReducedDynamics:
+def solve_reduced(scene: Scene, motion: Moving, q, tau, t) -> ReducedDynamics:
     """The equations of motion in the minimal velocities of a `Moving` place, and their solution."""
-    v, drift, N, quality = place
+    v, drift, N, quality = motion
     mass = _product(N.T, _product(mass_matrix(scene.system, q, t), N))
     bias = _product(N.T, inverse_dynamics(scene.system, q, v, drift, t))
     force = _product(N.T, applied(scene, q, v, tau, t))
     factor = cholesky(mass)
     rate = solve_factored(factor, force - bias)
     result = RESULTS.where(definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
-    serves = jnp.abs(quality) > least_quality(q.dtype)
-    result = RESULTS.where(serves, result, RESULTS.singular_basis)
+    is_regular = jnp.abs(quality) > least_quality(q.dtype)
+    result = RESULTS.where(is_regular, result, RESULTS.singular_basis)
     return ReducedDynamics(rate, v, _product(N, rate) + drift, mass, bias, force, N, result)
 
 

@@ -1,4 +1,4 @@
-"""Error against run time: scenes with known motions, integrated in every sensible way, as records, a table and a page."""
+"""Error against run time: scenes with known motions, by every sensible integrator, as records, a table and a page."""
 
 from jaxdyn.reports.cases import Case as Case
 from jaxdyn.reports.cases import cases as cases

@@ -27,7 +27,7 @@ class Case(NamedTuple):
     converged solution at `ts` serves.
       - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
       - `reduces`: whether the method "reduced" takes the scene without being told its number of freedoms.
-      - `largest`: the most trajectories at once that are measured unless `ways` are chosen; None for any number.
+      - `largest`: the most trajectories at once that are measured unless `integrators` are chosen; None for any number.
     """
 
     name: str

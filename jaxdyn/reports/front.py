@@ -1,4 +1,4 @@
-"""Who is on the front of a work-precision plot, and which way to integrate serves a whole class of scenes."""
+"""The front of a work-precision plot, and the best integrator for a class of scenes."""
 
 import math
 from collections import defaultdict
@@ -54,20 +54,20 @@ def beaten_by(
     if len(plots) > 1:
         raise ValueError(f"records has runs of {len(plots)} plots; give those of one scene, dtype and batch")
     ours = [r for r in records if r.source == "jaxdyn"]
-    found = []
+    faster = []
     for r in records:
         if r.source != "jaxdyn" and getattr(r, error) is not None:
             factor = cost_at(ours, getattr(r, error), error=error, cost=cost) / getattr(r, cost)
             if factor > 1:
-                found.append((r, factor))
-    return sorted(found, key=lambda pair: -pair[1])
+                faster.append((r, factor))
+    return sorted(faster, key=lambda pair: -pair[1])
 
 
 class Standing(NamedTuple):
-    """How one way to integrate does in a class of scenes.
+    """How one integrator does in a class of scenes.
 
-    `ratio`: its cost over that of the best way, geometric mean over scenes and target errors that it reaches; `reached`
-    of `wanted`: how many of those that some way reaches.
+    `ratio`: its cost over that of the best integrator, geometric mean over scenes and target errors that it reaches; `reached`
+    of `wanted`: how many of those that some integrator reaches.
     """
 
     kind: str
@@ -89,13 +89,13 @@ def standings(
         if r.source == "jaxdyn":
             kind = f"{r.kind}, {r.dtype}, batch {r.batch}"
             ladders[kind, r.label][r.scene].append(r)
-    found = []
+    table = []
     for kind in dict.fromkeys(kind for kind, _ in ladders):
-        ways = {label: scenes for (k, label), scenes in ladders.items() if k == kind}
-        goals = [(scene, target) for scene in {s for x in ways.values() for s in x} for target in targets]
+        integrators = {label: scenes for (k, label), scenes in ladders.items() if k == kind}
+        goals = [(scene, target) for scene in {s for x in integrators.values() for s in x} for target in targets]
         costs = {
             label: [cost_at(scenes.get(scene, ()), target, cost=cost) for scene, target in goals]
-            for label, scenes in ways.items()
+            for label, scenes in integrators.items()
         }
         best = [min(column) for column in zip(*costs.values(), strict=True)]
         rows = []
@@ -103,5 +103,5 @@ def standings(
             ratios = [x / b for x, b in zip(row, best, strict=True) if math.isfinite(x)]
             mean = math.exp(sum(map(math.log, ratios)) / len(ratios)) if ratios else math.inf
             rows.append(Standing(kind, label, mean, len(ratios), sum(map(math.isfinite, best))))
-        found += sorted(rows, key=lambda row: (-row.reached, row.ratio))
-    return found
+        table += sorted(rows, key=lambda row: (-row.reached, row.ratio))
+    return table

@@ -103,7 +103,7 @@ def content(findings: Findings, settings: dict[str, Any]) -> dict[str, Any]:
     base = base_parameters(model, tuple(term for term in fit.terms if term in TERMS))
     columns = free_columns(model.nb, model.nv, tuple(term for term in fit.terms if term in TERMS))
     nominal, fitted = nominal_parameters(model), findings.parameters
-    found = {
+    report = {
         **settings,
         "outcome": findings.outcome,
         "joint_names": list(model.joint_names),
@@ -132,19 +132,19 @@ def content(findings: Findings, settings: dict[str, Any]) -> dict[str, Any]:
         },
     }
     if isinstance(result, LeastSquares):
-        found["base_parameters"]["std"] = _numbers(result.std)
+        report["base_parameters"]["std"] = _numbers(result.std)
     else:
         rows = zip(names, nominal.tolist(), fitted.tolist(), strict=True)
-        found["parameters"] = {name: {"nominal": x0, "fitted": x} for name, x0, x in rows}
+        report["parameters"] = {name: {"nominal": x0, "fitted": x} for name, x0, x in rows}
     if isinstance(result, RobotFit):
-        _add_robot(found, result, findings.choice or result.choice, model)
-    return found
+        _add_robot(report, result, findings.choice or result.choice, model)
+    return report
 
 
-def _add_robot(found: dict[str, Any], result: RobotFit, choice: Choice, model: Model) -> None:
+def _add_robot(report: dict[str, Any], result: RobotFit, choice: Choice, model: Model) -> None:
     setting, extra = choice.setting, result.fit.extra
     spreads = result.intervals
-    found["chosen"] = {
+    report["chosen"] = {
         "v_s": setting.v_s,
         "prior": setting.prior,
         "robust": setting.robust,
@@ -154,16 +154,16 @@ def _add_robot(found: dict[str, Any], result: RobotFit, choice: Choice, model: M
             {**t.setting._asdict(), "extra": dict(t.setting.extra), "percent": t.percent} for t in choice.trials
         ],
     }
-    found["extra_terms"] = {} if extra is None else extra.named
-    found["weights"] = result.weights.tolist()
-    found["interval_factor"] = spreads.factor
+    report["extra_terms"] = {} if extra is None else extra.named
+    report["weights"] = result.weights.tolist()
+    report["interval_factor"] = spreads.factor
     rows = zip(spreads.parameters.names, _numbers(spreads.parameters.std), spreads.parameters.sources, strict=True)
     for name, std, source in rows:
-        found["parameters"].setdefault(name, {})
-        found["parameters"][name] |= {"std": std, "from": source}
+        report["parameters"].setdefault(name, {})
+        report["parameters"][name] |= {"std": std, "from": source}
     for name, value in zip(spreads.parameters.names, spreads.parameters.values, strict=True):
-        found["parameters"][name].setdefault("fitted", float(value))
-    found["base_parameters"] |= {"std": _numbers(spreads.base.std), "from": spreads.base.sources}
+        report["parameters"][name].setdefault("fitted", float(value))
+    report["base_parameters"] |= {"std": _numbers(spreads.base.std), "from": spreads.base.sources}
 
 
 def payload_content(payload: Payload) -> dict[str, Any]:

@@ -56,8 +56,8 @@ def ladder(
     inputs = [jnp.asarray(x[0] if batch == 1 else x, dtype) for x in starts]
     chosen = chosen_method(prepared.scene, method)
 
-    def motion(found) -> Motion:
-        q, v, result, stats = found
+    def motion(outputs) -> Motion:
+        q, v, result, stats = outputs
         codes = np.atleast_1d(np.asarray(result._value))
         # Of a batch the first trajectory is judged, if none of them failed: those that stop early cost less time.
         code = next((code for code in codes if code != RESULTS.successful._value), codes[0])
@@ -86,7 +86,11 @@ def evaluations(solver: str, steps: int, scene: Scene, method: Method) -> int | 
     tableau: Any = getattr(SOLVERS[solver](), "tableau", None)
     if tableau is None or tableau.implicit:
         return None
-    saves = passes_last_stage_on(tableau, method.jumping, method.projects) if method.corrects(scene) else tableau.fsal
+    saves = (
+        passes_last_stage_on(tableau, method.step_constants, method.projects)
+        if method.corrects(scene)
+        else tableau.fsal
+    )
     saved = steps - 1 if saves else 0
     return tableau.num_stages * steps - saved + 2
 
@@ -105,15 +109,15 @@ def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[M
     state = chosen.start(scene, q, v, t)
 
     def rates(y, t):
-        q, v = chosen.place(scene, y, t)
+        q, v = chosen.to_qv(scene, y, t)
         return chosen.rates(scene, y, q, v, t, scene.applied_force(q, v, t))
 
     def cost(function):
         many, inputs = function, (state, t)
         if batch > 1:
             many, inputs = jax.vmap(function), jax.tree.map(lambda x: jnp.tile(x, (batch, *[1] * x.ndim)), inputs)
-        found = jax.jit(many).lower(*inputs).compile().cost_analysis() or {}
-        return float(found.get("flops", 0.0)) / batch
+        analysis = jax.jit(many).lower(*inputs).compile().cost_analysis() or {}
+        return float(analysis.get("flops", 0.0)) / batch
 
     once = cost(rates)
     again = cost(lambda y, t: chosen.corrected(scene, y, t)) if chosen.corrects(scene) else 0.0
@@ -152,9 +156,9 @@ def measure(
     motions, times, calls = [], {}, {}
     for i, contestant in enumerate(contestants):
         began = time.perf_counter()
-        found = contestant.call()
+        outputs = contestant.call()
         passed = time.perf_counter() - began
-        motions.append(contestant.motion(found))
+        motions.append(contestant.motion(outputs))
         if passed > most / 4:
             times[i] = {"best": passed, "median": passed, "rounds": 1}
         else:

@@ -20,7 +20,7 @@ th:first-child, td:first-child { text-align: left; }
 .wide { overflow-x: auto; } svg { max-width: 100%; height: auto; } .note { color: #555; }
 """
 _READING = """
-Each line is one way to integrate the scene, each point a tolerance or a step: further left is more exact, further down is
+Each line is one integrator, each point a tolerance or a step: further left is more exact, further down is
 cheaper. Points with a grey disc are on the front: no other one beats them in both. The error is the largest |y - r|/(1 + |r|)
 over the entries y of position and velocity and over the save points, r the reference; quaternions are compared as rotation
 matrices. In the grey band on the left the reference itself is not known well enough. Times are the best of the rounds, per
@@ -51,8 +51,8 @@ def html_page(report: Report) -> str:
         f"<style>{STYLE}</style></head><body><h1>Error against run time</h1>",
         f"<p>{escaped(_machine(head))}</p><p class='note'>{_READING}</p>",
         "<h2>Ways to integrate, by class of scene</h2>",
-        "<p class='note'>Cost relative to the best way at the errors 1e-3, 1e-5, 1e-7 and 1e-9, geometric mean over the "
-        "scenes of the class and the errors that it reaches; how many of those that any way reaches.</p>",
+        "<p class='note'>Cost relative to the best integrator at the errors 1e-3, 1e-5, 1e-7 and 1e-9, geometric mean over the "
+        "scenes of the class and the errors that it reaches; how many of those that any integrator reaches.</p>",
         _standings(report.records),
     ]
     for name, known in report.scenes.items():
@@ -86,7 +86,7 @@ def _standings(records) -> str:
         (s.kind, s.label, f"{s.ratio:.2f}" if math.isfinite(s.ratio) else "-", f"{s.reached}/{s.wanted}")
         for s in standings(records)
     ]
-    return html_table(("class", "way", "cost", "reached"), cells)
+    return html_table(("class", "integrator", "cost", "reached"), cells)
 
 
 def _scene(name: str, known: Known, records: tuple[Record, ...]) -> list[str]:

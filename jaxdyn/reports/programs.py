@@ -66,8 +66,8 @@ class Programs:
             # What is measured is the integration: contacts that pull are reported by margins, and do not end it.
             options = {"method": method, "solver": SOLVERS[solver](), "max_steps": MOST_STEPS, "throw": False}
             options["contacts"] = "report"
-            found = simulate(scene, q, v, ts, **steps, **options)
-            return found.q, found.v, found.result, found.stats
+            solution = simulate(scene, q, v, ts, **steps, **options)
+            return solution.q, solution.v, solution.result, solution.stats
 
         several = one if batch == 1 else jax.vmap(one, (0, 0, 0, None))
         sizes = () if batch == 1 else (batch,)
@@ -95,10 +95,10 @@ class Programs:
         while len(states) < batch:
             first = len(states) - 1
             times = ts[0] + SPREAD * (ts[-1] - ts[0]) * np.arange(first, first + ahead + 1) / batch
-            found = self.solve("auto", "Dopri8", 1e-12, states[-1], times)
-            if not all(np.isfinite(x).all() for x in found):
+            solutions = self.solve("auto", "Dopri8", 1e-12, states[-1], times)
+            if not all(np.isfinite(x).all() for x in solutions):
                 raise RuntimeError("no starts for a batch: a simulation at tolerances of 1e-12 stopped early")
-            states += [*zip(*(x[1:] for x in found), strict=True)]
+            states += [*zip(*(x[1:] for x in solutions), strict=True)]
         q, v = (np.stack(x) for x in zip(*states[:batch], strict=True))
         return q, v, ts + delays[:, None]
 
@@ -153,16 +153,16 @@ def observed(scene: Scene, q, v):
     return jnp.concatenate([*parts, v])
 
 
-def largest_error(found: np.ndarray, known: np.ndarray) -> np.ndarray:
+def largest_error(computed: np.ndarray, known: np.ndarray) -> np.ndarray:
     """max |y - r|/(1 + |r|) over the columns of y (nt, n) and r (nt, n), (nt,).
 
     It is absolute for entries that are small and relative for large ones, as in the test set for IVP solvers.
     """
-    return np.max(np.abs(found - known) / (1 + np.abs(known)), 1)
+    return np.max(np.abs(computed - known) / (1 + np.abs(known)), 1)
 
 
 def converged(programs: Programs, values: Callable, reduces: bool = True) -> Reference:
-    """A solution of our own at tolerances of 1e-13, its error estimated from another way to integrate it.
+    """A solution of our own at tolerances of 1e-13, its error estimated from another integrator.
 
     That is other velocities (method "reduced") for a scene with constraints that `reduces`, another solver for others. The two
     share the equations of motion, so the estimate is of the integration alone.
@@ -170,7 +170,7 @@ def converged(programs: Programs, values: Callable, reduces: bool = True) -> Ref
     **Raises:** RuntimeError when one of them does not come to the end.
     """
     other = ("reduced", "Dopri8") if programs.scene.constraints and reduces else ("auto", "Tsit5")
-    fine, rough = (programs.solve(*way, 1e-13) for way in (("auto", "Dopri8"), other))
+    fine, rough = (programs.solve(*pair, 1e-13) for pair in (("auto", "Dopri8"), other))
     error = float(largest_error(values(*rough)[0], values(*fine)[0]).max())
     if not np.isfinite(error):
         raise RuntimeError("no converged reference: a simulation at tolerances of 1e-13 stopped early; loosen them")

@@ -112,10 +112,10 @@ COLUMNS = (
 
 def rows(records: Iterable[Record]) -> list[list[str]]:
     """Cells of a table, one row a record: COLUMNS."""
-    found = []
+    table = []
     for r in records:
         residuals = [x for x in (r.residual_position, r.residual_velocity) if x is not None]
-        found.append(
+        table.append(
             [
                 r.label,
                 r.dtype,
@@ -129,4 +129,4 @@ def rows(records: Iterable[Record]) -> list[list[str]]:
                 "" if r.result == "successful" else r.result,
             ]
         )
-    return found
+    return table

@@ -48,12 +48,12 @@ def integral(rate: Callable, ts, longest: float) -> tuple[np.ndarray, float]:
         half = (b - a) / pieces / 2
         return half * np.sum(weights * rate((edges[:-1] + half)[:, None] + half * nodes))
 
-    found = []
+    integrals = []
     for refined in (1, 2):
         pieces = [refined * max(1, int(np.ceil((b - a) / longest))) for a, b in itertools.pairwise(ts)]
         parts = [over(a, b, n) for (a, b), n in zip(itertools.pairwise(ts), pieces, strict=True)]
-        found.append(np.concatenate([[0.0], np.cumsum(parts)]))
-    return found[1], float(np.abs(found[1] - found[0]).max())
+        integrals.append(np.concatenate([[0.0], np.cumsum(parts)]))
+    return integrals[1], float(np.abs(integrals[1] - integrals[0]).max())
 
 
 def plane_pendulum(ts, length: float = 1.0, gravity: float = 9.81) -> Reference:
@@ -240,11 +240,11 @@ def rolling_down(
 ) -> Reference:
     """Solid ball that rolls straight down an inclined plane: (5/7) g sin(slope), turning about y."""
     pull, zero = 5 / 7 * gravity * np.sin(slope), 0 * ts
-    way, speed = velocity * ts + pull * ts**2 / 2, velocity + pull * ts
-    half = way / radius / 2
+    distance, speed = velocity * ts + pull * ts**2 / 2, velocity + pull * ts
+    half = distance / radius / 2
     # v is in the axes of the ball, which turn about y.
     c, s = np.cos(2 * half), np.sin(2 * half)
-    q = way, zero, radius + zero, np.cos(half), zero, np.sin(half), zero
+    q = distance, zero, radius + zero, np.cos(half), zero, np.sin(half), zero
     return closed_form(ts, q, (speed * c, zero, speed * s, zero, speed / radius, zero), "parabola")
 
 

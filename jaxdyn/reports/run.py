@@ -2,6 +2,7 @@
 
 import datetime
 import time
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
@@ -53,13 +54,14 @@ def report(
     full: bool = False,
     dtypes: Sequence[str] | None = None,
     batches: Sequence[int] | None = None,
-    ways: Sequence[Sequence[str]] | None = None,
+    integrators: Sequence[Sequence[str]] | None = None,
     rounds: int = 20,
     out: str | Path | None = None,
     peers: Peers | None = None,
     echo: Callable[[str], object] | None = None,
+    ways: Sequence[Sequence[str]] | None = None,
 ) -> Report:
-    """Measure error against run time of scenes whose motion is known, by every sensible way to integrate them.
+    """Measure error against run time of scenes whose motion is known, by every sensible method and solver.
 
     Tolerances and steps are traced, so one compiled program serves a whole ladder. All runs of one scene, dtype and batch are
     timed in turn within one loop; compilation is apart. float64 has to be enabled, as references are.
@@ -69,37 +71,43 @@ def report(
     - `scenes`: a name or names of `jaxdyn.reports.cases()`; None for all.
     - `full`: many methods, solvers and rungs, in float64 and float32, one trajectory and 256 at once; else a quick
       ladder of the usual ones in float64, one trajectory.
-    - `dtypes`, `batches`: others than those. `ways`: pairs of a method and a solver in place of those.
+    - `dtypes`, `batches`: others than those. `integrators`: pairs of a method and a solver in place of those.
     - `rounds`: timings of each run, at least 20 for a figure to be quoted.
     - `out`: directory for report.json, report.txt and report.html, and for records.jsonl, from which a call that was
       interrupted goes on.
     - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.reports.measure`.
     - `echo`: takes lines of progress, e.g. `print`.
+    - `ways`: the former name of `integrators`.
 
     **Returns:** a `Report`; `print(report.table())`; `jaxdyn.reports.write(report, directory)` makes its page.
 
-    **Raises:** ValueError for a name that is not known, a dtype, batch or way that cannot be, nothing to measure, float64 that
-    is not enabled, and a directory that holds records of another commit, machine or set of versions; ImportError for `out`
+    **Raises:** ValueError for a name that is not known, a dtype, batch or integrator that cannot be, nothing to measure, float64
+    that is not enabled, and a directory that holds records of another commit, machine or set of versions; ImportError for `out`
     without matplotlib.
 
     ```python
     quick = jd.report("pendulum_in_plane")
     ```
     """
-    chosen = _checked(scenes, dtypes, batches, ways, rounds)
+    if ways is not None:
+        warnings.warn("`ways` of jd.report is called `integrators` now", DeprecationWarning, stacklevel=2)
+        integrators = ways
+    chosen = _checked(scenes, dtypes, batches, integrators, rounds)
     dtypes = dtypes or (("float64", "float32") if full else ("float64",))
     batches = batches or ((1, 256) if full else (1,))
     say = echo or (lambda line: None)
     groups = []
     for case in chosen:
-        sizes = [batch for batch in batches if ways or case.largest is None or batch <= case.largest]
+        sizes = [batch for batch in batches if integrators or case.largest is None or batch <= case.largest]
         groups += [(case, dtype, batch) for dtype in dtypes for batch in sizes]
         if len(sizes) < len(batches):
-            say(f"{case.name}: batches above {case.largest} are left out: they take minutes, unless `ways` are chosen")
+            say(
+                f"{case.name}: batches above {case.largest} are left out: they take minutes, unless `integrators` are chosen"
+            )
     if not groups:
         raise ValueError(
-            f"batches {list(batches)} leave nothing to measure of {', '.join(case.name for case in chosen)}; choose `ways`, "
-            "or smaller batches"
+            f"batches {list(batches)} leave nothing to measure of {', '.join(case.name for case in chosen)}; choose "
+            "`integrators`, or smaller batches"
         )
     if out is not None:
         new_figure(1.0, 1.0)  # without matplotlib there is no page, which is better known before hours of runs
@@ -111,7 +119,7 @@ def report(
     }
     journal = Journal(None if out is None else Path(out), head)
     prepared, began = None, time.perf_counter()
-    only = "".join(f", {method} {solver}" for method, solver in ways or ()) + (", with peers" if peers else "")
+    only = "".join(f", {method} {solver}" for method, solver in integrators or ()) + (", with peers" if peers else "")
     keys = [f"{case.name}, {dtype}, batch {batch}, {rounds} rounds{only}" for case, dtype, batch in groups]
     todo = [(key, *group) for key, group in zip(keys, groups, strict=True) if key not in journal]
     if len(todo) < len(groups):
@@ -119,23 +127,23 @@ def report(
     for done, (key, case, dtype, batch) in enumerate(todo, 1):
         if prepared is None or prepared.case is not case:
             prepared = prepare(case)
-        records = _group(prepared, dtype, batch, ways, full, rounds, peers)
+        records = _group(prepared, dtype, batch, integrators, full, rounds, peers)
         journal.add(key, case.name, _known(prepared), records)
         passed = time.perf_counter() - began
         left = passed / done * (len(todo) - done)
         say(f"{done}/{len(todo)} {key}: {len(records)} runs; {passed:.0f} s, about {left:.0f} s left")
-    found = journal.report(keys)
+    result = journal.report(keys)
     if out is not None:
-        write(found, out)
-    return found
+        write(result, out)
+    return result
 
 
-def _group(prepared: Prepared, dtype, batch, ways, full, rounds, peers) -> list[Record]:
+def _group(prepared: Prepared, dtype, batch, integrators, full, rounds, peers) -> list[Record]:
     """Records of one scene in one dtype and number of trajectories: what is timed in one loop."""
     case, scene = prepared.case, prepared.scene
     starts = prepared.programs.lanes(batch)
     plain = dtype == "float64" and batch == 1
-    pairs = list(ways) if ways else combinations(case, bool(scene.constraints), full=full, plain=plain)
+    pairs = list(integrators) if integrators else combinations(case, bool(scene.constraints), full=full, plain=plain)
     counters = {method: flop_counter(prepared, method, batch) for method in dict(pairs)}
     contestants = [
         rung
@@ -155,11 +163,11 @@ def _known(prepared: Prepared) -> Known:
     return Known(prepared.case.text, reference.kind, reference.source, reference.error, published)
 
 
-def _checked(scenes, dtypes, batches, ways, rounds) -> list[Case]:
+def _checked(scenes, dtypes, batches, integrators, rounds) -> list[Case]:
     """The cases, after a check of the arguments of `report`."""
     known = cases()
     names = list(known) if scenes is None else [scenes] if isinstance(scenes, str) else list(scenes)
-    for argument, given in (("scenes", names), ("dtypes", dtypes), ("batches", batches), ("ways", ways)):
+    for argument, given in (("scenes", names), ("dtypes", dtypes), ("batches", batches), ("integrators", integrators)):
         if given is not None and len(given) == 0:
             raise ValueError(f"{argument} is empty; leave it out for the usual ones")
     for name in names:
@@ -168,10 +176,10 @@ def _checked(scenes, dtypes, batches, ways, rounds) -> list[Case]:
     for dtype in dtypes or ():
         if dtype not in ("float64", "float32"):
             raise ValueError(f"dtypes has {dtype!r}; choose from float64, float32")
-    for pair in ways or ():
+    for pair in integrators or ():
         if not isinstance(pair, tuple | list) or len(pair) != 2 or pair[1] not in SOLVERS:
             raise ValueError(
-                f'ways has {pair!r}; give pairs such as ("projected", "Dopri8"), solvers: {", ".join(SOLVERS)}'
+                f'integrators has {pair!r}; give pairs such as ("projected", "Dopri8"), solvers: {", ".join(SOLVERS)}'
             )
     for batch in batches or ():
         if isinstance(batch, bool) or not isinstance(batch, int) or batch < 1:
@@ -181,11 +189,11 @@ def _checked(scenes, dtypes, batches, ways, rounds) -> list[Case]:
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError('a report compares in float64; call jax.config.update("jax_enable_x64", True) first')
     chosen = [known[name] for name in dict.fromkeys(names)]
-    for case in chosen if ways else ():
+    for case in chosen if integrators else ():
         scene, _ = case.build()
-        for method in dict(ways or ()):
+        for method in dict(integrators or ()):
             try:
                 chosen_method(scene, method)
             except ValueError as error:
-                raise ValueError(f"ways has {method!r}, which {case.name} cannot take: {error}") from None
+                raise ValueError(f"integrators has {method!r}, which {case.name} cannot take: {error}") from None
     return chosen

@@ -115,8 +115,8 @@ def whole(
     process = process_of(options.process)
     devices = driver.local_devices(options.devices)
     reductions = checked_reductions(options.reductions)
-    found = describe(reductions)
-    kept = _kept(found, options.rows)
+    outputs = describe(reductions)
+    kept = _kept(outputs, options.rows)
     if isinstance(options.cost, str):
         if options.cost != MEASURED or pilot is None:
             raise ValueError(
@@ -126,8 +126,8 @@ def whole(
     else:
         pilot = None
     order = None if pilot else _order(options.cost, batch)
-    reducer = Reducer(reductions, found.shapes, found.variables)
-    job = driver.Job(order, reducer, kept, found.codes, process)
+    reducer = Reducer(reductions, outputs.shapes, outputs.variables)
+    job = driver.Job(order, reducer, kept, outputs.codes, process)
     description = (
         version()
         | {"platform": devices[0].platform, "float64": bool(jax.config.read("jax_enable_x64"))}
@@ -136,7 +136,7 @@ def whole(
         | {"order": None if order is None else digest(order), "rows stored": list(kept)}
         | {"reductions": described(reductions), "compression": options.compress}
     )
-    row_bytes = sum(_bytes(found.variables[name]) for name in kept)
+    row_bytes = sum(_bytes(outputs.variables[name]) for name in kept)
     with full_disk(path), Lock(path, process) as lock:
         store = Store(path) if path.exists() else None
         if store is not None:
@@ -148,21 +148,26 @@ def whole(
         memory = options.memory
         if memory is None and process.count > 1:  # which of them share this host is not known
             memory = int(program.SHARE * program.available_memory(devices) / process.count)
-        compiled = program.Program(found.one, batch, devices, lanes, memory)
+        compiled = program.Program(outputs.one, batch, devices, lanes, memory)
         if pilot:
             job.pilot = program.Program(pilot, batch, devices, compiled.lanes, memory)
         if store is None:
-            variables = [found.variables[name] for name in kept] + reducer.variables
+            variables = [outputs.variables[name] for name in kept] + reducer.variables
             variables = [replace(one, compressed=one.compressed or options.compress) for one in variables]
             chunk = options.chunk or max(_chunk(job, compiled, row_bytes), BATCHES * compiled.lanes if pilot else 0)
-            programs = {PROGRAM: program.fingerprint(found.one, batch), "lowered program": compiled.lowered}
+            programs = {PROGRAM: program.fingerprint(outputs.one, batch), "lowered program": compiled.lowered}
             store = Store.create(
-                path, variables, found.coordinates(order), description | programs, batch.count, min(chunk, batch.count)
+                path,
+                variables,
+                outputs.coordinates(order),
+                description | programs,
+                batch.count,
+                min(chunk, batch.count),
             )
             store.check(description)  # another process may have been first
         if store.description["lowered program"] != compiled.lowered:
             # Of other lanes, devices or processors; what is computed for one member has to be the same.
-            store.check({PROGRAM: program.fingerprint(found.one, batch)})
+            store.check({PROGRAM: program.fingerprint(outputs.one, batch)})
         meter = Progress(batch.count, store.finished, shown=options.progress)
         repaired = driver.drive(job, compiled, store, lock, meter, options.verify)
         meter.end()
@@ -191,12 +196,12 @@ def _chunk(job: driver.Job, compiled: program.Program, row_bytes: int) -> int:
     return driver.chunk_size(seconds, compiled.lanes, row_bytes, count, job.process.count)
 
 
-def _kept(found: Described, rows: bool | Sequence[str]) -> tuple[str, ...]:
+def _kept(described: Described, rows: bool | Sequence[str]) -> tuple[str, ...]:
     if isinstance(rows, bool):
-        return tuple(found.variables) if rows else ("result",)
-    unknown = [name for name in rows if name not in found.variables]
+        return tuple(described.variables) if rows else ("result",)
+    unknown = [name for name in rows if name not in described.variables]
     if unknown or isinstance(rows, str):
-        raise ValueError(f"rows is {rows!r}; name some of {', '.join(found.variables)}")
+        raise ValueError(f"rows is {rows!r}; name some of {', '.join(described.variables)}")
     return tuple(dict.fromkeys([*rows, "result"]))
 
 

@@ -46,14 +46,14 @@ def described_motion(
     def rows(drawn: Any, row: Any) -> dict[str, Any]:
         solution, scene, parameters = one(drawn, row)
         signals = traced_signals(solution, scene)
-        found = {signal.key: signal.values for signal in signals}
+        values = {signal.key: signal.values for signal in signals}
         poses = {f"pose_{name}": pose for name, pose in solution.poses.items()}
         named = _parameters(parameters)
         stats = {name: solution.stats[name] for name in ("num_steps", "time_reached")}
         # What does not change from call to call, of whichever was the last.
         seen.update(signals=[signal._replace(values=None) for signal in signals], poses=tuple(poses))
-        found |= poses | named | stats
-        return _with_quantities(found | {"result": code_of(solution.result)}, reductions)
+        values |= poses | named | stats
+        return _with_quantities(values | {"result": code_of(solution.result)}, reductions)
 
     shapes = shapes_of(rows, batch)
     variables, axes = {}, {}
@@ -81,17 +81,17 @@ def described_function(
     """Of `one(drawn, row) -> (dictionary of arrays, parameters)`."""
 
     def rows(drawn: Any, row: Any) -> dict[str, Any]:
-        found, parameters = one(drawn, row)
-        if not isinstance(found, Mapping) or not found:
-            raise ValueError(f"function returned a {type(found).__name__}; return a dictionary of arrays by name")
-        found = {str(name): jnp.asarray(value) for name, value in found.items()}
-        if {"result", "record", "partial", "rollout"} & found.keys():
+        values, parameters = one(drawn, row)
+        if not isinstance(values, Mapping) or not values:
+            raise ValueError(f"function returned a {type(values).__name__}; return a dictionary of arrays by name")
+        values = {str(name): jnp.asarray(value) for name, value in values.items()}
+        if {"result", "record", "partial", "rollout"} & values.keys():
             raise ValueError("function returned an array named result, record, partial or rollout; take another name")
-        success = found.pop("success", None)
+        success = values.pop("success", None)
         if success is None:
-            success = jnp.stack([jnp.isfinite(value).all() for value in found.values()]).all()
+            success = jnp.stack([jnp.isfinite(value).all() for value in values.values()]).all()
         code = jnp.where(success, 0, 1).astype(jnp.uint8)
-        return _with_quantities(found | _parameters(parameters) | {"result": code}, reductions)
+        return _with_quantities(values | _parameters(parameters) | {"result": code}, reductions)
 
     shapes = shapes_of(rows, batch)
     variables = {}
@@ -110,11 +110,11 @@ def version() -> dict[str, str]:
 
 def _parameters(tree: Any) -> dict[str, Any]:
     """Leaves by the names of their places."""
-    found = {}
+    values = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         name = jax.tree_util.keystr(path, simple=True, separator="_")
-        found[f"parameter_{name}" if name else "parameter"] = jnp.asarray(leaf)
-    return found
+        values[f"parameter_{name}" if name else "parameter"] = jnp.asarray(leaf)
+    return values
 
 
 def _with_quantities(rows: dict[str, Any], reductions: Mapping[str, Reduction]) -> dict[str, Any]:

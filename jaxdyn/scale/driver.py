@@ -92,7 +92,7 @@ def by_cost(program: Program, pilot: Program, numbers: np.ndarray, tally: Tally)
 
 def compute(program: Program, numbers: np.ndarray, tally: Tally | None = None) -> dict[str, np.ndarray]:
     """Rows of these rollouts; two batches are under way at a time."""
-    found: dict[str, np.ndarray] = {}
+    rows: dict[str, np.ndarray] = {}
     starts = range(0, len(numbers), program.lanes)
     under_way: list[tuple[int, Any]] = []
 
@@ -100,9 +100,9 @@ def compute(program: Program, numbers: np.ndarray, tally: Tally | None = None) -
         begin, results = under_way.pop(0)
         for name, values in results.items():
             values = np.asarray(values)
-            if name not in found:
-                found[name] = np.empty((len(numbers), *values.shape[1:]), values.dtype)
-            part = found[name][begin : begin + program.lanes]
+            if name not in rows:
+                rows[name] = np.empty((len(numbers), *values.shape[1:]), values.dtype)
+            part = rows[name][begin : begin + program.lanes]
             part[...] = values[: len(part)]
             if name == STEPS and tally is not None:
                 tally.add(values, len(program.devices))
@@ -113,7 +113,7 @@ def compute(program: Program, numbers: np.ndarray, tally: Tally | None = None) -
             fetch()
     while under_way:
         fetch()
-    return found
+    return rows
 
 
 def fill(job: Job, program: Program, store: Store, lock: Lock, meter: Progress, chunks: Iterable[int]) -> list[int]:
@@ -185,9 +185,9 @@ def merge(job: Job, store: Store) -> dict[str, Arrays]:
     """The results of all reductions, stored too."""
     names = [name for name in store.names if name.startswith("partial/")]
     partials = {name: np.concatenate([part for _, part in store.parts(name)]) for name in names}
-    found = job.reducer.merged(partials)
-    store.put(named(found))
-    return found
+    merged = job.reducer.merged(partials)
+    store.put(named(merged))
+    return merged
 
 
 def local_devices(devices: Sequence[Any] | None) -> list[Any]:

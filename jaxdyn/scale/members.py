@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxdyn.model.arguments import as_array
 
-MOST = 2**32  # members that a key counts
+MAX_MEMBERS = 2**32  # members that a key counts
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ def members(named: dict[str, Any], draw: Callable | None, samples: int | None, s
     for name, other in others:
         if other != size:
             raise ValueError(f"{first} is of {size} rollouts and {name} of {other}; give as many of each")
-    if not 0 < size < MOST:
+    if not 0 < size < MAX_MEMBERS:
         raise ValueError(f"{first} is of {size} rollouts; give from 1 to 2^32 - 1")
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < MOST:
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < MAX_MEMBERS:
         raise ValueError(f"seed is {seed!r}; give a whole number from 0 to 2^32 - 1")
     return Members(size, rows, draw, int(seed))
 
@@ -93,9 +93,9 @@ def member(parameters: Any, number: int, seed: int = 0) -> Any:
 
 def digest(tree: Any) -> str:
     """A hash of the numbers of a pytree, their shapes and their places."""
-    found = hashlib.sha256()
+    hashed = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         array = np.ascontiguousarray(leaf)
-        found.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
-        found.update(array.data)
-    return found.hexdigest()[:16]
+        hashed.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
+        hashed.update(array.data)
+    return hashed.hexdigest()[:16]

@@ -88,11 +88,11 @@ class Program:
 
     def _needed(self) -> int:
         """Bytes of the program and of the results that are in memory at once, on all devices, by XLA's own account."""
-        found = self.compiled.memory_analysis()
-        if found is None:
+        analysis = self.compiled.memory_analysis()
+        if analysis is None:
             return 0
-        own = found.temp_size_in_bytes + found.argument_size_in_bytes
-        return len(self.devices) * (own + IN_FLIGHT * found.output_size_in_bytes)
+        own = analysis.temp_size_in_bytes + analysis.argument_size_in_bytes
+        return len(self.devices) * (own + IN_FLIGHT * analysis.output_size_in_bytes)
 
 
 def shapes_of(one: Callable, members: Members) -> dict[str, jax.ShapeDtypeStruct]:
@@ -131,8 +131,8 @@ def _meminfo() -> int | None:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
         return None
-    found = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
-    return int(found[0]) * 1024 if found else None
+    available = [line.split()[1] for line in lines if line.startswith("MemAvailable:")]
+    return int(available[0]) * 1024 if available else None
 
 
 def _of_group() -> int | None:

@@ -38,12 +38,12 @@ class Reducer:
             for part, value in none.items():
                 key, array = _partial(name, part), np.asarray(value)
                 self.variables.append(Variable(key, array.shape, array.dtype, _axes(key, array.ndim), "chunk"))
-            found = reduction.merge({part: np.stack([value, value]) for part, value in none.items()})
-            if missing := set(reduction.parts) - found.keys():
+            merged = reduction.merge({part: np.stack([value, value]) for part, value in none.items()})
+            if missing := set(reduction.parts) - merged.keys():
                 raise ValueError(f"reductions[{name!r}].merge does not return {sorted(missing)}, which its parts name")
             of = variables.get(reduction.quantity) if isinstance(reduction.quantity, str) else None
             for part in reduction.parts:
-                key, array = f"{name}_{part}", np.asarray(found[part])
+                key, array = f"{name}_{part}", np.asarray(merged[part])
                 axes = _axes(key, array.ndim)
                 if of is not None and of.dims and array.shape[-len(of.dims) :] == of.shape:
                     axes = axes[: -len(of.dims)] + of.dims
@@ -51,19 +51,19 @@ class Reducer:
 
     def partials(self, rows: Mapping[str, np.ndarray], numbers: np.ndarray) -> Arrays:
         """Partial results of a chunk, by their names in the store, of the rollouts that succeeded."""
-        good, found = rows["result"] == 0, {}
+        good, sums = rows["result"] == 0, {}
         for name, reduction in self._reductions.items():
             parts = reduction.partial(rows[QUANTITY + name][good], numbers[good])
-            found |= {_partial(name, part): np.asarray(value)[None] for part, value in parts.items()}
-        return found
+            sums |= {_partial(name, part): np.asarray(value)[None] for part, value in parts.items()}
+        return sums
 
     def merged(self, partials: Mapping[str, np.ndarray]) -> dict[str, Arrays]:
         """Results of all reductions, of the partial results of all chunks by their names in the store."""
-        found = {}
+        results = {}
         for name, reduction in self._reductions.items():
             whole = reduction.merge({part: partials[_partial(name, part)] for part in self._partials[name]})
-            found[name] = {part: np.asarray(whole[part]) for part in reduction.parts}
-        return found
+            results[name] = {part: np.asarray(whole[part]) for part in reduction.parts}
+        return results
 
 
 def _partial(name: str, part: str) -> str:

@@ -61,12 +61,12 @@ class Mean(Reduction):
         """Chunk by chunk."""
         count, mean = 0, np.zeros(partials["mean"].shape[1:])
         squares = np.zeros_like(mean)
-        for n, one, apart in zip(partials["count"], partials["mean"], partials["squares"], strict=True):
+        for n, one, squares_within in zip(partials["count"], partials["mean"], partials["squares"], strict=True):
             if n == 0:
                 continue
             total, shift = count + n, one - mean
             mean = mean + shift * (n / total)
-            squares = squares + apart + shift**2 * (count * n / total)
+            squares = squares + squares_within + shift**2 * (count * n / total)
             count = total
         mean = mean if count else np.full_like(mean, np.nan)
         std = np.sqrt(squares / (count - 1)) if count > 1 else np.full_like(mean, np.nan)
@@ -133,11 +133,11 @@ class Quantiles(Histogram):
         counts = partials["counts"].sum(0)
         flat = counts.reshape(len(counts), math.prod(counts.shape[1:]))
         probabilities = np.asarray(self.probabilities, float)
-        found = np.empty((len(probabilities), flat.shape[1]))
+        quantiles = np.empty((len(probabilities), flat.shape[1]))
         for k, column in enumerate(flat.T):
-            found[:, k] = self._of_entry(column, probabilities)
+            quantiles[:, k] = self._of_entry(column, probabilities)
         return {
-            "quantiles": found.reshape(len(probabilities), *counts.shape[1:]),
+            "quantiles": quantiles.reshape(len(probabilities), *counts.shape[1:]),
             "probabilities": probabilities,
         }
 
@@ -151,8 +151,8 @@ class Quantiles(Histogram):
         inside = (place > 0) & (place <= self.bins)
         place = np.clip(place, 1, self.bins)
         share = (wanted - below[place - 1]) / np.maximum(counts[place], 1)
-        found = self.edges[place - 1] + share * (self.high - self.low) / self.bins
-        return np.where(inside, found, np.nan)
+        values = self.edges[place - 1] + share * (self.high - self.low) / self.bins
+        return np.where(inside, values, np.nan)
 
 
 @dataclass(frozen=True)
@@ -214,18 +214,18 @@ def quantities(reductions: Mapping[str, Reduction], rows: Mapping[str, Any]) -> 
 
     **Raises:** ValueError for the name of no array of a rollout.
     """
-    found = {}
+    arrays = {}
     for name, reduction in reductions.items():
         if callable(reduction.quantity):
-            found[name] = reduction.quantity(rows)
+            arrays[name] = reduction.quantity(rows)
         elif reduction.quantity in rows:
-            found[name] = rows[reduction.quantity]
+            arrays[name] = rows[reduction.quantity]
         else:
             raise ValueError(
                 f"reductions[{name!r}] is of {reduction.quantity!r}, which a rollout does not have; it has {', '.join(rows)}. "
                 "Ask for it in outputs, or give a function of them"
             )
-    return found
+    return arrays
 
 
 def described(reductions: Mapping[str, Reduction]) -> list[str]:

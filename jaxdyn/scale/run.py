@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.model.arguments import as_array
+from jaxdyn.model.arguments import Numbers, as_array
 from jaxdyn.model.printed import scene_lines
 from jaxdyn.scale.batch import Options, Run, whole
 from jaxdyn.scale.described import described_function, described_motion
@@ -23,7 +23,7 @@ def run(
     scene: Any,
     states: Any,
     parameters: Any,
-    ts: Any,
+    ts: Numbers,
     *,
     out: Any,
     samples: int | None = None,
@@ -137,8 +137,8 @@ def run(
     def pilot(drawn: Any, row: Any) -> dict[str, Any]:
         built, law, q0, v0 = begun(drawn, row)
         early = np.array([ts[0], ts[0] + SHARE * (ts[-1] - ts[0])])
-        found = simulate(built, q0, v0, early, control=law, throw=False, **{**options, "outputs": ()})
-        return {STEPS: found.stats[STEPS]}
+        solution = simulate(built, q0, v0, early, control=law, throw=False, **{**options, "outputs": ()})
+        return {STEPS: solution.stats[STEPS]}
 
     if not builds and not isinstance(scene, Scene):
         scene = Scene(scene)

@@ -74,9 +74,9 @@ class Store:
             except (FileNotFoundError, NotADirectoryError):  # it is there, and is no group of Zarr
                 attributes = {}
         if attributes.get("jaxdyn_store") != FORMAT:
-            found = attributes.get("jaxdyn_store", "nothing")
+            version = attributes.get("jaxdyn_store", "nothing")
             raise ValueError(
-                f"out is {str(path)!r}, whose format is {found} of jaxdyn and not {FORMAT}: it is of another version, or no "
+                f"out is {str(path)!r}, whose format is {version} of jaxdyn and not {FORMAT}: it is of another version, or no "
                 "store of jd.scale; name another one"
             )
         self.description = attributes["description"]
@@ -246,12 +246,12 @@ class Store:
 
     def _sums(self, chunk: int) -> np.ndarray:
         """The last four bytes of each array's file, which are its CRC-32C."""
-        found = []
+        checksums = []
         for name, array in self._arrays.items():
             with self._file(name, array, chunk).open("rb") as file:
                 file.seek(-4, os.SEEK_END)
-                found.append(int.from_bytes(file.read(4), "little"))
-        return np.asarray(found, np.uint32)
+                checksums.append(int.from_bytes(file.read(4), "little"))
+        return np.asarray(checksums, np.uint32)
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:

@@ -5,11 +5,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import rolling_sphere
 from jaxdyn.contact import Sphere, montana
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
 from jaxdyn.lie import se3
+from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia, robots
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
@@ -45,18 +47,20 @@ def _six_joints(links, masses, height, tip_radius, gravity) -> Model:
 
 def _joint_angles(pose, links, height):
     """Angles (6,) of the arm whose frame `tip` is to be at a pose (4, 4), the elbow above."""
-    base = np.eye(4)
-    base[2, 3] = height
+    xp = numpy_for(pose, links, height)
+    pose = xp.asarray(pose, float)
     wrist = pose[:3, 3] - links[2] * pose[:3, 0]
-    angles, _ = _spatial_finger(base, links[:2], wrist, wrist, np.zeros(3))
-    yaw, lift = angles[0], angles[1] + angles[2]
-    ahead, up = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([0.0, 0.0, 1.0])
-    forearm = np.cos(lift) * ahead + np.sin(lift) * up
-    left = np.cross(up, ahead)
-    turn = np.stack([forearm, left, np.cross(forearm, left)]) @ pose[:3, :3]
+    base = f64.pose_of(np.eye(3), (0.0, 0.0, height))
+    angles, _ = _spatial_finger(base, links[:2], wrist, wrist + xp.asarray([0.0, 0.0, 0.1]), np.zeros(3))
+    yaw, elevation = angles[0], angles[1] + angles[2]
+    up = xp.asarray([0.0, 0.0, 1.0])
+    ahead = xp.stack([xp.cos(yaw), xp.sin(yaw), 0 * yaw])
+    forearm = xp.cos(elevation) * ahead + xp.sin(elevation) * up
+    left = xp.cross(up, ahead)
+    turn = xp.stack([forearm, left, xp.cross(forearm, left)]) @ pose[:3, :3]
     # Of a roll a, a pitch b about -y and a roll c: the first row and column have b and one of the rolls each.
-    roll, pitch = np.arctan2(-turn[1, 0], turn[2, 0]), np.arctan2(np.hypot(*turn[0, 1:]), turn[0, 0])
-    return np.array([*angles, roll, pitch, np.arctan2(-turn[0, 1], -turn[0, 2])])
+    roll, pitch = xp.arctan2(-turn[1, 0], turn[2, 0]), xp.arctan2(xp.hypot(*turn[0, 1:]), turn[0, 0])
+    return xp.stack([*angles, roll, pitch, xp.arctan2(-turn[0, 1], -turn[0, 2])])
 
 
 def _sphere_arm_start(
@@ -72,13 +76,13 @@ def _sphere_arm_start(
     tip_radius=_TIP_RADIUS,
 ):
     _check_contact(contact)
-    if contact == "rolling" and (np.any(slide) or spin):
+    if contact == "rolling" and is_concrete(slide, spin) and (np.any(slide) or spin):
         raise ValueError(f"slide is {slide}, spin is {spin}; a rolling contact has neither, leave them out")
-    found = montana(*_surfaces(radius, tip_radius), jnp.asarray(eta, float))
-    pose = np.array(found.g_of)
-    pose[:3, 3] += center
+    kinematics = montana(*_surfaces(radius, tip_radius), jnp.asarray(eta, float))
+    g_of = numpy_for(kinematics.g_of).asarray(kinematics.g_of)
+    pose = f64.pose_of(g_of[:3, :3], g_of[:3, 3] + numpy_for(center).asarray(center, float))
     q = jnp.asarray(_joint_angles(pose, links, height))
-    twist = se3.Ad_apply(found.finger.pose, jnp.asarray([*slide, 0.0, *rolling, spin], float))
+    twist = se3.Ad_apply(kinematics.finger.pose, jnp.asarray([*slide, 0.0, *rolling, spin], float))
     arm = _six_joints(links, _MASSES, height, tip_radius, 0.0)
     return q, jnp.linalg.solve(body_jacobian(arm, q, "tip"), twist)
 
@@ -147,7 +151,7 @@ _FLANGE = "iiwa_link_7"
 
 def _lifting_start(count=2, radius=0.3, twist=(0.05, 0.0, 0.1, 0.0, 0.2, 0.3)):
     scene: Any = coordinated_lifting(count=count, radius=radius)
-    height = float(frame_pose(robots.iiwa(), jnp.asarray(_HOLDING), _FLANGE)[2, 3])
+    height = frame_pose(robots.iiwa(), jnp.asarray(_HOLDING), _FLANGE)[2, 3]
     q = jnp.asarray([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
     twist = jnp.asarray(twist, float)
     # Of all joint velocities that move the flanges with the plate, the smallest.
@@ -170,13 +174,14 @@ def coordinated_lifting(*, count=2, radius=0.3, mass=4.0, thickness=0.04, gravit
         raise ValueError(f"count is {count!r}; give the number of arms, a positive integer")
     fall = (0.0, 0.0, -gravity)
     arm = robots.iiwa(gravity=fall)
-    flange = np.asarray(frame_pose(arm, jnp.asarray(_HOLDING, arm.home.dtype), _FLANGE))
+    flange = frame_pose(robots.iiwa(gravity=None), jnp.asarray(_HOLDING, arm.home.dtype), _FLANGE)
+    xp = numpy_for(flange, radius)
+    flange = xp.asarray(flange)
     whole, grips = ModelBuilder("no arm", gravity=fall).build(), []
     for i in range(count):
-        turn = np.eye(4)
-        turn[:3, :3] = _turn(2 * np.pi / count * i)
-        base, grip = np.eye(4), np.eye(4)
-        base[0, 3], grip[:3, :3], grip[0, 3] = -radius - flange[0, 3], flange[:3, :3], -radius
+        turn = xp.asarray(f64.pose_of(_turn(2 * np.pi / count * i), np.zeros(3)))
+        base = xp.asarray(f64.pose_of(np.eye(3), (-radius - flange[0, 3], 0.0, 0.0)))
+        grip = xp.asarray(f64.pose_of(flange[:3, :3], (-radius, 0.0, 0.0)))
         whole = join(whole, arm, prefix=f"arm{i + 1}_", pose=turn @ base)
         grips.append(contact("rigid", f"arm{i + 1}_{_FLANGE}", turn @ grip, name=f"arm{i + 1}"))
     plate = ModelBuilder("plate", gravity=fall)

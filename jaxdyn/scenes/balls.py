@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Holonomic, rolling_sphere
 from jaxdyn.lie import so3
 from jaxdyn.model import inertia
@@ -24,8 +25,8 @@ class _Steady(eqx.Module):
 
 def _turntable_start(radius=0.2, rate=3.0, position=(1.0, 0.0), velocity=(0.0, 0.5)):
     # The contact point of the ball moves with the table: v + w x (-r e_z) = rate e_z x p.
-    slip = rate * np.array([-position[1], position[0]]) - velocity
-    spin = np.array([slip[1], -slip[0], 0.0]) / radius
+    slip = -rate * position[1] - velocity[0], rate * position[0] - velocity[1]
+    spin = slip[1] / radius, -slip[0] / radius, 0.0
     q = [0.0, *position, radius, 1.0, 0.0, 0.0, 0.0]
     return jnp.asarray(q), jnp.asarray([rate, *velocity, 0.0, *spin])
 
@@ -58,7 +59,8 @@ def ball_on_incline(*, mass=1.0, radius=0.1, slope=np.pi / 6, gravity=9.81) -> S
 
     vdot = (5/7) g sin(slope) e_x. Start: `velocity` (m/s) of the centre, without spin about the normal.
     """
-    pull = (gravity * np.sin(slope), 0.0, -gravity * np.cos(slope))
+    xp = numpy_for(slope)
+    pull = (gravity * xp.sin(slope), 0.0, -gravity * xp.cos(slope))
     builder = ModelBuilder("ball on an incline", gravity=pull)
     builder.add_body("ball", None, "free", inertia.sphere(mass, radius))
     return Scene(builder.build(), (rolling_sphere("ball", None, radius, name="contact"),))
@@ -107,5 +109,5 @@ def bowling_ball(*, mass=6.35, radius=0.10795, moment=0.0296, friction=0.12, gra
     """
     builder = ModelBuilder("bowling ball", gravity=(0.0, 0.0, -gravity))
     builder.add_body("ball", None, "free", (mass, (0.0, 0.0, 0.0), (moment, moment, moment)))
-    held = Holonomic(_Height(radius), name="lane")
-    return Scene(builder.build(), (held,), (_Sliding(friction * mass * gravity, radius),))
+    lane = Holonomic(_Height(radius), name="lane")
+    return Scene(builder.build(), (lane,), (_Sliding(friction * mass * gravity, radius),))

@@ -1,8 +1,12 @@
 """Boxes that are held: a cube in a hand of four fingers, and a box that stands on a table by the friction of its base."""
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.contact.cones import friction_cone, surface_cone
 from jaxdyn.contact.wrench_cones import wrench_cone
 from jaxdyn.grasp import Grasp, contact, point_contacts
@@ -34,7 +38,7 @@ _ROUNDS = 30  # of Newton's method, for the angles of a finger
 def _chain(model, tip: str) -> tuple[list[int], np.ndarray]:
     """Joints from the palm to a fingertip, and the tip's pose in the last body."""
     frame = frame_index(model, tip)
-    joints, offset = [model.topology.frame_bodies[frame]], np.asarray(model.frame_poses[frame], float)
+    joints, offset = [model.topology.frame_bodies[frame]], np.asarray(model.frame_poses, float)[frame]
     while (parent := model.topology.parents[joints[0]]) >= 0:
         joints.insert(0, parent)
     return joints, offset
@@ -42,15 +46,37 @@ def _chain(model, tip: str) -> tuple[list[int], np.ndarray]:
 
 def _tip(model, joints, offset, angles):
     """Position (3,) of a fingertip, and its Jacobian (3, n)."""
-    pose, axes, origins = np.eye(4), [], []
+    xp = numpy_for(angles)
+    pose, axes, origins = xp.eye(4), [], []
     home, screws = np.asarray(model.home, float), np.asarray(model.screws, float)
-    for joint, angle in zip(joints, angles, strict=True):
-        kind = model.topology.kinds[joint]
-        pose = pose @ home[joint] @ f64.joint_pose(kind, screws[joint], np.array([angle]))
-        axes.append(pose[:3, :3] @ screws[joint, 3:])
+    for k, joint in enumerate(joints):
+        axis = screws[joint, 3:]
+        # The joints' axes pass through the origins of their frames.
+        pose = pose @ home[joint] @ f64.pose_of(f64.rotation_matrix(axis, angles[k]), np.zeros(3))
+        axes.append(pose[:3, :3] @ axis)
         origins.append(pose[:3, 3])
     place = (pose @ offset)[:3, 3]
-    return place, np.cross(axes, place - np.array(origins)).T
+    return place, xp.cross(xp.stack(axes), place[None] - xp.stack(origins)).T
+
+
+def _least(jacobian, motion):
+    """Of all changes of a finger's angles that move its tip so, the smallest."""
+    return jacobian.T @ numpy_for(jacobian, motion).linalg.solve(jacobian @ jacobian.T, motion)
+
+
+def _reached(model, joints, offset, guess, target):
+    """Angles near a guess with which a fingertip is at its target, by Newton's method."""
+
+    def nearer(angles, _):
+        place, jacobian = _tip(model, joints, offset, angles)
+        return angles + _least(jacobian, target - place), None
+
+    if is_concrete(target):
+        for _ in range(_ROUNDS):
+            guess, _ = nearer(guess, None)
+        return guess
+    # A finger has a joint more than its tip needs: where it ends is decided by all steps, which are differentiated as they are.
+    return jax.lax.scan(nearer, jnp.asarray(guess), None, length=_ROUNDS)[0]
 
 
 def _cube_start(
@@ -58,22 +84,24 @@ def _cube_start(
 ):
     model = robots.allegro()
     quaternion, rotation = _quaternion(turned)
-    position, twist = np.asarray(position, float), np.asarray(twist, float)
-    angles, rates = np.array([_GUESS[int(name[6:-2])] for name in model.joint_names]), np.zeros(model.nv)
+    xp = numpy_for(size, position, turned, twist)
+    rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
+    angles: list[Any] = [_GUESS[int(name[6:-2])] for name in model.joint_names]
+    rates: list[Any] = [0.0] * model.nv
     for name, (point, _) in _PLACES.items():
         joints, offset = _chain(model, name)
         target = position + size / 2 * rotation @ np.asarray(point)
-        for _ in range(_ROUNDS):
-            place, jacobian = _tip(model, joints, offset, angles[joints])
-            angles[joints] += np.linalg.pinv(jacobian) @ (target - place)
-        if not np.linalg.norm(target - place) < 1e-12:
+        reached = _reached(model, joints, offset, np.array([angles[i] for i in joints]), target)
+        place, jacobian = _tip(model, joints, offset, reached)
+        if is_concrete(target) and not np.linalg.norm(target - place) < 1e-12:
             raise ValueError(
                 f"size is {size}, position {position.tolist()}, turned {list(turned)}: {name} cannot reach its place on the "
                 "cube; give a place nearer to the default one"
             )
         velocity = _carried(position, rotation @ twist[:3], rotation @ twist[3:], target)
-        # Of all joint velocities that move the fingertip with the cube, the smallest.
-        rates[joints] = np.linalg.pinv(jacobian) @ velocity
+        moving = _least(jacobian, velocity)
+        for k, i in enumerate(joints):
+            angles[i], rates[i] = reached[k], moving[k]
     # The cube's joint comes last: its name does.
     return jnp.asarray([*angles, *position, *quaternion]), jnp.asarray([*rates, *twist])
 
@@ -102,9 +130,10 @@ def allegro_with_cube(*, size=0.06, mass=0.1, mu=0.8, gravity=9.81) -> Grasp:
 
 
 def _table_start(tilt=0.02, rate=0.0, height=0.025, size=(0.2, 0.16, 0.24)):
-    s, c = np.sin(tilt), np.cos(tilt)
+    xp = numpy_for(tilt)
+    s, c = xp.sin(tilt), xp.cos(tilt)
     center = height + size[2] / 2
-    place = [center * s, 0.0, center * c, np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0]
+    place = [center * s, 0.0, center * c, xp.cos(tilt / 2), 0.0, xp.sin(tilt / 2), 0.0]
     moving = [center * rate, 0.0, 0.0, 0.0, rate, 0.0]
     return jnp.asarray([*place, tilt]), jnp.asarray([*moving, rate])
 
@@ -136,5 +165,5 @@ def box_on_table(
     base = contact("rigid", "table", (0.0, 0.0, -size[2] / 2), finger_pose=(0.0, 0.0, height), name="base")
     half_x, half_y = size[0] / 2, size[1] / 2
     rows = wrench_cone(half_x, half_y, mu)
-    rows = rows.at[4:].divide(max(half_x, half_y))
+    rows = rows.at[4:].divide(numpy_for(size).maximum(half_x, half_y))
     return Grasp(builder.build(), "box", [base], cones=surface_cone(rows))

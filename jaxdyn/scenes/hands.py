@@ -3,9 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import rolling_sphere, rolling_wheel
 from jaxdyn.contact.cones import friction_cone
 from jaxdyn.grasp import Grasp, contact
+from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
@@ -20,18 +22,21 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 def _rates(axes, origins, point, velocity):
     """Rates of revolute joints that give the point of the last link which is now at `point` the velocity."""
-    columns = np.cross(axes, np.asarray(point) - origins)
-    return np.linalg.lstsq(columns.T, velocity, rcond=None)[0]
+    xp = numpy_for(axes, origins, point, velocity)
+    columns = xp.cross(xp.asarray(axes, float), xp.asarray(point, float)[None] - xp.asarray(origins, float))
+    # The columns are independent, and the velocity is one that they can give.
+    return xp.linalg.solve(columns @ columns.T, columns @ xp.asarray(velocity, float))
 
 
 def _carried(position, velocity, omega, point):
     """Velocity of the point of a body that is now at `point`."""
-    return np.asarray(velocity) + np.cross(omega, np.asarray(point) - position)
+    xp = numpy_for(position, velocity, omega, point)
+    position, velocity, omega, point = (xp.asarray(x, float) for x in (position, velocity, omega, point))
+    return velocity + xp.cross(omega, point - position)
 
 
 def _turn(angle):
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return f64.rotation_matrix((0.0, 0.0, 1.0), angle)
 
 
 def _cones(mu, kind="hard-finger", in_plane=False):
@@ -56,29 +61,32 @@ def _planar_hand(name, links, masses, palm, gravity):
 
 def _planar_object(center, angle, velocity):
     """Position, and the velocity in the plane's axes, of an object with body velocity (vx, vy, w)."""
-    position = np.array([*center, 0.0])
-    linear = _turn(angle) @ np.array([velocity[0], velocity[1], 0.0])
-    return position, linear, np.array([0.0, 0.0, velocity[2]])
+    xp = numpy_for(center, angle, velocity)
+    linear = _turn(angle) @ xp.asarray([velocity[0], velocity[1], 0.0])
+    return xp.asarray([*center, 0.0]), linear, xp.asarray([0.0, 0.0, velocity[2]])
 
 
 def _planar_state(fingers, center, angle, velocity):
     """q and v: `fingers` has base, knee, fingertip and point of contact of each, `velocity` is that of the object."""
+    xp = numpy_for(fingers, center, angle, velocity)
     moving = _planar_object(center, angle, velocity)
     q, v = [], []
     for base, knee, tip, point in fingers:
-        low, high = (np.arctan2(*(b - a)[1::-1]) for a, b in ((base, knee), (knee, tip)))
+        low, high = (xp.arctan2(*(b - a)[1::-1]) for a, b in ((base, knee), (knee, tip)))
         q += [low, high - low]
-        v += [*_rates(np.stack([_UP, _UP]), np.stack([base, knee]), point, _carried(*moving, point))]
+        axes, origins = np.stack([_UP, _UP]), xp.stack([base, knee])
+        v += [*_rates(axes, origins, point, _carried(*moving, point))]
     return jnp.asarray([*q, *center, angle]), jnp.asarray([*v, *velocity])
 
 
 def _bar_start(center=(0.02, 0.38), angle=0.1, velocity=(0.2, -0.1, 0.5), links=_LINKS, palm=_PALM, length=0.3):
-    along = _turn(angle)[:, 0]
+    xp = numpy_for(center, angle, links, palm, length)
+    along = xp.asarray(_turn(angle))[:, 0]
     fingers = []
     for side in (-1.0, 1.0):
-        base, tip = np.array([side * palm / 2, 0.0, 0.0]), np.array([*center, 0.0]) + side * length / 2 * along
+        base, tip = xp.asarray([side * palm / 2, 0.0, 0.0]), xp.asarray([*center, 0.0]) + side * length / 2 * along
         ends = (base[:2], links[0], tip[:2], links[1])
-        knee = np.array([*(_circles(*ends) if side < 0 else _circles(*ends[2:], *ends[:2])), 0.0])
+        knee = xp.asarray([*(_circles(*ends) if side < 0 else _circles(*ends[2:], *ends[:2])), 0.0])
         fingers.append((base, knee, tip, tip))
     return _planar_state(fingers, center, angle, velocity)
 
@@ -101,9 +109,8 @@ def hand_with_bar(
     builder.add_body("bar", None, "planar", inertia.rod(mass, length), joint_name="object")
     contacts = []
     for i, side in ((1, -1.0), (2, 1.0)):
-        pose = np.eye(4)
-        pose[:3, :3] = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -side], [-side, 0.0, 0.0]]).T
-        pose[0, 3] = side * length / 2
+        turned = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -side], [-side, 0.0, 0.0]]).T
+        pose = f64.pose_of(turned, (side * length / 2, 0.0, 0.0))
         contacts.append(contact(kind, f"tip{i}", pose, in_plane=True))
     return Grasp(builder.build(), "bar", contacts, cones=_cones(mu, kind, in_plane=True))
 
@@ -116,15 +123,16 @@ def _disk_start(
     palm=_PALM,
     radius=0.1,
 ):
+    xp = numpy_for(center, tilts, links, palm, radius)
     fingers = []
     for side, tilt in zip((-1.0, 1.0), tilts, strict=True):
-        base = np.array([side * palm / 2, 0.0, 0.0])
-        along = _turn(tilt)[:, 1]
-        point = np.array([*center, 0.0]) + side * radius * _turn(tilt)[:, 0]
+        base, turned = xp.asarray([side * palm / 2, 0.0, 0.0]), xp.asarray(_turn(tilt))
+        along = turned[:, 1]
+        point = xp.asarray([*center, 0.0]) + side * radius * turned[:, 0]
         # The knee is at the distance of the first link from the base, on the line of the face.
-        way = point - base
-        reach = way @ along
-        knee = point - (reach - np.sqrt(reach**2 - way @ way + links[0] ** 2)) * along
+        to_point = point - base
+        reach = to_point @ along
+        knee = point - (reach - xp.sqrt(reach**2 - to_point @ to_point + links[0] ** 2)) * along
         fingers.append((base, knee, knee + links[1] * along, point))
     return _planar_state(fingers, center, 0.0, velocity)
 
@@ -159,10 +167,7 @@ def _directions(count=3):
 
 def _base(direction, circle):
     """Pose of a finger's base: z up, x to the axis."""
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([-direction, -np.cross(_UP, direction), _UP], 1)
-    pose[:3, 3] = circle * direction
-    return pose
+    return f64.pose_of(np.stack([-direction, -np.cross(_UP, direction), _UP], 1), circle * direction)
 
 
 def _spatial_hand(name, links, masses, circle, gravity):
@@ -181,28 +186,39 @@ def _spatial_hand(name, links, masses, circle, gravity):
 
 def _spatial_finger(base, links, tip, point, velocity):
     """Angles, and rates that give the point of the last link at `point` the velocity, of a finger that reaches `tip`."""
+    xp = numpy_for(base, links, tip, point, velocity)
+    base, tip = xp.asarray(base, float), xp.asarray(tip, float)
     local = base[:3, :3].T @ (tip - base[:3, 3])
-    yaw, reach = np.arctan2(local[1], local[0]), np.hypot(local[0], local[1])
-    ahead = base[:3, :3] @ _turn(yaw)
-    knee = _circles((0.0, 0.0), links[0], (reach, local[2]), links[1])
-    low, high = np.arctan2(knee[1], knee[0]), np.arctan2(local[2] - knee[1], reach - knee[0])
-    elbow = base[:3, 3] + knee[0] * ahead[:, 0] + knee[1] * _UP
-    axes, origins = np.stack([_UP, -ahead[:, 1], -ahead[:, 1]]), np.stack([base[:3, 3], base[:3, 3], elbow])
+    yaw, reach = xp.arctan2(local[1], local[0]), xp.hypot(local[0], local[1])
+    ahead = base[:3, :3] @ xp.asarray(_turn(yaw))
+    knee = xp.asarray(_circles((0.0, 0.0), links[0], (reach, local[2]), links[1]))
+    low, high = xp.arctan2(knee[1], knee[0]), xp.arctan2(local[2] - knee[1], reach - knee[0])
+    elbow = base[:3, 3] + knee[0] * ahead[:, 0] + knee[1] * xp.asarray(_UP)
+    axes = xp.stack([xp.asarray(_UP), -ahead[:, 1], -ahead[:, 1]])
+    origins = xp.stack([base[:3, 3], base[:3, 3], elbow])
     return [yaw, low, high - low], _rates(axes, origins, point, velocity)
 
 
 def _quaternion(turned):
     """Unit quaternion and matrix of a rotation vector."""
-    angle = np.linalg.norm(turned)
-    w, x, y, z = np.cos(angle / 2), *(np.sinc(angle / 2 / np.pi) / 2 * np.asarray(turned))
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return [w, x, y, z], np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    xp = numpy_for(turned)
+    turned = xp.asarray(turned, float)
+    square = turned @ turned
+    # sin(a/2)/a, whose derivatives at a = 0 are those of the series.
+    small = square < 1e-6
+    angle = xp.sqrt(xp.where(small, 1.0, square))
+    factor = xp.where(small, 0.5 - square / 48 + square**2 / 3840, xp.sin(angle / 2) / angle)
+    w = xp.where(small, 1 - square / 8 + square**2 / 384, xp.cos(angle / 2))
+    x, y, z = factor * turned
+    cross = f64.hat(xp.stack([x, y, z]))
+    return [w, x, y, z], xp.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
 def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
     """q and v: fingertips at `reach` (m) from the ball's centre, in directions fixed in the ball or in the world."""
     quaternion, rotation = _quaternion(turned)
-    position, twist = np.asarray(position, float), np.asarray(twist, float)
+    xp = numpy_for(position, turned, twist, circle, reach, radius)
+    rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
     moving = position, rotation @ twist[:3], rotation @ twist[3:]
     q, v = [], []
     for direction in _directions():
@@ -239,9 +255,8 @@ def hand_with_ball(
     builder.add_body("ball", None, "free", inertia.sphere(mass, radius), joint_name="object")
     contacts = []
     for i, direction in enumerate(_directions(), 1):
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([np.cross(_UP, -direction), _UP, -direction], 1)
-        pose[:3, 3] = radius * direction
+        turned = np.stack([np.cross(_UP, -direction), _UP, -direction], 1)
+        pose = f64.pose_of(turned, radius * direction)
         contacts.append(contact("hard-finger", f"tip{i}", pose))
     return Grasp(builder.build(), "ball", contacts, cones=_cones(mu))
 

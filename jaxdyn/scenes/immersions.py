@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import is_concrete
 from jaxdyn.constraints import loop
 from jaxdyn.geometry.immersion import constrain_by_immersion
 from jaxdyn.model.builder import ModelBuilder
@@ -86,7 +87,7 @@ def _by_model(masses, length, reaches, moments, gravity):
 
 
 def _by_loop(masses, length, reaches, moments, gravity):
-    if not moments[1] > 0:
+    if is_concrete(moments) and not moments[1] > 0:
         raise ValueError(
             f"moments is {moments}; a free body needs a moment of inertia, so that formulation='loop' takes moments[1] > 0"
         )

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import numpy_for
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.inertia import box, displaced
@@ -201,7 +202,8 @@ def free_box(*, mass=1.0, size=(0.3, 0.2, 0.1), frame=None, gravity=None) -> Sce
     """
     numbers = box(mass, size)
     if frame is not None:
-        rotation, place = np.asarray(frame, float)[:3, :3], np.asarray(frame, float)[:3, 3]
+        frame = numpy_for(frame).asarray(frame, float)
+        rotation, place = frame[:3, :3], frame[:3, 3]
         numbers = displaced(numbers, -rotation.T @ place, rotation.T)
     builder = ModelBuilder("box", gravity=None if gravity is None else (0.0, 0.0, -gravity))
     return Scene(builder.add_body("box", None, "free", numbers).build())

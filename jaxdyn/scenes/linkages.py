@@ -5,6 +5,7 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import loop
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
@@ -21,25 +22,43 @@ def thin_bar(mass, length):
 
 def _circles(center, radius, other, reach):
     """The intersection of two circles that lies to the left of the way from the first centre to the second."""
-    way = np.asarray(other, float) - center
-    apart = np.hypot(*way)
-    along = (radius**2 - reach**2 + apart**2) / (2 * apart)
+    xp = numpy_for(center, radius, other, reach)
+    center, other = xp.asarray(center, float), xp.asarray(other, float)
+    direction = other - center
+    distance = xp.sqrt(direction @ direction)
+    along = (radius**2 - reach**2 + distance**2) / (2 * distance)
     square = radius**2 - along**2
-    if square < 0:
-        raise ValueError(f"lengths {radius} and {reach} do not close over {apart:.6g}; no such configuration exists")
-    way = way / apart
-    return np.asarray(center, float) + along * way + np.sqrt(square) * np.array([-way[1], way[0]])
+    if is_concrete(square) and square < 0:
+        raise ValueError(f"lengths {radius} and {reach} do not close over {distance:.6g}; no such configuration exists")
+    direction = direction / distance
+    # Traced lengths that do not close give the nearest configuration, at which constraints are open.
+    height = xp.sqrt(square) if xp is np else jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return center + along * direction + height * xp.stack([-direction[1], direction[0]])
+
+
+def _across(length, angle):
+    """Velocity of the end of a link that turns at one radian per second, (2,)."""
+    xp = numpy_for(length, angle)
+    return length * xp.stack([-xp.sin(angle), xp.cos(angle)])
+
+
+def _solved(one, other, right):
+    """(x, y) with x one + y other = right, in the plane."""
+    determinant = one[0] * other[1] - one[1] * other[0]
+    return (right[0] * other[1] - right[1] * other[0]) / determinant, (
+        one[0] * right[1] - one[1] * right[0]
+    ) / determinant
 
 
 def _four_bar_start(lengths=(1.0, 3.0, 2.5, 3.5), angle=1.0, rate=1.0, in_plane=True):
     crank, coupler, rocker, ground = lengths
-    a = crank * np.array([np.cos(angle), np.sin(angle)])
+    xp = numpy_for(lengths, angle, rate)
+    a = crank * xp.stack([xp.cos(angle), xp.sin(angle)])
     b = _circles(a, coupler, (ground, 0.0), rocker)
-    coupling, rocking = np.arctan2(*(b - a)[::-1]), np.arctan2(b[1], b[0] - ground)
+    coupling, rocking = xp.arctan2(*(b - a)[::-1]), xp.arctan2(b[1], b[0] - ground)
     # Velocities of B as carried by the coupler and by the rocker agree.
-    turn = lambda length, at: length * np.array([-np.sin(at), np.cos(at)])  # noqa: E731
-    rates = np.linalg.solve(np.stack([turn(coupler, coupling), -turn(rocker, rocking)], 1), -rate * turn(crank, angle))
-    return jnp.asarray([angle, coupling - angle, rocking]), jnp.asarray([rate, rates[0] - rate, rates[1]])
+    first, second = _solved(_across(coupler, coupling), -_across(rocker, rocking), -rate * _across(crank, angle))
+    return jnp.asarray([angle, coupling - angle, rocking]), jnp.asarray([rate, first - rate, second])
 
 
 @named(_four_bar_start)
@@ -62,10 +81,11 @@ def four_bar(*, lengths=(1.0, 3.0, 2.5, 3.5), masses=(1.0, 3.0, 2.5), gravity=_D
 
 
 def _slider_crank_start(crank=1.0, rod=2.5, angle=1.0, rate=1.0):
-    lean = -np.arcsin(crank * np.sin(angle) / rod)
-    leaning = -crank * np.cos(angle) * rate / (rod * np.cos(lean))
-    place = crank * np.cos(angle) + rod * np.cos(lean)
-    sliding = -crank * np.sin(angle) * rate - rod * np.sin(lean) * leaning
+    xp = numpy_for(crank, rod, angle, rate)
+    lean = -xp.arcsin(crank * xp.sin(angle) / rod)
+    leaning = -crank * xp.cos(angle) * rate / (rod * xp.cos(lean))
+    place = crank * xp.cos(angle) + rod * xp.cos(lean)
+    sliding = -crank * xp.sin(angle) * rate - rod * xp.sin(lean) * leaning
     return jnp.asarray([angle, lean - angle, place]), jnp.asarray([rate, leaning - rate, sliding])
 
 
@@ -92,7 +112,7 @@ def _names(count: int) -> tuple[list[str], list[str]]:
 
 def _windows_start(count=2, rate=1.0):
     # Depth-first: each upright but the last one is followed by the coupler that it carries, which does not turn.
-    v = np.array([sign * rate for _ in range(count) for sign in (-1.0, 1.0)] + [-rate])
+    v = [sign * rate for _ in range(count) for sign in (-1.0, 1.0)] + [-rate]
     return jnp.zeros(2 * count + 1), jnp.asarray(v)
 
 
@@ -124,12 +144,13 @@ _BASES = ((0.0, 1.2), (-1.04, -0.6), (1.04, -0.6))
 
 
 def _parallel_start(point=(0.1, 0.05), velocity=(0.3, -0.2), length=1.0, bases=_BASES, elbows=(1, 1, 1)):
+    xp = numpy_for(point, velocity, length, bases)
     q, v = [], []
     for base, elbow in zip(bases, elbows, strict=True):
         a = _circles(base, length, point, length) if elbow > 0 else _circles(point, length, base, length)
-        first, second = (np.arctan2(*(end - start)[::-1]) for start, end in ((base, a), (a, np.asarray(point))))
-        turn = length * np.array([[-np.sin(first), -np.sin(second)], [np.cos(first), np.cos(second)]])
-        rates = np.linalg.solve(turn, velocity)
+        vectors = a - xp.asarray(base, float), xp.asarray(point, float) - a
+        first, second = (xp.arctan2(*vector[::-1]) for vector in vectors)
+        rates = _solved(_across(length, first), _across(length, second), velocity)
         q += [first, second - first]
         v += [rates[0], rates[1] - rates[0]]
     return jnp.asarray(q), jnp.asarray(v)
@@ -157,7 +178,7 @@ def parallel_manipulator(*, length=1.0, bases=_BASES, mass=1.0, gravity=None) ->
 
 
 def _ring_start(count=6, length=1.0, rate=1.0):
-    middle = length / 2 * np.array([1.0, 1 / np.tan(np.pi / count)])
+    middle = length / 2, length / 2 / np.tan(np.pi / count)
     q = [-middle[0], -middle[1], 0.0, *[2 * np.pi / count] * (count - 1)]
     return jnp.asarray(q), jnp.asarray([rate * middle[1], -rate * middle[0], rate, *[0.0] * (count - 1)])
 

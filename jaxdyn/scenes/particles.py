@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Holonomic
 from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -30,8 +31,8 @@ def _scene(dimension: int, mass, length, gravity) -> Scene:
 
 
 def _plane_start(length=1.0, angle=-np.pi / 2, rate=0.0):
-    direction = jnp.asarray([np.sin(angle), -np.cos(angle)])
-    return length * direction, length * rate * jnp.asarray([np.cos(angle), np.sin(angle)])
+    s, c = numpy_for(angle).sin(angle), numpy_for(angle).cos(angle)
+    return length * jnp.asarray([s, -c]), length * rate * jnp.asarray([c, s])
 
 
 @named(_plane_start)
@@ -47,10 +48,11 @@ def pendulum_in_plane(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
 
 
 def _sphere_start(length=1.0, theta=1.0, phi=0.0, theta_rate=0.0, phi_rate=1.0):
-    s, c, sp, cp = np.sin(theta), np.cos(theta), np.sin(phi), np.cos(phi)
+    xp = numpy_for(theta, phi)
+    s, c, sp, cp = xp.sin(theta), xp.cos(theta), xp.sin(phi), xp.cos(phi)
     q = length * jnp.asarray([s * cp, s * sp, -c])
-    along = theta_rate * np.array([c * cp, c * sp, s]) + phi_rate * s * np.array([-sp, cp, 0.0])
-    return q, length * jnp.asarray(along)
+    along = theta_rate * jnp.asarray([c * cp, c * sp, s]) + phi_rate * s * jnp.asarray([-sp, cp, 0.0])
+    return q, length * along
 
 
 @named(_sphere_start)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
@@ -33,7 +34,8 @@ def _disk(q, v, t, p):
 
 
 def _disk_start(radius=0.5, heading=0.0, steering=1.0, rolling=2.0):
-    c, s = np.cos(heading), np.sin(heading)
+    xp = numpy_for(heading)
+    c, s = xp.cos(heading), xp.sin(heading)
     speed = radius * rolling
     return jnp.asarray([0.0, 0.0, heading, 0.0]), jnp.asarray([speed * c, speed * s, steering, rolling])
 
@@ -84,21 +86,23 @@ def knife_edge_on_incline(*, mass=1.0, moment=0.2, slope=np.pi / 6, gravity=9.81
 
     Source: Bloch (2003), section 1.6.
     """
-    pull = (gravity * np.sin(slope), 0.0, -gravity * np.cos(slope))
+    xp = numpy_for(slope)
+    pull = (gravity * xp.sin(slope), 0.0, -gravity * xp.cos(slope))
     builder = ModelBuilder("skate", gravity=pull)
     builder.add_body("skate", None, "planar", (mass, (0.0, 0.0, 0.0), (0.0, 0.0, moment)))
     return Scene(builder.build(), (knife_edge("skate", contact=False, name="blade"),))
 
 
 def _coin_start(radius=0.05, circle=0.5, lean=np.pi / 36, gravity=9.81):
+    xp = numpy_for(radius, circle, lean, gravity)
     rho = radius / circle
-    sine, cosine = np.sin(lean), np.cos(lean)
-    spin = np.sqrt(4 * gravity / radius * sine / ((6 - 5 * rho * sine) * rho * cosine))
+    sine, cosine = xp.sin(lean), xp.cos(lean)
+    spin = xp.sqrt(4 * gravity / radius * sine / ((6 - 5 * rho * sine) * rho * cosine))
     turn = -rho * spin
     # The circle is about the world's z axis. Body x is horizontal, y the axle, z points up in the disk, to the axis.
-    turned = np.array([np.cos(lean / 2), np.sin(lean / 2), 0.0, 0.0])
-    center = np.array([0.0, circle - radius * sine, radius * cosine])
-    omega = np.array([0.0, turn * sine + spin, turn * cosine])
+    turned = (xp.cos(lean / 2), xp.sin(lean / 2), 0.0, 0.0)
+    center = (0.0, circle - radius * sine, radius * cosine)
+    omega = (0.0, turn * sine + spin, turn * cosine)
     forward = -turn * (circle - radius * sine)
     return jnp.asarray([*center, *turned]), jnp.asarray([forward, 0.0, 0.0, *omega])
 
@@ -111,9 +115,9 @@ def rolling_coin(*, mass=0.3048, radius=0.05, gravity=9.81) -> Scene:
 
     Source: Le Saux, Leine & Glocker (2005), eqs 5.10-5.12.
     """
-    moments = np.array([0.25, 0.5, 0.25]) * mass * radius**2
+    moments = [share * mass * radius**2 for share in (0.25, 0.5, 0.25)]
     builder = ModelBuilder("coin", gravity=(0.0, 0.0, -gravity))
-    builder.add_body("coin", None, "free", (mass, (0.0, 0.0, 0.0), tuple(moments)))
+    builder.add_body("coin", None, "free", (mass, (0.0, 0.0, 0.0), moments))
     axle = (np.zeros(3), (-np.pi / 2, 0.0, 0.0))  # z of the wheel along y of the body
     return Scene(builder.build(), (rolling_wheel("coin", axle, radius, name="rim"),))
 
@@ -141,7 +145,7 @@ def suslov(*, moments=(1.0, 1.5, 2.0), product=0.4) -> Scene:
     Source: Garcia-Naranjo & Jimenez (2017), The geometric discretisation of the Suslov problem.
     """
     xx, yy, zz = moments
-    tensor = np.array([[xx, 0.0, product], [0.0, yy, 0.0], [product, 0.0, zz]])
+    tensor = [[xx, 0.0, product], [0.0, yy, 0.0], [product, 0.0, zz]]
     builder = ModelBuilder("Suslov body", gravity=None)
     builder.add_body("body", None, "spherical", (1.0, (0.0, 0.0, 0.0), tensor))
     return Scene(builder.build(), (Pfaffian(_NoTurn(), name="no turn about z"),))

@@ -1,10 +1,13 @@
 """Hands whose fingertips roll on the object as surfaces do, whatever their shapes."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import numpy_for
 from jaxdyn.contact import Ellipsoid, RollingModel, rolling_contact
 from jaxdyn.grasp import Grasp
+from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
 from jaxdyn.scenes._named import named
 from jaxdyn.scenes.hands import (
@@ -17,6 +20,7 @@ from jaxdyn.scenes.hands import (
     _quaternion,
     _spatial_finger,
     _spatial_hand,
+    _turn,
 )
 
 _EGG = (0.1, 0.09, 0.11)
@@ -26,21 +30,31 @@ _ROUNDS = 60
 
 def _support(semi_axes, normal):
     """Point of an ellipsoid where the outward normal is the given one."""
-    scaled = np.asarray(semi_axes) * normal
-    return np.asarray(semi_axes) * scaled / np.linalg.norm(scaled)
+    xp = numpy_for(semi_axes, normal)
+    semi_axes, normal = xp.asarray(semi_axes, float), xp.asarray(normal, float)
+    scaled = semi_axes * normal
+    return semi_axes * scaled / xp.sqrt(scaled @ scaled)
 
 
 def _held(base, links, tip_axes, point, normal, velocity):
     """Angles and rates of a finger whose tip, an ellipsoid, touches a point with an outward normal and moves with it."""
-    center = point + np.max(tip_axes) * normal
-    for _ in range(_ROUNDS):
+    xp = numpy_for(base, links, tip_axes, point, normal, velocity)
+    base, tip_axes, point, normal, velocity = (xp.asarray(x, float) for x in (base, tip_axes, point, normal, velocity))
+
+    def around(center):
         (yaw, low, bend), rates = _spatial_finger(base, links, center, point, velocity)
-        up = low + bend
-        about = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-        pitch = np.array([[np.cos(up), 0.0, -np.sin(up)], [0.0, 1.0, 0.0], [np.sin(up), 0.0, np.cos(up)]])
-        turned = base[:3, :3] @ about @ pitch
-        center = point - turned @ _support(tip_axes, -turned.T @ normal)
-    return [yaw, low, bend], rates
+        pitch = f64.rotation_matrix((0.0, -1.0, 0.0), low + bend)
+        turned = base[:3, :3] @ xp.asarray(_turn(yaw)) @ xp.asarray(pitch)
+        return point - turned @ _support(tip_axes, -turned.T @ normal), ([yaw, low, bend], rates)
+
+    center = point + xp.max(tip_axes) * normal
+    if xp is np:
+        for _ in range(_ROUNDS):
+            center, turn = around(center)
+        return turn
+    # The derivatives of each round are those of the round before, shrunk: the loop is differentiated as it is.
+    center = jax.lax.scan(lambda at, _: (around(at)[0], None), center, None, length=_ROUNDS - 1)[0]
+    return around(center)[1]
 
 
 def _egg_start(
@@ -53,11 +67,12 @@ def _egg_start(
     tip_semi_axes=_TIP,
 ):
     quaternion, rotation = _quaternion(turned)
-    position, twist = np.asarray(position, float), np.asarray(twist, float)
+    xp = numpy_for(position, turned, twist, links, circle, semi_axes, tip_semi_axes)
+    rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
     moving = position, rotation @ twist[:3], rotation @ twist[3:]
     q, v = [], []
     for direction in _directions():
-        normal = direction
+        normal = xp.asarray(direction)
         point = position + rotation @ _support(semi_axes, rotation.T @ normal)
         velocity = _carried(*moving, point)
         angles, rates = _held(_base(direction, circle), links, tip_semi_axes, point, normal, velocity)
@@ -89,7 +104,7 @@ def hand_rolling_egg(
     Source: Montana (1988); Murray, Li & Sastry (1994), sections 5.6 and 6.3; EQUATIONS sections 8 and 10.
     """
     builder = _spatial_hand("hand rolling an egg", links, masses, circle, gravity)
-    builder.add_body("egg", None, "free", inertia.ellipsoid(mass, np.asarray(semi_axes, float)), joint_name="object")
+    builder.add_body("egg", None, "free", inertia.ellipsoid(mass, semi_axes), joint_name="object")
     egg, tip = Ellipsoid(semi_axes), Ellipsoid(tip_semi_axes)
     contacts = [rolling_contact(f"tip{i}", tip, "egg", egg, name=f"finger{i}") for i in (1, 2, 3)]
     system = RollingModel(builder.build(), contacts)

@@ -1,9 +1,10 @@
 """Linkages in space that move although counting their joints says that they cannot."""
 
 import jax.numpy as jnp
-import numpy as np
 
+from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import loop
+from jaxdyn.model import float64 as f64
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.scenes.linkages import thin_bar
@@ -12,26 +13,27 @@ from jaxdyn.systems.scene import Scene
 
 def _link(length, twist):
     """Pose of a link's end in its beginning: along x by the length, then turned about x by the twist."""
-    c, s = np.cos(twist), np.sin(twist)
-    return np.array([[1.0, 0.0, 0.0, length], [0.0, c, -s, 0.0], [0.0, s, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    return f64.pose_of(f64.rotation_matrix((1.0, 0.0, 0.0), twist), (length, 0.0, 0.0))
 
 
 def _second(length, twist, other):
     """Twist of the links of the length `other` that lets the linkage move: a/sin(alpha) = b/sin(beta)."""
-    sine = other * np.sin(twist) / length
-    if abs(sine) >= 1:
+    xp = numpy_for(length, twist, other)
+    sine = other * xp.sin(twist) / length
+    if is_concrete(sine) and abs(sine) >= 1:
         raise ValueError(
             f"lengths {length} and {other} with twist {twist} make no Bennett linkage; sin(beta) is {sine:.4g}"
         )
-    return np.arcsin(sine)
+    return xp.arcsin(sine)
 
 
 def _bennett_start(lengths=(1.0, 0.7), twist=1.1, angle=0.8, rate=1.0):
     first, second = twist, _second(lengths[0], twist, lengths[1])
+    xp = numpy_for(lengths, twist, angle, rate)
     # tan(q1/2) tan(q2/2) = k, and q3 = -q1 up to a turn.
-    k = np.sin((second + first) / 2) / np.sin((second - first) / 2)
-    follower = 2 * np.arctan2(k, np.tan(angle / 2))
-    following = -rate * np.sin(follower) / np.sin(angle)
+    k = xp.sin((second + first) / 2) / xp.sin((second - first) / 2)
+    follower = 2 * xp.arctan2(k, xp.tan(angle / 2))
+    following = -rate * xp.sin(follower) / xp.sin(angle)
     return jnp.asarray([angle, follower, -angle]), jnp.asarray([rate, following, -rate])
 
 
@@ -55,4 +57,4 @@ def bennett(*, lengths=(1.0, 0.7), twist=1.1, mass=1.0, gravity=(0.0, 0.0, -9.81
     builder.add_body("link1", None, "continuous", bars[0])
     builder.add_body("link2", "link1", "continuous", bars[1], pose=poses[0])
     builder.add_body("link3", "link2", "continuous", bars[0], pose=poses[1])
-    return Scene(builder.build(), (loop("link3", poses[0], None, np.linalg.inv(poses[1]), name="fourth joint"),))
+    return Scene(builder.build(), (loop("link3", poses[0], None, f64.inverse(poses[1]), name="fourth joint"),))

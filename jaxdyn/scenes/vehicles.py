@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import knife_edge, rolling_wheel
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
@@ -22,7 +23,7 @@ def _bicycle_start(
     front_radius=0.35,
 ):
     # The steer axis points down, so steering turns the front wheel's contact, behind the axis, to the left.
-    yaw_rate = -trail * np.cos(tilt) / wheel_base * steer_rate
+    yaw_rate = -trail * numpy_for(tilt).cos(tilt) / wheel_base * steer_rate
     q = [0.0, 0.0, rear_radius, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     v = [speed, -rear_radius * roll_rate, 0.0, roll_rate, 0.0, yaw_rate]
     return jnp.asarray(q), jnp.asarray([*v, speed / rear_radius, steer_rate, speed / front_radius])
@@ -57,15 +58,16 @@ def bicycle(
 
     Source: Meijaard, Papadopoulos, Ruina & Schwab (2007), table 1; there z points down.
     """
-    hub = np.array([0.0, 0.0, rear_radius])
-    axis = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
+    xp = numpy_for(wheel_base, trail, tilt, rear_radius, front_radius, rear_frame, front_frame)
+    hub = xp.asarray([0.0, 0.0, rear_radius])
+    axis = xp.asarray([xp.sin(tilt), 0.0, -xp.cos(tilt)])
     # A point of the steer axis close to the front wheel: its foot on the ground, moved up to the height of the axle.
-    head = np.array([wheel_base + trail, 0.0, 0.0]) - front_radius / np.cos(tilt) * axis
-    axle = np.array([wheel_base, 0.0, front_radius])
+    head = xp.asarray([wheel_base + trail, 0.0, 0.0]) - front_radius / xp.cos(tilt) * axis
+    axle = xp.asarray([wheel_base, 0.0, front_radius])
 
     def frame(numbers, origin):
         mass, center, (xx, yy, zz, xz) = numbers
-        return mass, np.asarray(center) - origin, np.array([[xx, 0, xz], [0, yy, 0], [xz, 0, zz]])
+        return mass, xp.asarray(center, float) - origin, [[xx, 0.0, xz], [0.0, yy, 0.0], [xz, 0.0, zz]]
 
     def wheel(numbers):
         mass, moments = numbers
@@ -87,8 +89,8 @@ def bicycle(
 
 
 def _drive_start(speed=0.5, yaw_rate=0.4, radius=0.1, half_track=0.25):
-    apart = yaw_rate * half_track
-    spins = [(speed - apart) / radius, (speed + apart) / radius]
+    speed_difference = yaw_rate * half_track
+    spins = [(speed - speed_difference) / radius, (speed + speed_difference) / radius]
     return jnp.zeros(5), jnp.asarray([speed, 0.0, yaw_rate, *spins])
 
 
@@ -125,9 +127,15 @@ def differential_drive(*, mass=8.0, moment=0.3, offset=0.05, wheel_mass=0.5, rad
 
 
 def _car_start(speed=2.0, steer=0.2, steer_rate=0.0, radius=0.15, half_track=0.4, wheel_base=1.2):
-    yaw_rate = speed * np.tan(steer) / wheel_base
-    apart = yaw_rate * half_track
-    spins = [(speed - apart) / radius, (speed + apart) / radius, steer_rate, speed / np.cos(steer) / radius]
+    xp = numpy_for(steer)
+    yaw_rate = speed * xp.tan(steer) / wheel_base
+    speed_difference = yaw_rate * half_track
+    spins = [
+        (speed - speed_difference) / radius,
+        (speed + speed_difference) / radius,
+        steer_rate,
+        speed / xp.cos(steer) / radius,
+    ]
     return jnp.asarray([0.0, 0.0, 0.0, 0.0, 0.0, steer, 0.0]), jnp.asarray([speed, 0.0, yaw_rate, *spins])
 
 
@@ -172,7 +180,7 @@ def car(
 
 
 def _snakeboard_start(speed=1.0, angles=(0.3, -0.2), rates=(0.0, 0.0), rotor_rate=1.0, half_length=0.3):
-    front, back = np.tan(angles)
+    front, back = (numpy_for(angle).tan(angle) for angle in angles)
     sideways, yaw_rate = speed * (front + back) / 2, speed * (front - back) / (2 * half_length)
     return jnp.asarray([0.0, 0.0, 0.0, *angles, 0.0]), jnp.asarray([speed, sideways, yaw_rate, *rates, rotor_rate])
 
@@ -199,8 +207,7 @@ def snakeboard(*, mass=6.0, moment=0.1, rotor_moment=0.16, truck_moment=0.02, ha
 
     builder = ModelBuilder("snakeboard", gravity=None)
     builder.add_body("board", None, "planar", (mass, (0.0, 0.0, 0.0), (0.0, 0.0, moment)))
-    for name, place in (("front truck", half_length), ("back truck", -half_length)):
-        joint = "1 front" if place > 0 else "2 back"
+    for name, joint, place in (("front truck", "1 front", half_length), ("back truck", "2 back", -half_length)):
         builder.add_body(name, "board", "continuous", turning(truck_moment), pose=(place, 0.0, 0.0), joint_name=joint)
     builder.add_body("rotor", "board", "continuous", turning(rotor_moment), joint_name="3 rotor")
     blades = [knife_edge(name, contact=False) for name in ("front truck", "back truck")]

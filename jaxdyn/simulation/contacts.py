@@ -1,6 +1,6 @@
 """Contacts during a motion: their forces as outputs, and where one of them pulls or leaves its cone, which ends the motion.
 
-The rows of a contact are two-sided; what its cone says about the multipliers is tested on the way. Let m(t) be the least
+The rows of a contact are two-sided; whether its cone admits the multipliers is tested during the motion. Let m(t) be the least
 margin of all contacts (`FrictionCone.margin`). The motion ends at the first zero of m that a step or a save point shows, found
 by bisection of the step's dense output. A cone that is entered and left within one step is not seen.
 """
@@ -44,9 +44,11 @@ def can_end(scene: Scene, contacts: str) -> bool:
 
 def allowances(scene: Scene, multipliers: Float[Array, " nc"]) -> Float[Array, " k"]:
     """Margin of each contact with a cone, plus the rounding of its force, eps^(1/2) |f|; N. Negative where it is lost."""
-    found = contact_forces(scene, multipliers)
+    contacts = contact_forces(scene, multipliers)
     slack = jnp.finfo(multipliers.dtype).eps ** 0.5
-    return jnp.stack([found.margins[name] + slack * jnp.sum(jnp.abs(found.forces[name])) for name in found.margins])
+    return jnp.stack(
+        [contacts.margins[name] + slack * jnp.sum(jnp.abs(contacts.forces[name])) for name in contacts.margins]
+    )
 
 
 class Loss(NamedTuple):
@@ -64,15 +66,15 @@ def first_loss(rows: Float[Array, "nt k"], reached, ts, within) -> Loss:
     """
     below = reached & (rows < 0).any(1)
     first = jnp.argmax(below)
-    found = Loss(below.any(), ts[first], jnp.argmin(rows[first]).astype(jnp.int32))
+    loss = Loss(below.any(), ts[first], jnp.argmin(rows[first]).astype(jnp.int32))
     if within is not None:
         happened, time, margins = within
-        # A basis that no longer serves may have ended the step too: then no margin is near zero.
+        # A singular basis may have ended the step too: then no margin is near zero.
         happened = happened & (jnp.min(margins) <= jnp.finfo(rows.dtype).eps ** 0.25 * (1 + jnp.max(jnp.abs(margins))))
         located = Loss(happened, time, jnp.argmin(margins).astype(jnp.int32))
-        earlier = happened & ~(found.happened & (found.time <= time))
-        found = jax.tree.map(lambda a, b: jnp.where(earlier, a, b), located, found)
-    return found._replace(entry=jnp.where(found.happened, found.entry, -1))
+        earlier = happened & ~(loss.happened & (loss.time <= time))
+        loss = jax.tree.map(lambda a, b: jnp.where(earlier, a, b), located, loss)
+    return loss._replace(entry=jnp.where(loss.happened, loss.entry, -1))
 
 
 def event(allowance, basis, start, dtype) -> diffrax.Event:
@@ -92,8 +94,10 @@ def reported(scene: Scene, multipliers: Float[Array, " nc"], outputs) -> dict[st
     """The outputs that are asked for, each by the contacts' names."""
     if not set(OUTPUTS) & set(outputs):
         return {}
-    found = contact_forces(scene, multipliers)
-    return {name: value for name, value in zip(OUTPUTS, (found.forces, found.margins), strict=True) if name in outputs}
+    contacts = contact_forces(scene, multipliers)
+    return {
+        name: value for name, value in zip(OUTPUTS, (contacts.forces, contacts.margins), strict=True) if name in outputs
+    }
 
 
 class Bisection(optimistix.Bisection):

@@ -27,7 +27,7 @@ from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.systems.scene import Scene, as_pytree, check_callback, checked_force
 
 STATE, HELD = "control", "held"
@@ -105,13 +105,13 @@ class Sampled(eqx.Module):
     state: Any
     period: Array
 
-    def __init__(self, law: Any, state: Any, period: Any):
+    def __init__(self, law: Any, state: Any, period: Numbers):
         self.law = as_pytree(law, "Sampled: law")
         self.state = jax.tree.map(lambda x: jnp.asarray(as_array(x, "Sampled: state")), state)
-        found = as_array(period, "Sampled: period")
-        if found.shape != () or not (isinstance(found, Tracer) or 0 < float(found) < np.inf):
+        seconds = as_array(period, "Sampled: period")
+        if seconds.shape != () or not (isinstance(seconds, Tracer) or 0 < float(seconds) < np.inf):
             raise ValueError(f"Sampled: period is {period!r}; give one positive number (s)")
-        self.period = jnp.asarray(found, float)
+        self.period = jnp.asarray(seconds, float)
 
     def called(self, q, v, t, state) -> tuple[Array, Any]:
         """The torque and the next state."""
@@ -159,11 +159,11 @@ def check_control(scene: Scene, control: Any, q, v, t) -> None:
             control.law,
             *(named if control.state is None else ("control.law", "law(q, v, t, state)", q, v, t, control.state)),
         )
-        found = eqx.filter_eval_shape(lambda *args: control.called(*args, _numbers(control.state, q)), q, v, t)  # pyright: ignore[reportCallIssue]
-        if not (isinstance(found, tuple) and len(found) == 2):
-            raise ValueError(f"control.law returned {found!r}; return (tau, state)")
-        checked_force(jnp.zeros(jnp.shape(found[0])), q, scene.nv, "control.law")
-        _check_state(_numbers(control.state, q), found[1], "control.law")
+        returned = eqx.filter_eval_shape(lambda *args: control.called(*args, _numbers(control.state, q)), q, v, t)  # pyright: ignore[reportCallIssue]
+        if not (isinstance(returned, tuple) and len(returned) == 2):
+            raise ValueError(f"control.law returned {returned!r}; return (tau, state)")
+        checked_force(jnp.zeros(jnp.shape(returned[0])), q, scene.nv, "control.law")
+        _check_state(_numbers(control.state, q), returned[1], "control.law")
     elif isinstance(control, Controller):
         state = eqx.filter_eval_shape(control.start, q, v, t)
         state, count = jax.tree.map(lambda x: jnp.zeros(x.shape, q.dtype), state), _count(scene)
@@ -290,7 +290,7 @@ def _held(control: Sampled, held, v):
     return held[0], held[1], held[2 : 2 + n], state
 
 
-def _check_state(state, found, name: str) -> None:
-    shapes = [jax.tree.map(jnp.shape, x) for x in (state, found)]
+def _check_state(state, returned, name: str) -> None:
+    shapes = [jax.tree.map(jnp.shape, x) for x in (state, returned)]
     if shapes[0] != shapes[1]:
         raise ValueError(f"{name} returned a state of shapes {shapes[1]}, expected {shapes[0]}; keep its structure")

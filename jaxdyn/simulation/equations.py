@@ -1,4 +1,4 @@
-"""The differential equation of a run: rates of the state, what is done after a step, what is watched on the way.
+"""The differential equation of a run: rates of the state, the projection after a step, and the margins that end a run.
 
 Functions of a run hold no arrays: what is traced of scene, control and method goes through `args`.
 """
@@ -24,7 +24,7 @@ class Equations(NamedTuple):
     """What diffrax and our own loops integrate.
 
     - `args`: what is traced. `derivative(t, y, args)`, and its two parts for solvers that split it.
-    - `torque(args, y, q, v, t)` of the control and `effort`, which is that plus the scene's forces, (nv,) or None.
+    - `torque(args, y, q, v, t)` of the control and `generalized_force`, which is that plus the scene's forces, (nv,) or None.
     - `project(t, y, error, args)` after a step; `quality` of the method's basis; `begin`, `advance` for steps of its own.
     - `allowances(args, y, q, v, t)` of contacts, joints and the control, which can end the run;
       `least_allowance(t, y, args)`, or None where nothing can.
@@ -32,7 +32,7 @@ class Equations(NamedTuple):
 
     args: tuple | None
     torque: Callable
-    effort: Callable
+    generalized_force: Callable
     derivative: Callable
     explicit_part: Callable
     implicit_part: Callable
@@ -72,7 +72,7 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
         tau = controls.torque(control, scene, y, q, v, t, multipliers)
         return None if tau is None else scene.limited(tau)
 
-    def effort(args, y, q, v, t):
+    def generalized_force(args, y, q, v, t):
         """Tau plus the scene's forces, or None when there are none."""
         force, tau = given(args)[0].applied_force(q, v, t), torque(args, y, q, v, t)
         return force if tau is None else tau if force is None else tau + force
@@ -82,11 +82,11 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
         scene, control, method = given(args)
         return controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
 
-    # Traced once for all the places where diffrax and differentiation call it, and once for each way in which it is traced.
+    # diffrax and differentiation call it in many places: it is traced once for each mode of `jd.compilation`.
     @functools.partial(jax.jit, static_argnums=0)
-    def traced(way, t, y, args):
+    def traced(mode, t, y, args):
         scene, _, method = given(args)
-        rates, force, v = method.evaluated(scene, y, t, functools.partial(effort, args, y))
+        rates, force, v = method.evaluated(scene, y, t, functools.partial(generalized_force, args, y))
         if added:
             rates = rates | of_control(args, y, retract(system, y["q"]), v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
@@ -98,9 +98,9 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
     def explicit_part(t, y, args):
         """All rates but those of `implicit_part`."""
         scene, _, method = given(args)
-        q, v = method.place(scene, y, t)
+        q, v = method.to_qv(scene, y, t)
         rates = method.rates(scene, y, q, v, t, torque(args, y, q, v, t)) | {"q": jnp.zeros_like(y["q"])}
-        force = effort(args, y, q, v, t) if added or "work" in y else None
+        force = generalized_force(args, y, q, v, t) if added or "work" in y else None
         rates = rates | of_control(args, y, q, v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
 
@@ -108,7 +108,7 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
     def implicit_part(t, y, args):
         """dq/dt = H v, and what the scene's forces add to the rates of velocity, on which they act linearly."""
         scene, _, method = given(args)
-        q, v = method.place(scene, y, t)
+        q, v = method.to_qv(scene, y, t)
         rates = jax.tree.map(jnp.zeros_like, y)
         force = scene.applied_force(q, v, t)
         if force is not None:
@@ -123,7 +123,7 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
         y = method.continued(scene, y, t)
         if controls.HELD in y:
-            y = y | {controls.HELD: controls.sampled(given(args)[1], y[controls.HELD], *method.place(scene, y, t), t)}
+            y = y | {controls.HELD: controls.sampled(given(args)[1], y[controls.HELD], *method.to_qv(scene, y, t), t)}
         return y, error, diffrax.RESULTS.successful
 
     def quality(t, y, args, **_):
@@ -139,28 +139,30 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
     def allowances(args, y, q, v, t):
         """How far the contacts are from being lost, the joints from their limits, and the control from where it ends."""
         scene, control, method = given(args)
-        found = []
+        margins = []
         if by_contacts:
-            found.append(unilateral.allowances(scene, method.multipliers(scene, q, v, t, effort(args, y, q, v, t))))
+            margins.append(
+                unilateral.allowances(scene, method.multipliers(scene, q, v, t, generalized_force(args, y, q, v, t)))
+            )
         if options["limits"] == "stop":
-            found.append(joint_limits.limit_margins(scene.system, q))
+            margins.append(joint_limits.limit_margins(scene.system, q))
         if by_control:
-            found.append(control.allowance(q, v, t)[None])
-        return jnp.concatenate(found)
+            margins.append(control.allowance(q, v, t)[None])
+        return jnp.concatenate(margins)
 
     @jax.jit
     def least_allowance(t, y, args):
         scene, _, method = given(args)
-        q, v = method.place(scene, y, t)
+        q, v = method.to_qv(scene, y, t)
         return jnp.min(allowances(args, y, q, v, t))
 
     @jax.jit
     def advance(t0, t1, y, args, carried):
         scene, _, method = given(args)
-        return method.advance(scene, y, t0, t1, carried, functools.partial(effort, args, y))
+        return method.advance(scene, y, t0, t1, carried, functools.partial(generalized_force, args, y))
 
-    watched = by_contacts or by_control or options["limits"] == "stop"
+    has_margins = by_contacts or by_control or options["limits"] == "stop"
     return Equations(
-        args, torque, effort, derivative, explicit_part, implicit_part, project, quality, begin, advance, allowances,
-        least_allowance if watched else None,
+        args, torque, generalized_force, derivative, explicit_part, implicit_part, project, quality, begin, advance, allowances,
+        least_allowance if has_margins else None,
     )  # fmt: skip

@@ -41,7 +41,7 @@ def traced_signals(solution: Any, scene: Any) -> list[Signal]:
     names = columns_of(scene.system)
     rows = _row_names(scene)
     both = ("position", "velocity")
-    found = [
+    columns = [
         ("q", solution.q, names.q, names.q_units),
         ("v", solution.v, names.v, names.v_units),
         ("a", solution.acceleration, names.v, names.a_units),
@@ -54,9 +54,9 @@ def traced_signals(solution: Any, scene: Any) -> list[Signal]:
     ]
     for name, values in solution.contact_forces.items():
         parts = tuple(str(k + 1) for k in range(np.shape(values)[-1]))
-        found.append((f"contact_force_{name}", values, parts, ("",) * len(parts)))
-    found += [(f"contact_margin_{name}", values, (), ("",)) for name, values in solution.contact_margins.items()]
-    return [Signal(key, x, tuple(n), tuple(u)) for key, x, n, u in found if x is not None]
+        columns.append((f"contact_force_{name}", values, parts, ("",) * len(parts)))
+    columns += [(f"contact_margin_{name}", values, (), ("",)) for name, values in solution.contact_margins.items()]
+    return [Signal(key, x, tuple(n), tuple(u)) for key, x, n, u in columns if x is not None]
 
 
 def _row_names(scene: Scene) -> tuple[str, ...]:
@@ -77,11 +77,11 @@ def times(solution: Any) -> np.ndarray:
 def write_csv(solution: Any, path: str | os.PathLike, scene: Any) -> None:
     """See `Solution.to_csv`."""
     path = _checked(path, ".csv")
-    found, ts = signals(solution, scene), times(solution)
+    columns, ts = signals(solution, scene), times(solution)
     # What reads logs takes joint names where each joint has one number, and else counts.
-    named = found[0].names == found[1].names
+    named = columns[0].names == columns[1].names
     header, arrays = ["t [s]"], []
-    for signal in found:
+    for signal in columns:
         parts = signal.names or ("",)
         arrays.append(signal.values.reshape(-1, len(ts), len(parts)))
         for k, (name, unit) in enumerate(zip(parts, signal.units, strict=True)):

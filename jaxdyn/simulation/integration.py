@@ -1,4 +1,4 @@
-"""The way from a start to the save points: which solver takes the steps, by our own loop or by diffrax's, and how that ended."""
+"""Integration from a start to the save points: the solver, the loop (our own or diffrax's), and the code at the end."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.methods import Reduced, serves
+from jaxdyn.simulation.methods import Reduced, is_regular
 from jaxdyn.simulation.solution import RESULTS, from_diffrax
 from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver, driver
 from jaxdyn.simulation.solvers.choice import is_fixed, progress_meter, stepping
@@ -15,7 +15,7 @@ from jaxdyn.simulation.solvers.differentiable import ROOM, run, run_adaptively
 from jaxdyn.simulation.solvers.driver import Drive
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.first_step import Adaptive
-from jaxdyn.simulation.solvers.fixed_steps import Watched, too_coarse
+from jaxdyn.simulation.solvers.fixed_steps import ErrorMonitoredSteps, too_coarse
 
 
 def integrate(term, project, quality, allowance, method, y0, ts, args, steps, options):
@@ -26,17 +26,17 @@ def integrate(term, project, quality, allowance, method, y0, ts, args, steps, op
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which integrates another vector field
     # Of a method that wraps an explicit one, diffrax says that it is one.
     explicit = isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
-    jumping = (*method.jumping, *({controls.HELD} & set(y0)))
+    step_constants = (*method.step_constants, *({controls.HELD} & set(y0)))
     if explicit and not continuous:
-        solver = ExplicitSteps(solver, project, jumping, method.projects, field=term.vector_field)
+        solver = ExplicitSteps(solver, project, step_constants, method.projects, field=term.vector_field)
     elif project:
-        solver = ProjectedSolver(solver, project, jumping, method.projects)
-    if continuous and isinstance(controller, Watched):
+        solver = ProjectedSolver(solver, project, step_constants, method.projects)
+    if continuous and isinstance(controller, ErrorMonitoredSteps):
         controller = diffrax.ConstantStepSize()  # backwards the state is another one
     event = None
     # Near a singular basis steps become short; a long one may pass it, which the sign shows.
-    watched = isinstance(method, Reduced) and not continuous
-    basis = (lambda t, y, args, **_: _signed(quality(t, y, args))) if watched else None
+    monitors_basis = isinstance(method, Reduced) and not continuous
+    basis = (lambda t, y, args, **_: _signed(quality(t, y, args))) if monitors_basis else None
     if allowance and not continuous:
         event = unilateral.event(allowance, basis, basis and basis(ts[0], y0, args), ts.dtype)
     elif basis:
@@ -55,12 +55,12 @@ def integrate(term, project, quality, allowance, method, y0, ts, args, steps, op
     if explicit and not continuous and not allowance and _is_driven(controller, adjoint, options):
         stepper: Any = solver
         plan = stepper.plan(y0)
-        if watched:
+        if monitors_basis:
             plan = plan._replace(quality=lambda t, y, args: _signed(quality(t, y, args)))
         rows, facts, sums = _drive(plan, stepper, controller, steps, options)(y0, args, ts)
     elif is_fixed(steps[-1]):
         rows, facts, solved = run((y0, args, ts), **how)
-        sums = solved.controller_state[2:] if isinstance(controller, Watched) else None
+        sums = solved.controller_state[2:] if isinstance(controller, ErrorMonitoredSteps) else None
     else:
         rows, facts = run_adaptively((y0, args, ts), how, options["limit_is_given"])
     result, stats, reached, *last = facts
@@ -76,8 +76,8 @@ def integrate(term, project, quality, allowance, method, y0, ts, args, steps, op
 
 
 def _is_driven(controller, adjoint, options) -> bool:
-    """Whether steps are made by a loop of our own: explicit ones, of a control that we know, with nothing shown on the way."""
-    known = type(controller) in (Adaptive, Watched)
+    """Whether steps are made by a loop of our own: explicit ones, with a known control and without a progress meter."""
+    known = type(controller) in (Adaptive, ErrorMonitoredSteps)
     return known and isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) and not options["progress"]
 
 
@@ -92,5 +92,5 @@ def _drive(plan: Plan, solver: ExplicitSteps, controller, steps, options) -> Dri
 
 
 def _signed(quality):
-    """The quality of a basis, of which a change of sign ends the run: zero where it no longer serves."""
-    return jnp.where(serves(quality), quality, jnp.zeros_like(quality))
+    """The quality of a basis, whose change of sign ends the run: zero where the basis is singular."""
+    return jnp.where(is_regular(quality), quality, jnp.zeros_like(quality))

@@ -24,6 +24,7 @@ from jaxdyn.constraints.rank import checked_tolerance
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Numbers
 from jaxdyn.reduction.bases import (
     Basis,
     Given,
@@ -56,18 +57,18 @@ class Method(eqx.Module):
         """State of the equation at (q, v)."""
         return {"q": q, "v": v}
 
-    def place(self, scene: Scene, y, t) -> tuple[Array, Array]:
+    def to_qv(self, scene: Scene, y, t) -> tuple[Array, Array]:
         """q, with unit quaternions, and v of a state."""
         return retract(scene.system, y["q"]), y["v"]
 
     def rates(self, scene: Scene, y, q, v, t, force) -> dict[str, Array]:
-        """dy/dt; q and v are those of `place`, `force` (nv,) is tau plus the scene's forces, or None."""
+        """dy/dt; q and v are those of `to_qv`, `force` (nv,) is tau plus the scene's forces, or None."""
         return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
 
-    def evaluated(self, scene: Scene, y, t, effort) -> tuple[dict[str, Array], Array | None, Array]:
+    def evaluated(self, scene: Scene, y, t, generalized_force) -> tuple[dict[str, Array], Array | None, Array]:
         """dy/dt with effort(q, v, t) for the force; the force (nv,) or None; and v (nv,)."""
-        q, v = self.place(scene, y, t)
-        force = effort(q, v, t)
+        q, v = self.to_qv(scene, y, t)
+        force = generalized_force(q, v, t)
         return self.rates(scene, y, q, v, t, force), force, v
 
     def acceleration(self, scene: Scene, q, v, t, force) -> Array:
@@ -99,11 +100,11 @@ class Method(eqx.Module):
         return y | {"q": retract(scene.system, y["q"])}, error
 
     def continued(self, scene: Scene, y, t) -> dict[str, Array]:
-        """The state as the next step starts from it: entries in `jumping` may have changed."""
+        """The state as the next step starts from it: entries in `step_constants` may have changed."""
         return y
 
     @property
-    def jumping(self) -> tuple[str, ...]:
+    def step_constants(self) -> tuple[str, ...]:
         """Entries of the state that are constant during a step."""
         return ()
 
@@ -184,15 +185,15 @@ class Baumgarte(Multipliers):
     beta: Float[Array, ""]
     name: ClassVar[str] = "baumgarte"
 
-    def __init__(self, alpha: Any = 10.0, beta: Any = 10.0):
+    def __init__(self, alpha: Numbers = 10.0, beta: Numbers = 10.0):
         self.alpha, self.beta = jnp.asarray(alpha, float), jnp.asarray(beta, float)
 
     def acceleration(self, scene, q, v, t, force):
         """Under the rows A a = gamma - 2 alpha psi - beta^2 phi."""
-        row, held = rows(scene, q, v, t), holonomic_rows(layout(scene))
+        row, holonomic = rows(scene, q, v, t), holonomic_rows(layout(scene))
         alpha, beta = self.alpha.astype(q.dtype), self.beta.astype(q.dtype)
         wanted = row.gamma - 2 * alpha * row.velocity
-        wanted = wanted.at[held].add(-(beta**2) * position_residual(scene, q, t))
+        wanted = wanted.at[holonomic].add(-(beta**2) * position_residual(scene, q, t))
         force = jnp.zeros_like(v) if force is None else force
         return solve_rows(scene, q, v, force, t, Rows(row.A, wanted, row.velocity)).acceleration
 
@@ -205,7 +206,7 @@ class Reduced(Method):
     **Arguments:**
 
     - `basis`: what nu is, as in `reduced_dynamics`: a tuple of indices of independent velocities, or a function N(q, t).
-      Where N becomes singular on the way the run ends with the code `singular_basis`. By default an orthonormal basis
+      Where N becomes singular the run ends with the code `singular_basis`. By default an orthonormal basis
       that is continued from step to step, which serves as long as the rank of the rows is constant.
     - `dof`: number of minimal velocities of the default basis. By default nv less the rank of the rows on concrete
       numbers, and less their number on traced ones.
@@ -227,12 +228,12 @@ class Reduced(Method):
         return Reduced(basis, dof=dof if self.dof is None else self.dof)
 
     @property
-    def jumping(self):
+    def step_constants(self):
         """The reference of an orthonormal basis."""
         return ("frame",) if self.basis is None or isinstance(self.basis, Orthonormal) else ()
 
     def _basis(self, y):
-        return Orthonormal(y["frame"]) if self.jumping else self.basis
+        return Orthonormal(y["frame"]) if self.step_constants else self.basis
 
     def _at(self, scene, y, q, t):
         return self._basis(y).at(scene, q, t)
@@ -240,32 +241,32 @@ class Reduced(Method):
     def start(self, scene, q, v, t):
         """q, nu and, for an orthonormal basis, its reference."""
         y = {"q": q}
-        if self.jumping:
+        if self.step_constants:
             reference = tangent_basis(scene, q, t, dof=self.dof) if self.basis is None else self.basis.reference
             y["frame"] = reference.astype(q.dtype)
         return y | {"nu": minimal_velocity(self._at(scene, y, q, t), v)}
 
-    def place(self, scene, y, t):
+    def to_qv(self, scene, y, t):
         """q, with unit quaternions, and v = N nu + v0."""
         q = retract(scene.system, y["q"])
-        found = self._at(scene, y, q, t)
-        return q, _product(found.N, y["nu"]) + found.v0
+        basis = self._at(scene, y, q, t)
+        return q, _product(basis.N, y["nu"]) + basis.v0
 
-    def evaluated(self, scene, y, t, effort):
+    def evaluated(self, scene, y, t, generalized_force):
         """From the reduced equations, which share one factorisation of the rows with v."""
         q = retract(scene.system, y["q"])
-        place = moving(scene, self._basis(y), q, y["nu"], t)
-        force = effort(q, place.v, t)
-        return self._rates(scene, y, place, q, t, force), force, place.v
+        motion = moving(scene, self._basis(y), q, y["nu"], t)
+        force = generalized_force(q, motion.v, t)
+        return self._rates(scene, y, motion, q, t, force), force, motion.v
 
     def rates(self, scene, y, q, v, t, force):
         """From the reduced equations; v is found anew."""
         return self._rates(scene, y, moving(scene, self._basis(y), q, y["nu"], t), q, t, force)
 
-    def _rates(self, scene, y, place, q, t, force):
-        found = solve_reduced(Scene(scene.system, scene.constraints), place, q, force, t)
-        fixed = {name: jnp.zeros_like(y[name]) for name in self.jumping}
-        return {"q": velocity_to_rate(scene.system, q, place.v), "nu": found.nu_rate} | fixed
+    def _rates(self, scene, y, motion, q, t, force):
+        reduced = solve_reduced(Scene(scene.system, scene.constraints), motion, q, force, t)
+        fixed = {name: jnp.zeros_like(y[name]) for name in self.step_constants}
+        return {"q": velocity_to_rate(scene.system, q, motion.v), "nu": reduced.nu_rate} | fixed
 
     def acceleration(self, scene, q, v, t, force):
         """Rate of v."""
@@ -273,7 +274,7 @@ class Reduced(Method):
 
     def corrects(self, scene):
         """Where there are holonomic rows, quaternions, or a reference to be renewed."""
-        return bool(holonomic_rows(layout(scene)).size or self.jumping or retracts(scene.system))
+        return bool(holonomic_rows(layout(scene)).size or self.step_constants or retracts(scene.system))
 
     def stepped(self, scene, y, t, error):
         """q on the holonomic constraints, its error without the part normal to them; nu stays."""
@@ -287,7 +288,7 @@ class Reduced(Method):
 
     def continued(self, scene, y, t):
         """N(q) as the new reference, which leaves N(q) and nu as they are."""
-        return y | {"frame": self._at(scene, y, y["q"], t).N} if self.jumping else y
+        return y | {"frame": self._at(scene, y, y["q"], t).N} if self.step_constants else y
 
     def quality(self, scene, y, t):
         """Of N at the state."""
@@ -334,16 +335,16 @@ class Variational(Multipliers):
 
     def begin(self, scene: Scene, y, t) -> variational.Carried:
         """What the first step takes beside y."""
-        return variational.begin(scene, *self.place(scene, y, t), t, self.rank_tol)
+        return variational.begin(scene, *self.to_qv(scene, y, t), t, self.rank_tol)
 
-    def advance(self, scene: Scene, y, t0, t1, carried: variational.Carried, effort: Callable):
-        """y at t1, the mean velocity on the way, what is carried on, and whether the step succeeded."""
-        found = variational.step(scene, y["q"], y["v"], carried, t0, t1, effort, self.rank_tol)
-        mean, y1 = found.carried.mean, {"q": found.q, "v": found.v}
+    def advance(self, scene: Scene, y, t0, t1, carried: variational.Carried, generalized_force: Callable):
+        """y at t1, the mean velocity of the step, the state of the method, and whether the step succeeded."""
+        stepped = variational.step(scene, y["q"], y["v"], carried, t0, t1, generalized_force, self.rank_tol)
+        mean, y1 = stepped.carried.mean, {"q": stepped.q, "v": stepped.v}
         if "work" in y:
-            done = 0.0 if found.force is None else (t1 - t0) * jnp.sum(found.force * mean)
+            done = 0.0 if stepped.force is None else (t1 - t0) * jnp.sum(stepped.force * mean)
             y1 = y1 | {"work": y["work"] + done}
-        return y1, mean, found.carried, found.solved
+        return y1, mean, stepped.carried, stepped.solved
 
     def acceleration(self, scene, q, v, t, force):
         """Of the continuous motion."""
@@ -371,7 +372,7 @@ def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
     return constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
 
 
-def serves(quality) -> Array:
+def is_regular(quality) -> Array:
     """Whether a quality (see `Method.quality`) is far enough from zero, also for NaN."""
     return jnp.abs(quality) > least_quality(quality.dtype)
 

@@ -1,4 +1,4 @@
-"""One run from its start to its solution: the start judged, the way integrated, the end judged, the outputs computed."""
+"""One run: checks of the start, integration, checks of the end, and the outputs."""
 
 import functools
 
@@ -14,7 +14,7 @@ from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.equations import equations
 from jaxdyn.simulation.integration import integrate
-from jaxdyn.simulation.methods import Method, consistent, serves, start_limit
+from jaxdyn.simulation.methods import Method, consistent, is_regular, start_limit
 from jaxdyn.simulation.outputs import at_save_point
 from jaxdyn.simulation.solution import RESULTS, Solution
 from jaxdyn.simulation.solvers import LieGroup, Stepper
@@ -25,6 +25,7 @@ from jaxdyn.simulation.solvers.choice import (
 )
 from jaxdyn.simulation.solvers.differentiable import COUNTS
 from jaxdyn.simulation.solvers.inputs import (
+    has_unit_quaternions,
     most_turned,
     turning,
     usable_steps,
@@ -37,12 +38,13 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     """The run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
     q0, v0, ts, *steps = numbers
     system, outputs = scene.system, options["outputs"]
+    unit_start = has_unit_quaternions(system, q0)
     q0 = retract(system, q0)
     in_order = jnp.isfinite(ts).all() & (ts[1:] > ts[:-1]).all()
     given_times, ts = ts, jnp.where(in_order, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     finite_start = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
     steps, fine_steps, fine_tolerances = usable_steps(steps, ts)
-    good = finite_start & in_order & fine_steps & fine_tolerances
+    good = finite_start & unit_start & in_order & fine_steps & fine_tolerances
     # A bad lane of a batch takes a harmless start, so that it does not make the others wait.
     harmless = jnp.zeros_like(q0)
     if isinstance(system, Model):
@@ -50,17 +52,17 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
             harmless.at[system.topology.nq :].set(1.0).at[: system.topology.nq].set(neutral(system).astype(q0.dtype))
         )
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
-    held = jnp.asarray(True)
+    start_ok = jnp.asarray(True)
     if scene.constraints:
-        held = consistent(scene, q0, v0, ts[0])
+        start_ok = consistent(scene, q0, v0, ts[0])
         if method.projects:
             given_start = q0, v0
             q0, v0 = method.onto_constraints(scene, q0, v0, ts[0])
             # Residuals of a small mechanism are small numbers of metres: how far it moves onto the constraints tells more.
-            ways = [
+            corrections = [
                 jnp.max(jnp.abs(x - y)) / (1 + jnp.max(jnp.abs(x))) for x, y in zip(given_start, (q0, v0), strict=True)
             ]
-            held = held & (jnp.maximum(*ways) <= 10 * start_limit(q0.dtype))
+            start_ok = start_ok & (jnp.maximum(*corrections) <= 10 * start_limit(q0.dtype))
     # Refuses callbacks that do not fit before diffrax meets them.
     for i, force in enumerate(scene.forces):
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", q0, v0, ts[0], first=(system,))
@@ -69,7 +71,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     added = tuple(states)  # names alone, as functions of a run hold no arrays
     options = options | {"control_ends": controls.can_end(control, q0, v0, ts[0])}
     eqs = equations(scene, control, method, added, options)
-    eqx.filter_eval_shape(eqs.effort, eqs.args, states, q0, v0, ts[0])
+    eqx.filter_eval_shape(eqs.generalized_force, eqs.args, states, q0, v0, ts[0])
     y0 = method.start(scene, q0, v0, ts[0]) | states
     first = method.quality(scene, y0, ts[0])
     y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
@@ -79,7 +81,9 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     elif isinstance(solver, LieGroup):
         solver = solver.fitted(system)
     # Of what a projection does, local coordinates leave nothing to be done about quaternions.
-    corrects = method.projects or bool(method.jumping) if isinstance(solver, LieGroup) else method.corrects(scene)
+    corrects = (
+        method.projects or bool(method.step_constants) if isinstance(solver, LieGroup) else method.corrects(scene)
+    )
     corrects = corrects or controls.HELD in added
     term = diffrax.ODETerm(eqs.derivative)
     if is_split(solver):
@@ -96,17 +100,17 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     y = jax.tree.map(lambda rows, start: jnp.where(_along(reached, rows), rows, start[None]), y, y0)
     work = y.pop("work", None)
 
-    def place(row):
+    def to_qv(row):
         y, t = row
-        return method.place(scene, method.corrected(scene, y, t), t)
+        return method.to_qv(scene, method.corrected(scene, y, t), t)
 
     # By the kernels that have put the start on the constraints.
-    q, v = map_rows(place, (y, ts))
+    q, v = map_rows(to_qv, (y, ts))
     lost = None
     if eqs.least_allowance is not None:
         margins, within = map_rows(lambda row: eqs.allowances(eqs.args, *row), (y, q, v, ts)), None
         if last is not None:
-            there = eqs.allowances(eqs.args, last, *method.place(scene, last, time_reached), time_reached)
+            there = eqs.allowances(eqs.args, last, *method.to_qv(scene, last, time_reached), time_reached)
             within = (result == RESULTS.event_occurred, time_reached, there)
         lost = unilateral.first_loss(margins, reached, ts, within)
         reached = reached & ~(lost.happened & (ts > lost.time))
@@ -134,16 +138,18 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         closed = map_rows(lambda row: consistent(scene, *row), (q, v, ts))
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
     elif scene.constraints:
-        met = map_rows(lambda row: method.satisfies(scene, *row[1:], eqs.effort(eqs.args, *row)), (y, q, v, ts))  # pyright: ignore[reportCallIssue]
+        force = lambda row: eqs.generalized_force(eqs.args, *row)  # noqa: E731
+        met = map_rows(lambda row: method.satisfies(scene, *row[1:], force(row)), (y, q, v, ts))  # pyright: ignore[reportCallIssue]
         result = RESULTS.where((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows, result)
     if first is not None:
-        result = RESULTS.where(serves(first), result, RESULTS.singular_basis)
-    result = RESULTS.where(held, result, RESULTS.inconsistent_start)
+        result = RESULTS.where(is_regular(first), result, RESULTS.singular_basis)
+    result = RESULTS.where(start_ok, result, RESULTS.inconsistent_start)
     angles = turning(system)
     if angles.size and not is_fixed(steps[-1]):
         coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
         result = RESULTS.where(coarse, RESULTS.coarse_start, result)
     for fine, code in (
+        (unit_start, RESULTS.unnormalized_start),
         (finite_start, RESULTS.nonfinite_start),
         (fine_tolerances, RESULTS.bad_tolerance),
         (fine_steps, RESULTS.bad_stepsize),

@@ -50,7 +50,7 @@ def at_save_point(
     """The outputs at one state; `of_control`: what the control adds to the state."""
     system, values = scene.system, {}
     pushed = {"power", "acceleration", "multipliers", *unilateral.OUTPUTS} & set(outputs)
-    force = eqs.effort(eqs.args, of_control, q, v, t) if pushed else None
+    force = eqs.generalized_force(eqs.args, of_control, q, v, t) if pushed else None
     if "energy" in outputs:
         values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
     if "power" in outputs:

@@ -18,7 +18,6 @@ from jaxtyping import Array
 from jaxdyn.compile import is_concrete, is_known, specialized
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
-from jaxdyn.model.tree import Model
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
@@ -43,19 +42,18 @@ from jaxdyn.simulation.solvers.inputs import (
 )
 from jaxdyn.simulation.start import checked_start, chosen_method
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import System, has_followers
+from jaxdyn.systems.system import SceneLike, System, has_followers
 
 if TYPE_CHECKING:
-    SceneLike = Scene | Model | System
     Control = Callable[[Array, Array, Array], Array] | controls.Controller | controls.Sampled | None
     Solver = diffrax.AbstractSolver | Stepper | None
     Stepsize = ArrayLike | diffrax.AbstractStepSizeController | None
 else:
-    SceneLike = Control = Solver = Stepsize = Any  # looked at below, by errors that name the argument
+    Control = Solver = Stepsize = Any  # looked at below, by errors that name the argument
 
 
 def simulate(
-    scene: "SceneLike",
+    scene: SceneLike,
     q0: Numbers,
     v0: Numbers,
     ts: Numbers,
@@ -110,10 +108,10 @@ def simulate(
     - `adjoint`: "reverse" (default) for reverse mode with checkpoints; "forward" for jvp, jacfwd and Hessians by
       forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
-    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration",
+    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration"
+      (the rate of v: of a free joint that of its body twist; `jd.frame_acceleration` gives those of frames in world axes),
       "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control), "control_state" (of
-      a controller) and
-      "pose:<frame>". They are computed only if asked for.
+      a controller) and "pose:<frame>". They are computed only if asked for.
     - `contacts`: of a scene with `cones`. "stop": where a contact pulls or leaves its cone (a margin below zero by more than
       rounding, eps^(1/2) of its force) the run ends, with the code `contact_lost` and the time, which is found within the
       step. "report": it goes on, and contacts hold on both sides.
@@ -177,7 +175,7 @@ def simulate(
         raise ValueError(
             "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
         )
-    if method.jumping and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if method.step_constants and isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards; take 'reverse', or "
             "jd.Reduced with independent velocities or a function"

@@ -21,10 +21,10 @@ from jaxdyn.systems.scene import Scene
 
 def from_diffrax(result) -> Any:
     """A code of diffrax as one of `RESULTS`, by its name."""
-    found: Any = RESULTS.successful
+    translated: Any = RESULTS.successful
     for name, code in diffrax.RESULTS._name_to_item.items():
-        found = RESULTS.where(result == code, getattr(RESULTS, name), found)
-    return found
+        translated = RESULTS.where(result == code, getattr(RESULTS, name), translated)
+    return translated
 
 
 # A number for each code, its place here, for arrays and files.
@@ -42,6 +42,7 @@ ADVICE = {
     "moves no inertia) or a force or control that is not finite there; or constraints whose rows lose rank on the way, "
     "which fixed steps pass (stepsize=0.01); or rtol and atol are below the rounding error",
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
+    "unnormalized_start": "start from jd.normalize(model, q0); quaternions are in the order w, x, y, z",
     "unordered_times": "give times ts that increase from each to the next",
     "bad_stepsize": "give a positive stepsize (s)",
     "bad_tolerance": "give finite rtol and atol that are not negative",

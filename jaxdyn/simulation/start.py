@@ -1,4 +1,4 @@
-"""Which method a run takes, and whether its start serves."""
+"""Which method a run takes, and whether its start satisfies the constraints."""
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from jaxdyn.simulation.methods import (
     Projected,
     Reduced,
     Variational,
-    serves,
+    is_regular,
     start_limit,
 )
 from jaxdyn.systems.scene import Scene
@@ -28,7 +28,7 @@ METHODS: dict[str, type[Method]] = {
 def chosen_method(scene: Scene, method: str | Method) -> Method:
     """How to integrate: "auto" is "projected" for a scene with constraints and "free" for one without.
 
-    "projected" is the rule because it serves where the others fail: dependent rows, and places where rows lose rank on
+    "projected" is the rule because it works where the others fail: dependent rows, and places where rows lose rank on
     the way, and needs no choice of velocities.
 
     **Raises:** ValueError for a method that does not fit the scene.
@@ -60,11 +60,11 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
     does not serve at the start.
     """
     limit = start_limit(q.dtype)
-    found, ratio, rank = start_evidence(scene, q, v, np.asarray(t, q.dtype), limit)
+    residuals, ratio, rank = start_evidence(scene, q, v, np.asarray(t, q.dtype), limit)
     if not ratio <= 1:
         raise ValueError(
             f"q0, v0 are not on the constraints: {open_constraints(scene, q, v, t, limit)} (position residual "
-            f"{float(found[0]):.3g}, velocity residual {float(found[1]):.3g}); start from "
+            f"{float(residuals[0]):.3g}, velocity residual {float(residuals[1]):.3g}); start from "
             "state = jd.assemble(scene, q0, v0), with state.q and state.v"
         )
     if rank == scene.nv:
@@ -79,11 +79,11 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
     with jax.ensure_compile_time_eval():
         q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
         method = method.fitted(scene, scene.nv - rank)
-        if method.basis is not None and not bool(_serves_at(scene, method.basis, q, t)):
+        if method.basis is not None and not bool(_is_regular_at(scene, method.basis, q, t)):
             raise ValueError(f"the basis does not serve at q0: {method.basis.advice(scene, q, t)}")
     return method
 
 
 @eqx.filter_jit
-def _serves_at(scene, basis, q, t):
-    return serves(basis.at(scene, q, t).quality)
+def _is_regular_at(scene, basis, q, t):
+    return is_regular(basis.at(scene, q, t).quality)

@@ -12,16 +12,17 @@ from jax.core import Tracer
 
 from jaxdyn.compile import is_expanding, is_rank_safe, partition_traced
 from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.model.arguments import as_array, check_shape, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
 from jaxdyn.simulation.solvers.driver import Drive
 from jaxdyn.simulation.solvers.rk4 import RK4
 from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import as_scene, checked_force
+from jaxdyn.systems.system import SceneLike
 
 
-def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Callable:
-    """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a tau that is held.
+def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True) -> Callable:
+    """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a constant tau, or under a law.
 
     The state is a pair (q (nq,), v (nv,)); batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
     torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
@@ -52,26 +53,26 @@ def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Calla
             "stepper: the scene has forces with modes (jd.DryFriction, jd.UnilateralContact), whose events end steps; take "
             "jd.simulate, or jd.CoulombFriction in their place"
         )
-    found = as_array(dt, "stepper: dt")
-    if found.shape != () or not (isinstance(found, Tracer) or 0 < float(found) < np.inf):
+    seconds = as_array(dt, "stepper: dt")
+    if seconds.shape != () or not (isinstance(seconds, Tracer) or 0 < float(seconds) < np.inf):
         raise ValueError(f"stepper: dt is {dt!r}; give one positive number (s)")
     if isinstance(substeps, bool) or not isinstance(substeps, (int, np.integer)) or substeps < 1:
         raise ValueError(f"stepper: substeps is {substeps!r}; give a positive integer")
     method, system, dtype = chosen_method(scene, "auto"), scene.system, state_dtype(scene.system)
     unknown, known = partition_traced(scene)
-    length = jnp.asarray(found, dtype) if isinstance(found, Tracer) else np.asarray(found, dtype)
+    length = jnp.asarray(seconds, dtype) if isinstance(seconds, Tracer) else np.asarray(seconds, dtype)
 
-    # Once for each way in which it is traced.
+    # Traced once for each mode of `jd.compilation`.
     @functools.partial(jax.jit, static_argnums=0)
-    def traced(way, t, y, args):
+    def traced(mode, t, y, args):
         unknown, tau = args
         scene = known(unknown)
 
-        def effort(q, v, t):
+        def generalized_force(q, v, t):
             force, given = scene.applied_force(q, v, t), scene.limited(tau)
             return given if force is None else given + force
 
-        return method.evaluated(scene, y, t, effort)[0]
+        return method.evaluated(scene, y, t, generalized_force)[0]
 
     def field(t, y, args):
         return traced((is_expanding(), is_rank_safe()), t, y, args)
@@ -82,7 +83,7 @@ def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Calla
         return y, error, diffrax.RESULTS.successful
 
     corrector = project if method.corrects(scene) else None
-    solver = ExplicitSteps(RK4(), corrector, method.jumping, method.projects, field=field)
+    solver = ExplicitSteps(RK4(), corrector, method.step_constants, method.projects, field=field)
 
     def advance(q, v, tau, t):
         y = method.start(scene, q, v, t)
@@ -90,7 +91,7 @@ def stepper(scene: Any, dt: Any, substeps: int = 1, remat: bool = True) -> Calla
             solver.plan(y), driver.Fixed(4, 3), None, None, length / substeps, substeps, substeps
         )  # fmt: skip
         rows, _, _ = drive(y, (unknown, tau), jnp.stack([t, t + length]))
-        return method.place(scene, jax.tree.map(lambda x: x[0], rows), t + length)
+        return method.to_qv(scene, jax.tree.map(lambda x: x[0], rows), t + length)
 
     taken = jax.checkpoint(advance) if remat else advance
 

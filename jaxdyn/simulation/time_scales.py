@@ -13,11 +13,11 @@ from jaxdyn.compile import compiled, is_known
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_state
+from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
-from jaxdyn.systems.system import displace
+from jaxdyn.systems.system import SceneLike, displace
 
 # A step of an undamped oscillation may grow it by this much: explicit methods of order 8 do so at any length, if by little.
 _GROWTH = 1e-3
@@ -67,7 +67,7 @@ def _longest_step(values) -> Array:
     return jnp.min(jnp.where(rest, jnp.inf, stable / jnp.where(rest, jnp.ones_like(size), size)), initial=jnp.inf)
 
 
-def stiffness(scene: Any, q: Any, v: Any, t: Any = 0.0, control: Any = None) -> Stiffness:
+def stiffness(scene: SceneLike, q: Numbers, v: Numbers, t: Numbers = 0.0, control: Any = None) -> Stiffness:
     """Fastest rates of the motion M da + D dv + K dq = 0 near a state, D = -df/dv and K = -df/dq.
 
     f is the sum of the scene's forces, of `control(q, v, t)` and, for a system that is not a `Model`, of -dV/dq. What
@@ -101,7 +101,7 @@ def stiffness(scene: Any, q: Any, v: Any, t: Any = 0.0, control: Any = None) -> 
     else:
         values = jnp.linalg.eigvals(matrix)
     fastest = (jnp.max(jnp.asarray(x), initial=0.0) for x in (-values.real, values.imag))
-    return Stiffness(*(x.astype(q.dtype) for x in (*fastest, _longest_step(jnp.asarray(values)))))
+    return Stiffness(*(x.astype(matrix.dtype) for x in (*fastest, _longest_step(jnp.asarray(values)))))
 
 
 @compiled

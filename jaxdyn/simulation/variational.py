@@ -31,8 +31,8 @@ from jaxdyn.constraints.base import (
     constraint_jacobian,
     holonomic_rows,
     layout,
+    nonholonomic_rows,
     position_residual,
-    slip_rows,
     velocity_residual,
 )
 from jaxdyn.constraints.dynamics import correction
@@ -83,16 +83,16 @@ def begin(scene: Scene, q, v, t, rank_tol: float | None) -> Carried:
     return Carried(_slopes(scene.system, q, v, t)[0], v, A, spare)
 
 
-def step(scene: Scene, q, v, carried: Carried, t0, t1, effort: Callable, rank_tol: float | None) -> Step:
+def step(scene: Scene, q, v, carried: Carried, t0, t1, generalized_force: Callable, rank_tol: float | None) -> Step:
     """One step from t0 to t1.
 
-    `effort(q, v, t)` (nv,) is tau plus the scene's forces, or None. `v` only serves to guess the next velocity.
+    `generalized_force(q, v, t)` (nv,) is tau plus the scene's forces, or None. `v` only serves to guess the next velocity.
     Derivatives are those of the solved equations, by the implicit function theorem.
     """
     system, n = scene.system, scene.nv
     h, middle = t1 - t0, 0.5 * (t0 + t1)
     A = carried.A
-    held, slipping = holonomic_rows(layout(scene)), slip_rows(layout(scene))
+    holonomic, nonholonomic = holonomic_rows(layout(scene)), nonholonomic_rows(layout(scene))
 
     def halfway(xi):
         return displace(system, q, 0.5 * h * xi)
@@ -101,7 +101,7 @@ def step(scene: Scene, q, v, carried: Carried, t0, t1, effort: Callable, rank_to
         """2 dL/dxi - J^T (p0+ + a + c), and Ad^T (a + c)."""
         xi, x = z[:n], 0.5 * h * z[:n]
         own, push = _slopes(system, halfway(xi), xi, middle)
-        force = effort(halfway(xi), xi, middle)
+        force = generalized_force(halfway(xi), xi, middle)
         push = h * (push if force is None else push + force)
         left = carried.momentum if A is None else carried.momentum + _product(A.T, z[n:])
         arrived = _turned(system, x, left)
@@ -112,10 +112,10 @@ def step(scene: Scene, q, v, carried: Carried, t0, t1, effort: Callable, rank_to
         if A is None:
             return moved
         opened = jnp.zeros_like(z[n:])
-        if held.size:
-            opened = opened.at[held].set(position_residual(scene, displace(system, q, h * xi), t1) / h)
-        if slipping.size:
-            opened = opened.at[slipping].set(velocity_residual(scene, halfway(xi), xi, middle)[slipping])
+        if holonomic.size:
+            opened = opened.at[holonomic].set(position_residual(scene, displace(system, q, h * xi), t1) / h)
+        if nonholonomic.size:
+            opened = opened.at[nonholonomic].set(velocity_residual(scene, halfway(xi), xi, middle)[nonholonomic])
         return jnp.concatenate([moved, opened])
 
     def slope(function, z):
@@ -142,7 +142,7 @@ def step(scene: Scene, q, v, carried: Carried, t0, t1, effort: Callable, rank_to
     if right_inverse is not None:
         for _ in range(2):
             velocity = velocity - _product(right_inverse, velocity_residual(scene, end, velocity, t1))
-    return Step(end, velocity, Carried(last, xi, rows, spare), effort(halfway(xi), xi, middle), solved)
+    return Step(end, velocity, Carried(last, xi, rows, spare), generalized_force(halfway(xi), xi, middle), solved)
 
 
 def _newton(function, slope, z, n: int):
@@ -210,9 +210,11 @@ def _tree_slopes(model: Model, q, v):
         wrenches += [inertias[:, :1] * g, jax.vmap(cross)(inertias[:, 1:4], g)]
     moved = sum_to_coordinates(model, jnp.concatenate(wrenches, axis=1))
     carrier = np.array(topology.parents)[topology.dof_body]
-    still = jnp.zeros((1, 6), q.dtype)
-    bent = jax.vmap(se3.ad_apply)(take(jnp.concatenate([twists, still]), carrier % (topology.nb + 1)), frame.subspace)
-    p, pull = (jnp.sum(rows * moved[:, :6], axis=1) for rows in (frame.subspace, bent))
+    at_rest = jnp.zeros((1, 6), q.dtype)
+    bracket = jax.vmap(se3.ad_apply)(
+        take(jnp.concatenate([twists, at_rest]), carrier % (topology.nb + 1)), frame.subspace
+    )
+    p, pull = (jnp.sum(rows * moved[:, :6], axis=1) for rows in (frame.subspace, bracket))
     if model.gravity is not None:
         pull = pull + jnp.sum(frame.subspace * moved[:, 6:], axis=1)
     return p if model.armature is None else p + model.armature * v, pull

@@ -7,7 +7,7 @@ of one-forms in these coordinates: what acts on dq by tau . dq. Those of a scene
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -17,10 +17,10 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_known, run
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import batch_hint
+from jaxdyn.model.arguments import Function, batch_hint
 from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, joint_rates, normalize
 from jaxdyn.systems.mass_factor import solve_positive
-from jaxdyn.systems.scene import as_pytree
+from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.start import check_mass_matrix
 
 
@@ -114,7 +114,7 @@ class MetricSystem(System):
     potential: Callable | None = None
     parameters: Any = None
 
-    def __init__(self, metric, nq, *, potential=None, parameters=None):
+    def __init__(self, metric: Function, nq, *, potential=None, parameters=None):
         self.metric = as_pytree(metric, "metric")
         self.potential = None if potential is None else as_pytree(potential, "potential")
         self.nq = checked_size(nq)
@@ -279,3 +279,9 @@ def checked_size(nq) -> int:
 def as_parameter(leaf):
     """A Python number as a float array, so that it is a leaf that can be differentiated; anything else as it is."""
     return jnp.asarray(leaf, float) if isinstance(leaf, (int, float)) and not isinstance(leaf, bool) else leaf
+
+
+if TYPE_CHECKING:
+    SceneLike = Scene | Model | System
+else:
+    SceneLike = Any  # `as_scene` takes them, and functions say which they need

@@ -127,17 +127,17 @@ def outward(factors: ArticulatedFactors, left: list[list]) -> list:
     out: list = []
     for i, parent in enumerate(links.parents):
         V = twist_to_child(factors.chains[i], twists[parent]) if parent >= 0 else None
-        found: list = [None] * len(left[i])
-        for j in reversed(range(len(found))):
+        joint_accelerations: list = [None] * len(left[i])
+        for j in reversed(range(len(joint_accelerations))):
             s, gain = entry(links.subspaces[i], j, 1), factors.gains[i][j]
             free = left[i][j] * factors.inverses[i][j]
             if V is None:
-                found[j] = free
+                joint_accelerations[j] = free
                 V = s * free
                 continue
-            x = found[j] = free - dot(gain, V)
+            x = joint_accelerations[j] = free - dot(gain, V)
             V = V + s * x
-        out.append(found)
+        out.append(joint_accelerations)
         twists[i] = V
     return out
 

@@ -60,7 +60,7 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
         acc = rotate_to_child(chain, acc if r is None else acc + dot(K, r))
         w, dw = rotate_to_child(chain, w), rotate_to_child(chain, dw)
         S = links.subspaces[i]
-        slides, turns = _moves(S[:3]), _moves(S[3:])
+        slides, turns = _is_nonzero(S[:3]), _is_nonzero(S[3:])
         if speeds is not None:
             if slides:
                 slide = dot(part(S, 0, 3), speeds[i])
@@ -85,7 +85,7 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
     return wrenches
 
 
-def _moves(S) -> bool:
+def _is_nonzero(S) -> bool:
     """Whether part of a motion subspace is other than zero by declaration."""
     return not isinstance(S, np.ndarray) or bool(S.any())
 

@@ -25,7 +25,7 @@ from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_
 from jaxdyn.systems.scene import Scene
 
 
-class Place(NamedTuple):
+class StateTerms(NamedTuple):
     """What is known of a state before its mode: rows, mass matrix, and the sliding velocities (n, 2)."""
 
     row: Rows
@@ -45,11 +45,11 @@ class Pushed(NamedTuple):
     pivots: Array
 
 
-def place_at(scene: Scene, elements: Elements, q, v, t) -> Place:
+def terms_at(scene: Scene, elements: Elements, q, v, t) -> StateTerms:
     """Of the scene as it is, with its elements."""
     row = rows(extended(scene), q, v, t)
     metric = mass_factor(mass_matrix(scene.system, q, t))
-    return Place(row, metric, metric.whiten(row.A.T), by_element(elements, row.velocity))
+    return StateTerms(row, metric, metric.whiten(row.A.T), by_element(elements, row.velocity))
 
 
 def by_element(elements: Elements, rowwise) -> Array:
@@ -78,22 +78,22 @@ def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
     They go on smoothly through w = 0 to w < 0, as the events that end a mode there are looked for from both sides: w/|w| with
     the sign that `reference` (n, 2) has, which for one row is constant.
     """
-    found = []
+    unit_vectors = []
     for i, one in enumerate(elements.each):
         w, s = slip[i], reference[i]
         least = 100 * float(jnp.finfo(w.dtype).eps)
         square = jnp.sum(w * w)
-        moves = square > least**2
-        length = jnp.sqrt(jnp.where(moves, square, jnp.ones_like(square)))
+        is_sliding = square > least**2
+        length = jnp.sqrt(jnp.where(is_sliding, square, jnp.ones_like(square)))
         if one.smooth:
             speed = force_at(scene, one).smoothing.astype(w.dtype)
-            found.append(w * jnp.where(moves, jnp.tanh(length / speed) / length, 1 / speed))
+            unit_vectors.append(w * jnp.where(is_sliding, jnp.tanh(length / speed) / length, 1 / speed))
         elif len(one.tangent) < 2:
-            found.append(s)
+            unit_vectors.append(s)
         else:
             forward = jnp.where(jnp.sum(s * w) < 0, -1.0, 1.0).astype(w.dtype)
-            found.append(jnp.where(moves, forward * w / length, s))
-    return jnp.stack(found)
+            unit_vectors.append(jnp.where(is_sliding, forward * w / length, s))
+    return jnp.stack(unit_vectors)
 
 
 def slides(elements: Elements, mode: Mode) -> list:
@@ -102,21 +102,21 @@ def slides(elements: Elements, mode: Mode) -> list:
     return [mode.closed[i] & free[i] for i in range(len(elements.each))]
 
 
-def push(scene: Scene, elements: Elements, mode: Mode, place: Place, along, wanted) -> Pushed:
+def push(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, wanted) -> Pushed:
     """Forces that give the active rows the rates `wanted` (count,); impulses that give them velocities."""
     dtype = wanted.dtype
     active = elements.active(mode).astype(dtype)
     sliding = slides(elements, mode)
     Z = [
         jnp.where(sliding[i], force_at(scene, elements.each[i]).coefficient.astype(dtype), 0.0)
-        * _product(along[i, : len(elements.each[i].tangent)], place.row.A[jnp.asarray(elements.each[i].tangent)])
+        * _product(along[i, : len(elements.each[i].tangent)], terms.row.A[jnp.asarray(elements.each[i].tangent)])
         for i in elements.coupled
     ]
     count = len(Z)
-    pushes = place.metric.whiten(jnp.stack(Z).T) if count else jnp.zeros((scene.nv, 0), dtype)
-    right = jnp.concatenate([wanted[:, None], _product(place.Y.T, pushes)], 1) * active[:, None]
-    found = solve_rows(place.Y * active[None], active, right)
-    base, by_normal = found[:, 0], found[:, 1:]
+    pushes = terms.metric.whiten(jnp.stack(Z).T) if count else jnp.zeros((scene.nv, 0), dtype)
+    right = jnp.concatenate([wanted[:, None], _product(terms.Y.T, pushes)], 1) * active[:, None]
+    solved = solve_rows(terms.Y * active[None], active, right)
+    base, by_normal = solved[:, 0], solved[:, 1:]
     sign = mode.signs(dtype)
     at = [elements.each[i].normal for i in elements.coupled]
     normal = jnp.zeros((0,), dtype)
@@ -128,7 +128,7 @@ def push(scene: Scene, elements: Elements, mode: Mode, place: Place, along, want
         for i, pivot in zip(elements.coupled, own, strict=True):
             pivots[i] = jnp.where(sliding[i], pivot, jnp.ones_like(pivot))
     lam = (base + _product(by_normal, normal)) * active
-    change = place.metric.unwhiten(_product(place.Y, lam) - _product(pushes, normal))
+    change = terms.metric.unwhiten(_product(terms.Y, lam) - _product(pushes, normal))
     zero = jnp.zeros((), dtype)
     each = [sign[i] * lam[one.normal] if one.normal >= 0 else zero for i, one in enumerate(elements.each)]
     return Pushed(lam, jnp.stack(each), by_element(elements, lam), change, jnp.stack(pivots))
@@ -167,14 +167,14 @@ def _eliminated(K, right):
             share = matrix[j][i] / pivot
             matrix[j] = matrix[j] - share * matrix[i]
             values[j] = values[j] - share * values[i]
-    found: list[Any] = [None] * n
+    unknowns: list[Any] = [None] * n
     for i in reversed(range(n)):
         rest = values[i]
         for j in range(i + 1, n):
-            rest = rest - matrix[i][j] * found[j]
+            rest = rest - matrix[i][j] * unknowns[j]
         pivot = matrix[i][i]
-        found[i] = rest / jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
-    return jnp.stack(found), pivots
+        unknowns[i] = rest / jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
+    return jnp.stack(unknowns), pivots
 
 
 class Motion(NamedTuple):
@@ -188,68 +188,72 @@ class Motion(NamedTuple):
     sizes: Array
 
 
-def motion_at(scene: Scene, elements: Elements, mode: Mode, place: Place, reference, effort, q, v, t) -> Motion:
-    """Accelerations in a mode; `effort` (nv,) is tau and the forces without modes, or None."""
-    along = directions(scene, elements, place.slip, reference)
-    force = jnp.zeros_like(v) if effort is None else effort
+def motion_at(
+    scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, reference, generalized_force, q, v, t
+) -> Motion:
+    """Accelerations in a mode; `generalized_force` (nv,) is tau and the forces without modes, or None."""
+    along = directions(scene, elements, terms.slip, reference)
+    force = jnp.zeros_like(v) if generalized_force is None else generalized_force
     sliding = slides(elements, mode)
     given = {}
     for i, one in enumerate(elements.each):
         if one.normal < 0:
             given[i] = normal_given(scene, one, q, v, t)
             level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(v.dtype) * given[i], 0.0)
-            force = force - level * _product(along[i, : len(one.tangent)], place.row.A[jnp.asarray(one.tangent)])
-    free = place.metric.whiten(force - bias_force(scene.system, q, v, t))
-    wanted = place.row.gamma - _product(place.Y.T, free)
-    pushed = push(scene, elements, mode, place, along, wanted)
-    acceleration = place.metric.unwhiten(free) + pushed.change
+            force = force - level * _product(along[i, : len(one.tangent)], terms.row.A[jnp.asarray(one.tangent)])
+    free = terms.metric.whiten(force - bias_force(scene.system, q, v, t))
+    wanted = terms.row.gamma - _product(terms.Y.T, free)
+    pushed = push(scene, elements, mode, terms, along, wanted)
+    acceleration = terms.metric.unwhiten(free) + pushed.change
     normal = jnp.stack([given.get(i, pushed.normal[i]) for i in range(len(elements.each))])
-    parts = place.row.A * acceleration[None]
-    sizes = jnp.sum(jnp.abs(parts), 1) + jnp.abs(place.row.gamma)
-    return Motion(acceleration, pushed, normal, jnp.sum(parts, 1) - place.row.gamma, sizes)
+    parts = terms.row.A * acceleration[None]
+    sizes = jnp.sum(jnp.abs(parts), 1) + jnp.abs(terms.row.gamma)
+    return Motion(acceleration, pushed, normal, jnp.sum(parts, 1) - terms.row.gamma, sizes)
 
 
 def gaps(scene: Scene, elements: Elements, q, t) -> Array:
     """Of the elements that open, (n,); zero of others."""
     whole = extended(scene)
-    held = position_residual(whole, q, t)
+    residuals = position_residual(whole, q, t)
     # Contacts have one row each among the residuals, behind those of the scene's own constraints.
-    at, found = held.shape[0] - sum(one.opens for one in elements.each), []
+    at, gap_of_each = residuals.shape[0] - sum(one.opens for one in elements.each), []
     for one in elements.each:
-        found.append(held[at] if one.opens else jnp.zeros((), q.dtype))
+        gap_of_each.append(residuals[at] if one.opens else jnp.zeros((), q.dtype))
         at += one.opens
-    return jnp.stack(found)
+    return jnp.stack(gap_of_each)
 
 
-def rebounds(scene: Scene, elements: Elements, place: Place) -> Array:
+def rebounds(scene: Scene, elements: Elements, terms: StateTerms) -> Array:
     """Velocity of each gap (n,) after an impact by Newton's hypothesis: e times that with which it closes.
 
     Slow ones are zero, as the flight after them would be hardly higher than the rounding of the gap.
     """
-    zero, found = jnp.zeros((), place.row.velocity.dtype), []
+    zero, rates = jnp.zeros((), terms.row.velocity.dtype), []
     least = float(jnp.finfo(zero.dtype).eps) ** 0.3
     for one in elements.each:
         if one.opens:
-            rebound = -force_at(scene, one).restitution.astype(zero.dtype) * place.row.velocity[one.normal]
-            found.append(jnp.where(rebound > least, rebound, zero))
+            rebound = -force_at(scene, one).restitution.astype(zero.dtype) * terms.row.velocity[one.normal]
+            rates.append(jnp.where(rebound > least, rebound, zero))
         else:
-            found.append(zero)
-    return jnp.stack(found)
+            rates.append(zero)
+    return jnp.stack(rates)
 
 
-def jumped(scene: Scene, elements: Elements, mode: Mode, place: Place, along, v, rebound) -> tuple[Array, Pushed]:
+def jumped(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, v, rebound) -> tuple[Array, Pushed]:
     """The velocity after impulses that end the motion of the active rows, or give gaps the velocity `rebound` (n,), and these."""
-    wanted = -place.row.velocity
+    wanted = -terms.row.velocity
     for i, one in enumerate(elements.each):
         if one.opens:
             wanted = wanted.at[one.normal].add(rebound[i])
-    pushed = push(scene, elements, mode, place, along, wanted)
+    pushed = push(scene, elements, mode, terms, along, wanted)
     return v + pushed.change, pushed
 
 
-def conditions(scene: Scene, elements: Elements, mode: Mode, place: Place, motion: Motion, reference, q, t) -> Array:
+def conditions(
+    scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, motion: Motion, reference, q, t
+) -> Array:
     """What a mode keeps positive, (n, CHANNELS): 1 where it asks for nothing."""
-    gap, found = gaps(scene, elements, q, t), []
+    gap, condition_rows = gaps(scene, elements, q, t), []
     one_ = jnp.ones((), q.dtype)
     for i, one in enumerate(elements.each):
         normal = one_
@@ -263,9 +267,9 @@ def conditions(scene: Scene, elements: Elements, mode: Mode, place: Place, motio
             square = jnp.sum(hold * hold)
             size = jnp.sqrt(jnp.where(square > 0, square, one_)) * (square > 0).astype(q.dtype)
             margin = force_at(scene, one).static.astype(q.dtype) * motion.normal[i] - size
-            friction = jnp.where(mode.stick[i], margin, jnp.sum(reference[i] * place.slip[i]))
+            friction = jnp.where(mode.stick[i], margin, jnp.sum(reference[i] * terms.slip[i]))
             friction = jnp.where(mode.closed[i], friction, one_)
         if one.tangent:
             pivot = motion.pushed.pivots[i]
-        found.append(jnp.stack([normal, friction, pivot]))
-    return jnp.stack(found)
+        condition_rows.append(jnp.stack([normal, friction, pivot]))
+    return jnp.stack(condition_rows)

@@ -1,4 +1,4 @@
-"""What happened on the way of a motion with modes."""
+"""The events of a motion with modes."""
 
 import equinox as eqx
 import jax

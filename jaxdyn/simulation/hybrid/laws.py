@@ -1,7 +1,7 @@
 """The functions of a motion with modes, of a scene whose unknown numbers are arguments: vector field, projection, conditions and
 transitions, on states with the entries q, v and `slip`, the directions (n, 2) in which elements slide.
 
-Directions are constants of a step (`jumping`), renewed where it ends.
+Directions are constants of a step (`step_constants`), renewed where it ends.
 """
 
 from collections.abc import Callable
@@ -17,16 +17,16 @@ from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, v
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.simulation.hybrid.dynamics import (
-    Place,
+    StateTerms,
     by_element,
     conditions,
     directions,
     gaps,
     jumped,
     motion_at,
-    place_at,
     rebounds,
     solve_rows,
+    terms_at,
 )
 from jaxdyn.simulation.hybrid.machine import Laws
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extended, force_at
@@ -43,10 +43,17 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
 
     def at(args, t, y):
         unknown, mode = args
-        scene, effort = given(unknown)
+        scene, generalized_force = given(unknown)
         q, v = retract(scene.system, y["q"]), y["v"]
-        place = place_at(scene, elements, q, v, t)
-        return scene, mode, q, v, place, motion_at(scene, elements, mode, place, y["slip"], effort(q, v, t), q, v, t)
+        terms = terms_at(scene, elements, q, v, t)
+        return (
+            scene,
+            mode,
+            q,
+            v,
+            terms,
+            motion_at(scene, elements, mode, terms, y["slip"], generalized_force(q, v, t), q, v, t),
+        )
 
     @jax.jit
     def field(t, y, args):
@@ -61,13 +68,13 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
 
     def judge(args, t, y):
         y = plan.structure(y)
-        scene, mode, q, v, place, motion = at(args, t, y)
-        found = _judged(scene, elements, mode, place, motion, y["slip"], q, v, t)
-        return found.conditions, found.levels
+        scene, mode, q, v, terms, motion = at(args, t, y)
+        judged = _judged(scene, elements, mode, terms, motion, y["slip"], q, v, t)
+        return judged.conditions, judged.levels
 
     def judge_all(unknown, mode, slip, t, q, v):
-        scene, _, q, v, place, motion = at((unknown, mode), t, {"q": q, "v": v, "slip": slip})
-        return _judged(scene, elements, mode, place, motion, slip, q, v, t)
+        scene, _, q, v, terms, motion = at((unknown, mode), t, {"q": q, "v": v, "slip": slip})
+        return _judged(scene, elements, mode, terms, motion, slip, q, v, t)
 
     def jump(unknown, mode, slip, t, q, v):
         return _jumped(given(unknown)[0], elements, mode, slip, t, q, v)
@@ -89,8 +96,8 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
 
     def land(unknown, mode, slip, t, y):
         y = plan.structure(y)
-        found = run(jump, unknown, mode, slip, t, y["q"], y["v"])
-        return ravel_pytree(y | {"v": found.v})[0]
+        jumped_state = run(jump, unknown, mode, slip, t, y["q"], y["v"])
+        return ravel_pytree(y | {"v": jumped_state.v})[0]
 
     def slip_of(y):
         return plan.structure(y)["slip"]
@@ -110,28 +117,28 @@ def put_back(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     """q and v by the least change onto the rows that act, and the error (or None) without its part normal to them."""
     whole, dtype = extended(scene), y["v"].dtype
     q, v = retract(scene.system, y["q"]), y["v"]
-    place = place_at(scene, elements, q, v, t)
-    held = holonomic_rows(layout(whole))
+    terms = terms_at(scene, elements, q, v, t)
+    holonomic = holonomic_rows(layout(whole))
     active = elements.active(mode).astype(dtype)
-    holds = jnp.zeros((elements.count,), dtype).at[held].set(1.0) * active
+    holds = jnp.zeros((elements.count,), dtype).at[holonomic].set(1.0) * active
 
     def change(wanted, which):
         """The least velocities that change the rows by `wanted`."""
-        lam = solve_rows(place.Y * which[None], which, (wanted * which)[:, None])[:, 0]
-        return place.metric.unwhiten(_product(place.Y, lam))
+        lam = solve_rows(terms.Y * which[None], which, (wanted * which)[:, None])[:, 0]
+        return terms.metric.unwhiten(_product(terms.Y, lam))
 
     tangent = None
     if error is not None:
         e = rate_to_velocity(scene.system, q, error["q"])
-        e = e - change(_product(place.row.A, e), holds)
+        e = e - change(_product(terms.row.A, e), holds)
         tangent = error | {
             "q": velocity_to_rate(scene.system, q, e),
-            "v": error["v"] - change(_product(place.row.A, error["v"]), active),
+            "v": error["v"] - change(_product(terms.row.A, error["v"]), active),
         }
     blank = jnp.zeros((elements.count,), dtype)
-    if held.size:
+    if holonomic.size:
         for _ in range(_ROUNDS):
-            q = displace(scene.system, q, -change(blank.at[held].set(position_residual(whole, q, t)), holds))
+            q = displace(scene.system, q, -change(blank.at[holonomic].set(position_residual(whole, q, t)), holds))
     for _ in range(_ROUNDS):
         v = v - change(velocity_residual(whole, q, v, t), active)
     slip = by_element(elements, velocity_residual(whole, q, v, t))
@@ -139,20 +146,20 @@ def put_back(scene: Scene, elements: Elements, mode: Mode, t, y, error):
 
 
 def _jumped(scene: Scene, elements: Elements, mode: Mode, slip, t, q, v) -> Jumped:
-    place = place_at(scene, elements, q, v, t)
-    along, rebound = directions(scene, elements, jnp.zeros_like(slip), slip), rebounds(scene, elements, place)
-    after, pushed = jumped(scene, elements, mode, place, along, v, rebound)
-    rates = _product(place.row.A, after - v) + place.row.velocity
+    terms = terms_at(scene, elements, q, v, t)
+    along, rebound = directions(scene, elements, jnp.zeros_like(slip), slip), rebounds(scene, elements, terms)
+    after, pushed = jumped(scene, elements, mode, terms, along, v, rebound)
+    rates = _product(terms.row.A, after - v) + terms.row.velocity
     gap = jnp.stack([rates[one.normal] if one.opens else jnp.zeros((), v.dtype) for one in elements.each]) - rebound
     M = mass_matrix(scene.system, q, t)
     size = jnp.max(jnp.abs(_product(M, v))) + jnp.max(jnp.abs(M)) + jnp.max(jnp.abs(pushed.multipliers))
     return Jumped(after, pushed.normal, pushed.holding, by_element(elements, rates), gap, rebound, size)
 
 
-def _judged(scene: Scene, elements: Elements, mode: Mode, place: Place, motion, slip, q, v, t) -> Judged:
+def _judged(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, motion, slip, q, v, t) -> Judged:
     dtype, eps = v.dtype, float(jnp.finfo(v.dtype).eps)
-    values = conditions(scene, elements, mode, place, motion, slip, q, t)
-    speeds = jnp.sum(jnp.abs(place.row.A) * jnp.abs(v)[None], 1)
+    values = conditions(scene, elements, mode, terms, motion, slip, q, t)
+    speeds = jnp.sum(jnp.abs(terms.row.A) * jnp.abs(v)[None], 1)
     zero = jnp.zeros((), dtype)
     reach = 1 + jnp.max(jnp.abs(q))
     force = jnp.sum(jnp.abs(motion.normal)) + jnp.sum(jnp.abs(motion.pushed.holding))
@@ -169,7 +176,7 @@ def _judged(scene: Scene, elements: Elements, mode: Mode, place: Place, motion, 
     cone = jnp.stack(
         [force_at(scene, one).static.astype(dtype) * motion.normal[i] for i, one in enumerate(elements.each)]
     )
-    gap_rates = [(place.row.velocity[one.normal], motion.rates[one.normal]) if one.opens else (zero, zero)
+    gap_rates = [(terms.row.velocity[one.normal], motion.rates[one.normal]) if one.opens else (zero, zero)
                  for one in elements.each]  # fmt: skip
     return Judged(
         values,
@@ -177,7 +184,7 @@ def _judged(scene: Scene, elements: Elements, mode: Mode, place: Place, motion, 
         motion.normal,
         motion.pushed.holding,
         cone,
-        place.slip,
+        terms.slip,
         by_element(elements, motion.rates),
         jnp.stack(slip_size),
         jnp.stack(rate_size),

@@ -3,7 +3,7 @@
 A step that ends where a condition of the mode is violated is taken again, shorter, until its end is the event: the root is
 bracketed by the steps before and behind it, and approached by the secant rule of Illinois. So the state at the event is that of
 a step of full order, and not of an interpolation. Conditions are looked at in the middle and at the end of every step: what
-is violated and mended between is not seen.
+is violated and satisfied again between them is not seen.
 """
 
 from functools import partial
@@ -18,7 +18,7 @@ from jaxdyn.compile import any_in_batch, recompute_unless, run
 from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
 from jaxdyn.simulation.hybrid.transitions import Change
 from jaxdyn.simulation.solvers.driver import save
-from jaxdyn.simulation.solvers.explicit import Plan, bent_output, step_in_turn, whole_step
+from jaxdyn.simulation.solvers.explicit import Plan, projected_output, step_in_turn, whole_step
 
 _SAFETY, _LEAST, _MOST, _AFTER_EVENT = 0.9, 0.2, 10.0, 0.3
 _SIMULTANEOUS, _REAL = 1e-9, 1e-6  # of the size of a condition in the step
@@ -94,15 +94,15 @@ def _looked_at(laws: Laws, args, t0, t1, y, step, rtol, atol):
     scaled = step.error / (atol + rtol * jnp.maximum(jnp.abs(y), jnp.abs(step.projected)))
     size = jnp.sqrt(jnp.mean(scaled * scaled))
     middle = (t0 + t1) / 2
-    between = bent_output(laws.plan, None, middle, t0, t1, y, step.raw, step.stages, step.shift)
+    between = projected_output(laws.plan, None, middle, t0, t1, y, step.raw, step.stages, step.shift)
     return step, size, laws.judge(args, t1, step.projected), laws.judge(args, middle, between)
 
 
 def _attempted(laws: Laws, *given):
     kernel: Any = partial(run, attempt, *given, static=(laws,), calls=True, served=True)
-    found, served = kernel(otherwise=lambda *_: None)
+    outcome, served = kernel(otherwise=lambda *_: None)
     again = partial(attempt_in_turn, laws)
-    return again(*given) if found is None else recompute_unless(served, again, found, given)
+    return again(*given) if outcome is None else recompute_unless(served, again, outcome, given)
 
 
 def blank(elements: Elements, dtype, most: int) -> Records:
@@ -126,7 +126,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, max_steps: int, m
     begun: Change = laws.transit(unknown, start, y0, mode, slip, hit)
     y = laws.placed(y0, begun.v, begun.slip)
     conditions, _ = run(judged, (unknown, begun.mode), start, y, static=(laws,))
-    code = jnp.where(begun.paradox, PARADOX, jnp.where(begun.found, FINE, NO_MODE)).astype(jnp.int32)
+    code = jnp.where(begun.paradox, PARADOX, jnp.where(begun.settled, FINE, NO_MODE)).astype(jnp.int32)
     zero = jnp.zeros((), ts.dtype)
     first = 1e-4 * (end - start)
     lane = Lane(
@@ -143,11 +143,11 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, max_steps: int, m
         active = is_active(lane)
         t1 = jnp.where(active, jnp.minimum(lane.t + lane.length, end), lane.t)
         args = unknown, lane.mode
-        found = _attempted(laws, args, lane.t, t1, lane.y, rtol, atol)
-        after, kept, hit = _decided(laws, lane, t1, end, found, eps)
+        attempt = _attempted(laws, args, lane.t, t1, lane.y, rtol, atol)
+        after, kept, hit = _decided(laws, lane, t1, end, attempt, eps)
         after = jax.tree.map(lambda a, b: jnp.where(active, a, b), after, lane)
         kept, hit = kept & active, hit & active & kept
-        saved, rows = save(laws.plan, ts, lane, after, kept, found[0], saved, rows)
+        saved, rows = save(laws.plan, ts, lane, after, kept, attempt[0], saved, rows)
         happens = hit.any()
         after, records = lax.cond(
             any_in_batch(happens),
@@ -168,9 +168,9 @@ def judged(laws: Laws, args, t, y):
     return laws.judge(args, t, y)
 
 
-def _decided(laws: Laws, lane: Lane, t1, end, found, eps: float) -> tuple[Lane, Array, Array]:
+def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float) -> tuple[Lane, Array, Array]:
     """The lane after an attempt, whether the step is kept, and which conditions ended it."""
-    step, size, (values, levels), (between, levels_between) = found
+    step, size, (values, levels), (between, levels_between) = attempt
     length = t1 - lane.t
     good = size < 1
     factor = _SAFETY * (1 / size) ** (1 / laws.order)
@@ -274,7 +274,7 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
         rows = jax.tree.map(lambda all_, one, at=place: all_.at[at].set(one), rows, row)
         count = count + mine.astype(jnp.int32)
     crowded = count > most
-    code = jnp.where(change.found, FINE, NO_MODE)
+    code = jnp.where(change.settled, FINE, NO_MODE)
     code = jnp.where(crowded, CROWDED, code)
     code = jnp.where(change.paradox | lost, PARADOX, code)
     after = lane._replace(

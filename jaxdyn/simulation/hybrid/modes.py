@@ -100,26 +100,27 @@ def elements_of(scene: Scene) -> Elements:
     """
     places, own = layout(extended(scene)), len(scene.constraints)
     names = [place.name for place in places[:own]]
-    found, used = [], []
+    elements, used = [], []
     chosen: list[Any] = [(i, force) for i, force in enumerate(scene.forces) if isinstance(force, WithModes)]
     for (i, force), place in zip(chosen, places[own:], strict=True):
-        held, slips = place.slip - place.start, place.end - place.slip
-        tangent = tuple(range(place.slip, place.end))
+        gap_rows, friction_rows = place.nonholonomic - place.start, place.end - place.nonholonomic
+        tangent = tuple(range(place.nonholonomic, place.end))
         name = force.name
         while name in used:
             name = f"{name} ({i})" if name == force.name else f"{name}'"
         used.append(name)
         if isinstance(force, UnilateralContact):
-            if held != 1 or slips > 2:
+            if gap_rows != 1 or friction_rows > 2:
                 raise ValueError(
-                    f"contact {name!r} has {held} rows on positions and {slips} on velocities; a contact has a gap and up "
-                    "to two rows without slip: leave out spin=True"
+                    f"contact {name!r} has {gap_rows} rows on positions and {friction_rows} on velocities; a contact has "
+                    "a gap and up to two rows without slip: leave out spin=True"
                 )
-            found.append(Element(name, i, place.start, tangent, True, False))
+            elements.append(Element(name, i, place.start, tangent, True, False))
             continue
-        if held or not 1 <= slips <= 2:
+        if gap_rows or not 1 <= friction_rows <= 2:
             raise ValueError(
-                f"friction {name!r}: along has {held} rows on positions and {slips} on velocities; give one or two on velocities"
+                f"friction {name!r}: along has {gap_rows} rows on positions and {friction_rows} on velocities; give "
+                "one or two on velocities"
             )
         normal = -1
         if force.constraint is not None:
@@ -132,5 +133,5 @@ def elements_of(scene: Scene) -> Elements:
                     f"friction {name!r}: constraint {force.constraint!r} has {places[at].end - normal} rows, of which none is a "
                     "normal force; name one with one row"
                 )
-        found.append(Element(name, i, normal, tangent, False, force.smoothing is not None))
-    return Elements(tuple(found), places[own].start, places[-1].end)
+        elements.append(Element(name, i, normal, tangent, False, force.smoothing is not None))
+    return Elements(tuple(elements), places[own].start, places[-1].end)

@@ -17,7 +17,7 @@ from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.hybrid import machine
-from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, place_at, slides
+from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, slides, terms_at
 from jaxdyn.simulation.hybrid.events import Events
 from jaxdyn.simulation.hybrid.laws import laws_of, put_back
 from jaxdyn.simulation.hybrid.modes import Mode, elements_of, extended, force_at
@@ -26,6 +26,7 @@ from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.simulation.solvers.choice import label, unwrapped
+from jaxdyn.simulation.solvers.inputs import has_unit_quaternions
 from jaxdyn.systems.scene import Scene, check_callback, checked_force
 from jaxdyn.systems.system import retract
 
@@ -76,31 +77,32 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
         scene, control = known(unknown)
         whole = extended(scene)
 
-        def effort(q, v, t):
+        def generalized_force(q, v, t):
             force = whole.applied_force(q, v, t)
             if control is None:
                 return force
             tau = whole.limited(checked_force(control(q, v, t), q, scene.nv, "control"))
             return tau if force is None else tau + force
 
-        return scene, effort
+        return scene, generalized_force
 
     for i, force in enumerate(bare):
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", q0, v0, ts[0], first=(system,))
     in_order = jnp.isfinite(ts).all() & (ts[1:] > ts[:-1]).all()
     given_times, ts = ts, jnp.where(in_order, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
+    unit_start = has_unit_quaternions(system, q0)
     q0 = retract(system, q0)
     finite_start = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
     fine = jnp.isfinite(rtol) & (rtol >= 0) & jnp.isfinite(atol) & (atol >= 0)
     rtol, atol = (jnp.maximum(jnp.where(fine, x, 1e-3), 10 * eps).astype(dtype) for x in (rtol, atol))
-    good = finite_start & in_order & fine
+    good = finite_start & unit_start & in_order & fine
     harmless = neutral(system).astype(dtype) if isinstance(system, Model) else jnp.zeros_like(q0)
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
 
-    mode, slip, held = _guess(scene, elements, q0, v0, ts[0])
+    mode, slip, start_ok = _guess(scene, elements, q0, v0, ts[0])
     own = Scene(system, scene.constraints)
     if scene.constraints:
-        held = held & consistent(own, q0, v0, ts[0])
+        start_ok = start_ok & consistent(own, q0, v0, ts[0])
     y0 = {"q": q0, "v": v0, "slip": slip}
     laws = laws_of(given, elements, options["solver"], y0)
     most = options["max_events"]
@@ -117,7 +119,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
 
     def report(unknown, row):
         y, mode, t = row
-        scene_, effort = given(unknown)
+        scene_, generalized_force = given(unknown)
         system, control = scene_.system, known(unknown)[1]
         q, v, values = y["q"], y["v"], {}
         if "energy" in outputs:
@@ -126,14 +128,14 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
             tau = jnp.zeros_like(v) if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
             values["torque"] = scene_.limited(tau)
         if {"acceleration", "multipliers", "contact_forces"} & set(outputs):
-            place = place_at(scene_, elements, q, v, t)
-            found = motion_at(scene_, elements, mode, place, y["slip"], effort(q, v, t), q, v, t)
+            terms = terms_at(scene_, elements, q, v, t)
+            at_time = motion_at(scene_, elements, mode, terms, y["slip"], generalized_force(q, v, t), q, v, t)
             if "acceleration" in outputs:
-                values["acceleration"] = found.acceleration
+                values["acceleration"] = at_time.acceleration
             if "multipliers" in outputs:
-                values["multipliers"] = found.pushed.multipliers[: elements.own]
+                values["multipliers"] = at_time.pushed.multipliers[: elements.own]
             if "contact_forces" in outputs:
-                values["contact_forces"] = _forces(scene_, elements, mode, place, found, y["slip"])
+                values["contact_forces"] = _forces(scene_, elements, mode, terms, at_time, y["slip"])
         frames = [name.removeprefix("pose:") for name in outputs if name.startswith("pose:")]
         return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
 
@@ -154,7 +156,8 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
         result = RESULTS.where(lane.code == code, getattr(RESULTS, name), result)
     result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
     for fits, name in (
-        (held, "inconsistent_start"),
+        (start_ok, "inconsistent_start"),
+        (unit_start, "unnormalized_start"),
         (finite_start, "nonfinite_start"),
         (fine, "bad_tolerance"),
         (in_order, "unordered_times"),
@@ -189,15 +192,15 @@ def _guess(scene: Scene, elements, q, v, t):
     mode = Mode(~opens | (gap <= small * reach), speed <= small * (1 + jnp.max(jnp.abs(v))), jnp.zeros(gap.shape, bool))
     smooth = jnp.asarray(np.array([one.smooth for one in elements.each]))
     limit = float(jnp.finfo(q.dtype).eps) ** 0.4
-    held = (~opens | (gap >= -limit * reach)).all()
-    return mode._replace(stick=mode.stick & ~smooth), lax.stop_gradient(unit), held
+    start_ok = (~opens | (gap >= -limit * reach)).all()
+    return mode._replace(stick=mode.stick & ~smooth), lax.stop_gradient(unit), start_ok
 
 
-def _forces(scene: Scene, elements, mode: Mode, place, found, slip) -> dict:
+def _forces(scene: Scene, elements, mode: Mode, terms, at_time, slip) -> dict:
     """Friction along the rows (2,), what holds or what brakes, and normal force, by the names of the elements: (3,)."""
-    along, sliding, forces = directions(scene, elements, place.slip, slip), slides(elements, mode), {}
+    along, sliding, forces = directions(scene, elements, terms.slip, slip), slides(elements, mode), {}
     for i, one in enumerate(elements.each):
-        level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(slip.dtype) * found.normal[i], 0.0)
-        normal = jnp.where(mode.closed[i], found.normal[i], 0.0)
-        forces[one.name] = jnp.append(found.pushed.holding[i] - level * along[i], normal)
+        level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(slip.dtype) * at_time.normal[i], 0.0)
+        normal = jnp.where(mode.closed[i], at_time.normal[i], 0.0)
+        forces[one.name] = jnp.append(at_time.pushed.holding[i] - level * along[i], normal)
     return forces

@@ -1,4 +1,4 @@
-"""The way from the start to the save points, and reverse mode through its events.
+"""Integration from the start to the save points, and reverse mode through its events.
 
 Backwards the motion is taken again in pieces, from each save point or event to the next, within the modes that are known by then.
 Each piece is differentiated as motions without events are. At an event the condition e of the mode falls to zero, so its time
@@ -44,7 +44,7 @@ class Hybrid(eqx.Module):
     def __call__(self, y0, unknown, ts):
         return _driven((y0, unknown, ts), lax.stop_gradient(self))
 
-    def found(self, moving):
+    def driven(self, moving):
         """What a call returns."""
         y0, unknown, ts = moving
         flat, _ = ravel_pytree(y0)
@@ -56,13 +56,13 @@ class Hybrid(eqx.Module):
 
 @eqx.filter_custom_vjp
 def _driven(moving, how: Hybrid):
-    return how.found(moving)
+    return how.driven(moving)
 
 
 @_driven.def_fwd
 def _(perturbed, moving, how: Hybrid):
-    found = how.found(moving)
-    return found, found[2]
+    driven = how.driven(moving)
+    return driven, driven[2]
 
 
 @_driven.def_bwd
@@ -96,11 +96,11 @@ def _replayed(how: Hybrid, moving, lane, records, begun):
         record = jax.tree.map(lambda x: x[place], records)
         until = jnp.where(event, lax.stop_gradient(record.time), ts[1:][jnp.clip(at, 0, saves - 1)])
         known = ~event | (record.name >= 0)
-        moves = known & (until > t) & (until <= end)
-        until = jnp.where(moves, until, t)
+        advances = known & (until > t) & (until <= end)
+        until = jnp.where(advances, until, t)
         drive = Drive(laws.plan, norm, how.rtol, how.atol, None, how.max_steps, room)
-        found, _, _ = drive(laws.plan.structure(y), (unknown, mode), jnp.stack([t, until]))
-        here = jnp.where(moves, ravel_pytree(jax.tree.map(lambda x: x[0], found))[0], y)
+        driven, _, _ = drive(laws.plan.structure(y), (unknown, mode), jnp.stack([t, until]))
+        here = jnp.where(advances, ravel_pytree(jax.tree.map(lambda x: x[0], driven))[0], y)
         landed = _crossed(laws, unknown, mode, record, t, until, here)
         crosses = event & known
         t, y = (jnp.where(crosses, a, b) for a, b in zip(landed, (until, here), strict=True))
@@ -121,12 +121,12 @@ def _crossed(laws: Laws, unknown, mode: Mode, record: Records, t, known_time, y)
         return run(machine.judged, (unknown, mode), t, y, static=(laws,))[0].reshape(-1)[which]
 
     rate = lax.stop_gradient(laws.plan.field_of((unknown, mode), known_time, y))
-    still = lax.stop_gradient((known_time, y))
-    _, slope = jax.jvp(condition, still, (jnp.ones_like(known_time), rate))
+    fixed = lax.stop_gradient((known_time, y))
+    _, slope = jax.jvp(condition, fixed, (jnp.ones_like(known_time), rate))
     value = condition(known_time, y)
-    moves = hit & (slope != 0)
-    late = (value - lax.stop_gradient(value)) / lax.stop_gradient(jnp.where(moves, slope, jnp.ones_like(slope)))
-    late = jnp.where(moves, late, jnp.zeros_like(late))
+    is_regular = hit & (slope != 0)
+    late = (value - lax.stop_gradient(value)) / lax.stop_gradient(jnp.where(is_regular, slope, jnp.ones_like(slope)))
+    late = jnp.where(is_regular, late, jnp.zeros_like(late))
     time = jnp.where(hit, known_time - late, t)
     y = laws.land(unknown, record.impact, record.impact_slip, time, y - late * rate)
     return time, _with_slip(laws, y, record.slip)

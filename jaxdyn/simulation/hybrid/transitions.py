@@ -64,7 +64,7 @@ class Change(NamedTuple):
     mode: Mode
     slip: Array
     v: Array
-    found: Array
+    settled: Array
     paradox: Array
 
 
@@ -89,9 +89,9 @@ def _first(x):
 def aligned(slip, reference):
     """Directions of slipping (n, 2) of what moves, on the side of the old ones; the old ones of what does not."""
     size, unit = length(lax.stop_gradient(slip))
-    moves = size > 100 * float(jnp.finfo(slip.dtype).eps)
+    is_sliding = size > 100 * float(jnp.finfo(slip.dtype).eps)
     forward = jnp.where(jnp.sum(unit * reference, 1) < 0, -1.0, 1.0).astype(slip.dtype)
-    return lax.stop_gradient(jnp.where(moves[:, None], forward[:, None] * unit, reference))
+    return lax.stop_gradient(jnp.where(is_sliding[:, None], forward[:, None] * unit, reference))
 
 
 def at_once(elements: Elements, mode: Mode, slip, judged: Judged, hit) -> tuple[Mode, Array, Array]:
@@ -143,17 +143,17 @@ def changed_mode(elements: Elements, cones, mode: Mode, slip, begins, v, jump: C
 
         def body(carry):
             mode, slip, count, busy, _ = carry
-            wrong, stick, against, found = wrong_of(mode, slip)
+            wrong, stick, against, values = wrong_of(mode, slip)
             busy = busy & wrong.any() & (count < most)
             after = flip((mode, slip), wrong, stick, against)
             mode, slip = jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, (mode, slip))
-            return mode, slip, count + busy.astype(jnp.int32), busy, found
+            return mode, slip, count + busy.astype(jnp.int32), busy, values
 
         start = jax.eval_shape(wrong_of, mode, slip)[3]
         blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
         first = mode, slip, jnp.zeros((), jnp.int32), jnp.ones((), bool), blank
-        mode, slip, count, _, found = lax.while_loop(unfinished, body, first)
-        return mode, slip, count < most, found
+        mode, slip, count, _, values = lax.while_loop(unfinished, body, first)
+        return mode, slip, count < most, values
 
     def by_velocity(mode, slip):
         after: Jumped = jump(mode, slip)
@@ -181,30 +181,34 @@ def changed_mode(elements: Elements, cones, mode: Mode, slip, begins, v, jump: C
         scale = small * (jnp.sum(jnp.abs(now.normal)) + jnp.sum(jnp.abs(now.holding)))
         hold, against = length(-now.holding)
         speed, _ = length(now.slip)
-        still = speed <= small * now.slip_size
+        at_rest = speed <= small * now.slip_size
         resting = opens & (now.gap <= small * now.gap_size) & (jnp.abs(now.gap_velocity) <= small * now.slip_size)
         wrong = jnp.stack(
             [
                 opens & mode.closed & ~mode.stick & (now.normal < -scale),
                 resting & ~mode.closed & (now.gap_rate < -small * now.rate_size),
                 mode.closed & mode.stick & ((hold > now.cone + scale) | (opens & (now.normal < -scale))),
-                mode.closed & ~mode.stick & rough & still & (jnp.sum(slip * now.slip_rate, 1) < -small * now.rate_size),
+                mode.closed
+                & ~mode.stick
+                & rough
+                & at_rest
+                & (jnp.sum(slip * now.slip_rate, 1) < -small * now.rate_size),
                 ~opens & (now.normal < -scale) & coupled,
             ],
             1,
         )
-        return wrong, still, against, now
+        return wrong, at_rest, against, now
 
     coupled = jnp.asarray(np.array([one.normal >= 0 for one in elements.each]))
     judged: Judged = judge(mode, slip, v)
     impact, impact_slip, hit, after = solve(by_velocity, mode, slip)
     v = after.v
     speed, unit = length(after.slip)
-    moves = speed > _loose(v.dtype) * judged.slip_size
-    slip = impact_slip = lax.stop_gradient(jnp.where(moves[:, None], unit, impact_slip))
-    # What rebounds opens; what came to rest with others is held if it can be.
+    is_sliding = speed > _loose(v.dtype) * judged.slip_size
+    slip = impact_slip = lax.stop_gradient(jnp.where(is_sliding[:, None], unit, impact_slip))
+    # Elements that rebound open; those that came to rest together stick if their cones allow it.
     closed = impact.closed & ~(opens & (after.rebound > 0))
-    resting = impact._replace(closed=closed, stick=(impact.stick | (rough & ~moves & ~begins)) & closed)
+    resting = impact._replace(closed=closed, stick=(impact.stick | (rough & ~is_sliding & ~begins)) & closed)
     final, slip, settled, now = solve(by_force, resting, slip)
     final = final._replace(stick=final.stick & final.closed)
     # Where sliding has no forces, no mode is found; where it has two, one is.

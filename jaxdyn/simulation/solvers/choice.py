@@ -12,7 +12,7 @@ import optimistix
 from jaxdyn.compile import is_concrete, is_known
 from jaxdyn.model.arguments import batch_hint
 from jaxdyn.simulation.solvers.first_step import Adaptive
-from jaxdyn.simulation.solvers.fixed_steps import Watched
+from jaxdyn.simulation.solvers.fixed_steps import ErrorMonitoredSteps
 from jaxdyn.simulation.solvers.lie import LieGroup
 from jaxdyn.simulation.solvers.rk4 import RK4
 from jaxdyn.simulation.solvers.rosenbrock import Rodas5P
@@ -159,7 +159,7 @@ def stepping(solver, term, ts, rtol, atol, stepsize):
         newton = optimistix.Newton(rtol, atol)  # pyright: ignore[reportArgumentType]
         solver = eqx.tree_at(lambda s: s.root_finder, solver, newton)
     if is_fixed(stepsize):
-        return solver, Watched(solver.order(term)), stepsize
+        return solver, ErrorMonitoredSteps(solver.order(term)), stepsize
     controller = stepsize
     if controller is None:
         smallest = 16 * eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))

@@ -20,9 +20,9 @@ from jaxtyping import Array
 
 from jaxdyn.compile import Carry, Given, Passed, Task, Turn, any_in_batch, recompute_unless, run, run_loop
 from jaxdyn.simulation.solvers import reverse
-from jaxdyn.simulation.solvers.explicit import Plan, Step, bent_output, step_in_turn, whole_step
+from jaxdyn.simulation.solvers.explicit import Plan, Step, projected_output, step_in_turn, whole_step
 from jaxdyn.simulation.solvers.first_step import first_step
-from jaxdyn.simulation.solvers.fixed_steps import no_sums, watched
+from jaxdyn.simulation.solvers.fixed_steps import accumulated, no_sums
 
 _SAFETY, _LEAST_FACTOR, _MOST_FACTOR = 0.9, 0.2, 10.0  # of diffrax's PIDController
 _ROUNDED = 100  # numbers before the end from which on a step goes to the end
@@ -43,7 +43,7 @@ class Fixed(NamedTuple):
 
 
 class Driven(NamedTuple):
-    """Rows of the state at ts[1:], diffrax's result, counts, the time reached, sums about fixed steps (`watched`), and, where
+    """Rows of the state at ts[1:], diffrax's result, counts, the time reached, sums about fixed steps (`accumulated`), and, where
     asked for, what reverse mode needs."""
 
     rows: Array
@@ -75,24 +75,24 @@ class Drive(eqx.Module):
     def __call__(self, y0, args, ts):
         return _driven((y0, args, ts), jax.lax.stop_gradient(self))
 
-    def found(self, moving, room: int | None):
+    def with_history(self, moving, room: int | None):
         """What a call returns, and the `History` of at most `room` steps, or None."""
         y0, args, ts = moving
         most = self.max_steps if room is None else room
         steps = self.rtol, self.atol, self.stepsize
-        found = drive(self.plan, self.how, ravel_pytree(y0)[0], args, ts, *steps, most, room is not None)
-        rows = jax.vmap(self.plan.structure)(found.rows)
-        return (rows, (found.result, found.counts, found.reached), found.sums), found.history
+        driven = drive(self.plan, self.how, ravel_pytree(y0)[0], args, ts, *steps, most, room is not None)
+        rows = jax.vmap(self.plan.structure)(driven.rows)
+        return (rows, (driven.result, driven.counts, driven.reached), driven.sums), driven.history
 
 
 @eqx.filter_custom_vjp
 def _driven(moving, how: Drive):
-    return how.found(moving, None)[0]
+    return how.with_history(moving, None)[0]
 
 
 @_driven.def_fwd
 def _(perturbed, moving, how: Drive):
-    return how.found(moving, how.room)
+    return how.with_history(moving, how.room)
 
 
 @_driven.def_bwd
@@ -105,10 +105,10 @@ def _(history, gradients, perturbed, moving, how: Drive):
     steps = None if isinstance(how.how, Adaptive) else number_of_steps(ts[0], ts[-1], how.stepsize)
     of_y, of_args, of_ts = reverse.pulled(how.plan, history, start, args, ts, steps, rows, perturbed[1:])
 
-    def keep(x, moves):
-        return x if moves else None
+    def or_none(x, varies):
+        return x if varies else None
 
-    return jax.tree.map(keep, structure(of_y), perturbed[0]), of_args, keep(of_ts, perturbed[2])
+    return jax.tree.map(or_none, structure(of_y), perturbed[0]), of_args, or_none(of_ts, perturbed[2])
 
 
 class _Limits(NamedTuple):
@@ -155,8 +155,8 @@ def drive(
     rtol, atol = (jnp.zeros_like(start) if x is None else x for x in (rtol, atol))
     begin: Any = partial(_begin, plan, how)
     given = args, start, end, y0, rtol, atol
-    found, served = run(_begin, *given, static=(plan, how), calls=True, served=True)
-    rate, length, quality = recompute_unless(served, begin, found, given)
+    first, served = run(_begin, *given, static=(plan, how), calls=True, served=True)
+    rate, length, quality = recompute_unless(served, begin, first, given)
     steps = none
     if not isinstance(how, Adaptive):
         length = stepsize
@@ -171,11 +171,11 @@ def drive(
     records, strides = ((), ()) if history is None else (history.rows, history.strides)
     carry = Carry(lane, none, rows, records)
     how_far = plan, how, max_steps, strides
-    task, given = Task(_turn, _by_turns, how_far, bent_output, (plan,), strides), Given(ts)
+    task, given = Task(_turn, _by_turns, how_far, projected_output, (plan,), strides), Given(ts)
 
     def run_on(carry):
-        found = run_loop(task, args, limits, given, carry)
-        return (carry, False) if found is None else found
+        after = run_loop(task, args, limits, given, carry)
+        return (carry, False) if after is None else after
 
     # All steps, or those before the first one that wants more care than machine code takes; that one, and so on.
     carry, always_ends = run_on(carry)
@@ -239,13 +239,13 @@ def number_of_steps(start, end, stepsize):
 def _advanced(plan: Plan, how, args, limits: _Limits, lane: _Lane, active) -> tuple[_Lane, Array, Step]:
     """The lane after a step, whether that is kept, and the step; all of it one kernel where it is numbers."""
     advance: Any = partial(run, _advance, args, limits, lane, active, static=(plan, how), calls=True, served=True)
-    found, served = advance(otherwise=lambda *_: None)
+    advanced, served = advance(otherwise=lambda *_: None)
 
     given = args, limits, lane, active
-    if found is None:
+    if advanced is None:
         return _advance_in_turn(plan, how, *given)
     served = served if served is True else served | ~active
-    return recompute_unless(served, partial(_advance_in_turn, plan, how), found, given)
+    return recompute_unless(served, partial(_advance_in_turn, plan, how), advanced, given)
 
 
 def _advance(plan: Plan, how, args, limits: _Limits, lane: _Lane, active):
@@ -268,7 +268,7 @@ def _accepted(plan: Plan, how, args, limits: _Limits, lane: _Lane, active, step:
     else:
         kept, t, at_least, failed = jnp.asarray(True), t_next, lane.at_least, jnp.asarray(False)
         start, before, y, error = (plan.structure(x) for x in (limits.y0, lane.y, step.projected, step.error))
-        sums = watched(how.order, how.error_order, start, before, y, error, *lane.sums)
+        sums = accumulated(how.order, how.error_order, start, before, y, error, *lane.sums)
         done = (lane.taken + 2).astype(end.dtype) / limits.steps.astype(end.dtype)
         after = limits.start + (end - limits.start) * done
         after = jnp.where((lane.taken + 2 >= limits.steps) | (after > limits.floor), end, after)
@@ -301,7 +301,7 @@ def save(plan: Plan, ts, before: Any, after: Any, kept, step: Step, saved, rows)
         saved, rows = carry
         here, place = is_passed(saved), jnp.minimum(saved, count - 1)
         at = ts[place + 1], before.t, after.t, before.y, step.raw, step.stages, step.shift
-        row = run(bent_output, None, *at, static=(plan,))
+        row = run(projected_output, None, *at, static=(plan,))
         rows = rows.at[place].set(jnp.where(here, row, rows[place]))
         return saved + here.astype(jnp.int32), rows
 

@@ -21,7 +21,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import along, any_in_batch, implicit, recompute_unless, run
 from jaxdyn.constraints.projection import enlarged
-from jaxdyn.simulation.solvers.projected import Bent, ProjectedSolver
+from jaxdyn.simulation.solvers.projected import ProjectedInterpolation, ProjectedSolver
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
@@ -50,7 +50,7 @@ class ExplicitSteps(ProjectedSolver):
 
     A projection acts before the last stage where that is the first one of the next step, which then need not be computed anew
     (it is in `ProjectedSolver`). It also acts on the error, which must not need the last stage then, unless the manifold has
-    no branches. Entries that are `jumping` change with the projection, and the stage with them.
+    no branches. Entries that are `step_constants` change with the projection, and the stage with them.
 
     **Arguments:** as of `ProjectedSolver`; `project` None for none; `field(t, y, args)`, the vector field of the term.
     """
@@ -63,13 +63,13 @@ class ExplicitSteps(ProjectedSolver):
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         """Dense output of the wrapped method, ending at the projected point if there is one."""
         interpolation = partial(_Interpolation, self.solver.interpolation_cls)
-        return interpolation if self.project is None else partial(Bent, interpolation)
+        return interpolation if self.project is None else partial(ProjectedInterpolation, interpolation)
 
     def plan(self, y0) -> "Plan":
         """How steps of states like this one are made."""
         leaves, tree = jax.tree.flatten(y0)
         shapes = tuple(x.shape for x in leaves)
-        return Plan(type(self.solver), self.field, self.project, self.jumping, self.branching, tree, shapes)
+        return Plan(type(self.solver), self.field, self.project, self.step_constants, self.branching, tree, shapes)
 
     def init(self, terms, t0, t1, y0, args):
         """The last stage of the step before, and whether there is one."""
@@ -84,11 +84,11 @@ class ExplicitSteps(ProjectedSolver):
 
         def tangent(args, *rest):
             *state, steps = rest
-            found, moved = along(partial(_in_turn, plan), (args, *state), steps)
-            return found, jax.tree.map(_no_change, found) if moved is None else moved
+            results, changes = along(partial(_in_turn, plan), (args, *state), steps)
+            return results, jax.tree.map(_no_change, results) if changes is None else changes
 
-        found: Any = implicit(args, state, partial(_at_once, plan), tangent)
-        projected, shift, error, raw, k, result = found
+        results: Any = implicit(args, state, partial(_at_once, plan), tangent)
+        projected, shift, error, raw, k, result = results
         dense = {"y0": y0, "y1": structure(raw), "stages": k}
         if self.project is not None:
             dense = {"dense_info": dense, "shift": structure(shift)}
@@ -103,7 +103,7 @@ class Plan(NamedTuple):
     solver: type
     field: Callable
     project: Callable | None
-    jumping: tuple[str, ...]
+    step_constants: tuple[str, ...]
     branching: bool
     tree: Any
     shapes: tuple
@@ -136,7 +136,7 @@ class Plan(NamedTuple):
     @property
     def projects_before_last(self) -> bool:
         """Whether the last stage comes after the projection."""
-        return self.project is not None and passes_last_stage_on(self.tableau, self.jumping, self.branching)
+        return self.project is not None and passes_last_stage_on(self.tableau, self.step_constants, self.branching)
 
     @property
     def knows_error(self) -> bool:
@@ -170,7 +170,7 @@ class Plan(NamedTuple):
     def ended(self, args, t1, y, error):
         """y projected, what that adds, the error, and a result."""
         project: Any = self.project
-        method = ProjectedSolver(diffrax.Euler(), project, self.jumping, self.branching)
+        method = ProjectedSolver(diffrax.Euler(), project, self.step_constants, self.branching)
         given = method.ended(t1, self.structure(y), self.structure(error), args)
         return *(ravel_pytree(x)[0] for x in given[:3]), given[3]
 
@@ -187,11 +187,11 @@ def _at_once(plan: Plan, args, t0, t1, start, kept, ready):
 
     first = lax.cond(ready, lambda y: dt * kept, anew, start)
     whole: Any = partial(run, _whole, args, t0, t1, start, first, static=(plan,), calls=True, served=True)
-    found, served = whole(otherwise=lambda *_: None)
-    if found is None:
+    step, served = whole(otherwise=lambda *_: None)
+    if step is None:
         return _in_turn(plan, args, t0, t1, start, kept, ready)
     again: Any = partial(_in_turn, plan)
-    return recompute_unless(served, again, (*found, diffrax.RESULTS.successful), (args, t0, t1, start, kept, ready))
+    return recompute_unless(served, again, (*step, diffrax.RESULTS.successful), (args, t0, t1, start, kept, ready))
 
 
 class Step(NamedTuple):
@@ -219,8 +219,8 @@ def whole_step(plan: Plan, args, t0, t1, y, rate) -> Step:
 
 def step_in_turn(plan: Plan, args, t0, t1, y, rate) -> Step:
     """The same as a loop over the stages, without derivatives."""
-    found: Any = _in_turn(plan, args, t0, t1, y, rate, jnp.asarray(plan.passes_rate_on))
-    projected, shift, error, raw, stages, _ = found
+    step: Any = _in_turn(plan, args, t0, t1, y, rate, jnp.asarray(plan.passes_rate_on))
+    projected, shift, error, raw, stages, _ = step
     return Step(projected, shift, error, raw, stages, _last_rate(plan, t0, t1, stages, rate))
 
 
@@ -229,16 +229,16 @@ def _last_rate(plan: Plan, t0, t1, stages, rate):
     return jnp.where(dt == 0, rate, stages[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt))
 
 
-def bent_output(plan: Plan, _, t, t0, t1, y, raw, stages, shift):
+def projected_output(plan: Plan, _, t, t0, t1, y, raw, stages, shift):
     """The state (n,) at a time t within a step, by the method's dense output bent to where the projection put its end."""
     inner: Any = plan.solver.interpolation_cls(
         t0=t0, t1=t1, y0=plan.structure(y), y1=plan.structure(raw), k=jax.vmap(plan.structure)(stages)
     )
-    found = ravel_pytree(inner.evaluate(t))[0]
+    y_dense = ravel_pytree(inner.evaluate(t))[0]
     if plan.project is None:
-        return found
+        return y_dense
     x = jnp.asarray((t - t0) / jnp.where(t1 == t0, jnp.ones_like(t1), t1 - t0), y.dtype)
-    return found + x * x * (3 - 2 * x) * shift
+    return y_dense + x * x * (3 - 2 * x) * shift
 
 
 def _first(plan: Plan, args, t0, t1, start):
@@ -306,6 +306,6 @@ def _sum(weights, k):
     return functools.reduce(jnp.add, terms) if terms else jnp.zeros_like(k[0])
 
 
-def passes_last_stage_on(tableau, jumping: tuple[str, ...], branching: bool) -> bool:
+def passes_last_stage_on(tableau, step_constants: tuple[str, ...], branching: bool) -> bool:
     """Whether the last stage of a projected step is the first one of the next: see `ExplicitSteps`."""
-    return tableau.fsal and not jumping and bool(tableau.b_error[-1] == 0 or not branching)
+    return tableau.fsal and not step_constants and bool(tableau.b_error[-1] == 0 or not branching)

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from jaxdyn.compile import is_concrete
 from jaxdyn.model.arguments import batch_hint, check_shape
@@ -9,6 +10,9 @@ from jaxdyn.model.tree import Model
 from jaxdyn.simulation.solvers.choice import is_fixed
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import has_quaternions
+
+# Numbers that a file holds to a few digits are of unit length to this.
+_LENGTH_TOLERANCE = 1e-3
 
 
 def check_start(scene: Scene, q0, v0) -> None:
@@ -19,17 +23,33 @@ def check_start(scene: Scene, q0, v0) -> None:
         check_shape(scene.system, name, value)
         if is_concrete(value):
             _check_finite(name, value)
-    if not (has_quaternions(scene.system) and is_concrete(q0)):
+    if not is_concrete(q0):
         return
-    topology = scene.system.topology
-    for joint, kind, place in zip(topology.joint_names, topology.kinds, topology.q_slices, strict=True):
-        if kind in ("spherical", "free"):
-            norm = float(np.linalg.norm(np.asarray(q0, float)[place][-4:]))
-            if abs(norm - 1) > 1e-3:
-                raise ValueError(
-                    f"q0 has a quaternion of length {norm:.6g} at joint {joint!r}, expected 1; "
-                    "divide it by its length (order w, x, y, z)"
-                )
+    for joint, places in _quaternions(scene.system):
+        length = float(np.linalg.norm(np.asarray(q0, float)[places]))
+        if abs(length - 1) > _LENGTH_TOLERANCE:
+            raise ValueError(
+                f"q0 has a quaternion of length {length:.6g} at joint {joint!r}, expected 1; "
+                "divide it by its length (order w, x, y, z)"
+            )
+
+
+def has_unit_quaternions(system, q) -> Bool[Array, ""]:
+    """Whether every quaternion of q is of unit length, within what numbers in files are rounded to, or zero."""
+    squares = [jnp.sum(q[places] ** 2) for _, places in _quaternions(system)]
+    if not squares:
+        return jnp.asarray(True)
+    low, high = (1 - _LENGTH_TOLERANCE) ** 2, (1 + _LENGTH_TOLERANCE) ** 2
+    return jnp.stack([(x == 0) | ((x >= low) & (x <= high)) for x in squares]).all()
+
+
+def _quaternions(system) -> list[tuple[str, slice]]:
+    """Joints whose coordinates end with a quaternion, and where it stands in q."""
+    if not has_quaternions(system):
+        return []
+    top = system.topology
+    joints = zip(top.joint_names, top.kinds, top.q_slices, strict=True)
+    return [(name, slice(at.stop - 4, at.stop)) for name, kind, at in joints if kind in ("spherical", "free")]
 
 
 def most_turned(dtype) -> float:

@@ -15,7 +15,7 @@ from jaxdyn.simulation.solvers.wrapped import Wrapped
 _EXPECTED = 10  # times the normal part of the estimated error a projection may move a step
 
 
-class Bent(diffrax.AbstractLocalInterpolation):
+class ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
     """Dense output of the wrapped method, bent so that the step ends where the projection put it.
 
     The bend is as small as the local error, so the order of the dense output is kept and it stays continuous from one
@@ -53,14 +53,14 @@ class ProjectedSolver(Wrapped):
 
     **Arguments:** `solver`, any diffrax method of an `ODETerm`. `project(t, y, error, args) -> (y, error, diffrax.RESULTS)`:
     the state put back, the error estimate (None if there is none) without its part normal to the manifold, and whether it
-    succeeded; everything it depends on comes through `args`, so that gradients reach it. The state is a dictionary. `jumping`
-    names entries of it: constants of a step that `project` may change for the next one, so that within the step the dense
-    output keeps the old ones. `branching`: whether the manifold may have branches that meet. If not, `project` leaves
-    errors as they are.
+    succeeded; everything it depends on comes through `args`, so that gradients reach it. The state is a dictionary.
+    `step_constants` names entries of it that are constant within a step and that `project` may change for the next one; the
+    dense output of the step keeps the old ones. `branching`: whether the manifold may have branches that meet. If not, `project`
+    leaves errors as they are.
     """
 
     project: Callable
-    jumping: tuple[str, ...] = eqx.field(static=True, default=())
+    step_constants: tuple[str, ...] = eqx.field(static=True, default=())
     branching: bool = eqx.field(static=True, default=True)
 
     @property
@@ -71,13 +71,13 @@ class ProjectedSolver(Wrapped):
     @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         """Dense output of the wrapped method, ending at the projected point."""
-        return functools.partial(Bent, self.solver.interpolation_cls)
+        return functools.partial(ProjectedInterpolation, self.solver.interpolation_cls)
 
     def ended(self, t, y, error, args):
-        """A step's result y projected, what that adds to it (zero in entries that are `jumping`), its error, and a result."""
+        """A step's result y projected, what that adds to it (zero in `step_constants`), its error, and a result."""
         projected, left, result = self.project(t, y, error, args)
         shift = jax.tree.map(lambda a, b: a - b, projected, y)
-        shift = shift | {name: jnp.zeros_like(shift[name]) for name in self.jumping}
+        shift = shift | {name: jnp.zeros_like(shift[name]) for name in self.step_constants}
         if error is not None:
             left = jax.tree.map(
                 lambda left, error, shift: enlarged(left, _unexpected(shift, error - left)), left, error, shift

@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxdyn.compile import Carry, Given, Task, Turn, any_in_batch, recompute_unless, run, run_loop, unless
-from jaxdyn.simulation.solvers.explicit import Plan, bent_output, step_in_turn, whole_step
+from jaxdyn.simulation.solvers.explicit import Plan, projected_output, step_in_turn, whole_step
 
 KEPT = 512  # states that are kept of a run
 
@@ -81,7 +81,7 @@ class _Ends(NamedTuple):
     steps: Any
 
 
-class _Way(NamedTuple):
+class _Cotangents(NamedTuple):
     """Cotangents on the way back.
 
     Of the state after a step, and what rows within the step gave to that of the state before it; sums of those of what does not
@@ -98,55 +98,55 @@ class _Way(NamedTuple):
     places: Array  # (6,) of what is read next: state, times, flag, row, time of that row and of the one before it
 
 
-class _Forth(NamedTuple):
+class _Replay(NamedTuple):
     """The way from a state that was kept, by steps that are taken again."""
 
     y: Array
     places: Array  # (2,) of the times and the flag of the next step
 
 
-def pulled(plan: Plan, history: History, y0, args, ts, steps, rows, moves) -> tuple[Array, Any, Array]:
+def pulled(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tuple[Array, Any, Array]:
     """Cotangents of y0, of the leaves of `args` that are to have one (None elsewhere), and of ts.
 
-    **Arguments:** `rows` (nt - 1, n), cotangents of the solution at ts[1:]; `steps`, the number of fixed ones, or None; `moves`:
+    **Arguments:** `rows` (nt - 1, n), cotangents of the solution at ts[1:]; `steps`, the number of fixed ones, or None; `varies`:
     which leaves of `args`, and whether the times, are to have cotangents.
     """
-    moving, times_move = moves
+    moving, times_move = varies
     free, fixed = eqx.partition(args, moving)
     free_leaves, structure = jax.tree.flatten(free)
     stride, static = history.stride, (plan, times_move, structure)
     none, least = jnp.zeros((), ts.dtype), jnp.zeros((), jnp.int32)
     saved = jnp.asarray(ts.shape[0] - 1, jnp.int32)
 
-    def back(first, last, states, way: _Way) -> _Way:
+    def back(first, last, states, cotangents: _Cotangents) -> _Cotangents:
         """Through the steps first .. last - 1, which begin from the rows of `states`."""
         ends = _Ends(first, ts[0], ts[-1], steps)
-        way = way._replace(places=_places(last - 1, first, way.saved))
+        cotangents = cotangents._replace(places=_places(last - 1, first, cotangents.saved))
         given = Given(None, (states, history.times, history.kept, rows, ts, ts))
         task = Task(_turn_back, _back_by_turns, static)
 
         def run_on(carry):
-            found = run_loop(task, (fixed, free_leaves), ends, given, carry)
-            return (carry, False) if found is None else found
+            after = run_loop(task, (fixed, free_leaves), ends, given, carry)
+            return (carry, False) if after is None else after
 
-        carry, always_ends = run_on(Carry(way))
+        carry, always_ends = run_on(Carry(cotangents))
         if not always_ends:
             turn = partial(_back_by_turn, *static, (fixed, free_leaves), ends, given)
-            carry = lax.while_loop(partial(_is_on_the_way, ends), lambda carry: run_on(turn(carry))[0], carry)
+            carry = lax.while_loop(partial(_is_unfinished, ends), lambda carry: run_on(turn(carry))[0], carry)
         return carry.state
 
-    def forth(first, last, y):
+    def replayed(first, last, y):
         """States from which the steps first .. last - 1 begin, (stride, n), the first of them y."""
-        state = _Forth(y, jnp.stack([first, first]))
+        state = _Replay(y, jnp.stack([first, first]))
         given = Given(None, (history.times, history.kept))
-        task = Task(_turn_forth, _forth_by_turns, (plan,), strides=(1,))
+        task = Task(_turn_of_replay, _replay_by_turns, (plan,), strides=(1,))
         carry = Carry(state, records=(jnp.zeros((stride, y.size), y.dtype),))
-        found = run_loop(task, args, (first, last), given, carry)
-        carry, always_ends = (carry, False) if found is None else found
-        return (carry if always_ends else _forth_by_turns(plan, args, (first, last), given, carry)).records[0]
+        after = run_loop(task, args, (first, last), given, carry)
+        carry, always_ends = (carry, False) if after is None else after
+        return (carry if always_ends else _replay_by_turns(plan, args, (first, last), given, carry)).records[0]
 
     zeros = [jnp.zeros_like(x) for x in free_leaves]
-    way = _Way(
+    cotangents = _Cotangents(
         jnp.zeros_like(y0),
         jnp.zeros_like(y0),
         zeros,
@@ -157,19 +157,19 @@ def pulled(plan: Plan, history: History, y0, args, ts, steps, rows, moves) -> tu
         _places(least, least, saved),
     )
     if stride == 1:
-        way = back(least, history.count, history.states, way)
+        cotangents = back(least, history.count, history.states, cotangents)
     else:
         segments = (history.count + stride - 1) // stride
 
-        def segment(k, way):
+        def segment(k, cotangents):
             s = segments - 1 - k
             first = s * stride
             last = jnp.minimum(first + stride, history.count)
-            return back(first, last, forth(first, last, history.states[s]), way)
+            return back(first, last, replayed(first, last, history.states[s]), cotangents)
 
-        way = lax.fori_loop(0, segments, segment, way)
-    of_ts = way.ts.at[0].add(way.start).at[-1].add(way.end)
-    return way.after, jax.tree.unflatten(structure, way.args), of_ts
+        cotangents = lax.fori_loop(0, segments, segment, cotangents)
+    of_ts = cotangents.ts.at[0].add(cotangents.start).at[-1].add(cotangents.end)
+    return cotangents.after, jax.tree.unflatten(structure, cotangents.args), of_ts
 
 
 def _places(step, first, saved):
@@ -178,7 +178,7 @@ def _places(step, first, saved):
     return jnp.stack([step - first, step, step, row, saved, row])
 
 
-def _is_on_the_way(ends: _Ends, carry: Carry):
+def _is_unfinished(ends: _Ends, carry: Carry):
     return any_in_batch(carry.state.places[1] >= ends.first)
 
 
@@ -186,80 +186,80 @@ def _read(given: Given, places):
     return tuple(table[places[i]] for i, table in enumerate(given.tables))
 
 
-def _turn_back(plan: Plan, times_move, structure, args, ends: _Ends, way: _Way, read) -> Turn:
+def _turn_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangents: _Cotangents, read) -> Turn:
     """Through a step, or to the next one of the rows within it."""
     pull = partial(_pulled_step, plan, times_move, structure, *args)
-    return _taken_back(pull, times_move, ends, way, read)
+    return _back_through_step(pull, times_move, ends, cotangents, read)
 
 
 def _back_by_turn(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
     """The same as operations of JAX around kernels."""
-    way, pull = carry.state, partial(_pull, plan, times_move, structure, *args)
-    turn = _taken_back(pull, times_move, ends, way, _read(given, way.places))
-    return Carry(jax.tree.map(lambda new, old: jnp.where(turn.active, new, old), turn.state, way))
+    cotangents, pull = carry.state, partial(_pull, plan, times_move, structure, *args)
+    turn = _back_through_step(pull, times_move, ends, cotangents, _read(given, cotangents.places))
+    return Carry(jax.tree.map(lambda new, old: jnp.where(turn.active, new, old), turn.state, cotangents))
 
 
 def _back_by_turns(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
     turn = partial(_back_by_turn, plan, times_move, structure, args, ends, given)
-    return lax.while_loop(partial(_is_on_the_way, ends), turn, carry)
+    return lax.while_loop(partial(_is_unfinished, ends), turn, carry)
 
 
-def _taken_back(pull, times_move: bool, ends: _Ends, way: _Way, read) -> Turn:
+def _back_through_step(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read) -> Turn:
     """A turn; pull(t0, t1, y, at, after, row) gives the cotangents of a step."""
     y, (t0, t1), kept, row, at_row, at_next = read
-    step, active = way.places[1], way.places[1] >= ends.first
+    step, active = cotangents.places[1], cotangents.places[1] >= ends.first
     kept = kept & active
 
     def when(flag, x):
         return jnp.where(flag, x, jnp.zeros_like(x))
 
-    here = kept & (way.saved > 0) & (at_row > t0)
-    row, after = when(here, row), when(kept, way.after)
+    here = kept & (cotangents.saved > 0) & (at_row > t0)
+    row, after = when(here, row), when(kept, cotangents.after)
     at = jnp.where(here, at_row, t1)
     # What nothing depends on gets nothing, even where a step has no derivative.
     asked = kept & ((after != 0).any() | (row != 0).any())
     back = jax.tree.map(lambda x: when(asked, x), pull(t0, t1, y, at, after, row))
     of_args, of_y, of_t0, of_t1, of_at = back
     from_start, to_end = _shares(step, t0, ends), _shares(step + 1, t1, ends)
-    saved = way.saved - here.astype(jnp.int32)
+    saved = cotangents.saved - here.astype(jnp.int32)
     again = here & (saved > 0) & (at_next > t0)
-    before = way.before + of_y
+    before = cotangents.before + of_y
     following = jnp.where(again, step, step - 1)
-    state = _Way(
-        jnp.where(again, jnp.zeros_like(before), jnp.where(kept, before, way.after)),
+    state = _Cotangents(
+        jnp.where(again, jnp.zeros_like(before), jnp.where(kept, before, cotangents.after)),
         when(again, before),
-        [total + x for total, x in zip(way.args, of_args, strict=True)],
-        way.start + of_t0 * (1 - from_start) + of_t1 * (1 - to_end),
-        way.end + of_t0 * from_start + of_t1 * to_end,
-        way.ts.at[way.saved].add(when(here, of_at)) if times_move else way.ts,
+        [total + x for total, x in zip(cotangents.args, of_args, strict=True)],
+        cotangents.start + of_t0 * (1 - from_start) + of_t1 * (1 - to_end),
+        cotangents.end + of_t0 * from_start + of_t1 * to_end,
+        cotangents.ts.at[cotangents.saved].add(when(here, of_at)) if times_move else cotangents.ts,
         saved,
-        _places(following, step - way.places[0], saved),
+        _places(following, step - cotangents.places[0], saved),
     )
     return Turn(state, active, following >= ends.first)
 
 
-def _turn_forth(plan: Plan, args, ends, way: _Forth, read) -> Turn:
+def _turn_of_replay(plan: Plan, args, ends, replay: _Replay, read) -> Turn:
     """A step that is taken again."""
     (t0, t1), kept = read
-    return _taken_forth(_result(plan, args, t0, t1, way.y), ends, way, kept)
+    return _replayed_step(_result(plan, args, t0, t1, replay.y), ends, replay, kept)
 
 
-def _taken_forth(after, ends, way: _Forth, kept) -> Turn:
+def _replayed_step(after, ends, replay: _Replay, kept) -> Turn:
     first, last = ends
-    step = way.places[0]
-    state = _Forth(jnp.where(kept, after, way.y), way.places + 1)
-    return Turn(state, step < last, step + 1 < last, None, step - first, (way.y,))
+    step = replay.places[0]
+    state = _Replay(jnp.where(kept, after, replay.y), replay.places + 1)
+    return Turn(state, step < last, step + 1 < last, None, step - first, (replay.y,))
 
 
-def _forth_by_turns(plan: Plan, args, ends, given: Given, carry: Carry) -> Carry:
+def _replay_by_turns(plan: Plan, args, ends, given: Given, carry: Carry) -> Carry:
     """The same as operations of JAX around kernels."""
 
     def turn(_, carry):
-        way, (between,) = carry.state, carry.records
-        (t0, t1), kept = _read(given, way.places)
-        turn = _taken_forth(_repeated(plan, args, t0, t1, way.y), ends, way, kept)
+        replay, (between,) = carry.state, carry.records
+        (t0, t1), kept = _read(given, replay.places)
+        turn = _replayed_step(_repeated(plan, args, t0, t1, replay.y), ends, replay, kept)
         place = jnp.where(turn.active, turn.index, between.shape[0])
-        return Carry(turn.state, records=(between.at[place].set(way.y, mode="drop"),))
+        return Carry(turn.state, records=(between.at[place].set(replay.y, mode="drop"),))
 
     return lax.fori_loop(carry.state.places[0], ends[1], turn, carry)
 
@@ -276,15 +276,28 @@ def _pull(plan: Plan, times_move: bool, structure, fixed, free, t0, t1, y, at, a
     given = fixed, free, t0, t1, y, at, after, row
     static = plan, times_move, structure
     kernel: Any = partial(run, _pulled_step, *given, static=static, calls=True, served=True)
-    found, served = kernel(otherwise=lambda *_: None)
+    pulled_back, served = kernel(otherwise=lambda *_: None)
     again = partial(_pulled_in_turn, *static)
-    return again(*given) if found is None else recompute_unless(served, again, found, given)
+    return again(*given) if pulled_back is None else recompute_unless(served, again, pulled_back, given)
 
 
 def _pulled_step(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
     """Cotangents of the leaves `free`, of y, t0, t1 and at, from those of the step's result and of its row at the time `at`."""
-    apart = plan._replace(field=Apart(plan.field), project=plan.project and Apart(plan.project))
-    return _pulled_by(partial(whole_step, apart), apart, times_move, structure, fixed, free, t0, t1, y, at, after, row)
+    programs = plan._replace(field=OwnProgram(plan.field), project=plan.project and OwnProgram(plan.project))
+    return _pulled_by(
+        partial(whole_step, programs),
+        programs,
+        times_move,
+        structure,
+        fixed,
+        free,
+        t0,
+        t1,
+        y,
+        at,
+        after,
+        row,
+    )
 
 
 def _pulled_in_turn(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
@@ -298,7 +311,7 @@ def _pulled_by(step, plan: Plan, times_move, structure, fixed, free, t0, t1, y, 
         args = eqx.combine(jax.tree.unflatten(structure, free), fixed)
         rate = plan.field_of(args, t0_, y) if plan.passes_rate_on else jnp.zeros_like(y)
         made = step(args, t0_, t1_, y, rate)
-        return made.projected, bent_output(plan, None, at_, t0_, t1_, y, made.raw, made.stages, made.shift)
+        return made.projected, projected_output(plan, None, at_, t0_, t1_, y, made.raw, made.stages, made.shift)
 
     times = (t0, t1, at) if times_move else ()
     _, pull = jax.vjp(forward, free, y, *times)
@@ -309,9 +322,9 @@ def _pulled_by(step, plan: Plan, times_move, structure, fixed, free, t0, t1, y, 
 def _repeated(plan: Plan, args, t0, t1, y):
     """The result of a step."""
     kernel: Any = partial(run, _result, args, t0, t1, y, static=(plan,), calls=True, served=True)
-    found, served = kernel(otherwise=lambda *_: None)
+    result, served = kernel(otherwise=lambda *_: None)
     again = partial(_result_in_turn, plan)
-    return again(args, t0, t1, y) if found is None else recompute_unless(served, again, found, (args, t0, t1, y))
+    return again(args, t0, t1, y) if result is None else recompute_unless(served, again, result, (args, t0, t1, y))
 
 
 def _result(plan: Plan, args, t0, t1, y):
@@ -324,7 +337,7 @@ def _result_in_turn(plan: Plan, args, t0, t1, y):
     return step_in_turn(plan, args, t0, t1, y, rate).projected
 
 
-class Apart(NamedTuple):
+class OwnProgram(NamedTuple):
     """A function of a plan whose derivatives are those of its own program of numbers. Equal ones share it."""
 
     function: Any
@@ -333,8 +346,8 @@ class Apart(NamedTuple):
         """What the function does; its arrays where it returns something beside them."""
         arrays, rest = eqx.partition(args[-1], eqx.is_array)
         del rest
-        found, served = run(_applied, arrays, args[:-1], static=(self.function,), served=True, apart=True)
-        return found if served is True else jax.tree.map(lambda x: unless(~served, x), found)
+        results, served = run(_applied, arrays, args[:-1], static=(self.function,), served=True, own_program=True)
+        return results if served is True else jax.tree.map(lambda x: unless(~served, x), results)
 
 
 def _applied(function, args, given):

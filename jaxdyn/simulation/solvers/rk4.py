@@ -26,7 +26,7 @@ class RK4(diffrax.AbstractERK):
     """Classical Runge-Kutta method: order 4, four evaluations a step, for fixed steps.
 
     Dense output is of order 3 (local error h^4) and keeps the global order 4. The difference from the midpoint rule, of
-    h^3, tells steps that are too long (`Watched`); to choose them by it is not worth while.
+    h^3, tells steps that are too long (`ErrorMonitoredSteps`); to choose them by it is not worth while.
 
     Source: Hairer, Norsett & Wanner 1993, tables II.1.2 and section II.6.
     """

@@ -16,7 +16,7 @@ from jaxdyn.systems.scene import Scene
 OPACITY = 0.35
 
 
-def held_body(scene: Scene) -> str | None:
+def grasped_body(scene: Scene) -> str | None:
     """Name of the body that a hand holds."""
     return scene.object if isinstance(scene, Grasp) else None
 
@@ -26,7 +26,7 @@ def see_through(shape: Shape) -> Shape:
     return dataclasses.replace(shape, opacity=min(shape.opacity, OPACITY))
 
 
-def held_solids(scene: Grasp, solids: list[Shape], thin: float) -> list[Shape]:
+def grasped_solids(scene: Grasp, solids: list[Shape], thin: float) -> list[Shape]:
     """The solids of a held body: those of its inertia, but a bar between its contacts in a plane, and for three equal moments,
     which a ball and a cube have, the one of them on whose surface its contacts are."""
     model, name = scene.system, scene.object

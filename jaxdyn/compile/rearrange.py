@@ -35,7 +35,7 @@ def _split(params, args, out):
 
 
 def _pad(params, args, out):
-    found = np.full(out.shape, args[1].item(), args[0].dtype)
+    padded = np.full(out.shape, args[1].item(), args[0].dtype)
     config = params["padding_config"]
     if any(low < 0 or high < 0 for low, high, _ in config):
         raise NotNumbers("padding that cuts")
@@ -44,8 +44,8 @@ def _pad(params, args, out):
         for (low, _, gap), n in zip(config, args[0].shape, strict=True)
     )
     if args[0].size:
-        found[where] = args[0]
-    return found
+        padded[where] = args[0]
+    return padded
 
 
 def _places(shape, indices, window, inserted, batching, index_map, index_batching, sizes, window_dims, result_shape):
@@ -120,14 +120,14 @@ def dynamic_update_slice(params, args, eqn):
     _known_places(eqn, *starts)
     at = [min(max(int(x), 0), n - m) for x, n, m in zip(starts, operand.shape, update.shape, strict=True)]
     is_known = operand.dtype.kind != "O" and update.dtype.kind != "O"
-    found = operand.copy() if is_known else as_objects(operand).copy()
-    found[tuple(slice(i, i + m) for i, m in zip(at, update.shape, strict=True))] = (
+    updated = operand.copy() if is_known else as_objects(operand).copy()
+    updated[tuple(slice(i, i + m) for i, m in zip(at, update.shape, strict=True))] = (
         update if is_known else as_objects(update)
     )
-    return [found]
+    return [updated]
 
 
-MOVES: dict[str, Callable] = {
+REARRANGEMENTS: dict[str, Callable] = {
     "reshape": _reshape,
     "squeeze": lambda params, args, out: args[0].reshape(out.shape),
     "expand_dims": lambda params, args, out: args[0].reshape(out.shape),

@@ -1,0 +1,67 @@
+"""Products of exponentials in base-frame twists, as Murray, Li & Sastry and Li & Wu write them (EQUATIONS section 2).
+
+With xi_j the twist of joint j in the world frame at q = 0, body i stands at exp(hat(xi_1) q_1) ... exp(hat(xi_i) q_i) g_i(0), and
+the adjoints A_ij of the exponentials between bodies j and i carry twists from one to the other:
+
+    J_i = Ad^-1_{g_i(0)} [A_i1 xi_1 ... A_ii xi_i],
+    M_ij = sum_l xi_i^T A_li^T M'_l A_lj xi_j,    M'_l = Ad^T_{g_l(0)^-1} M_l Ad_{g_l(0)^-1}.
+
+This is the form to read and to check against; `mass_matrix` and `mass_matrix_derivative` use recursions instead.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import run
+from jaxdyn.dynamics.kinematics import body_subspace, forward_kinematics, take
+from jaxdyn.lie import se3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.tree import Model, neutral
+
+
+def base_twists(model: Model) -> Float[Array, "nv 6"]:
+    """Twist of every joint in the world frame at the neutral configuration, xi_j = Ad_{g_j(0)} S_j.
+
+    **Returns:** (nv, 6), one row (v, omega) for each velocity coordinate: m/rad and rad/rad of a joint that turns, m/m of one
+    that slides.
+
+    Source: Murray, Li & Sastry (1994), section 3.2; EQUATIONS section 2.
+    """
+    check_shapes(model)
+    return run(_base_twists, model)
+
+
+def _base_twists(model: Model):
+    home = forward_kinematics(model, neutral(model))
+    return jax.vmap(se3.Ad_apply)(take(home, model.topology.dof_body), body_subspace(model))
+
+
+def link_adjoints(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb nb 6 6"]:
+    """Adjoints A_ij = Ad^-1 of exp(hat(xi_{j+1}) q_{j+1}) ... exp(hat(xi_i) q_i), from body j to body i.
+
+    A_ii = 1, and A_ij = 0 unless body j is an ancestor of body i. In terms of poses g_i(q) of the bodies in the world,
+    A_ij = Ad_{g_i(0)} Ad^-1_{g_j(q)^-1 g_i(q)} Ad^-1_{g_j(0)}. Along a path to the root A_ij A_jk = A_ik, and
+    d(A_lj xi_j)/dq_k = A_lk [A_kj xi_j, xi_k], from which `mass_matrix_derivative` follows.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (nb, nb, 6, 6) in the order of `model.body_names`; they act on twists (v, omega).
+
+    **Raises:** ValueError when the shape of q does not fit the model.
+
+    Source: Li & Wu, Property 2; Murray, Li & Sastry (1994), eq. 4.27; EQUATIONS section 2.
+    """
+    (q,) = check_shapes(model, q=q)
+    return run(_link_adjoints, model, q)
+
+
+def _link_adjoints(model: Model, q):
+    poses, home = forward_kinematics(model, q), forward_kinematics(model, neutral(model))
+    # What takes the neutral pose of a body to the pose at q: the product of the exponentials down to this body.
+    products = _product(poses, jax.vmap(se3.inverse)(home))
+    between = jax.vmap(jax.vmap(lambda a, b: se3.Ad(_product(se3.inverse(a), b)), (None, 0)), (0, None))(
+        products, products
+    )
+    return jnp.where(model.topology.ancestors[:, :, None, None], between, jnp.zeros_like(between))

@@ -1,0 +1,40 @@
+"""Arnold's form of Euler's equations on the groups SO(3) and SE(3) with a left-invariant metric."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.lie import se3, so3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.systems.mass_factor import solve_positive
+
+
+def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Array, " n"]) -> Float[Array, " n"]:
+    """B(c, a) of Arnold, defined by <B(c, a), b> = <[a, b], c> for all b, with <x, y> = x . inertia y.
+
+    On SO(3) inertia B(c, a) = (inertia c) x a; on SE(3) inertia B(c, a) = ad_a^T (inertia c). Without forces a rigid body moves
+    by Euler's equations dV/dt = B(V, V): the geodesics of the metric, as the left translations of Lemma 7.1 show.
+
+    **Arguments:** `inertia` (3, 3), kg m^2, in body axes, with angular velocities `c`, `a` (3,), rad/s; or (6, 6), a spatial
+    inertia in a body frame (`jd.inertia.spatial_inertia`), with body twists (v, omega) (6,).
+
+    **Returns:** (3,), rad/s^2, or (6,), m/s^2 and rad/s^2; NaN where the inertia is not positive definite.
+
+    **Raises:** ValueError for other shapes.
+
+    Source: Arnold (1989), Mathematical Methods of Classical Mechanics, appendix 2; Loparo & Vakalis, section 7; EQUATIONS
+    section 12.
+    """
+    given = as_array(inertia, "inertia")
+    inertia = jnp.asarray(given, given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else float)
+    c, a = as_array(c, "c", inertia.dtype), as_array(a, "a", inertia.dtype)
+    if inertia.shape not in ((3, 3), (6, 6)):
+        raise ValueError(f"inertia has shape {inertia.shape}; give (3, 3) or (6, 6){batch_hint(inertia, (3, 3))}")
+    for name, value in (("c", c), ("a", a)):
+        if value.shape != inertia.shape[:1]:
+            raise ValueError(
+                f"{name} has shape {value.shape}, expected {inertia.shape[:1]}{batch_hint(value, inertia.shape[:1])}"
+            )
+    momentum = _product(inertia, c)
+    force = so3.cross(momentum, a) if a.shape[0] == 3 else se3.adT_apply(a, momentum)
+    return solve_positive(inertia, force)

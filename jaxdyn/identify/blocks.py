@@ -1,0 +1,220 @@
+"""Pieces of a parameter tree: coordinates y, zero at the start, of some numbers of a system, and what they are then.
+
+A block writes its numbers into the list of the system's leaves. Every y is allowed: what a number cannot be, no y stands for.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.identify.chart import Chart, Coordinates
+from jaxdyn.identify.distances import affine_residual, barrier_residual, entropic_residual
+from jaxdyn.lie import se3, so3
+
+
+class Block(eqx.Module):
+    """Some numbers of a system, by coordinates y (size,)."""
+
+    names: eqx.AbstractVar[tuple[str, ...]]
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> int:
+        """Number of coordinates."""
+
+    @abc.abstractmethod
+    def values(self, y: Float[Array, " size"], leaves: list) -> Float[Array, " m"]:
+        """The numbers (m,) that `names` names."""
+
+    @abc.abstractmethod
+    def write(self, y: Float[Array, " size"], leaves: list) -> None:
+        """Put the numbers into the list of the system's leaves."""
+
+    def residual(self, y: Float[Array, " size"], leaves: list) -> Float[Array, " k"]:
+        """What is known beforehand, as residuals of unit deviation (k,)."""
+        return jnp.zeros((0,), y.dtype)
+
+
+class Numbers(Block):
+    """Entries of a leaf: x0 + unit y ("free"), x0 exp(y) ("positive"), or between bounds by a logistic function ("bounded").
+
+    A Gaussian prior is |root (x - mean)|^2, root^T root the inverse of its covariance.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    place: int = eqx.field(static=True)
+    index: tuple[int, ...] = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    origin: Float[Array, " m"]
+    unit: Float[Array, " m"]
+    lower: Float[Array, " m"] | None = None
+    upper: Float[Array, " m"] | None = None
+    mean: Float[Array, " m"] | None = None
+    root: Float[Array, "m m"] | None = None
+
+    @property
+    def size(self):
+        return len(self.index)
+
+    def values(self, y, leaves):
+        if self.kind == "positive":
+            return self.origin * jnp.exp(y)
+        if self.kind == "bounded":
+            low: Any = self.lower
+            span = self.upper - low
+            share = (self.origin - low) / span
+            return low + span * jax.nn.sigmoid(jnp.log(share) - jnp.log1p(-share) + y)
+        return self.origin + self.unit * y
+
+    def write(self, y, leaves):
+        _put(leaves, self.place, self.index, self.values(y, leaves))
+
+    def residual(self, y, leaves):
+        if self.root is None:
+            return super().residual(y, leaves)
+        mean: Any = self.mean
+        return self.root @ (self.values(y, leaves) - mean)
+
+
+class Poses(Block):
+    """Poses T0 exp(unit y) of a leaf (..., 4, 4); the numbers are the twists (v, omega), m and rad, from where they were."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    place: int = eqx.field(static=True)
+    rows: tuple[int, ...] = eqx.field(static=True)
+    origin: Float[Array, "m 4 4"]
+    root: Float[Array, "m6 m6"] | None = None
+
+    @property
+    def size(self):
+        return 6 * len(self.rows)
+
+    def values(self, y, leaves):
+        return y
+
+    def write(self, y, leaves):
+        moved = jax.vmap(lambda T, twist: T @ se3.exp(twist))(self.origin, y.reshape(-1, 6))
+        index = (np.array(self.rows)[:, None] * 16 + np.arange(16)).reshape(-1)
+        _put(leaves, self.place, index, moved.reshape(-1))
+
+    def residual(self, y, leaves):
+        return super().residual(y, leaves) if self.root is None else self.root @ y
+
+
+class Directions(Block):
+    """Vectors (3,), or screws (6,), that keep their length and turn: exp(hat(B y)), B (3, 2) across the vector."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    place: int = eqx.field(static=True)
+    index: tuple[int, ...] = eqx.field(static=True)
+    origin: Float[Array, "m k 3"]
+    across: Float[Array, "m 3 2"]
+    root: Float[Array, "m2 m2"] | None = None
+
+    @property
+    def size(self):
+        return 2 * self.origin.shape[0]
+
+    def values(self, y, leaves):
+        turned = jax.vmap(lambda parts, B, y: parts @ so3.exp(B @ y).T)(self.origin, self.across, y.reshape(-1, 2))
+        return turned.reshape(-1)
+
+    def write(self, y, leaves):
+        _put(leaves, self.place, self.index, self.values(y, leaves))
+
+    def residual(self, y, leaves):
+        return super().residual(y, leaves) if self.root is None else self.root @ y
+
+
+class Inertias(Block):
+    """Inertias of bodies by log-Cholesky coordinates relative to the nominal ones: no y stands for an impossible body.
+
+    - `total`: the mass of all bodies of the model together, kept exactly: all that are free are made heavier by one factor.
+    - `ellipsoids` (bodies, 4, 4): Q of ellipsoids that hold the bodies, tr(P Q) > 0, or zero for a body without one.
+    - `weight`: of the distance to the nominal bodies, by `metric`.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    place: int = eqx.field(static=True)
+    metric: str | None = eqx.field(static=True)
+    chart: Chart
+    weight: Float[Array, ""]
+    ellipsoids: Float[Array, "bodies 4 4"] | None = None
+    total: Float[Array, ""] | None = None
+
+    @property
+    def size(self):
+        return len(self.chart.bodies) * {"full": 10, "mass": 1, "fixed": 0}[self.chart.inertia]
+
+    def _theta(self, y):
+        return y.reshape(len(self.chart.bodies), -1)
+
+    def _inertias(self, y):
+        inertias = self.chart.inertias(self._theta(y))
+        if self.total is None:
+            return inertias
+        free = np.array(self.chart.bodies)
+        own = jnp.sum(inertias[free, 0])
+        ratio = (self.total - (jnp.sum(inertias[:, 0]) - own)) / own
+        return jnp.where(np.isin(np.arange(len(inertias)), free)[:, None], ratio * inertias, inertias)
+
+    def values(self, y, leaves):
+        free = self._inertias(y)[np.array(self.chart.bodies)]
+        return free.reshape(-1)
+
+    def write(self, y, leaves):
+        leaves[self.place] = self._inertias(y).astype(leaves[self.place].dtype)
+
+    def residual(self, y, leaves):
+        U = self.chart.relative_factors(self._theta(y))
+        parts = [jnp.zeros((0,), y.dtype)]
+        if self.metric is not None:
+            distance = affine_residual if self.metric == "affine" else entropic_residual
+            parts.append(jnp.sqrt(self.weight) * jax.vmap(distance)(U).reshape(-1))
+        if self.ellipsoids is not None:
+            # tr(P Q) over its nominal value: one at the start, zero where the mass would sit on the ellipsoid.
+            factors = self.chart.factors
+            P = jnp.einsum("bij,bjk,blk,bml->bim", factors, U, U, factors)
+            P0 = jnp.einsum("bij,bkj->bik", factors, factors)
+            now, nominal = (jnp.einsum("bij,bji->b", x, self.ellipsoids) for x in (P, P0))
+            has_mass = nominal > 0
+            share = jnp.where(has_mass, now, 1.0) / jnp.where(has_mass, nominal, 1.0)
+            parts.append(jnp.sqrt(self.weight) * barrier_residual(jnp.log(share)))
+        return jnp.concatenate(parts)
+
+    def coordinates(self, y) -> Coordinates:
+        """The point in the chart."""
+        return Coordinates(self._theta(y), jnp.zeros((0, self.chart.nominal_terms.shape[1]), y.dtype))
+
+
+class Tied(Block):
+    """Entries that follow others: x = scale x_other + offset. They have no coordinates of their own."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    place: int = eqx.field(static=True)
+    index: tuple[int, ...] = eqx.field(static=True)
+    other: int = eqx.field(static=True)
+    other_index: tuple[int, ...] = eqx.field(static=True)
+    scale: Float[Array, ""]
+    offset: Float[Array, ""]
+
+    @property
+    def size(self):
+        return 0
+
+    def values(self, y, leaves):
+        return self.scale * leaves[self.other].reshape(-1)[np.array(self.other_index)] + self.offset
+
+    def write(self, y, leaves):
+        _put(leaves, self.place, self.index, self.values(y, leaves))
+
+
+def _put(leaves: list, place: int, index: Any, values: Array) -> None:
+    leaf = leaves[place]
+    flat = leaf.reshape(-1).at[np.array(index)].set(values.astype(leaf.dtype))
+    leaves[place] = flat.reshape(leaf.shape)

@@ -1,0 +1,132 @@
+"""What a fit compares with a log: torques, momentum, energy, or simulated motion, open-loop or under the logged controller.
+
+Each is a list of errors of one piece of a log, in units of `scale`. Momentum and energy are balances over a piece,
+
+    M v |_0^T     = integral of C^T v - g + f + tau           (nv,),   as dM/dt = C + C^T,
+    T + V |_0^T   = integral of v . (f + tau)                 (),
+
+with f the scene's forces, by the trapezoidal rule over its samples: they need velocities and no accelerations, and the errors of
+velocities enter at the ends alone. Sample ten times faster than the motion, or more.
+
+Source: Gautier & Khalil (1988), energy; Slotine & Li (1987), filtered dynamics; Bock (1983), multiple shooting.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.identify.replay import SampledTorque, Segments, motion_errors, motion_scale, moving_scale, simulate_segment
+from jaxdyn.identify.result import needed_torque
+from jaxdyn.identify.sensors import Measured
+from jaxdyn.systems.system import displace
+
+SIMULATED = ("trajectory", "closed-loop")
+BALANCES = ("momentum", "energy")
+ERRORS = ("trajectory", "torque", "momentum", "energy", "closed-loop")
+
+
+class Objective(eqx.Module):
+    """What is compared: `error`, how torques are between samples, options of `simulate`, the logged controller, and the
+    indices of the coordinates that were measured (None: all)."""
+
+    error: str = eqx.field(static=True)
+    hold: str = eqx.field(static=True)
+    options: Any
+    control: Any = None
+    observed: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def scale(self, system, pieces: Segments) -> Array:
+        """Units of the errors."""
+        torque = moving_scale(jnp.sqrt(jnp.mean(pieces.tau**2, axis=(0, 1))))
+        span = jnp.mean(pieces.t[:, -1] - pieces.t[:, 0])
+        if self.error == "torque":
+            return torque
+        if self.error == "momentum":
+            return torque * span
+        if self.error == "energy":
+            power = jnp.sqrt(jnp.mean(jnp.sum(pieces.tau * pieces.v, axis=-1) ** 2))
+            return jnp.where(power > 0, power, jnp.ones_like(power)) * span
+        motion = motion_scale(system, pieces)
+        return motion if self.error == "trajectory" else jnp.concatenate([motion, torque[None]])
+
+    def errors(self, measured: Measured, piece: Segments, change, scale) -> Float[Array, "n k"]:
+        """Errors of one piece, a row for each sample (one row for a balance); `change` (2, nv): of its first state."""
+        scene, system = measured.scene, measured.scene.system
+        piece = corrected(measured, piece, None if self.error in SIMULATED else self.hold)
+        if self.error == "torque":
+            tau = jax.vmap(lambda t, q, v, a: needed_torque(scene, q, v, a, t))(piece.t, piece.q, piece.v, piece.a)
+            return self._seen((tau - piece.tau) / scale[None])
+        if self.error == "momentum":
+            return self._seen((momentum_balance(scene, piece) / scale)[None])
+        if self.error == "energy":
+            return (energy_balance(scene, piece) / scale)[None, None]
+        start = None if change is None else change * scale[:2]
+        options = dict(self.options)
+        if self.error == "trajectory":
+            law = SampledTorque(piece.t + measured.delay, piece.tau, self.hold)
+            q, v = simulate_segment(scene, piece, start, self.hold, options, control=law)
+            return jnp.concatenate([self._seen(e) for e in motion_errors(system, piece, q, v, scale)], axis=1)
+        q, v, tau = simulate_segment(scene, piece, start, self.hold, options, control=self.control, outputs=("torque",))
+        errors = [*motion_errors(system, piece, q, v, scale[:2]), (tau - piece.tau) / scale[2][None]]
+        return jnp.concatenate([self._seen(error) for error in errors], axis=1)
+
+    def _seen(self, errors):
+        return errors if self.observed is None else errors[:, jnp.asarray(self.observed)]
+
+
+def corrected(measured: Measured, piece: Segments, hold: str | None) -> Segments:
+    """The motion and the torques that a piece of a log stands for; with `hold` the delayed ones at its samples."""
+    system = measured.scene.system
+    q = jax.vmap(lambda q: displace(system, q, -measured.position_bias))(piece.q)
+    tau = measured.torque_gain[None] * piece.tau + measured.torque_bias[None]
+    if hold is not None and piece.tau.shape[0] > 1:
+        law = SampledTorque(piece.t, tau, hold)
+        # The gradient of the instant at a sample is that of the line after it.
+        tau = jax.vmap(lambda t: law.at(t - measured.delay))(piece.t)
+    return eqx.tree_at(lambda p: (p.q, p.tau), piece, (q, tau))
+
+
+def momentum_balance(scene, piece: Segments) -> Float[Array, " nv"]:
+    """M v at the end less at the start, less the impulse in between (nv,): zero for a motion of the scene."""
+    system = scene.system
+
+    def pushed(t, q, v, tau):
+        C, g = dynamics.coriolis_matrix(system, q, v, t), dynamics.gravity_force(system, q, t)
+        force = scene.applied_force(q, v, t)
+        return v @ C - g + tau + (0.0 if force is None else force)
+
+    rate = jax.vmap(pushed)(piece.t, piece.q, piece.v, piece.tau)
+    t: Any = piece.t
+    momentum = [dynamics.mass_matrix(system, piece.q[i], t[i]) @ piece.v[i] for i in (0, -1)]
+    return momentum[1] - momentum[0] - _integral(rate, piece.t)
+
+
+def energy_balance(scene, piece: Segments) -> Float[Array, ""]:
+    """Energy at the end less at the start, less the work in between (J): zero for a motion of the scene.
+
+    Constraints that do not move with time do no work, so it holds for mechanisms too.
+    """
+    system = scene.system
+
+    def power(t, q, v, tau):
+        force = scene.applied_force(q, v, t)
+        return jnp.sum(v * (tau if force is None else tau + force))
+
+    work = _integral(jax.vmap(power)(piece.t, piece.q, piece.v, piece.tau), piece.t)
+    t: Any = piece.t
+    energy = [
+        dynamics.kinetic_energy(system, piece.q[i], piece.v[i], t[i])
+        + dynamics.potential_energy(system, piece.q[i], t[i])
+        for i in (0, -1)
+    ]
+    return energy[1] - energy[0] - work
+
+
+def _integral(rate, t):
+    """Trapezoidal rule along the first axis."""
+    steps = (t[1:] - t[:-1]).reshape(-1, *[1] * (rate.ndim - 1))
+    return jnp.sum(steps * (rate[1:] + rate[:-1]) / 2, axis=0)

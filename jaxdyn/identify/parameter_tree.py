@@ -1,0 +1,375 @@
+"""What a fit may change of a system, a scene or a `Measured` one, and what is known of it beforehand: one tree of parameters."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.identify.blocks import Block, Directions, Inertias, Numbers, Poses, Tied
+from jaxdyn.identify.chart import make_chart
+from jaxdyn.identify.distances import METRICS
+from jaxdyn.identify.picking import across, entries_taken, free_bodies, models_of, root_of, rows_of
+from jaxdyn.identify.sensors import Measured
+from jaxdyn.model.arguments import state_dtype
+from jaxdyn.model.inertia import pseudo_inertia
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene, as_scene
+
+_TEN = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+
+
+class _Leaf:
+    """Stands for a leaf while a user's function picks it."""
+
+    def __init__(self, place: int, name: str):
+        self.place, self.name = place, name
+
+
+class Parameters(eqx.Module):
+    """Numbers of a system that a fit may change: free, positive, bounded, turned, tied; feasible inertias; and their priors.
+
+    Nothing is free at first. Each method frees a leaf, or rows of it (bodies, joints), and returns a new tree.
+
+    **Arguments:** `system`: a `Model`, another system, a `Scene`, or a `jd.identify.Measured` scene with its sensors.
+
+    **Raises:** ValueError in each method for what is picked that is no floating-point leaf, is picked twice, or starts where
+    it is not allowed; the message names the leaf.
+
+    ```python
+    scene = jd.Scene(model, forces=[jd.JointDamping([0.1, 0.1])])
+    parameters = (
+        jd.identify.Parameters(scene)
+        .inertias(bodies=["a", "b"], metric="affine", weight=1.0)
+        .positive(lambda scene: scene.forces[0])
+        .poses(lambda scene: scene.system.home, rows=["b"], std=0.001)
+        .directions(lambda scene: scene.system.gravity, std=0.01)
+    )
+    fit = jd.identify.fit_parameters(scene, log, parameters, error="torque")
+    ```
+    """
+
+    given: Any
+    blocks: tuple[Block, ...]
+
+    def __init__(self, system: Any, blocks: tuple[Block, ...] = ()):
+        self.given = system
+        self.blocks = tuple(blocks)
+
+    # What can be changed.
+
+    def free(self, where: Any, *, rows=None, mean=None, std=None, covariance=None) -> "Parameters":
+        """Numbers of any sign. `where`: a function that picks leaves, `lambda scene: scene.system.parameters["mass"]`.
+
+        `rows`: indices along the leaf's first axis, or names of bodies or joints where it has one row for each; all by
+        default. A Gaussian prior: `std` (a number or one each) or `covariance` (m, m), about `mean` (where they are now).
+        """
+        return self._numbers("free", where, rows, mean, std, covariance)
+
+    def positive(self, where: Any, *, rows=None, mean=None, std=None, covariance=None) -> "Parameters":
+        """Numbers that stay above zero at every iterate, searched by their logarithm. Arguments as of `free`."""
+        return self._numbers("positive", where, rows, mean, std, covariance)
+
+    def bounded(self, where: Any, lower, upper, *, rows=None, mean=None, std=None, covariance=None) -> "Parameters":
+        """Numbers that stay between `lower` and `upper` (numbers, or one each) at every iterate. Other arguments as of `free`."""
+        return self._numbers("bounded", where, rows, mean, std, covariance, lower, upper)
+
+    def directions(self, where: Any, *, rows=None, std=None) -> "Parameters":
+        """Vectors (..., 3), or screws (..., 6), that turn and keep their length: gravity, axes of joints.
+
+        `std`: of a prior on the angle from where they are, rad.
+        """
+        blocks = list(self.blocks)
+        for leaf, value, name in self._picked(where, "directions"):
+            if value.shape[-1] not in (3, 6):
+                raise ValueError(
+                    f"directions picks {name} of shape {value.shape}; pick vectors (..., 3) or screws (..., 6)"
+                )
+            index, labels = self._entries(name, value, rows)
+            vectors = value.reshape(-1)[index].reshape(-1, value.shape[-1] // 3, 3)
+            axes = vectors[:, -1]
+            axes = np.where(np.linalg.norm(axes, axis=1, keepdims=True) > 0, axes, vectors[:, 0])
+            if not np.linalg.norm(axes, axis=1).all():
+                raise ValueError(
+                    f"directions picks {name}, where a vector is zero: {vectors.tolist()}; name the others in rows="
+                )
+            bases = np.stack([across(axis) for axis in axes])
+            root = None if std is None else np.eye(2 * len(vectors)) / std
+            blocks.append(Directions(labels, leaf, tuple(index), *self._arrays(vectors, bases, root)))
+        return self._with(blocks)
+
+    def poses(self, where: Any, *, rows=None, std=None) -> "Parameters":
+        """Poses (..., 4, 4), which stay rigid motions: home poses, frames. `std`: of a prior on all six numbers, m and rad."""
+        blocks = list(self.blocks)
+        for leaf, value, name in self._picked(where, "poses"):
+            if value.shape[-2:] != (4, 4):
+                raise ValueError(f"poses picks {name} of shape {value.shape}; pick poses (..., 4, 4)")
+            poses = value.reshape(-1, 4, 4)
+            chosen, labels = rows_of(self.given, name, len(poses), rows)
+            names = tuple(f"{label} {c}" for label in labels for c in ("vx", "vy", "vz", "wx", "wy", "wz"))
+            root = None if std is None else np.eye(6 * len(chosen)) / std
+            blocks.append(Poses(names, leaf, tuple(chosen), *self._arrays(poses[np.array(chosen)], root)))
+        return self._with(blocks)
+
+    def inertias(
+        self,
+        bodies: Iterable[str] | None = None,
+        *,
+        shape: str = "full",
+        metric: str | None = "entropic",
+        weight: float = 1.0,
+        ellipsoids: Mapping[str, tuple] | None = None,
+        total: float | None = None,
+    ) -> "Parameters":
+        """Inertias of bodies, so that no iterate is a body that cannot exist.
+
+        - `bodies`: names; all that have mass by default. All other bodies are frozen.
+        - `shape`: "full", all ten numbers, or "mass", the density alone (which rods and points allow too).
+        - `metric`: of the distance to where the bodies are now, which is added `weight` times: "entropic" (the log-det
+          divergence), "affine" (the squared affine-invariant distance), or None for none.
+        - `ellipsoids`: {body: (centre (3,), semi-axes (3,))} in the body's frame, m, that hold the body's mass.
+        - `total`: mass of all bodies of the model (kg), kept exactly.
+
+        **Raises:** ValueError for unknown bodies, bodies that are not feasible now, ellipsoids that do not hold them now.
+        """
+        model, leaf, name = self._model()
+        if metric is not None and metric not in METRICS:
+            raise ValueError(f"metric is {metric!r}; take one of {METRICS}, or None")
+        chosen = None if bodies is None else rows_of(self.given, name, model.nb, list(bodies))[0]
+        one = np.ones(model.nv)
+        chart, _ = make_chart(model, (), 0.01, shape, one, one, one, bodies=chosen)
+        if chosen is not None and set(chosen) != set(chart.bodies):
+            empty = [model.body_names[i] for i in chosen if i not in chart.bodies]
+            raise ValueError(f"inertias frees {empty}, which have no mass; give them some, or leave them out")
+        names = [f"{name}[{model.body_names[i]}] {number}" for i in chart.bodies for number in _TEN]
+        own = float(np.asarray(model.inertias)[:, 0].sum())
+        frozen = own - float(np.asarray(model.inertias)[np.array(chart.bodies, int), 0].sum())
+        if total is not None and not total > frozen:
+            raise ValueError(f"total is {total} kg, and the frozen bodies weigh {frozen:.6g} kg; give more than that")
+        quadrics = None if ellipsoids is None else self._quadrics(model, chart, ellipsoids)
+        parts = self._arrays(np.asarray(float(weight)), quadrics, None if total is None else np.asarray(float(total)))
+        if not weight > 0:
+            raise ValueError(f"weight is {weight}; give a positive number, or metric=None")
+        return self._with([*self.blocks, Inertias(tuple(names), leaf, metric, chart, *parts)])
+
+    def tied(self, where: Any, to: Any, *, scale=1.0, offset=0.0, rows=None, to_rows=None) -> "Parameters":
+        """Numbers that follow others: x = scale x_other + offset, entry by entry. Others may be free, or tied before."""
+        (leaf, value, name), *rest = self._picked(where, "tied")
+        (other, source, other_name), *more = self._picked(to, "to", twice=True)
+        if rest or more:
+            raise ValueError("tied picks several leaves; tie one leaf, or rows of it, to one other")
+        index, labels = self._entries(name, value, rows)
+        other_index, _ = self._entries(other_name, source, to_rows)
+        if len(other_index) == 1:
+            other_index = other_index * len(index)
+        if len(index) != len(other_index):
+            raise ValueError(
+                f"tied: {name} has {len(index)} numbers and {other_name} {len(other_index)}; name rows that match"
+            )
+        if leaf == other and set(index) & set(other_index):
+            raise ValueError(f"tied: {name} would follow itself; name other rows")
+        numbers = self._arrays(np.asarray(float(scale)), np.asarray(float(offset)))
+        return self._with([*self.blocks, Tied(labels, leaf, tuple(index), other, tuple(other_index), *numbers)])
+
+    # What a fit asks.
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates y."""
+        return sum(block.size for block in self.blocks)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Where the numbers stand, as one writes it after the system: "parameters['mass']"."""
+        return tuple(name for block in self.blocks for name in block.names)
+
+    @property
+    def start(self) -> Float[Array, " p"]:
+        """y (p,) of the system as given: zeros."""
+        return jnp.zeros((self.size,), self.dtype)
+
+    @property
+    def dtype(self):
+        """Floating-point type of the coordinates."""
+        return state_dtype(_scene(self.given).system)
+
+    def _walk(self, y, visit: Callable):
+        leaves, structure = jax.tree.flatten(self.given)
+        begin, visited = 0, []
+        for block in self.blocks:
+            part = y[begin : begin + block.size]
+            begin += block.size
+            leaves[block.place] = jnp.asarray(leaves[block.place])  # pyright: ignore[reportAttributeAccessIssue]
+            visited.append(visit(block, part, leaves))
+            block.write(part, leaves)
+        return jax.tree.unflatten(structure, leaves), visited
+
+    def system(self, y: Float[Array, " p"]) -> Any:
+        """What was given, with the numbers of y."""
+        return self._walk(y, lambda *_: None)[0]
+
+    def scene(self, y: Float[Array, " p"]) -> Scene:
+        """The scene with the numbers of y."""
+        return _scene(self.system(y))
+
+    def values(self, y: Float[Array, " p"]) -> Float[Array, " m"]:
+        """The numbers (m,) that `names` names."""
+        parts = self._walk(y, lambda block, part, leaves: block.values(part, leaves))[1]
+        return jnp.concatenate([jnp.zeros((0,), y.dtype), *(part.astype(y.dtype) for part in parts)])
+
+    def residual(self, y: Float[Array, " p"]) -> Float[Array, " k"]:
+        """What is known beforehand, as residuals of unit deviation (k,): half of their sum of squares is -log of the prior."""
+        parts = self._walk(y, lambda block, part, leaves: block.residual(part, leaves))[1]
+        return jnp.concatenate([jnp.zeros((0,), y.dtype), *(part.astype(y.dtype) for part in parts)])
+
+    # How it is put together.
+
+    def _with(self, blocks: list[Block]) -> "Parameters":
+        return Parameters(self.given, tuple(blocks))
+
+    def _arrays(self, *values) -> list[Any]:
+        return [None if x is None else jnp.asarray(x, self.dtype) for x in values]
+
+    def _named_leaves(self):
+        paths, structure = jax.tree_util.tree_flatten_with_path(self.given)
+        return (
+            [leaf for _, leaf in paths],
+            [jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths],
+            structure,
+        )
+
+    def _model(self) -> tuple[Model, int, str]:
+        """The model of the system, the place of its inertias among the leaves, and their name."""
+        models = models_of(self.given)
+        if len(models) != 1:
+            raise ValueError(
+                f"inertias: a {type(self.given).__name__} with {len(models)} models of bodies; free numbers of other systems "
+                "with positive= and free="
+            )
+        leaves, names, _ = self._named_leaves()
+        place = next(i for i, leaf in enumerate(leaves) if leaf is models[0].inertias)
+        self._refuse_twice(place, names[place], "inertias")
+        return models[0], place, names[place]
+
+    def _quadrics(self, model: Model, chart, ellipsoids: Mapping[str, tuple]) -> np.ndarray:
+        quadrics = np.zeros((len(chart.bodies), 4, 4))
+        for body, (centre, semi_axes) in ellipsoids.items():
+            if body not in model.body_names or model.body_names.index(body) not in chart.bodies:
+                raise ValueError(
+                    f"ellipsoids names {body!r}, which is no free body; they are {free_bodies(model, chart)}"
+                )
+            k = chart.bodies.index(model.body_names.index(body))
+            centre, inverse = np.asarray(centre, float), np.diag(1 / np.asarray(semi_axes, float) ** 2)
+            quadrics[k, :3, :3], quadrics[k, :3, 3] = -inverse, inverse @ centre
+            quadrics[k, 3, :3], quadrics[k, 3, 3] = inverse @ centre, 1 - centre @ inverse @ centre
+            P = np.asarray(pseudo_inertia(model.inertias[chart.bodies[k]]), np.float64)
+            if not np.sum(P * quadrics[k]) > 0:
+                raise ValueError(
+                    f"the ellipsoid of {body!r} does not hold the body as it is now; give larger semi-axes"
+                )
+        return quadrics
+
+    def _refuse_twice(self, place: int, name: str, argument: str, index: Sequence[int] | None = None) -> None:
+        for block in self.blocks:
+            if block.place != place:  # pyright: ignore[reportAttributeAccessIssue]
+                continue
+            taken = entries_taken(block)
+            if index is None or taken is None or set(index) & set(taken):
+                raise ValueError(f"{argument} picks {name} a second time; pick every number once")
+
+    def _picked(self, where, argument: str, twice: bool = False) -> list[tuple[int, np.ndarray, str]]:
+        """The leaves that a user's function picks: place, value, name.
+
+        **Raises:** ValueError for a function that fails or gives anything else, for leaves that are no floating-point numbers.
+        """
+        leaves, names, structure = self._named_leaves()
+        kind = type(self.given).__name__
+        marked = jax.tree.unflatten(structure, [_Leaf(i, name) for i, name in enumerate(names)])
+        example = f"write e.g. {argument}=lambda system: system.parameters['mass']"
+        if not callable(where):
+            raise ValueError(f"{argument} is {where!r}; pass a function that picks leaves, {example}")
+        try:
+            entries = jax.tree.leaves(where(marked))
+        except (AttributeError, IndexError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{argument} picks nothing of this {kind} ({type(error).__name__}: {error}); {example}, of whole leaves"
+            ) from error
+        strange = [leaf for leaf in entries if not isinstance(leaf, _Leaf)]
+        if strange or not entries:
+            raise ValueError(
+                f"{argument} picks {strange[0] if strange else 'nothing'!r}, which is no leaf of this {kind}; {example}"
+            )
+        picked = []
+        for leaf in entries:
+            value = leaves[leaf.place]
+            if not eqx.is_inexact_array_like(value):
+                raise ValueError(f"{argument} picks {leaf.name}, which is {value!r} and no floating-point number")
+            if not twice and any(value is model.inertias for model in models_of(self.given)):
+                raise ValueError(
+                    f"{argument} picks {leaf.name}, the inertias of bodies, of which few choices are physical; free them by "
+                    "jd.identify.Parameters(system).inertias(...)"
+                )
+            picked.append((leaf.place, np.asarray(value, np.float64), leaf.name))
+        if len({place for place, *_ in picked}) < len(picked):
+            places = [place for place, *_ in picked]
+            name = next(name for place, _, name in picked if places.count(place) > 1)
+            raise ValueError(f"{argument} picks {name} a second time; pick every number once")
+        return picked
+
+    def _entries(self, name: str, value: np.ndarray, rows) -> tuple[list[int], tuple[str, ...]]:
+        """Flat indices of the entries in some rows of a leaf, and their names."""
+        indices = np.arange(value.size).reshape(value.shape)
+        if rows is not None:
+            indices = indices[np.array(rows_of(self.given, name, len(indices) if value.ndim else 0, rows)[0])]
+        chosen = indices.reshape(-1).tolist()
+        at = [np.unravel_index(i, value.shape) for i in chosen]
+        return chosen, tuple(name + "".join(f"[{i}]" for i in index) for index in at)
+
+    def _numbers(self, kind, where, rows, mean, std, covariance, lower=None, upper=None) -> "Parameters":
+        tree = self
+        for place, value, name in self._picked(where, kind):
+            index, labels = tree._entries(name, value, rows)
+            tree._refuse_twice(place, name, kind, index)
+            origin = value.reshape(-1)[index]
+            if kind == "positive" and not (origin > 0).all():
+                raise ValueError(
+                    f"positive picks {name}, which is {value.tolist()}; start above zero, or pick it in free"
+                )
+            limits = (None, None)
+            if kind == "bounded":
+                limits = tuple(np.broadcast_to(np.asarray(x, float), origin.shape) for x in (lower, upper))
+                if not ((limits[0] < origin) & (origin < limits[1])).all():
+                    raise ValueError(
+                        f"bounded picks {name}, which is {origin.tolist()} and not between {lower} and {upper}; give bounds "
+                        "that hold where the fit starts"
+                    )
+            root = root_of(std, covariance, origin.size, f"{kind} of {name}")
+            if mean is not None and root is None:
+                raise ValueError(f"{kind} of {name}: mean is given without std or covariance; give one of them")
+            center = (
+                None
+                if root is None
+                else np.broadcast_to(origin if mean is None else np.asarray(mean, float), origin.shape)
+            )
+            unit = np.where(origin == 0, 1, np.abs(origin))
+            numbers = self._arrays(origin, unit, *limits, center, root)
+            tree = tree._with([*tree.blocks, Numbers(labels, place, tuple(index), kind, *numbers)])
+        return tree
+
+
+def picked(system: Any, positive=None, free=None) -> Parameters:
+    """The tree of what `positive` and `free` pick; nothing else is free.
+
+    **Raises:** ValueError as `Parameters` says, and where nothing is picked.
+    """
+    tree = Parameters(system)
+    if positive is not None:
+        tree = tree.positive(positive)
+    return tree if free is None else tree.free(free)
+
+
+def _scene(given) -> Scene:
+    return given.scene if isinstance(given, Measured) else as_scene(given)
