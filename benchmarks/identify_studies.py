@@ -3,9 +3,9 @@
     python -m benchmarks.identify_studies cutoff [--data ../shared/data]
 
 cutoff: the logs of `benchmarks.identify_robots`, low-passed at several frequencies and fitted with the first four terms at
-settings given; 0.2 s are dropped at each end. The error on what was not fitted, in per cent of the torque: of the log as filtered ("own"),
-and of both sides low-passed once more at 2.5 Hz ("< 2.5 Hz"), which compares the fits with each other; and the share of the
-residual's power above ten times the band of the motion, which is vibration.
+settings given; 0.2 s are dropped at each end. The error on what was not fitted, in per cent of the torque: of the log as
+filtered ("own"), and of both sides low-passed once more at 2.5 Hz ("< 2.5 Hz"), which compares the fits with each other; and the
+share of the residual's power above ten times the band of the motion, which is vibration.
 """
 
 import argparse

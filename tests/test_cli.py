@@ -271,7 +271,7 @@ def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsy
     assert chosen["cutoff_hz"] == pytest.approx(5, abs=0.9) and chosen["torque_error"]["test_percent"] < 0.5
     assert main([*args, "--cutoff", "14"]) == 0
     text = capsys.readouterr().out
-    assert re.search(r"1.csv: (9\d|100) % .* where no rigid body is: vibration; try --cutoff [45]", text)
+    assert re.search(r"1.csv: (9\d|100) % .* where no rigid body is: vibration; try --cutoff [456]", text)
     given = json.loads(report.read_text())
     assert given["cutoff_hz"] == 14 and given["torque_error"]["test_percent"] > 2
     assert main([*args, "--cutoff", "low"]) == 2
