@@ -24,13 +24,19 @@ from jaxdyn.io.urdf import load_urdf  # noqa: E402
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def recorded(folder: Path) -> identify.Log:
-    """The raw log, filtered."""
+def samples(folder: Path) -> identify.Log:
+    """The raw log."""
     log = folder / "franka_panda/matlab/data/Exciting_Traj/Trajectory_1/rbt_log"
     if not log.is_dir():
         raise SystemExit(f"no Franka log at {log}; name the directory of recorded data with --data")
     t, q, tau = (np.loadtxt(log / f"exciting_traj_{name}.txt") for name in ("time", "positions", "torques"))
-    return identify.from_raw(t, q.reshape(-1, 7), tau.reshape(-1, 7))
+    return identify.Log(t, q.reshape(-1, 7), tau=tau.reshape(-1, 7))
+
+
+def recorded(folder: Path) -> identify.Log:
+    """The log, low-passed at 8 Hz."""
+    raw = samples(folder)
+    return identify.from_raw(raw.t, raw.q, raw.tau)
 
 
 def panda():

@@ -59,8 +59,8 @@ def kuka():
     return builder.build()
 
 
-def kuka_log(folder: Path, name: str, cutoff: float = 10.0):
-    """One of its logs: motor angles, and motor torques times the gear ratios."""
+def kuka_samples(folder: Path, name: str) -> identify.Log:
+    """One of its raw logs: motor angles, and motor torques times the gear ratios."""
     from scipy.io import loadmat
 
     file = folder / f"kuka_kr300/data/recorded_trajectories/2020-10-21 10s FF {name} 08ms/data.mat"
@@ -68,7 +68,13 @@ def kuka_log(folder: Path, name: str, cutoff: float = 10.0):
         raise SystemExit(f"no KUKA log at {file}; name the directory of recorded data with --data")
     rec = loadmat(file, squeeze_me=True, struct_as_record=False)["rec"]
     q, tau = np.deg2rad(rec.act_pos_mot_deg.T), rec.act_torque_abs_nm.T * np.array(GEARS)
-    return identify.from_raw(np.asarray(rec.time_cont, float), q, tau, cutoff=cutoff, trim=50, every=1)
+    return identify.Log(np.asarray(rec.time_cont, float), q, tau=tau)
+
+
+def kuka_log(folder: Path, name: str, cutoff: float = 10.0):
+    """One of its logs, low-passed."""
+    raw = kuka_samples(folder, name)
+    return identify.from_raw(raw.t, raw.q, raw.tau, cutoff=cutoff, trim=50, every=1)
 
 
 def z_scores(model, fit, logs) -> np.ndarray:

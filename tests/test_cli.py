@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import jax.numpy as jnp
 import mujoco
@@ -64,7 +65,7 @@ def test_help_names_units_columns_and_examples(capsys):
     for command, words in {
         "info": ("rad", "kg", "--repair"),
         "simulate": ("N m", "tau1", "--torque gravity"),
-        "identify": ("tau1", "--lock", "8 Hz"),
+        "identify": ("tau1", "--lock", "--cutoff"),
     }.items():
         with pytest.raises(SystemExit) as stop:
             main([command, "--help"])
@@ -169,7 +170,7 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, c
     raw, out = tmp_path / "log.csv", tmp_path / "fitted.urdf"
     write_log(raw, jd.identify.Log(t, q, tau=tau))
     plot = tmp_path / "fit.png"
-    args = ["--urdf", str(panda), "--log", str(raw), "--lock", *FINGERS]
+    args = ["--urdf", str(panda), "--log", str(raw), "--lock", *FINGERS, "--cutoff", "8"]
     given = ["--terms", *jd.identify.TERMS, "--v-s", "0.01", "--prior", "1", "--weights", "none"]
     assert main(["identify", *args, *given, "--out", str(out), "--plot", str(plot)]) == 0
     text = capsys.readouterr().out
@@ -217,7 +218,8 @@ def test_identify_the_recorded_panda_with_terms_chosen(panda, franka, tmp_path, 
     t, q, tau = franka
     raw, out = tmp_path / "log.csv", tmp_path / "fitted.urdf"
     write_log(raw, jd.identify.Log(t, q, tau=tau))
-    assert main(["identify", "--urdf", str(panda), "--log", str(raw), "--lock", *FINGERS, "--out", str(out)]) == 0
+    args = ["identify", "--urdf", str(panda), "--log", str(raw), "--lock", *FINGERS, "--cutoff", "8", "--out", str(out)]
+    assert main(args) == 0
     assert "dahl at panda_joint1" in capsys.readouterr().out
     report = json.loads(out.with_suffix(".json").read_text())
     (errors,) = report["test_logs"].values()
@@ -241,6 +243,38 @@ def simulated_logs(model, folder, seeds, noise=0.0):
         paths.append(str(folder / f"{chr(65 + k)}.csv"))
         write_log(paths[-1], jd.identify.Log(t, q, v, a, tau + noise * rng.normal(size=tau.shape)))
     return paths
+
+
+def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsys):
+    """Raw logs of a motion up to 0.5 Hz, torques that vibrate at 9 Hz."""
+    model = jd.repair_inertias(jd.load_urdf(arm))
+    paths = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        t = np.linspace(0, 12, 2401)
+        w = 2 * np.pi * 0.1 * np.arange(1, 6)[:, None]
+        angle = w * t[:, None, None] + rng.uniform(0, 6, (5, 3))
+        size = rng.uniform(0.3, 0.6, (5, 3)) / w
+        q, v, a = (np.sum(size * x, 1) for x in (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle)))
+        tau = jd.identify.regressor(model, q, v, a) @ jd.identify.nominal_parameters(model)
+        tau += 0.05 * np.abs(tau).max(axis=0) * np.sin(2 * np.pi * 9 * t)[:, None]
+        paths.append(str(tmp_path / f"{seed}.csv"))
+        write_log(paths[-1], jd.identify.Log(t, q, tau=tau))
+    report = tmp_path / "fit.json"
+    args = ["identify", "--urdf", str(arm), "--log", paths[0], "--test-log", paths[1], "--report", str(report)]
+    args += ["--repair", "--terms", "viscous", "--v-s", "0.01", "--prior", "1", "--robust", "none"]
+    assert main(args) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"--cutoff auto: 5(\.\d+)? Hz, ten times the band of the motion, 0.5", text)
+    assert "where no rigid body is" not in text
+    chosen = json.loads(report.read_text())
+    assert chosen["cutoff_hz"] == pytest.approx(5, abs=0.9) and chosen["torque_error"]["test_percent"] < 0.5
+    assert main([*args, "--cutoff", "14"]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"1.csv: (9\d|100) % .* where no rigid body is: vibration; try --cutoff [456]", text)
+    given = json.loads(report.read_text())
+    assert given["cutoff_hz"] == 14 and given["torque_error"]["test_percent"] > 2
+    assert main([*args, "--cutoff", "low"]) == 2
 
 
 def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):

@@ -2,16 +2,16 @@
 
 import argparse
 import json
-import math
 import pathlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jaxdyn import __version__, identify
-from jaxdyn.cli.common import Stopwatch, add_model_options, coordinate_labels, load_model, number, output_path
+from jaxdyn.cli.common import Stopwatch, add_model_options, coordinate_labels, load_model, output_path
 from jaxdyn.cli.identify_file import with_file
-from jaxdyn.cli.identify_logs import filtered_log, log_names, log_paths
+from jaxdyn.cli.identify_logs import filtered_log, log_cutoff, log_names, log_paths, raw_log
+from jaxdyn.cli.identify_options import make_fit, parse_options, settled
 from jaxdyn.cli.identify_tables import judged_table, payload_text, tables
 from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
@@ -25,8 +25,6 @@ from jaxdyn.model.builder import inertia_report, repair_inertias
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.identification import Findings, Judged, content, payload_content
 
-# Of the simulation in a trajectory fit (s).
-_LONGEST_STEP = 0.0025
 # Share of the residual's power far above the motion from which on it is worth a warning.
 _VIBRATES = 0.3
 HELP = "identify inertias, friction and rotor inertias from logs of positions and torques"
@@ -54,10 +52,10 @@ logs (--log FILE.csv ..., --test-log FILE.csv ..., one header line, or FILE.npz)
 
 filtering:
   A raw log (no columns a1..) is put on a uniform grid, low-passed without delay at --cutoff, and differentiated:
-  v and a are made from q. Choose the cut-off some 5 to 10 times above the fastest motion; 8 Hz suits exciting
-  motions of arms, and a warning says when what a fit leaves over lies far above the motion. A log with columns a1.. is
-  taken as filtered and used as it is. With --filtered so is one without them, and v and a that are missing are made by
-  differences.
+  v and a are made from q. --cutoff auto takes ten times the band that holds 99 % of the velocity's power, or less where
+  a joint's torque vibrates below that, down to five times; all logs get the same. A warning says when what a fit leaves
+  over lies far above the motion. A log with columns a1.. is taken as filtered and used as it is. With --filtered so is
+  one without them, and v and a that are missing are made by differences.
 
 terms (--terms), beside the links:
   viscous v + coulomb tanh(v / v_s) + offset + armature a (rotor inertia), and
@@ -123,7 +121,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SHARE",
         help="without --test-log: share of every log that is fitted to tell the error on the rest (default: 0.7)",
     )
-    data.add_argument("--cutoff", type=float, default=8.0, metavar="HZ", help="of the low-pass filter (default: 8 Hz)")
+    data.add_argument(
+        "--cutoff",
+        default="auto",
+        metavar="HZ",
+        help="of the low-pass filter; auto, from the spectra of --log (default)",
+    )
     data.add_argument(
         "--every", type=int, metavar="N", help="keep each Nth filtered sample (default: 15 per cut-off period)"
     )
@@ -172,17 +175,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     files.add_argument("--progress", action="store_true", help="print what is tried, and the loss, while fitting")
 
 
-class _Options(NamedTuple):
-    """How a fit is to be made; what is "auto" is chosen by the fit."""
-
-    method: str
-    terms: str | tuple[str, ...]
-    v_s: float | str
-    prior: float | str
-    robust: float | str | None
-    weights: str | None
-
-
 @on_one_thread()
 def run(args: argparse.Namespace) -> None:
     """Fit, print the errors and the parameters, write the files."""
@@ -196,7 +188,7 @@ def run(args: argparse.Namespace) -> None:
     json_path = output_path(args.report, (".json",), "--report")
     html = output_path(args.html, (".html",), "--html")
     plot = output_path(args.plot, (".png", ".pdf", ".svg"), "--plot")
-    options = _options(args)
+    options = parse_options(args)
     if out is not None and args.method == "least-squares":
         raise ValueError("--out: least squares gives combinations of parameters and no bodies, so there is no URDF to "
                          "write; take --method feasible, or --report FILE.json")  # fmt: skip
@@ -213,20 +205,23 @@ def run(args: argparse.Namespace) -> None:
         repaired = dict.fromkeys((*given, *dict(inertia_report(model))))
         print(f"repaired inertias: {', '.join(repaired) or 'none needed it'}")
         model = repair_inertias(model)
-    logs = [filtered_log(model, path, args) for path in train_paths]
+    raws = [raw_log(model, path, args) for path in train_paths]
+    # What is held out has no say.
+    cutoff = log_cutoff(raws if test_paths else [identify.split(raw, args.train)[0] for raw in raws], args)
+    logs = [filtered_log(raw, path, args, cutoff) for raw, path in zip(raws, train_paths, strict=True)]
     names = log_names(train_paths + test_paths)
 
     watch = Stopwatch()
     if test_paths:
-        final = judge = _fit(model, logs, options, args)
-        tests = [filtered_log(model, path, args) for path in test_paths]
+        final = judge = make_fit(model, logs, options, args)
+        tests = [filtered_log(raw_log(model, path, args), path, args, cutoff) for path in test_paths]
         test_names, trained = names[len(logs) :], logs
     else:
         trained, tests = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
         test_names = [f"{name} (last {100 * (1 - args.train):.3g} %)" for name in names]
-        judge = _fit(model, trained, options, args)
+        judge = make_fit(model, trained, options, args)
         # What was chosen on the training part stays; the numbers are those of everything.
-        final = _fit(model, logs, _settled(options, judge), args)
+        final = make_fit(model, logs, settled(options, judge), args)
     seconds = str(watch)
     fit = final.fit if isinstance(final, RobotFit) else final
     v_s = float(fit.v_s if isinstance(fit, LeastSquares) else fit.friction.v_s)
@@ -242,7 +237,7 @@ def run(args: argparse.Namespace) -> None:
         told=identify.identifiability(model, logs, base_terms(fit.terms), v_s=v_s),
         choice=judge.choice if isinstance(judge, RobotFit) else None,
     )
-    findings.warnings.extend(_warnings(findings, args))
+    findings.warnings.extend(_warnings(findings))
     print(judged_table(findings))
     print(f"{args.method} fit of {model.name!r}, {model.nv} joints: {findings.outcome}, in {seconds}")
     for line in findings.warnings:
@@ -253,11 +248,13 @@ def run(args: argparse.Namespace) -> None:
         print(f"Wrote {out}.")
     payload = None
     if isinstance(final, RobotFit) and args.payload_log:
-        loaded = [filtered_log(model, path, args) for path in args.payload_log]
+        loaded = [filtered_log(raw_log(model, path, args), path, args, cutoff) for path in args.payload_log]
         payload = identify.fit_payload(model, logs, loaded, args.payload_body, robot=final)
         print(payload_text(payload))
     if json_path is not None:
-        report = content(findings, _asked(args)) | ({} if payload is None else {"payload": payload_content(payload)})
+        report = content(findings, _asked(args, cutoff)) | (
+            {} if payload is None else {"payload": payload_content(payload)}
+        )
         write_text(json_path, json.dumps(report, indent=2) + "\n")
         print(f"Wrote {json_path}.")
     if html is not None:
@@ -295,83 +292,14 @@ def _torques_beside(result: RobotFit | Fit) -> dict[str, dict[str, float]]:
     }
 
 
-def _asked(args) -> dict[str, Any]:
+def _asked(args, cutoff: float | None) -> dict[str, Any]:
     return {
         "jaxdyn": __version__,
         "urdf": str(pathlib.Path(args.urdf)),
         "logs": [str(pathlib.Path(path)) for path in args.log],
         "method": args.method,
-        "cutoff_hz": None if args.filtered else args.cutoff,
+        "cutoff_hz": cutoff,
     }
-
-
-def _options(args) -> _Options:
-    simple = args.method != "feasible"
-    terms = args.terms
-    if terms is None or terms == ["auto"]:
-        terms = TERMS if simple else "auto"
-    elif "auto" in terms:
-        raise ValueError(f"--terms {' '.join(terms)}: auto stands alone; it chooses the terms")
-    elif simple and set(terms) & set(EXTRA):
-        raise ValueError(f"--terms {' '.join(terms)}: --method {args.method} takes {', '.join(TERMS)}; the others need "
-                         "--method feasible")  # fmt: skip
-    v_s = args.v_s if args.v_s == "auto" else number(args.v_s, "--v-s")
-    prior = args.prior if args.prior == "auto" else number(args.prior, "--prior")
-    if simple:
-        v_s, prior = 0.01 if v_s == "auto" else v_s, 1.0 if prior == "auto" else prior
-    robust = {"auto": "auto", "none": None}.get(args.robust, args.robust)
-    robust = number(robust, "--robust") if robust not in ("auto", None) else robust
-    weights = "auto" if args.weights == "auto" else None
-    return _Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights)
-
-
-def _settled(options: _Options, result) -> _Options:
-    """The options with what a fit chose in place of "auto"."""
-    if not isinstance(result, RobotFit):
-        return options
-    setting = result.choice.setting
-    return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust)
-
-
-def _fit(model: Model, logs: list[Log], options: _Options, args) -> RobotFit | Fit | LeastSquares:
-    def show(step, loss, _):
-        if args.progress:
-            print(f"  step {step}: loss {loss:.8g}", flush=True)
-
-    def tell(trial):
-        if args.progress:
-            extra = ", ".join(f"{name} {list(joints)}" for name, joints in trial.setting.extra)
-            print(f"  left out: {trial.percent:.3f} % with v_s {trial.setting.v_s:g}, prior {trial.setting.prior:g}, "
-                  f"robust {trial.setting.robust}, terms {extra or 'none more'}", flush=True)  # fmt: skip
-
-    if options.method == "least-squares":
-        return identify.least_squares(model, logs, options.terms, v_s=float(options.v_s))
-    if options.method == "feasible":
-        return identify.fit_robot(
-            model,
-            logs,
-            options.terms,
-            v_s=options.v_s,
-            prior=options.prior,
-            robust=options.robust,
-            weights=options.weights,
-            callback=tell,
-        )
-    (log,) = logs
-    v_s = float(options.v_s)
-    fit = identify.fit_torques(model, log, options.terms, v_s=v_s, prior=float(options.prior), callback=show)
-    dt = float(np.median(np.diff(np.asarray(log.t))))
-    return identify.fit_trajectory(
-        fit.model,
-        log,
-        options.terms,
-        v_s=v_s,
-        horizon=min(max(1, round(args.horizon / dt)), len(log) - 1),
-        steps=args.steps,
-        callback=show,
-        # Fixed steps: in a batch of segments, adaptive ones cost every segment what the stiffest needs.
-        substeps=max(1, math.ceil(dt / _LONGEST_STEP)),
-    )
 
 
 def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
@@ -390,16 +318,17 @@ def _judged(model: Model, result, names: list[str], logs: list[Log]) -> list[Jud
     ]
 
 
-def _warnings(findings: Findings, args) -> list[str]:
+def _warnings(findings: Findings) -> list[str]:
     lines = []
     labels, _ = coordinate_labels(findings.model)
     for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
         lines += [f"{one.name}: {line}" for line in suspicions(findings.model, one.log, labels)]
         lines += [f"{one.name}: {line}" for line in at_rest(one.log, one.predicted - np.asarray(one.log.tau), labels)]
         share, edge = vibration(one.log, one.predicted - np.asarray(one.log.tau))
-        if share > _VIBRATES and (args.filtered or edge < args.cutoff):
+        if share > _VIBRATES and (one.log.cutoff is None or edge < one.log.cutoff):
+            mend = f"low-pass it at {edge:.2g} Hz" if one.log.cutoff is None else f"try --cutoff {edge:.2g}"
             lines.append(
                 f"{one.name}: {100 * share:.0f} % of the power of what the fit leaves over is above {edge:.2g} Hz, ten times "
-                f"the fastest motion, where no rigid body is: vibration; try --cutoff {edge:.2g}"
+                f"the fastest motion, where no rigid body is: vibration; {mend}"
             )
     return lines

@@ -5,6 +5,7 @@ import pathlib
 import numpy as np
 
 from jaxdyn import identify
+from jaxdyn.cli.common import number
 from jaxdyn.identify import Log
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.tree import Model
@@ -28,18 +29,51 @@ def log_names(paths: list[str]) -> list[str]:
     return [path if names.count(name) > 1 else name for path, name in zip(paths, names, strict=True)]
 
 
-def filtered_log(model: Model, path: str, args) -> Log:
-    """The log of a file, filtered unless it has been; says so. **Raises:** ValueError for logs that do not fit the model."""
+def raw_log(model: Model, path: str, args) -> Log:
+    """The log of a file as it was recorded. **Raises:** ValueError for logs that do not fit the model."""
     raw = read_log(path, joint_names=model.joint_names, rename=_renaming(args.rename))
     if raw.q.shape[1] != model.nq or raw.nv != model.nv:
         raise ValueError(
             f"{path}: the log has {raw.q.shape[1]} columns of q and {raw.nv} of tau, the model has {model.nq} and "
             f"{model.nv} (joints {', '.join(model.joint_names)}); hold joints that were not logged with --lock"
         )
-    span = f"{path}: {len(raw)} samples, {float(raw.t[-1] - raw.t[0]):.4g} s"
     if len(raw) < 2:
-        raise ValueError(f"{span}; a log needs more than one sample")
-    if raw.a is not None and raw.v is not None:
+        raise ValueError(f"{_span(path, raw)}; a log needs more than one sample")
+    return raw
+
+
+def log_cutoff(logs: list[Log], args) -> float | None:
+    """The cut-off (Hz) of all logs, None where none is filtered here; says what "auto" chose and why.
+
+    **Raises:** ValueError for a cut-off that is no positive number, and for logs that tell none.
+    """
+    logs = [log for log in logs if not (args.filtered or _is_filtered(log))]
+    if args.cutoff != "auto":
+        cutoff = number(args.cutoff, "--cutoff")
+        if not cutoff > 0:
+            raise ValueError(f"--cutoff is {cutoff} Hz; give a positive frequency, or auto")
+        return cutoff if logs else None
+    if not logs:
+        return None
+    try:
+        found = identify.choose_cutoff(logs)
+    except ValueError as error:
+        raise ValueError(f"--cutoff auto: {error}") from None
+    # Three digits are what a spectrum is worth.
+    cutoff = float(f"{found.frequency:.3g}")
+    how = f"ten times the band of the motion, {found.motion:.3g} Hz"
+    if found.vibration is not None:
+        how = f"below a vibration at {found.vibration:.3g} Hz; the motion is below {found.motion:.3g} Hz"
+    elif cutoff < 9.9 * found.motion:
+        how = f"what the sampling allows; the motion is below {found.motion:.3g} Hz"
+    print(f"--cutoff auto: {cutoff:g} Hz, {how}")
+    return cutoff
+
+
+def filtered_log(raw: Log, path: str, args, cutoff: float | None) -> Log:
+    """The log, filtered unless it has been; says so. **Raises:** ValueError for logs that are too short for the filter."""
+    span = _span(path, raw)
+    if _is_filtered(raw):
         print(f"{span}, with v and a: taken as filtered")
         return raw
     if args.filtered:
@@ -48,21 +82,30 @@ def filtered_log(model: Model, path: str, args) -> Log:
         a = np.gradient(np.asarray(v), np.asarray(raw.t), axis=0)
         return Log(raw.t, raw.q, v, a, raw.tau, joint_names=raw.joint_names)
     rate = (len(raw) - 1) / float(raw.t[-1] - raw.t[0])
-    if not args.cutoff > 0:
-        raise ValueError(f"--cutoff is {args.cutoff} Hz; give a positive frequency")
-    every = max(1, int(rate / (15 * args.cutoff))) if args.every is None else args.every
+    if cutoff is None:  # the logs that are fitted are filtered, and this one is not
+        cutoff = log_cutoff([raw], args)
+        assert cutoff is not None
+    every = max(1, int(rate / (15 * cutoff))) if args.every is None else args.every
     trim = 25 * every if args.trim is None else args.trim
     if every < 1 or trim < 0:
         raise ValueError(f"--every is {every}, --trim is {trim}; give --every of at least 1 and --trim of at least 0")
     try:
         log = identify.from_raw(
-            raw.t, raw.q, raw.tau, cutoff=args.cutoff, trim=trim, every=every, joint_names=raw.joint_names
+            raw.t, raw.q, raw.tau, cutoff=cutoff, trim=trim, every=every, joint_names=raw.joint_names
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    print(f"{span} at {rate:.4g} Hz; low-passed at {args.cutoff:g} Hz, {trim} samples dropped at each end, "
+    print(f"{span} at {rate:.4g} Hz; low-passed at {cutoff:g} Hz, {trim} samples dropped at each end, "
           f"each {every}th kept: {len(log)}")  # fmt: skip
     return log
+
+
+def _span(path: str, raw: Log) -> str:
+    return f"{path}: {len(raw)} samples, {float(raw.t[-1] - raw.t[0]):.4g} s"
+
+
+def _is_filtered(raw: Log) -> bool:
+    return raw.a is not None and raw.v is not None
 
 
 def _renaming(items: list[str]) -> dict[str, str]:

@@ -304,8 +304,8 @@ def _transpose(cotangents, *operands, program, rows):
     given = [type(x) is not ad.Zero for x in cotangents]
     backwards = derive.transposed(program, linear, given)
     fixed = [x for x, varies in zip(operands, linear, strict=True) if not varies]
-    given = [x for x in cotangents if type(x) is not ad.Zero]
-    results = iter(kernel_p.bind(*fixed, *given, program=backwards, rows=rows))
+    moved = [x for x in cotangents if type(x) is not ad.Zero]
+    results = iter(kernel_p.bind(*fixed, *moved, program=backwards, rows=rows))
     out = []
     for x, varies in zip(operands, linear, strict=True):
         if not varies:

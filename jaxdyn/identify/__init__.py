@@ -11,7 +11,6 @@ from jaxdyn.identify.identifiability import identifiability as identifiability
 from jaxdyn.identify.identifiability import whiteness as whiteness
 from jaxdyn.identify.intervals import Intervals as Intervals
 from jaxdyn.identify.logs import Log as Log
-from jaxdyn.identify.logs import from_raw as from_raw
 from jaxdyn.identify.logs import split as split
 from jaxdyn.identify.mechanisms import completed as completed
 from jaxdyn.identify.parameter_tree import Parameters as Parameters
@@ -19,6 +18,7 @@ from jaxdyn.identify.parameters import fit_parameters as fit_parameters
 from jaxdyn.identify.parameters import parameter_error as parameter_error
 from jaxdyn.identify.payload import Payload as Payload
 from jaxdyn.identify.payload import fit_payload as fit_payload
+from jaxdyn.identify.raw import from_raw as from_raw
 from jaxdyn.identify.regression import BaseParameters as BaseParameters
 from jaxdyn.identify.regression import LeastSquares as LeastSquares
 from jaxdyn.identify.regression import base_parameters as base_parameters
@@ -35,6 +35,8 @@ from jaxdyn.identify.result import ParameterFit as ParameterFit
 from jaxdyn.identify.robot import RobotFit as RobotFit
 from jaxdyn.identify.robot import fit_robot as fit_robot
 from jaxdyn.identify.sensors import Measured as Measured
+from jaxdyn.identify.spectra import Cutoff as Cutoff
+from jaxdyn.identify.spectra import choose_cutoff as choose_cutoff
 from jaxdyn.identify.torque_terms import EXTRA as EXTRA
 from jaxdyn.identify.torque_terms import TorqueTerm as TorqueTerm
 from jaxdyn.identify.trajectory import fit_trajectory as fit_trajectory

@@ -1,0 +1,97 @@
+"""What `jaxdyn identify` was asked for, and the fit that it asks for."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdyn import identify
+from jaxdyn.cli.common import number
+from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
+from jaxdyn.model.tree import Model
+
+# Of the simulation in a trajectory fit (s).
+_LONGEST_STEP = 0.0025
+
+
+class Options(NamedTuple):
+    """How a fit is to be made; what is "auto" is chosen by the fit."""
+
+    method: str
+    terms: str | tuple[str, ...]
+    v_s: float | str
+    prior: float | str
+    robust: float | str | None
+    weights: str | None
+
+
+def parse_options(args) -> Options:
+    """Options from the command line. **Raises:** ValueError for what the method does not take, and for what is no number."""
+    simple = args.method != "feasible"
+    terms = args.terms
+    if terms is None or terms == ["auto"]:
+        terms = TERMS if simple else "auto"
+    elif "auto" in terms:
+        raise ValueError(f"--terms {' '.join(terms)}: auto stands alone; it chooses the terms")
+    elif simple and set(terms) & set(EXTRA):
+        raise ValueError(f"--terms {' '.join(terms)}: --method {args.method} takes {', '.join(TERMS)}; the others need "
+                         "--method feasible")  # fmt: skip
+    v_s = args.v_s if args.v_s == "auto" else number(args.v_s, "--v-s")
+    prior = args.prior if args.prior == "auto" else number(args.prior, "--prior")
+    if simple:
+        v_s, prior = 0.01 if v_s == "auto" else v_s, 1.0 if prior == "auto" else prior
+    robust = {"auto": "auto", "none": None}.get(args.robust, args.robust)
+    robust = number(robust, "--robust") if robust not in ("auto", None) else robust
+    weights = "auto" if args.weights == "auto" else None
+    return Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights)
+
+
+def settled(options: Options, result) -> Options:
+    """The options with what a fit chose in place of "auto"."""
+    if not isinstance(result, RobotFit):
+        return options
+    setting = result.choice.setting
+    return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust)
+
+
+def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit | Fit | LeastSquares:
+    """The fit of some logs by the method asked for."""
+
+    def show(step, loss, _):
+        if args.progress:
+            print(f"  step {step}: loss {loss:.8g}", flush=True)
+
+    def tell(trial):
+        if args.progress:
+            extra = ", ".join(f"{name} {list(joints)}" for name, joints in trial.setting.extra)
+            print(f"  left out: {trial.percent:.3f} % with v_s {trial.setting.v_s:g}, prior {trial.setting.prior:g}, "
+                  f"robust {trial.setting.robust}, terms {extra or 'none more'}", flush=True)  # fmt: skip
+
+    if options.method == "least-squares":
+        return identify.least_squares(model, logs, options.terms, v_s=float(options.v_s))
+    if options.method == "feasible":
+        return identify.fit_robot(
+            model,
+            logs,
+            options.terms,
+            v_s=options.v_s,
+            prior=options.prior,
+            robust=options.robust,
+            weights=options.weights,
+            callback=tell,
+        )
+    (log,) = logs
+    v_s = float(options.v_s)
+    fit = identify.fit_torques(model, log, options.terms, v_s=v_s, prior=float(options.prior), callback=show)
+    dt = float(np.median(np.diff(np.asarray(log.t))))
+    return identify.fit_trajectory(
+        fit.model,
+        log,
+        options.terms,
+        v_s=v_s,
+        horizon=min(max(1, round(args.horizon / dt)), len(log) - 1),
+        steps=args.steps,
+        callback=show,
+        # Fixed steps: in a batch of segments, adaptive ones cost every segment what the stiffest needs.
+        substeps=max(1, math.ceil(dt / _LONGEST_STEP)),
+    )

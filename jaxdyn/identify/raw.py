@@ -1,0 +1,78 @@
+"""Logs from raw samples: uniform in time, low-passed without delay, differentiated."""
+
+import numpy as np
+
+from jaxdyn.identify.logs import Log
+from jaxdyn.identify.spectra import choose_cutoff
+
+
+def from_raw(
+    t, q, tau, *, cutoff: float | str = 8.0, order: int = 4, trim: int = 200, every: int = 8, joint_names=None
+) -> Log:
+    """A log for torque fits from raw positions and torques: uniform time, low-pass without delay, numerical rates.
+
+    The samples are interpolated linearly to a uniform grid of as many samples. q is low-passed forward and backward
+    (Butterworth, zero phase); v is its numerical gradient, low-passed again; a the gradient of v, low-passed again; tau
+    is low-passed the same way, so that both sides of the equation of motion went through the same filter. The filter's
+    transients at both ends are dropped, and as the signals hold nothing above the cut-off, only every few samples are
+    kept.
+
+    **Arguments:**
+
+    - `t` (n,) s, strictly increasing, jitter allowed; `q`, `tau` (n, nv): one coordinate per joint.
+    - `cutoff`: Hz, half-power frequency of one pass; or "auto", from this log's spectra by `choose_cutoff`. Several logs of
+      a fit should go through one low-pass: choose it once for all of them, and give the number.
+    - `order`: of the filter. `trim`: samples dropped at each end. `every`: keep every so-many-th sample.
+
+    **Returns:** `Log` with t, q, v, a, tau.
+
+    **Raises:** ValueError for all that `Log` refuses; too few samples for the filter and the trimming; a cut-off above
+    half the sampling rate; a gap in time longer than half a period of the cut-off, which interpolation would invent.
+
+    Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
+    """
+    from scipy.signal import butter, filtfilt
+
+    if isinstance(cutoff, str) and cutoff != "auto":
+        raise ValueError(f'cutoff is {cutoff!r}; give a frequency in Hz, or "auto"')
+    raw = Log(t, q, tau=tau, joint_names=joint_names)
+    cutoff = choose_cutoff(raw).frequency if isinstance(cutoff, str) else cutoff
+    t = np.asarray(raw.t, np.float64)
+    q = np.asarray(raw.q, np.float64)
+    tau = np.asarray(raw.tau, np.float64)
+    if q.shape[1] != tau.shape[1]:
+        raise ValueError(
+            f"q has {q.shape[1]} columns and tau {tau.shape[1]}: rates by differences need one coordinate per joint; "
+            "give v and a of quaternion joints to Log directly"
+        )
+    n = len(t)
+    need = max(2 * trim + every + 1, 3 * (order + 1) + 1)
+    if n < need:
+        raise ValueError(
+            f"{n} samples are too few for the filter: at least {need} (order={order}, trim={trim}, every={every})"
+        )
+    rate = (n - 1) / (t[-1] - t[0])
+    if not 0 < cutoff < rate / 2:
+        raise ValueError(f"cutoff={cutoff} Hz must lie between 0 and half the sampling rate, {rate / 2:.4g} Hz")
+    widest = int(np.argmax(np.diff(t)))
+    if t[widest + 1] - t[widest] > 0.5 / cutoff:
+        raise ValueError(
+            f"gap of {t[widest + 1] - t[widest]:.4g} s after row {widest} (t={t[widest]:.6g} s), longer than half a "
+            f"period of cutoff={cutoff} Hz; cut the log there or lower the cut-off"
+        )
+    grid = np.linspace(t[0], t[-1], n)
+    # scipy's annotations leave open what `output` gives.
+    numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
+
+    def uniform(x):
+        return np.stack([np.interp(grid, t, column) for column in x.T], axis=1)
+
+    def low(x):
+        return filtfilt(numerator, denominator, x, axis=0)
+
+    q = low(uniform(q))
+    v = low(np.gradient(q, grid, axis=0))
+    a = low(np.gradient(v, grid, axis=0))
+    tau = low(uniform(tau))
+    keep = slice(trim, n - trim, every)
+    return Log(grid[keep], q[keep], v[keep], a[keep], tau[keep], joint_names=raw.joint_names, cutoff=cutoff)
