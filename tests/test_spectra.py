@@ -85,5 +85,9 @@ def test_recorded_arms_get_about_five_hertz(data_dir):
         rec = loadmat(folder / "data.mat", squeeze_me=True, struct_as_record=False)["rec"]
         logs.append(identify.Log(rec.time_cont, np.deg2rad(rec.act_pos_mot_deg.T), tau=rec.act_torque_abs_nm.T))
     for log in logs:
-        for part in (log, *identify.split(log, 0.6)):
+        for part in (log, identify.split(log, 0.6)[0]):
             assert 4 <= identify.choose_cutoff(part).frequency <= 7  # six seconds have lines 0.17 Hz apart
+    # Four seconds, hardly two periods: two of the three logs tell it, and one is refused, not sent through at 100 Hz.
+    assert [identify.choose_cutoff(identify.split(log, 0.6)[1]).frequency < 7.6 for log in logs[1:3]] == [True, True]
+    with pytest.raises(ValueError, match="noise of the positions"):
+        identify.choose_cutoff(identify.split(logs[3], 0.6)[1])

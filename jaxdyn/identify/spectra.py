@@ -51,13 +51,18 @@ def choose_cutoff(logs: Log | Sequence[Log]) -> Cutoff:
 
     **Returns:** `Cutoff`.
 
-    **Raises:** ValueError for joints with more than one coordinate, for fewer than 32 samples, and for logs that do not move.
+    **Raises:** ValueError for joints with more than one coordinate, for fewer than 32 samples, and for logs that do not
+    move or whose noise hides the motion.
     """
     logs = (logs,) if isinstance(logs, Log) else tuple(logs)
     spectra = [_Spectra.of(log) for log in logs]
     motion = max(one.motion for one in spectra)
     if not motion > 0:
         raise ValueError("the positions do not move, so their spectrum tells no cut-off; give one in Hz")
+    if not np.isfinite(motion):
+        raise ValueError(
+            "the noise of the positions is as strong as their motion, so no cut-off is chosen; give one in Hz"
+        )
     frequency = _ABOVE * motion
     found = [valley for one in spectra if (valley := one.valley(motion)) is not None]
     vibration = None
@@ -155,14 +160,18 @@ def _band(frequency: np.ndarray, velocity: np.ndarray, slow: float) -> float:
 def _motion(frequency: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float:
     """Band of the motion from raw positions, whose noise would have most of the velocity's power at high frequencies.
 
-    The band of the velocity is looked for below ten times itself, upwards from where the positions' power lies.
+    The band of the velocity is looked for below ten times itself, upwards from where the positions' power lies; infinite where
+    that leads to ten times the latter, which is noise.
     """
     # Two lines are the least that the window can tell apart.
     band = max(_band(frequency, position, _SLOW), float(frequency[2])) if position.any() else 0.0
+    most = _ABOVE * band
     while band > 0:
         below = frequency <= _ABOVE * band
         higher = max(_band(frequency[below], velocity[below], _SLOW), float(frequency[2]))
         if higher <= band:
             return band
+        if higher > most:
+            return np.inf
         band = higher
     return 0.0
