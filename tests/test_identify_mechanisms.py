@@ -64,6 +64,25 @@ def test_a_four_bar_by_its_crank_alone():
 
 
 @pytest.mark.slow
+def test_link_lengths_of_a_four_bar_by_two_encoders():
+    """Coupler and rocker of a linkage whose crank and rocker are measured: each length is in a joint, a body and the loop."""
+    q0, v0 = jd.scenes.four_bar.start()
+    q, v, tau = moved(jd.scenes.four_bar(), q0, v0, (0,), size=20.0)
+    links = jd.identify.Construction(
+        lambda numbers: jd.scenes.four_bar(lengths=(1.0, *numbers["lengths"], 3.5)), {"lengths": jnp.array([2.9, 2.6])}
+    )
+    measured = {"1": (q[:, 0], v[:, 0]), "3": (q[:, 2], v[:, 2])}
+    log = jd.identify.completed(links.scene, T, measured, tau, q[0])
+    # What was measured is not moved onto the constraints of wrong lengths.
+    np.testing.assert_array_equal(log.q[:, [0, 2]], q[:, [0, 2]])
+    np.testing.assert_array_equal(log.v[:, [0, 2]], v[:, [0, 2]])
+    tree = jd.identify.Parameters(links).positive(lambda links: links.numbers["lengths"])
+    fit = found(links, log, tree, ["1", "3"])
+    np.testing.assert_allclose(fit.values, [3.0, 2.5], rtol=1e-5)
+    assert fit.result == "converged" and (fit.deviation < 1e-3).all()
+
+
+@pytest.mark.slow
 def test_a_redundant_manipulator_by_its_base_joints():
     """Six motors, two freedoms; measured are the three joints at the bases, one more than the freedoms."""
     q0, v0 = jd.scenes.parallel_manipulator.start()

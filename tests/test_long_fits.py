@@ -19,7 +19,7 @@ import sys, time, jax
 jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, sys.argv[2])
 from tests.test_long_fits import fitted
-fitted(sys.argv[1], method=sys.argv[3], callback=lambda step, loss, system: time.sleep(0.05))
+fitted(sys.argv[1], method=sys.argv[3], callback=lambda step, loss, system: time.sleep(0.2))
 """
 
 
@@ -59,15 +59,18 @@ def fitted(path=None, *, method="adam", start=(0.5, 2.9, 0.0), **options):
     )
 
 
-@pytest.mark.parametrize("method", ["adam", pytest.param("gauss-newton", marks=pytest.mark.slow)])
-def test_a_killed_fit_goes_on_to_the_same_numbers(tmp_path, method):
+# Gauss-Newton steps end after six points.
+@pytest.mark.parametrize(
+    ("method", "least", "points"), [("adam", 5, 41), pytest.param("gauss-newton", 3, 6, marks=pytest.mark.slow)]
+)
+def test_a_killed_fit_goes_on_to_the_same_numbers(tmp_path, method, least, points):
     path, root = tmp_path / "fit.ckpt", str(Path(__file__).parent.parent)
     run = subprocess.Popen(
         [sys.executable, "-c", _SCRIPT, str(path), root, method], env=os.environ | {"PYTHONPATH": root}
     )
     try:
         until = time.monotonic() + 300
-        while not path.exists() or len(checkpoint.read(path)[0]) == 0 or _steps(path) < 5:
+        while not path.exists() or len(checkpoint.read(path)[0]) == 0 or _steps(path) < least:
             assert run.poll() is None and time.monotonic() < until
             time.sleep(0.02)
     finally:
@@ -77,7 +80,7 @@ def test_a_killed_fit_goes_on_to_the_same_numbers(tmp_path, method):
     seen = []
     resumed = fitted(path, method=method, callback=lambda step, *_: seen.append(step))
     whole = fitted(None, method=method)
-    assert 5 <= begun < 40 and seen[0] in (begun - 1, begun) and len(resumed.history) == 41
+    assert least <= begun < points and seen[0] in (begun - 1, begun) and len(resumed.history) == points
     np.testing.assert_array_equal(resumed.history, whole.history)
     np.testing.assert_array_equal(resumed.values, whole.values)
 

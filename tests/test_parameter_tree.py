@@ -217,3 +217,69 @@ def test_geometry_gravity_and_sensors_are_found_together(log):
     np.testing.assert_allclose(computed["delay"], delay, atol=1e-3)
     assert fit.history[-1] < 1e-4 * fit.history[0] and fit.result == "converged"
     assert fit.error(recorded) < 5
+
+
+def test_a_length_that_enters_everywhere_is_found(log):
+    """The length of the links moves joints and, with a mass per length, bodies: one number of a construction."""
+
+    def build(numbers):
+        length = numbers["length"]
+        builder = jd.ModelBuilder("arm")
+        for i, axis in enumerate(((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.3, 1.0, 0.0))):
+            body = jd.inertia.displaced(
+                jd.inertia.box(numbers["density"] * length, (length, 0.1, 0.1)), (0.5 * length, 0, 0)
+            )
+            place = (length, 0.0, 0.0) if i else None
+            builder.add_body(f"link{i}", f"link{i - 1}" if i else None, "revolute", body, axis=axis, pose=place)
+        return builder.build()
+
+    true = build({"length": 0.4, "density": 3.0})
+    t = np.linspace(0.0, 2.0, 41)
+    q, v, a, tau = driven(true.replace(damping=jnp.zeros(3)), t)
+    recorded = jd.identify.Log(t, q, v, a, tau / 1.2)
+    links = jd.identify.Construction(build, {"length": 0.5, "density": 2.0})
+    # The gain of the torques is known to a part in a thousand: with it alone no mass would be told apart.
+    measured = jd.identify.Measured(links, torque_gain=[1.2] * 3)
+    tree = jd.identify.Parameters(measured).positive(lambda m: list(m.scene.numbers.values()))
+    fit = jd.identify.fit_parameters(measured, recorded, tree, error="torque", tolerance=1e-14)
+    assert fit.names == ("scene.numbers['density']", "scene.numbers['length']")
+    np.testing.assert_allclose(fit.values, [3.0, 0.4], rtol=1e-9)
+    assert fit.error(recorded) < 1e-6
+    np.testing.assert_allclose(fit.scene.system.inertias, true.inertias, rtol=1e-8, atol=1e-12)
+    alone = jd.identify.fit_parameters(
+        links, jd.identify.Log(t, q, v, a, tau), positive=lambda links: links.numbers["length"], error="torque", steps=3
+    )
+    assert alone.values.shape == (1,)
+    with pytest.raises(ValueError, match="build is 3; give a function"):
+        jd.identify.Construction(3, {})
+    with pytest.raises(ValueError, match="numbers has 'long'; give floating-point numbers"):
+        jd.identify.Construction(build, {"length": "long"})
+
+
+class Tracking(eqx.Module):
+    """Proportional and derivative gains about a moving reference, as logged."""
+
+    gain: float = 15.0
+
+    def __call__(self, q, v, t):
+        phase = jnp.array([0.0, 1.0, 2.0])
+        return self.gain * (0.4 * jnp.sin(3 * t + phase) - q) + 1.0 * (1.2 * jnp.cos(3 * t + phase) - v)
+
+
+def test_numbers_of_a_controlled_arm_by_its_motion_in_closed_loop():
+    """Damping and a mass from a log under a controller; its torques are part of what is compared."""
+    true, law, t = scene_of(arm()), Tracking(), np.linspace(0.0, 1.0, 26)
+    motion = jd.simulate(
+        true, jnp.zeros(3), jnp.zeros(3), jnp.asarray(t), control=law, outputs=("torque",), rtol=1e-10, atol=1e-10
+    )
+    log = jd.identify.Log(t, *(np.asarray(x) for x in (motion.q, motion.v, np.zeros((26, 3)), motion.torque)))
+    wrong = scene_of(arm(mass=(2.0, 1.0, 0.8), damping=(0.5, 0.5, 0.5)))
+    tree = jd.identify.Parameters(wrong).positive(lambda s: s.forces[0]).inertias(["link2"], shape="mass", metric=None)
+    options = {"error": "closed-loop", "horizon": 25, "substeps": 8, "control": law}
+    fit = jd.identify.fit_parameters(wrong, log, tree, tolerance=1e-10, **options)
+    found = dict(zip(fit.names, fit.values, strict=True))
+    damping = [value for name, value in found.items() if name.startswith("forces")]
+    np.testing.assert_allclose(damping, [0.3, 0.2, 0.1], rtol=2e-3)
+    np.testing.assert_allclose(fit.scene.system.inertias[2, 0], 0.5, rtol=1e-4)
+    # Per cent; what steps of 5 ms leave.
+    assert fit.result == "converged" and jd.identify.parameter_error(fit.system, log, **options) < 1e-2

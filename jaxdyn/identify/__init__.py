@@ -1,5 +1,6 @@
 """Parameters from measurements: least squares, and physically feasible fits by torque or by trajectory error."""
 
+from jaxdyn.identify.construction import Construction as Construction
 from jaxdyn.identify.exciting import Excitation as Excitation
 from jaxdyn.identify.exciting import exciting_motion as exciting_motion
 from jaxdyn.identify.feasible import fit_torques as fit_torques

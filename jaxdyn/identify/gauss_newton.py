@@ -44,6 +44,7 @@ class Linear(NamedTuple):
     by_starts: float = 0.0  # what the starts alone would take from the loss
     priors: int = 0  # how many of the errors, the last ones, are those of the prior
     prior_weight: float = 1.0
+    start_rank: int = 0  # how many directions of the starts have an effect
 
     @property
     def finite(self) -> bool:
@@ -78,12 +79,17 @@ def linear(errors, by_y, by_start) -> Linear:
     loss = float(np.sum(errors**2))
     if by_start is None:
         return Linear(loss, errors.reshape(-1), by_y.reshape(-1, p))
-    basis, triangular = np.linalg.qr(np.asarray(by_start, np.float64))
+    # Starts of mechanisms are put on the constraints: not all of their directions have an effect.
+    U, s, Vt = np.linalg.svd(np.asarray(by_start, np.float64), full_matrices=False)
+    kept = s > _RANK_TOLERANCE * s.max(axis=1, keepdims=True, initial=0.0)
+    basis, inverse = U * kept[:, None], np.swapaxes(Vt, 1, 2) / np.where(kept, s, np.inf)[:, None]
     turned = np.swapaxes(basis, 1, 2)
     shares, own = turned @ by_y, turned @ errors[..., None]
     rest, rows = errors - (basis @ own)[..., 0], by_y - basis @ shares
-    offset, gain = np.linalg.solve(triangular, own)[..., 0], np.linalg.solve(triangular, shares)
-    return Linear(loss, rest.reshape(-1), rows.reshape(-1, p), offset, gain, float(np.sum(own**2)))
+    offset, gain = (inverse @ own)[..., 0], inverse @ shares
+    return Linear(
+        loss, rest.reshape(-1), rows.reshape(-1, p), offset, gain, float(np.sum(own**2)), start_rank=int(kept.sum())
+    )
 
 
 def gauss_newton(
@@ -163,7 +169,7 @@ def deviations(end: Linear, slopes: np.ndarray) -> np.ndarray:
     count = len(end.errors) - end.priors
     data = end.rows[:count]
     fit = truncated(data, end.errors[:count], _RANK_TOLERANCE)
-    spare = count - (0 if end.offset is None else end.offset.size) - (fit.rank if end.priors == 0 else 0)
+    spare = count - end.start_rank - (fit.rank if end.priors == 0 else 0)
     if spare <= 0:
         return np.full(len(slopes), np.nan)
     square = max(float(np.sum(end.errors[:count] ** 2)), 1e-300) / spare

@@ -1,4 +1,4 @@
-"""Logs of mechanisms of which a few joints were measured: the rest of the motion from the constraints."""
+"""Mechanisms of which a few joints were measured: states on the constraints next to these, and logs of the whole motion."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,20 +7,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float
 
-from jaxdyn.constraints.assembly import assemble
-from jaxdyn.constraints.base import layout, rows
+from jaxdyn.constraints.assembly import Assembly, assemble
+from jaxdyn.constraints.base import layout, position_residual, rows
 from jaxdyn.constraints.dynamics import RESULTS
 from jaxdyn.constraints.mobility import degrees_of_freedom
 from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import as_array, state_dtype
 from jaxdyn.model.names import columns_in_v
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.scene import as_scene
-from jaxdyn.systems.system import displace
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import displace, displacement
 
-# Gauss-Newton steps of positions where more joints were measured than there are freedoms; they start a sample away.
-_ROUNDS = 4
+# Gauss-Newton steps towards what was measured; constraints count so many times as much as a measured coordinate, and
+# staying where it is so little that only coordinates that nothing tells do.
+_ROUNDS, _EXACT, _STAYS = 5, 1e2, 1e-8
 
 
 def observed_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
@@ -38,6 +40,43 @@ def observed_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
     return columns  # pyright: ignore[reportReturnType]
 
 
+def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> Assembly:
+    """The state on a scene's constraints that is nearest to (q, v): in the mass metric, or, where only the velocities `columns`
+    and their coordinates were measured, the least squares of these. The others then stay as near as the constraints let them.
+    """
+    if columns is None:
+        return assemble(scene, q, v, t, throw=False)
+
+    def nearer(at, _):
+        step = rows(scene, at, jnp.zeros_like(v), t).A[holonomic]
+        left = jnp.concatenate([-_EXACT * position_residual(scene, at, t), displacement(scene.system, at, q)[measured]])
+        return displace(scene.system, at, _least_squares(step, picked, left)), None
+
+    measured = np.array(columns)
+    picked = jnp.eye(scene.nv, dtype=q.dtype)[measured]
+    holonomic = np.concatenate([np.arange(place.start, place.nonholonomic) for place in layout(scene)])
+    near = lax.scan(nearer, q, None, length=_ROUNDS)[0] if len(holonomic) else q
+    return assemble(scene, near, nearest_velocity(scene, near, v, t, columns), t, throw=False)
+
+
+def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> Float[Array, " nv"]:
+    """The velocity (nv,) on a scene's constraints whose `columns` are the least squares of those of v."""
+    picked = jnp.eye(scene.nv, dtype=q.dtype)[np.array(columns)]
+
+    def nearer(now, _):
+        here = rows(scene, q, now, t)
+        left = jnp.concatenate([-_EXACT * here.velocity, (v - now)[np.array(columns)]])
+        return now + _least_squares(here.A, picked, left), None
+
+    return lax.scan(nearer, v, None, length=_ROUNDS)[0]
+
+
+def _least_squares(A, picked, left):
+    """The smallest change that takes away what is left of constraints and of measured coordinates."""
+    both = jnp.concatenate([_EXACT * A, picked])
+    return jnp.linalg.solve(both.T @ both + _STAYS * jnp.eye(both.shape[1], dtype=both.dtype), both.T @ left)
+
+
 def completed(scene: Any, t, measured: dict[Any, Any], tau, guess) -> Log:
     """A log of all joints of a mechanism, from those that were measured and the constraints.
 
@@ -49,7 +88,8 @@ def completed(scene: Any, t, measured: dict[Any, Any], tau, guess) -> Log:
       rad or m, by name, or by index for a system without bodies;
     `tau` (n, nv), N m or N, zero where there are no motors; `guess` (nq,): a configuration near the first one.
 
-    **Returns:** `Log` without accelerations. Pass the joints as `observed=` to `fit_parameters`, which then compares them alone.
+    **Returns:** `Log` without accelerations, in which what was measured stays as it is. Pass the joints as `observed=` to
+    `fit_parameters`, which then compares them alone.
 
     **Raises:** ValueError for joints that do not exist or have several freedoms, wrong shapes, and for a sample at which the
     mechanism cannot be assembled (its number and time).
@@ -76,29 +116,16 @@ def completed(scene: Any, t, measured: dict[Any, Any], tau, guess) -> Log:
         raise ValueError(f"guess has shape {guess.shape}, expected {(system.nq,)} = (nq,)")
     exact = isinstance(system, Model) and len(names) <= degrees_of_freedom(scene, guess)
 
-    picked = jnp.eye(system.nv, dtype=dtype)[np.array(columns)]
-    holonomic = np.concatenate([np.arange(place.start, place.nonholonomic) for place in layout(scene)])
-
-    def least_squares(A, b, measured):
-        # The constraints' rows are exact: they count a thousand times as much as what was measured.
-        return jnp.linalg.lstsq(jnp.concatenate([1e3 * A, picked]), jnp.concatenate([1e3 * b, measured]))[0]
-
     def follow(near, sample):
         at, rate, time = sample
         start = near.at[np.array(places)].set(at)
-        hold = {name: at[i] for i, name in enumerate(names)} if exact else None
-        assembly = assemble(scene, start, None, time, hold=hold, throw=False)
-
-        def nearer(_, assembly):
-            A = rows(scene, assembly.q, jnp.zeros_like(assembly.v), time).A[holonomic]
-            change = least_squares(A, jnp.zeros_like(A[:, 0]), at - assembly.q[np.array(places)])
-            return assemble(scene, displace(system, assembly.q, change), None, time, throw=False)
-
-        if not exact and len(holonomic):
-            assembly = lax.fori_loop(0, _ROUNDS, nearer, assembly)
-        here = rows(scene, assembly.q, jnp.zeros_like(assembly.v), time)
-        v = least_squares(here.A, -here.velocity, rate)
-        return assembly.q, (assembly.q, v, assembly.result == RESULTS.successful)
+        v = jnp.zeros((system.nv,), dtype).at[np.array(columns)].set(rate)
+        if not exact:
+            nearest = on_constraints(scene, start, v, time, columns)
+            return nearest.q, (nearest.q, nearest.v, nearest.result == RESULTS.successful)
+        held = assemble(scene, start, None, time, hold={name: at[i] for i, name in enumerate(names)}, throw=False)
+        v = nearest_velocity(scene, held.q, v, time, columns)
+        return held.q, (held.q, v, held.result == RESULTS.successful)
 
     _, (q, v, good) = jax.jit(lambda *samples: lax.scan(follow, guess, samples))(
         positions, velocities, jnp.asarray(t, dtype)
@@ -108,4 +135,6 @@ def completed(scene: Any, t, measured: dict[Any, Any], tau, guess) -> Log:
         raise ValueError(
             f"the mechanism cannot be assembled at sample {i} (t = {t[i]:.6g} s); check measured, lengths and guess"
         )
-    return Log(t, np.asarray(q), np.asarray(v), None, np.asarray(tau, np.float64))
+    q, v = np.array(q), np.array(v)
+    q[:, np.array(places)], v[:, np.array(columns)] = positions, velocities
+    return Log(t, q, v, None, np.asarray(tau, np.float64))

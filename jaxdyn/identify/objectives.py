@@ -11,6 +11,7 @@ velocities enter at the ends alone. Sample ten times faster than the motion, or 
 Source: Gautier & Khalil (1988), energy; Slotine & Li (1987), filtered dynamics; Bock (1983), multiple shooting.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -65,12 +66,13 @@ class Objective(eqx.Module):
         if self.error == "energy":
             return (energy_balance(scene, piece) / scale)[None, None]
         start = None if change is None else change * scale[:2]
-        options = dict(self.options)
+        options: dict[str, Any] = dict(self.options)
+        simulated = partial(simulate_segment, scene, piece, start, self.hold, options, observed=self.observed)
         if self.error == "trajectory":
             law = SampledTorque(piece.t + measured.delay, piece.tau, self.hold)
-            q, v = simulate_segment(scene, piece, start, self.hold, options, control=law)
+            q, v = simulated(control=law)
             return jnp.concatenate([self._seen(e) for e in motion_errors(system, piece, q, v, scale)], axis=1)
-        q, v, tau = simulate_segment(scene, piece, start, self.hold, options, control=self.control, outputs=("torque",))
+        q, v, tau = simulated(control=self.control, outputs=("torque",))
         errors = [*motion_errors(system, piece, q, v, scale[:2]), (tau - piece.tau) / scale[2][None]]
         return jnp.concatenate([self._seen(error) for error in errors], axis=1)
 

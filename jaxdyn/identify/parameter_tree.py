@@ -13,11 +13,11 @@ from jaxdyn.identify.blocks import Block, Directions, Inertias, Numbers, Poses, 
 from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.distances import METRICS
 from jaxdyn.identify.picking import across, entries_taken, free_bodies, models_of, root_of, rows_of
-from jaxdyn.identify.sensors import Measured
+from jaxdyn.identify.sensors import with_sensors
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.inertia import pseudo_inertia
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.scene import Scene
 
 _TEN = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 
@@ -34,7 +34,8 @@ class Parameters(eqx.Module):
 
     Nothing is free at first. Each method frees a leaf, or rows of it (bodies, joints), and returns a new tree.
 
-    **Arguments:** `system`: a `Model`, another system, a `Scene`, or a `jd.identify.Measured` scene with its sensors.
+    **Arguments:** `system`: a `Model`, another system, a `Scene`, a `jd.identify.Measured` scene with its sensors, or a
+    `jd.identify.Construction`.
 
     **Raises:** ValueError in each method for what is picked that is no floating-point leaf, is picked twice, or starts where
     it is not allowed; the message names the leaf.
@@ -194,7 +195,7 @@ class Parameters(eqx.Module):
     @property
     def dtype(self):
         """Floating-point type of the coordinates."""
-        return state_dtype(_scene(self.given).system)
+        return state_dtype(with_sensors(self.given).scene.system)
 
     def _walk(self, y, visit: Callable):
         leaves, structure = jax.tree.flatten(self.given)
@@ -213,7 +214,7 @@ class Parameters(eqx.Module):
 
     def scene(self, y: Float[Array, " p"]) -> Scene:
         """The scene with the numbers of y."""
-        return _scene(self.system(y))
+        return with_sensors(self.system(y)).scene
 
     def values(self, y: Float[Array, " p"]) -> Float[Array, " m"]:
         """The numbers (m,) that `names` names."""
@@ -369,7 +370,3 @@ def picked(system: Any, positive=None, free=None) -> Parameters:
     if positive is not None:
         tree = tree.positive(positive)
     return tree if free is None else tree.free(free)
-
-
-def _scene(given) -> Scene:
-    return given.scene if isinstance(given, Measured) else as_scene(given)

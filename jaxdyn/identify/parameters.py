@@ -75,8 +75,8 @@ def fit_parameters(
 
     **Arguments:**
 
-    - `system`: any system (a `Model`, a `LagrangianSystem`, ...), a `Scene`, whose forces count, or a `jd.identify.Measured`
-      scene; where the fit starts.
+    - `system`: any system (a `Model`, a `LagrangianSystem`, ...), a `Scene`, whose forces count, a `jd.identify.Measured`
+      scene, or a `jd.identify.Construction`; where the fit starts.
     - `log` with q, v, tau, and a for error="torque"; or several logs. Those that are simulated need one `horizon`.
     - `parameters`: what is free, and what is known of it (`jd.identify.Parameters` of the same system). For plain numbers instead
       `positive`, `free`: functions that pick leaves, or whole parts, of `system`:

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.assembly import assemble
 from jaxdyn.identify.logs import Log, as_logs
+from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.run import simulate
@@ -187,11 +187,12 @@ def simulate_segment(
     *,
     control: Any = None,
     outputs: tuple[str, ...] = (),
+    observed: tuple[int, ...] | None = None,
 ) -> tuple[Any, ...]:
     """Motion (n, nq), (n, nv) of one segment from its first state, displaced by `change`; NaN from where it fails.
 
     Under its torques, or under a `control`. `outputs`: of `jd.simulate`, which come behind. With constraints the first state
-    is put on them.
+    is put on them, next to what was `observed` (`on_constraints`).
     """
     t: Any = one.t
     given = dict(options)
@@ -205,7 +206,7 @@ def simulate_segment(
     if change is not None:
         q0, v0 = displace(scene.system, q0, change[0]), v0 + change[1]
     if scene.constraints:
-        state = assemble(scene, q0, v0, t[0], throw=False)
+        state = on_constraints(scene, q0, v0, t[0], observed)
         q0, v0 = state.q, state.v
     control = SampledTorque(t, one.tau, hold) if control is None else control
     motion = simulate(scene, q0, v0, t, control=control, outputs=outputs, throw=False, **given)

@@ -6,8 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdyn.identify.construction import Construction, built
 from jaxdyn.model.arguments import as_array, state_dtype
-from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.scene import as_scene
 
 
 class Measured(eqx.Module):
@@ -17,7 +18,7 @@ class Measured(eqx.Module):
 
     **Arguments:**
 
-    - `scene`: a `Scene`, or a system.
+    - `scene`: a `Scene`, a system, or a `Construction`.
     - `position_bias` (nv,), rad or m, along the joints (encoders); zero by default.
     - `torque_gain` (nv,): of a drive, N m per unit of the log (per ampere for currents; gears included); ones
       by default. `torque_bias` (nv,), N m; zero.
@@ -35,15 +36,16 @@ class Measured(eqx.Module):
     ```
     """
 
-    scene: Scene
+    scene: Any
     position_bias: Float[Array, " nv"]
     torque_gain: Float[Array, " nv"]
     torque_bias: Float[Array, " nv"]
     delay: Float[Array, ""]
 
     def __init__(self, scene: Any, *, position_bias=None, torque_gain=None, torque_bias=None, delay=0.0):
-        self.scene = as_scene(scene)
-        dtype, nv = state_dtype(self.scene.system), self.scene.nv
+        self.scene = scene if isinstance(scene, Construction) else as_scene(scene)
+        own = built(scene)
+        dtype, nv = state_dtype(own.system), own.nv
         given = {
             "position_bias": (position_bias, 0.0),
             "torque_gain": (torque_gain, 1.0),
@@ -60,5 +62,7 @@ class Measured(eqx.Module):
 
 
 def with_sensors(system: Any) -> Measured:
-    """A measured scene as it is, and a scene or system with ideal sensors."""
-    return system if isinstance(system, Measured) else Measured(system)
+    """A measured scene as it is, and a scene or system with ideal sensors; what is constructed is built."""
+    if not isinstance(system, Measured):
+        return Measured(built(system))
+    return eqx.tree_at(lambda m: m.scene, system, built(system.scene), is_leaf=lambda x: x is system.scene)
