@@ -24,8 +24,8 @@ demo: $(VENV)/.installed-plot  ## simulate, check and plot a first example
 test: $(VENV)/.installed-test  ## the tests, without the slow ones
 	$(PYTEST) -m "not slow"
 
-test-all: $(VENV)/.installed-test  ## every test, on every robot, with XLA's own flags
-	XLA_FLAGS= $(PYTEST) --all-robots
+test-all: $(VENV)/.installed-test  ## every test, on every robot
+	$(PYTEST) --all-robots
 
 lint: $(VENV)/.installed-dev  ## style and formatting
 	$(BIN)/ruff check .

@@ -20,10 +20,6 @@ from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Compiling is most of what tests do: XLA compiles fast and runs slowly here (see `quick` in pinocchio_bridge), unless its flags
-# are given. `make test-all` gives none, so that every test also runs as a user's program does.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
-
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -856,8 +856,10 @@ def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     assert list(table.coordinate.values) == list(jd.load_urdf(tmp_path / "arm.urdf").joint_names)
     study.write_text(head + 'scene = "chaplygin_sleigh"\n[parameters]\nmass = { uniform = [1.0, 2.0] }\n')
     assert main(["sweep", str(study), "--quiet", "--out", str(tmp_path / "b.zarr")]) == 0
-    table = xarray.open_zarr(tmp_path / "b.zarr", chunks=None)
-    assert len(np.unique(table.parameter_mass)) == len(np.unique(table.q[:, -1, 2])) == 6
-    study.write_text(head + 'scene = "closed_ring"\n[parameters]\nbodies = { uniform = [4.0, 6.0] }\n')
+    drawn = xarray.open_zarr(tmp_path / "b.zarr", chunks=None)
+    mass = drawn.parameter_mass.values
+    assert mass.shape == (6,) and len(set(mass)) == 6 and ((mass >= 1) & (mass <= 2)).all()
+    assert len(np.unique(drawn.q[:, -1, 2])) == 6
+    study.write_text(head + 'scene = "windows"\n[parameters]\ncount = { uniform = [1.0, 2.0] }\n')
     assert main(["sweep", str(study), "--quiet", "--out", str(tmp_path / "c.zarr")]) == 2
-    assert "is built from known numbers, so that bodies cannot be drawn" in capsys.readouterr().err
+    assert "is built from known numbers, so that count cannot be drawn" in capsys.readouterr().err
