@@ -7,7 +7,7 @@ settings given; 0.2 s are dropped at each end. The error on what was not fitted,
 filtered ("own"), and of both sides low-passed once more at 2.5 Hz ("< 2.5 Hz"), which compares the fits with each other; and the
 share of the residual's power above ten times the band of the motion, which is vibration.
 
-delay: the Franka's log at 8 Hz, the first four terms, with and without `delay="auto"`: error on the last 30 %, and the delays (ms)
+delay: the Franka's log at 8 Hz, first four terms, with and without `delay="auto"`: error on the last 30 %, and delays (ms)
 with half of their 95 % intervals.
 """
 
