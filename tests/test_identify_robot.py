@@ -11,7 +11,7 @@ from jaxdyn.identify.condensed import block_slices, condensed_rows
 from jaxdyn.identify.logs import as_measured
 from jaxdyn.identify.one_fit import eliminate
 from jaxdyn.identify.regression import condense, condense_model
-from jaxdyn.identify.robot import huber_weights
+from jaxdyn.identify.robot_problem import huber_weights
 from jaxdyn.identify.selection import folds, helped
 from jaxdyn.identify.spectra import motion_band, vibration
 from jaxdyn.identify.suspicions import at_rest, suspicions

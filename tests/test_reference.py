@@ -35,6 +35,7 @@ ELSEWHERE = {
     "geometry.pull_back": "test_lagrangian_scenes",
     "identify.Intervals": "test_identify_robot",
     "identify.Payload": "test_identify_robot",
+    "identify.Delays": "test_delays",
     "identify.RobotFit": "test_identify_robot",
     "identify.fit_payload": "test_identify_robot",
     "identify.fit_robot": "test_identify_robot",

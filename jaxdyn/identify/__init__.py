@@ -1,6 +1,8 @@
 """Parameters from measurements: least squares, and physically feasible fits by torque or by trajectory error."""
 
 from jaxdyn.identify.construction import Construction as Construction
+from jaxdyn.identify.delays import Delays as Delays
+from jaxdyn.identify.delays import shift_torques as shift_torques
 from jaxdyn.identify.exciting import Excitation as Excitation
 from jaxdyn.identify.exciting import exciting_motion as exciting_motion
 from jaxdyn.identify.feasible import fit_torques as fit_torques

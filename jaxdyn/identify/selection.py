@@ -112,8 +112,8 @@ def search(
     return search.best([setting._replace(robust=threshold) for threshold in losses])
 
 
-def helped(before: np.ndarray, after: np.ndarray) -> tuple[int, ...]:
-    """Numbers of the torques whose squared errors (folds, nv) a term lowered by enough, and in most of the parts."""
-    total = after.sum(axis=0) < (1 - _WORTH) * before.sum(axis=0)
+def helped(before: np.ndarray, after: np.ndarray, worth: float = _WORTH) -> tuple[int, ...]:
+    """Numbers of the torques whose squared errors (folds, nv) fell by the share `worth`, and in most of the parts."""
+    total = after.sum(axis=0) < (1 - worth) * before.sum(axis=0)
     often = np.mean(after < before, axis=0) >= _MOST
     return tuple(int(joint) for joint in np.flatnonzero(total & often))

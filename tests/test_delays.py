@@ -1,0 +1,94 @@
+"""Delays between positions and torques: found where they are, to their intervals, and none where there is none."""
+
+import numpy as np
+import pytest
+from test_identify_robot import arm, motion
+
+from jaxdyn import identify
+
+GIVEN = {"terms": identify.TERMS, "v_s": 0.05, "prior": 1.0, "robust": None}
+NUMBERS = [0.3, 0.2, 0.4, 0.3, 0.1, -0.2, 0.05, 0.02]
+
+
+def late(seed, delay, noise=0.05, n=600):
+    """A log whose torques are those that the arm needed `delay` (2,) before, by exact evaluation at those times."""
+    model = arm()
+    x = identify.nominal_parameters(model)
+    x[20:] = NUMBERS
+    log = motion(seed, n, 12.0)
+    columns = []
+    for joint, d in enumerate(delay):
+        before = motion_at(seed, log.t - d)
+        columns.append((identify.regressor(model, *before, v_s=0.05) @ x)[:, joint])
+    tau = np.stack(columns, axis=1)
+    return identify.Log(log.t, log.q, log.v, log.a, tau + noise * np.random.default_rng(seed).normal(size=tau.shape))
+
+
+def motion_at(seed, t):
+    """q, v, a of `motion(seed)` at any times."""
+    generator = np.random.default_rng(seed)
+    amplitude, phase = generator.uniform(0.3, 1.0, (4, 2)), generator.uniform(0, 2 * np.pi, (4, 2))
+    w = np.arange(1, 5)[:, None] * 1.3
+    angle = w * t[:, None, None] + phase
+    waves = (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle))
+    return tuple(np.sum(amplitude * x, 1) for x in waves)
+
+
+def test_the_motion_of_the_witness_is_that_of_the_log():
+    log = motion(3)
+    for mine, other in zip(motion_at(3, log.t), (log.q, log.v, log.a), strict=True):
+        np.testing.assert_allclose(mine, other, atol=1e-12)
+
+
+def test_delays_are_found_to_their_intervals():
+    """12 ms at one joint, -5 ms at the other; and the robot's numbers come out as without delays."""
+    truth = np.array([0.012, -0.005])
+    logs, test = [late(1, truth), late(2, truth)], late(3, truth, 0.0)
+    fit = identify.fit_robot(arm(), logs, delay="auto", **GIVEN)
+    off = np.abs(fit.delays.seconds - truth)
+    assert np.all(off <= fit.delays.factor * fit.delays.std) and off.max() < 1e-3
+    assert np.all(fit.delays.std < 1e-3) and np.all(fit.delays.squares[1].sum(0) < fit.delays.squares[0].sum(0))
+    plain = identify.fit_robot(arm(), logs, **GIVEN)
+    assert plain.delays is None and plain.aligned(test) is test
+    assert fit.fit.error(fit.aligned(test)) < 0.3 * plain.fit.error(test)
+    x = identify.nominal_parameters(arm())
+    x[20:] = NUMBERS
+    # Intervals of the other numbers are those at the delays found, so nearness is what is asked of these.
+    base = fit.intervals.combinations.values
+    near, far = (np.linalg.norm(base(f.fit.vector) - base(x)) for f in (fit, plain))
+    assert near < 0.3 * far
+    given = identify.fit_robot(arm(), logs, delay=fit.delays.seconds, **GIVEN)
+    np.testing.assert_allclose(given.fit.vector, fit.fit.vector, rtol=1e-8, atol=1e-10)
+
+
+def test_a_delay_that_is_not_there_is_not_found():
+    fit = identify.fit_robot(arm(), [late(1, (0, 0)), late(2, (0, 0))], delay="auto", **GIVEN)
+    assert np.all(np.abs(fit.delays.seconds) <= fit.delays.factor * fit.delays.std)
+
+
+@pytest.mark.slow
+def test_intervals_of_delays_cover():
+    """20 arms of two joints: the 95 % intervals hold the truth nine times in ten."""
+    inside = []
+    for seed in range(20):
+        truth = np.random.default_rng(seed).uniform(-0.01, 0.01, 2)
+        found = identify.fit_robot(arm(), late(seed, truth), delay="auto", **GIVEN).delays
+        inside.append(np.abs(found.seconds - truth) <= found.factor * found.std)
+    assert np.mean(inside) >= 0.85
+
+
+def test_shifted_torques_are_those_of_later_times():
+    log = motion(0, 600, 12.0)
+    wave = np.stack([np.sin(3 * log.t), np.cos(2 * log.t)], axis=1)
+    log = identify.Log(log.t, log.q, log.v, log.a, wave, cutoff=8.0)
+    moved = identify.shift_torques(log, (0.013, -0.021))
+    assert moved.cutoff == 8.0 and len(log) - len(moved) == 3
+    expected = np.stack([np.sin(3 * (moved.t + 0.013)), np.cos(2 * (moved.t - 0.021))], axis=1)
+    # Cubic splines: 5 / 384 (w h)^4, and more at the ends.
+    np.testing.assert_allclose(moved.tau, expected, atol=1e-5)
+    assert identify.shift_torques(log, 0.0) is log
+    for words, delay in (("delay is", (0.1, 0.1, 0.1)), ("delay is nan", np.nan), ("nothing is left", 13.0)):
+        with pytest.raises(ValueError, match=words):
+            identify.shift_torques(log, delay)
+    with pytest.raises(ValueError, match="delay is 'late'"):
+        identify.fit_robot(arm(), log, delay="late", **GIVEN)
