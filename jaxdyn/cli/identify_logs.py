@@ -56,16 +56,16 @@ def log_cutoff(logs: list[Log], args) -> float | None:
     if not logs:
         return None
     try:
-        found = identify.choose_cutoff(logs)
+        choice = identify.choose_cutoff(logs)
     except ValueError as error:
         raise ValueError(f"--cutoff auto: {error}") from None
     # Three digits are what a spectrum is worth.
-    cutoff = float(f"{found.frequency:.3g}")
-    how = f"ten times the band of the motion, {found.motion:.3g} Hz"
-    if found.vibration is not None:
-        how = f"below a vibration at {found.vibration:.3g} Hz; the motion is below {found.motion:.3g} Hz"
-    elif cutoff < 9.9 * found.motion:
-        how = f"what the sampling allows; the motion is below {found.motion:.3g} Hz"
+    cutoff = float(f"{choice.frequency:.3g}")
+    how = f"ten times the band of the motion, {choice.motion:.3g} Hz"
+    if choice.vibration is not None:
+        how = f"below a vibration at {choice.vibration:.3g} Hz; the motion is below {choice.motion:.3g} Hz"
+    elif cutoff < 9.9 * choice.motion:
+        how = f"what the sampling allows; the motion is below {choice.motion:.3g} Hz"
     print(f"--cutoff auto: {cutoff:g} Hz, {how}")
     return cutoff
 

@@ -44,5 +44,5 @@ def map_rows(function: Callable, rows):
         last = jnp.broadcast_to(x[-1:], (blocks * size - count, *x.shape[1:]))
         return jnp.concatenate([x, last]).reshape(blocks, size, *x.shape[1:])
 
-    found = lax.map(at_once, jax.tree.map(divided, rows))
-    return jax.tree.map(lambda x: x.reshape(blocks * size, *x.shape[2:])[:count], found)
+    mapped = lax.map(at_once, jax.tree.map(divided, rows))
+    return jax.tree.map(lambda x: x.reshape(blocks * size, *x.shape[2:])[:count], mapped)

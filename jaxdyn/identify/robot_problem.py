@@ -57,8 +57,8 @@ class RobotProblem:
         rest = np.setdiff1d(np.arange(len(blocks)), part)
         if key not in self._rows:
             self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
-        found = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
-        return self.data(setting._replace(robust=None)).blocks.squares(found.x, part).sum(axis=0)
+        estimate = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
+        return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part).sum(axis=0)
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
         """Fit some times over; after each but the last, update weights and loads."""

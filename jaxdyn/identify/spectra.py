@@ -64,10 +64,10 @@ def choose_cutoff(logs: Log | Sequence[Log]) -> Cutoff:
             "the noise of the positions is as strong as their motion, so no cut-off is chosen; give one in Hz"
         )
     frequency = _ABOVE * motion
-    found = [valley for one in spectra if (valley := one.valley(motion)) is not None]
+    valleys = [valley for one in spectra if (valley := one.valley(motion)) is not None]
     vibration = None
-    if found:
-        frequency, vibration = min(found)
+    if valleys:
+        frequency, vibration = min(valleys)
     return Cutoff(min(frequency, _SAMPLING * min(one.rate for one in spectra)), motion, vibration)
 
 
@@ -106,15 +106,15 @@ class _Spectra(NamedTuple):
         bands = np.stack([self.torque[mask].mean(axis=0) for mask in inside])
         sums = np.stack([self.torque[mask].sum(axis=0) for mask in inside])
         total = self.torque.sum(axis=0)
-        found = []
+        valleys = []
         for joint in range(bands.shape[1]):
             for high in range(1, len(bands)):
                 low = int(np.argmin(bands[:high, joint]))
                 rises = bands[high, joint] > _RISE * bands[low, joint]
                 if rises and sums[high, joint] > _SHARE * total[joint]:
-                    found.append((float(edges[low : low + 2].mean()), float(edges[high : high + 2].mean())))
+                    valleys.append((float(edges[low : low + 2].mean()), float(edges[high : high + 2].mean())))
                     break
-        return min(found) if found else None
+        return min(valleys) if valleys else None
 
 
 def motion_band(log: Log) -> float:
