@@ -56,7 +56,7 @@ def figure(grasp, motion) -> matplotlib.figure.Figure:
         xlabel="time (s)",
         ylabel="force (N)",
         ylim=(0, None),
-        title=f"margin: {MU} x normal - tangential force",
+        title=f"margin: {MU} normal - tangential",
     )
     axes.legend(fontsize=8, frameon=False)
     made.suptitle(
