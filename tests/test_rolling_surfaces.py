@@ -260,8 +260,8 @@ def test_an_egg_keeps_its_energy_and_both_methods_agree():
     np.testing.assert_allclose(np.linalg.norm(places, axis=1), 1.0, atol=1e-14)
     # Errors of some 1e-11 a step, of motions that part from each other in 5 s.
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
-    # The places are where the surfaces touch, and eta gives the pose back.
-    for row in ends[0][::5]:
+    # The places are where the surfaces touch, and eta gives the pose back. (The start is the pole, where this chart ends.)
+    for row in ends[0][5::5]:
         pose = relative_pose(Plane(), Ellipsoid(AXES), scene.system.contact_coordinates(row)[0])
         np.testing.assert_allclose(pose, jd.frame_pose(scene.system, row, "egg"), atol=1e-11)
 
@@ -295,7 +295,7 @@ def test_motions_are_batched_and_have_derivatives_in_states_and_shapes():
     steps = jnp.concatenate([-2 * axes, -axes, axes, 2 * axes])
     none = jnp.zeros_like(steps)
     ends = quick(jax.vmap(end))(
-        AXES + jnp.concatenate([steps, none]), OMEGA + jnp.concatenate([none, steps * omegas[0, 0] / step])
+        AXES[None] + jnp.concatenate([steps, none]), OMEGA[None] + jnp.concatenate([none, steps * omegas[0, 0] / step])
     )
     low2, low, high, high2 = jnp.moveaxis(ends.reshape(2, 4, 3), 1, 0)
     differences = (low2 - 8 * low + 8 * high - high2) / (12 * step)
