@@ -7,17 +7,15 @@ is to be there within COLD and CACHED seconds; the exit status is 1 where it is 
 """
 
 import argparse
-import contextlib
 import os
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-import venv
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+from benchmarks.wheel import installed
+
 COLD, CACHED = 40.0, 15.0  # s
 FIRST_LINE = 5.0  # s; importing jax is most of it
 
@@ -61,19 +59,8 @@ def main(argv=None) -> int:
     parser.add_argument("--keep", type=Path, help="make wheel and environment here and leave them")
     parser.add_argument("--whole", action="store_true", help="let both runs of the demo go on to their end")
     options = parser.parse_args(argv)
-    with contextlib.ExitStack() as stack:
-        place = (options.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))).resolve()
-        place.mkdir(parents=True, exist_ok=True)
-        pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-        subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", place, ROOT], check=True)
-        wheel = max(place.glob("jaxdyn-*.whl"), key=os.path.getmtime)
-        venv.create(place / "env", with_pip=True)
-        python = place / "env" / ("Scripts" if os.name == "nt" else "bin") / "python"
-        began = time.perf_counter()
-        install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", f"{wheel}[plot]"]
-        subprocess.run(install, check=True)
-        installed = time.perf_counter() - began
-        print(f"pip install: {installed:.0f} s")
+    with installed(options.keep, "[plot]") as (place, python, _, seconds):
+        print(f"pip install: {seconds:.0f} s")
         caches = {"XDG_CACHE_HOME": str(place / "cache"), "MPLCONFIGDIR": str(place / "cache" / "matplotlib")}
         late = False
         for name, limit in (("cold", COLD), ("cached", CACHED)):
@@ -87,7 +74,7 @@ def main(argv=None) -> int:
                 f"python -m jaxdyn.demo, {name}: first line after {seen['first line']:.1f} s, first picture after "
                 f"{seen['first picture']:.1f} s (at most {limit:g} s){ended}"
             )
-        print(f"from pip install to the first picture: {installed:.0f} s and what 'cold' says")
+        print(f"from pip install to the first picture: {seconds:.0f} s and what 'cold' says")
         return int(late)
 
 

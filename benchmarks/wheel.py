@@ -65,23 +65,33 @@ def seconds_to_import(python: Path, name: str, folder: Path) -> float:
     return min(rows)
 
 
+@contextlib.contextmanager
+def installed(keep: Path | None, extras: str = ""):
+    """The wheel with `extras` in a fresh environment: its folder, its Python, the wheel, and the seconds that pip took.
+
+    All of it is made in `keep` and left there, or in a temporary folder that goes at the end.
+    """
+    with contextlib.ExitStack() as stack:
+        folder = (keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))).resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+        subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, ROOT], check=True)
+        wheel = max(folder.glob("jaxdyn-*.whl"), key=os.path.getmtime)
+        venv.create(folder / "env", with_pip=True)
+        python = folder / "env" / ("Scripts" if os.name == "nt" else "bin") / "python"
+        began = time.perf_counter()
+        install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", f"{wheel}{extras}"]
+        subprocess.run(install, check=True)
+        yield folder, python, wheel, time.perf_counter() - began
+
+
 def main(argv=None) -> int:
     """Build, install, try; the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--keep", type=Path, help="make wheel and environment here and leave them")
     options = parser.parse_args(argv)
-    with contextlib.ExitStack() as stack:
-        folder = (options.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))).resolve()
-        folder.mkdir(parents=True, exist_ok=True)
-        pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-        subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, ROOT], check=True)
-        wheel = max(folder.glob("jaxdyn-*.whl"), key=os.path.getmtime)
-        print(f"built {wheel.name}, {wheel.stat().st_size / 1e3:.0f} kB")
-        venv.create(folder / "env", with_pip=True)
-        python = folder / "env" / ("Scripts" if os.name == "nt" else "bin") / "python"
-        began = time.perf_counter()
-        subprocess.run([python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", wheel], check=True)
-        print(f"installed in {time.perf_counter() - began:.0f} s")
+    with installed(options.keep) as (folder, python, wheel, seconds):
+        print(f"built {wheel.name}, {wheel.stat().st_size / 1e3:.0f} kB; installed in {seconds:.0f} s")
         subprocess.run([python, "-I", "-c", SMOKE], cwd=folder, check=True)
         subprocess.run(
             [python, "-I", "-m", "jaxdyn", "info", "arm.urdf"], cwd=folder, check=True, stdout=subprocess.DEVNULL

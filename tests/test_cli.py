@@ -140,6 +140,7 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, tmp_path, cap
         main(["simulate", str(arm), "--sample", "0.05", "--friction", "0", "--torque", str(out), "--out", str(again)])
         == 0
     )
+    # Between rows of 0.05 s the torque is a line where it was a curve: 1e-5 rad here.
     np.testing.assert_allclose(read_log(again).q, motion.q, atol=1e-4)
 
 
@@ -268,6 +269,7 @@ def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsy
     assert re.search(r"--cutoff auto: 5(\.\d+)? Hz, ten times the band of the motion, 0.5", text)
     assert "where no rigid body is" not in text
     chosen = json.loads(report.read_text())
+    # Ten times a band that is read from lines 0.08 Hz apart.
     assert chosen["cutoff_hz"] == pytest.approx(5, abs=0.9) and chosen["torque_error"]["test_percent"] < 0.5
     assert main([*args, "--cutoff", "14"]) == 0
     text = capsys.readouterr().out

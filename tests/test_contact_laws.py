@@ -133,7 +133,7 @@ def test_contact_coordinates_of_the_whole_arm_follow():
     exact = decayed(np.asarray(TS), errors[0], np.zeros(5))
     np.testing.assert_allclose(errors, exact, atol=1e-6)  # of RK4's steps of 20 ms
     slopes = [np.polyfit(TS[-6:], np.log(np.abs(e[-6:])), 1)[0] for e in (errors, exact)]
-    np.testing.assert_allclose(*slopes, rtol=0.01)
+    np.testing.assert_allclose(*slopes, rtol=0.01)  # rates; the errors themselves are compared above
     np.testing.assert_allclose(solution.multipliers[:, 0], 5.0, atol=1e-7)
 
 
@@ -148,7 +148,7 @@ def test_rates_of_a_tip_that_rolls_follow():
     solution = jd.simulate(scene, q, v, TS, control=law, stepsize=0.02, outputs=("multipliers",))
     errors = np.asarray(jax.vmap(task.rolling)(solution.q, solution.v)) - np.asarray(target)
     np.testing.assert_allclose(errors, errors[0] * np.exp(-4.0 * np.asarray(TS))[:, None], atol=1e-6)
-    np.testing.assert_allclose(np.polyfit(TS[:8], np.log(np.abs(errors[:8])), 1)[0], -4.0, rtol=0.01)
+    np.testing.assert_allclose(np.polyfit(TS[:8], np.log(np.abs(errors[:8])), 1)[0], -4.0, rtol=0.01)  # likewise
     np.testing.assert_allclose(solution.multipliers, np.tile(lam, (TS.size, 1)), atol=1e-7)
 
 

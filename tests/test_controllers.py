@@ -180,6 +180,7 @@ def test_a_law_without_a_state_is_sampled(arm):
         for p in (0.01, 0.005)
     ]
     assert 1e-6 < difference[1] < difference[0] < 0.01
+    # First order in the period; the second order makes the ratio 2.008.
     np.testing.assert_allclose(difference[0] / difference[1], 2.0, rtol=0.05)
 
 

@@ -138,8 +138,12 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         closed = map_rows(lambda row: consistent(scene, *row), (q, v, ts))
         result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
     elif scene.constraints:
-        force = lambda row: eqs.generalized_force(eqs.args, *row)  # noqa: E731
-        met = map_rows(lambda row: method.satisfies(scene, *row[1:], force(row)), (y, q, v, ts))  # pyright: ignore[reportCallIssue]
+
+        def is_met(row):
+            force = eqs.generalized_force(eqs.args, *row)
+            return method.satisfies(scene, *row[1:], force)  # pyright: ignore[reportCallIssue]
+
+        met = map_rows(is_met, (y, q, v, ts))
         result = RESULTS.where((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows, result)
     if first is not None:
         result = RESULTS.where(is_regular(first), result, RESULTS.singular_basis)
