@@ -1,7 +1,6 @@
 """Functions that are called with known numbers, compiled once."""
 
 import functools
-import os
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxdyn.compile import mode
+from jaxdyn.compile.garbage import uncollected
 from jaxdyn.compile.known import Known, is_concrete, is_staged, partition_traced
 
 _MOST_NUMBERS = 10_000  # beyond which a tree is no input of mechanics, but data that no program should contain
@@ -18,12 +18,18 @@ _MOST_NUMBERS = 10_000  # beyond which a tree is no input of mechanics, but data
 def compiled(function: Callable) -> Callable:
     """`function`, compiled once per shape and mode; within a trace as it is, where a nested `jit` would hide what is known."""
 
+    @uncollected
     def program(mode, *args):
         del mode  # of which there is one program each
         return function(*args)
 
+    @functools.wraps(program)
+    def program_for_now(*args):
+        with mode.called_at_once(not mode.wants_usual_options()):
+            return program(*args)
+
     usual = eqx.filter_jit(program)
-    quick = functools.cache(lambda: _jit(program, compiler_options=quick_options()))
+    quick = functools.cache(lambda: _jit(program_for_now, compiler_options=quick_options()))
 
     @functools.wraps(function)
     def call(*args):
@@ -50,7 +56,7 @@ def quick_options() -> dict[str, Any] | None:
 
     None where the environment asks for the usual ones, or XLA does not know these.
     """
-    if os.environ.get("JAXDYN_COMPILATION_OPTIONS") == "usual":
+    if mode.wants_usual_options():
         return None
     try:
         jax.jit(lambda: 0.0, compiler_options=_QUICK)()

@@ -63,7 +63,6 @@ class _Expansion:
         self.has_rules = False
         self.flagged: Any = False  # whether any number is
         self.calls = calls
-        self.called: dict = {}
         binary = {"add": graph.add, "add_any": graph.add, "sub": graph.sub, "mul": graph.mul}
         binary |= {"and": graph.both, "or": graph.either}
         binary |= {name: functools.partial(graph.compare, name) for name in numbers.COMPARISONS}
@@ -139,24 +138,8 @@ class _Expansion:
     def _called(self, inner: ClosedJaxpr, args) -> list:
         """A function as a subprogram, if it is long; arguments that are known are compiled in."""
         known = tuple(None if x.dtype.kind == "O" else (x.shape, x.dtype.str, x.tobytes()) for x in args)
-        key = inner, known
-        if key not in self.called:
-            graph = Graph(self.graph.most)
-            inputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]
-            inputs = [array for array, x in zip(inputs, known, strict=True) if x is None]
-            entries = iter([graph.inputs(place, array) for place, array in enumerate(inputs)])
-            expansion = _Expansion(graph, False)
-            results = expansion.closed(
-                inner, [next(entries) if x is None else y for x, y in zip(known, args, strict=True)]
-            )
-            outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]
-            results = [as_objects(x) for x in results]
-            if expansion.flagged is not False:
-                outputs.append(_FLAG)
-                results.append(objects([expansion.flagged], ()))
-            self.called[key] = graph.finish(inputs, outputs, results)
-            self.has_rules |= expansion.has_rules
-        program = self.called[key]
+        program, has_rules = _subprogram(inner, known, self.graph.most)
+        self.has_rules |= has_rules
         given = [x for x, y in zip(args, known, strict=True) if y is None]
         is_short = program.cost < MIN_SUBPROGRAM_OPERATIONS
         results = self.graph.replay(program, given)[1] if is_short else self.graph.call(program, given)
@@ -338,6 +321,27 @@ class _Expansion:
         solutions = [matrices.triangular_solve(self.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
         solutions = np.stack(solutions).reshape(b.shape)
         return [solutions if params["left_side"] else np.swapaxes(solutions, -1, -2)]
+
+
+@functools.lru_cache(maxsize=256)
+def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, bool]:
+    """The program of a function that others call, and whether it has rules.
+
+    `known`: shape, dtype and bytes of the arguments that are compiled in; None for the others. Where numbers may be flagged, there is one
+    more output, which says whether one is.
+    """
+    graph = Graph(most)
+    arrays = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]
+    inputs = [array for array, x in zip(arrays, known, strict=True) if x is None]
+    entries = iter([graph.inputs(place, array) for place, array in enumerate(inputs)])
+    expansion = _Expansion(graph, False)
+    args = [next(entries) if x is None else np.frombuffer(x[2], x[1]).reshape(x[0]) for x in known]
+    results = [as_objects(x) for x in expansion.closed(inner, args)]
+    outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]
+    if expansion.flagged is not False:
+        outputs.append(_FLAG)
+        results.append(objects([expansion.flagged], ()))
+    return graph.finish(inputs, outputs, results), expansion.has_rules
 
 
 _INNER = {

@@ -6,6 +6,7 @@ the kernel of the transposed program. So derivatives of any order, forward and r
 On a CPU it is lowered to a call of machine code, elsewhere to the program's numbers as operations of JAX.
 """
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from jax.interpreters import ad, batching, mlir
 
 from jaxdyn.compile import derive, mode, sharding
 from jaxdyn.compile.expand import expand
+from jaxdyn.compile.garbage import uncollected
 from jaxdyn.compile.graph import inlined
 from jaxdyn.compile.known import Known, partition, partition_traced
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
@@ -153,6 +155,7 @@ def _name_of(function) -> str:
 
 
 @functools.lru_cache(maxsize=1024)
+@uncollected
 def _program(function, static, known: Known, count: int, structure, shapes, tangent, most, calls, served):
     """The program of a function and the structure of its results, or why there is none."""
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
@@ -260,6 +263,11 @@ def _(*args, program, rows):
 
 @kernel_p.def_abstract_eval
 def _(*avals, program, rows):
+    is_one = not any(len(x.shape) > 1 for x in avals)
+    if is_one and mode.is_called_at_once() and not mode.is_expanding():
+        assert target is not None
+        with contextlib.suppress(target.Unsupported):  # which is said where the kernel is lowered
+            target.make_ahead(target.kernel(program, target.width_of(program, 1), [False] * len(avals)))
     return sharding.results_of(avals, program.outputs)
 
 

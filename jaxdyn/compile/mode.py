@@ -12,6 +12,7 @@ MAX_OPERATIONS = 60_000
 
 _mode: contextvars.ContextVar[str | None] = contextvars.ContextVar("jaxdyn_compilation", default=None)
 _expanding: contextvars.ContextVar[bool] = contextvars.ContextVar("jaxdyn_expanding", default=False)
+_called_at_once: contextvars.ContextVar[bool] = contextvars.ContextVar("jaxdyn_called_at_once", default=False)
 _said: set[str] = set()
 
 
@@ -68,6 +69,26 @@ def expanding():
         yield
     finally:
         _expanding.reset(token)
+
+
+def is_called_at_once() -> bool:
+    """Whether what is traced is called as soon as it is compiled."""
+    return _called_at_once.get()
+
+
+@contextlib.contextmanager
+def called_at_once(whether: bool):
+    """While something is traced that is called as soon as it is compiled; or hardly ever, as what singular samples need."""
+    token = _called_at_once.set(whether)
+    try:
+        yield
+    finally:
+        _called_at_once.reset(token)
+
+
+def wants_usual_options() -> bool:
+    """Whether the environment asks for compilation without what shortens a first call."""
+    return os.environ.get("JAXDYN_COMPILATION_OPTIONS") == "usual"
 
 
 def say_once(message: str) -> None:

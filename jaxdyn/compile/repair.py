@@ -21,7 +21,7 @@ from jax.interpreters import batching, mlir
 from jaxdyn.compile.flags import unless
 from jaxdyn.compile.kernel import run
 from jaxdyn.compile.known import partition_traced
-from jaxdyn.compile.mode import is_expanding
+from jaxdyn.compile.mode import called_at_once, is_expanding
 from jaxdyn.compile.sharding import varying_alike
 
 SAMPLES_AT_ONCE = 32  # samples that are computed again together
@@ -132,6 +132,8 @@ def run_repaired(function: Callable, tree, *args, static: tuple = ()):
 
 
 def _one(careful: Callable):
+    careful = _hardly_called(careful)
+
     @custom_vmap
     def one(flag, values, args):
         return lax.cond(flag, lambda: _like(careful(*args), values), lambda: values)
@@ -149,6 +151,14 @@ def _one(careful: Callable):
         return one(*jax.tree.unflatten(structure, varying_alike(leaves)))
 
     return alike
+
+
+def _hardly_called(careful: Callable) -> Callable:
+    def call(*args):
+        with called_at_once(False):
+            return careful(*args)
+
+    return call
 
 
 def _many(careful: Callable, axes: list):

@@ -15,7 +15,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxdyn.compile import ahead
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
+from jaxdyn.compile.garbage import uncollected
 from jaxdyn.compile.objects import Code, features
 from jaxdyn.compile.program import FLOATS, Program, kind_of
 
@@ -155,6 +157,7 @@ class _Kernel:
         self.program: Any = program
         self.width, self.uniform = width, uniform
         self.code: Code | None = None
+        self.is_awaited = False  # whether another thread has been told to make it
         order = varying_first(uniform)
         sizes = [-1 - program.inputs[i].size if uniform[i] else program.inputs[i].size for i in order]
         sizes += [array.size for array in program.outputs]
@@ -171,16 +174,30 @@ class _Kernel:
     def address(self) -> int:
         """Of its code, which is made where there is none."""
         if self.code is None:
-            program, width = self.program, self.width
-            with _announced(program):
-                is_program = isinstance(program, Program)
-                for called in (program,) if is_program and calls_itself(program, width) else program.subprograms:
-                    _publish(called, width)
-                text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
-                self.code = Code(text)
-            self.program = None
-            self.entry.kernel = self.code.address("kernel")
+            with ahead.turn():
+                if self.code is None:
+                    self._make()
         return self.entry.kernel
+
+    @uncollected
+    def _make(self) -> None:
+        program, width = self.program, self.width
+        with _announced(program):
+            is_program = isinstance(program, Program)
+            for called in (program,) if is_program and calls_itself(program, width) else program.subprograms:
+                _publish(called, width)
+            text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
+            code = Code(text)
+        self.entry.kernel = code.address("kernel")
+        self.code, self.program = code, None
+
+
+def make_ahead(number: int) -> None:
+    """Let another thread make the code of a kernel that is going to be called soon."""
+    made = _kernels[number]
+    if made.code is None and not made.is_awaited:
+        made.is_awaited = True
+        ahead.make_later(made.address)
 
 
 def _publish(called: Program, width: int) -> None:
@@ -194,8 +211,7 @@ def _publish(called: Program, width: int) -> None:
 def _prepare(number: int) -> int:
     """What the handler calls for a kernel without code: its address, or zero where there is none."""
     try:
-        with _lock:
-            return _kernels[number].address()
+        return _kernels[number].address()
     except BaseException:  # an interruption too: there is no Python above this call that could be told
         logger.exception("jaxdyn: a kernel could not be compiled")
         return 0
@@ -223,8 +239,7 @@ def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     given = [np.ascontiguousarray(x, array.dtype) for x, array in zip(arrays, program.inputs, strict=True)]
     results = [np.empty(array.shape, array.dtype) for array in program.outputs]
     data = (ctypes.c_void_p * (len(given) + len(results)))(*(x.ctypes.data for x in (*given, *results)))
-    with _lock:
-        address = _kernels[number].address()
+    address = _kernels[number].address()
     _KERNEL(address)(data, 1, 0, 1)
     return results
 

@@ -173,16 +173,16 @@ def drive(
     how_far = plan, how, max_steps, strides
     task, given = Task(_turn, _by_turns, how_far, projected_output, (plan,), strides), Given(ts)
 
-    def run_on(carry):
-        after = run_loop(task, args, limits, given, carry)
-        return (carry, False) if after is None else after
-
-    # All steps, or those before the first one that wants more care than machine code takes; that one, and so on.
-    carry, always_ends = run_on(carry)
-    if not always_ends:
-        step_on = partial(_by_turn, *how_far, args, limits, given)
-        unfinished = partial(_is_unfinished, max_steps, limits)
-        carry = lax.while_loop(unfinished, lambda carry: run_on(step_on(carry))[0], carry)
+    unfinished = partial(_is_unfinished, max_steps, limits)
+    after = run_loop(task, args, limits, given, carry)
+    if after is None:
+        carry = _by_turns(*how_far, args, limits, given, carry)
+    else:
+        carry, always_ends = after
+        if not always_ends:  # but where a step wants more care than machine code takes: then that one, and on
+            step_on = partial(_by_turn, *how_far, args, limits, given, advance=_advanced_with_care)
+            run_on: Any = partial(run_loop, task, args, limits, given)
+            carry = lax.while_loop(unfinished, lambda carry: run_on(step_on(carry))[0], carry)
     lane, rows = carry.state, carry.rows
     if history is not None:
         states, times, kept = carry.records
@@ -213,11 +213,13 @@ def _turn(plan: Plan, how, max_steps: int, strides, args, limits: _Limits, lane:
     return Turn(after, active, more, Passed(kept, after.t, dense), lane.taken, written)
 
 
-def _by_turn(plan: Plan, how, max_steps: int, strides, args, limits: _Limits, given: Given, carry: Carry) -> Carry:
-    """A step, as operations of JAX around kernels."""
+def _by_turn(
+    plan: Plan, how, max_steps: int, strides, args, limits: _Limits, given: Given, carry: Carry, advance=None
+) -> Carry:
+    """A step, as operations of JAX around kernels; by `advance` (default: `_advanced`)."""
     lane = carry.state
     active = _is_active(max_steps, limits, lane)
-    after, kept, step = _advanced(plan, how, args, limits, lane, active)
+    after, kept, step = (advance or _advanced)(plan, how, args, limits, lane, active)
     records = carry.records
     if records:
         new = reverse.row(lane.y, lane.t, lane.t_next, kept)
@@ -246,6 +248,13 @@ def _advanced(plan: Plan, how, args, limits: _Limits, lane: _Lane, active) -> tu
         return _advance_in_turn(plan, how, *given)
     served = served if served is True else served | ~active
     return recompute_unless(served, partial(_advance_in_turn, plan, how), advanced, given)
+
+
+def _advanced_with_care(plan: Plan, how, args, limits: _Limits, lane: _Lane, active) -> tuple[_Lane, Array, Step]:
+    """The same where machine code has failed the step of every lane that is active."""
+    none, stages = jnp.zeros_like(lane.y), jnp.zeros((plan.count, lane.y.size), lane.y.dtype)
+    unchanged = lane, jnp.zeros_like(active), Step(none, none, none, none, stages, none)
+    return recompute_unless(~active, partial(_advance_in_turn, plan, how), unchanged, (args, limits, lane, active))
 
 
 def _advance(plan: Plan, how, args, limits: _Limits, lane: _Lane, active):

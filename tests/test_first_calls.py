@@ -1,0 +1,207 @@
+"""What shortens a first call: code that is made ahead by another thread, a collector that rests, and quick options for XLA."""
+
+import contextlib
+import gc
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+from jaxdyn import compile as backend
+from jaxdyn.compile import ahead, calls, mode, objects, target
+from jaxdyn.compile.garbage import uncollected
+
+LONGEST = 20.0  # s that a test waits for another thread
+
+
+@pytest.fixture
+def usual(monkeypatch):
+    """The environment in which all of this is off."""
+    monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", "usual")
+    calls.quick_options.cache_clear()
+    yield
+    calls.quick_options.cache_clear()
+
+
+def native(function):
+    return lambda *args: backend.run(lambda _, *args: function(*args), (), *args)
+
+
+def is_made(before: set, count: int = 1) -> list[bool]:
+    """Whether each kernel that is new has code."""
+    new = [target._kernels[number] for number in target._kernels if number not in before]
+    assert len(new) == count
+    return [made.code is not None for made in new]
+
+
+def awaited(condition) -> bool:
+    end = time.monotonic() + LONGEST
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)
+    return condition()
+
+
+# --- code that is made ahead ---
+
+
+def test_code_is_made_while_the_rest_is_traced():
+    seen = []
+
+    def function(x):
+        before = set(target._kernels)
+        y = native(lambda x: jnp.sin(x) * 1.17171)(x)
+        seen.append(awaited(lambda: is_made(before) == [True]))
+        return y
+
+    x = jnp.arange(3.0)
+    np.testing.assert_allclose(backend.compiled(function)(x), jnp.sin(x) * 1.17171, rtol=1e-15)
+    assert seen == [True]
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_code_is_not_made_ahead_for_a_program_that_others_call(batched, monkeypatch):
+    """Under `jax.jit`, and in a batch, nobody knows yet what is called."""
+    monkeypatch.setattr(target, "make_ahead", lambda number: pytest.fail("made ahead"))
+    function = backend.compiled(native(lambda x: jnp.sin(x) * 1.27272 + float(batched)))
+    x = jnp.arange(6.0).reshape(2, 3)
+    computed = jax.vmap(function)(x) if batched else jax.jit(function)(x[0])
+    np.testing.assert_allclose(computed, jnp.sin(x if batched else x[0]) * 1.27272 + float(batched), rtol=1e-15)
+
+
+def test_code_of_a_way_that_is_hardly_taken_is_not_made_ahead():
+    def function(x):
+        careful = native(lambda x: jnp.sin(x) * 1.37373)
+        return backend.recompute_unless(jnp.all(x > 0), careful, jnp.cos(x), (x,))
+
+    before, x = set(target._kernels), 1 + jnp.arange(3.0)
+    repaired = backend.compiled(function)
+    np.testing.assert_allclose(repaired(x), jnp.cos(x), rtol=1e-15)
+    assert awaited(lambda: ahead._worker is None) and is_made(before) == [False]
+    np.testing.assert_allclose(repaired(-x), jnp.sin(-x) * 1.37373, rtol=1e-15)
+    assert is_made(before) == [True]
+
+
+def test_who_calls_a_kernel_goes_before_what_is_made_ahead():
+    order, begin, begun = [], threading.Event(), threading.Event()
+
+    def take_turn(name):
+        with ahead.turn():
+            if name == "first":
+                begun.set()
+                assert begin.wait(LONGEST)
+            order.append(name)
+
+    ahead.make_later(lambda: take_turn("first"))
+    ahead.make_later(lambda: take_turn("later"))
+    assert begun.wait(LONGEST)
+    caller = threading.Thread(target=take_turn, args=("called",))
+    caller.start()
+    assert awaited(lambda: ahead._urgent == 1)
+    begin.set()
+    caller.join(LONGEST)
+    assert awaited(lambda: ahead._worker is None)
+    assert order == ["first", "called", "later"]
+
+
+def test_an_error_of_the_other_thread_is_told_to_who_calls(monkeypatch):
+    """It is made again when it is called: once it fails there too, then not any more."""
+    failures, made = [2], objects._compiled
+
+    def failing(text):
+        if failures[0]:
+            failures[0] -= 1
+            raise MemoryError("no room")
+        return made(text)
+
+    monkeypatch.setattr(objects, "_compiled", failing)
+    monkeypatch.setattr(objects, "_read", lambda key: None)
+    function = backend.compiled(native(lambda x: jnp.sin(x) * 1.47474))
+    x = jnp.arange(3.0)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="could not be compiled"):
+        jax.block_until_ready(function(x))
+    np.testing.assert_allclose(function(x), jnp.sin(x) * 1.47474, rtol=1e-15)
+
+
+def test_a_turn_that_is_interrupted_is_given_back():
+    with contextlib.suppress(KeyboardInterrupt), ahead.turn():
+        raise KeyboardInterrupt
+    with ahead.turn():
+        assert ahead._busy
+    assert not ahead._busy and not ahead._urgent
+
+
+# --- the collector ---
+
+
+def test_the_collector_rests_while_a_function_runs():
+    assert gc.isenabled()
+    nested = uncollected(uncollected(gc.isenabled))
+    assert not nested() and gc.isenabled()
+    with pytest.raises(ValueError, match="wrong"):
+        uncollected(lambda: int("wrong"))()
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        assert not uncollected(gc.isenabled)() and not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+def test_the_collector_rests_until_the_last_thread_is_done():
+    go_on, inside = threading.Event(), threading.Event()
+
+    @uncollected
+    def wait():
+        inside.set()
+        go_on.wait(LONGEST)
+
+    other = threading.Thread(target=wait)
+    other.start()
+    assert inside.wait(LONGEST)
+    assert not uncollected(gc.isenabled)() and not gc.isenabled()
+    go_on.set()
+    other.join()
+    assert gc.isenabled()
+
+
+def test_the_collector_rests_while_a_program_is_traced():
+    seen = []
+
+    def function(x):
+        seen.append(gc.isenabled())
+        return jnp.sin(x) * 1.57575
+
+    jax.jit(native(function))(jnp.ones(2))
+    assert seen and not any(seen) and gc.isenabled()
+
+
+# --- the switch ---
+
+
+def test_the_environment_turns_all_of_it_off(usual, monkeypatch):
+    monkeypatch.setattr(target, "make_ahead", lambda number: pytest.fail("made ahead"))
+    seen = []
+
+    def function(x):
+        seen.append((gc.isenabled(), mode.is_called_at_once()))
+        return native(lambda x: jnp.sin(x) * 1.67676)(x)
+
+    np.testing.assert_allclose(backend.compiled(function)(jnp.ones(2)), np.sin(1) * 1.67676, rtol=1e-15)
+    assert set(seen) == {(True, False)} and calls.quick_options() is None
+
+
+def test_both_ways_agree(request):
+    """A step of a mechanism with a loop, with all of it and without."""
+    scene = jd.scenes.four_bar()
+
+    def function(q, v):
+        return jd.constrained_dynamics(scene, q, v, jnp.zeros(scene.nv)).acceleration
+
+    q, v = jnp.asarray([0.4, 0.3, -0.5])[: scene.nv], jnp.zeros(scene.nv)
+    quick = backend.compiled(function)(q, v)
+    request.getfixturevalue("usual")
+    np.testing.assert_allclose(backend.compiled(lambda q, v: function(q, v))(q, v), quick, rtol=1e-13, atol=1e-13)
