@@ -327,8 +327,8 @@ class _Expansion:
 def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, bool]:
     """The program of a function that others call, and whether it has rules.
 
-    `known`: shape, dtype and bytes of the arguments that are compiled in; None for the others. Where numbers may be flagged, there is one
-    more output, which says whether one is.
+    `known`: shape, dtype and bytes of the arguments that are compiled in; None for the others. Where numbers may be
+    flagged, there is one more output, which says whether one is.
     """
     graph = Graph(most)
     arrays = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]
