@@ -6,17 +6,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
+from jax.flatten_util import ravel_pytree
 from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn import scenes
 from jaxdyn.constraints import projection
 from jaxdyn.constraints.assembly import residuals
-from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
+from jaxdyn.constraints.base import (
+    constraint_jacobian,
+    holonomic_rows,
+    layout,
+    position_residual,
+    velocity_residual,
+)
+from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.projection import project_state, project_step
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import displace
+from jaxdyn.systems.system import displace, retract
 
 DRIFTS = (0.0, 1e-12, 1e-9, 1e-6, 1e-4)
 
@@ -29,6 +38,32 @@ def drifted(name, **parameters):
     rng = np.random.default_rng(2)
     off = jnp.asarray(rng.normal(size=(2, len(DRIFTS), scene.nv))) * jnp.asarray(DRIFTS)[None, :, None]
     return scene, jax.vmap(lambda e: displace(scene.system, q, e))(off[0]), v[None] + off[1]
+
+
+def in_fixed_steps(rank_tol, scene, q, v, t):
+    """The projection as four steps of a fixed matrix, one after the other; its derivatives are those of the steps."""
+    q = retract(scene.system, q)
+    holonomic = holonomic_rows(layout(scene))
+    B = correction(scene, q, t, rank_tol, holonomic=False)
+    B_holonomic = B if holonomic.size in (0, B.shape[1]) else correction(scene, q, t, rank_tol, holonomic=True)
+    if holonomic.size:
+
+        def move(place, _):
+            step = jnp.matmul(B_holonomic, position_residual(scene, place, t))
+            return displace(scene.system, place, -step), None
+
+        moved, _ = lax.scan(move, q, None, length=4)
+        before, after = (position_residual(scene, x, t) for x in (q, moved))
+        better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
+        q = jnp.where(better, retract(scene.system, moved), q)
+
+    def slow(v, _):
+        return v - jnp.matmul(B, velocity_residual(scene, q, v, t)), None
+
+    projected, _ = lax.scan(slow, v, None, length=4)
+    before, after = (velocity_residual(scene, q, x, t) for x in (v, projected))
+    better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
+    return q, jnp.where(better, projected, v)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +81,7 @@ def test_states_come_back_by_the_least_change(name, parameters):
 
     def both(q, v):
         computed = project_state(scene, q, v, zero, rank_tol)
-        fixed = projection._in_fixed_steps(rank_tol, scene, q, v, zero, ())
+        fixed = in_fixed_steps(rank_tol, scene, q, v, zero)
         M, A = mass_matrix(scene.system, computed[0]), constraint_jacobian(scene, computed[0])
         return computed, fixed, residuals(scene, *computed), (M, A)
 
@@ -117,7 +152,7 @@ def test_a_singular_sample_of_a_batch_is_projected_by_its_rank(mode):
     scene, q, v = drifted("windows", count=2)
     zero = jnp.asarray(0.0)
     program = jax.jit(jax.vmap(lambda q, v: project_state(scene, q, v, zero)))
-    matrices = jax.jit(jax.vmap(lambda q, v: projection._in_fixed_steps(None, scene, q, v, zero, ())[:2]))
+    matrices = jax.jit(jax.vmap(lambda q, v: in_fixed_steps(None, scene, q, v, zero)))
     # Uprights and couplers in one line: the rows of the windows lose rank.
     flat = jnp.asarray([-np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, -np.pi / 2])
     for states in (q, q.at[1].set(flat)):
@@ -163,7 +198,7 @@ def test_derivatives_are_those_of_the_steps():
         return sum(jnp.vdot(w, x) for w, x in zip(weights, way(here, q, v, jnp.asarray(0.0)), strict=True))
 
     def fixed(scene, q, v, t):
-        return projection._in_fixed_steps(None, scene, q, v, t, ())[:2]
+        return in_fixed_steps(None, scene, q, v, t)
 
     at = scene.system.inertias, q, v
     steps = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in at)
@@ -180,3 +215,40 @@ def test_derivatives_are_those_of_the_steps():
     move = jax.jit(lambda h: value(*(x + h * s for x, s in zip(at, steps, strict=True)), project_state))
     slope = (move(1e-5) - move(-1e-5)) / 2e-5
     assert_close(computed[1][1], slope, 1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, of_scene", [("four_bar", True), ("rolling_coin", False)])
+def test_derivatives_of_first_and_second_order_are_limits_of_differences(name, of_scene, mode):
+    """Along a line through lengths, inertias, q, v and time, 1e-4 away: forward, reverse, and each over the other."""
+    scene, q, v = drifted(name)
+    rng = np.random.default_rng(5)
+    numbers, structure = ravel_pytree((scene, q[-1], v[-1], jnp.asarray(0.3)))
+    direction = jnp.asarray(rng.normal(size=numbers.shape)) * jnp.where(numbers == 0, 0.0, 1.0)
+    if not of_scene:  # whose frames a line would leave
+        direction = direction.at[: ravel_pytree(scene)[0].size].set(0.0)
+    weights = jnp.asarray(rng.normal(size=q[-1].size + v[-1].size))
+
+    def value(numbers):
+        return jnp.vdot(weights, jnp.concatenate(project_state(*structure(numbers))))
+
+    def along(function):
+        return lambda h: jax.jvp(function, (numbers + h * direction,), (direction,))[1]
+
+    @quick
+    def program(steps):
+        moved = jax.vmap(lambda h: (value(numbers + h * direction), along(value)(h)))(steps)
+        second = jax.jvp(along(value), (0.0,), (1.0,))[1]
+        reverse = jnp.vdot(jax.grad(value)(numbers), direction)
+        over_forward = jax.grad(along(value))(0.0)
+        return moved, reverse, second, over_forward
+
+    h = 1e-5
+    (values, slopes), reverse, second, over_forward = program(jnp.asarray([-2.0, -1.0, 0.0, 1.0, 2.0]) * h)
+    weights_of = np.asarray([1.0, -8.0, 0.0, 8.0, -1.0]) / (12 * h)
+    size = float(jnp.linalg.norm(direction))
+    # Differences have 1e-16 / h of rounding, and h^4 of the fifth derivative.
+    np.testing.assert_allclose(slopes[2], weights_of @ np.asarray(values), rtol=1e-8, atol=1e-9 * size)
+    np.testing.assert_allclose(reverse, slopes[2], rtol=1e-11)
+    np.testing.assert_allclose(second, weights_of @ np.asarray(slopes), rtol=1e-7, atol=1e-8 * size)
+    np.testing.assert_allclose(over_forward, second, rtol=1e-10)

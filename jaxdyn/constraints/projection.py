@@ -19,7 +19,8 @@ from jaxdyn.compile import (
     run_repaired,
 )
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
-from jaxdyn.constraints.dynamics import correction, whitened_rows
+from jaxdyn.constraints.dynamics import whitened_rows
+from jaxdyn.constraints.projection_derivative import LOST, Corrections, projected
 from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, tolerance
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_factored
@@ -27,9 +28,6 @@ from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
 _STEPS_A_ROUND, _MOST_ROUNDS = 2, 3
-# Roundings of the largest entry: residuals of that size are sums of many terms, and rise and fall by chance.
-_LOST = 64
-_STEPS_DIFFERENTIATED = 4
 
 
 def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
@@ -37,7 +35,7 @@ def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
 
     One factorisation serves all steps: with B fixed, each step multiplies the residual by the size of the correction
     times the curvature of the constraint, 1e-8 -> 1e-16 after one. The steps end when the next one would be lost in rounding.
-    Those that are differentiated are a fixed number, so that derivatives converge as far. A projection that does not
+    Derivatives are those of the equations that the result satisfies (`projection_derivative`). A projection that does not
     reduce the residual is not applied.
     """
     return project_step(scene, q, v, t, (), rank_tol)[:2]
@@ -58,7 +56,7 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
         *errors, steps = rest
 
         def again(scene, q, v, t, *errors):
-            return run_repaired(_in_fixed_steps, scene, q, v, t, errors, static=(rank_tol,))
+            return run_repaired(_with_derivatives, scene, q, v, t, errors, static=(rank_tol,))
 
         projected, moved = along(again, (scene, q, v, t, *errors), steps)
         return projected, jax.tree.map(jnp.zeros_like, projected) if moved is None else moved
@@ -162,10 +160,9 @@ def _moved(scene: Scene, q, v, t, errors, every: Callable, some: Callable):
     if holonomic.size:
         q, position_left, is_open = _closed(scene, q, some, lambda place: position_residual(scene, place, t))
 
-    def velocity_rows(v):
-        return velocity_residual(scene, q, v, t)
-
-    v, velocity_left, is_slipping = _descend(v, every, velocity_rows, lambda v, step: v - step)
+    none, size = jnp.zeros_like(v), jnp.max(jnp.abs(v))
+    y, velocity_left, is_slipping = _descend(none, size, every, lambda y: velocity_residual(scene, q, v - y, t))
+    v = v - y
     if errors:
         A = constraint_jacobian(scene, q, t)
         of_place = some if holonomic.size else None
@@ -197,29 +194,32 @@ def enlarged(error, by):
 def _closed(scene: Scene, q, step, residual):
     """q on the holonomic constraints, an estimate of its distance from them, and whether another step would reduce it."""
 
-    def move(place, change):
-        return retract(scene.system, displace(scene.system, place, -change))
+    def moved(x):
+        return retract(scene.system, displace(scene.system, q, -x))
 
-    return _descend(q, step, residual, move)
+    none, size = jnp.zeros((scene.nv,), q.dtype), jnp.max(jnp.abs(q))
+    x, away, more = _descend(none, size, step, lambda x: residual(moved(x)))
+    return moved(x), away, more
 
 
-def _descend(x, step, residual, move):
-    """x moved by x -> move(x, step(residual(x))) until that would change it by rounding alone, `_STEPS_A_ROUND` times at most.
+def _descend(x, size, step, residual):
+    """x made longer by step(residual(x)) until that would change what it is taken from, of entries up to `size`, by rounding
+    alone, `_STEPS_A_ROUND` times at most.
 
-    Also the largest entry of the next step, which is about how far x is still away, and whether to take it.
+    Also the largest entry of the next step, which is about how far it is still away, and whether to take it.
     """
-    rounding = float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.abs(x))
+    rounding = float(jnp.finfo(x.dtype).eps) * size
 
     def improve(state):
         x, r, _, _ = state
         change = step(r)
-        tried = move(x, change)
+        tried = x + change
         left = residual(tried)
-        before, after, size = (jnp.max(jnp.abs(y)) for y in (r, left, change))
+        before, after, length = (jnp.max(jnp.abs(y)) for y in (r, left, change))
         falls = after < before
         # The next step is about this one times what it has left of the residual.
-        more = falls & (size * after > rounding * before)
-        away = jnp.where(falls, size * after / before, jnp.where(before > 0, size, jnp.zeros_like(size)))
+        more = falls & (length * after > rounding * before)
+        away = jnp.where(falls, length * after / before, jnp.where(before > 0, length, jnp.zeros_like(length)))
         return jnp.where(falls, tried, x), jnp.where(falls, left, r), more, away
 
     first = residual(x)
@@ -227,43 +227,19 @@ def _descend(x, step, residual, move):
     for _ in range(_STEPS_A_ROUND):
         state = jax.tree.map(partial(jnp.where, state[2]), improve(state), state)
     x, _, more, away = state
-    return x, away, more & (away > _LOST * rounding)
+    return x, away, more & (away > LOST * rounding)
 
 
-def _in_fixed_steps(rank_tol, scene: Scene, q, v, t, errors):
-    """The same for derivatives, which are those of the steps as they are."""
-    q = retract(scene.system, q)
-    holonomic = holonomic_rows(layout(scene))
-    B = correction(scene, q, t, rank_tol, holonomic=False)
-    B_holonomic = B if holonomic.size in (0, B.shape[1]) else correction(scene, q, t, rank_tol, holonomic=True)
-    position_left = jnp.zeros((), q.dtype)
-    if holonomic.size:
-
-        def move(place, _):
-            step = _product(B_holonomic, position_residual(scene, place, t))
-            return displace(scene.system, place, -step), None
-
-        moved, _ = lax.scan(move, q, None, length=_STEPS_DIFFERENTIATED)
-        before, after = (position_residual(scene, x, t) for x in (q, moved))
-        better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
-        q = jnp.where(better, retract(scene.system, moved), q)
-        position_left = jnp.max(jnp.abs(_product(B_holonomic, jnp.where(better, after, before))))
-
-    def slow(v, _):
-        return v - _product(B, velocity_residual(scene, q, v, t)), None
-
-    projected, _ = lax.scan(slow, v, None, length=_STEPS_DIFFERENTIATED)
-    before, after = (velocity_residual(scene, q, x, t) for x in (v, projected))
-    better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
+def _with_derivatives(rank_tol, scene: Scene, q, v, t, errors):
+    """The same as equations that the result satisfies."""
+    state, errors = projected(scene, q, v, t, rank_tol), lax.stop_gradient(errors)
     if errors:
-        A, velocity_left = (
-            constraint_jacobian(scene, q, t),
-            jnp.max(jnp.abs(_product(B, jnp.where(better, after, before)))),
+        q = lax.stop_gradient(retract(scene.system, q))
+        on, A = Corrections.at(scene, q, t, rank_tol), constraint_jacobian(scene, q, t)
+        of_place = partial(on.shortest, on.of_held) if on.held.size else None
+        errors = _allowed(
+            errors,
+            (of_place, partial(_product, A[on.held]), state.q_left),
+            (partial(on.shortest, on.every), partial(_product, A), state.v_left),
         )
-        of_place = partial(_product, B_holonomic) if holonomic.size else None
-        corrections = (
-            (of_place, partial(_product, A[holonomic]), position_left),
-            (partial(_product, B), partial(_product, A), velocity_left),
-        )
-        errors = lax.stop_gradient(_allowed(errors, *corrections))
-    return q, jnp.where(better, projected, v), errors
+    return state.q, state.v, lax.stop_gradient(errors)

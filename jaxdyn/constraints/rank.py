@@ -1,7 +1,7 @@
 """Whether rows are independent, and pseudo-inverses of those that may not be."""
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.core
@@ -69,6 +69,35 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = Fa
     inverse, quality = inverse_and_quality
     doubtful = any_in_batch(~(quality > least_pivot(Y, rank_tol)))
     return lax.cond(doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
+
+
+class LeastSquares(NamedTuple):
+    """The shortest vectors with given products with the columns of Y, and what takes them apart again."""
+
+    Y: Array
+    factor: Any  # of Y^T Y, or None
+    inverse: Any  # of Y, or None
+
+    def shortest(self, right):
+        """The shortest w with Y^T w = right."""
+        if self.factor is None:
+            return _product(self.inverse.T, right)
+        return _product(self.Y, solve_factored(self.factor, right))
+
+    def multipliers(self, w):
+        """The smallest x with Y x = w, for w that is a sum of columns."""
+        if self.factor is None:
+            return _product(self.inverse, w)
+        return solve_factored(self.factor, _product(self.Y.T, w))
+
+
+def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
+    """By Cholesky's factor in a program of numbers, in which samples with dependent columns are flagged; else by the
+    pseudo-inverse."""
+    if not is_expanding():
+        return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
+    factor = cholesky(_product(Y.T, Y))
+    return LeastSquares(Y, unless(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
 
 
 def _by_normal_equations(_, Y):

@@ -1,0 +1,165 @@
+"""The projection onto the constraints once more, for its derivatives: as equations that its result satisfies.
+
+The closest state to (q, v), in the metric M(q), is
+
+    q' = q - M^-1 A^T mu,   phi(q', t) = 0;        v' = v - M^-1 A^T nu,   A(q') v' = b(q', t),
+
+with M and A taken at q, and A of the holonomic rows for q'. For fixed mu and x = M^-1 A^T mu the change of M^-1 A^T mu is
+M^-1 (dA^T mu - dM x): no factorisation is differentiated. What mu and nu change by is what keeps q' and v' on the
+constraints.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jaxdyn.compile import along, implicit
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
+from jaxdyn.constraints.dynamics import whitened_rows
+from jaxdyn.constraints.rank import LeastSquares, least_squares, tolerance
+from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.systems.mass_factor import MassFactor
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displace, retract
+
+# Roundings of the largest entry: residuals of that size are sums of many terms, and rise and fall by chance.
+LOST = 64
+# Each step multiplies what is left by the size of the correction times the curvature of the constraints.
+_STEPS = 4
+
+
+class Projected(NamedTuple):
+    """q and v on the constraints, and how they came there.
+
+    - `of_q`, `of_v`: the multipliers mu, of the holonomic rows, and nu, of all rows.
+    - `q_left`, `v_left`: how far q and v are from the constraints still.
+    - `q_moved`, `v_moved`: one where the correction was applied, else zero.
+    """
+
+    q: Array
+    v: Array
+    of_q: Array
+    of_v: Array
+    q_left: Array
+    v_left: Array
+    q_moved: Array
+    v_moved: Array
+
+
+class Corrections(NamedTuple):
+    """Steps that remove residuals: by Y = U^-1 A^T in the metric M = U U^T, for all rows and for the holonomic ones."""
+
+    metric: MassFactor
+    every: LeastSquares
+    held: Any  # which rows are holonomic
+    of_held: LeastSquares
+
+    @classmethod
+    def at(cls, scene: Scene, q, t, rank_tol) -> "Corrections":
+        held = holonomic_rows(layout(scene))
+        metric, Y = whitened_rows(scene, q, t)
+        every = least_squares(Y, tolerance(rank_tol, Y))
+        apart = held.size not in (0, Y.shape[1])
+        return cls(metric, every, held, least_squares(Y[:, held], tolerance(rank_tol, Y)) if apart else every)
+
+    def by_forces(self, of: LeastSquares, multipliers):
+        """M^-1 A^T times multipliers."""
+        return self.metric.unwhiten(_product(of.Y, multipliers))
+
+    def shortest(self, of: LeastSquares, residual):
+        """The shortest step that changes the rows by `residual`."""
+        return self.metric.unwhiten(of.shortest(residual))
+
+
+def projected(scene: Scene, q, v, t, rank_tol: float | None) -> Projected:
+    """The state on the constraints that is closest to one nearby, as far as `_STEPS` come, with derivatives of any order.
+
+    A correction that leaves a larger residual is not applied, unless that is rounding.
+    """
+    return _closest(scene, retract(scene.system, q), v, t, rank_tol)
+
+
+def _closest(scene: Scene, q, v, t, rank_tol) -> Projected:
+    return implicit(scene, (q, v, t), partial(_solved, rank_tol), partial(_changed, rank_tol))
+
+
+def _solved(rank_tol, scene: Scene, q, v, t) -> Projected:
+    on, none = Corrections.at(scene, q, t, rank_tol), jnp.zeros_like(v)
+
+    def settled(residual, of, size):
+        """The whitened correction, how far away that still is, and whether it is applied."""
+
+        def step(whitened, _):
+            return whitened + of.shortest(residual(on.metric.unwhiten(whitened))), None
+
+        whitened, _ = lax.scan(step, none, None, length=_STEPS)
+        before, after = (residual(on.metric.unwhiten(x)) for x in (none, whitened))
+        away = jnp.max(jnp.abs(on.shortest(of, after)))
+        applied = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
+        applied = applied | (away <= LOST * float(jnp.finfo(v.dtype).eps) * size)
+        left = jnp.where(applied, away, jnp.max(jnp.abs(on.shortest(of, before))))
+        return jnp.where(applied, whitened, none), left, applied.astype(v.dtype)
+
+    place, of_q, q_left, q_moved = q, jnp.zeros((0,), q.dtype), jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
+    if on.held.size:
+        size = jnp.max(jnp.abs(q))
+        whitened, q_left, q_moved = settled(
+            lambda x: position_residual(scene, displace(scene.system, q, -x), t), on.of_held, size
+        )
+        place = _place(scene, q, on.metric.unwhiten(whitened))
+        of_q = on.of_held.multipliers(whitened)
+    size = jnp.max(jnp.abs(v))
+    whitened, v_left, v_moved = settled(lambda y: velocity_residual(scene, place, v - y, t), on.every, size)
+    speed, of_v = v - on.metric.unwhiten(whitened), on.every.multipliers(whitened)
+    return Projected(place, speed, of_q, of_v, q_left, v_left, q_moved, v_moved)
+
+
+def _place(scene: Scene, q, x):
+    return retract(scene.system, displace(scene.system, q, -x))
+
+
+def _changed(rank_tol, scene: Scene, q, v, t, steps) -> tuple[Projected, Projected]:
+    """The projection, and its change for `steps` in the leaves of the scene, q, v and t."""
+    state, on = _closest(scene, q, v, t, rank_tol), Corrections.at(scene, q, t, rank_tol)
+    *of_scene, dq, dv, dt = steps
+    x = on.by_forces(on.of_held, state.of_q) if on.held.size else jnp.zeros_like(v)
+    y = on.by_forces(on.every, state.of_v)
+
+    def forces(scene, q, t):
+        """Of fixed multipliers, less those that fixed corrections take."""
+        A, M = constraint_jacobian(scene, q, t), mass_matrix(scene.system, q, t)
+        return _product(A[on.held].T, state.of_q) - _product(M, x), _product(A.T, state.of_v) - _product(M, y)
+
+    change = along(forces, (scene, q, t), [*of_scene, dq, dt])[1]
+    dx, dy = (jnp.zeros_like(v),) * 2 if change is None else map(on.metric.solve, change)
+
+    def closed(residual, args, given, correction, of, moved):
+        """The change of a correction, and that of its multipliers, which keeps the residual at zero."""
+        whitened = jnp.zeros_like(v)
+        for _ in range(_STEPS):
+            change = along(residual, args, [*given, correction + on.metric.unwhiten(whitened)])[1]
+            whitened = whitened + moved * of.shortest(change)
+        return correction + on.metric.unwhiten(whitened), of.multipliers(whitened)
+
+    of_q, dplace = jnp.zeros_like(state.of_q), dq
+    if on.held.size:
+
+        def position(scene, q, t, x):
+            return position_residual(scene, displace(scene.system, q, -x), t)
+
+        args = scene, q, t, x
+        dx, of_q = closed(position, args, [*of_scene, dq, dt], dx, on.of_held, state.q_moved)
+        dplace = along(partial(_place, scene), (q, x), [dq, dx])[1]
+
+    def velocity(scene, q, v, t, y):
+        return velocity_residual(scene, q, v - y, t)
+
+    args = scene, state.q, v, t, y
+    dy, of_v = closed(velocity, args, [*of_scene, dplace, dv, dt], dy, on.every, state.v_moved)
+    none = jnp.zeros((), v.dtype)
+    dq, dv = (jnp.zeros_like(z) if d is None else d for z, d in ((q, dplace), (v, dv)))
+    return state, Projected(dq, dv - dy, of_q, of_v, none, none, none, none)
