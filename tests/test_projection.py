@@ -230,7 +230,8 @@ def test_derivatives_of_first_and_second_order_are_limits_of_differences(name, o
     weights = jnp.asarray(rng.normal(size=q[-1].size + v[-1].size))
 
     def value(numbers):
-        return jnp.vdot(weights, jnp.concatenate(project_state(*structure(numbers))))
+        scene, q, v, t = structure(numbers)
+        return jnp.vdot(weights, jnp.concatenate(project_state(scene, q, v, t)))
 
     def along(function):
         return lambda h: jax.jvp(function, (numbers + h * direction,), (direction,))[1]
