@@ -162,6 +162,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="errors beyond K standard deviations count by their size, not its square: a number, none, or auto (default)",
     )
     fit.add_argument(
+        "--delay",
+        nargs="+",
+        default=["none"],
+        metavar="S",
+        help="how late torques were recorded against positions: auto, found with the fit; seconds, one number or one for each "
+        "torque; or none (default)",
+    )
+    fit.add_argument(
         "--horizon", type=float, default=0.25, metavar="S", help="length of the simulated pieces, s (default: 0.25)"
     )
     fit.add_argument(
@@ -312,6 +320,7 @@ def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
 def _judged(model: Model, result, names: list[str], logs: list[Log]) -> list[Judged]:
     nominal = identify.nominal_parameters(model)
     fit = result.fit if isinstance(result, RobotFit) else result
+    logs = [result.aligned(log) for log in logs] if isinstance(result, RobotFit) else logs
     return [
         Judged(name, log, fit.torques(log), identify.regressor(model, log.q, log.v, log.a) @ nominal)
         for name, log in zip(names, logs, strict=True)

@@ -23,6 +23,7 @@ class Options(NamedTuple):
     prior: float | str
     robust: float | str | None
     weights: str | None
+    delay: str | float | tuple[float, ...] = 0.0
 
 
 def parse_options(args) -> Options:
@@ -43,7 +44,22 @@ def parse_options(args) -> Options:
     robust = {"auto": "auto", "none": None}.get(args.robust, args.robust)
     robust = number(robust, "--robust") if robust not in ("auto", None) else robust
     weights = "auto" if args.weights == "auto" else None
-    return Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights)
+    delay = parse_delay(args.delay)
+    if simple and delay != 0.0:
+        raise ValueError(
+            f"--delay {' '.join(args.delay)}: --method {args.method} knows no delay; take --method feasible"
+        )
+    return Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights, delay)
+
+
+def parse_delay(words: list[str]) -> str | float | tuple[float, ...]:
+    """ "auto", zero for none, seconds, or those of each torque. **Raises:** ValueError for anything else."""
+    if words in (["auto"], ["none"]):
+        return "auto" if words == ["auto"] else 0.0
+    if {"auto", "none"} & set(words):
+        raise ValueError(f"--delay {' '.join(words)}: auto and none stand alone")
+    seconds = tuple(number(word, "--delay") for word in words)
+    return seconds[0] if len(seconds) == 1 else seconds
 
 
 def settled(options: Options, result) -> Options:
@@ -51,7 +67,12 @@ def settled(options: Options, result) -> Options:
     if not isinstance(result, RobotFit):
         return options
     setting = result.choice.setting
-    return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust)
+    delay = options.delay
+    if delay == "auto" and (result.delays is None or not np.any(result.delays.seconds)):
+        delay = 0.0  # none that helps
+    return options._replace(
+        terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust, delay=delay
+    )
 
 
 def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit | Fit | LeastSquares:
@@ -78,6 +99,7 @@ def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit 
             prior=options.prior,
             robust=options.robust,
             weights=options.weights,
+            delay=options.delay,
             callback=tell,
         )
     (log,) = logs

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxdyn.cli.common import coordinate_labels, short, table
-from jaxdyn.identify import TERMS, LeastSquares, Payload, RobotFit, nominal_parameters
+from jaxdyn.identify import TERMS, Delays, LeastSquares, Payload, RobotFit, nominal_parameters
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.model.tree import Model
@@ -42,7 +42,9 @@ def tables(findings: Findings) -> str:
         parts.append("Base parameters: URDF, fitted, standard deviation by blocks of samples\n" + table(header, rows))
         return "\n".join(parts)
     if isinstance(result, RobotFit):
-        parts += [_choice_text(findings.choice or result.choice, model), _robot_base_table(result, model)]
+        parts += [_choice_text(findings.choice or result.choice, model)]
+        parts += [] if result.delays is None else [delays_text(result.delays, coordinate_labels(model)[0])]
+        parts += [_robot_base_table(result, model)]
     parts.append(_mass_table(findings))
     return "\n".join(parts)
 
@@ -92,6 +94,17 @@ def _choice_text(choice: Choice, model: Model) -> str:
     return (
         f"v_s {setting.v_s:g}, prior {setting.prior:g}, loss {loss}, extra terms: {extra}{how if choice.trials else ''}"
     )
+
+
+def delays_text(delays: Delays, labels) -> str:
+    """How late torques are, in ms, with half of the 95 % intervals of those that were found."""
+    half = 1e3 * delays.factor * delays.std
+    cells = [
+        f"{label} {1e3 * d:.1f}" + (f" +- {h:.1f}" if np.isfinite(h) and d else "")
+        for label, d, h in zip(labels, delays.seconds, half, strict=True)
+    ]
+    none = "; zero where a delay lowers no error on parts left out" if delays.squares is not None else ", as given"
+    return f"Delays of the torques against the positions (ms): {', '.join(cells)}{none}"
 
 
 def _robot_base_table(result: RobotFit, model: Model) -> str:

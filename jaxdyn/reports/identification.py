@@ -157,6 +157,13 @@ def _add_robot(report: dict[str, Any], result: RobotFit, choice: Choice, model: 
     report["extra_terms"] = {} if extra is None else extra.named
     report["weights"] = result.weights.tolist()
     report["interval_factor"] = spreads.factor
+    if result.delays is not None:
+        report["delays"] = {
+            "seconds": result.delays.seconds.tolist(),
+            "std": _numbers(result.delays.std),
+            "interval_factor": result.delays.factor if np.isfinite(result.delays.factor) else None,
+            "by": "given" if result.delays.squares is None else "auto",
+        }
     rows = zip(spreads.parameters.names, _numbers(spreads.parameters.std), spreads.parameters.sources, strict=True)
     for name, std, source in rows:
         report["parameters"].setdefault(name, {})

@@ -116,6 +116,14 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
         f"<p>v_s {setting.v_s:g}, prior {setting.prior:g}, {loss}; terms beyond viscous and Coulomb friction: "
         f"{escaped(extra)}.</p>",
     ]
+    if result.delays is not None:
+        half = result.delays.factor * result.delays.std
+        cells = [
+            (label, f"{1e3 * d:.1f}", f"{1e3 * h:.1f}" if np.isfinite(h) and d else "-")
+            for label, d, h in zip(labels, result.delays.seconds, half, strict=True)
+        ]
+        note = "How late torques were recorded against positions, which the logs were shifted by; zero where that helps nothing"
+        parts += [f"<p class='note'>{note}.</p>", html_table(("joint", "delay (ms)", "+-"), cells)]
     if trials:
         cells = [
             (
