@@ -11,7 +11,7 @@ which is the last one in MuJoCo and the next one here.
 
 Each program runs in a process of its own. "cold" is its first fit there, compilation and all, with an empty folder of object
 files; "warm" the second fit of the same numbers. sysid compiles nothing, so that its time is one number; it stops after `--limit`
-seconds. A chain of 30 bodies with torques from its own dynamics and 1 % of noise is fitted by ours alone.
+seconds. Chains of bodies with torques from their own dynamics and 1 % of noise are fitted by ours alone.
 
 The peer needs `pip install "mujoco[sysid]"`.
 """
@@ -55,8 +55,9 @@ CASES = {
     "motion-10": Case("motion", 1, 665),
     "motion-30": Case("motion", 3, 665),
     "motion-70": Case("motion", 7, 665),
-    "chain-100": Case("torque", 10, 665, "chain of 30"),
-    "convex-chain-300": Case("torque", 30, 665, "chain of 30", "fit_torques"),
+    "chain-100": Case("torque", 10, 665, "chain of 10", "fit_torques"),
+    "chain-150": Case("torque", 15, 665, "chain of 15", "fit_torques"),
+    "chain-300": Case("torque", 30, 665, "chain of 30", "fit_torques"),
 }
 
 
@@ -66,7 +67,7 @@ def problem(case: Case, data: Path):
     from jaxdyn import identify
 
     if case.arm != "Franka":
-        return *chain(30, case.free, case.samples), tuple(f"link{i}" for i in range(30 - case.free, 30))
+        return *chain(case.free, case.free, case.samples), tuple(f"link{i}" for i in range(case.free))
     model, raw = panda(), samples(data)
     rate = (len(raw) - 1) / float(raw.t[-1] - raw.t[0])
     log = identify.from_raw(raw.t, raw.q, raw.tau)

@@ -230,10 +230,10 @@ def test_identify_the_recorded_panda_with_terms_chosen(panda, franka, tmp_path, 
     assert report["chosen"]["extra_terms"]["dahl"]
 
 
-def simulated_logs(model, folder, seeds, noise=0.0, delay=0.0):
+def simulated_logs(model, folder, seeds, noise=0.0, delay=0.0, gains=1.0):
     """Filtered logs of sums of sines with exact rates, as files A.csv, B.csv, ..., of different lengths and sampling.
 
-    Torques are those of `delay` before (s).
+    Torques are those of `delay` before (s), over the gains of drives.
     """
     paths = []
     for k, seed in enumerate(seeds):
@@ -249,7 +249,7 @@ def simulated_logs(model, folder, seeds, noise=0.0, delay=0.0):
         q, v, a = at(t)
         tau = jd.identify.regressor(model, *at(t - delay)) @ jd.identify.nominal_parameters(model)
         paths.append(str(folder / f"{chr(65 + k)}.csv"))
-        write_log(paths[-1], jd.identify.Log(t, q, v, a, tau + noise * rng.normal(size=tau.shape)))
+        write_log(paths[-1], jd.identify.Log(t, q, v, a, tau / gains + noise * rng.normal(size=tau.shape)))
     return paths
 
 
@@ -447,6 +447,36 @@ def test_identify_a_payload(arm, tmp_path, capsys):
     assert abs(computed["mass"] - 0.7) < 0.01 and computed["percent"] < 0.2 * computed["percent_without"]
     assert main([*args, "--payload-body", "foot"]) == 2
     assert "the bodies are" in capsys.readouterr().err
+
+
+def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys):
+    """Currents of three drives; what is written is then the robot in newton metres."""
+    truth = jd.repair_inertias(jd.load_urdf(arm))
+    jd.save_urdf(truth, tmp_path / "true.urdf")
+    held = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
+    (tmp_path / "held").mkdir()
+    gains = np.array([0.8, 1.2, 1.1])
+    empty = simulated_logs(truth, tmp_path, (0, 1), noise=0.002, gains=gains)
+    loaded = simulated_logs(
+        truth.replace(inertias=truth.inertias.at[-1].add(held)), tmp_path / "held", (2, 3), noise=0.002, gains=gains
+    )
+    args = ["identify", "--urdf", str(tmp_path / "true.urdf"), "--log", *empty, "--payload-log", *loaded]
+    args += ["--terms", "viscous", "coulomb", "--v-s", "0.1", "--prior", "1", "--robust", "none"]
+    files = ["--report", str(tmp_path / "fit.json"), "--html", str(tmp_path / "fit.html")]
+    known = ["--payload-mass", "0.7", "--payload-centre", "0.05", "0", "0.1"]
+    assert main([*args, *files, *known]) == 0
+    assert "Drives, torque = gain * what the logs hold" in capsys.readouterr().out
+    assert "Drives, torque = gain" in (tmp_path / "fit.html").read_text()
+    report = json.loads((tmp_path / "fit.json").read_text())
+    found = report["drive_gains"]
+    told = np.array([name in found["told"] for name in truth.joint_names])
+    off = np.abs(np.array(found["gains"]) - gains)
+    assert told.any() and np.all(off <= 4 * np.array(found["std"]))
+    assert np.all(off[told] < 0.05) and abs(report["payload"]["mass"] - 0.7) < 0.03
+    assert report["torque_error"]["test_percent"] < 2
+    for option, words in ((known[:2], "gains need --payload-log"), (known[2:], "without --payload-mass")):
+        assert main([*args, *option]) == 2
+        assert words in capsys.readouterr().err
 
 
 def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):

@@ -43,6 +43,8 @@ def parse_options(args) -> Options:
         v_s, prior = 0.01 if v_s == "auto" else v_s, 1.0 if prior == "auto" else prior
     robust = {"auto": "auto", "none": None}.get(args.robust, args.robust)
     robust = number(robust, "--robust") if robust not in ("auto", None) else robust
+    if args.payload_centre is not None and args.payload_mass is None:
+        raise ValueError("--payload-centre: without --payload-mass; give both, or neither and the payload is found")
     weights = "auto" if args.weights == "auto" else None
     delay = parse_delay(args.delay)
     if simple and delay != 0.0:
@@ -50,6 +52,26 @@ def parse_options(args) -> Options:
             f"--delay {' '.join(args.delay)}: --method {args.method} knows no delay; take --method feasible"
         )
     return Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights, delay)
+
+
+def find_gains(model: Model, unloaded: list[Log], loaded: list[Log], options: Options, args) -> identify.DriveGains:
+    """Gains of the drives by the known payload. **Raises:** ValueError where an option that it needs is missing."""
+    if args.payload_centre is None or not loaded:
+        raise ValueError(
+            f"--payload-mass {args.payload_mass:g}: gains need --payload-log, logs with it, and --payload-centre X Y Z, where "
+            "its centre of mass is in the frame of the link that holds it"
+        )
+    terms = TERMS if options.terms == "auto" else tuple(term for term in TERMS if term in options.terms)
+    return identify.fit_gains(
+        model,
+        unloaded,
+        loaded,
+        args.payload_mass,
+        args.payload_centre,
+        body=args.payload_body,
+        terms=terms,
+        v_s=options.v_s,
+    )
 
 
 def parse_delay(words: list[str]) -> str | float | tuple[float, ...]:

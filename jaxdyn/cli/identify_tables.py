@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxdyn.cli.common import coordinate_labels, short, table
-from jaxdyn.identify import TERMS, Delays, LeastSquares, Payload, RobotFit, nominal_parameters
+from jaxdyn.identify import TERMS, Delays, DriveGains, LeastSquares, Payload, RobotFit, nominal_parameters
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.model.tree import Model
@@ -132,6 +132,20 @@ def _mass_table(findings: Findings) -> str:
         rows.append([name, short(old[0]), short(new[0]), sources.get(f"{name}.m", "-"), *centre])
     text = "Bodies: mass (kg) in the URDF and fitted, what settled it, fitted centre of mass (m)"
     return text + "\n" + table(["body", "URDF", "fitted", "from", "x", "y", "z"], rows)
+
+
+def gains_text(gains: DriveGains, labels) -> str:
+    """Gains of the drives with half of their 95 % intervals, and which joints the payload did not tell."""
+    half = gains.factor * gains.std
+    cells = ", ".join(
+        f"{label} {short(float(g))} +- {short(float(h), 2)}"
+        for label, g, h in zip(labels, gains.gains, half, strict=True)
+    )
+    rest = [label for label in labels if label not in gains.told]
+    line = f"Drives, torque = gain * what the logs hold, by the known payload: {cells}"
+    if rest:
+        line += f"\nThe payload hardly tells the gains of {', '.join(rest)}: they are about the others' median"
+    return line
 
 
 def payload_text(payload: Payload) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxdyn.identify import (
     TERMS,
+    DriveGains,
     Fit,
     LeastSquares,
     Log,
@@ -171,6 +172,18 @@ def _add_robot(report: dict[str, Any], result: RobotFit, choice: Choice, model: 
     for name, value in zip(spreads.parameters.names, spreads.parameters.values, strict=True):
         report["parameters"][name].setdefault("fitted", float(value))
     report["base_parameters"] |= {"std": _numbers(spreads.base.std), "from": spreads.base.sources}
+
+
+def gains_content(gains: DriveGains) -> dict[str, Any]:
+    """Gains of drives for the JSON file."""
+    return {
+        "gains": gains.gains.tolist(),
+        "std": gains.std.tolist(),
+        "interval_factor": gains.factor,
+        "told": list(gains.told),
+        "percent": gains.error,
+        "v_s": gains.v_s,
+    }
 
 
 def payload_content(payload: Payload) -> dict[str, Any]:
