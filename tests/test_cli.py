@@ -230,19 +230,26 @@ def test_identify_the_recorded_panda_with_terms_chosen(panda, franka, tmp_path, 
     assert report["chosen"]["extra_terms"]["dahl"]
 
 
-def simulated_logs(model, folder, seeds, noise=0.0):
-    """Filtered logs of sums of sines with exact rates, as files A.csv, B.csv, ..., of different lengths and sampling."""
+def simulated_logs(model, folder, seeds, noise=0.0, delay=0.0, gains=1.0):
+    """Filtered logs of sums of sines with exact rates, as files A.csv, B.csv, ..., of different lengths and sampling.
+
+    Torques are those of `delay` before (s), over the gains of drives.
+    """
     paths = []
     for k, seed in enumerate(seeds):
         rng = np.random.default_rng(seed)
         t = np.linspace(0, 4 + k, 401 - 50 * k)
         size, rate, phase = rng.uniform(0.2, 0.5, (3, 3)), rng.uniform(1, 4, (3, 3)), rng.uniform(0, 6, (3, 3))
-        angle = rate * t[:, None, None] + phase
-        signs = (np.sin(angle), rate * np.cos(angle), -(rate**2) * np.sin(angle))
-        q, v, a = (np.sum(size * x, 1) for x in signs)
-        tau = jd.identify.regressor(model, q, v, a) @ jd.identify.nominal_parameters(model)
+
+        def at(t, size=size, rate=rate, phase=phase):
+            angle = rate * t[:, None, None] + phase
+            signs = (np.sin(angle), rate * np.cos(angle), -(rate**2) * np.sin(angle))
+            return [np.sum(size * x, 1) for x in signs]
+
+        q, v, a = at(t)
+        tau = jd.identify.regressor(model, *at(t - delay)) @ jd.identify.nominal_parameters(model)
         paths.append(str(folder / f"{chr(65 + k)}.csv"))
-        write_log(paths[-1], jd.identify.Log(t, q, v, a, tau + noise * rng.normal(size=tau.shape)))
+        write_log(paths[-1], jd.identify.Log(t, q, v, a, tau / gains + noise * rng.normal(size=tau.shape)))
     return paths
 
 
@@ -367,6 +374,47 @@ def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys):
         jd.save_urdf(truth, tmp_path / "x.urdf", torques={"elbow": {"offset": 1.0}})
 
 
+def test_identify_finds_delays_from_a_file_of_options(arm, tmp_path, capsys):
+    """20 ms: found, printed, in both reports, judged on shifted logs, counted in a payload; given as a number, the same fit."""
+    truth = jd.repair_inertias(jd.load_urdf(arm))
+    jd.save_urdf(truth, tmp_path / "true.urdf")
+    simulated_logs(truth, tmp_path, (0, 1), noise=0.005, delay=0.02)
+    held = truth.replace(inertias=truth.inertias.at[-1].add(jd.inertia.sphere(0.7, 0.05)))
+    (tmp_path / "held").mkdir()
+    simulated_logs(held, tmp_path / "held", (2,), noise=0.005, delay=0.02)
+    file = tmp_path / "fit.toml"
+    file.write_text(
+        'urdf = "true.urdf"\nlog = "A.csv"\ntest-log = "B.csv"\ndelay = "auto"\nreport = "fit.json"\nhtml = "fit.html"\n'
+        'terms = ["viscous", "coulomb"]\nv-s = 0.1\nprior = 1\nrobust = "none"\npayload-log = "held/A.csv"\n'
+    )
+    assert main(["identify", str(file)]) == 0
+    assert "Delays of the torques against the positions (ms)" in capsys.readouterr().out
+    report = json.loads((tmp_path / "fit.json").read_text())
+    found = report["delays"]
+    off, half = np.abs(np.array(found["seconds"]) - 0.02), found["interval_factor"] * np.array(found["std"])
+    assert found["by"] == "auto" and np.all(off <= half) and np.all(half < 0.005)
+    name = f"{truth.joint_names[0]}.delay"
+    assert report["parameters"][name]["fitted"] == found["seconds"][0]
+    assert report["test_logs"]["B.csv"]["percent"] < 1 and abs(report["payload"]["mass"] - 0.7) < 0.02
+    assert "How late torques were recorded" in (tmp_path / "fit.html").read_text()
+    given = [str(x) for x in found["seconds"]]
+    assert main(["identify", str(file), "--delay", *given]) == 0
+    again = json.loads((tmp_path / "fit.json").read_text())
+    assert again["delays"]["by"] == "given" and again["delays"]["std"] == [None] * 3
+    np.testing.assert_allclose(
+        again["test_logs"]["B.csv"]["percent"], report["test_logs"]["B.csv"]["percent"], rtol=1e-6
+    )
+    for option, words in (
+        (["auto", "0.1"], "stand alone"),
+        (["late"], "--delay: 'late'"),
+        (["0.1", "0.1"], "each of 3 torques"),
+        (["0.1", "--method", "least-squares"], "knows no delay"),
+    ):
+        parts = ["--urdf", str(tmp_path / "true.urdf"), "--log", str(tmp_path / "A.csv")]
+        assert main(["identify", *parts, "--delay", *option]) == 2
+        assert words in capsys.readouterr().err
+
+
 def test_identify_repairs_a_link_of_zero_inertia(arm, tmp_path, capsys):
     truth = jd.repair_inertias(jd.load_urdf(arm))
     a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
@@ -399,6 +447,36 @@ def test_identify_a_payload(arm, tmp_path, capsys):
     assert abs(computed["mass"] - 0.7) < 0.01 and computed["percent"] < 0.2 * computed["percent_without"]
     assert main([*args, "--payload-body", "foot"]) == 2
     assert "the bodies are" in capsys.readouterr().err
+
+
+def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys):
+    """Currents of three drives; what is written is then the robot in newton metres."""
+    truth = jd.repair_inertias(jd.load_urdf(arm))
+    jd.save_urdf(truth, tmp_path / "true.urdf")
+    held = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
+    (tmp_path / "held").mkdir()
+    gains = np.array([0.8, 1.2, 1.1])
+    empty = simulated_logs(truth, tmp_path, (0, 1), noise=0.002, gains=gains)
+    loaded = simulated_logs(
+        truth.replace(inertias=truth.inertias.at[-1].add(held)), tmp_path / "held", (2, 3), noise=0.002, gains=gains
+    )
+    args = ["identify", "--urdf", str(tmp_path / "true.urdf"), "--log", *empty, "--payload-log", *loaded]
+    args += ["--terms", "viscous", "coulomb", "--v-s", "0.1", "--prior", "1", "--robust", "none"]
+    files = ["--report", str(tmp_path / "fit.json"), "--html", str(tmp_path / "fit.html")]
+    known = ["--payload-mass", "0.7", "--payload-centre", "0.05", "0", "0.1"]
+    assert main([*args, *files, *known]) == 0
+    assert "Drives, torque = gain * what the logs hold" in capsys.readouterr().out
+    assert "Drives, torque = gain" in (tmp_path / "fit.html").read_text()
+    report = json.loads((tmp_path / "fit.json").read_text())
+    found = report["drive_gains"]
+    told = np.array([name in found["told"] for name in truth.joint_names])
+    off = np.abs(np.array(found["gains"]) - gains)
+    assert told.any() and np.all(off <= 4 * np.array(found["std"]))
+    assert np.all(off[told] < 0.05) and abs(report["payload"]["mass"] - 0.7) < 0.03
+    assert report["torque_error"]["test_percent"] < 2
+    for option, words in ((known[:2], "gains need --payload-log"), (known[2:], "without --payload-mass")):
+        assert main([*args, *option]) == 2
+        assert words in capsys.readouterr().err
 
 
 def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):

@@ -11,8 +11,8 @@ from jaxdyn import __version__, identify
 from jaxdyn.cli.common import Stopwatch, add_model_options, coordinate_labels, load_model, output_path
 from jaxdyn.cli.identify_file import with_file
 from jaxdyn.cli.identify_logs import filtered_log, log_cutoff, log_names, log_paths, raw_log
-from jaxdyn.cli.identify_options import make_fit, parse_options, settled
-from jaxdyn.cli.identify_tables import judged_table, payload_text, tables
+from jaxdyn.cli.identify_options import find_gains, make_fit, parse_options, settled
+from jaxdyn.cli.identify_tables import gains_text, judged_table, payload_text, tables
 from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.identify.identifiability import base_terms
@@ -23,7 +23,7 @@ from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
 from jaxdyn.model.builder import inertia_report, repair_inertias
 from jaxdyn.model.tree import Model
-from jaxdyn.reports.identification import Findings, Judged, content, payload_content
+from jaxdyn.reports.identification import Findings, Judged, content, gains_content, payload_content
 
 # Share of the residual's power far above the motion from which on it is worth a warning.
 _VIBRATES = 0.3
@@ -40,6 +40,7 @@ examples:
   jaxdyn identify --urdf arm.urdf --log A.csv B.csv --test-log C.csv --out fitted.urdf --report fit.json --html fit.html
   jaxdyn identify --urdf panda.urdf --log log.csv --lock panda_finger_joint1 panda_finger_joint2 --plot fit.png
   jaxdyn identify --urdf arm.urdf --log empty.csv --payload-log holding.csv --report fit.json
+  jaxdyn identify --urdf arm.urdf --log empty.csv --payload-log holding.csv --payload-mass 2.8 --payload-centre 0 0 0.05
   jaxdyn identify --urdf panda.urdf --log log.csv --method least-squares --report base_parameters.json
 
 logs (--log FILE.csv ..., --test-log FILE.csv ..., one header line, or FILE.npz):
@@ -62,6 +63,10 @@ terms (--terms), beside the links:
   load |tau_rigid| tanh(v / v_s); dahl, pre-sliding; asymmetric |v|; quadratic v |v|; spring sin q, cos q.
   "auto" takes the first four, and of the others what lowers the error on parts of the training logs that are left out in
   turn, joint by joint. --v-s, --prior and --robust auto are chosen the same way. The test logs are never looked at.
+
+drives (--payload-mass, --payload-centre):
+  With a payload that is known, columns tau1.. may be currents, or torques under gains that are not sure. The gain of each
+  drive, torque = gain * column, comes from the torque that the payload adds; all else is then fitted to scaled logs.
 
 methods (--method):
   feasible         convex fit of the torques over all physically possible bodies; the URDF written is sound (default)
@@ -101,6 +106,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="logs of the same robot with something in its hand, which is then told apart from it",
     )
     parser.add_argument("--payload-body", metavar="LINK", help="the link that holds it (default: the last one)")
+    parser.add_argument(
+        "--payload-mass",
+        type=float,
+        metavar="KG",
+        help="its mass, where known: the gains of the drives are then found too",
+    )
+    parser.add_argument(
+        "--payload-centre",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="its centre of mass in the link's frame, m",
+    )
     parser.add_argument(
         "--rename",
         nargs="+",
@@ -162,6 +180,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="errors beyond K standard deviations count by their size, not its square: a number, none, or auto (default)",
     )
     fit.add_argument(
+        "--delay",
+        nargs="+",
+        default=["none"],
+        metavar="S",
+        help="how late torques were recorded against positions: auto, found with the fit; seconds, one number or one for each "
+        "torque; or none (default)",
+    )
+    fit.add_argument(
         "--horizon", type=float, default=0.25, metavar="S", help="length of the simulated pieces, s (default: 0.25)"
     )
     fit.add_argument(
@@ -211,10 +237,17 @@ def run(args: argparse.Namespace) -> None:
     logs = [filtered_log(raw, path, args, cutoff) for raw, path in zip(raws, train_paths, strict=True)]
     names = log_names(train_paths + test_paths)
 
+    gains, loaded = None, [filtered_log(raw_log(model, path, args), path, args, cutoff) for path in args.payload_log]
+    if args.payload_mass is not None:
+        empty = logs if test_paths else [identify.split(log, args.train)[0] for log in logs]
+        gains = find_gains(model, empty, loaded, options, args)
+        logs, loaded = ([gains.scaled(log) for log in group] for group in (logs, loaded))
+
     watch = Stopwatch()
     if test_paths:
         final = judge = make_fit(model, logs, options, args)
         tests = [filtered_log(raw_log(model, path, args), path, args, cutoff) for path in test_paths]
+        tests = tests if gains is None else [gains.scaled(log) for log in tests]
         test_names, trained = names[len(logs) :], logs
     else:
         trained, tests = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
@@ -238,6 +271,8 @@ def run(args: argparse.Namespace) -> None:
         choice=judge.choice if isinstance(judge, RobotFit) else None,
     )
     findings.warnings.extend(_warnings(findings))
+    if gains is not None:
+        print(gains_text(gains, coordinate_labels(model)[0]))
     print(judged_table(findings))
     print(f"{args.method} fit of {model.name!r}, {model.nv} joints: {findings.outcome}, in {seconds}")
     for line in findings.warnings:
@@ -248,20 +283,21 @@ def run(args: argparse.Namespace) -> None:
         print(f"Wrote {out}.")
     payload = None
     if isinstance(final, RobotFit) and args.payload_log:
-        loaded = [filtered_log(raw_log(model, path, args), path, args, cutoff) for path in args.payload_log]
         payload = identify.fit_payload(model, logs, loaded, args.payload_body, robot=final)
         print(payload_text(payload))
     if json_path is not None:
         report = content(findings, _asked(args, cutoff)) | (
             {} if payload is None else {"payload": payload_content(payload)}
         )
+        report |= {} if gains is None else {"drive_gains": gains_content(gains)}
         write_text(json_path, json.dumps(report, indent=2) + "\n")
         print(f"Wrote {json_path}.")
     if html is not None:
         from jaxdyn.reports.identification_page import page
 
         labels, units = coordinate_labels(model)
-        write_text(html, page(findings, labels, units, f"jaxdyn identify: {model.name}"))
+        lines = [] if gains is None else gains_text(gains, labels).split("\n")
+        write_text(html, page(findings, labels, units, f"jaxdyn identify: {model.name}", lines))
         print(f"Wrote {html}.")
     if plot is not None:
         from jaxdyn.reports.plotting import torque_figure
@@ -312,6 +348,7 @@ def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
 def _judged(model: Model, result, names: list[str], logs: list[Log]) -> list[Judged]:
     nominal = identify.nominal_parameters(model)
     fit = result.fit if isinstance(result, RobotFit) else result
+    logs = [result.aligned(log) for log in logs] if isinstance(result, RobotFit) else logs
     return [
         Judged(name, log, fit.torques(log), identify.regressor(model, log.q, log.v, log.a) @ nominal)
         for name, log in zip(names, logs, strict=True)

@@ -23,6 +23,7 @@ class Options(NamedTuple):
     prior: float | str
     robust: float | str | None
     weights: str | None
+    delay: str | float | tuple[float, ...] = 0.0
 
 
 def parse_options(args) -> Options:
@@ -42,8 +43,45 @@ def parse_options(args) -> Options:
         v_s, prior = 0.01 if v_s == "auto" else v_s, 1.0 if prior == "auto" else prior
     robust = {"auto": "auto", "none": None}.get(args.robust, args.robust)
     robust = number(robust, "--robust") if robust not in ("auto", None) else robust
+    if args.payload_centre is not None and args.payload_mass is None:
+        raise ValueError("--payload-centre: without --payload-mass; give both, or neither and the payload is found")
     weights = "auto" if args.weights == "auto" else None
-    return Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights)
+    delay = parse_delay(args.delay)
+    if simple and delay != 0.0:
+        raise ValueError(
+            f"--delay {' '.join(args.delay)}: --method {args.method} knows no delay; take --method feasible"
+        )
+    return Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights, delay)
+
+
+def find_gains(model: Model, unloaded: list[Log], loaded: list[Log], options: Options, args) -> identify.DriveGains:
+    """Gains of the drives by the known payload. **Raises:** ValueError where an option that it needs is missing."""
+    if args.payload_centre is None or not loaded:
+        raise ValueError(
+            f"--payload-mass {args.payload_mass:g}: gains need --payload-log, logs with it, and --payload-centre X Y Z, where "
+            "its centre of mass is in the frame of the link that holds it"
+        )
+    terms = TERMS if options.terms == "auto" else tuple(term for term in TERMS if term in options.terms)
+    return identify.fit_gains(
+        model,
+        unloaded,
+        loaded,
+        args.payload_mass,
+        args.payload_centre,
+        body=args.payload_body,
+        terms=terms,
+        v_s=options.v_s,
+    )
+
+
+def parse_delay(words: list[str]) -> str | float | tuple[float, ...]:
+    """ "auto", zero for none, seconds, or those of each torque. **Raises:** ValueError for anything else."""
+    if words in (["auto"], ["none"]):
+        return "auto" if words == ["auto"] else 0.0
+    if {"auto", "none"} & set(words):
+        raise ValueError(f"--delay {' '.join(words)}: auto and none stand alone")
+    seconds = tuple(number(word, "--delay") for word in words)
+    return seconds[0] if len(seconds) == 1 else seconds
 
 
 def settled(options: Options, result) -> Options:
@@ -51,7 +89,12 @@ def settled(options: Options, result) -> Options:
     if not isinstance(result, RobotFit):
         return options
     setting = result.choice.setting
-    return options._replace(terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust)
+    delay = options.delay
+    if delay == "auto" and (result.delays is None or not np.any(result.delays.seconds)):
+        delay = 0.0  # none that helps
+    return options._replace(
+        terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust, delay=delay
+    )
 
 
 def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit | Fit | LeastSquares:
@@ -78,6 +121,7 @@ def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit 
             prior=options.prior,
             robust=options.robust,
             weights=options.weights,
+            delay=options.delay,
             callback=tell,
         )
     (log,) = logs

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxdyn.cli.common import coordinate_labels, short, table
-from jaxdyn.identify import TERMS, LeastSquares, Payload, RobotFit, nominal_parameters
+from jaxdyn.identify import TERMS, Delays, DriveGains, LeastSquares, Payload, RobotFit, nominal_parameters
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.model.tree import Model
@@ -42,7 +42,9 @@ def tables(findings: Findings) -> str:
         parts.append("Base parameters: URDF, fitted, standard deviation by blocks of samples\n" + table(header, rows))
         return "\n".join(parts)
     if isinstance(result, RobotFit):
-        parts += [_choice_text(findings.choice or result.choice, model), _robot_base_table(result, model)]
+        parts += [_choice_text(findings.choice or result.choice, model)]
+        parts += [] if result.delays is None else [delays_text(result.delays, coordinate_labels(model)[0])]
+        parts += [_robot_base_table(result, model)]
     parts.append(_mass_table(findings))
     return "\n".join(parts)
 
@@ -94,6 +96,17 @@ def _choice_text(choice: Choice, model: Model) -> str:
     )
 
 
+def delays_text(delays: Delays, labels) -> str:
+    """How late torques are, in ms, with half of the 95 % intervals of those that were found."""
+    half = 1e3 * delays.factor * delays.std
+    cells = [
+        f"{label} {1e3 * d:.1f}" + (f" +- {h:.1f}" if np.isfinite(h) and d else "")
+        for label, d, h in zip(labels, delays.seconds, half, strict=True)
+    ]
+    none = "; zero where a delay lowers no error on parts left out" if delays.squares is not None else ", as given"
+    return f"Delays of the torques against the positions (ms): {', '.join(cells)}{none}"
+
+
 def _robot_base_table(result: RobotFit, model: Model) -> str:
     base, combinations = result.intervals.base, result.intervals.combinations
     basic = tuple(term for term in result.fit.terms if term in TERMS)
@@ -119,6 +132,20 @@ def _mass_table(findings: Findings) -> str:
         rows.append([name, short(old[0]), short(new[0]), sources.get(f"{name}.m", "-"), *centre])
     text = "Bodies: mass (kg) in the URDF and fitted, what settled it, fitted centre of mass (m)"
     return text + "\n" + table(["body", "URDF", "fitted", "from", "x", "y", "z"], rows)
+
+
+def gains_text(gains: DriveGains, labels) -> str:
+    """Gains of the drives with half of their 95 % intervals, and which joints the payload did not tell."""
+    half = gains.factor * gains.std
+    cells = ", ".join(
+        f"{label} {short(float(g))} +- {short(float(h), 2)}"
+        for label, g, h in zip(labels, gains.gains, half, strict=True)
+    )
+    rest = [label for label in labels if label not in gains.told]
+    line = f"Drives, torque = gain * what the logs hold, by the known payload: {cells}"
+    if rest:
+        line += f"\nThe payload hardly tells the gains of {', '.join(rest)}: they are about the others' median"
+    return line
 
 
 def payload_text(payload: Payload) -> str:

@@ -8,6 +8,8 @@ from jaxdyn.identify.exciting import exciting_motion as exciting_motion
 from jaxdyn.identify.feasible import fit_torques as fit_torques
 from jaxdyn.identify.friction import TERMS as TERMS
 from jaxdyn.identify.friction import Friction as Friction
+from jaxdyn.identify.gains import DriveGains as DriveGains
+from jaxdyn.identify.gains import fit_gains as fit_gains
 from jaxdyn.identify.identifiability import Identifiability as Identifiability
 from jaxdyn.identify.identifiability import Whiteness as Whiteness
 from jaxdyn.identify.identifiability import identifiability as identifiability

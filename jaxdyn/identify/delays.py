@@ -10,8 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxdyn.identify.intervals import Intervals
 from jaxdyn.identify.logs import Log
-from jaxdyn.identify.one_fit import Setting
+from jaxdyn.identify.one_fit import Estimate, Setting
+from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem
 from jaxdyn.identify.selection import folds, helped
 from jaxdyn.identify.torque_terms import TorqueTerm
@@ -109,6 +111,26 @@ def find_delays(
         squares.append(np.array([problem.left_out(setting, part) for part in parts]))
     kept = np.isin(every, helped(*squares, worth=0.0))
     return Delays(np.where(kept, delay, 0.0), std, spread.factor, (squares[0], squares[1]))
+
+
+def with_delays(
+    problem: RobotProblem, setting: Setting, estimate: Estimate, fit: Fit, delays: Delays
+) -> tuple[Intervals, Delays]:
+    """Intervals of a fit to shifted logs in which the delays are unknowns like all others, and the delays with theirs.
+
+    A delay's column is the slope of the torque that the fit foretells, without the noise of the measured one's. What resembles
+    it, viscous friction above all, is then known as well as it is beside it. Delays that help nothing are taken as zero.
+    """
+    kept = tuple(int(joint) for joint in np.flatnonzero(delays.seconds))
+    slopes = {id(log): -np.gradient(fit.torques(log), np.asarray(log.t, np.float64), axis=0) for log in problem.logs}
+    term = TorqueTerm(_DELAY.name, lambda log, load, v_s: slopes[id(log)])
+    wide = problem.with_term(term)
+    free = setting._replace(extra=(*setting.extra, (term.name, kept)))
+    spread = wide.intervals(free, estimate._replace(x=np.append(estimate.x, np.zeros(problem.model.nv))))
+    values, std = spread.parameters.values.copy(), delays.std.copy()
+    values[len(values) - len(kept) :] = delays.seconds[list(kept)]
+    std[list(kept)] = spread.parameters.std[len(values) - len(kept) :]
+    return spread._replace(parameters=spread.parameters._replace(values=values)), delays._replace(std=std)
 
 
 def _shifted(logs: Sequence[Log], delay: np.ndarray) -> tuple[Log, ...]:

@@ -101,6 +101,7 @@ def fit_payload(
         raise ValueError(f"body is {body!r}; the bodies are {', '.join(model.body_names)}")
     number = model.body_names.index(body)
     robot = fit_robot(model, unloaded, terms, **options) if robot is None else robot
+    unloaded, loaded = (tuple(robot.aligned(log) for log in logs) for logs in (unloaded, loaded))
     setting, x = robot.choice.setting, robot.fit.vector.copy()
     _, extra, _ = split_terms(robot.terms, model.nv)
     x[10 * model.nb : -model.nv] = 0  # the bodies and the rotors, whose torque the gears carry

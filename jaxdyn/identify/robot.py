@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.identify.chart import check_bodies
-from jaxdyn.identify.delays import Delays, find_delays, shift_torques
+from jaxdyn.identify.delays import Delays, find_delays, shift_torques, with_delays
 from jaxdyn.identify.feasible import check_prior
 from jaxdyn.identify.friction import TERMS
 from jaxdyn.identify.intervals import Intervals
@@ -33,7 +33,8 @@ class RobotFit(eqx.Module):
     - `fit`: the `Fit`, on all logs: model, friction, extra torques, `torques(log)`, `error(log)`.
     - `weights` (nv,): of each torque, one over the root mean square of its residual, of mean one; ones where not fitted.
     - `choice`: the setting (v_s, extra terms of which joints, prior) and what was tried; no trials where all was given.
-    - `intervals`: standard deviations of all parameters and of the base parameters, each from the data or from the prior.
+    - `intervals`: standard deviations of all parameters and of the base parameters, each from the data or from the prior; delays
+      that were found are among the unknowns, as `joint.delay`.
     - `terms`: those of the fit, extra ones with the numbers of their torques, as `fit_robot` takes them.
     - `delays`: of the torques against the positions, which the logs were shifted by; None where none was asked for.
     """
@@ -125,6 +126,8 @@ def fit_robot(
     delays, given = None, logs
     if is_found:
         delays = find_delays(model, given, setting, basic, extra, fixed, np.zeros(model.nv), **finding)
+    elif np.shape(delay) not in ((), (model.nv,)):
+        raise ValueError(f"delay is {delay}; give a number of seconds, or one for each of {model.nv} torques")
     elif np.any(np.asarray(delay) != 0):
         delays = Delays(np.broadcast_to(np.asarray(delay, np.float64), (model.nv,)), np.full(model.nv, np.inf), np.inf)
     if delays is not None:
@@ -148,7 +151,10 @@ def fit_robot(
     estimate = problem.refine(setting, fixed, rounds=_ROUNDS)
     data = problem.data(setting)
     fit = problem.result(setting, estimate, data)
-    spread = problem.intervals(setting, estimate)
+    if is_found and delays is not None and delays.seconds.any():
+        spread, delays = with_delays(problem, setting, estimate, fit, delays)
+    else:
+        spread = problem.intervals(setting, estimate)
     used = dict(setting.extra)
     chosen = (*basic, *((term, used[term.name]) for term in extra if term.name in used))
     return RobotFit(fit, problem.weights, Choice(setting, trials, by), spread, chosen, delays)

@@ -97,6 +97,12 @@ class RobotProblem:
         data, curved = self.data(setting), self.curved(setting)
         return intervals(self.model, data, setting, estimate, self.weights, self.basic, curved)
 
+    def with_term(self, term: TorqueTerm) -> "RobotProblem":
+        """The same logs and weights with the columns of one more term, behind all others."""
+        wide = RobotProblem(self.model, self.logs, self.basic, (*self.extra, term), self.inertia, self.blocks)
+        wide.weights, wide.loads, wide.sample_weights = self.weights, self.loads, self.sample_weights
+        return wide
+
     def _weigh(self, setting: Setting, estimate: Estimate) -> None:
         fit, threshold = self.result(setting, estimate, self.data(setting)), setting.robust
         assert threshold is not None

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxdyn.identify import (
     TERMS,
+    DriveGains,
     Fit,
     LeastSquares,
     Log,
@@ -157,6 +158,13 @@ def _add_robot(report: dict[str, Any], result: RobotFit, choice: Choice, model: 
     report["extra_terms"] = {} if extra is None else extra.named
     report["weights"] = result.weights.tolist()
     report["interval_factor"] = spreads.factor
+    if result.delays is not None:
+        report["delays"] = {
+            "seconds": result.delays.seconds.tolist(),
+            "std": _numbers(result.delays.std),
+            "interval_factor": result.delays.factor if np.isfinite(result.delays.factor) else None,
+            "by": "given" if result.delays.squares is None else "auto",
+        }
     rows = zip(spreads.parameters.names, _numbers(spreads.parameters.std), spreads.parameters.sources, strict=True)
     for name, std, source in rows:
         report["parameters"].setdefault(name, {})
@@ -164,6 +172,18 @@ def _add_robot(report: dict[str, Any], result: RobotFit, choice: Choice, model: 
     for name, value in zip(spreads.parameters.names, spreads.parameters.values, strict=True):
         report["parameters"][name].setdefault("fitted", float(value))
     report["base_parameters"] |= {"std": _numbers(spreads.base.std), "from": spreads.base.sources}
+
+
+def gains_content(gains: DriveGains) -> dict[str, Any]:
+    """Gains of drives for the JSON file."""
+    return {
+        "gains": gains.gains.tolist(),
+        "std": gains.std.tolist(),
+        "interval_factor": gains.factor,
+        "told": list(gains.told),
+        "percent": gains.error,
+        "v_s": gains.v_s,
+    }
 
 
 def payload_content(payload: Payload) -> dict[str, Any]:

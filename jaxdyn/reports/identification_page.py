@@ -14,8 +14,8 @@ from jaxdyn.reports.plotting import BLUE, GREY, RED, new_figure, torque_figure
 _MOST_SAMPLES = 1500
 
 
-def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title: str) -> str:
-    """The page; `labels` and `units` of each torque.
+def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title: str, notes: Sequence[str] = ()) -> str:
+    """The page; `labels` and `units` of each torque, `notes` to stand behind the error.
 
     **Raises:** ImportError without matplotlib.
     """
@@ -25,6 +25,7 @@ def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title:
         f"<p><b>Torque error {total_percent(findings.tests):.2f} %</b> on what was not fitted, "
         f"{total_percent(findings.train):.2f} % on what was; {total_percent(findings.tests, 'nominal'):.1f} % with the file's "
         f"own numbers. {escaped(findings.outcome)}.</p>",
+        *(f"<p>{escaped(line)}.</p>" for line in notes),
         *(f"<p class='warn'>{escaped(line)}</p>" for line in findings.warnings),
         "<h2>Errors, in per cent of the torque measured</h2>",
         _errors(findings, labels),
@@ -116,6 +117,14 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
         f"<p>v_s {setting.v_s:g}, prior {setting.prior:g}, {loss}; terms beyond viscous and Coulomb friction: "
         f"{escaped(extra)}.</p>",
     ]
+    if result.delays is not None:
+        half = result.delays.factor * result.delays.std
+        cells = [
+            (label, f"{1e3 * d:.1f}", f"{1e3 * h:.1f}" if np.isfinite(h) and d else "-")
+            for label, d, h in zip(labels, result.delays.seconds, half, strict=True)
+        ]
+        note = "How late torques were recorded against positions, which the logs were shifted by; zero where that helps nothing"
+        parts += [f"<p class='note'>{note}.</p>", html_table(("joint", "delay (ms)", "+-"), cells)]
     if trials:
         cells = [
             (

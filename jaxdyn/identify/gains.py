@@ -1,0 +1,277 @@
+"""Gains of drives, told by a payload that is known.
+
+A drive's log holds its current, or a torque under a gain taken as right: i = tau / g. Gains and inertias scale each other, so
+that one log tells neither; a payload of known mass and centre adds a torque p in newton metres, which tells both:
+
+    i_j = (W_j x + [loaded] (p_j + Y_j I)) / g_j,
+
+with x the robot's base parameters and friction, and I the payload's rotational inertia where it is not known. All joints share
+the inertias in x, so that a joint that hardly feels the payload is told by those that do. The logs are condensed once.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxdyn.identify.condensed import Blocks
+from jaxdyn.identify.friction import TERMS, check_terms
+from jaxdyn.identify.jackknife import block_groups, jackknife, student
+from jaxdyn.identify.logs import Log, as_logs, as_measured
+from jaxdyn.identify.regression import base_parameters, condense_model, free_columns, parameter_names, regressor
+from jaxdyn.identify.selection import VELOCITIES
+from jaxdyn.identify.threads import on_one_thread
+from jaxdyn.identify.torque_terms import coulomb_column
+from jaxdyn.model import inertia as _inertia
+from jaxdyn.model.tree import Model
+
+_STEPS, _ROUNDS = 50, 3
+# Half of a 95 % interval, as a share of the gain, up to which a gain counts as told.
+_TOLD = 0.5
+# Standard deviation of the logarithm of a gain that nothing tells, about those of the others.
+_APART = 1.0
+# Errors are never trusted beyond this share of the signal, so that logs without noise stay well posed.
+_FINEST = 1e-9
+# Share of a column that others must leave of it, for it to count at all.
+_RANK = 1e-9
+
+
+class DriveGains(eqx.Module):
+    """Result of `fit_gains`.
+
+    - `gains` (nv,): torque = gain times what the log holds. `std` (nv,): standard deviations, by blocks of samples as in
+      `Intervals`; `factor`: a 95 % interval is plus and minus this many of them.
+    - `told`: names of the joints whose half interval is below half of the gain. The other gains are about the median of these.
+    - `error`: of what the logs hold, in per cent, over all logs. `v_s`: smoothing velocity of Coulomb friction.
+    """
+
+    gains: np.ndarray
+    std: np.ndarray
+    factor: float
+    told: tuple[str, ...] = eqx.field(static=True)
+    error: float
+    v_s: float
+
+    def scaled(self, log: Log) -> Log:
+        """A log of these drives with torques in N m, as all fits take it."""
+        tau = np.asarray(log.tau, np.float64) * self.gains
+        return Log(log.t, log.q, log.v, log.a, tau, joint_names=log.joint_names, cutoff=log.cutoff)
+
+
+@on_one_thread()
+def fit_gains(
+    model: Model,
+    unloaded: Log | Sequence[Log],
+    loaded: Log | Sequence[Log],
+    mass: float,
+    centre,
+    *,
+    inertia=None,
+    body: str | None = None,
+    terms=TERMS,
+    v_s: float | str = "auto",
+    blocks: int = 20,
+) -> DriveGains:
+    """The gain of each drive, from logs without and with a payload that is known.
+
+    Least squares over gains and base parameters together, each joint weighed by one over its error, iterated. Fit the robot
+    to `gains.scaled(log)` then.
+
+    **Arguments:**
+
+    - `model`: the robot; its inertias do not matter. `unloaded`, `loaded`: logs with v and a, or sequences of them, with currents
+      (or torques under gains taken as right) in place of torques.
+    - `mass` (kg), `centre` (3,) (m) of the payload, in the frame of the body that holds it. `inertia` (3, 3): about the
+      centre, in axes of that frame (kg m^2); None: found too, which costs some of what the payload tells.
+    - `body`: name of the body that holds it, the last one by default. `terms`: of friction and rotors, of `TERMS`; `v_s`:
+      smoothing velocity of Coulomb friction (rad/s, m/s), or "auto", that which leaves the least.
+    - `blocks`: consecutive samples are cut into about this many blocks, whose scatter gives the intervals.
+
+    **Returns:** `DriveGains`.
+
+    **Raises:** ValueError when logs and model do not fit together, for an unknown body, and where the payload tells no gain.
+
+    Source: Gautier & Briot (2014), "Global identification of joint drive gains and dynamic parameters of robots", ASME Journal of
+    Dynamic Systems, Measurement, and Control 136; errors here are those of the currents, which least squares over both allows.
+    """
+    unloaded, loaded = as_logs(unloaded, model), as_logs(loaded, model)
+    terms = check_terms(terms, 1.0)
+    body = model.body_names[-1] if body is None else body
+    if body not in model.body_names:
+        raise ValueError(f"body is {body!r}; the bodies are {', '.join(model.body_names)}")
+    centre = np.asarray(centre, np.float64)
+    if not (np.isfinite(mass) and mass > 0) or centre.shape != (3,) or not np.isfinite(centre).all():
+        raise ValueError(f"mass is {mass} and centre {centre.tolist()}; give a positive mass (kg) and a point (3,) (m)")
+    moments = np.zeros((3, 3)) if inertia is None else np.asarray(inertia, np.float64)
+    known = np.asarray(_inertia.inertial_parameters(float(mass), centre, moments), np.float64)
+    number, logs = model.body_names.index(body), (*unloaded, *loaded)
+    is_loaded = np.arange(len(logs)) >= len(unloaded)
+    own = slice(10 * number, 10 * number + 10)
+    carried = []
+    for log, holds in zip(logs, is_loaded, strict=True):
+        columns = holds * regressor(model, log.q, log.v, log.a)[:, :, own]
+        free = columns[:, :, 4:] if inertia is None else columns[:, :, :0]
+        carried.append(np.concatenate([(columns @ known)[:, :, None], free], axis=2))
+    best = None
+    for velocity in VELOCITIES if isinstance(v_s, str) else (float(v_s),):
+        coulomb = [as_measured(log, coulomb_column(log, velocity)) for log in logs]
+        data = condense_model(model, logs, v_s=velocity, coulomb=coulomb, extra=carried, blocks=blocks)
+        trial = _fit(_Problem(model, data, terms), velocity)
+        if best is None or trial[0] < best[0]:
+            best = trial
+    assert best is not None
+    _, error, gains, std, factor, velocity = best
+    is_told = factor * std < _TOLD * gains
+    if not is_told.any():
+        raise ValueError(
+            f"the payload of {mass:g} kg on {body} tells the gain of no joint; take a heavier one, move more joints against "
+            "gravity, or give its inertia"
+        )
+    told = tuple(name for name, yes in zip(_joint_names(model), is_told, strict=True) if yes)
+    return DriveGains(gains, std, factor, told, error, velocity)
+
+
+class _Problem:
+    """Condensed logs of nv joints, and what of their columns is an unknown of its own: base parameters and the inertia I."""
+
+    def __init__(self, model: Model, data: Blocks, terms):
+        self.data, self.nv = data, model.nv
+        shared = 10 * model.nb
+        base = base_parameters(model, terms)
+        independent = free_columns(model.nb, model.nv, terms)[base.independent]
+        self.size = len(independent) + data.terms - 5
+        # For each joint, the columns of its triangle and the unknowns that these belong to.
+        self.columns, self.unknowns = [], []
+        for joint in range(model.nv):
+            places = data.places(joint)[: shared + 4]
+            where = {int(place): k for k, place in enumerate(places)}
+            pairs = [(where[int(x)], i) for i, x in enumerate(independent) if int(x) in where]
+            pairs += [(shared + 5 + k, len(independent) + k) for k in range(data.terms - 5)]
+            columns, unknowns = np.array(pairs).T
+            self.columns.append(columns)
+            self.unknowns.append(unknowns)
+        self.known = shared + 4
+
+    def rows(self, joint: int, triangle: np.ndarray, z: np.ndarray, u: float):
+        """Errors of a joint's condensed currents at the unknowns z and the gain exp(u), and their slopes (m, size + 1)."""
+        h, W = np.exp(-u), triangle[:, self.columns[joint]]
+        foretold = h * (W @ z[self.unknowns[joint]] + triangle[:, self.known])
+        slopes = np.zeros((len(triangle), self.size + 1))
+        slopes[:, self.unknowns[joint]] = h * W
+        slopes[:, -1] = -foretold
+        return foretold - triangle[:, -1], slopes
+
+    def linearised(self, triangles, z, u, weights):
+        """Weighted errors (m,) and slopes (m, size + nv) of all joints."""
+        errors, slopes = [], []
+        for joint, triangle in enumerate(triangles):
+            error, part = self.rows(joint, triangle, z, u[joint])
+            wide = np.zeros((len(error), self.size + self.nv))
+            wide[:, : self.size], wide[:, self.size + joint] = part[:, :-1], part[:, -1]
+            errors.append(weights[joint] * error)
+            slopes.append(weights[joint] * wide)
+        return np.concatenate(errors), np.concatenate(slopes)
+
+
+class _State(NamedTuple):
+    """Unknowns beside the gains, logarithms of gains, and the weights of joints."""
+
+    z: np.ndarray
+    u: np.ndarray
+    weights: np.ndarray
+
+
+def _fit(problem: _Problem, v_s: float):
+    """Score, error in per cent, gains, standard deviations, factor of an interval, v_s."""
+    data, nv = problem.data, problem.nv
+    triangles, samples = data.merged(), int(data.samples.sum())
+    sizes = np.array([max(float(np.linalg.norm(R[:, -1])), 1e-300) for R in triangles])
+    start = _start(problem, triangles)
+    state = _State(np.zeros(problem.size), start, 1 / sizes)
+    rms = sizes
+    for _ in range(_ROUNDS):
+        state = _descended(problem, triangles, state, start)
+        rms = np.array(
+            [np.linalg.norm(problem.rows(j, R, state.z, state.u[j])[0]) for j, R in enumerate(triangles)]
+        ) / np.sqrt(samples)
+        state = state._replace(weights=1 / np.maximum(rms, _FINEST * sizes / np.sqrt(samples)))
+    grams, slopes = [], []
+    for block in data.triangles:
+        error, J = problem.linearised(block, *state)
+        grams.append(J.T @ J)
+        slopes.append(J.T @ error)
+    groups = block_groups(len(data))
+    total = np.sum(grams, axis=0)
+    curvature = np.diag(_held(total, problem.size))
+    parts = [np.stack([np.sum([x[i] for i in group], axis=0) for group in groups]) for x in (grams, slopes)]
+    changes, inverse = jackknife(parts[0], parts[1], curvature)
+    variance = np.sum(changes**2, axis=1) + np.diag(inverse @ curvature @ inverse)
+    gains = np.exp(state.u)
+    score = float(np.sum(np.log(np.maximum(rms, _FINEST * sizes))))
+    percent = 100 * float(np.sqrt(samples * np.sum(rms**2) / np.sum(sizes**2)))
+    return score, percent, gains, gains * np.sqrt(variance[-nv:]), student(len(groups) - 1), v_s
+
+
+def _held(gram: np.ndarray, size: int) -> np.ndarray:
+    """Curvature (n,) that holds what no data tell: a trace of each number's own, and the prior of the gains."""
+    held = 1e-12 * np.maximum(np.diag(gram), 1e-300)
+    held[size:] = 1 / _APART**2
+    return held
+
+
+def _start(problem: _Problem, triangles) -> np.ndarray:
+    """Logarithms of the gains (nv,) by each joint alone: i_j = W_j z_j + h_j p_j is linear; where that tells none, the median.
+
+    **Raises:** ValueError where no joint tells any.
+    """
+    logarithms = np.full(problem.nv, np.nan)
+    for joint, R in enumerate(triangles):
+        table = R[:, [*problem.columns[joint], problem.known, R.shape[1] - 1]]
+        size = np.linalg.norm(table[:, -2])
+        used = np.linalg.norm(table, axis=0) > 0
+        used[-2:] = True
+        T = np.asarray(np.linalg.qr(table[:, used], mode="r"))
+        k = T.shape[1] - 2
+        if len(T) > k and abs(T[k, k]) > 1e-6 * size > 0:
+            h, noise = T[k, k + 1] / T[k, k], np.linalg.norm(T[k + 1 :, k + 1])
+            if h > 0 and noise / np.sqrt(problem.data.samples.sum()) < 0.5 * h * abs(T[k, k]):
+                logarithms[joint] = -np.log(h)
+    if np.isnan(logarithms).all():
+        raise ValueError(
+            "the payload's torque is told apart in no joint; are the loaded logs loaded, and do they move joints against gravity?"
+        )
+    return np.where(np.isnan(logarithms), np.nanmedian(logarithms), logarithms)
+
+
+def _descended(problem: _Problem, triangles, state: _State, start: np.ndarray) -> _State:
+    """Gauss-Newton steps from where each is the best unknown for its gains; halved until the loss falls."""
+    z, u, weights = state
+
+    def loss(z, u) -> float:
+        error, _ = problem.linearised(triangles, z, u, weights)
+        return float(error @ error + np.sum((u - start) ** 2) / _APART**2)
+
+    z, now = z.copy(), np.inf
+    for step in range(_STEPS):
+        error, J = problem.linearised(triangles, z, u, weights)
+        held = np.sqrt(_held(J.T @ J, problem.size))
+        pull = np.concatenate([np.zeros(problem.size), (u - start) / _APART])
+        A, b = np.concatenate([J, np.diag(held)]), np.concatenate([error, pull])
+        if step == 0:  # the unknowns beside the gains are linear
+            A = A[:, : problem.size]
+        scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+        change = -np.linalg.lstsq(A / scale, b, rcond=_RANK)[0] / scale
+        dz, du = change[: problem.size], change[problem.size :] if step else np.zeros(problem.nv)
+        share = 1.0
+        while (after := loss(z + share * dz, u + share * du)) > now and share > 1e-6:
+            share /= 2
+        z, u = z + share * dz, u + share * du
+        if step > 1 and now - after <= 1e-12 * now:
+            break
+        now = min(now, after)
+    return state._replace(z=z, u=u)
+
+
+def _joint_names(model: Model) -> list[str]:
+    return [name.rpartition(".")[0] for name in parameter_names(model)[10 * model.nb : 10 * model.nb + model.nv]]
