@@ -1,22 +1,27 @@
-"""A thousand arms that slide on spheres under force feedback, here with rigid contact and in MJX with its soft one.
+"""A thousand arms that slide on spheres under force feedback, here with rigid contact, in C MuJoCo and MJX with their soft one.
 
-    python -m benchmarks.arms_on_spheres [--arms 1000] [--peers 64] [--seconds 5] [--gradient]
+    python -m benchmarks.arms_on_spheres [--arms 1000] [--seconds 5] [--gradient] [--mjx 8] [--growth 4 8 16 --growth-seconds 0.2]
 
 The arm of six joints of `jd.scenes.sphere_arm`, its tip on a sphere, each with a goal of its own for the five contact
 coordinates, pressed with 5 N. The law is `jd.control.HybridForce` with integral action, and knows a ball of 0.2 kg where the
-plant has 0.3. Here: RK4 of 10 ms, one constraint. MJX: the same bodies, two spheres with frictionless contact, steps of 2 ms;
-it is fed the law's torques at every step, with the integral of the force that its contact gave. Printed: seconds of a second
+plant has 0.3. Here: RK4 of 10 ms, one constraint. MuJoCo: the same bodies, two spheres with frictionless contact, steps of 2 ms;
+it is fed the law's torques at every step, with the integral of the force that its contact gave. C MuJoCo runs in a thread for
+each core (`mujoco.rollout`), between calls of the law for all arms at once, compiled. Printed: seconds of a second
 call, and the force error after the first second, in which integral action takes most of the wrong mass away.
+
+MJX computes few arms, as its time on a CPU grows with their number: `--growth` prints its seconds for a short motion of several
+numbers of arms.
 """
 
 import argparse
+import os
 import time
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
+from mujoco import mjx, rollout
 
 import jaxdyn as jd
 from benchmarks import timing
@@ -61,6 +66,9 @@ def with_contact(model) -> mujoco.MjModel:
         body = body.add_body(pos=home[:3, 3], quat=turned, **inertial)
         body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=screw[3:])
     body.add_geom(pos=[0.1, 0.0, 0.0], size=[TIP, 0, 0], **sphere)
+    body.add_site(name="tip", pos=[0.1, 0.0, 0.0], size=[1.2 * TIP, 0, 0], type=mujoco.mjtGeom.mjGEOM_SPHERE)
+    for kind in (mujoco.mjtSensor.mjSENS_TOUCH, mujoco.mjtSensor.mjSENS_FRAMEPOS):
+        spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="tip")
     return spec.compile()
 
 
@@ -91,17 +99,47 @@ def rigid(goals, span, gradient):
     return seconds, np.abs(late - FORCE), float(jnp.max(jnp.abs(gaps)))
 
 
-def soft(goals, span):
-    """The same of MJX."""
+def same_arm():
+    """The plant, its start, and MuJoCo's model of it, which has its bias forces."""
     plant = jd.scenes.sphere_arm(masses=MASSES)
     q, v = jd.scenes.sphere_arm.start(rolling=(0.0, 0.0))
     source = with_contact(plant.system)
-    # The same arm: its bias forces.
     data = mujoco.MjData(source)
     data.qpos[:], data.qvel[:] = np.asarray(q), 0.3
     mujoco.mj_forward(source, data)
     bias = np.asarray(jd.bias_force(plant.system, q, jnp.full(6, 0.3)))
     np.testing.assert_allclose(data.qfrc_bias, bias, atol=1e-8)
+    return plant, q, v, source
+
+
+def in_threads(goals, span):
+    """The same of C MuJoCo, in a thread for each core."""
+    _, q, v, source = same_arm()
+    step, n = float(source.opt.timestep), len(goals)
+    data = [mujoco.MjData(source) for _ in range(os.cpu_count() or 1)]
+    law = jax.jit(jax.vmap(lambda goal, q, v, t, z: law_for(goal)(q, v, t, z), (0, 0, 0, None, 0)))
+    kind = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+    states = np.tile(np.concatenate([[0.0], q, v]), (n, 1))
+    z, forces, tips = np.zeros((n, 1)), [], []
+    jax.block_until_ready(law(goals, states[:, 1:7], states[:, 7:], 0.0, z))
+    began = time.perf_counter()
+    with rollout.Rollout(nthread=len(data)) as runner:
+        for k in range(round(span / step)):
+            tau = np.asarray(law(goals, states[:, 1:7], states[:, 7:], k * step, z))
+            after, sensed = runner.rollout(source, data, states, tau[:, None], control_spec=kind, nstep=1)
+            states = after[:, -1]
+            forces.append(sensed[:, -1, 0])
+            tips.append(sensed[:, -1, 1:4])
+            z = z + step * (forces[-1][:, None] - FORCE)
+    seconds = time.perf_counter() - began
+    late = np.asarray(forces)[round(1.0 / step) :]
+    gaps = np.linalg.norm(np.asarray(tips) - CENTER, axis=-1) - RADIUS - TIP
+    return seconds, np.abs(late - FORCE), float(np.max(np.abs(gaps)))
+
+
+def soft(goals, span):
+    """The same of MJX."""
+    plant, q, v, source = same_arm()
     model, blank = mjx.put_model(source), mjx.make_data(source)
     step, count = float(source.opt.timestep), round(span / float(source.opt.timestep))
 
@@ -136,22 +174,27 @@ def main(argv=None) -> None:
     """Measure, print, write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", type=int, default=1000)
-    parser.add_argument("--peers", type=int, default=64, help="arms in MJX")
+    parser.add_argument("--mjx", type=int, default=8, help="arms in MJX; 0 for none")
+    parser.add_argument(
+        "--growth", type=int, nargs="*", default=[], help="numbers of arms in MJX, to see how its time grows"
+    )
+    parser.add_argument("--growth-seconds", type=float, default=0.2, help="of motion, for --growth")
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--gradient", action="store_true", help="time the gradient too")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     start = jnp.asarray([0.2, -0.1, 0.15, 0.1, 0.3])  # of `jd.scenes.sphere_arm.start`
-    steps = np.random.default_rng(0).uniform(-0.1, 0.1, (max(options.arms, options.peers), 5))
-    goals, rows = start + jnp.asarray(steps), {}
-    goals, peers = goals[: options.arms], goals[: options.peers]
-    for name, batch, computed in (
-        ("jaxdyn", goals, rigid(goals, options.seconds, options.gradient) if options.arms else None),
-        ("MJX", peers, soft(peers, options.seconds) if options.peers else None),
+    most = max(options.arms, options.mjx, *options.growth, 1)
+    goals, rows = start + jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (most, 5))), {}
+    for name, count, computed in (
+        ("jaxdyn", options.arms, lambda goals: rigid(goals, options.seconds, options.gradient)),
+        ("C MuJoCo", options.arms, lambda goals: in_threads(goals, options.seconds)),
+        ("MJX", options.mjx, lambda goals: soft(goals, options.seconds)),
     ):
-        if computed is None:
+        if not count:
             continue
-        seconds, error, gap = computed
+        batch = goals[:count]
+        seconds, error, gap = computed(batch)
         rows[name] = {
             "arms": len(batch),
             "seconds": seconds,
@@ -164,6 +207,10 @@ def main(argv=None) -> None:
             f"most; gap up to {gap:.1g} m",
             flush=True,
         )
+    for count in options.growth:
+        seconds, *_ = soft(goals[:count], options.growth_seconds)
+        print(f"MJX: {count} arms, {options.growth_seconds:g} s of motion in {seconds:.2f} s", flush=True)
+        rows[f"MJX, {count} arms"] = {"arms": count, "seconds": seconds, "motion": options.growth_seconds}
     print("written to", timing.write("benchmark_arms_on_spheres", {"machine": timing.machine(), "rows": rows}))
 
 

@@ -1,11 +1,12 @@
 """Rollouts a second of jaxdyn, MJX, frax and C MuJoCo, on all cores, in turns.
 
-    python -m benchmarks.rollout_peers [panda g1 disk hand windows] [--batch 1024] [--steps 100] [--rounds 5] [--mjx-g1]
+    python -m benchmarks.rollout_peers [panda g1 disk hand windows] [--batch 1024] [--steps 100] [--rounds 5] [--mjx 2] [--mjx-g1]
 
 A rollout is `steps` steps of RK4 of 1 ms, from random states, of which the last state is kept; constant torques for the robots.
 Robots are read by all from one URDF, without joint limits, damping and friction; end states are compared first. C MuJoCo runs
 in its own threads (`mujoco.rollout`), as many as there are cores. The forward dynamics of frax, which has no integrator, and of
-MJX are stepped by the RK4 below, compiled with it; MJX computes a sixteenth of the batch. They read no floating base from a URDF
+MJX are stepped by the RK4 below, compiled with it; MJX computes `--mjx` rollouts, since its time for each grows with their
+number on a CPU (16 of a Panda take 200 s). They read no floating base from a URDF
 as we write it: the G1 stands on a fixed base here, with 29 joints; MJX compiles it for minutes: `--mjx-g1`. Rolling without
 slip, a hand with rolling contacts and forty windows whose loops stay closed are in none of the three: those rows are ours alone.
 """
@@ -23,7 +24,6 @@ from benchmarks import jax_peers, timing
 from benchmarks.dynamics import FILES, ROBOTS
 
 DT = 1e-3
-FEWER = 16  # times fewer rollouts of MJX, whose time on a CPU grows with their number
 
 
 def rk4(acceleration, q, v, tau, steps: int):
@@ -76,7 +76,7 @@ def with_mujoco(model, q, v, tau, steps: int):
     return call
 
 
-def robot(name: str, batch: int, steps: int, mjx_g1: bool) -> dict:
+def robot(name: str, batch: int, steps: int, of_mjx: int, mjx_g1: bool) -> dict:
     """Calls that return the last positions of a batch, by the library's name."""
     file, _, lock = FILES[name]
     model = jd.load_urdf(ROBOTS / file, lock=lock).replace(damping=None, friction=None)
@@ -91,7 +91,7 @@ def robot(name: str, batch: int, steps: int, mjx_g1: bool) -> dict:
     for peer, acceleration in jax_peers.forward_dynamics(model).items():
         if peer == "MJX" and name == "g1" and not mjx_g1:
             continue
-        some = [x[: batch if peer != "MJX" else max(1, batch // FEWER)] for x in (q, v, tau)]
+        some = [x[: batch if peer != "MJX" else of_mjx] for x in (q, v, tau)]
         calls[peer] = _compiled(lambda q, v, tau, f=acceleration: rk4(f, q, v, tau, steps)[0], *some)
     try:
         calls["C MuJoCo"] = with_mujoco(model, q, v, tau, steps)
@@ -111,11 +111,13 @@ def scene(name: str, batch: int, steps: int) -> dict:
     else:
         named = {"disk": jd.scenes.rolling_disk, "hand": jd.scenes.hand_with_ball}[name]
         built, (q, v) = named(), named.start()
+    # Nothing grips the ball: its contacts hold on both sides.
+    free = {"contacts": "report"} if name == "hand" else {}
     ts = DT * np.array([0.0, steps])
     speeds = np.linspace(0.5, 1.5, batch)[:, None]
 
     def ours(q, v):
-        return jd.simulate(built, q, v, ts, stepsize=DT, throw=False).q[-1]
+        return jd.simulate(built, q, v, ts, stepsize=DT, throw=False, **free).q[-1]
 
     return {"jaxdyn": _compiled(ours, np.tile(q, (batch, 1)), speeds * np.asarray(v))}
 
@@ -136,6 +138,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--mjx", type=int, default=2, help="rollouts that MJX computes")
     parser.add_argument("--mjx-g1", action="store_true")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -144,13 +147,15 @@ def main() -> None:
         batch = args.batch if name != "windows" else max(1, args.batch // 16)
         print(name, flush=True)
         if name in FILES:
-            calls = robot(name, batch, args.steps, args.mjx_g1)
+            calls = robot(name, batch, args.steps, args.mjx, args.mjx_g1)
         else:
             calls = scene(name, batch, args.steps)
         first = {}
         for peer, call in calls.items():
             before = time.perf_counter()
             first[peer] = call()
+            if not np.isfinite(first[peer]).all():
+                raise RuntimeError(f"{name}: {peer} gives rollouts that did not reach their end")
             difference = np.abs(first[peer] - first["jaxdyn"][: len(first[peer])]).max()
             print(
                 f"  {peer}: {time.perf_counter() - before:.2g} s, last positions at most {difference:.1e} from ours",

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +56,42 @@ def test_block_turns_sticks_and_slips_at_the_times_of_the_closed_form(shaken):
     want = np.select([at < turns, at < sticks, at < slips], [first(at), back(at), 0 * at], again(at))
     np.testing.assert_allclose(shaken.v[:, 0], want, rtol=0, atol=1e-9)
     np.testing.assert_allclose(shaken.events.times("friction: slip"), [slips], atol=1e-10)
+
+
+def test_steps_of_fixed_length_end_at_events_and_go_on(shaken):
+    """To the order of RK4; the points of the steps stay where they were, so that the end is met."""
+    errors = []
+    for stepsize in (0.08, 0.04):
+        motion = jd.simulate(block(), [0.0], [2.0], TS, control=load, stepsize=stepsize)
+        assert motion.success and list(motion.events.name[:4]) == list(shaken.events.name[:4])
+        np.testing.assert_allclose(motion.events.time[:3], shaken.events.time[:3], rtol=0, atol=stepsize**4)
+        np.testing.assert_allclose(motion.v, shaken.v, rtol=0, atol=stepsize**4)
+        errors.append(np.abs(motion.q[-1] - shaken.q[-1]).max())
+        # A step for each length, and the few that look for the three events.
+        assert 4 / stepsize <= int(motion.stats["num_steps"]) < 4 / stepsize + 3 * 20
+    assert 10 < errors[0] / errors[1] < 24
+
+
+def test_steps_of_fixed_length_have_gradients_through_events():
+    ts = jnp.asarray([0.0, 2.5, 4.0])
+
+    def seen(mu, speed):
+        scene = block(mu, 1.6 * mu)
+        motion = jd.simulate(scene, [0.0], jnp.stack([speed]), ts, control=load, stepsize=0.02, throw=False)
+        return motion.q[-1, 0] + motion.events.time[1]
+
+    values = jnp.asarray(MU), jnp.asarray(2.0)
+    h, gradient = 1e-5, jax.grad(seen, (0, 1))(*values)
+    for i, got in enumerate(gradient):
+        up, down = ([x + sign * h * (i == k) for k, x in enumerate(values)] for sign in (1, -1))
+        assert abs(float(got) - float(seen(*up) - seen(*down)) / (2 * h)) < 1e-5 * max(1.0, abs(float(got)))
+
+
+def test_steps_of_fixed_length_that_are_too_long_say_so():
+    spring = jd.JointSpring(jnp.asarray([400.0]), jnp.asarray([0.0]))
+    scene = jd.Scene(block().system, forces=(*block().forces, spring))
+    assert jd.simulate(scene, [0.4], [0.0], [0.0, 3.0], stepsize=0.08, throw=False).result == jd.RESULTS.coarse_steps
+    assert jd.simulate(scene, [0.4], [0.0], [0.0, 3.0], stepsize=0.005).success
 
 
 def test_friction_balances_at_rest_and_lies_on_the_cone_while_it_slides(shaken):
@@ -340,7 +377,8 @@ def test_float32_finds_the_same_events():
         (lambda: jd.DryFriction(0.5, 1.0, smoothing=0.0), "smoothing"),
         (lambda: jd.UnilateralContact("lane"), "ground_contact"),
         (lambda: jd.ground_contact("ball", radius=-1.0), "radius"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=0.1), "stepsize"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=-0.1), "stepsize"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=diffrax.PIDController(1e-6, 1e-6)), "stepsize"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, solver=jd.Rodas5P()), "solver"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, adjoint="forward"), "adjoint"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, outputs=("work",)), "outputs"),

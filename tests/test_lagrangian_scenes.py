@@ -408,17 +408,35 @@ def test_block_slides_until_it_stops():
     """It stops after v0 / (mu g), v0^2 / (2 mu g) further on; slid the other way it is the mirror image."""
     stop = 2.0 / (0.3 * G)
     q0, v0 = scenes.sliding_block.start(velocity=2.0)
-    solution = simulate(scenes.sliding_block(mass=1.7), q0, v0, jnp.asarray([0.0, stop]), stepsize=stop / 2)
+    solution = simulate(
+        scenes.sliding_block(mass=1.7, direction=1), q0, v0, jnp.asarray([0.0, stop]), stepsize=stop / 2
+    )
     assert_close(solution.q[-1], [2.0**2 / (2 * 0.3 * G)], 1e-13)  # the method is exact for a parabola
     assert_close(solution.v[-1], [0.0], 1e-13)
     assert_close(scenes.sliding_block(mass=1.7, direction=-1).applied_force(q0, -v0), [0.3 * 1.7 * G], 1e-15)
 
 
+def test_block_sticks_where_it_stops():
+    """Said by an event, at the time of the closed form; steps of fixed length end there too."""
+    stop, ts = 2.0 / (0.3 * G), jnp.asarray([0.0, 0.5, 2.0])
+    q0, v0 = scenes.sliding_block.start(velocity=2.0)
+    for steps in ({"rtol": 1e-11, "atol": 1e-11}, {"stepsize": 0.1}):
+        solution = simulate(scenes.sliding_block(mass=1.7), q0, v0, ts, **steps)
+        assert bool(solution.success) and list(solution.events.name[:2]) == ["friction: stick", ""]
+        assert_close(solution.events.time[0], stop, 1e-12)
+        assert_close(solution.q[1:, 0], [1.0 - 0.15 * G * 0.25, 2.0**2 / (0.6 * G)], 1e-12)
+        assert_close(solution.v[1:, 0], [2.0 - 0.15 * G, 0.0], 1e-12)
+    with pytest.raises(ValueError, match=r"static is .* and direction 1"):
+        scenes.sliding_block(static=0.4, direction=1)
+
+
 def test_a_block_that_has_stopped_gains_no_energy():
     """Past its stop adaptive steps end with a code, and fixed ones stay at rest to the change of a step."""
     stop, h = 2.0 / (0.3 * G), 1e-3
-    scene, (q0, v0) = scenes.sliding_block(), scenes.sliding_block.start(velocity=2.0)
+    scene, (q0, v0) = scenes.sliding_block(direction=1), scenes.sliding_block.start(velocity=2.0)
     ts = jnp.asarray([0.0, 3 * stop])
+    with pytest.raises(RuntimeError, match=r"jd\.DryFriction"):
+        simulate(scene, q0, v0, ts, max_steps=500)
     solution = simulate(scene, q0, v0, ts, throw=False, max_steps=500)
     assert not bool(solution.success) and abs(float(solution.stats["time_reached"]) - stop) < 1e-3
     solution = simulate(scene, q0, v0, ts, stepsize=h, throw=False)

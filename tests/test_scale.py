@@ -168,7 +168,7 @@ def test_a_program_has_no_communication(pendulums):
         solution = jd.simulate(build({"damping": row["p"]}), row["q0"], jnp.zeros(2), ts, stepsize=0.01, throw=False)
         return {"q": solution.q, "v": solution.v}
 
-    compiled = program.Program(one, batch, jax.local_devices(), 8, None)
+    compiled = program.Program(program.Traced(one, batch), batch, jax.local_devices(), 8, None, True)
     text = compiled.compiled.as_text()
     assert "jaxdyn_kernel" in text
     for collective in (

@@ -11,6 +11,7 @@ Imports nothing of jaxdyn. Others import the names below, and no module of this 
 
 from jaxdyn.compile.calls import compiled as compiled
 from jaxdyn.compile.calls import first_numbers as first_numbers
+from jaxdyn.compile.calls import glue_options as glue_options
 from jaxdyn.compile.calls import specialized as specialized
 from jaxdyn.compile.flags import unless as unless
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations

@@ -36,7 +36,7 @@ def compiled(function: Callable) -> Callable:
         if is_staged():
             return function(*args)
         # JAX takes options for a program that stands in no transformation.
-        is_glue = mode.current() != "plain" and jax.default_backend() == "cpu" and is_concrete(args)
+        is_glue = _is_glue(jax.default_backend()) and is_concrete(args)
         return (quick() if is_glue else usual)(mode.current(), *args)
 
     return call
@@ -63,6 +63,15 @@ def quick_options() -> dict[str, Any] | None:
     except jax.errors.JaxRuntimeError:
         return None
     return _QUICK
+
+
+def glue_options(platform: str) -> dict[str, Any] | None:
+    """Options to compile a program of kernels and what stands between them for this platform, in the mode in force."""
+    return quick_options() if _is_glue(platform) else None
+
+
+def _is_glue(platform: str) -> bool:
+    return mode.current() != "plain" and platform == "cpu"
 
 
 def specialized(function: Callable) -> Callable:

@@ -76,7 +76,7 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "sliding_block",
             "Block that slides to a stop by Coulomb friction, up to nine tenths of its way: exact for every method of order two",
             "free",
-            named("sliding_block"),
+            named("sliding_block", direction=1),
             lambda start: references.braked(0.06 * ten),
             0.06 * ten,
             5,

@@ -18,7 +18,7 @@ from jaxdyn.scale.processes import process_of
 from jaxdyn.scale.progress import Progress
 from jaxdyn.scale.reducer import Reducer
 from jaxdyn.scale.reductions import Arrays, checked_reductions, described
-from jaxdyn.scale.store import Store, full_disk, packages
+from jaxdyn.scale.store import Store, full_disk, zarr_package
 
 LISTED = 1000  # failures that a result lists
 PROGRAM = "program of a rollout (scene, control, solver, functions)"  # how a store names its hash
@@ -62,7 +62,8 @@ class Run:
 
     def dataset(self) -> Any:
         """The store as an `xarray.Dataset`, read as it is used."""
-        _, xarray = packages()
+        import xarray
+
         return xarray.open_zarr(self.out, chunks=None)
 
     def __str__(self) -> str:
@@ -104,7 +105,7 @@ def whole(
 
     `pilot(drawn, row)` counts the steps of a short part of a rollout, for a cost that is measured.
     """
-    packages()
+    zarr_package()
     path = as_path(options.out, "out")
     if not path.parent.is_dir():
         raise ValueError(f"out is {str(path)!r}: there is no directory {path.parent}")
@@ -126,7 +127,7 @@ def whole(
     else:
         pilot = None
     order = None if pilot else _order(options.cost, batch)
-    reducer = Reducer(reductions, outputs.shapes, outputs.variables)
+    reducer = Reducer(reductions, outputs.traced.shapes, outputs.variables)
     job = driver.Job(order, reducer, kept, outputs.codes, process)
     description = (
         version()
@@ -148,9 +149,9 @@ def whole(
         memory = options.memory
         if memory is None and process.count > 1:  # which of them share this host is not known
             memory = int(program.SHARE * program.available_memory(devices) / process.count)
-        compiled = program.Program(outputs.one, batch, devices, lanes, memory)
+        compiled = program.Program(outputs.traced, batch, devices, lanes, memory, outputs.is_motion)
         if pilot:
-            job.pilot = program.Program(pilot, batch, devices, compiled.lanes, memory)
+            job.pilot = program.Program(program.Traced(pilot, batch), batch, devices, compiled.lanes, memory, True)
         if store is None:
             variables = [outputs.variables[name] for name in kept] + reducer.variables
             variables = [replace(one, compressed=one.compressed or options.compress) for one in variables]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.scale.members import Members
-from jaxdyn.scale.program import shapes_of
+from jaxdyn.scale.program import Traced
 from jaxdyn.scale.reducer import QUANTITY
 from jaxdyn.scale.reductions import Reduction, quantities
 from jaxdyn.scale.store import Variable
@@ -22,12 +22,13 @@ OUTCOMES = ("successful", "failed")  # codes of functions that are no motions
 class Described(NamedTuple):
     """A function of one member, `one(drawn, row) -> dict of arrays`, with all that a store says of them.
 
-    `shapes` are those of its arrays, by name; `variables` are those that can be stored; `codes` the names of result codes; `axes`
-    the coordinates.
+    `traced` is the function traced; `is_motion`, whether kernels compute it; `variables` are those that can be stored; `codes`
+    the names of result codes; `axes` the coordinates.
     """
 
     one: Callable[[Any, Any], dict[str, Any]]
-    shapes: dict[str, jax.ShapeDtypeStruct]
+    traced: Traced
+    is_motion: bool
     variables: dict[str, Variable]
     codes: tuple[str, ...]
     axes: dict[str, tuple[Any, dict[str, Any]]]
@@ -55,7 +56,8 @@ def described_motion(
         values |= poses | named | stats
         return _with_quantities(values | {"result": code_of(solution.result)}, reductions)
 
-    shapes = shapes_of(rows, batch)
+    traced = Traced(rows, batch)
+    shapes = traced.shapes
     variables, axes = {}, {}
     for signal in seen["signals"]:
         dims = dimensions(signal)
@@ -72,7 +74,7 @@ def described_motion(
             variables[name] = _variable(name, shapes, None, {"units": unit} if unit else {})
     variables["result"] = _codes(CODES)
     axes["t"] = (ts, {"units": "s"})
-    return Described(rows, shapes, variables, CODES, axes)
+    return Described(rows, traced, True, variables, CODES, axes)
 
 
 def described_function(
@@ -93,14 +95,15 @@ def described_function(
         code = jnp.where(success, 0, 1).astype(jnp.uint8)
         return _with_quantities(values | _parameters(parameters) | {"result": code}, reductions)
 
-    shapes = shapes_of(rows, batch)
+    traced = Traced(rows, batch)
+    shapes = traced.shapes
     variables = {}
     for name in shapes:
         if name != "result" and not name.startswith(QUANTITY):
             unit = units.get(name.removeprefix("parameter_"))
             variables[name] = _variable(name, shapes, None, {"units": unit} if unit else {})
     variables["result"] = _codes(OUTCOMES)
-    return Described(rows, shapes, variables, OUTCOMES, {})
+    return Described(rows, traced, False, variables, OUTCOMES, {})
 
 
 def version() -> dict[str, str]:

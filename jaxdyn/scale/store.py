@@ -11,8 +11,10 @@ and renamed by Zarr, so that a process that is killed leaves whole files only.
 
 import contextlib
 import errno
+import importlib.util
 import os
 import shutil
+import sys
 import time
 import uuid
 import warnings
@@ -44,17 +46,18 @@ class Variable:
     compressed: bool = False
 
 
-def packages() -> tuple[Any, Any]:
-    """zarr and xarray.
+def zarr_package() -> Any:
+    """zarr, where xarray is there too; that is imported when a result is read.
 
     **Raises:** ImportError that names the extra.
     """
     try:
-        import xarray
         import zarr
     except ImportError as error:
         raise ImportError(f"jd.scale needs {error.name}: pip install 'jaxdyn[scale]'") from error
-    return zarr, xarray
+    if "xarray" not in sys.modules and importlib.util.find_spec("xarray") is None:
+        raise ImportError("jd.scale needs xarray: pip install 'jaxdyn[scale]'")
+    return zarr
 
 
 class Store:
@@ -64,7 +67,7 @@ class Store:
     """
 
     def __init__(self, path: Path):
-        zarr, _ = packages()
+        zarr = zarr_package()
         self.path = path
         self._zarr = zarr
         with self._writing():
@@ -97,7 +100,7 @@ class Store:
         chunk: int,
     ) -> "Store":
         """A new store, made beside its place and moved there; where another process was first, that one's."""
-        zarr, _ = packages()
+        zarr = zarr_package()
         from zarr.codecs import Crc32cCodec, ZstdCodec
 
         beside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import numpy_for
+from jaxdyn.contact.unilateral import DryFriction
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.inertia import box, displaced
@@ -218,12 +219,22 @@ def _block(q, v, t, p):
 
 
 @named(_block_start)
-def sliding_block(*, mass=1.0, friction=0.3, gravity=9.81, direction=1) -> Scene:
-    """Block that slides on a table with Coulomb friction: m xdd = u - sign(xd) mu m g, at rest with the sign `direction`.
+def sliding_block(*, mass=1.0, friction=0.3, static=None, gravity=9.81, direction=None) -> Scene:
+    """Block that slides on a table with Coulomb friction, m xdd = u - sign(xd) mu m g, and sticks under |u| <= `static` m g.
 
-    Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on. It is not held there (see `jd.SlidingFriction`).
+    Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on, where it sticks (`jd.DryFriction`, whose events say
+    when). `static`: None for the coefficient of sliding.
+
+    With a `direction`, 1 or -1, it slides that way and does not stick: sign(0) is `direction`, so that all methods integrate
+    it, up to where it stops (`jd.SlidingFriction`).
 
     Source: EQUATIONS section 11 and erratum E42.
     """
     system = LagrangianSystem(_block, 1, parameters={"mass": mass})
+    if direction is None:
+        return Scene(system, forces=(DryFriction(friction, mass * gravity, 0, static=static),))
+    if static is not None:
+        raise ValueError(
+            f"sliding_block: static is {static} and direction {direction}; a block that does not stick has none"
+        )
     return Scene(system, forces=(SlidingFriction(friction, mass * gravity, direction),))

@@ -120,7 +120,8 @@ def simulate(
       "report": the run goes on; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point, or
       -1, and a concrete run warns (`JointLimitWarning`).
     - `max_events`: of a scene with forces that have modes (`jd.DryFriction`, `jd.UnilateralContact`), after which the run ends
-      with the code `too_many_events`. Such scenes take explicit adaptive methods, and are differentiated in reverse mode.
+      with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps, which end at events,
+      and are differentiated in reverse mode.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
       4096 with "direct", and where reverse mode goes through adaptive steps: it remembers where each one ends, at 8 bytes a
@@ -200,6 +201,8 @@ def simulate(
         "limit_is_given": max_steps is not None,
         "max_events": max_events,
     }
+    if modal and is_fixed(stepsize) and max_steps is None:
+        options["max_steps"] += hybrid.SEARCHED * max_events
     dtype = state_dtype(scene.system)
     numbers: list[Any] = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
     numbers.append(jnp.asarray(stepsize, dtype) if is_fixed(stepsize) else stepsize)

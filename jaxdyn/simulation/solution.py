@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.dynamics import RESULTS as RESULTS
 from jaxdyn.constraints.dynamics import Outcome
 from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.printed import solution_lines
 from jaxdyn.simulation.controls import at_start
 from jaxdyn.simulation.export import as_xarray, write_csv, write_npz
@@ -162,6 +163,8 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
                 f"{float(rates.explicit_step):.3g} s; pass solver=jd.Rodas5P(), or raise max_steps (now {options['max_steps']})"
             )
+        if any(isinstance(force, SlidingFriction) for force in scene.forces):
+            advice = f"where a contact with jd.SlidingFriction comes to rest, take jd.DryFriction, which sticks; else {advice}"
     if name == "contact_lost":
         contact = coned_contacts(scene)[int(solution.stats["lost_contact"])].name
         advice = f"the contact is {contact!r}; {advice}"

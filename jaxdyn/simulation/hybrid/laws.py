@@ -105,7 +105,7 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
     def placed(y, v, slip):
         return ravel_pytree(plan.structure(y) | {"v": v, "slip": slip})[0]
 
-    return Laws(plan, elements, judge, transit, land, solver.error_order(None), slip_of, placed)
+    return Laws(plan, elements, judge, transit, land, solver.order(None), solver.error_order(None), slip_of, placed)
 
 
 def _shape_of(y0):

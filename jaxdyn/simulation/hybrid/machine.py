@@ -2,7 +2,8 @@
 
 A step that ends where a condition of the mode is violated is taken again, shorter, until its end is the event: the root is
 bracketed by the steps before and behind it, and approached by the secant rule of Illinois. So the state at the event is that of
-a step of full order, and not of an interpolation. Conditions are looked at in the middle and at the end of every step: what
+a step of full order, and not of an interpolation. Steps of fixed length are cut by events too, and go on to the points that they
+would have met. Conditions are looked at in the middle and at the end of every step: what
 is violated and satisfied again between them is not seen.
 """
 
@@ -17,8 +18,9 @@ from jaxtyping import Array
 from jaxdyn.compile import any_in_batch, recompute_unless, run
 from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
 from jaxdyn.simulation.hybrid.transitions import Change
-from jaxdyn.simulation.solvers.driver import save
+from jaxdyn.simulation.solvers.driver import number_of_steps, save
 from jaxdyn.simulation.solvers.explicit import Plan, projected_output, step_in_turn, whole_step
+from jaxdyn.simulation.solvers.fixed_steps import accumulated, no_sums
 
 _SAFETY, _LEAST, _MOST, _AFTER_EVENT = 0.9, 0.2, 10.0, 0.3
 _SIMULTANEOUS, _REAL = 1e-9, 1e-6  # of the size of a condition in the step
@@ -60,12 +62,25 @@ class Lane(NamedTuple):
     kept: Array
     code: Array
     count: Array
+    sums: tuple[Array, Array]  # about steps of fixed length (`accumulated`)
+
+
+class Steps(NamedTuple):
+    """Steps of fixed length: from `start`, `length` apart."""
+
+    start: Array
+    length: Array
+
+    def to_next(self, t):
+        """The length of a step from t to the next of the points."""
+        passed = jnp.floor((t - self.start) / self.length + 1e-3)
+        return self.start + (passed + 1) * self.length - t
 
 
 class Laws(NamedTuple):
     """The functions of a motion: `plan` of its steps, `judge(args, t, y)` -> conditions and their levels (n, CHANNELS), of flat
     states; `transit(unknown, t, y, mode, slip, hit)` -> `Change`; `land(unknown, mode, slip, t, y)`, the state after
-    an impact; `order` of the error estimate; `slip(y)` (n, 2) of a flat
+    an impact; `order` of the method and `error_order` of its estimate; `slip(y)` (n, 2) of a flat
     state, and `placed(y, v, slip)`, the flat state with these."""
 
     plan: Plan
@@ -73,7 +88,8 @@ class Laws(NamedTuple):
     judge: Any
     transit: Any
     land: Any
-    order: float
+    order: Any
+    error_order: Any
     slip: Any
     placed: Any
 
@@ -114,10 +130,10 @@ def blank(elements: Elements, dtype, most: int) -> Records:
     return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, mode, slip, mode, slip)
 
 
-def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, max_steps: int, most: int):
+def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_steps: int, most: int):
     """Rows of the state at ts[1:], the lane at its end, the records, and the change by which it began.
 
-    `y0` (m,), flat; `mode`, `slip` (n, 2): a first guess. `most`: events.
+    `y0` (m,), flat; `mode`, `slip` (n, 2): a first guess; `stepsize` (s), or None for adaptive steps. `most`: events.
     """
     start, end, count = ts[0], ts[-1], ts.shape[0] - 1
     eps, dtype, n = float(jnp.finfo(ts.dtype).eps), y0.dtype, len(laws.elements.each)
@@ -128,11 +144,15 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, max_steps: int, m
     conditions, _ = run(judged, (unknown, begun.mode), start, y, static=(laws,))
     code = jnp.where(begun.paradox, PARADOX, jnp.where(begun.settled, FINE, NO_MODE)).astype(jnp.int32)
     zero = jnp.zeros((), ts.dtype)
-    first = 1e-4 * (end - start)
+    first, steps = 1e-4 * (end - start), None
+    if stepsize is not None:
+        first = (end - start) / number_of_steps(start, end, stepsize).astype(ts.dtype)
+        steps = Steps(start, first)
     lane = Lane(
         start, y, first, first, begun.mode, conditions, no, zero, zero, zero, zero, none, none,
-        jnp.ones_like(conditions), none, none, code, none,
+        jnp.ones_like(conditions), none, none, code, none, no_sums(_moving(laws, y)),
     )  # fmt: skip
+    origin = y
     rows = jnp.broadcast_to(jnp.full_like(y, jnp.inf), (count, y.size))
 
     def is_active(lane: Lane):
@@ -144,7 +164,9 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, max_steps: int, m
         t1 = jnp.where(active, jnp.minimum(lane.t + lane.length, end), lane.t)
         args = unknown, lane.mode
         attempt = _attempted(laws, args, lane.t, t1, lane.y, rtol, atol)
-        after, kept, hit = _decided(laws, lane, t1, end, attempt, eps)
+        after, kept, hit = _decided(laws, lane, t1, end, attempt, eps, steps)
+        if steps is not None:
+            after = _monitored(laws, origin, lane, after, kept, attempt[0])
         after = jax.tree.map(lambda a, b: jnp.where(active, a, b), after, lane)
         kept, hit = kept & active, hit & active & kept
         saved, rows = save(laws.plan, ts, lane, after, kept, attempt[0], saved, rows)
@@ -163,17 +185,30 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, max_steps: int, m
     return rows, lane, records, begun
 
 
+def _moving(laws: Laws, y) -> dict[str, Array]:
+    """What moves of a flat state: not the directions of sliding."""
+    parts = laws.plan.structure(y)
+    return {"q": parts["q"], "v": parts["v"]}
+
+
+def _monitored(laws: Laws, origin, lane: Lane, after: Lane, kept, step) -> Lane:
+    """With what the error of a kept step adds to the sum."""
+    start, before, y, error = (_moving(laws, x) for x in (origin, lane.y, step.projected, step.error))
+    sums = accumulated(laws.order, laws.error_order, start, before, y, error, *lane.sums)
+    return after._replace(sums=jax.tree.map(lambda new, old: jnp.where(kept, new, old), sums, lane.sums))
+
+
 def judged(laws: Laws, args, t, y):
     """Conditions and levels."""
     return laws.judge(args, t, y)
 
 
-def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float) -> tuple[Lane, Array, Array]:
+def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float, steps: Steps | None) -> tuple[Lane, Array, Array]:
     """The lane after an attempt, whether the step is kept, and which conditions ended it."""
     step, size, (values, levels), (between, levels_between) = attempt
     length = t1 - lane.t
-    good = size < 1
-    factor = _SAFETY * (1 / size) ** (1 / laws.order)
+    good = size < 1 if steps is None else jnp.isfinite(step.projected).all()
+    factor = _SAFETY * (1 / size) ** (1 / laws.error_order)
     factor = jnp.where(jnp.isnan(factor), _LEAST, factor)
     factor = jnp.clip(factor, jnp.where(good, 1.0, _LEAST), jnp.where(good, _MOST, _SAFETY)).astype(length.dtype)
 
@@ -221,6 +256,10 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float) -> tuple[Lane
     next_length = jnp.where(located, _AFTER_EVENT * usual, next_length)
     least = 4 * eps * jnp.maximum(jnp.abs(lane.t), eps)
     short = ~good & (next_length < least)
+    if steps is not None:
+        short, usual = ~good, lane.usual
+        to_next = steps.to_next(jnp.where(kept, t1, lane.t))
+        next_length = jnp.where(locating & ~located, secant, to_next)
     pivot = jnp.min(lane.conditions[:, 2]) < 0.05  # friction that leaves no forces grows without bound before
     code = jnp.where(short, jnp.where(pivot, PARADOX, SHORT), lane.code).astype(jnp.int32)
     # Steps end on the run's end, or well before it.
@@ -233,7 +272,7 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float) -> tuple[Lane
             t, jnp.where(kept, step.projected, lane.y), next_length, usual, lane.mode,
             jnp.where(kept, values, lane.conditions), locating & ~located, low, high_, value_low, value_high, side,
             jnp.where(locating & ~located, lane.tries + one, 0), scale, lane.taken + one, lane.kept + kept.astype(jnp.int32),
-            code, lane.count,
+            code, lane.count, lane.sums,
         ),
         kept,
         hit,

@@ -25,12 +25,14 @@ from jaxdyn.simulation.hybrid.replay import Hybrid
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
 from jaxdyn.simulation.solution import Solution
-from jaxdyn.simulation.solvers.choice import label, unwrapped
+from jaxdyn.simulation.solvers.choice import is_fixed, label, unwrapped
+from jaxdyn.simulation.solvers.fixed_steps import too_coarse
 from jaxdyn.simulation.solvers.inputs import has_unit_quaternions
 from jaxdyn.systems.scene import Scene, check_callback, checked_force
 from jaxdyn.systems.system import retract
 
 OUTPUTS = ("energy", "acceleration", "multipliers", "contact_forces", "torque")
+SEARCHED = 40  # attempts at most to end a step at an event
 _CODES = {
     machine.SHORT: "dt_min_reached",
     machine.PARADOX: "painleve_paradox",
@@ -47,12 +49,20 @@ def check_options(control, stepsize, solver, adjoint, outputs) -> None:
     what = "the scene has forces with modes (jd.DryFriction, jd.UnilateralContact)"
     if isinstance(control, (Controller, Sampled)):
         raise ValueError(f"control is a {type(control).__name__}, and {what}; give a function control(q, v, t)")
-    if stepsize is not None:
-        raise ValueError(f"stepsize is {stepsize!r}, and {what}, whose events end steps; leave it out")
+    if stepsize is not None and not is_fixed(stepsize):
+        raise ValueError(
+            f"stepsize is {stepsize!r}, and {what}; leave it out for steps that keep rtol and atol, or give a length (s)"
+        )
     if not isinstance(solver, diffrax.AbstractERK) or isinstance(unwrapped(solver), diffrax.AbstractWrappedSolver):
-        raise ValueError(f"solver is {label(solver)}, and {what}; take an explicit one, as diffrax.Dopri8() or Tsit5()")
+        raise ValueError(
+            f"solver is {label(solver)}, and {what}, looked for within explicit steps; take diffrax.Dopri8() or Tsit5(), "
+            "or, where forces are stiff, friction without modes (jd.CoulombFriction)"
+        )
     if not isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        raise ValueError(f"adjoint is {type(adjoint).__name__}, and {what}; leave it out, for reverse mode")
+        raise ValueError(
+            f"adjoint is {type(adjoint).__name__}, and {what}, whose motions are taken again from event to event for "
+            "reverse mode alone; leave it out, and take jax.grad or jax.jacrev"
+        )
     for name in outputs:
         if name not in OUTPUTS and not name.startswith("pose:"):
             raise ValueError(f"outputs has {name!r}, and {what}; choose from {', '.join(OUTPUTS)} and 'pose:<frame>'")
@@ -65,8 +75,8 @@ def check_count(most: Any) -> None:
 
 
 def motion(scene: Scene, control, numbers, options) -> Solution:
-    """The solution; `numbers` are q0, v0, ts, rtol, atol, and a stepsize that is not used."""
-    q0, v0, ts, rtol, atol, _ = numbers
+    """The solution; `numbers` are q0, v0, ts, rtol, atol, and the length of fixed steps or None."""
+    q0, v0, ts, rtol, atol, stepsize = numbers
     system, elements, outputs = scene.system, elements_of(scene), options["outputs"]
     eps, dtype = float(jnp.finfo(q0.dtype).eps), q0.dtype
     unknown, known = partition_traced((scene, control))
@@ -95,7 +105,11 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     finite_start = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
     fine = jnp.isfinite(rtol) & (rtol >= 0) & jnp.isfinite(atol) & (atol >= 0)
     rtol, atol = (jnp.maximum(jnp.where(fine, x, 1e-3), 10 * eps).astype(dtype) for x in (rtol, atol))
-    good = finite_start & unit_start & in_order & fine
+    fine_steps = jnp.ones((), bool)
+    if stepsize is not None:
+        fine_steps = jnp.isfinite(stepsize) & (stepsize > 0)
+        stepsize = jnp.where(fine_steps, stepsize, ts[-1] - ts[0])
+    good = finite_start & unit_start & in_order & fine & fine_steps
     harmless = neutral(system).astype(dtype) if isinstance(system, Model) else jnp.zeros_like(q0)
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
 
@@ -106,7 +120,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     y0 = {"q": q0, "v": v0, "slip": slip}
     laws = laws_of(given, elements, options["solver"], y0)
     most = options["max_events"]
-    hybrid = Hybrid(laws, mode, rtol, atol, options["max_steps"], most)
+    hybrid = Hybrid(laws, mode, rtol, atol, stepsize, options["max_steps"], most)
     rows, times, facts = hybrid(y0, unknown, ts)
     lane, records, begun = facts
     # A save point at an event shows what was before.
@@ -153,13 +167,19 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     codes: Any = RESULTS
     result: Any = codes.where(lane.t < ts[-1], codes.max_steps_reached, codes.successful)
     for code, name in _CODES.items():
+        if code == machine.SHORT and stepsize is not None:
+            name = "nonfinite_state"
         result = RESULTS.where(lane.code == code, getattr(RESULTS, name), result)
+    if stepsize is not None:
+        coarse = (result == RESULTS.successful) & too_coarse(lane.sums)
+        result = RESULTS.where(coarse, RESULTS.coarse_steps, result)
     result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
     for fits, name in (
         (start_ok, "inconsistent_start"),
         (unit_start, "unnormalized_start"),
         (finite_start, "nonfinite_start"),
         (fine, "bad_tolerance"),
+        (fine_steps, "bad_stepsize"),
         (in_order, "unordered_times"),
     ):
         result = RESULTS.where(fits, result, getattr(RESULTS, name))

@@ -1,6 +1,7 @@
 """Integration from the start to the save points, and reverse mode through its events.
 
-Backwards the motion is taken again in pieces, from each save point or event to the next, within the modes that are known by then.
+Backwards the motion is taken again in pieces, from each save point or event to the next, within the modes that are known by then;
+steps of fixed length begin anew with each piece.
 Each piece is differentiated as motions without events are. At an event the condition e of the mode falls to zero, so its time
 follows what moves e at that moment,
 
@@ -38,6 +39,7 @@ class Hybrid(eqx.Module):
     mode: Mode
     rtol: Any
     atol: Any
+    stepsize: Any  # None for adaptive steps
     max_steps: int = eqx.field(static=True)
     most: int = eqx.field(static=True)
 
@@ -49,7 +51,17 @@ class Hybrid(eqx.Module):
         y0, unknown, ts = moving
         flat, _ = ravel_pytree(y0)
         rows, lane, records, begun = machine.drive(
-            self.laws, unknown, ts, flat, self.mode, y0["slip"], self.rtol, self.atol, self.max_steps, self.most
+            self.laws,
+            unknown,
+            ts,
+            flat,
+            self.mode,
+            y0["slip"],
+            self.rtol,
+            self.atol,
+            self.stepsize,
+            self.max_steps,
+            self.most,
         )
         return jax.vmap(self.laws.plan.structure)(rows), records.time[: self.most], (lane, records, begun)
 
@@ -86,8 +98,10 @@ def _replayed(how: Hybrid, moving, lane, records, begun):
     known_times = jnp.concatenate([ts[1:], jnp.where(happened, records.time[:most], jnp.inf)])
     is_event = jnp.arange(saves + most) >= saves
     order = jnp.lexsort((is_event, lax.stop_gradient(known_times)))  # a save point at an event is before it
-    norm = driver.Adaptive(laws.order, optimistix.rms_norm)
     room = min(how.max_steps, ROOM)
+    control: Any = driver.Adaptive(laws.error_order, optimistix.rms_norm)
+    if how.stepsize is not None:
+        control, room = driver.Fixed(laws.order, laws.error_order), how.max_steps
     end = lax.stop_gradient(lane.t)
 
     def piece(carry, at):
@@ -98,7 +112,7 @@ def _replayed(how: Hybrid, moving, lane, records, begun):
         known = ~event | (record.name >= 0)
         advances = known & (until > t) & (until <= end)
         until = jnp.where(advances, until, t)
-        drive = Drive(laws.plan, norm, how.rtol, how.atol, None, how.max_steps, room)
+        drive = Drive(laws.plan, control, how.rtol, how.atol, how.stepsize, how.max_steps, room)
         driven, _, _ = drive(laws.plan.structure(y), (unknown, mode), jnp.stack([t, until]))
         here = jnp.where(advances, ravel_pytree(jax.tree.map(lambda x: x[0], driven))[0], y)
         landed = _crossed(laws, unknown, mode, record, t, until, here)
