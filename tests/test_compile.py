@@ -26,6 +26,8 @@ from jaxdyn.compile import compute, derive, kernel, mode, objects, program, targ
 from jaxdyn.compile.code import kernel_ir
 from jaxdyn.compile.expand import NotNumbers, expand
 
+pytestmark = pytest.mark.native
+
 PACKAGE = Path(jd.__file__).parent
 RNG = np.random.default_rng(0)
 FLOATS = (jnp.float64, jnp.float32)

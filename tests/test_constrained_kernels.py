@@ -19,6 +19,8 @@ from jaxdyn.simulation.methods import consistent
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract
 
+pytestmark = pytest.mark.native
+
 POSE = ((0.1, -0.2, 0.3), (0.5, 0.2, -0.4))
 OTHER = ((-0.3, 0.1, 0.2), (-0.2, 0.7, 0.3))
 # A floating base carries three branches: the loops have bodies in common, one reaches the world, one its own ancestor.

@@ -14,6 +14,8 @@ from jaxdyn.simulation.solvers import driver
 from jaxdyn.simulation.solvers.explicit import ExplicitSteps
 from jaxdyn.systems.scene import Scene
 
+pytestmark = pytest.mark.native
+
 
 def field(t, y, args):
     """Coupled pendulums in a state of two parts, of which the angles may be a matrix."""

@@ -15,6 +15,8 @@ from jaxdyn import compile as backend
 from jaxdyn.compile import ahead, calls, mode, objects, target
 from jaxdyn.compile.garbage import uncollected
 
+pytestmark = pytest.mark.native
+
 LONGEST = 20.0  # s that a test waits for another thread
 
 

@@ -10,6 +10,8 @@ import pytest
 
 from jaxdyn.compile.code import varying_first
 
+pytestmark = pytest.mark.native
+
 PAGE = mmap.PAGESIZE
 
 # In a process of its own, which a kernel that goes beyond its buffers would end.

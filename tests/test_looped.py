@@ -12,6 +12,8 @@ from jaxdyn.dynamics import scans, world_frame
 from jaxdyn.model.robots import chain as planar_chain
 from jaxdyn.model.robots import random_tree as chain
 
+pytestmark = pytest.mark.native
+
 KINDS = ("free", "revolute", "spherical", "helical", "planar", "prismatic")
 
 

@@ -15,6 +15,8 @@ from jaxdyn.dynamics import recursions
 from jaxdyn.dynamics import world_frame as matrix_form
 from jaxdyn.model.joints import KINDS
 
+pytestmark = pytest.mark.native
+
 
 def program_of(function, *args):
     """The program of the one kernel that a function is."""

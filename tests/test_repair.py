@@ -9,6 +9,8 @@ from pinocchio_bridge import assert_close
 from jaxdyn import compile as backend
 from jaxdyn.compile import any_in_batch, is_rank_safe, recompute_unless, repair_flagged
 
+pytestmark = pytest.mark.native
+
 
 def test_a_flag_of_any_sample_is_one_of_the_batch():
     def pick(x):

@@ -9,6 +9,8 @@ import pytest
 import jaxdyn as jd
 from jaxdyn.simulation.solvers import reverse
 
+pytestmark = pytest.mark.native
+
 MODEL = jd.ModelBuilder("two links")
 MODEL.add_body("upper", None, "revolute", (1.0, (0.4, 0.0, 0.0), (0.02, 0.05, 0.05)), axis=(0, 1, 0))
 MODEL.add_body(

@@ -12,6 +12,8 @@ import jaxdyn as jd
 from jaxdyn.compile import map_rows
 from jaxdyn.compile.rows import AT_ONCE
 
+pytestmark = pytest.mark.native
+
 model = jd.robots.chain(2)
 
 

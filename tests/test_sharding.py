@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.native
+
 
 def _run(*what: str, **environment: str) -> list:
     command = [sys.executable, str(Path(__file__).with_name("divided.py")), *what]
