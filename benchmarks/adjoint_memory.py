@@ -20,7 +20,7 @@ ADJOINTS = ("reverse", "direct", "backsolve", "forward")
 
 
 def measured(adjoint: str, steps: int) -> dict:
-    """MiB, seconds and the gradient's norm."""
+    """KiB, seconds and the gradient's norm."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -55,8 +55,8 @@ def measured(adjoint: str, steps: int) -> dict:
         begun = time.perf_counter()
         gradient = jax.block_until_ready(compiled(model.inertias))
         times.append(time.perf_counter() - begun)
-    mib = memory.temp_size_in_bytes / 2**20
-    return {"mib": mib, "cold": cold, "warm": min(times), "norm": float(jnp.linalg.norm(gradient))}
+    kib = memory.temp_size_in_bytes / 1024
+    return {"kib": kib, "cold": cold, "warm": min(times), "norm": float(jnp.linalg.norm(gradient))}
 
 
 def main() -> None:
@@ -69,7 +69,7 @@ def main() -> None:
         print(json.dumps(measured(options.only, options.steps[0])))
         return
     print(
-        "| adjoint | steps | memory (MiB) | compiling (s) | a call (s) | norm of the gradient |\n|---|---|---|---|---|---|"
+        "| adjoint | steps | memory (KiB) | compiling (s) | a call (s) | norm of the gradient |\n|---|---|---|---|---|---|"
     )
     for adjoint in ADJOINTS:
         for steps in options.steps:
@@ -81,7 +81,7 @@ def main() -> None:
                 continue
             x = json.loads(done.stdout.splitlines()[-1])
             print(
-                f"| {adjoint} | {steps} | {x['mib']:.1f} | {x['cold']:.1f} | {x['warm']:.3g} | {x['norm']:.10g} |",
+                f"| {adjoint} | {steps} | {x['kib']:.0f} | {x['cold']:.1f} | {x['warm']:.3g} | {x['norm']:.10g} |",
                 flush=True,
             )
 

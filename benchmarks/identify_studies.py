@@ -1,6 +1,6 @@
 """Studies of recorded robots behind docs/identification.md.
 
-    python -m benchmarks.identify_studies cutoff|delay [--data ../shared/data]
+    python -m benchmarks.identify_studies cutoff|delay|a2 [--data ../shared/data]
 
 cutoff: the logs of `benchmarks.identify_robots`, low-passed at several frequencies and fitted with the first four terms at
 settings given; 0.2 s are dropped at each end. The error on what was not fitted, in per cent of the torque: of the log as
@@ -9,6 +9,9 @@ share of the residual's power above ten times the band of the motion, which is v
 
 delay: the Franka's log at 8 Hz, first four terms, with and without `delay="auto"`: error on the last 30 %, and delays (ms)
 with half of their 95 % intervals.
+
+a2: what a fit leaves over at the KUKA's second joint: how long it stands still, how far off the torque is there, the share of the
+residual's power there, the band that holds 90 % of it with and without that start, and which columns would explain it.
 """
 
 import argparse
@@ -21,7 +24,7 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402
 
 from benchmarks.identify_franka import panda, recorded, samples  # noqa: E402
-from benchmarks.identify_robots import ROOT, kuka, kuka_samples  # noqa: E402
+from benchmarks.identify_robots import ROOT, kuka, kuka_log, kuka_samples  # noqa: E402
 from jaxdyn import identify  # noqa: E402
 from jaxdyn.identify.logs import as_measured  # noqa: E402
 from jaxdyn.identify.spectra import vibration  # noqa: E402
@@ -74,7 +77,81 @@ def delays(data: Path) -> None:
             print(", ".join(f"{1e3 * d:.1f} +- {1e3 * h:.1f}" for d, h in zip(fit.delays.seconds, half, strict=True)))
 
 
-STUDIES = {"cutoff": cutoffs, "delay": delays}
+def slow_joint(data: Path) -> None:
+    """Where the KUKA's second joint goes wrong: when, how slowly, and which columns would explain it."""
+    model, joint = kuka(), 1
+    logs = {name: kuka_log(data, name) for name in "ABC"}
+    fit = identify.fit_robot(model, [logs["A"], logs["B"]], identify.TERMS, v_s=0.0003, prior=1.0, robust=1.345).fit
+    residuals = {name: np.asarray(log.tau)[:, joint] - fit.torques(log)[:, joint] for name, log in logs.items()}
+    moving = {name: first_move(log, joint) for name, log in logs.items()}
+    print(
+        f"{'':4} {'rest':>8} {'off there':>12} {'power there':>12} {'90 % below':>11} {'after it':>9} {'rms':>8} {'moving':>8}"
+    )
+    for name, log in logs.items():
+        r, start = residuals[name], moving[name]
+        rest, share = float(log.t[start] - log.t[0]), 100 * np.sum(r[:start] ** 2) / np.sum(r**2)
+        bands = [f"{band(x, log.t):.2f} Hz" for x in (r, r[start:])]
+        sizes = [f"{np.sqrt(np.mean(x**2)):.0f}" for x in (r, r[start:])]
+        print(
+            f"{name:4} {rest:6.2f} s {np.mean(r[:start]):+8.0f} N m {share:10.0f} % {bands[0]:>11} {bands[1]:>9} "
+            f"{sizes[0]:>8} {sizes[1]:>8}"
+        )
+    print(f"Coulomb friction fitted at a2: {float(fit.friction.coulomb[joint]):.0f} N m")
+    print("share of a2's residual explained, fitted to each log itself; and rms on C fitted to A and B (N m)")
+    for label, column in CAUSES.items():
+        columns = {name: column(log) for name, log in logs.items()}
+        shares = []
+        for name in logs:
+            rest = residuals[name] - columns[name] @ solved(columns[name], residuals[name])
+            shares.append(1 - np.sum(rest**2) / np.sum(residuals[name] ** 2))
+        both = [np.concatenate([x["A"], x["B"]]) for x in (columns, residuals)]
+        rms = np.sqrt(np.mean((residuals["C"] - columns["C"] @ solved(*both)) ** 2))
+        print(f"{label:36} " + " ".join(f"{share:5.2f}" for share in shares) + f" {rms:8.0f}")
+
+
+def first_move(log: identify.Log, joint: int) -> int:
+    """The first sample at which a joint has moved by a hundredth of its way."""
+    q = np.asarray(log.q)[:, joint]
+    return int(np.argmax(np.abs(q - q[0]) > 1e-2 * np.ptp(q)))
+
+
+def band(x: np.ndarray, t) -> float:
+    """The frequency (Hz) below which 90 % of a signal's power lies."""
+    power = np.cumsum(np.abs(np.fft.rfft(x)) ** 2)
+    return float(np.fft.rfftfreq(len(x), float(t[1] - t[0]))[np.searchsorted(power, 0.9 * power[-1])])
+
+
+def solved(columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Coefficients of least squares."""
+    return np.linalg.lstsq(columns, residual, rcond=None)[0]
+
+
+def lagged(signal: np.ndarray, t, seconds) -> np.ndarray:
+    """A signal behind first-order lags of some seconds, side by side."""
+    dt, result = float(t[1] - t[0]), np.zeros((len(signal), len(seconds)))
+    for k, lag in enumerate(seconds):
+        keep = np.exp(-dt / lag)
+        for i in range(1, len(signal)):
+            result[i, k] = keep * result[i - 1, k] + (1 - keep) * signal[i]
+    return result
+
+
+def _of(*signals) -> np.ndarray:
+    return np.stack([np.asarray(x, np.float64) for x in signals], axis=1)
+
+
+LAGS = (0.1, 0.3, 1.0, 3.0)
+CAUSES = {
+    "exp(-t / 0.5 s)": lambda log: _of(np.exp(-(np.asarray(log.t) - log.t[0]) / 0.5)),
+    "sin, cos of q2 and of 2 q2": lambda log: _of(*(f(k * log.q[:, 1]) for k in (1, 2) for f in (np.sin, np.cos))),
+    "sin, cos of q2, 2 q2, q3 and 2 q3": lambda log: _of(
+        *(f(k * log.q[:, j]) for j in (1, 2) for k in (1, 2) for f in (np.sin, np.cos))
+    ),
+    "low-passes of sign v2 (0.1 to 3 s)": lambda log: lagged(np.sign(log.v[:, 1]), log.t, LAGS),
+    "low-passes of v2 (0.1 to 3 s)": lambda log: lagged(np.asarray(log.v[:, 1]), log.t, LAGS),
+    "v2, a2, sign v2": lambda log: _of(log.v[:, 1], log.a[:, 1], np.sign(log.v[:, 1])),
+}
+STUDIES = {"cutoff": cutoffs, "delay": delays, "a2": slow_joint}
 
 
 def main() -> None:

@@ -48,9 +48,11 @@ class Construction(eqx.Module):
 
 
 def _number(value) -> Float[Array, "..."]:
+    if eqx.is_inexact_array(value):  # traced ones too
+        return jnp.asarray(value)
     if isinstance(value, bool) or not (isinstance(value, int) or eqx.is_inexact_array_like(value)):
         raise ValueError(f"numbers has {value!r}; give floating-point numbers or arrays")
-    return jnp.asarray(value) if eqx.is_inexact_array(value) else jnp.asarray(value, float)
+    return jnp.asarray(value, float)
 
 
 def built(system: Any) -> Scene:
