@@ -5,7 +5,8 @@
 - store: seconds of a run against those of its programs alone, an arm of seven joints, 400 steps of RK4, 11 rows each, in turns.
 - memory: peak of processes that run 1, 3 and 10 times as many rolling disks with 100 rows each (1e6 with --full, 9 GB on disk).
 - resume: a store of 1e5 (1e6 with --full) rolling disks with 99 % of its chunks: seconds from the start of a new process, imports
-  and compilation included, until the first new chunk is stored.
+  and compilation included, until the first new chunk is stored; and the same with JAX's cache of compiled programs
+  (JAX_COMPILATION_CACHE_DIR), which the first process filled.
 - cores: the arm in processes that may use one core and two: seconds and efficiency, t1/(2 t2).
 - cost: four-bars whose springs are soft or stiff, adaptive steps: lane-steps that a batch waits for over steps that are needed,
   and seconds, in the order of the numbers, by falling cost (`cost=`), and by the cost that is measured (`cost="measured"`).
@@ -29,6 +30,7 @@ import jaxdyn as jd
 from jaxdyn.scale import batch, driver
 
 QUIET = {"progress": False}
+CACHE = "JAX_COMPILATION_CACHE_DIR"
 
 
 def arm(samples: int, out, **options):
@@ -104,12 +106,13 @@ def store(folder: Path, samples: int) -> None:
     )
 
 
-def child(function: str, *arguments, cores: int | None = None) -> tuple[float, int]:
+def child(function: str, *arguments, cores: int | None = None, environment=None) -> tuple[float, int]:
     """Seconds of the loop and peak memory (bytes) of a process that runs `function`."""
     command = [sys.executable, "-m", "benchmarks.scale", "--child", function, *map(str, arguments)]
 
     command += [] if cores is None else [str(cores)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    environment = os.environ | (environment or {})
+    done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
     seconds, peak = done.stdout.split()[-2:]
     return float(seconds), int(peak)
 
@@ -123,27 +126,29 @@ def memory(folder: Path, samples: int) -> None:
 
 def resume(folder: Path, samples: int) -> None:
     """From the start of a process to the first new chunk, with 99 % done."""
-    out = folder / "resume.zarr"
-    run = disks(samples, out, points=11, chunk=max(1, samples // 100))
+    out, cache = folder / "resume.zarr", folder / "programs"
+    child("resumed", samples, out, environment={CACHE: str(cache)})
     from jaxdyn.scale.store import Store
 
     kept = Store(out)
     last = kept.chunks - 1
-    kept.forget(last)
-    before = time.perf_counter()
     command = [sys.executable, "-m", "benchmarks.scale", "--child", "resumed", str(samples), str(out)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    while not kept.is_done(last):
-        if process.poll() not in (None, 0):
-            raise RuntimeError("the resumed process failed")
-        time.sleep(0.005)
-    first = time.perf_counter() - before
-    process.communicate()
-    whole = time.perf_counter() - before
-    print(
-        f"resume: {run.samples} disks, 99 % done: {first:.3g} s to the first new chunk, {whole:.3g} s to the end with all "
-        "chunks looked through"
-    )
+    bare = {name: value for name, value in os.environ.items() if name != CACHE}
+    for name, environment in (("", bare), (", with JAX's cache of programs", bare | {CACHE: str(cache)})):
+        kept.forget(last)
+        before = time.perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+        while not kept.is_done(last):
+            if process.poll() not in (None, 0):
+                raise RuntimeError("the resumed process failed")
+            time.sleep(0.005)
+        first = time.perf_counter() - before
+        process.communicate()
+        whole = time.perf_counter() - before
+        print(
+            f"resume: {samples} disks, 99 % done{name}: {first:.3g} s to the first new chunk, {whole:.3g} s to the end with "
+            "all chunks looked through"
+        )
 
 
 def cores(folder: Path, samples: int) -> None:
