@@ -21,6 +21,8 @@ from jaxdyn.model.tree import Model
 
 # Shifts smaller than this (s) are none; the largest of one step, and how many steps are made.
 _SMALL, _STEP, _ROUNDS = 1e-6, 0.03, 12
+# Share of a standard deviation that the last step may be.
+_SETTLED = 0.1
 
 
 class Delays(NamedTuple):
@@ -95,13 +97,14 @@ def find_delays(
         if np.abs(step).max(initial=0) < _SMALL:
             break
         delay = delay + np.clip(step, -_STEP, _STEP)
-    else:
+    spread = problem.intervals(free, estimate)
+    std = spread.parameters.std[-model.nv :]
+    # Weights of a robust loss may keep the steps from shrinking below what no one knows anyway.
+    if np.any(np.abs(step) >= np.maximum(_SMALL, _SETTLED * std)):
         raise ValueError(
             f"delays do not settle; the last ones are {np.round(delay, 4).tolist()} s. Give them as numbers, or choose a "
             "lower cut-off"
         )
-    spread = problem.intervals(free, estimate)
-    std = spread.parameters.std[-model.nv :]
     # What does not foretell parts that are left out is none. Columns of the delay itself know the torque, and are not used here.
     squares = []
     for shift in (np.zeros(model.nv), delay):
