@@ -245,3 +245,23 @@ def test_times_that_do_not_increase_have_a_code():
         computed = run(jnp.array(times))
         assert computed.result == jd.RESULTS.unordered_times
         assert jnp.isnan(computed.q).all()
+
+
+@pytest.mark.parametrize("adjoint", ["forward", pytest.param("direct", marks=pytest.mark.slow)])
+def test_forward_mode_over_a_batch_is_that_of_its_samples(adjoint):
+    """A loop that is batched first and differentiated then, and the other way round."""
+    model, ts = jd.robots.chain(1), jnp.linspace(0.0, 0.2, 3)
+    starts = jnp.asarray([[0.3], [-0.4], [1.2]])
+
+    def moved(scale, q):
+        options = {"solver": diffrax.Heun(), "stepsize": 0.1, "adjoint": adjoint}
+        return jd.simulate(model, scale * q, jnp.zeros(1), ts, **options).q
+
+    def batch(scale):
+        return jax.vmap(lambda q: moved(scale, q))(starts)
+
+    batched_first = jax.jvp(batch, (1.0,), (1.0,))[1]
+    differentiated_first = jax.vmap(lambda q: jax.jvp(lambda scale: moved(scale, q), (1.0,), (1.0,))[1])(starts)
+    np.testing.assert_allclose(batched_first, differentiated_first, rtol=1e-13, atol=1e-15)
+    slope = (np.asarray(batch(1 + 1e-5)) - np.asarray(batch(1 - 1e-5))) / 2e-5
+    np.testing.assert_allclose(batched_first, slope, atol=1e-9)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 
 from jaxdyn.compile.known import partition_traced
 
@@ -17,7 +18,7 @@ def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
 
     @jax.custom_jvp
     def run(traced, *args):
-        return solve(known(traced), *args)
+        return _batch_first(solve(known(traced), *args))
 
     def rule(primals, tangents):
         traced, *args = primals
@@ -25,10 +26,27 @@ def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
         steps: list = [None] * known.structure.num_leaves
         for place, step in zip(known.places, tangents[0], strict=True):
             steps[place] = step
-        return tangent(known(traced), *args, [None if isinstance(x, zero) else x for x in (*steps, *tangents[1:])])
+        steps = [None if isinstance(x, zero) else x for x in (*steps, *tangents[1:])]
+        return _batch_first(tangent(known(traced), *args, steps))
 
     run.defjvp(rule, symbolic_zeros=True)
     return run(unknown, *args)
+
+
+def _batch_first(tree):
+    """The same arrays; in a batch, that is their leading axis.
+
+    Where a loop was batched before it is differentiated, JAX takes the value of a rule for one with its batch where that of the
+    function has it.
+    """
+
+    def first(x):
+        shape = jnp.shape(x)
+        if not shape or x.dtype == jax.dtypes.float0:
+            return x
+        return jnp.reshape(jnp.reshape(x, (1, *shape) if len(shape) == 1 else -1), shape)
+
+    return jax.tree.map(first, tree)
 
 
 def along(function: Callable, args: tuple, steps):
