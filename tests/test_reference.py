@@ -19,6 +19,7 @@ PAGES = sorted(path.stem for path in REFERENCE.glob("*.md") if path.stem != "ind
 # What another export returns, whose example shows it.
 SHOWN_BY = {
     "LeggedDynamics": "underactuated_inverse_dynamics",
+    "identify.DriveGains": "identify.fit_gains",
     "identify.Cutoff": "identify.choose_cutoff",
     "identify.Excitation": "identify.exciting_motion",
     "identify.Identifiability": "identify.identifiability",

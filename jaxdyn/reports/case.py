@@ -1,5 +1,6 @@
 """What a case of the report is: a scene with its reference, what is measured of it, and points that others have published."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -45,12 +46,15 @@ class Case(NamedTuple):
 
 
 def named(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
-    """`build` of a scene of `jaxdyn.scenes`, its start in numpy."""
+    """`build` of a scene of `jaxdyn.scenes`, its start in numpy; the scene and its start take the parameters that they have."""
+
+    def taken(function):
+        known = inspect.signature(function).parameters
+        return function(**{key: value for key, value in parameters.items() if key in known})
 
     def build():
         scene = getattr(scenes, name)
-        taken = {key: value for key, value in parameters.items() if key in ("formulation", "count", "contact")}
-        q, v = scene.start(**parameters)
-        return scene(**taken), (np.asarray(q), np.asarray(v))
+        q, v = taken(scene.start_function)
+        return taken(scene), (np.asarray(q), np.asarray(v))
 
     return build
