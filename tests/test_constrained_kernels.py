@@ -86,6 +86,7 @@ def test_equations_of_motion_and_rows_hold(solved):
     assert_close(np.einsum("nij,nj->ni", A, a), gamma, 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["rank_aware", pytest.param("range_space", marks=pytest.mark.slow)])
 def test_derivatives_are_those_of_the_dense_solve(method):
     """In masses, poses of a loop, states and forces; the dense solve in plain mode."""
@@ -190,7 +191,7 @@ def test_gradients_beside_a_singular_sample():
         assert np.isfinite(np.asarray(x)).all()
 
 
-@pytest.mark.parametrize("name", ["few", "windows", pytest.param("turning", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["windows", *(pytest.param(x, marks=pytest.mark.slow) for x in ("few", "turning"))])
 def test_residuals_of_open_loops(name):
     """Under nested `vmap`s, their derivatives, and the check of a motion's states, in both modes."""
     scene = scenes.windows() if name == "windows" else mechanism(name)
@@ -222,7 +223,9 @@ def at_start(name):
     return made(), q, v
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in ("andrews", "rolling_coin"))) for x in NAMES]
+)
 def test_systems_of_equations(name):
     """Accelerations, multipliers and derivatives, also off the constraints."""
     scene, q, v = at_start(name)

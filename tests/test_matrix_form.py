@@ -22,6 +22,7 @@ CASES = {
     "panda": lambda: load_robot("panda_description/urdf/panda.urdf", lock=("finger",))[1],
     "solo12": lambda: load_robot("solo_description/robots/solo12.urdf", floating=True)[1],
 }
+FEW = pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x != "forest")) for x in CASES])
 
 
 @functools.cache
@@ -49,7 +50,7 @@ def case(name):
     return (model, states, *jax.tree.map(np.asarray, out))
 
 
-@pytest.mark.parametrize("name", CASES)
+@FEW
 def test_link_frames_agree_with_the_tree_frame(name):
     _, (_, v, a), _, link, world = case(name)
     assert_close(link["mass_matrix"], world["mass_matrix"], 1e-12)
@@ -61,7 +62,7 @@ def test_link_frames_agree_with_the_tree_frame(name):
     assert_close(np.einsum("sij,sj->si", link["mass_matrix"], a) + bias, world["inverse_dynamics"], 1e-12)
 
 
-@pytest.mark.parametrize("name", CASES)
+@FEW
 def test_identities_of_the_block_matrices(name):
     model, (_, v, a), m, link, world = case(name)
     for s in range(len(v)):
@@ -165,7 +166,11 @@ def test_three_joint_arm_as_printed():
     assert_close(potential, g * sum(x * y for x, y in zip(m, h, strict=True)))
 
 
-@pytest.mark.parametrize("parents", [None, [0, 1, 2, 3, 4, 5], [0, 0, 2, -1, 4, 4]], ids=["tree", "chain", "forest"])
+@pytest.mark.parametrize(
+    "parents",
+    [*(pytest.param(x, marks=pytest.mark.slow) for x in (None, [0, 1, 2, 3, 4, 5])), [0, 0, 2, -1, 4, 4]],
+    ids=["tree", "chain", "forest"],
+)
 def test_derivative_of_the_mass_matrix(parents):
     kinds = ["revolute", "prismatic", "helical", "continuous", "revolute", "helical", "revolute"]
     model = random_tree(21, kinds, parents=None if parents is None else [-1, *parents])

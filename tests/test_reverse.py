@@ -72,6 +72,7 @@ def test_a_bad_lane_leaves_the_others_alone():
     np.testing.assert_allclose(computed[::2], alone, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["projected", pytest.param("reduced", marks=pytest.mark.slow)])
 def test_derivatives_of_constrained_motions(method):
     """Of a rolling disk, in what it starts with and in its mass, forward and reverse."""

@@ -14,9 +14,6 @@ from jaxdyn.dynamics import recursions
 
 FEW = {
     "panda.urdf": False,
-    "ur5_robot.urdf": False,
-    "kinova.urdf": False,
-    "allegro_right_hand.urdf": False,
     "anymal.urdf": True,
 }
 # ur3.urdf is a xacro file without links, which Pinocchio refuses too; the links of these two have no mass, so that some of
