@@ -161,6 +161,7 @@ def test_a_singular_sample_is_solved_with_its_rank():
             assert_close(x, y, 1e-10)
 
 
+@pytest.mark.slow
 def test_a_sample_is_not_changed_by_a_singular_one_beside_it():
     scene, q, v0 = two_windows()
 
@@ -175,6 +176,7 @@ def test_a_sample_is_not_changed_by_a_singular_one_beside_it():
         assert np.array_equal(x[others], y[others])
 
 
+@pytest.mark.slow
 def test_gradients_beside_a_singular_sample():
     scene, q, v0 = two_windows()
     q, turn, others = q.at[1].set(FLAT), jnp.cos(jnp.arange(5.0)), np.array([0, 2, 3])

@@ -40,6 +40,7 @@ def drift(solution) -> float:
     return float(jnp.max(jnp.abs(solution.energy - solution.energy[0])))
 
 
+@pytest.mark.slow
 def test_a01_pendulum_in_plane():
     """IFToMM A01: exact positions (elliptic functions), energy error below 1e-9 J over 10 s."""
     computed = motion(scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(), [0.0, 1.0, 5.0, 9.99, 10.0])
@@ -78,6 +79,7 @@ def test_andrews():
     assert drift(computed) < 1e-11
 
 
+@pytest.mark.slow
 def test_chaplygin_sleigh():
     """tanh and sech: printed state at t = 10."""
     computed = motion(scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start(), [0.0, 1.0, 2.0, 5.0, 10.0])

@@ -139,6 +139,7 @@ def test_twists_are_those_of_the_relative_pose(name):
     np.testing.assert_allclose(pose[:3, :3] @ computed.finger.frame[:, 2], -computed.object.frame[:, 2], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_pose_are_its_differences():
     o, f = PAIRS["ellipsoid on ellipsoid"]
     step, direction = 1e-5, jnp.array([0.3, -0.5, 0.2, 0.9, 0.4])

@@ -44,7 +44,7 @@ ROBOTS = {
     "icub": ("icub_description/robots/icub_reduced.urdf", True, ()),
     "g1": ("g1_description/urdf/g1_29dof_rev_1_0.urdf", True, ()),
 }
-# One tree with joints of every kind serves all fast tests, by one program; forests: test_kinematics, test_matrix_form.
+# One tree with joints of every kind serves all fast tests, by one program; a forest: test_matrix_form.
 CASES = [pytest.param(name, marks=[pytest.mark.slow] * (name != "floating")) for name in (*TREES, *ROBOTS)]
 
 
@@ -378,7 +378,7 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
 
 
 def test_batch_equals_loop_and_eager_equals_jit():
-    model = TREES["fixed"]()
+    model = TREES["floating"]()
     states = random_states(model, 5, 2)
     batch = PROGRAM(model, *states)
     one = quick(values)

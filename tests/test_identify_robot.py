@@ -395,6 +395,7 @@ def test_vibration_is_told_from_friction():
 # --- payloads ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_payload_is_what_loaded_logs_differ_by(truth):
     """A wrong nominal robot, friction and noise: mass, centre and inertia come back within their intervals."""
     model, nominal = arm(), arm(0.2, 3)

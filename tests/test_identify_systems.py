@@ -56,7 +56,7 @@ NAMES = tuple(f"parameters['{key}'][{i}]" for key in ("masses", "moments") for i
     ("error", "method"),
     [
         pytest.param("torque", "gauss-newton", marks=pytest.mark.slow),
-        ("torque", "lbfgs"),
+        pytest.param("torque", "lbfgs", marks=pytest.mark.slow),
         ("trajectory", "gauss-newton"),
     ],
 )

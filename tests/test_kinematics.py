@@ -61,7 +61,9 @@ def case(name):
     return source, model, bridge, frames, q, v, jax.tree.map(np.asarray, compiled(model, q, v))
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "forest")) for name in CASES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "every_kind")) for name in CASES]
+)
 def test_agrees_with_pinocchio(name):
     source, model, bridge, frames, q, v, ours = case(name)
     data = source.createData()

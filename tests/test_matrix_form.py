@@ -90,14 +90,14 @@ def test_identities_of_the_block_matrices(name):
 
 def test_tip_wrench_by_virtual_power():
     # Jt^T F_t: the tip's wrench on its surroundings is an external wrench on the last body with the sign turned.
-    model, (q, v, _), m, link, _ = case("panda")
+    model, (q, v, _), m, link, world = case("forest")
     wrench = np.array([1.0, -2, 3, 0.4, 0.5, -0.6])
     body = model.topology.frame_bodies[-1]
     on_body = -m.Pt[0][:, 6 * body : 6 * body + 6].T @ wrench
     external = jnp.zeros((model.nb, 6)).at[body].set(on_body)
     zero = jnp.zeros(model.nv)
     tau = quick(matrix_form.inverse_dynamics)(model, q[0], v[0], zero, external)
-    assert_close(tau, case("panda")[4]["bias_force"][0] + link["Jt"][0].T @ wrench, 1e-12)
+    assert_close(tau, world["bias_force"][0] + link["Jt"][0].T @ wrench, 1e-12)
 
 
 @quick

@@ -39,7 +39,10 @@ def gradients(adjoint, **options):
 
 @pytest.mark.parametrize(
     "options",
-    [{"stepsize": 0.05, "max_steps": 16}, {"rtol": 1e-6, "atol": 1e-6, "max_steps": 64, "solver": diffrax.Tsit5()}],
+    [
+        {"stepsize": 0.05, "max_steps": 16},
+        pytest.param({"rtol": 1e-6, "atol": 1e-6, "max_steps": 64, "solver": diffrax.Tsit5()}, marks=pytest.mark.slow),
+    ],
     ids=["fixed", "adaptive"],
 )
 def test_derivatives_are_those_of_diffrax(options, monkeypatch):

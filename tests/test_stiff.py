@@ -99,6 +99,7 @@ def test_coefficients_of_the_rosenbrock_method():
     assert max(size) < 1 + 1e-9 and size[-1] < 1e-4
 
 
+@pytest.mark.slow
 def test_order_of_the_rosenbrock_method():
     """A nonautonomous equation of two arrays: the end and the dense output."""
 

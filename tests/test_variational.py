@@ -248,6 +248,7 @@ def test_gradients():
     np.testing.assert_allclose(reverse, (values[::2] - values[1::2]) / (2 * d), rtol=1e-7)  # half of the digits
 
 
+@pytest.mark.slow
 def test_slopes_of_a_lagrangian():
     """dL/dv and dL/dq of a tree of all joints by automatic differentiation; of one system given in three ways."""
     model = tree("free", "spherical", "planar", "revolute")
