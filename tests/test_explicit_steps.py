@@ -78,7 +78,6 @@ def twice(scene):
     return Scene(scene.system, (rolling, jd.Pfaffian(rolling.A, name="again")))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param(name, marks=[pytest.mark.slow] * (name != "free body")) for name in CASES]
 )

@@ -220,7 +220,6 @@ def test_geometry_gravity_and_sensors_are_found_together(log):
     assert fit.error(recorded) < 5
 
 
-@pytest.mark.slow
 def test_a_length_that_enters_everywhere_is_found(log):
     """The length of the links moves joints and, with a mass per length, bodies: one number of a construction."""
 
@@ -268,7 +267,6 @@ class Tracking(eqx.Module):
         return self.gain * (0.4 * jnp.sin(3 * t + phase) - q) + 1.0 * (1.2 * jnp.cos(3 * t + phase) - v)
 
 
-@pytest.mark.slow
 def test_numbers_of_a_controlled_arm_by_its_motion_in_closed_loop():
     """Damping and a mass from a log under a controller; its torques are part of what is compared."""
     true, law, t = scene_of(arm()), Tracking(), np.linspace(0.0, 1.0, 26)
