@@ -42,6 +42,7 @@ def test_the_fingers_move_with_the_cube(hand):
         jd.scenes.allegro_with_cube.start(position=(0.3, 0.0, 0.0))
 
 
+@pytest.mark.slow
 def test_allegro_hand_grasps_a_cube(hand):
     """Fingertips meet their points; three hard fingers have force closure and hold the cube's weight within cones."""
     grasp, _, q = hand
@@ -59,6 +60,7 @@ def test_allegro_hand_grasps_a_cube(hand):
     np.testing.assert_allclose(wrench, [*weight, 0, 0, 0], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_contacts_that_do_not_touch_are_refused_with_their_gap(hand):
     """A cube 10 mm off along x: simulate names the contacts and how far they are open."""
     grasp, place, q = hand

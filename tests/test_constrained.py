@@ -237,6 +237,7 @@ def relative_twists(scene, q, v):
     return computed
 
 
+@pytest.mark.slow
 def test_dependent_rows_give_the_same_motion_and_the_least_multipliers():
     """The four-bar with five rows of a revolute joint in space for two in the plane, and a loop listed twice."""
     q, v = scenes.four_bar.start()

@@ -46,7 +46,7 @@ def torques(pendulum):
     return p, quick(lambda q, v, t: (hybrid(q, v, t), gauge(q, v, t)))
 
 
-@pytest.mark.parametrize("ki", [None, 4.0])
+@pytest.mark.parametrize("ki", [pytest.param(None, marks=pytest.mark.slow), 4.0])
 def test_motion_and_force_on_a_sphere(pendulum, ki):
     """Errors by the closed form; the force is the wanted one at every moment."""
     scene, q0, v0 = pendulum
@@ -69,6 +69,7 @@ def test_wrong_mass_shifts_the_force_by_the_stated_error(pendulum):
     assert np.abs(lam - PRESS)[0] > 1.0
 
 
+@pytest.mark.slow
 def test_integral_action_takes_a_force_error_away():
     """At the lowest place a wrong mass moves nothing and presses with a constant error, which decays as exp(-KI t)."""
     plant, q0, v0 = scenes.spherical_pendulum(mass=1.3), jnp.asarray([0.0, 0.0, -1.0]), jnp.zeros(3)
@@ -142,6 +143,7 @@ def test_three_motors_of_a_parallel_manipulator():
     np.testing.assert_allclose(moved[1].acceleration, moved[0].acceleration, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gauge_invariant_law_decays_as_its_gain_says(pendulum):
     """|W^T J (ed + Kp e)| is exp(-kd t) of its first value; the force as wanted."""
     scene, q0, v0 = pendulum

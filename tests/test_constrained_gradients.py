@@ -105,6 +105,7 @@ def test_methods_agree_on_derivatives(slopes):
         np.testing.assert_allclose(slopes[name], slopes["projected"], atol=1e-6 * np.abs(slopes["projected"]).max())
 
 
+@pytest.mark.slow
 def test_a_thousand_mechanisms_of_different_lengths():
     """One vmap over crank and rod: every lane stays closed and ends where the crank's angle puts it in closed form."""
     rng = np.random.default_rng(0)

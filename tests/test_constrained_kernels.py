@@ -88,6 +88,7 @@ def test_equations_of_motion_and_rows_hold(solved):
     assert_close(np.einsum("nij,nj->ni", A, a), gamma, 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["rank_aware", pytest.param("range_space", marks=pytest.mark.slow)])
 def test_derivatives_are_those_of_the_dense_solve(method):
     """In masses, poses of a loop, states and forces; the dense solve in plain mode."""
@@ -162,6 +163,7 @@ def test_a_singular_sample_is_solved_with_its_rank():
             assert_close(x, y, 1e-10)
 
 
+@pytest.mark.slow
 def test_a_sample_is_not_changed_by_a_singular_one_beside_it():
     scene, q, v0 = two_windows()
 
@@ -176,6 +178,7 @@ def test_a_sample_is_not_changed_by_a_singular_one_beside_it():
         assert np.array_equal(x[others], y[others])
 
 
+@pytest.mark.slow
 def test_gradients_beside_a_singular_sample():
     scene, q, v0 = two_windows()
     q, turn, others = q.at[1].set(FLAT), jnp.cos(jnp.arange(5.0)), np.array([0, 2, 3])
@@ -192,7 +195,7 @@ def test_gradients_beside_a_singular_sample():
         assert np.isfinite(np.asarray(x)).all()
 
 
-@pytest.mark.parametrize("name", ["few", "windows", pytest.param("turning", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["windows", *(pytest.param(x, marks=pytest.mark.slow) for x in ("few", "turning"))])
 def test_residuals_of_open_loops(name):
     """Under nested `vmap`s, their derivatives, and the check of a motion's states, in both modes."""
     scene = scenes.windows() if name == "windows" else mechanism(name)
@@ -224,7 +227,9 @@ def at_start(name):
     return made(), q, v
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in ("andrews", "rolling_coin"))) for x in NAMES]
+)
 def test_systems_of_equations(name):
     """Accelerations, multipliers and derivatives, also off the constraints."""
     scene, q, v = at_start(name)

@@ -40,6 +40,7 @@ def drift(solution) -> float:
     return float(jnp.max(jnp.abs(solution.energy - solution.energy[0])))
 
 
+@pytest.mark.slow
 def test_a01_pendulum_in_plane():
     """IFToMM A01: exact positions (elliptic functions), energy error below 1e-9 J over 10 s."""
     computed = motion(scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(), [0.0, 1.0, 5.0, 9.99, 10.0])
@@ -63,6 +64,7 @@ def test_car_axis():
     np.testing.assert_allclose(computed.v[-1], v, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_andrews():
     """Positions published to 1e-10, velocities to 5e-8 relative; the energy balance is exact."""
     computed = motion(scenes.andrews(), scenes.andrews.start(), [0.0, 0.01, 0.02, 0.03], rtol=1e-13, atol=1e-13)
@@ -77,6 +79,7 @@ def test_andrews():
     assert drift(computed) < 1e-11
 
 
+@pytest.mark.slow
 def test_chaplygin_sleigh():
     """tanh and sech: printed state at t = 10."""
     computed = motion(scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start(), [0.0, 1.0, 2.0, 5.0, 10.0])
@@ -160,7 +163,14 @@ def test_a02_forty_windows():
     assert drift(computed) < 1e-4
 
 
-@pytest.mark.parametrize(("solver", "order"), [(diffrax.Tsit5(), 5), (diffrax.Dopri8(), 8), (diffrax.Kvaerno5(), 5)])
+@pytest.mark.parametrize(
+    ("solver", "order"),
+    [
+        pytest.param(diffrax.Tsit5(), 5, marks=pytest.mark.slow),
+        (diffrax.Dopri8(), 8),
+        pytest.param(diffrax.Kvaerno5(), 5, marks=pytest.mark.slow),
+    ],
+)
 def test_projection_keeps_the_order(solver, order):
     """Error of the spherical pendulum at t = 1 under halved steps, and of a save point between steps."""
     scene, (q, v) = scenes.spherical_pendulum(), scenes.spherical_pendulum.start()
@@ -235,7 +245,7 @@ def test_bad_starts_and_methods_are_refused():
     assert [bool(codes(x * q)) for x in (0.9, 1.0)] == [True, False]
 
 
-@pytest.mark.parametrize("method", ["multipliers", "baumgarte"])
+@pytest.mark.parametrize("method", [pytest.param("multipliers", marks=pytest.mark.slow), "baumgarte"])
 def test_rows_that_contradict_each_other_end_with_a_code(method):
     """q1 = 0 and q1 = t^2 meet at t = 0, with their rates. Without a projection no open constraint would tell."""
     system = LagrangianSystem(double_pendulum, 2)

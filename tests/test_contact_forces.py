@@ -51,6 +51,7 @@ def test_optimal_forces_hold_the_ball():
     np.testing.assert_allclose(computed.x, other.x, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_optimal_forces_are_differentiable_in_friction_and_wrench():
     _, G = held_ball()
 

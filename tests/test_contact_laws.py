@@ -56,6 +56,7 @@ def body_forces(twist, pose):
     return M, turning, np.concatenate([pose[:3, :3].T @ [0.0, 0.0, -9.81 * MASS], np.zeros(3)])
 
 
+@pytest.mark.slow
 def test_law_of_a_tip_that_slides_is_the_printed_one():
     """tau = J^T F_m with F_m of erratum E21 for the arm whose mass is the ball: five errors, and one force."""
     scene, (q, v) = light("frictionless"), start("frictionless")

@@ -26,6 +26,7 @@ def bump(alpha):
 
 
 EGG, TIP = Ellipsoid([0.1, 0.2, 0.15]), Ellipsoid([0.03, 0.02, 0.05], poles="x")
+FAST = ("sphere on sphere", "ellipsoid on a parametrised surface")
 PAIRS = {
     "sphere on sphere": (Sphere(0.1), Sphere(0.02)),
     "ellipsoid on ellipsoid": (EGG, TIP),
@@ -116,7 +117,7 @@ def test_ball_on_a_plane_rolls_by_its_radius():
     np.testing.assert_allclose(jnp.linalg.norm((kinematics.rolling @ jnp.array([0.6, -0.8]))[:2]), 0.1, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in FAST)) for x in PAIRS])
 def test_twists_are_those_of_the_relative_pose(name):
     o, f = PAIRS[name]
 
@@ -138,6 +139,7 @@ def test_twists_are_those_of_the_relative_pose(name):
     np.testing.assert_allclose(pose[:3, :3] @ computed.finger.frame[:, 2], -computed.object.frame[:, 2], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_pose_are_its_differences():
     o, f = PAIRS["ellipsoid on ellipsoid"]
     step, direction = 1e-5, jnp.array([0.3, -0.5, 0.2, 0.9, 0.4])
@@ -205,6 +207,7 @@ def test_where_a_chart_ends_traced_numbers_are_finite_and_told():
     assert bool(surface_geometry(other, other.coordinates(ball.point(pole))).regular)
 
 
+@pytest.mark.slow
 def test_float32_stays_float32():
     kinematics = montana(Sphere(jnp.float32(0.1)), Sphere(jnp.float32(0.02)), ETA.astype(jnp.float32))
     assert kinematics.J_c.dtype == jnp.float32 == kinematics.forward.dtype

@@ -161,6 +161,7 @@ def test_derivatives_are_those_of_differences():
     np.testing.assert_allclose(forward[smooth], fine[smooth], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_second_derivative_is_that_of_differences():
     S, c = jnp.eye(3)[None] * jnp.array([-1.0, -1.0, -1.0])[None, None], jnp.zeros((1, 3))
 
@@ -212,6 +213,7 @@ def test_too_few_steps_are_told():
     np.testing.assert_allclose(limited.x[~stalled], whole.x[~stalled], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_known_zeros_of_rows_cost_nothing():
     """Rows that are numpy arrays while a program is traced: the same solution by half the operations."""
     Q, q, G, *_ = (np.asarray(x[:3]) for x in quadruped(3, 1))

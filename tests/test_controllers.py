@@ -88,6 +88,7 @@ def test_a_controllers_state_is_integrated_with_the_motion():
     assert last == computed.q[-1, 0]
 
 
+@pytest.mark.slow
 def test_adaptive_steps_integrate_a_state_as_fixed_ones_do():
     """Multipliers reach a filter: z = the solution of dz/dt = 5 (lam - z) with the lam of the output."""
     scene = scenes.spherical_pendulum()

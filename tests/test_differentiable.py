@@ -51,6 +51,7 @@ WEIGHTS = np.sin(np.arange(12.0)).reshape(4, 3)
 START = jnp.asarray([1.0, 2.0, 20.0]), jnp.asarray(28.0), jnp.asarray(TS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "solver"),
     [
@@ -131,7 +132,7 @@ def test_room_for_steps(monkeypatch):
     np.testing.assert_array_equal(plain[0], free[0])
 
 
-@pytest.mark.parametrize("case", ["no step", "one step"])
+@pytest.mark.parametrize("case", [pytest.param("no step", marks=pytest.mark.slow), "one step"])
 def test_runs_that_end_early(case):
     """No step kept, as the rates after the start are no numbers, or one: codes, and derivatives of what was reached."""
 

@@ -145,6 +145,7 @@ def test_spurious_terms_of_the_sleigh():
     assert abs(terms.terms @ np.array([u * c, w])) < 1e-12
 
 
+@pytest.mark.slow
 def test_no_spurious_terms():
     """Integrable rows, s = h(r), allow the substitution; so does, by accident, the upright disk."""
     curved = Pfaffian(lambda q, t: jnp.stack([jnp.cos(q[0]) * q[1], jnp.sin(q[0]), 1.0 + 0 * t]))  # d(q1 sin q0 + q2)

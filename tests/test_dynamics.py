@@ -44,8 +44,8 @@ ROBOTS = {
     "icub": ("icub_description/robots/icub_reduced.urdf", True, ()),
     "g1": ("g1_description/urdf/g1_29dof_rev_1_0.urdf", True, ()),
 }
-# Where nothing slow is wanted, small arms stand for all.
-FEW = [pytest.param(name, marks=[pytest.mark.slow] * (name not in ("panda", "ur5"))) for name in ROBOTS]
+# One tree with joints of every kind serves all fast tests, by one program; a forest: test_matrix_form.
+CASES = [pytest.param(name, marks=[pytest.mark.slow] * (name != "floating")) for name in (*TREES, *ROBOTS)]
 
 
 def values(model, q, v, a, tau, external):
@@ -115,7 +115,7 @@ def pinocchio_values(source, bridge, q, v, a, tau, external):
     return out, acceleration
 
 
-@pytest.mark.parametrize("name", [*TREES, *FEW])
+@pytest.mark.parametrize("name", CASES)
 def test_agrees_with_pinocchio(name):
     source, _, bridge, states, ours = case(name)
     q, *rest = states
@@ -128,7 +128,7 @@ def test_agrees_with_pinocchio(name):
         assert_close(ours["forward_dynamics"][s], acceleration, max(1e-10, 1e-15 * condition), "forward_dynamics")
 
 
-@pytest.mark.parametrize("name", [*TREES, *FEW])
+@pytest.mark.parametrize("name", CASES)
 def test_identities_at_one_state(name):
     _, model, _, (_, v, a, tau, _), ours = case(name)
     mass, armature = ours["mass_matrix"], 0.0 if model.armature is None else np.asarray(model.armature)
@@ -238,7 +238,7 @@ def _mjcf(model) -> str:
     )
 
 
-@pytest.mark.parametrize("first", ["free", "revolute"])
+@pytest.mark.parametrize("first", ["free", pytest.param("revolute", marks=pytest.mark.slow)])
 def test_agrees_with_mujoco(first):
     kinds = [first, "revolute", "spherical", "prismatic", "revolute", "spherical", "revolute"]
     model = random_tree(41, kinds)
@@ -328,6 +328,7 @@ PLACE_FREE = ("mass_matrix", "coriolis", "gravity_force", "bias_force", "inverse
 PLACE_FREE += ("kinetic_energy", "centroidal_momentum", "centroidal_momentum_matrix", "torque_regressor")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fixed", pytest.param("floating", marks=pytest.mark.slow)])
 def test_far_robot_is_as_exact_as_at_home(name):
     # Ten kilometres away, no bit changes, in float64 and in float32.
@@ -377,7 +378,7 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
 
 
 def test_batch_equals_loop_and_eager_equals_jit():
-    model = TREES["fixed"]()
+    model = TREES["floating"]()
     states = random_states(model, 5, 2)
     batch = PROGRAM(model, *states)
     one = quick(values)
@@ -478,6 +479,7 @@ def test_every_quantity_has_derivatives_in_every_leaf():
         assert_close(got, want, 1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds",
     [("revolute", "spherical", "prismatic"), pytest.param(("revolute", "free", "planar"), marks=pytest.mark.slow)],

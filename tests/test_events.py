@@ -72,6 +72,7 @@ def test_steps_of_fixed_length_end_at_events_and_go_on(shaken):
     assert 10 < errors[0] / errors[1] < 24
 
 
+@pytest.mark.slow
 def test_steps_of_fixed_length_have_gradients_through_events():
     ts = jnp.asarray([0.0, 2.5, 4.0])
 
@@ -305,6 +306,7 @@ def test_gradients_go_through_an_impact():
     np.testing.assert_allclose(gradient, differences(values, at, 1e-4 * jnp.eye(4)), atol=1e-6)  # of the differences
 
 
+@pytest.mark.slow
 def test_friction_in_proportion_to_a_multiplier_of_both_sides():
     """A bead on a rough hoop without gravity: N = m v^2/R either way, so v = v0/(1 + mu v0 t/R)."""
     system = jd.LagrangianSystem(lambda q, v, t, p: 0.5 * jnp.sum(v * v) - p["g"] * q[1], 2, parameters={"g": 0.0})
@@ -340,6 +342,7 @@ def test_smooth_friction_creeps_as_it_says():
     np.testing.assert_allclose(forces[-1], -half, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_belt_drags_a_block_along_until_the_spring_is_stronger():
     """It sticks to the belt while k x < mu_s N: to the time x_s/v_belt, and slips there."""
     k, belt = 2.0, 0.5
@@ -359,6 +362,7 @@ def test_belt_drags_a_block_along_until_the_spring_is_stronger():
     np.testing.assert_allclose(motion.q[motion.ts > slips, 0][t < stuck], x[t < stuck], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_float32_finds_the_same_events():
     with jax.enable_x64(False):
         scene = jd.Scene(jd.scenes.sliding_block().system, forces=(jd.DryFriction(MU, G, 0, static=MU_S),))

@@ -24,7 +24,9 @@ def field(t, y, args):
     return {"angles": y["rates"].reshape(y["angles"].shape), "rates": pull - 0.05 * y["rates"]}
 
 
-@pytest.mark.parametrize("shape", [(1,), (7,), (3, 4), pytest.param((40,), marks=pytest.mark.slow)], ids=str)
+@pytest.mark.parametrize(
+    "shape", [(7,), *(pytest.param(x, marks=pytest.mark.slow) for x in ((1,), (3, 4), (40,)))], ids=str
+)
 @pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5(), diffrax.Heun()], ids=lambda s: type(s).__name__)
 def test_steps_are_those_of_diffrax(solver, shape):
     """States of one piece, of several, and of one that is too large to be cut."""
@@ -153,7 +155,7 @@ def motion(name, **options):
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("free_body", {}),
+        pytest.param("free_body", {}, marks=pytest.mark.slow),
         pytest.param("double_pendulum", {"outputs": ("energy", "acceleration")}, marks=pytest.mark.slow),
         ("rolling_disk", {"outputs": ("multipliers", "constraint_residual", "energy", "acceleration")}),
         pytest.param("four_bar", {}, marks=pytest.mark.slow),

@@ -136,6 +136,7 @@ def test_the_motion_does_not_depend_on_the_gauge(state):
     assert_close(back, x.reduced_acceleration, 1e-12)
 
 
+@pytest.mark.slow
 def test_bodies_with_dependent_rows():
     """A pendulum with its rod listed three times; the sleigh, a body whose velocity is not dq/dt. Eager calls."""
     scene, (q, v) = scenes.spherical_pendulum(), scenes.spherical_pendulum.start()

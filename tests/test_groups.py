@@ -264,7 +264,12 @@ def check(derivatives, oracle, where):
 TOLERANCE = {"float64": (1e-14, 3e-14, 5e-14), "float32": (1e-6, 4e-6, 1e-5)}
 
 # se3 contains every formula of so3 as a block, so so3 itself need not be compiled again in float32.
-CASES = [("so3", "float64"), ("se3", "float64"), ("se2", "float64"), ("se3", "float32"), ("se2", "float32")]
+CASES = [
+    ("so3", "float64"),
+    ("se3", "float64"),
+    ("se2", "float64"),
+    *(pytest.param(x, "float32", marks=pytest.mark.slow) for x in ("se3", "se2")),
+]
 
 
 def third_derivatives(s):

@@ -89,6 +89,7 @@ def solved(grasp, motions, q, nu, tau):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hand", [pytest.param(name, marks=[pytest.mark.slow] * (name != "tall")) for name in HANDS])
 def test_equations_of_any_hand_are_those_with_multipliers(hand):
     """M~ is the projection of the saddle-point system, on random grasps; lemma 6.1; forces (6.24); energies and powers."""

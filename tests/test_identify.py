@@ -340,7 +340,7 @@ def noisy(iiwa, wrong_iiwa):
     return log, identify.fit_torques(wrong_iiwa, log)
 
 
-@pytest.mark.parametrize("method", ["newton", "lbfgs", pytest.param("adam", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["newton", *(pytest.param(x, marks=pytest.mark.slow) for x in ("lbfgs", "adam"))])
 def test_every_iterate_is_feasible_and_the_optimum_is_one(wrong_iiwa, noisy, method):
     """Whatever the method, it stays among physical models and goes to the one minimum of a convex loss."""
     log, newton = noisy

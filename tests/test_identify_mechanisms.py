@@ -20,6 +20,7 @@ def moved(scene, q0, v0, motors, size=2.0):
     return np.asarray(motion.q), np.asarray(motion.v), tau
 
 
+@pytest.mark.slow
 def test_a_four_bar_is_completed_from_its_crank():
     scene = jd.scenes.four_bar()
     q, v, tau = moved(scene, *jd.scenes.four_bar.start(), (0,), size=20.0)

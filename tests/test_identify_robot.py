@@ -293,6 +293,7 @@ def correlated(seed, n):
     return np.stack([np.convolve(x, kernel / np.linalg.norm(kernel), "same") for x in white(seed, n).T], axis=1)
 
 
+@pytest.mark.slow
 def test_intervals_cover():
     """1 % of noise on the torques, 8 arms of 13 combinations: 95 % intervals hold the truth nine times in ten."""
     assert coverage(white, 8) >= 0.90
@@ -394,6 +395,7 @@ def test_vibration_is_told_from_friction():
 # --- payloads ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_payload_is_what_loaded_logs_differ_by(truth):
     """A wrong nominal robot, friction and noise: mass, centre and inertia come back within their intervals."""
     model, nominal = arm(), arm(0.2, 3)

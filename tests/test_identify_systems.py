@@ -53,7 +53,12 @@ NAMES = tuple(f"parameters['{key}'][{i}]" for key in ("masses", "moments") for i
 
 
 @pytest.mark.parametrize(
-    ("error", "method"), [("torque", "gauss-newton"), ("torque", "lbfgs"), ("trajectory", "gauss-newton")]
+    ("error", "method"),
+    [
+        pytest.param("torque", "gauss-newton", marks=pytest.mark.slow),
+        pytest.param("torque", "lbfgs", marks=pytest.mark.slow),
+        ("trajectory", "gauss-newton"),
+    ],
 )
 def test_parameters_of_a_lagrangian_are_recovered(swung, error, method):
     """Masses and moments of both links, which the motion determines with known lengths; and they stay positive."""

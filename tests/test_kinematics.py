@@ -61,7 +61,9 @@ def case(name):
     return source, model, bridge, frames, q, v, jax.tree.map(np.asarray, compiled(model, q, v))
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "g1")) for name in CASES])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "every_kind")) for name in CASES]
+)
 def test_agrees_with_pinocchio(name):
     source, model, bridge, frames, q, v, ours = case(name)
     data = source.createData()
@@ -187,7 +189,7 @@ def test_neutral_is_home_and_derivatives_are_finite_there():
     assert np.isfinite(hessian).all() and np.abs(hessian).max() > 0
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
 def test_far_robot_is_as_exact_as_at_home(dtype):
     # Moving the robot by 1e4 m along the world axes changes no bit of what does not depend on the place.
     fixed = as_dtype(random_tree(4, ["revolute", "helical", "spherical", "prismatic"]), dtype)

@@ -281,6 +281,7 @@ def hanging(angle):
 FORMULATIONS = ("lagrangian", "immersion", "model", "loop")
 
 
+@pytest.mark.slow
 def test_double_pendulum_in_four_formulations():
     """One mechanism: the same accelerations, energies and equations as printed, for bars and for point masses."""
     built = {name: scenes.double_pendulum(formulation=name) for name in FORMULATIONS}
@@ -444,6 +445,7 @@ def test_a_block_that_has_stopped_gains_no_energy():
     assert_close(scene.applied_force(q0, -v0), [0.3 * G], 1e-15)
 
 
+@pytest.mark.slow
 def test_trajectories_are_differentiated_by_parameters_of_the_lagrangian():
     """Reverse mode through half a second of a double pendulum, against central differences."""
     at = jnp.asarray([1.0, 0.5, 1.0, 0.5, 0.35, G])

@@ -38,6 +38,7 @@ def test_a_motion_ends_where_a_joint_meets_its_limit(cart):
     assert bool(free.success) and int(free.stats["passed_limit"]) == -1
 
 
+@pytest.mark.slow
 def test_lanes_end_at_their_own_times(cart):
     """From -v: down and back up again, or through the lower limit; q(t) = v t + t^2 / 4."""
     speeds = jnp.array([[0.0], [-0.9], [-1.2], [0.5]])

@@ -29,6 +29,7 @@ def test_joints_of_every_kind():
         assert_close(x, y, 1e-11)
 
 
+@pytest.mark.slow
 def test_derivatives():
     model = random_tree(3, ("revolute", "spherical", "prismatic"), parents=(-1, 0, 0))
     q, v, _, tau, _ = (x[0] for x in random_states(model, 1, 1))
@@ -73,7 +74,7 @@ def test_five_hundred_links(branching):
 
 
 @pytest.mark.parametrize("links", [pytest.param(40, marks=pytest.mark.slow), dynamics.MAX_BODIES + 1])
-@pytest.mark.parametrize("count", [1, 40])
+@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 40])
 def test_long_chains(count, links):
     """With the most bodies of a kernel and more, against the matrix form; which way was taken."""
     model = planar_chain(links)

@@ -22,6 +22,7 @@ CASES = {
     "panda": lambda: load_robot("panda_description/urdf/panda.urdf", lock=("finger",))[1],
     "solo12": lambda: load_robot("solo_description/robots/solo12.urdf", floating=True)[1],
 }
+FEW = pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x != "forest")) for x in CASES])
 
 
 @functools.cache
@@ -49,7 +50,7 @@ def case(name):
     return (model, states, *jax.tree.map(np.asarray, out))
 
 
-@pytest.mark.parametrize("name", CASES)
+@FEW
 def test_link_frames_agree_with_the_tree_frame(name):
     _, (_, v, a), _, link, world = case(name)
     assert_close(link["mass_matrix"], world["mass_matrix"], 1e-12)
@@ -61,7 +62,7 @@ def test_link_frames_agree_with_the_tree_frame(name):
     assert_close(np.einsum("sij,sj->si", link["mass_matrix"], a) + bias, world["inverse_dynamics"], 1e-12)
 
 
-@pytest.mark.parametrize("name", CASES)
+@FEW
 def test_identities_of_the_block_matrices(name):
     model, (_, v, a), m, link, world = case(name)
     for s in range(len(v)):
@@ -89,14 +90,14 @@ def test_identities_of_the_block_matrices(name):
 
 def test_tip_wrench_by_virtual_power():
     # Jt^T F_t: the tip's wrench on its surroundings is an external wrench on the last body with the sign turned.
-    model, (q, v, _), m, link, _ = case("panda")
+    model, (q, v, _), m, link, world = case("forest")
     wrench = np.array([1.0, -2, 3, 0.4, 0.5, -0.6])
     body = model.topology.frame_bodies[-1]
     on_body = -m.Pt[0][:, 6 * body : 6 * body + 6].T @ wrench
     external = jnp.zeros((model.nb, 6)).at[body].set(on_body)
     zero = jnp.zeros(model.nv)
     tau = quick(matrix_form.inverse_dynamics)(model, q[0], v[0], zero, external)
-    assert_close(tau, case("panda")[4]["bias_force"][0] + link["Jt"][0].T @ wrench, 1e-12)
+    assert_close(tau, world["bias_force"][0] + link["Jt"][0].T @ wrench, 1e-12)
 
 
 @quick
@@ -165,7 +166,11 @@ def test_three_joint_arm_as_printed():
     assert_close(potential, g * sum(x * y for x, y in zip(m, h, strict=True)))
 
 
-@pytest.mark.parametrize("parents", [None, [0, 1, 2, 3, 4, 5], [0, 0, 2, -1, 4, 4]], ids=["tree", "chain", "forest"])
+@pytest.mark.parametrize(
+    "parents",
+    [*(pytest.param(x, marks=pytest.mark.slow) for x in (None, [0, 1, 2, 3, 4, 5])), [0, 0, 2, -1, 4, 4]],
+    ids=["tree", "chain", "forest"],
+)
 def test_derivative_of_the_mass_matrix(parents):
     kinds = ["revolute", "prismatic", "helical", "continuous", "revolute", "helical", "revolute"]
     model = random_tree(21, kinds, parents=None if parents is None else [-1, *parents])

@@ -38,6 +38,7 @@ def agree(section: str, theirs: dict, ours: dict, rtol: float) -> None:
         np.testing.assert_allclose(b, a, rtol=rtol, atol=rtol * max(1.0, np.abs(a[np.isfinite(a)]).max()), err_msg=left)
 
 
+@pytest.mark.slow
 def test_calls_of_pinocchio(robots_dir):
     path = str(robots_dir / "ur_description" / "urdf" / "ur5_robot.urdf")
     model, robot = pin.buildModelFromUrdf(path), jd.load_urdf(path)

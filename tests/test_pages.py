@@ -86,6 +86,7 @@ def test_every_export_is_described():
     assert len(exports()) > 300 and not wrong, "\n".join(wrong)
 
 
+@pytest.mark.slow
 def test_examples_of_the_page_on_pictures_run(tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="viser is not installed")
     monkeypatch.chdir(tmp_path)
@@ -119,6 +120,7 @@ def test_recipe_geometry():
     np.testing.assert_allclose(recipe("Optimising a geometry")["lengths"], [0.32, 0.95, 0.75], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_recipe_operational_space():
     names = recipe("Operational space")
     # The circle starts with 0.2 m/s, the arm at rest: the error rises and then decays as its gains say.

@@ -27,6 +27,8 @@ from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
+# With the slow tests also without kernels.
+BOTH = pytest.mark.parametrize("mode", ["auto", pytest.param("plain", marks=pytest.mark.slow)], indirect=True)
 DRIFTS = (0.0, 1e-12, 1e-9, 1e-6, 1e-4)
 
 
@@ -99,6 +101,7 @@ def test_states_come_back_by_the_least_change(name, parameters):
         assert np.linalg.norm(across) <= 20 * drift * max(np.linalg.norm(force), 1e-12) + 1e-13
 
 
+@BOTH
 @pytest.mark.parametrize(
     "name, parameters",
     [("windows", {"count": 2}), pytest.param("rolling_coin", {}, marks=pytest.mark.slow)],
@@ -130,6 +133,7 @@ def test_errors_of_a_step_lose_what_the_projection_removes(name, parameters, mod
     assert_close(computed[0], jnp.stack([q] * 3), 1e-14)
 
 
+@BOTH
 def test_what_a_projection_leaves_open_is_an_error(mode):
     """States so far off that all steps are not enough, or one would lead away; beside them one that is closed."""
     scene, (q, v) = scenes.windows(count=1), scenes.windows.start(count=1)
@@ -148,6 +152,7 @@ def test_what_a_projection_leaves_open_is_an_error(mode):
     assert (error > 0.3 * left)[1:].all()
 
 
+@BOTH
 def test_a_singular_sample_of_a_batch_is_projected_by_its_rank(mode):
     scene, q, v = drifted("windows", count=2)
     zero = jnp.asarray(0.0)
@@ -164,7 +169,7 @@ def test_a_singular_sample_of_a_batch_is_projected_by_its_rank(mode):
     "name",
     ["andrews", "car_axis", "rolling_disk", "chaplygin_sleigh", pytest.param("rolling_coin", marks=pytest.mark.slow)],
 )
-@pytest.mark.parametrize("off", [1e-3, 1e-6, 0.0])
+@pytest.mark.parametrize("off", [1e-3, *(pytest.param(x, marks=pytest.mark.slow) for x in (1e-6, 0.0))])
 def test_kernels_project_as_matrices_do(name, off):
     """On the constraints to rounding, and as close to the start of the projection as in plain mode."""
     made = getattr(scenes, name)

@@ -188,7 +188,10 @@ def wanted(name):
 
 
 @pytest.mark.parametrize("traced", [False, True], ids=["known", "traced"])
-@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=[pytest.mark.slow] * (x not in ("every kind", "screws of other norms"))) for x in TREES],
+)
 def test_against_matrix_form(name, traced):
     model = TREES[name]()
     sample = [x[0] for x in random_states(model, 1, 7)]

@@ -298,6 +298,7 @@ def steering(q, v, t):
     return jnp.stack([zero, zero, 0.1 * jnp.cos(t) - 0.02 * v[2], 0.3 * jnp.sin(2 * t)])
 
 
+@pytest.mark.slow
 def test_rolling_disk_with_torques_full_and_reduced():
     """Four coordinates with multipliers and two velocities: one motion to 1e-10; m d/dt (rho phidot (cos, sin))."""
     scene, state = scenes.rolling_disk(mass=2.0, radius=RHO), scenes.rolling_disk.start(radius=RHO)
@@ -320,9 +321,10 @@ def test_rolling_disk_with_torques_full_and_reduced():
     np.testing.assert_allclose(full.acceleration[:, 2:], torques[:, 2:] / [0.125, 0.25 + 2.0 * RHO**2], atol=1e-10)
 
 
-def test_sleigh_in_minimal_velocities():
+@pytest.mark.parametrize("method", [Reduced((0, 2)), pytest.param("reduced", marks=pytest.mark.slow)], ids=str)
+def test_sleigh_in_minimal_velocities(method):
     """tanh and sech: printed state at t = 10, v = (forward, sideways, yaw rate) with the yaw rate and speed kept."""
-    computed = moved(scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start(), [0.0, 10.0], method="reduced")
+    computed = moved(scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start(), [0.0, 10.0], method=method)
     assert bool(computed.success)
     np.testing.assert_allclose(computed.q[-1], [-8.600842105481, -0.4306517115655, 3.570508149338], atol=1e-10)
     np.testing.assert_allclose(computed.v[-1], [1.169390226108, 0.0, 0.00670176830728], atol=1e-10)
@@ -382,14 +384,20 @@ def test_a_basis_that_becomes_singular_ends_the_run():
         simulate(scene, *state, ts, method="reduced", adjoint="backsolve")
 
 
-def test_baumgarte_pulls_back_but_errs():
-    """phi'' + 2 alpha phi' + beta^2 phi = 0 along the accelerations; the residual is between the other methods'."""
+def test_accelerations_of_baumgarte():
+    """phi'' + 2 alpha phi' + beta^2 phi = 0 along them."""
     scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(angle=0.4, rate=0.5)
     alpha, beta = 3.0, 5.0
     off, drift = q * 1.01, v + jnp.asarray([0.1, 0.02])
     a = Baumgarte(alpha, beta).acceleration(scene, off, drift, jnp.zeros(()), None)
     phi, rate = 0.5 * (off @ off - 1.0), off @ drift
     np.testing.assert_allclose(off @ a + drift @ drift, -2 * alpha * rate - beta**2 * phi, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_baumgarte_pulls_back_but_errs():
+    """The residual is between those of the other methods."""
+    scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(angle=0.4, rate=0.5)
     options = {"rtol": 1e-8, "atol": 1e-8}
     opened, pulled, held = (
         moved(scene, (q, v), [0.0, 5.0], method=method, **options).constraint_residual[-1, 0]

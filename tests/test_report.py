@@ -241,10 +241,10 @@ def counting():
 @pytest.mark.parametrize(
     ("name", "solver"),
     [
-        ("pendulum", "Tsit5"),
+        pytest.param("pendulum", "Tsit5", marks=pytest.mark.slow),
         ("pendulum_in_plane", "Tsit5"),
-        ("pendulum", "Dopri8"),
-        ("pendulum_in_plane", "Dopri8"),
+        pytest.param("pendulum", "Dopri8", marks=pytest.mark.slow),
+        pytest.param("pendulum_in_plane", "Dopri8", marks=pytest.mark.slow),
         ("pendulum", "RK4"),
     ],
 )

@@ -41,7 +41,10 @@ def gradients(adjoint, **options):
 
 @pytest.mark.parametrize(
     "options",
-    [{"stepsize": 0.05, "max_steps": 16}, {"rtol": 1e-6, "atol": 1e-6, "max_steps": 64, "solver": diffrax.Tsit5()}],
+    [
+        {"stepsize": 0.05, "max_steps": 16},
+        pytest.param({"rtol": 1e-6, "atol": 1e-6, "max_steps": 64, "solver": diffrax.Tsit5()}, marks=pytest.mark.slow),
+    ],
     ids=["fixed", "adaptive"],
 )
 def test_derivatives_are_those_of_diffrax(options, monkeypatch):
@@ -74,6 +77,7 @@ def test_a_bad_lane_leaves_the_others_alone():
     np.testing.assert_allclose(computed[::2], alone, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["projected", pytest.param("reduced", marks=pytest.mark.slow)])
 def test_derivatives_of_constrained_motions(method):
     """Of a rolling disk, in what it starts with and in its mass, forward and reverse."""

@@ -12,13 +12,7 @@ from pinocchio_bridge import ROBOTS, Bridge, assert_close, quick, random_states
 import jaxdyn as jd
 from jaxdyn.dynamics import recursions
 
-FEW = {
-    "panda.urdf": False,
-    "ur5_robot.urdf": False,
-    "kinova.urdf": False,
-    "allegro_right_hand.urdf": False,
-    "anymal.urdf": True,
-}
+FEW = {"panda.urdf": False}
 # ur3.urdf is a xacro file without links, which Pinocchio refuses too; the links of these two have no mass, so that some of
 # their joints move no inertia and M is singular.
 REFUSED = {"ur3.urdf": "ur3.urdf", "romeo.urdf": "no inertia", "romeo_laas_small.urdf": "no inertia"}

@@ -269,6 +269,7 @@ def several(code, count, *args, **environment):
     return [started(code, *args, **name | environment) for name in names]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_processes_share_a_store_and_do_the_work_of_one_that_is_killed(tmp_path, count):
     out = tmp_path / "shared.zarr"
@@ -412,7 +413,9 @@ def test_chunks_of_others_are_left_to_them_while_they_live(tmp_path):
     assert not out.with_name("a.zarr.lock").exists()
 
 
-@pytest.mark.parametrize("damage", ["bit", "cut", "missing", "partial", "record"])
+@pytest.mark.parametrize(
+    "damage", ["bit", "missing", "record", *(pytest.param(x, marks=pytest.mark.slow) for x in ("cut", "partial"))]
+)
 def test_a_chunk_that_is_not_whole_is_computed_again(tmp_path, damage):
     out = tmp_path / "a.zarr"
     reductions = {"y": jd.scale.Mean("y")}
@@ -840,6 +843,7 @@ def test_sweep_refuses(tmp_path, capsys, old, new, error):
     assert not (tmp_path / "study.zarr").exists()
 
 
+@pytest.mark.slow
 def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     from jaxdyn.cli import main
 

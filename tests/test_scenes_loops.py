@@ -233,6 +233,7 @@ def test_andrews_from_its_bodies():
     assert float(kinetic) > 0.1
 
 
+@pytest.mark.slow
 def test_spherical_pendulum_three_ways():
     """Angles, projection in space, and the second fundamental form a = P_T g + S(v, v): one motion."""
     radius, gravity = 1.3, 9.81

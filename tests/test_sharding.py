@@ -87,6 +87,7 @@ def _check_fits(*names: str) -> None:
         assert computed["calls"] == ({} if name == "slopes" else ONCE), name
 
 
+@pytest.mark.slow
 def test_a_fit_to_samples_of_two_logs_is_shared_among_devices():
     _check_fits("torque")
 

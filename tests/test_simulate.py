@@ -247,6 +247,7 @@ def test_outputs_are_those_of_the_saved_states(driven, leg):
     assert float(solution.stats["time_reached"]) == 2.0
 
 
+@pytest.mark.slow
 def test_stiff_friction_with_an_implicit_method():
     """Dry friction smoothed over 1e-5 m/s: sinh(v / v_s) decays at level / (m v_s) = 5e4 1/s."""
     builder = ModelBuilder("slider", gravity=None)
@@ -428,6 +429,7 @@ def test_other_numbers_do_not_compile_anew(pendulum):
     assert len(traces) == 3 * count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param("four_bar", marks=pytest.mark.slow), "rolling_disk"])
 def test_numbers_that_are_compiled_in_change_nothing(name, monkeypatch):
     """The motion and the assembled start of the first scene of its shape are those of the program for any numbers."""
@@ -566,7 +568,9 @@ def test_quaternions_near_unit_length_are_normalised(leg):
 
 
 @pytest.mark.parametrize(
-    "wrapped", [LieGroup(diffrax.Tsit5()), diffrax.HalfSolver(diffrax.Tsit5())], ids=["Lie", "half"]
+    "wrapped",
+    [LieGroup(diffrax.Tsit5()), pytest.param(diffrax.HalfSolver(diffrax.Tsit5()), marks=pytest.mark.slow)],
+    ids=["Lie", "half"],
 )
 @pytest.mark.parametrize("name", ["free_body", pytest.param("rolling_coin", marks=pytest.mark.slow)])
 def test_methods_that_wrap_an_explicit_one(wrapped, name):

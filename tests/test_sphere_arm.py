@@ -116,6 +116,7 @@ def newton_euler(J, J_rate, rates, rows, pose):
     return solution[:n], J @ solution[:n] + J_rate @ rates, solution[n:]
 
 
+@pytest.mark.slow
 def test_frictionless_motion_is_that_of_the_printed_equations(solved):
     """Equation E21: six unknowns, the accelerations of the five contact coordinates and the normal force."""
     at, kinematics = solved["frictionless"], at_contact(ETA)

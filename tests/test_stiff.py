@@ -99,6 +99,7 @@ def test_coefficients_of_the_rosenbrock_method():
     assert max(size) < 1 + 1e-9 and size[-1] < 1e-4
 
 
+@pytest.mark.slow
 def test_order_of_the_rosenbrock_method():
     """A nonautonomous equation of two arrays: the end and the dense output."""
 
@@ -186,7 +187,11 @@ IMPLICIT = diffrax.Kvaerno3(root_finder=optimistix.Newton(1e-13, 1e-13))
 
 @pytest.mark.parametrize(
     ("solver", "order"),
-    [(diffrax.Dopri5(), 5), (jd.Rodas5P(), 5), pytest.param(IMPLICIT, 3, marks=pytest.mark.slow)],
+    [
+        pytest.param(diffrax.Dopri5(), 5, marks=pytest.mark.slow),
+        (jd.Rodas5P(), 5),
+        pytest.param(IMPLICIT, 3, marks=pytest.mark.slow),
+    ],
     ids=["Dopri5", "Rodas5P", "Kvaerno3"],
 )
 def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
@@ -200,6 +205,7 @@ def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
     assert np.log2(error[0, 0] / error[2, 0]) / 2 > order - 0.8, error
 
 
+@pytest.mark.slow
 def test_gradient_of_an_implicit_step_in_local_coordinates(ball):
     """Both modes through one step of Rodas5P against differences, and finite at rest."""
     solver, term = jd.LieGroup(jd.Rodas5P()).fitted(ball), turning(ball)
@@ -323,6 +329,7 @@ def test_implicit_explicit_split():
 # Gradients of many adaptive steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
     [diffrax.Dopri8(), pytest.param(jd.Rodas5P(), marks=pytest.mark.slow)],

@@ -95,7 +95,7 @@ def parts(name, shape):
 
 
 # One of each kind of construction; all others are slow tests, as XLA compiles each for some seconds.
-QUICK = ("bennett", "double_pendulum-model", "hand_with_disk", "rolling_coin", "spherical_pendulum", "suslov")
+QUICK = ("bennett", "double_pendulum-model", "rolling_coin", "suslov")
 
 
 def cases(slow):
@@ -171,6 +171,7 @@ def test_vmap_over_a_length_is_a_loop_of_builds():
             np.testing.assert_allclose(got[i], want, rtol=1e-15, atol=1e-16)
 
 
+@pytest.mark.slow
 def test_period_of_a_pendulum_by_its_length():
     """T = 2 pi sqrt(l/g), dT/dl = T / (2 l), of a point on a rod that is fixed to the joint's body."""
 

@@ -46,7 +46,7 @@ def null_space(rows) -> np.ndarray:
     return free @ free.T
 
 
-@pytest.mark.parametrize("kind", ["3d", "6D"])
+@pytest.mark.parametrize("kind", ["3d", pytest.param("6D", marks=pytest.mark.slow)])
 def test_rows_and_accelerations_are_pinocchios(tmp_path, kind):
     """The null space of Pinocchio's rows, and the accelerations of M a + h = tau within it, at rest."""
     path = write(tmp_path, YAML.format(kind), turn=0.3)

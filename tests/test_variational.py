@@ -98,6 +98,7 @@ def test_order_two(name, runs):
     np.testing.assert_allclose(np.log2(errors[0] / errors[2]) / 2, 2.0, atol=0.07)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FEW[:2])
 def test_energy_errors_do_not_grow(name, runs):
     """Over 500 coarse steps, 2000 fine ones: the second half is no worse than the first."""
@@ -111,6 +112,7 @@ def test_energy_errors_do_not_grow(name, runs):
     np.testing.assert_allclose(first[:-1] / first[1:], 4.0, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_momenta_are_conserved():
     """Two bodies, one of them floating, without gravity: total momentum about the world's origin, over 400 steps."""
     model = tree("free", "revolute", gravity=None)
@@ -246,6 +248,7 @@ def test_gradients():
     np.testing.assert_allclose(reverse, (values[::2] - values[1::2]) / (2 * d), rtol=1e-7)  # half of the digits
 
 
+@pytest.mark.slow
 def test_slopes_of_a_lagrangian():
     """dL/dv and dL/dq of a tree of all joints by automatic differentiation; of one system given in three ways."""
     model = tree("free", "spherical", "planar", "revolute")
@@ -273,6 +276,7 @@ def test_slopes_of_a_lagrangian():
         np.testing.assert_allclose(pull, q * v * v + jnp.sin(q), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_float32(runs):
     """As exact as float64 up to rounding: 2e-4 after 800 steps, beside a method's error of 2e-4."""
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), scenes.pendulum_in_plane())

@@ -106,6 +106,7 @@ def assert_follows(model, law, computed):
     np.testing.assert_allclose(turned, 0.0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_weight_is_shifted_as_the_gains_say(biped, evaluated):
     """Centre of mass and attitude by the closed form, the held feet's forces those of the program, inside the cones."""
     model, q, feet, _ = biped
@@ -159,6 +160,7 @@ def test_feet_come_first(biped, evaluated):
     assert bool(wanted.success)
 
 
+@pytest.mark.slow
 def test_batches_and_gradients_in_gains(biped):
     """vmap equals the loop; the slope of the torques in a gain and a target against differences."""
     model, q, _, _ = biped
