@@ -377,6 +377,7 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
         )
 
 
+@pytest.mark.slow
 def test_batch_equals_loop_and_eager_equals_jit():
     model = TREES["floating"]()
     states = random_states(model, 5, 2)

@@ -451,7 +451,7 @@ def test_franka_least_squares_against_pinocchio_and_numpy(franka):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("method", ["newton", "lbfgs"])
+@pytest.mark.parametrize("method", ["newton", pytest.param("lbfgs", marks=pytest.mark.slow)])
 def test_franka_feasible_fit_on_held_out_data(franka, method):
     model, train, test, _ = franka
     fit = identify.fit_torques(model, train, method=method)
