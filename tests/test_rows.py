@@ -55,6 +55,15 @@ def test_rows_of_one_sample_take_its_kernel_and_those_of_a_batch_that_of_a_batch
     assert len(batch) == len(both) == 1 and batch != single and both != single
 
 
+def test_rows_of_which_nothing_is_computed_are_not_copied_in_blocks():
+    rows = states(3 * AT_ONCE)
+    handed_on = jax.make_jaxpr(lambda rows: map_rows(lambda row: row[::-1], rows))(rows)
+    computed = jax.make_jaxpr(lambda rows: map_rows(lambda row: row[0] + row[1], rows))(rows)
+    assert "scan" not in str(handed_on) and "scan" in str(computed)
+    q, v = map_rows(lambda row: row[::-1], rows)
+    assert (q == rows[1]).all() and (v == rows[0]).all()
+
+
 @pytest.mark.parametrize("count", [3, AT_ONCE + 3])
 def test_rows_are_batched_and_differentiated(count):
     rows = states(count)

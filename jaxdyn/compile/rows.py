@@ -44,5 +44,8 @@ def map_rows(function: Callable, rows):
         last = jnp.broadcast_to(x[-1:], (blocks * size - count, *x.shape[1:]))
         return jnp.concatenate([x, last]).reshape(blocks, size, *x.shape[1:])
 
+    block = jax.tree.map(lambda x: jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype), rows)
+    if not at_once.trace(block).jaxpr.eqns:  # nothing is computed: blocks would be copied only
+        return at_once(rows)
     mapped = lax.map(at_once, jax.tree.map(divided, rows))
     return jax.tree.map(lambda x: x.reshape(blocks * size, *x.shape[2:])[:count], mapped)
