@@ -216,7 +216,6 @@ def framed(
             "entry:",
             *allocated,
             *pointers,
-            *e.entry,
             "  %last = sub i64 %n, 1",
             "  %some = icmp ult i64 %begin, %end",
             "  br i1 %some, label %block, label %done",

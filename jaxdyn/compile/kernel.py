@@ -27,6 +27,7 @@ from jaxdyn.compile.graph import inlined
 from jaxdyn.compile.known import Known, partition, partition_traced
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
 from jaxdyn.compile.rows import is_row
+from jaxdyn.compile.shared import divided
 from jaxdyn.compile.trigonometry import cosine, sine
 
 try:
@@ -384,6 +385,8 @@ def _lower_on_cpu(ctx, *operands, program, rows):
         return _lower_repeated(ctx, *operands, program=program, rows=rows)
     apart = lead[: len(lead) - rows]  # rows of one sample go through the kernel of one sample
     samples = math.prod(apart) if all(isinstance(n, int) for n in apart) else None
+    if samples != 1 and target is not None and target.is_supported() and divided(program, uniform) is not None:
+        return _lower_divided(ctx, *operands, program=program, rows=rows)
     try:
         assert target is not None
         number = target.kernel(program, target.width_of(program, samples), uniform)
@@ -412,6 +415,15 @@ def _repeated(*args, program, rows):
     return kernel_p.bind(*(jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in args), program=program, rows=rows)
 
 
+def _divided(*args, program, rows):
+    """The call as two, the first of what all samples share."""
+    uniform = [x.ndim == 1 for x in args]
+    once, each = divided(program, uniform)  # pyright: ignore[reportGeneralTypeIssues]
+    shared = kernel_p.bind(*(x for x in args if x.ndim == 1), program=once, rows=0)
+    return kernel_p.bind(*args, *shared, program=each, rows=rows)
+
+
+_lower_divided = mlir.lower_fun(_divided, multiple_results=True)
 _lower_repeated = mlir.lower_fun(_repeated, multiple_results=True)
 _lower_with_last_axis = mlir.lower_fun(_with_last_axis, multiple_results=True)
 

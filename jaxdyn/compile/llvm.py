@@ -33,7 +33,6 @@ class Emitter:
     def __init__(self, width: int):
         self.width = width
         self.lines: list[str] = []
-        self.entry: list[str] = []  # what is done once, before the first sample
         self.declared: dict[str, str] = {}
         self.count = self.stores = 0
         self.sines: dict[str, tuple[str, str]] = {}
@@ -226,15 +225,17 @@ class Emitter:
         return value
 
     def load_for_all(self, place: int, entry: int, kind: str) -> str:
-        """An entry of an argument that is the same for all samples, read once."""
-        lines, self.lines = self.lines, self.entry
+        """An entry of an argument that is the same for all samples.
+
+        Read in every block: as one number it is an operand of an instruction for all lanes, where a vector that is kept from
+        block to block would take as much memory as the lanes.
+        """
         value = self.load_one(f"%a{place}", entry, kind)
-        if self.width > 1:
-            of = self.type(kind)
-            first = self.put(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
-            value = self.put(f"shufflevector {of} {first}, {of} poison, <{self.width} x i32> zeroinitializer")
-        self.lines = lines
-        return value
+        if self.width == 1:
+            return value
+        of = self.type(kind)
+        first = self.put(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
+        return self.put(f"shufflevector {of} {first}, {of} poison, <{self.width} x i32> zeroinitializer")
 
     def load_at(self, array: str, k: int, kind: str) -> str:
         """Entry k, in all lanes, of an array in memory whose entries stand one after the other, each with its lanes."""

@@ -1,0 +1,97 @@
+"""What depends on arguments alone that all samples of a batch share, such as the numbers of a model: computed once a call.
+
+A program is divided into one of a single sample, which computes the numbers that do not vary, and one of the batch, which reads
+those of them that it needs. Of forward dynamics of a given robot a third goes to the first.
+"""
+
+from collections.abc import Sequence
+
+from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
+from jaxdyn.compile.program import Array, Constant, Operation, Program, dtype_of
+
+
+def divided(program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
+    """A program of the uniform inputs, in their order, and one of all inputs and the results of the first.
+
+    None where too few operations would be saved to be worth a second call.
+    """
+    if not isinstance(program, Program) or not any(uniform):
+        return None
+    key = ("divided", tuple(uniform))
+    if key not in program.derived:
+        program.derived[key] = _divided(program, uniform)
+    return program.derived[key]
+
+
+def _divided(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
+    is_shared: list[bool] = []
+    for op, _, args in program.operations:
+        if op == "input":
+            is_shared.append(uniform[args[0]])
+        else:
+            is_shared.append(op not in ("call", "part") and all(is_shared[x] for x in args if type(x) is not Constant))
+    saved = sum(
+        shared and x.op not in ("input", "neg") for shared, x in zip(is_shared, program.operations, strict=True)
+    )
+    if saved < MIN_SHARED_OPERATIONS:
+        return None
+    passed = _passed(program, is_shared)
+    kinds = sorted({program.operations[i].kind for i in passed})
+    by_kind = [[i for i in passed if program.operations[i].kind == kind] for kind in kinds]
+    arrays = [Array((len(entries),), dtype_of(kind)) for kind, entries in zip(kinds, by_kind, strict=True)]
+
+    places = [i for i, same in enumerate(uniform) if same]
+    first = _Renumbered()
+    for i, (op, kind, args) in enumerate(program.operations):
+        if is_shared[i]:
+            args = (places.index(args[0]), args[1]) if op == "input" else first.args(args)
+            first.add(i, Operation(op, kind, args))
+    once = Program(
+        [program.inputs[i] for i in places],
+        arrays,
+        first.operations,
+        [tuple(first.index[i] for i in entries) for entries in by_kind],
+        name=f"{program.name}, of what samples share",
+    )
+
+    count, rest = len(program.inputs), _Renumbered()
+    for place, (kind, entries) in enumerate(zip(kinds, by_kind, strict=True), count):
+        for k, i in enumerate(entries):
+            rest.add(i, Operation("input", kind, (place, k)))
+    for i, (op, kind, args) in enumerate(program.operations):
+        if is_shared[i]:
+            continue
+        rest.add(i, Operation(op, kind, args if op == "input" else rest.args(args)))
+    each = Program(
+        [*program.inputs, *arrays],
+        program.outputs,
+        rest.operations,
+        [rest.args(row) for row in program.results],
+        program.subprograms,
+        name=program.name,
+    )
+    return once, each
+
+
+def _passed(program: Program, is_shared: Sequence[bool]) -> list[int]:
+    """Numbers that all samples share and that are read by what varies or are results, in the order in which they are read."""
+    read = [x.args for i, x in enumerate(program.operations) if not is_shared[i] and x.op != "input"]
+    numbers: dict[int, None] = {}
+    for args in (*read, *program.results):
+        numbers |= {x: None for x in args if type(x) is not Constant and is_shared[x]}
+    return list(numbers)
+
+
+class _Renumbered:
+    """Operations with new numbers."""
+
+    def __init__(self):
+        self.operations: list[Operation] = []
+        self.index: dict[int, int] = {}
+
+    def add(self, i: int, operation: Operation) -> None:
+        self.index[i] = len(self.operations)
+        self.operations.append(operation)
+
+    def args(self, args) -> tuple:
+        return tuple(x if type(x) is Constant else self.index[x] for x in args)
