@@ -113,3 +113,28 @@ def test_reduced_and_projected_steps_are_watched():
 
         fine, _ = codes(quick(jax.vmap(run))(jnp.asarray([0.01, 0.6])))
         np.testing.assert_array_equal(fine, [True, False], err_msg=method)
+
+
+@pytest.mark.parametrize("name", ["RK4", "Tsit5", pytest.param("Dopri8", marks=pytest.mark.slow)])
+def test_torques_held_from_step_to_step_are_those_within_each(name):
+    """A unit mass under forces that jump where steps end: v_k = sum of tau_i dt, and its derivative in every tau_i, exactly."""
+    model, dt, count = slider(), 0.1, 24  # tenths are rounded, and so are ends of steps, differently
+    ts = jnp.asarray(np.arange(count) * dt)
+    tau = jnp.asarray(np.random.default_rng(0).normal(size=(count, 1)))
+    choice = {"stepsize": dt, "solver": SOLVERS[name]}
+
+    def velocity(tau):
+        control = jd.identify.SampledTorque(ts, tau, "previous")
+        motion = jd.simulate(model, jnp.zeros(1), jnp.zeros(1), ts, control=control, **choice)
+        return motion.v[:, 0]
+
+    v, back = jax.vjp(velocity, tau)
+    np.testing.assert_allclose(v[1:], jnp.cumsum(tau[:-1, 0]) * dt, rtol=1e-11, atol=1e-13)
+    (derivative,) = back(jnp.zeros(count).at[-1].set(1.0))
+    np.testing.assert_allclose(derivative[:, 0], jnp.full(count, dt).at[-1].set(0.0), rtol=1e-11, atol=1e-13)
+
+    def by_number(q, v, t):  # as a table of a learned policy is read
+        return tau[jnp.floor(t / dt).astype(int)]
+
+    motion = jd.simulate(model, jnp.zeros(1), jnp.zeros(1), ts, control=by_number, **choice)
+    np.testing.assert_allclose(motion.v[:, 0], v, rtol=1e-11, atol=1e-13)

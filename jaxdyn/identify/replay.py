@@ -26,6 +26,8 @@ INITIAL = ("measured", "free")
 class SampledTorque(eqx.Module):
     """A control that replays torques: linear between the samples, or held from each sample to the next ("previous").
 
+    Fixed steps that end on the samples take held torques exactly: what jumps where a step ends is constant within it.
+
     `t` (n,) s; `tau` (n, nv) N m.
     """
 

@@ -134,6 +134,17 @@ class Plan(NamedTuple):
         return np.concatenate([[0.0], self.tableau.c])
 
     @property
+    def sides(self) -> np.ndarray:
+        """From where the stages take the limit in time: 1 from after, at the start, -1 from before, at the end, else 0.
+
+        What jumps where steps end, as a torque held from sample to sample, is constant within them. The last stage is at the
+        start of the next step where it is passed on.
+        """
+        sides = (self.times == 0).astype(float) - (self.times == 1)
+        sides[-1] = 1.0 if self.tableau.fsal else sides[-1]
+        return sides
+
+    @property
     def projects_before_last(self) -> bool:
         """Whether the last stage comes after the projection."""
         return self.project is not None and passes_last_stage_on(self.tableau, self.step_constants, self.branching)
@@ -162,9 +173,11 @@ class Plan(NamedTuple):
         """How far a flat state is from where the method fails, which a change of sign tells; one where it never does."""
         return jnp.ones((), y.dtype) if self.quality is None else self.quality(t, self.structure(y), args)
 
-    def rate(self, args, t0, t1, y, c):
-        """A stage: (t1 - t0) times the vector field."""
-        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))
+    def rate(self, args, t0, t1, y, c, side):
+        """A stage: (t1 - t0) times the vector field, at one of the `times` and from one of the `sides`."""
+        # By more than the rounding of ends of steps and of times of samples, which are seldom computed alike.
+        away = 4 * jnp.finfo(jnp.result_type(t0, t1)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0)) + lax.stop_gradient(side * jnp.sign(t1 - t0) * away)
         return jnp.asarray(t1 - t0, y.dtype) * ravel_pytree(self.field(t, self.structure(y), args))[0]
 
     def ended(self, args, t1, y, error):
@@ -212,7 +225,7 @@ def whole_step(plan: Plan, args, t0, t1, y, rate) -> Step:
     `rate` is the vector field at y where that is passed on from step to step.
     """
     dt = jnp.asarray(t1 - t0, y.dtype)
-    first = dt * rate if plan.passes_rate_on else plan.rate(args, t0, t1, y, 0.0)
+    first = dt * rate if plan.passes_rate_on else _first(plan, args, t0, t1, y)
     projected, shift, error, raw, stages = _whole(plan, args, t0, t1, y, first)
     return Step(projected, shift, error, raw, stages, _last_rate(plan, t0, t1, stages, rate))
 
@@ -242,21 +255,22 @@ def projected_output(plan: Plan, _, t, t0, t1, y, raw, stages, shift):
 
 
 def _first(plan: Plan, args, t0, t1, start):
-    return plan.rate(args, t0, t1, start, 0.0)
+    return plan.rate(args, t0, t1, start, 0.0, 1.0)
 
 
 def _whole(plan: Plan, args, t0, t1, start, first):
     """A step but for its code, which is success."""
     k, none = [first], jnp.zeros_like(start)
+    points = [(float(time), float(side)) for time, side in zip(plan.times, plan.sides, strict=True)]
     for i in range(1, plan.count - plan.projects_before_last):
-        k.append(plan.rate(args, t0, t1, start + _sum(plan.sums[i], k), float(plan.times[i])))
+        k.append(plan.rate(args, t0, t1, start + _sum(plan.sums[i], k), *points[i]))
     raw, error = start + _sum(plan.sums[plan.count], k), _sum(plan.sums[plan.count + 1], k)
     projected, shift = raw, none
     is_early = plan.projects_before_last and not plan.knows_error
     if plan.project is not None:
         projected, shift, left, _ = plan.ended(args, t1, raw, none if is_early else error)
     if plan.projects_before_last:
-        k.append(plan.rate(args, t0, t1, projected, 1.0))
+        k.append(plan.rate(args, t0, t1, projected, *points[-1]))
     if plan.project is not None:
         error = enlarged(error + float(plan.sums[-1, -1]) * k[-1], left) if is_early else left
     return projected, shift, error, raw, jnp.stack(k)
@@ -267,19 +281,19 @@ def _in_turn(plan: Plan, args, t0, t1, start, kept, ready):
     count, none = plan.count, jnp.zeros_like(start)
     ready = ~any_in_batch(~ready) if plan.tableau.fsal else jnp.asarray(False)
     dt = jnp.asarray(t1 - t0, start.dtype)
-    times = jnp.asarray(plan.times, jnp.result_type(t0, t1))
-    rows = jnp.arange(count), jnp.asarray(plan.sums.T, start.dtype), times
+    times, sides = (jnp.asarray(x, jnp.result_type(t0, t1)) for x in (plan.times, plan.sides))
+    rows = jnp.arange(count), jnp.asarray(plan.sums.T, start.dtype), times, sides
 
     def stage(carry, row):
         total, *end = carry
-        i, weights, c = row
+        i, weights, *point = row
         y = start + total[i]
         if plan.projects_before_last:
             error = total[count + 1] if plan.knows_error else none
             ended = partial(plan.ended, args, t1)
             end = lax.cond(i == count - 1, ended, lambda y, _: (y, *end[1:]), y, error)
             y = end[0]
-        k = lax.cond(ready & (i == 0), lambda y: dt * kept, lambda y: plan.rate(args, t0, t1, y, c), y)
+        k = lax.cond(ready & (i == 0), lambda y: dt * kept, lambda y: plan.rate(args, t0, t1, y, *point), y)
         return (total + weights[:, None] * k[None], *end), k
 
     blank = jnp.zeros((count + 2, start.size), start.dtype)
