@@ -14,6 +14,7 @@ from jaxdyn.compile.calls import first_numbers as first_numbers
 from jaxdyn.compile.calls import glue_options as glue_options
 from jaxdyn.compile.calls import specialized as specialized
 from jaxdyn.compile.flags import unless as unless
+from jaxdyn.compile.garbage import uncollected as uncollected
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
 from jaxdyn.compile.kernel import compute as compute
 from jaxdyn.compile.kernel import native as native

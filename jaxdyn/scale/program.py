@@ -4,11 +4,9 @@ Members do not know of each other, so a program has no communication at all: `ja
 device whose lanes are done waits for nobody until the batch is read. Processes share a store and no program.
 """
 
-import contextlib
-import gc
 import hashlib
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ import jax
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
-from jaxdyn.compile import compilation, glue_options
+from jaxdyn.compile import compilation, glue_options, uncollected
 from jaxdyn.scale.members import Members
 
 logger = logging.getLogger("jaxdyn")
@@ -63,8 +61,7 @@ class Program:
         self.lanes = max(least, -(-lanes // least) * least)
         budget = available_memory(self.devices) * SHARE if memory is None else memory
         while True:
-            with uncollected():
-                lowered = self._batch.lower(self._inputs_of(self.lanes))
+            lowered = uncollected(self._batch.lower)(self._inputs_of(self.lanes))
             self.lowered = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
             self.compiled = lowered.compile(compiler_options=self._options)
             self.bytes = self._needed()
@@ -107,18 +104,6 @@ class Program:
         return len(self.devices) * (own + IN_FLIGHT * analysis.output_size_in_bytes)
 
 
-@contextlib.contextmanager
-def uncollected() -> Iterator[None]:
-    """Without the search for cycles of dead objects: a fifth of the time to trace, as tracing makes many objects that live on."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
-
-
 class Traced:
     """`one(drawn, row) -> dict of arrays`, traced once: its operations are mapped over lanes without running its Python again.
 
@@ -126,9 +111,8 @@ class Traced:
     """
 
     def __init__(self, one: Callable, members: Members):
-        trace = jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True)
-        with uncollected():
-            operations, self.shapes = trace(given_to_one(members))
+        trace = uncollected(jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True))
+        operations, self.shapes = trace(given_to_one(members))
         self._call = jaxpr_as_fun(operations)
         self._structure = jax.tree.structure(self.shapes)
 
@@ -144,6 +128,7 @@ def given_to_one(members: Members) -> Any:
     )
 
 
+@uncollected
 def fingerprint(one: Callable, members: Members) -> str:
     """A hash of what is computed for one member, by operations of JAX alone: the same on every machine with these versions."""
     with compilation("plain"):
