@@ -16,7 +16,7 @@ from jaxdyn.simulation.equations import equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, start_limit
 from jaxdyn.simulation.outputs import at_save_point
-from jaxdyn.simulation.solution import RESULTS, Solution
+from jaxdyn.simulation.solution import RESULTS, Solution, first_of
 from jaxdyn.simulation.solvers import LieGroup, Stepper
 from jaxdyn.simulation.solvers.choice import (
     is_fixed,
@@ -106,7 +106,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
 
     # By the kernels that have put the start on the constraints.
     q, v = map_rows(to_qv, (y, ts))
-    lost = None
+    lost, ends = None, []
     if eqs.least_allowance is not None:
         margins, within = map_rows(lambda row: eqs.allowances(eqs.args, *row), (y, q, v, ts)), None
         if last is not None:
@@ -120,23 +120,41 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         limits = 2 * q.shape[1] if options["limits"] == "stop" else 0
         at_limit = lost.happened & (lost.entry >= count) & (lost.entry < count + limits)
         by_control = lost.happened & (lost.entry >= count + limits)
-        result = RESULTS.where(lost.happened & (lost.entry < count), RESULTS.contact_lost, result)
-        result = RESULTS.where(at_limit, RESULTS.joint_limit_passed, result)
-        result = RESULTS.where(by_control, RESULTS.control_singular, result)
-    result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.singular_basis, result)
+        by_contact = lost.happened & (lost.entry < count)
+        ends += [
+            (by_control, RESULTS.control_singular),
+            (at_limit, RESULTS.joint_limit_passed),
+            (by_contact, RESULTS.contact_lost),
+        ]
     if has_followers(system):
         follows = jnp.cumsum(~map_rows(system.follows, q)) == 0
-        result = RESULTS.where(follows.all(), result, RESULTS.no_single_contact)
+        ends.insert(0, (~follows.all(), RESULTS.no_single_contact))
         reached = reached & follows
         time_reached = jnp.where(follows.all(), time_reached, jnp.max(jnp.where(reached, ts, ts[0])))
+    result = first_of([*ends, (result == RESULTS.event_occurred, RESULTS.singular_basis)], result)
     ended = (result == RESULTS.successful) | (result == RESULTS.coarse_steps)
-    result = RESULTS.where(ended & ~reached.all(), RESULTS.nonfinite_state, result)
+    nonfinite = ended & ~reached.all()
     # Fixed steps go on from what is not finite: all that is known is the last state before it that was kept.
     kept = jnp.max(jnp.where(reached, ts, ts[0]))
-    time_reached = jnp.where(result == RESULTS.nonfinite_state, kept, time_reached)
+    time_reached = jnp.where(nonfinite | (result == RESULTS.nonfinite_state), kept, time_reached)
+    failures = [
+        (~in_order, RESULTS.unordered_times),
+        (~fine_steps, RESULTS.bad_stepsize),
+        (~fine_tolerances, RESULTS.bad_tolerance),
+        (~finite_start, RESULTS.nonfinite_start),
+        (~unit_start, RESULTS.unnormalized_start),
+    ]
+    angles = turning(system)
+    if angles.size and not is_fixed(steps[-1]):
+        coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
+        failures.append((coarse, RESULTS.coarse_start))
+    failures.append((~start_ok, RESULTS.inconsistent_start))
+    if first is not None:
+        failures.append((~is_regular(first), RESULTS.singular_basis))
+    failures.append((nonfinite, RESULTS.nonfinite_state))
     if method.projects and scene.constraints:
         closed = map_rows(lambda row: consistent(scene, *row), (q, v, ts))
-        result = RESULTS.where((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints, result)
+        failures.append(((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints))
     elif scene.constraints:
 
         def is_met(row):
@@ -144,22 +162,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
             return method.satisfies(scene, *row[1:], force)  # pyright: ignore[reportCallIssue]
 
         met = map_rows(is_met, (y, q, v, ts))
-        result = RESULTS.where((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows, result)
-    if first is not None:
-        result = RESULTS.where(is_regular(first), result, RESULTS.singular_basis)
-    result = RESULTS.where(start_ok, result, RESULTS.inconsistent_start)
-    angles = turning(system)
-    if angles.size and not is_fixed(steps[-1]):
-        coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
-        result = RESULTS.where(coarse, RESULTS.coarse_start, result)
-    for fine, code in (
-        (unit_start, RESULTS.unnormalized_start),
-        (finite_start, RESULTS.nonfinite_start),
-        (fine_tolerances, RESULTS.bad_tolerance),
-        (fine_steps, RESULTS.bad_stepsize),
-        (in_order, RESULTS.unordered_times),
-    ):
-        result = RESULTS.where(fine, result, code)
+        failures.append(((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows))
 
     def or_nan(rows):
         return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
@@ -169,7 +172,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     computed = map_rows(lambda row: of_row(*row), (q, v, ts, of_control))
     rows = {"q": q, "v": v} | computed | ({} if work is None else {"work": work})
     whole = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
-    result = RESULTS.where((result == RESULTS.successful) & ~whole, RESULTS.nonfinite_state, result)
+    result = first_of([*failures, ((result == RESULTS.successful) & ~whole, RESULTS.nonfinite_state)], result)
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     if lost is not None and unilateral.can_end(scene, options["contacts"]):

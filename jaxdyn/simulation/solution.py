@@ -1,9 +1,11 @@
 """What a simulation gives back: the motion, how it ended, and in words what to do when it ended early."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -20,12 +22,21 @@ from jaxdyn.simulation.solvers.choice import for_stiff, known_stiffness, unwrapp
 from jaxdyn.systems.scene import Scene
 
 
+def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
+    """The code of the first case (condition, code) whose condition holds, else the one given.
+
+    Looked up in a table: of a chain of `RESULTS.where` XLA copies the beginning into every computation that reads the end, and
+    takes a second to compile a run for that.
+    """
+    conditions, codes = zip(*cases, strict=True)
+    place = jnp.argmax(jnp.stack([*map(jnp.asarray, conditions), jnp.asarray(True)]))
+    return jax.tree.map(lambda *each: jnp.stack(each)[place], *codes, otherwise)
+
+
 def from_diffrax(result) -> Any:
     """A code of diffrax as one of `RESULTS`, by its name."""
-    translated: Any = RESULTS.successful
-    for name, code in diffrax.RESULTS._name_to_item.items():
-        translated = RESULTS.where(result == code, getattr(RESULTS, name), translated)
-    return translated
+    names = diffrax.RESULTS._name_to_item.items()
+    return first_of([(result == code, getattr(RESULTS, name)) for name, code in names], RESULTS.internal_error)
 
 
 # A number for each code, its place here, for arrays and files.
