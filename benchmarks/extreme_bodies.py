@@ -8,7 +8,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.extremes import Outcome, Study, as_dtype, case, outcome, study, table
-from jaxdyn.constraints import dynamics as constrained
+from jaxdyn.constraints.codes import code_of
 from jaxdyn.dynamics import recursions
 from jaxdyn.dynamics import scans as looped
 from jaxdyn.dynamics import world_frame as matrix_form
@@ -77,7 +77,7 @@ def masses(dtypes, gradient):
         q, v = jnp.asarray(_Q, dtype), jnp.asarray(_V, dtype)
         computed = jnp.stack([form(here, q, v, jnp.zeros_like(v)) for form in FORMS])
         coded = jd.constrained_dynamics(jd.Scene(here), q, v)
-        return Outcome((computed, coded.acceleration), x, coded.result._value, x)
+        return Outcome((computed, coded.acceleration), x, code_of(coded.result), x)
 
     outcomes = study(run, jnp.asarray(SERIES), dtypes, False).outcomes
     # What the ratio costs, but no more than leaves two digits.
@@ -85,7 +85,7 @@ def masses(dtypes, gradient):
     labels = [f"tip {r:.0e} kg" for r in RATIOS]
     plain, coded = {}, {}
     for dtype, computed in outcomes.items():
-        fine = jnp.full(len(labels), jd.RESULTS.successful._value)
+        fine = jnp.full(len(labels), code_of(jd.RESULTS.successful))
         plain[dtype] = Outcome(computed.end[0][:-1], computed.residual[:-1], fine, computed.value[:-1])
         coded[dtype] = computed._replace(end=computed.end[1])
     none = dict.fromkeys(dtypes)
@@ -95,7 +95,6 @@ def masses(dtypes, gradient):
     )
     labels = [f"{label}, constrained_dynamics" for label in (*labels, "tip 0 kg")]
     exact, allowed = np.vstack([exact, exact[:1]]), {d: np.append(x, x[-1]) for d, x in allowed.items()}
-    options["results"] = constrained.RESULTS
     return rows + table("masses", labels, Study(coded, none, None), exact, allowed, "60 digits", **options)
 
 

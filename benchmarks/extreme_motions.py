@@ -7,6 +7,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.extremes import FIXED, Outcome, Row, as_dtype, case, name_of, outcome, quick, study, table
+from jaxdyn.constraints.codes import code_of
 from jaxdyn.reports import references
 
 LOOSE = {"float64": 1e-6, "float32": 1e-3}
@@ -135,7 +136,7 @@ def steps(dtypes, gradient, solvers=None):
         def run(point, x, solver=solver):
             rate, damping = point
             sizes, computed = run_oscillator(rate, damping, solver, count)
-            return Outcome(sizes, x, computed.result._value, x)
+            return Outcome(sizes, x, code_of(computed.result), x)
 
         points = [np.concatenate([0 * near[0], near[1]]), np.concatenate([near[0], 0 * near[1]])]
         studied = study(run, tuple(jnp.asarray(x) for x in points), dtypes, False)
@@ -173,7 +174,7 @@ def beyond(dtypes, gradient):
 
     def run(rate, x):
         sizes, computed = run_oscillator(rate, 0 * rate, None, 2000)
-        return Outcome(jnp.minimum(sizes[1], jnp.full_like(rate, 1e30)), x, computed.result._value, x)
+        return Outcome(jnp.minimum(sizes[1], jnp.full_like(rate, 1e30)), x, code_of(computed.result), x)
 
     studied = study(run, jnp.asarray(factors * limit), dtypes, False)
     labels = [f"{f} of the limit" for f in factors]
@@ -237,7 +238,7 @@ def chaos(dtypes, gradient):
             stretch * 1e-7 < 0.1,
             1e-8,
             100.0,
-            name_of(computed.result._value[0]),
+            name_of(code_of(computed.result)[0]),
         )
     )
     rows.append(_kept("rtol 1e-8", "float64", computed, 1e-6))
@@ -253,7 +254,7 @@ def chaos(dtypes, gradient):
                 stretch * 1e-5 < 0.1,
                 1e-6,
                 100.0,
-                name_of(computed.result._value[0]),
+                name_of(code_of(computed.result)[0]),
             )
         )
         rows.append(_kept("rtol 1e-6", "float32", computed, 1e-3))
@@ -282,7 +283,7 @@ def _grown(what, dtype, error, stretch, small, unit, allowed, code):
 
 
 def _kept(what, dtype, computed, allowed):
-    energy, code = np.asarray(computed.energy[0], float), name_of(computed.result._value[0])
+    energy, code = np.asarray(computed.energy[0], float), name_of(code_of(computed.result)[0])
     drift = float(np.abs(energy - energy[0]).max() / (2 * 9.81))
     return Row(
         "chaos", f"{what}, 20 s", dtype, drift, allowed, "energy", None, bool(np.isnan(drift)), code, None, True, CHAOS
@@ -303,7 +304,7 @@ def million(dtypes, gradient, count=1_000_000):
             )
         )
         computed = program(*(jnp.asarray(x, dtype) for x in (*start, ts)))
-        code = name_of(computed.result._value)
+        code = name_of(code_of(computed.result))
         q, v, energy = (np.asarray(x, float) for x in (computed.q, computed.v, computed.energy))
         signs = np.sign(np.sum(q * reference.q, 1, keepdims=True))
         checks = {

@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.extremes import FIXED, Outcome, as_dtype, case, outcome, study, table
-from jaxdyn.constraints import dynamics as constrained
+from jaxdyn.constraints.codes import code_of
 from jaxdyn.reports import references
 
 LOOSE = {"float64": 1e-6, "float32": 2e-3}
@@ -165,7 +165,7 @@ def grasps(dtypes, gradient):
         dynamics = jd.grasp.object_dynamics(grasp, q, jnp.zeros(6, dtype), tau + x)
         inside = jd.grasp.internal_forces(grasp, q, dynamics.contact_forces)
         moved = jnp.max(jnp.abs(jd.grasp.grasp_map(grasp, q) @ inside))
-        return Outcome(dynamics.rate, moved, dynamics.result._value, jnp.sum(dynamics.rate) + jnp.sum(inside))
+        return Outcome(dynamics.rate, moved, code_of(dynamics.result), jnp.sum(dynamics.rate) + jnp.sum(inside))
 
     def reach(near, x):
         dtype = near.dtype
@@ -176,13 +176,11 @@ def grasps(dtypes, gradient):
         tau = 0.1 * jnp.cos(jnp.arange(hand.nv, dtype=dtype)) + x
         dynamics = jd.grasp.object_dynamics(hand, q, V, tau)
         other = jd.constrained_dynamics(hand, q, dynamics.velocity, tau)
-        return Outcome(dynamics.acceleration - other.acceleration, x, dynamics.result._value, jnp.sum(dynamics.rate))
+        return Outcome(dynamics.acceleration - other.acceleration, x, code_of(dynamics.result), jnp.sum(dynamics.rate))
 
     studied = study(hold, jnp.asarray(nearness), dtypes, gradient)
     labels = [f"three points {n:.0e} rad from a line" for n in nearness]
-    rows += table(
-        "grasps", labels, studied, exact, LOOSE, "Newton and Euler", advice=GRASPS, results=constrained.RESULTS
-    )
+    rows += table("grasps", labels, studied, exact, LOOSE, "Newton and Euler", advice=GRASPS)
     studied = study(reach, jnp.asarray(nearness), dtypes, gradient, step=1e-2)
     labels = [f"knee {n:.0e} rad from straight" for n in nearness]
     # The joints' accelerations grow with 1/knee, and so does what rounding leaves of their difference.
@@ -198,7 +196,6 @@ def grasps(dtypes, gradient):
         size=1.0,
         residual=False,
         advice=GRASPS,
-        results=constrained.RESULTS,
     )
     return rows
 
@@ -260,8 +257,8 @@ def starts(dtypes, gradient):
         result = outcome(solution, end=(solution.energy[1:] - solution.energy[0]) / 50.0)
         if code is None:
             return result
-        good = code == constrained.RESULTS.successful
-        bad = jnp.asarray(jd.RESULTS.inconsistent_start._value)
+        good = code == jd.RESULTS.successful
+        bad = code_of(jd.RESULTS.inconsistent_start)
         return result._replace(code=jnp.where(good, result.code, bad))
 
     for assembled in (True, False):

@@ -21,8 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import jaxdyn as jd
 from benchmarks.timing import chosen_names
+from jaxdyn.constraints.codes import CODES, code_of
 
 DTYPES = ("float64", "float32")
 MODULES = ("extreme_bodies", "extreme_motions", "extreme_rows")
@@ -106,13 +106,12 @@ def outcome(solution, value=None, end=None, residual=None) -> Outcome:
     if residual is None and solution.constraint_residual is not None:
         residual = jnp.max(solution.constraint_residual)
     zero = jnp.zeros((), last.dtype)
-    return Outcome(end, zero if residual is None else residual, solution.result._value, value)
+    return Outcome(end, zero if residual is None else residual, code_of(solution.result), value)
 
 
-def name_of(code, results=None) -> str:
-    """Name of a result code."""
-    results = jd.RESULTS if results is None else results
-    return next(name for name, item in results._name_to_item.items() if int(item._value) == int(code))
+def name_of(code) -> str:
+    """Name of a result code, by its number."""
+    return CODES[int(code)]
 
 
 def quick(function):
@@ -183,7 +182,6 @@ def table(
     residual=True,
     wanted=None,
     excused=0.0,
-    results=None,
 ):
     """Rows of a study. `exact` (points, .) is what the ends are compared with, relative to `size` (default: its largest).
 
@@ -210,7 +208,7 @@ def table(
                     against,
                     float(computed.residual[i]) if residual else None,
                     bool(np.isnan(end[i]).any()),
-                    name_of(computed.code[i], results),
+                    name_of(computed.code[i]),
                     digits,
                     slope is None or bool(np.isfinite(slope[i])),
                     advice,

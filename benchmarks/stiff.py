@@ -20,6 +20,7 @@ import numpy as np
 import jaxdyn as jd
 from benchmarks.extremes import name_of
 from benchmarks.timing import chosen_names
+from jaxdyn.constraints.codes import code_of
 from jaxdyn.reports.references import car_axis
 
 SOLVERS: dict[str, Any] = {
@@ -231,7 +232,7 @@ def program(case: Case, solver, dtype=float, **options) -> Callable:
         solution = jd.simulate(
             scene, q0, v0, case.ts, control=control, solver=solver, adjoint="forward", **tolerances, **options
         )
-        return solution.q, (solution.stats["num_steps"], solution.success, solution.result._value)
+        return solution.q, (solution.stats["num_steps"], solution.success, code_of(solution.result))
 
     def both(stiffness, tolerance):
         log = jnp.log(stiffness.astype(dtype))

@@ -20,7 +20,7 @@ from jaxdyn.constraints import model_couplings as model_couplings
 from jaxdyn.constraints import rolling_sphere as rolling_sphere
 from jaxdyn.constraints import rolling_wheel as rolling_wheel
 from jaxdyn.constraints.assembly import assemble as assemble
-from jaxdyn.constraints.dynamics import RESULTS as RESULTS
+from jaxdyn.constraints.codes import RESULTS as RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics as constrained_dynamics
 from jaxdyn.constraints.dynamics import projections as projections
 from jaxdyn.constraints.dynamics import second_fundamental_form as second_fundamental_form

@@ -140,7 +140,7 @@ def test_a_small_loop_that_is_open_is_refused():
     scene = extremes.as_dtype(scenes.four_bar(lengths=lengths, gravity=gravity), jnp.float32)
     q, v = (x.astype(jnp.float32) for x in scenes.four_bar.start())
     ts = jnp.asarray([0.0, 0.1], jnp.float32)
-    run = extremes.quick(jax.vmap(lambda off: simulate(scene, q.at[1].add(off), v, ts).result._value))
+    run = extremes.quick(jax.vmap(lambda off: code_of(simulate(scene, q.at[1].add(off), v, ts).result)))
     codes = [extremes.name_of(code) for code in run(jnp.asarray([0.0, 0.2], jnp.float32))]
     assert codes == ["successful", "inconsistent_start"]
 

@@ -12,8 +12,9 @@ from pinocchio_bridge import quick
 
 import jaxdyn as jd
 from jaxdyn.cli.common import output_path
+from jaxdyn.constraints.codes import CODES, name_of
 from jaxdyn.constraints.reactions import constraint_forces
-from jaxdyn.simulation.solution import from_diffrax
+from jaxdyn.simulation.solution import OF_DIFFRAX, from_diffrax
 
 ARM = jd.robots.chain(2)
 BODY = ARM.body_names[-1]
@@ -267,8 +268,10 @@ def test_one_enumeration_of_results():
 
 
 def test_every_code_of_diffrax_has_its_name():
-    for name, code in diffrax.RESULTS._name_to_item.items():
-        assert from_diffrax(code) == getattr(jd.RESULTS, name)
+    assert len(OF_DIFFRAX) == len(set(OF_DIFFRAX)) == len(diffrax.RESULTS)
+    for name in OF_DIFFRAX:
+        assert from_diffrax(getattr(diffrax.RESULTS, name)) == getattr(jd.RESULTS, name)
+    assert len(CODES) == len(jd.RESULTS) and all(name_of(getattr(jd.RESULTS, name)) == name for name in CODES)
 
 
 def test_models_scenes_and_solutions_print_as_short_text():

@@ -19,7 +19,7 @@ from jaxdyn.cli.common import (
     vector,
 )
 from jaxdyn.constraints.assembly import assemble
-from jaxdyn.constraints.dynamics import RESULTS
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify import SampledTorque
 from jaxdyn.identify.excitation import FourierTorque, random_torque

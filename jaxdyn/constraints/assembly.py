@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import along, compute, constant, first_numbers, implicit, is_concrete, is_staged, run, specialized
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
-from jaxdyn.constraints.dynamics import RESULTS, Outcome, correction, right_inverse, whitened_rows
+from jaxdyn.constraints.codes import RESULTS, Outcome
+from jaxdyn.constraints.dynamics import correction, right_inverse, whitened_rows
 from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, openness, row_limits

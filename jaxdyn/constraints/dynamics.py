@@ -13,11 +13,11 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
-import optimistix
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import is_rank_safe, partition_traced, repair_flagged, run
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
+from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import checked_tolerance, eps_of, least_pivot, pseudo_inverse, quality_of, tolerance
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
@@ -28,59 +28,6 @@ from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_
 from jaxdyn.systems.scene import Scene, as_scene, checked_force
 
 METHODS = ("rank_aware", "schur", "range_space")
-
-
-class RESULTS(optimistix.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a computation ended: one enumeration for constrained dynamics and for simulations."""
-
-    singular_mass_matrix = (
-        "The mass matrix is not positive definite to rounding: a joint moves no inertia, or next to none."
-    )
-    dependent_rows = "The constraint rows are dependent; take method='rank_aware'."
-    contradictory_rows = "No acceleration satisfies the constraint rows: they contradict each other."
-    singular_basis = "The minimal velocities do not determine the others here; choose another basis."
-    not_assembled = "No configuration and velocity that satisfy the constraints were found."
-    # Of simulations: those of diffrax, by its names, and ours.
-    dt_min_reached = "The minimum step size was reached in the differential equation solver."
-    event_occurred = "An event ended the motion."
-    max_steps_rejected = "Too many steps were rejected."
-    internal_error = "diffrax met an error of its own."
-    nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
-    nonfinite_state = "The state became NaN or infinite."
-    unordered_times = "The save points are not finite and increasing."
-    bad_stepsize = "The step is not positive and finite."
-    bad_tolerance = "A tolerance is negative or not finite."
-    coarse_steps = (
-        "The fixed steps are too long, or too many for the dtype: the motion may be wrong by a tenth of it or more."
-    )
-    coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
-    inconsistent_start = "The initial state is not on the constraints."
-    open_constraints = "The constraints opened, and the projection could not close them."
-    contact_lost = "A contact pulled or left its friction cone."
-    joint_limit_passed = "A joint passed one of its position limits."
-    control_singular = "The control came to where its task cannot be followed: task and constraints lose rank."
-    too_many_events = "Events followed each other without end, or there were more than max_events."
-    painleve_paradox = (
-        "Friction and normal force of a sliding contact left no forces, or more than one (Painleve's paradox)."
-    )
-    no_contact_mode = "No mode of the contacts was found that agrees with their forces."
-    no_single_contact = (
-        "Surfaces that roll do not touch in one point any more: their relative curvature is not positive."
-    )
-    unnormalized_start = "A quaternion of the initial state is not of unit length."
-
-
-# Of optimistix the message of this one is empty, which prints as nothing.
-RESULTS._index_to_message[RESULTS.successful._value.item()] = "successful"
-
-
-class Outcome(eqx.Module):
-    """What has a `result`, one of `RESULTS`."""
-
-    @property
-    def success(self) -> Bool[Array, "..."]:
-        """Whether `result` is `RESULTS.successful`."""
-        return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class ConstrainedDynamics(Outcome):

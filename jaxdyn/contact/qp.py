@@ -11,7 +11,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -24,9 +23,10 @@ from jaxdyn.model.arguments import Numbers
 from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
 
 
-class RESULTS(lx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+class RESULTS(eqx.Enumeration):
     """How a quadratic program ended."""
 
+    successful = "successful"
     infeasible = "No x satisfies the rows and cones of the quadratic program."
     stalled = "The quadratic program was not solved to the tolerance in the steps that it was given."
     indefinite = "The matrix Q of the quadratic program is not positive definite."

@@ -20,7 +20,8 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import compiled
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
-from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
+from jaxdyn.constraints.codes import RESULTS, Outcome
+from jaxdyn.constraints.dynamics import applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp, check_grasp

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.assembly import Assembly, assemble
 from jaxdyn.constraints.base import layout, position_residual, rows
-from jaxdyn.constraints.dynamics import RESULTS
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.mobility import degrees_of_freedom
 from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import as_array, state_dtype

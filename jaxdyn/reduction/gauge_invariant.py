@@ -23,7 +23,8 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import compiled
 from jaxdyn.constraints.base import constraint_jacobian, layout, rows
-from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
+from jaxdyn.constraints.codes import RESULTS, Outcome
+from jaxdyn.constraints.dynamics import applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import compiled, is_concrete, run_repaired
 from jaxdyn.constraints.base import layout
-from jaxdyn.constraints.dynamics import RESULTS, Outcome, applied
+from jaxdyn.constraints.codes import RESULTS, Outcome
+from jaxdyn.constraints.dynamics import applied
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros

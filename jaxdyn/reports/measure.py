@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.constraints.codes import CODES, code_of
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared
 from jaxdyn.reports.records import Record
 from jaxdyn.reports.timing import interleaved
 from jaxdyn.simulation.methods import Method, Reduced
-from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.simulation.solvers.explicit import passes_last_stage_on
 from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import Scene
@@ -58,10 +58,9 @@ def ladder(
 
     def motion(outputs) -> Motion:
         q, v, result, stats = outputs
-        codes = np.atleast_1d(np.asarray(result._value))
         # Of a batch the first trajectory is judged, if none of them failed: those that stop early cost less time.
-        code = next((code for code in codes if code != RESULTS.successful._value), codes[0])
-        name = next(name for name in RESULTS._name_to_item if code == getattr(RESULTS, name)._value)
+        names = [CODES[code] for code in np.atleast_1d(np.asarray(code_of(result)))]
+        name = next((name for name in names if name != "successful"), names[0])
         q, v, stats = jax.tree.map(lambda x: np.asarray(x if batch == 1 else x[0]), (q, v, stats))
         steps = int(stats["num_steps"])
         count = evaluations(solver, steps, prepared.scene, chosen)

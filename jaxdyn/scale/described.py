@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.constraints.codes import CODES, code_of
 from jaxdyn.scale.members import Members
 from jaxdyn.scale.program import Traced
 from jaxdyn.scale.reducer import QUANTITY
 from jaxdyn.scale.reductions import Reduction, quantities
 from jaxdyn.scale.store import Variable
 from jaxdyn.simulation.export import dimensions, traced_signals
-from jaxdyn.simulation.solution import CODES, code_of
 
 OUTCOMES = ("successful", "failed")  # codes of functions that are no motions
 
@@ -72,9 +72,9 @@ def described_motion(
         if name.startswith("parameter_") or name in steps:
             unit = steps.get(name) or units.get(name.removeprefix("parameter_"))
             variables[name] = _variable(name, shapes, None, {"units": unit} if unit else {})
-    variables["result"] = _codes(CODES)
+    variables["result"] = _codes(tuple(CODES))
     axes["t"] = (ts, {"units": "s"})
-    return Described(rows, traced, True, variables, CODES, axes)
+    return Described(rows, traced, True, variables, tuple(CODES), axes)
 
 
 def described_function(

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
-from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics, solve_rows
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
 from jaxdyn.constraints.rank import checked_tolerance
 from jaxdyn.constraints.tolerances import openness

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.dynamics import RESULTS as RESULTS
-from jaxdyn.constraints.dynamics import Outcome
+from jaxdyn.constraints.codes import RESULTS as RESULTS
+from jaxdyn.constraints.codes import Outcome, name_of
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.printed import solution_lines
@@ -20,6 +20,13 @@ from jaxdyn.simulation.export import as_xarray, write_csv, write_npz
 from jaxdyn.simulation.limits import joint_of
 from jaxdyn.simulation.solvers.choice import for_stiff, known_stiffness, unwrapped
 from jaxdyn.systems.scene import Scene
+
+# Names of the codes of diffrax, each also one of ours.
+OF_DIFFRAX = (
+    "successful", "max_steps_reached", "singular", "breakdown", "stagnation", "conlim", "nonfinite_input",
+    "nonlinear_max_steps_reached", "nonlinear_divergence", "nonfinite", "dt_min_reached", "event_occurred", "max_steps_rejected",
+    "internal_error",
+)  # fmt: skip
 
 
 def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
@@ -35,17 +42,8 @@ def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
 
 def from_diffrax(result) -> Any:
     """A code of diffrax as one of `RESULTS`, by its name."""
-    names = diffrax.RESULTS._name_to_item.items()
-    return first_of([(result == code, getattr(RESULTS, name)) for name, code in names], RESULTS.internal_error)
-
-
-# A number for each code, its place here, for arrays and files.
-CODES = tuple(RESULTS._name_to_item)
-
-
-def code_of(result: Any) -> Array:
-    """A result, traced or batched, as its place in `CODES` (uint8)."""
-    return jnp.argmax(jnp.stack([result == getattr(RESULTS, name) for name in CODES]), 0).astype(jnp.uint8)
+    cases = [(result == getattr(diffrax.RESULTS, name), getattr(RESULTS, name)) for name in OF_DIFFRAX]
+    return first_of(cases, RESULTS.internal_error)
 
 
 ADVICE = {
@@ -162,7 +160,7 @@ class Solution(Outcome):
 def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     if bool(solution.success):
         return
-    name = next(name for name in RESULTS._name_to_item if bool(solution.result == getattr(RESULTS, name)))
+    name = name_of(solution.result)
     reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])
     advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
     if name == "max_steps_reached" and isinstance(unwrapped(options["solver"]), diffrax.AbstractERK):

@@ -11,7 +11,7 @@ from jax import lax
 
 from jaxdyn.compile import partition_traced, run
 from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.constraints.dynamics import RESULTS
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.model.tree import Model, neutral

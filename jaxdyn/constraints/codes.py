@@ -1,0 +1,83 @@
+"""How a computation ended: one enumeration for constrained dynamics and for simulations, and its codes by name and number."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+CODES: list[str] = []  # names; their places stand for the codes in arrays and files
+
+
+class RESULTS(eqx.Enumeration):
+    """How a computation ended: one enumeration for constrained dynamics and for simulations."""
+
+    successful = "successful"
+    # Of equation solvers: those of lineax and optimistix, by their names.
+    max_steps_reached = "The maximum number of steps was reached; raise max_steps."
+    singular = "A linear solver met a singular matrix."
+    breakdown = "An iterative linear solver broke down."
+    stagnation = "An iterative linear solver came no further."
+    conlim = "A linear solver met a matrix of too large a condition number."
+    nonfinite_input = "A linear solver was given NaN or infinity."
+    nonlinear_max_steps_reached = "The maximum number of steps of a nonlinear solver was reached."
+    nonlinear_divergence = "A nonlinear solver diverged."
+    nonfinite = "A solver met NaN or infinity."
+    # Of constrained dynamics.
+    singular_mass_matrix = (
+        "The mass matrix is not positive definite to rounding: a joint moves no inertia, or next to none."
+    )
+    dependent_rows = "The constraint rows are dependent; take method='rank_aware'."
+    contradictory_rows = "No acceleration satisfies the constraint rows: they contradict each other."
+    singular_basis = "The minimal velocities do not determine the others here; choose another basis."
+    not_assembled = "No configuration and velocity that satisfy the constraints were found."
+    # Of simulations: those of diffrax, by its names, and ours.
+    dt_min_reached = "The minimum step size was reached in the differential equation solver."
+    event_occurred = "An event ended the motion."
+    max_steps_rejected = "Too many steps were rejected."
+    internal_error = "diffrax met an error of its own."
+    nonfinite_start = "The initial state is not finite, or a quaternion in it is zero."
+    nonfinite_state = "The state became NaN or infinite."
+    unordered_times = "The save points are not finite and increasing."
+    bad_stepsize = "The step is not positive and finite."
+    bad_tolerance = "A tolerance is negative or not finite."
+    coarse_steps = (
+        "The fixed steps are too long, or too many for the dtype: the motion may be wrong by a tenth of it or more."
+    )
+    coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
+    inconsistent_start = "The initial state is not on the constraints."
+    open_constraints = "The constraints opened, and the projection could not close them."
+    contact_lost = "A contact pulled or left its friction cone."
+    joint_limit_passed = "A joint passed one of its position limits."
+    control_singular = "The control came to where its task cannot be followed: task and constraints lose rank."
+    too_many_events = "Events followed each other without end, or there were more than max_events."
+    painleve_paradox = (
+        "Friction and normal force of a sliding contact left no forces, or more than one (Painleve's paradox)."
+    )
+    no_contact_mode = "No mode of the contacts was found that agrees with their forces."
+    no_single_contact = (
+        "Surfaces that roll do not touch in one point any more: their relative curvature is not positive."
+    )
+    unnormalized_start = "A quaternion of the initial state is not of unit length."
+
+    # An enumeration of equinox does not tell its names.
+    CODES.extend(name for name in vars() if not name.startswith("_"))
+
+
+def code_of(result: Any) -> Array:
+    """A result, traced or batched, as its place in `CODES` (uint8)."""
+    return jnp.argmax(jnp.stack([result == getattr(RESULTS, name) for name in CODES]), 0).astype(jnp.uint8)
+
+
+def name_of(result: Any) -> str:
+    """The name of one known result."""
+    return CODES[int(code_of(result))]
+
+
+class Outcome(eqx.Module):
+    """What has a `result`, one of `RESULTS`."""
+
+    @property
+    def success(self) -> Bool[Array, "..."]:
+        """Whether `result` is `RESULTS.successful`."""
+        return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
