@@ -54,7 +54,6 @@ USERS = {
     "diffrax": FROM_SIMULATION,
     "optax": {"identify"} | PROGRAMS,
     "optimistix": {"constraints", "reduction", "simulation", "identify"} | PROGRAMS,
-    "lineax": ABOVE_DYNAMICS,
     "matplotlib": FILES_AND_PLOTS,
     "scipy": {"contact", "identify"}
     | FILES_AND_PLOTS,  # a dependency of jax, so always there; not when jaxdyn is imported
