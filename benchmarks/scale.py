@@ -1,6 +1,6 @@
 """Large batches through `jd.scale.run`: what storing costs, memory, resuming, two cores, rollouts of unequal cost.
 
-    python -m benchmarks.scale [store memory resume cores cost] [--samples 100000] [--full]
+    python -m benchmarks.scale [store memory resume cores cost hosts] [--samples 100000] [--full]
 
 - store: seconds of a run against those of its programs alone, an arm of seven joints, 400 steps of RK4, 11 rows each, in turns.
 - memory: peak of processes that run 1, 3 and 10 times as many rolling disks with 100 rows each (1e6 with --full, 9 GB on disk).
@@ -10,10 +10,13 @@
 - cores: the arm in processes that may use one core and two: seconds and efficiency, t1/(2 t2).
 - cost: four-bars whose springs are soft or stiff, adaptive steps: lane-steps that a batch waits for over steps that are needed,
   and seconds, in the order of the numbers, by falling cost (`cost=`), and by the cost that is measured (`cost="measured"`).
+- hosts: what the arm's rollouts compute, write and exchange, measured here, and what that makes on paper for 1, 8 and 64 hosts
+  of 64 cores; what an iteration of a fit exchanges.
 """
 
 import argparse
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -27,9 +30,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdyn as jd
+from benchmarks.operations import operations
 from jaxdyn.scale import batch, driver
 
 QUIET = {"progress": False}
+COLLECTIVES = "all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast"
 CACHE = "JAX_COMPILATION_CACHE_DIR"
 
 
@@ -170,10 +175,48 @@ def cost(folder: Path, samples: int) -> None:
         )
 
 
+def hosts(folder: Path, samples: int) -> None:
+    """To many hosts, on paper, from what is measured here."""
+    programs = []
+    drive = driver.drive
+
+    def noted(job, program, *rest):
+        programs.append(program)
+        return drive(job, program, *rest)
+
+    batch.driver.drive = noted
+    run = arm(samples, folder / "hosts.zarr")
+    batch.driver.drive = drive
+    files = [path for path in (folder / "hosts.zarr").rglob("*") if path.is_file()]
+    chunks = -(-samples // run.chunk)
+    bytes_each, files_each = sum(path.stat().st_size for path in files) / samples, len(files) / chunks
+    model = jd.robots.iiwa()
+    counted = operations(lambda *x: jd.forward_dynamics(model, *x), *[jnp.zeros(7)] * 3)
+    evaluations = 4 * round(0.4 / 1e-3)
+    flops = evaluations * (counted.all if counted else float("nan"))
+    exchanged = len(re.findall(rf" ({COLLECTIVES})(-start)?\(", programs[-1].compiled.as_text()))
+    cores = len(os.sched_getaffinity(0))
+    pace = samples / run.seconds / cores
+    print(
+        f"hosts: {samples} arms on {cores} cores: {pace:.3g} rollouts/s a core of {flops:.3g} operations each "
+        f"({pace * flops / 1e9:.2g} G/s), {bytes_each:.0f} bytes on disk each, {files_each:.1f} files a chunk of {run.chunk}, "
+        f"{exchanged} collectives in the program\n"
+        "| hosts of 64 cores | rollouts/s | T operations/s | rows, GB/s | reductions alone, MB/s | files/s at 2 s a chunk |\n"
+        "|---|---|---|---|---|---|"
+    )
+    for count in (1, 8, 64):
+        total = 64 * count * pace
+        print(
+            f"| {count} | {total:.2g} | {total * flops / 1e12:.2g} | {total * bytes_each / 1e9:.2g} | {total / 1e6:.2g} | "
+            f"{files_each * count / 2:.3g} |"
+        )
+    print("a fit of 70 numbers: one all-reduce of 568 bytes an iteration (tests/test_sharding.py counts it)")
+
+
 def main() -> None:
     """Print the tables that were asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="*", default=["store", "memory", "resume", "cores", "cost"])
+    parser.add_argument("what", nargs="*", default=["store", "memory", "resume", "cores", "cost", "hosts"])
     parser.add_argument("--samples", type=int, default=100_000)
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
@@ -191,6 +234,7 @@ def main() -> None:
         return
     many = 1_000_000 if args.full else args.samples
     sizes = {"store": args.samples, "memory": many, "resume": many, "cores": args.samples, "cost": 4096}
+    sizes["hosts"] = args.samples
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     for name in args.what:
         with tempfile.TemporaryDirectory(dir="out" if Path("out").is_dir() else None) as folder:

@@ -21,6 +21,7 @@ from jax import lax
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
+from benchmarks.operations import operations
 from jaxdyn import compile as backend
 from jaxdyn.compile import compute, derive, kernel, mode, objects, program, target
 from jaxdyn.compile.code import kernel_ir
@@ -680,6 +681,14 @@ def test_models_known_and_given_move_alike():
     assert known.cost < 0.8 * program_of(jd.forward_dynamics, model, q, v, tau).cost
     text = jax.jit(lambda *x: jd.forward_dynamics(model, *x)).lower(q, v, tau).as_text()
     assert text.count("custom_call") == 1 and "dot_general" not in text
+
+
+def test_operations_of_the_kernels_of_a_function_are_counted():
+    model = jd.robots.iiwa()
+    counted = operations(lambda *x: jd.forward_dynamics(model, *x), *[jnp.zeros(7)] * 3)
+    # Nothing depends on the first joint's angle, about the direction of gravity.
+    assert counted and 800 < counted.all < 1200 and counted.functions == 2 * 6
+    assert operations(lambda q: q + 1, jnp.zeros(7)) is None
 
 
 def test_what_all_samples_share_is_read_once():
