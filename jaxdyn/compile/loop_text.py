@@ -1,6 +1,6 @@
 """The text of loops (see `loops`): LLVM's intermediate representation around the programs of a turn and of a row.
 
-entry   pointers, and numbers that all samples share
+entry   pointers
 block   the next samples: constants and states go to memory of the lanes, rows and records are copied to the results
 turn    the program of a turn; new states where a lane takes part and is served; its records
 rows    while a lane has a row to write: the program of a row
