@@ -14,7 +14,7 @@ class RESULTS(eqx.Enumeration):
 
     successful = "successful"
     # Of equation solvers: those of lineax and optimistix, by their names.
-    max_steps_reached = "The maximum number of steps was reached; raise max_steps."
+    max_steps_reached = "The maximum number of solver steps was reached."
     singular = "A linear solver met a singular matrix."
     breakdown = "An iterative linear solver broke down."
     stagnation = "An iterative linear solver came no further."

@@ -16,7 +16,7 @@ from jaxdyn.simulation.equations import equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, start_limit
 from jaxdyn.simulation.outputs import at_save_point
-from jaxdyn.simulation.solution import RESULTS, Solution, first_of
+from jaxdyn.simulation.solution import RESULTS, Solution, first_of, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
 from jaxdyn.simulation.solvers.choice import (
     is_fixed,
@@ -97,7 +97,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, rows)
     finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]
     reached = good & jnp.stack(finite).all(0)
-    y = jax.tree.map(lambda rows, start: jnp.where(_along(reached, rows), rows, start[None]), y, y0)
+    y = jax.tree.map(functools.partial(rows_where, reached), y, y0)
     work = y.pop("work", None)
 
     def to_qv(row):
@@ -164,24 +164,17 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         met = map_rows(is_met, (y, q, v, ts))
         failures.append(((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows))
 
-    def or_nan(rows):
-        return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
-
     of_control = {name: y[name] for name in added}
     of_row = functools.partial(at_save_point, scene, control, method, eqs, outputs)
     computed = map_rows(lambda row: of_row(*row), (q, v, ts, of_control))
     rows = {"q": q, "v": v} | computed | ({} if work is None else {"work": work})
     whole = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
     result = first_of([*failures, ((result == RESULTS.successful) & ~whole, RESULTS.nonfinite_state)], result)
+    rows = jax.tree.map(lambda x: rows_where(reached, x, jnp.nan), rows)
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     if lost is not None and unilateral.can_end(scene, options["contacts"]):
         stats["lost_contact"] = jnp.where(lost.entry < count, lost.entry, -1)
     if lost is not None and options["limits"] == "stop":
         stats["passed_limit"] = jnp.where(at_limit, (lost.entry - count) % q.shape[1], -1).astype(jnp.int32)
-    return Solution(ts=given_times, result=result, stats=stats, solver=label(solver), **jax.tree.map(or_nan, rows))
-
-
-def _along(mask, rows):
-    """The mask (nt,) shaped so that it applies to the rows (nt, ...)."""
-    return mask.reshape(-1, *[1] * (rows.ndim - 1))
+    return Solution(ts=given_times, result=result, stats=stats, solver=label(solver), **rows)

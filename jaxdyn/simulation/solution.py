@@ -40,6 +40,11 @@ def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
     return jax.tree.map(lambda *each: jnp.stack(each)[place], *codes, otherwise)
 
 
+def rows_where(kept, rows, otherwise):
+    """Rows (nt, ...) where the mask (nt,) holds, elsewhere what fits their shape."""
+    return jnp.where(kept.reshape(-1, *[1] * (rows.ndim - 1)), rows, jnp.asarray(otherwise, rows.dtype))
+
+
 def from_diffrax(result) -> Any:
     """A code of diffrax as one of `RESULTS`, by its name."""
     cases = [(result == getattr(diffrax.RESULTS, name), getattr(RESULTS, name)) for name in OF_DIFFRAX]

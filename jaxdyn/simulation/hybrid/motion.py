@@ -24,7 +24,7 @@ from jaxdyn.simulation.hybrid.modes import Mode, elements_of, extended, force_at
 from jaxdyn.simulation.hybrid.replay import Hybrid
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
-from jaxdyn.simulation.solution import Solution
+from jaxdyn.simulation.solution import Solution, first_of, rows_where
 from jaxdyn.simulation.solvers.choice import is_fixed, label, unwrapped
 from jaxdyn.simulation.solvers.fixed_steps import too_coarse
 from jaxdyn.simulation.solvers.inputs import has_unit_quaternions
@@ -129,7 +129,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     first = {"q": q0, "v": v0, "slip": begun.slip}
     y = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rows)
     reached = good & jnp.isfinite(y["q"]).all(1) & jnp.isfinite(y["v"]).all(1)
-    y = jax.tree.map(lambda rows, one: jnp.where(_along(reached, rows), rows, one[None]), y, first)
+    y = jax.tree.map(partial(rows_where, reached), y, first)
 
     def report(unknown, row):
         y, mode, t = row
@@ -161,28 +161,23 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     y = jax.tree.map(lambda a, b: jnp.concatenate([a[:1], b]), y, later)
     values = lax.map(partial(run, report, unknown), (y, modes, ts))
 
-    def or_nan(rows):
-        return jnp.where(_along(reached, rows), rows, jnp.full_like(rows, jnp.nan))
-
     codes: Any = RESULTS
-    result: Any = codes.where(lane.t < ts[-1], codes.max_steps_reached, codes.successful)
+    cases = [
+        (~in_order, codes.unordered_times),
+        (~fine_steps, codes.bad_stepsize),
+        (~fine, codes.bad_tolerance),
+        (~finite_start, codes.nonfinite_start),
+        (~unit_start, codes.unnormalized_start),
+        (~start_ok, codes.inconsistent_start),
+    ]
     for code, name in _CODES.items():
         if code == machine.SHORT and stepsize is not None:
             name = "nonfinite_state"
-        result = RESULTS.where(lane.code == code, getattr(RESULTS, name), result)
+        cases.append((lane.code == code, getattr(codes, name)))
+    cases.append((lane.t < ts[-1], codes.max_steps_reached))
     if stepsize is not None:
-        coarse = (result == RESULTS.successful) & too_coarse(lane.sums)
-        result = RESULTS.where(coarse, RESULTS.coarse_steps, result)
-    result = RESULTS.where((result == RESULTS.successful) & ~reached.all(), RESULTS.nonfinite_state, result)
-    for fits, name in (
-        (start_ok, "inconsistent_start"),
-        (unit_start, "unnormalized_start"),
-        (finite_start, "nonfinite_start"),
-        (fine, "bad_tolerance"),
-        (fine_steps, "bad_stepsize"),
-        (in_order, "unordered_times"),
-    ):
-        result = RESULTS.where(fits, result, getattr(RESULTS, name))
+        cases.append((too_coarse(lane.sums), codes.coarse_steps))
+    result = first_of([*cases, (~reached.all(), codes.nonfinite_state)], codes.successful)
     stats = {
         "num_steps": lane.taken,
         "num_accepted_steps": lane.kept,
@@ -192,14 +187,8 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     happened = Events(times, records.name[:most], elements.names)
     solver = label(options["solver"])
     shown = {"q": y["q"], "v": y["v"], **values}
-    return Solution(
-        ts=given_times, result=result, stats=stats, events=happened, solver=solver, **jax.tree.map(or_nan, shown)
-    )
-
-
-def _along(mask, rows):
-    """The mask (nt,) shaped so that it applies to the rows (nt, ...)."""
-    return mask.reshape(-1, *[1] * (rows.ndim - 1))
+    shown = jax.tree.map(lambda rows: rows_where(reached, rows, jnp.nan), shown)
+    return Solution(ts=given_times, result=result, stats=stats, events=happened, solver=solver, **shown)
 
 
 def _guess(scene: Scene, elements, q, v, t):
