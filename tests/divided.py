@@ -114,7 +114,9 @@ def compare_all():
     compare("four-bar in shard_map", local, *start)
     plane = jax.make_mesh((2, 4), ("one", "other"), axis_types=(AUTO, AUTO))
     grid = jax.NamedSharding(plane, jax.P("one", "other"))
-    compare("two axes", jax.vmap(jax.vmap(dynamics)), *(jax.device_put(x.reshape(4, 4, model.nv), grid) for x in states))
+    compare(
+        "two axes", jax.vmap(jax.vmap(dynamics)), *(jax.device_put(x.reshape(4, 4, model.nv), grid) for x in states)
+    )
 
 
 def compare_cached():
