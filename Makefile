@@ -7,6 +7,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Tests of one file go to one worker, so that what they share is computed once.
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+# The files with tests of native kernels: a run of those alone need not import the others.
+NATIVE := $(shell grep -l "mark.native" tests/test_*.py)
 # Most of a test of mechanics is XLA's compiling. These options leave a third of that out, and change no more than rounding.
 QUICK := XLA_FLAGS="--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 
@@ -24,7 +26,7 @@ demo: $(VENV)/.installed-plot  ## simulate, check and plot a first example
 	$(BIN)/python -m jaxdyn.demo
 
 test: $(VENV)/.installed-test  ## the tests, without the slow ones
-	$(QUICK) $(PYTEST) -m "not slow and not native"; mechanics=$$?; $(PYTEST) -m "not slow and native" && exit $$mechanics
+	$(QUICK) $(PYTEST) -m "not slow and not native"; mechanics=$$?; $(PYTEST) -m "not slow and native" $(NATIVE) && exit $$mechanics
 
 test-all: $(VENV)/.installed-test  ## every test, on every robot, with XLA's own options
 	$(PYTEST) --all-robots

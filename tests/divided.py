@@ -11,7 +11,7 @@ import sys
 from collections import Counter
 from functools import partial
 
-os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=8"
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
 os.environ["JAX_PLATFORMS"] = "cpu"
 
 import jax
@@ -25,8 +25,8 @@ from jaxdyn.identify import minimise
 jax.config.update("jax_enable_x64", True)
 COLLECTIVES = "all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast"
 AUTO, EXPLICIT = jax.sharding.AxisType.Auto, jax.sharding.AxisType.Explicit
-model = jd.robots.iiwa()
-states = tuple(jax.random.normal(jax.random.key(0), (3, 16, 7)))
+model = jd.robots.chain(3)
+states = tuple(jax.random.normal(jax.random.key(0), (3, 16, model.nv)))
 
 
 def exchanged(program) -> dict:
@@ -114,7 +114,9 @@ def compare_all():
     compare("four-bar in shard_map", local, *start)
     plane = jax.make_mesh((2, 4), ("one", "other"), axis_types=(AUTO, AUTO))
     grid = jax.NamedSharding(plane, jax.P("one", "other"))
-    compare("two axes", jax.vmap(jax.vmap(dynamics)), *(jax.device_put(x.reshape(4, 4, 7), grid) for x in states))
+    compare(
+        "two axes", jax.vmap(jax.vmap(dynamics)), *(jax.device_put(x.reshape(4, 4, model.nv), grid) for x in states)
+    )
 
 
 def compare_cached():

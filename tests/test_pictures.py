@@ -16,8 +16,6 @@ from jaxdyn.pictures import inferred, motion
 from jaxdyn.pictures.drawing import cone_sides
 from jaxdyn.pictures.solids import SIZES, Shape, Shapes, finer, joined, sharpened, simplified
 
-WITH_BODIES = [name for name in jd.scenes.names() if isinstance(getattr(jd.scenes, name)().system, jd.Model)]
-
 
 def volume(vertices, faces) -> float:
     """Volume by the divergence theorem: positive where triangles run counter-clockwise from outside."""
@@ -77,14 +75,19 @@ def test_solids_of_inertia_have_that_inertia(moments):
     np.testing.assert_allclose(computed, inertia[2], atol=(1e-12 if solid.kind == "box" else 0.03) * max(moments))
 
 
-@pytest.mark.parametrize("name", WITH_BODIES)
-def test_every_scene_of_bodies_has_solids_and_a_stage(name):
-    """Without kinematics compiled: solids are on frames of the model, finite and right side out."""
-    scene = getattr(jd.scenes, name)()
-    shapes = inferred.completed(scene, Shapes())
-    assert shapes and shapes.frames() <= set(scene.system.frame_names)
-    for shape in shapes:
-        assert volume(*shape.triangles()) > 0
+def test_every_scene_of_bodies_has_solids_and_a_stage():
+    """Without kinematics compiled: solids are on frames of the model, finite and right side out.
+
+    Scenes are built here, not as the names of cases, since cases are collected by every process of the tests.
+    """
+    built = {name: getattr(jd.scenes, name)() for name in jd.scenes.names()}
+    with_bodies = {name: scene for name, scene in built.items() if isinstance(scene.system, jd.Model)}
+    assert len(with_bodies) > 20
+    for name, scene in with_bodies.items():
+        shapes = inferred.completed(scene, Shapes())
+        assert shapes and shapes.frames() <= set(scene.system.frame_names), name
+        for shape in shapes:
+            assert volume(*shape.triangles()) > 0, name
 
 
 URDF = """<robot name="arm">

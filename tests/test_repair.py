@@ -1,5 +1,7 @@
 """What only some samples of a batch need: flags of the whole batch, samples that are computed again, and their derivatives."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,23 +63,34 @@ def _root(x, scale):
     return repair_flagged(x < 1, careful, lambda x, scale: jnp.sqrt(scale * x), computed, (x, scale))
 
 
+@functools.cache
+def _roots(nested):
+    """A program of the roots of a batch, which way each was computed, and derivatives in both directions."""
+    run = jax.vmap(_root, (0, None))
+    if nested:
+        run = jax.vmap(run, (0, 0))
+
+    @jax.jit
+    def computed(x, scales):
+        y, (way,) = run(x, scales)
+        slope = jax.grad(lambda x: jnp.sum(run(x, scales)[0]))(x)
+        moved = jax.jvp(lambda s: run(x, s)[0], (scales,), (jnp.ones_like(scales),))[1]
+        return y, way, slope, moved
+
+    return computed
+
+
 @pytest.mark.parametrize("nested", [False, True])
 @pytest.mark.parametrize("few", [0, 1, 50, 96])
 def test_samples_that_need_it_are_repaired(nested, few):
     """None, one, more than are computed at once, and all; values, which way, and derivatives in both directions."""
     x = jnp.where(jnp.arange(96) % 96 < few, 0.5, 2.0) + jnp.arange(96) / 1000
     shape = (8, 12) if nested else (96,)
-    run = jax.vmap(_root, (0, None))
-    scales = jnp.asarray(3.0)
-    if nested:
-        run = jax.vmap(jax.vmap(_root, (0, None)), (0, 0))
-        scales = jnp.arange(1.0, 9.0)
-    y, (way,) = jax.jit(run)(x.reshape(shape), scales)
+    scales = jnp.arange(1.0, 9.0) if nested else jnp.asarray(3.0)
+    y, way, slope, moved = _roots(nested)(x.reshape(shape), scales)
     want = np.sqrt(np.asarray(x).reshape(shape) * (np.asarray(scales)[:, None] if nested else 3.0))
     assert_close(y, want, 1e-14)
     assert way.reshape(-1).tolist() == [1] * few + [0] * (96 - few)
-    slope = jax.grad(lambda x: jnp.sum(run(x, scales)[0]))(x.reshape(shape))
-    moved = jax.jvp(lambda s: run(x.reshape(shape), s)[0], (scales,), (jnp.ones_like(scales),))[1]
     assert_close(slope, want / (2 * np.asarray(x).reshape(shape)), 1e-13)
     assert_close(moved, want / (2 * (np.asarray(scales)[:, None] if nested else 3.0)), 1e-13)
 

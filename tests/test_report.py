@@ -1,6 +1,7 @@
 """The report of error against run time: references, counts, errors, the front, the page and the command."""
 
 import dataclasses
+import functools
 import sys
 
 import diffrax
@@ -46,11 +47,17 @@ from jaxdyn.systems.scene import Scene
 MOMENTS = np.array([1.0, 2.0, 3.0])
 
 
+@functools.cache
+def built(name):
+    """Scene and start of a case."""
+    return cases()[name].build()
+
+
 def test_references_start_where_the_scenes_do():
     for name, case in cases().items():
         if case.reference is None:
             continue
-        _, (q, v) = case.build()
+        _, (q, v) = built(name)
         reference = case.reference((q, v))
         assert reference.q.shape == (len(reference.ts), len(q)), name
         np.testing.assert_allclose(reference.q[0], q, atol=1e-14, err_msg=name)
@@ -59,8 +66,8 @@ def test_references_start_where_the_scenes_do():
 
 @pytest.mark.slow
 def test_every_case_builds():
-    for name, case in cases().items():
-        scene, (q, v) = case.build()
+    for name in cases():
+        scene, (q, v) = built(name)
         assert q.shape == (scene.nq,) and v.shape == (scene.nv,), name
 
 
@@ -266,7 +273,7 @@ def test_evaluations_of_implicit_methods_are_not_known():
 def test_every_way_can_be_simulated():
     """Solvers suit the steps they get, methods the scene, and ladders go from coarse to fine."""
     for case in cases().values():
-        scene, _ = case.build()
+        scene, _ = built(case.name)
         for full, plain in ((False, True), (True, True), (True, False)):
             pairs = running.combinations(case, bool(scene.constraints), full=full, plain=plain)
             assert len(set(pairs)) == len(pairs) >= 3

@@ -78,6 +78,7 @@ def test_rows_are_batched_and_differentiated(count):
 
     for derivative in (lambda f: f, lambda f: jax.grad(f, (0, 1)), lambda f: jax.jacfwd(f, (0, 1))):
         ours, theirs = (
-            jax.vmap(derivative(lambda *x, way=way: total(way, *x)))(many, scales) for way in (map_rows, lax.map)
+            jax.jit(jax.vmap(derivative(lambda *x, way=way: total(way, *x))))(many, scales)
+            for way in (map_rows, lax.map)
         )
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12), ours, theirs)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
-from pinocchio_bridge import assert_close, random_inertia, random_states, random_tree, to_pinocchio
+from pinocchio_bridge import assert_close, quick, random_inertia, random_states, random_tree, to_pinocchio
 
 import jaxdyn as jd
 from jaxdyn.constraints.base import constraint_jacobian
@@ -113,16 +113,24 @@ def test_wrench_through_joints_is_that_of_pinocchio(tree, mode):
 
 def test_part_of_the_wrench_along_the_joint_is_its_force(tree):
     q, v, a, _, pulls = (x[0] for x in random_states(tree, 1, 1))
-    tau = jd.inverse_dynamics(tree, q, v, a, external=pulls) - tree.armature * a
-    wrenches = jd.joint_wrench(tree, q, v, a, external=pulls)
-    world = jd.joint_wrench(tree, q, v, a, external=pulls, axes="world")
+
+    @quick
+    def compute(q, v, a):
+        wrenches, one, world = (
+            jd.joint_wrench(tree, q, v, a, *name, external=pulls, axes=axes)
+            for name, axes in (((), "body"), (("j4",), "body"), ((), "world"))
+        )
+        tau = jd.inverse_dynamics(tree, q, v, a, external=pulls) - tree.armature * a
+        jacobians = [jd.body_jacobian(tree, q, name) for name in tree.body_names]
+        turns = [jd.frame_pose(tree, q, name)[:3, :3] for name in tree.body_names]
+        return tau, wrenches, one, world, jacobians, turns
+
+    tau, wrenches, one, world, jacobians, turns = jax.tree.map(np.asarray, compute(q, v, a))
     for i, place in enumerate(tree.topology.v_slices):
         # The joint's own columns of the body Jacobian are its motion subspace.
-        own = jd.body_jacobian(tree, q, tree.body_names[i])[:, place]
-        assert_close(own.T @ wrenches[i], tau[place])
-        turn = jd.frame_pose(tree, q, tree.body_names[i])[:3, :3]
-        assert_close(world[i], jnp.concatenate([turn @ wrenches[i, :3], turn @ wrenches[i, 3:]]))
-    assert_close(jd.joint_wrench(tree, q, v, a, "j4", external=pulls), wrenches[4])
+        assert_close(jacobians[i][:, place].T @ wrenches[i], tau[place])
+        assert_close(world[i], np.concatenate([turns[i] @ wrenches[i, :3], turns[i] @ wrenches[i, 3:]]))
+    assert_close(one, wrenches[4])
     with pytest.raises(ValueError, match="axes is 'frame'; choose from body, world"):
         jd.joint_wrench(tree, q, v, a, axes="frame")
 
@@ -133,13 +141,20 @@ def test_wrenches_of_constraints_on_bodies(name):
     make = getattr(jd.scenes, name)
     scene = make()
     q, v = make.start()
-    dynamics = jd.constrained_dynamics(scene, q, v)
-    pulls = jd.body_wrenches(scene, q, dynamics.multipliers)
-    forces = sum(jd.constraint_forces(scene, q, dynamics.multipliers).values())
-    assert_close(jd.generalized_force(scene.system, q, pulls), forces)
-    wrenches = jd.joint_wrench(scene.system, q, v, dynamics.acceleration, external=pulls)
+
+    @quick
+    def compute(q, v):
+        dynamics = jd.constrained_dynamics(scene, q, v)
+        pulls = jd.body_wrenches(scene, q, dynamics.multipliers)
+        forces = sum(jd.constraint_forces(scene, q, dynamics.multipliers).values())
+        wrenches = jd.joint_wrench(scene.system, q, v, dynamics.acceleration, external=pulls)
+        jacobians = [jd.body_jacobian(scene.system, q, name) for name in scene.system.body_names]
+        return jd.generalized_force(scene.system, q, pulls), forces, wrenches, jacobians
+
+    pulled, forces, wrenches, jacobians = jax.tree.map(np.asarray, compute(q, v))
+    assert_close(pulled, forces)
     for i, place in enumerate(scene.system.topology.v_slices):
-        own = jd.body_jacobian(scene.system, q, scene.system.body_names[i])[:, place]
+        own = jacobians[i][:, place]
         assert np.abs(own.T @ wrenches[i]).max() < 1e-9 * max(1.0, float(np.abs(wrenches).max()))
 
 
