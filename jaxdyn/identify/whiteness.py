@@ -1,0 +1,44 @@
+"""How long the errors of a fit last, and how many independent ones they are worth."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdyn.identify.logs import Log
+
+
+class Whiteness(NamedTuple):
+    """Of a residual (n, nv): correlation time (s) of each torque, and how many independent samples it is worth (nv,)."""
+
+    correlation_time: np.ndarray
+    effective_samples: np.ndarray
+
+
+def whiteness(log: Log, residual: np.ndarray) -> Whiteness:
+    """How far what a fit leaves over is from independent errors.
+
+    The integrated correlation time, dt (1 + 2 sum of the autocorrelation up to its first zero), is dt for white noise; the
+    residual is worth the length of the log over it. The low-pass of `from_raw` alone leaves some 1 / (2 cutoff).
+
+    Source: Priestley (1981), "Spectral analysis and time series", section 5.3.
+    """
+    n, nv = residual.shape
+    step = float(log.t[-1] - log.t[0]) / max(n - 1, 1)
+    lasting = np.full(nv, step)
+    for j, x in enumerate((residual - residual.mean(axis=0)).T):
+        spectrum = np.abs(np.fft.rfft(x, 2 * n)) ** 2
+        correlation = np.fft.irfft(spectrum)[:n]
+        if not correlation[0] > 0:
+            continue
+        correlation = correlation / correlation[0]
+        end = int(np.argmax(correlation < 0)) or n
+        lasting[j] = step * max(1.0, 1 + 2 * float(correlation[1:end].sum()))
+    return Whiteness(lasting, n * step / lasting)
+
+
+def stretches(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> float:
+    """How many independent samples the residuals (n, nv) of all logs are worth, by the torque whose errors last longest."""
+    return sum(
+        float(whiteness(log, residual).effective_samples.min()) for log, residual in zip(logs, residuals, strict=True)
+    )
