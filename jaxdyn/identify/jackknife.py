@@ -2,7 +2,7 @@
 
 Errors of neighbouring groups hang together, which a jackknife does not see: of the variance of a mean of errors whose correlation
 decays exponentially it finds the share 1 - T / (2 L), with L the length of a group and T the integrated correlation time. Groups
-are therefore twice as long as errors last at least, where a log allows it, which leaves an eighth of a standard deviation
+are therefore twice as long as errors last at least, where that leaves six of them, which leaves an eighth of a standard deviation
 unseen; leaving out groups that tell much errs to the other side.
 
 Source: Efron (1982), "The jackknife, the bootstrap and other resampling plans"; Kunsch (1989), "The jackknife and the bootstrap
@@ -12,8 +12,9 @@ multi-stage samples", for what leaving out corrects.
 
 import numpy as np
 
-# Blocks left out together, and independent errors in them: no fewer than these where that leaves so many groups at least.
-_TOGETHER, _INDEPENDENT, _FEWEST = 2, 2, 4
+# Blocks left out together, and independent errors in them: no fewer than these where that leaves so many groups at least. Of
+# Student's t with less than five degrees of freedom, a number over its deviation has squares without a variance.
+_TOGETHER, _INDEPENDENT, _FEWEST = 2, 2, 6
 
 
 def block_groups(count: int, worth: float) -> list[np.ndarray]:

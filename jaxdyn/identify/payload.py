@@ -112,7 +112,7 @@ def fit_payload(
     residuals = [robot.fit.torques(log) - np.asarray(log.tau, np.float64) for log in unloaded]
 
     def worth(payload) -> float:
-        return stretches(logs, [*residuals, *_residuals(robot, loaded, own, payload)[0]])
+        return stretches([*residuals, *_residuals(robot, loaded, own, payload)[0]])
 
     for _ in range(_ROUNDS if extra else 1):
         loads = []

@@ -335,7 +335,7 @@ def least_squares(
     places = columns[base.independent]
     fitted = x0.copy()
     fitted[places] += fit.change
-    worth = stretches(logs, [_torques(model, log, fitted, v_s) - np.asarray(log.tau, np.float64) for log in logs])
+    worth = stretches([_torques(model, log, fitted, v_s) - np.asarray(log.tau, np.float64) for log in logs])
     std, factor = _scatter(parts, fitted, places, fit.half, weights, worth)
     std = np.where(fit.unknown, np.inf, std)
     nominal = base.values(x0[columns])

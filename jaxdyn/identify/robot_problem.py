@@ -96,7 +96,7 @@ class RobotProblem:
     def intervals(self, setting: Setting, estimate: Estimate, fit: Fit) -> Intervals:
         """Standard deviations of an estimate, which is this fit."""
         data, curved = self.data(setting), self.curved(setting)
-        worth = stretches(self.logs, [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs])
+        worth = stretches([fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs])
         return intervals(self.model, data, setting, estimate, self.weights, self.basic, worth, curved)
 
     def with_term(self, term: TorqueTerm) -> "RobotProblem":

@@ -23,22 +23,27 @@ def whiteness(log: Log, residual: np.ndarray) -> Whiteness:
 
     Source: Priestley (1981), "Spectral analysis and time series", section 5.3.
     """
-    n, nv = residual.shape
+    n = len(residual)
     step = float(log.t[-1] - log.t[0]) / max(n - 1, 1)
-    lasting = np.full(nv, step)
+    lasting = _lasting(residual)
+    return Whiteness(step * lasting, n / lasting)
+
+
+def _lasting(residual: np.ndarray) -> np.ndarray:
+    """Integrated correlation times (k,) of the columns of a residual (n, k), in samples."""
+    n, columns = residual.shape
+    lasting = np.ones(columns)
     for j, x in enumerate((residual - residual.mean(axis=0)).T):
-        spectrum = np.abs(np.fft.rfft(x, 2 * n)) ** 2
+        spectrum = np.abs(np.fft.rfft(x / (np.abs(x).max(initial=0) or 1.0), 2 * n)) ** 2
         correlation = np.fft.irfft(spectrum)[:n]
         if not correlation[0] > 0:
             continue
         correlation = correlation / correlation[0]
         end = int(np.argmax(correlation < 0)) or n
-        lasting[j] = step * max(1.0, 1 + 2 * float(correlation[1:end].sum()))
-    return Whiteness(lasting, n * step / lasting)
+        lasting[j] = max(1.0, 1 + 2 * float(correlation[1:end].sum()))
+    return lasting
 
 
-def stretches(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> float:
-    """How many independent samples the residuals (n, nv) of all logs are worth, by the torque whose errors last longest."""
-    return sum(
-        float(whiteness(log, residual).effective_samples.min()) for log, residual in zip(logs, residuals, strict=True)
-    )
+def stretches(residuals: Sequence[np.ndarray]) -> float:
+    """How many independent samples the residuals (n, k) of all logs are worth, by the column whose errors last longest."""
+    return sum(float((len(residual) / _lasting(residual)).min()) for residual in residuals)
