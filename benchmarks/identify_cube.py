@@ -138,7 +138,7 @@ def main() -> None:
         f"{len(logs)} flights of {PIECE + 1} samples or more; fitted {len(train)}, predicted {len(test)}; {fit.result} after "
         f"{len(fit.history) - 1} steps in {seconds:.1f} s, once more in {time.perf_counter() - begun:.2f} s"
     )
-    # Fits of disjoint fifths: errors within a toss go together, which one fit's deviations do not know.
+    # Fits of disjoint fifths: a witness that knows nothing of how deviations are computed.
     parts = np.array([identified(train[k::5], start).values for k in range(5)])
     grouped = parts.std(axis=0, ddof=1) / 5**0.5
     for name, *numbers in zip(fit.names, fit.values, fit.deviation, grouped, strict=True):

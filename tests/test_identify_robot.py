@@ -8,6 +8,7 @@ import pytest
 
 from jaxdyn import identify, inertia
 from jaxdyn.identify.condensed import block_slices, condensed_rows
+from jaxdyn.identify.jackknife import block_groups, jackknife
 from jaxdyn.identify.logs import as_measured
 from jaxdyn.identify.one_fit import eliminate
 from jaxdyn.identify.regression import condense, condense_model
@@ -16,6 +17,7 @@ from jaxdyn.identify.selection import folds, helped
 from jaxdyn.identify.spectra import motion_band, vibration
 from jaxdyn.identify.suspicions import at_rest, suspicions
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
+from jaxdyn.identify.whiteness import stretches
 from jaxdyn.model.builder import ModelBuilder
 
 
@@ -293,6 +295,42 @@ def correlated(seed, n):
     return np.stack([np.convolve(x, kernel / np.linalg.norm(kernel), "same") for x in white(seed, n).T], axis=1)
 
 
+def lasting(seed, n, keep=0.97):
+    """Noise whose correlation decays exponentially over some 33 samples: on 300 of them ten groups of blocks are too short."""
+    noise = white(seed, n)
+    for i in range(1, n):
+        noise[i] = keep * noise[i - 1] + np.sqrt(1 - keep**2) * noise[i]
+    return noise
+
+
+def test_groups_of_blocks_are_as_long_as_errors_last():
+    """Twice as long at least, where that leaves six groups; and of two blocks, however short errors are."""
+    sizes = [[len(group) for group in block_groups(20, worth)] for worth in (np.inf, 16.0, 1.0)]
+    assert sizes == [[2] * 10, [3] * 4 + [2] * 4, [4, 4, 3, 3, 3, 3]]
+    assert len(block_groups(3, np.inf)) == 2 and len(block_groups(570, 1e4)) == 285
+    log = motion(0)
+    two = [identify.whiteness(log, x).effective_samples.min() for x in (white(0, 300), lasting(0, 300))]
+    assert stretches([white(0, 300), lasting(0, 300)]) == pytest.approx(sum(two))
+
+
+def test_the_share_of_the_variance_that_groups_see_is_that_of_theory():
+    """Mean of noise of correlation keep^k: groups of L see 1 - T / (2 L) of its variance, T = 2 / -log keep."""
+    keep, length, groups = 0.95, 80, 50
+    noise = np.random.default_rng(0).normal(size=(400, length * groups))
+    for i in range(1, noise.shape[1]):
+        noise[:, i] = keep * noise[:, i - 1] + np.sqrt(1 - keep**2) * noise[:, i]
+    sums = noise.reshape(400, groups, length).sum(axis=2)
+    seen = []
+    for series, total in zip(sums, noise.mean(axis=1), strict=True):
+        slopes = (length * total - series)[:, None]
+        root, _ = jackknife(np.full((groups, 1, 1), float(length)), slopes, np.zeros((1, 1)))
+        seen.append(np.sum(root**2))
+    expected = 1 - 2 / -np.log(keep) / (2 * length)
+    # 400 means know their variance to 7 %.
+    assert abs(np.mean(seen) / np.var(noise.mean(axis=1)) / expected - 1) < 0.2
+    assert expected < 0.8
+
+
 @pytest.mark.slow
 def test_intervals_cover():
     """1 % of noise on the torques, 8 arms of 13 combinations: 95 % intervals hold the truth nine times in ten."""
@@ -300,9 +338,9 @@ def test_intervals_cover():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noises", [white, correlated])
+@pytest.mark.parametrize("noises", [white, correlated, lasting])
 def test_intervals_cover_for_many_arms(noises):
-    """As above; 40 arms, and noise that is correlated."""
+    """As above; 40 arms, and noise that is correlated: over a thirtieth of the log, and over a fifth."""
     assert 0.90 <= coverage(noises, 40) <= 0.99
 
 

@@ -160,6 +160,44 @@ def test_linear_parameters_and_their_deviations_are_those_of_least_squares(oscil
     )
 
 
+def test_deviations_count_errors_that_last(oscillation):
+    """Linear, so that numpy fits again without each group: six of 81 samples, whose errors last for a third of the log."""
+    log, noise = oscillation, np.random.default_rng(4).normal(size=81)
+    for i in range(1, 81):
+        noise[i] = 0.97 * noise[i - 1] + 0.24 * noise[i]
+    noisy = identify.Log(log.t, log.q, log.v, log.a, np.asarray(log.tau) + 0.05 * noise[:, None])
+    start = oscillator(inertia=2.0, stiffness=1.0, offset=0.0, drive=2.0, damping=0.1)
+    fit = identify.fit_parameters(
+        start, noisy, free=lambda s: [s.system.parameters, s.forces[0].coefficient], error="torque", tolerance=0.0
+    )
+    t, q, v, a, tau = (np.asarray(x).reshape(-1) for x in (noisy.t, noisy.q, noisy.v, noisy.a, noisy.tau))
+    A = np.stack([-np.sin(3 * t), a, -np.ones_like(t), q, v], axis=1)
+    edges = np.linspace(0, 81, 21).astype(int)  # twenty blocks, four or three of which make a group
+    groups = [np.arange(edges[part[0]], edges[part[-1] + 1]) for part in np.array_split(np.arange(20), 6)]
+    without = [np.linalg.lstsq(np.delete(A, group, 0), np.delete(tau, group), rcond=None)[0] for group in groups]
+    scatter = np.sqrt(5 / 6 * np.sum((np.array(without) - np.mean(without, axis=0)) ** 2, axis=0))
+    best, (rest,) = np.linalg.lstsq(A, tau, rcond=None)[:2]
+    independent = np.sqrt(rest / 76 * np.diag(np.linalg.inv(A.T @ A)))
+    assert np.any(scatter > 1.2 * independent)
+    np.testing.assert_allclose(fit.values, best, rtol=1e-7)
+    np.testing.assert_allclose(fit.deviation, np.maximum(scatter, independent), rtol=1e-6)
+    assert fit.factor == pytest.approx(2.5706, abs=1e-4)  # Student's t, five degrees of freedom
+
+
+def test_logs_of_their_own_are_left_out_whole():
+    """Thirty throws of a mass, each with an error of its own: the deviation of the mean is that of thirty, not of all samples."""
+    generator, t = np.random.default_rng(2), np.linspace(0, 1, 11)
+    own, logs = generator.normal(size=30), []
+    one = np.ones((11, 1))
+    for error in own:
+        tau = (2.0 + 0.1 * error) * one + 0.001 * generator.normal(size=(11, 1))
+        logs.append(identify.Log(t, 0 * one, 0 * one, one, tau))
+    mass = oscillator(inertia=1.0, stiffness=0.0, offset=0.0, drive=0.0)
+    fit = identify.fit_parameters(mass, logs, free=lambda s: s.system.parameters["inertia"], error="torque")
+    pairs = own.reshape(15, 2).mean(axis=1)
+    np.testing.assert_allclose(fit.deviation, 0.1 * pairs.std(ddof=1) / 15**0.5, rtol=0.02)
+
+
 @pytest.mark.slow
 def test_trajectories_with_noise_and_free_starts(oscillation):
     """The log's clock reaches the drive; starts that are fitted too take their noise out of the parameters."""

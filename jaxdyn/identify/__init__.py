@@ -11,9 +11,7 @@ from jaxdyn.identify.friction import Friction as Friction
 from jaxdyn.identify.gains import DriveGains as DriveGains
 from jaxdyn.identify.gains import fit_gains as fit_gains
 from jaxdyn.identify.identifiability import Identifiability as Identifiability
-from jaxdyn.identify.identifiability import Whiteness as Whiteness
 from jaxdyn.identify.identifiability import identifiability as identifiability
-from jaxdyn.identify.identifiability import whiteness as whiteness
 from jaxdyn.identify.intervals import Intervals as Intervals
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import split as split
@@ -45,3 +43,5 @@ from jaxdyn.identify.spectra import choose_cutoff as choose_cutoff
 from jaxdyn.identify.torque_terms import EXTRA as EXTRA
 from jaxdyn.identify.torque_terms import TorqueTerm as TorqueTerm
 from jaxdyn.identify.trajectory import fit_trajectory as fit_trajectory
+from jaxdyn.identify.whiteness import Whiteness as Whiteness
+from jaxdyn.identify.whiteness import whiteness as whiteness

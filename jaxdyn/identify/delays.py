@@ -97,7 +97,7 @@ def find_delays(
         if np.abs(step).max(initial=0) < _SMALL:
             break
         delay = delay + np.clip(step, -_STEP, _STEP)
-    spread = problem.intervals(free, estimate)
+    spread = problem.intervals(free, estimate, problem.result(free, estimate, data))
     std = spread.parameters.std[-model.nv :]
     # Weights of a robust loss may keep the steps from shrinking below what no one knows anyway.
     if np.any(np.abs(step) >= np.maximum(_SMALL, _SETTLED * std)):
@@ -129,7 +129,7 @@ def with_delays(
     term = TorqueTerm(_DELAY.name, lambda log, load, v_s: slopes[id(log)])
     wide = problem.with_term(term)
     free = setting._replace(extra=(*setting.extra, (term.name, kept)))
-    spread = wide.intervals(free, estimate._replace(x=np.append(estimate.x, np.zeros(problem.model.nv))))
+    spread = wide.intervals(free, estimate._replace(x=np.append(estimate.x, np.zeros(problem.model.nv))), fit)
     values, std = spread.parameters.values.copy(), delays.std.copy()
     values[len(values) - len(kept) :] = delays.seconds[list(kept)]
     std[list(kept)] = spread.parameters.std[len(values) - len(kept) :]

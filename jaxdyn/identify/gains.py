@@ -201,7 +201,8 @@ def _fit(problem: _Problem, v_s: float):
         error, J = problem.linearised(block, *state)
         grams.append(J.T @ J)
         slopes.append(J.T @ error)
-    groups = block_groups(len(data))
+    # How long the errors of currents last is not asked.
+    groups = block_groups(len(data), np.inf)
     total = np.sum(grams, axis=0)
     curvature = np.diag(_held(total, problem.size))
     parts = [np.stack([np.sum([x[i] for i in group], axis=0) for group in groups]) for x in (grams, slopes)]

@@ -158,23 +158,36 @@ def with_prior(data: Linear, residual, rows, weight: float) -> Linear:
     )
 
 
-def deviations(end: Linear, slopes: np.ndarray) -> np.ndarray:
-    """Standard deviations (m,) of numbers with the slopes (m, p) by y; infinite where neither data nor prior determine them.
+class Determined(NamedTuple):
+    """The errors near a minimum in coordinates in which data and prior together have the curvature 1.
 
-    Errors of the data count as independent ones of one size, which is theirs; those of the prior have the size it says. NaN when
-    the errors are not finite, or no more than the unknowns.
+    `data` (n, r), `errors` (n,): rows and errors of the data over their deviation; `prior` (k, r): rows of the prior; `numbers`
+    (m, r): slopes of numbers; `idle` (m,): which of these neither data nor prior determine.
+    """
+
+    data: np.ndarray
+    errors: np.ndarray
+    prior: np.ndarray
+    numbers: np.ndarray
+    idle: np.ndarray
+
+
+def determined(end: Linear, slopes: np.ndarray) -> Determined | None:
+    """What numbers with the slopes (m, p) by y are told by; None when the errors are not finite, or no more than the unknowns.
+
+    Errors of the data have one size, which is theirs; those of the prior the size it says.
     """
     if not end.finite:
-        return np.full(len(slopes), np.nan)
+        return None
     count = len(end.errors) - end.priors
     data = end.rows[:count]
     fit = truncated(data, end.errors[:count], _RANK_TOLERANCE)
     spare = count - end.start_rank - (fit.rank if end.priors == 0 else 0)
     if spare <= 0:
-        return np.full(len(slopes), np.nan)
-    square = max(float(np.sum(end.errors[:count] ** 2)), 1e-300) / spare
+        return None
+    noise = (max(float(np.sum(end.errors[:count] ** 2)), 1e-300) / spare) ** 0.5
     # The prior's rows were weighed by a noise that was assumed: here by the one that is seen.
-    rows = np.concatenate([data / square**0.5, end.rows[count:] / end.prior_weight**0.5])
+    rows = np.concatenate([data / noise, end.rows[count:] / end.prior_weight**0.5])
     size = np.linalg.norm(rows, axis=0)
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
     _, s, Vt = np.linalg.svd(np.linalg.qr(rows / size)[1], full_matrices=True)
@@ -184,5 +197,6 @@ def deviations(end: Linear, slopes: np.ndarray) -> np.ndarray:
     seen = np.where(unseen[None], 0.0, scaled)
     idle = np.linalg.norm(seen @ Vt[rank:].T, axis=1) > 1e-6 * np.linalg.norm(seen, axis=1)
     idle |= np.abs(scaled[:, unseen]).sum(axis=1) > 0
-    known = np.sqrt(np.sum((seen @ Vt[:rank].T / s[:rank]) ** 2, axis=1))
-    return np.where(idle, np.inf, known)
+    turned = Vt[:rank].T / s[:rank]
+    rows = (rows / size) @ turned
+    return Determined(rows[:count], end.errors[:count] / noise, rows[count:], seen @ turned, idle)

@@ -1,4 +1,4 @@
-"""What a log can tell: rank, condition and the weakest directions in words; how far what is left over is from noise."""
+"""What a log can tell: rank, condition and the weakest directions in words."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -91,32 +91,3 @@ def _words(direction: np.ndarray, names: Sequence[str]) -> str:
     signs = np.sign(direction[order[0]]) if order else 1.0
     parts = [f"{signs * direction[i]:+.2f} {names[i]}" for i in order]
     return " ".join(parts).removeprefix("+") + (" ..." if np.sum(direction[order] ** 2) < 0.9 else "")
-
-
-class Whiteness(NamedTuple):
-    """Of a residual (n, nv): correlation time (s) of each torque, and how many independent samples it is worth (nv,)."""
-
-    correlation_time: np.ndarray
-    effective_samples: np.ndarray
-
-
-def whiteness(log: Log, residual: np.ndarray) -> Whiteness:
-    """How far what a fit leaves over is from independent errors.
-
-    The integrated correlation time, dt (1 + 2 sum of the autocorrelation up to its first zero), is dt for white noise; the
-    residual is worth the length of the log over it. The low-pass of `from_raw` alone leaves some 1 / (2 cutoff).
-
-    Source: Priestley (1981), "Spectral analysis and time series", section 5.3.
-    """
-    n, nv = residual.shape
-    step = float(log.t[-1] - log.t[0]) / max(n - 1, 1)
-    lasting = np.full(nv, step)
-    for j, x in enumerate((residual - residual.mean(axis=0)).T):
-        spectrum = np.abs(np.fft.rfft(x, 2 * n)) ** 2
-        correlation = np.fft.irfft(spectrum)[:n]
-        if not correlation[0] > 0:
-            continue
-        correlation = correlation / correlation[0]
-        end = int(np.argmax(correlation < 0)) or n
-        lasting[j] = step * max(1.0, 1 + 2 * float(correlation[1:end].sum()))
-    return Whiteness(lasting, n * step / lasting)

@@ -58,6 +58,7 @@ def intervals(
     estimate: Estimate,
     weights: np.ndarray,
     terms,
+    worth: float,
     curved: Data | None = None,
 ) -> Intervals:
     """`Intervals` of one fit of condensed logs.
@@ -66,8 +67,9 @@ def intervals(
     leaving b out moves the fit by (H - D_b)^-1 g_b. Their covariance times (B - 1) is the data's share, and
     max(prior, 1) H^-1 P H^-1 the prior's. All in the coordinates of the chart, then carried over to x.
 
-    `curved`: logs whose curvature counts, where the loss is not made of squares: Huber's has none beyond its threshold, though it
-    has a slope there.
+    `worth`: how many independent errors the logs hold (`stretches`), which says how long what is left out must be. `curved`: logs
+    whose curvature counts, where the loss is not made of squares: Huber's has none beyond its threshold, though it has a slope
+    there.
 
     Source: Efron (1982), the jackknife; Cameron & Miller (2015), cluster-robust inference (CR3); Huber
     (1981), "Robust statistics", section 6.4, whose curvature is that of psi'.
@@ -77,7 +79,7 @@ def intervals(
     slopes = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
     grams_of_curvature = (data if curved is None else curved).blocks.grams(weights)
     grams = np.einsum("pi,bpq,qj->bij", jacobian, grams_of_curvature, jacobian, optimize=True) / sigma**2
-    groups = block_groups(len(blocks))
+    groups = block_groups(len(blocks), worth)
     slopes, grams = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (slopes, grams))
     changes, inverse = jackknife(grams, slopes, curvature)
     count = len(groups)

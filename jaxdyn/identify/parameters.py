@@ -9,7 +9,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.identify.checkpoint import checkpoint_at
-from jaxdyn.identify.gauss_newton import Linear, Unknowns, deviations, gauss_newton, linear, with_prior
+from jaxdyn.identify.clusters import deviations, groups_of
+from jaxdyn.identify.gauss_newton import Linear, Unknowns, gauss_newton, linear, with_prior
+from jaxdyn.identify.jackknife import student
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.mechanisms import observed_columns
 from jaxdyn.identify.minimise import METHODS, minimise
@@ -167,13 +169,20 @@ def fit_parameters(
     watch = Watch(int(steps), report, checkpoint=key, show=progress, seconds=seconds)
     estimate, end, history, result = _minimised(problem, unknowns, method, watch, learning_rate, tolerance)
     values, slopes = (np.asarray(x, np.float64) for x in values_and_slopes(tree, estimate.y))
+    deviation, factor = None, np.nan
+    if end is not None and not end.finite:
+        deviation = np.full(len(slopes), np.nan)
+    elif end is not None:
+        groups = groups_of(problem, logs, end.errors[: len(end.errors) - end.priors])
+        deviation, factor = deviations(end, slopes, groups), student(int(groups.max(initial=1)))
     return ParameterFit(
         system=tree.system(estimate.y),
         nominal=system,
         names=tree.names,
         values=values,
         nominal_values=np.asarray(values_and_slopes(tree, tree.start)[0], np.float64),
-        deviation=None if end is None else deviations(end, slopes),
+        deviation=deviation,
+        factor=factor,
         history=history,
         result=result,
         method=f"{error} fit by {method if isinstance(method, str) else type(method).__name__}",

@@ -18,6 +18,7 @@ from jaxdyn.identify.regression import noise_level, regressor, truncated
 from jaxdyn.identify.robot import RobotFit, fit_robot
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import split_terms
+from jaxdyn.identify.whiteness import stretches
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.builder import ModelBuilder
@@ -108,6 +109,11 @@ def fit_payload(
     own = slice(10 * number, 10 * number + 10)
     logs, payload = (*unloaded, *loaded), np.zeros(10)
     is_loaded = np.arange(len(logs)) >= len(unloaded)
+    residuals = [robot.fit.torques(log) - np.asarray(log.tau, np.float64) for log in unloaded]
+
+    def worth(payload) -> float:
+        return stretches([*residuals, *_residuals(robot, loaded, own, payload)[0]])
+
     for _ in range(_ROUNDS if extra else 1):
         loads = []
         for log, holds in zip(logs, is_loaded, strict=True):
@@ -117,8 +123,8 @@ def fit_payload(
         data = gather(model, logs, setting.v_s, extra, loads, _BLOCKS)
         kept = np.concatenate([np.arange(data.basic), data.places(setting.extra)]).astype(int)
         rows = _rows(data.blocks, is_loaded, own, kept, robot.weights)
-        payload, std, factor = _solve(data.blocks, is_loaded, own, kept, robot.weights, rows)
-    error, without = _errors(model, robot, loaded, own, payload)
+        payload, std, factor = _solve(data.blocks, is_loaded, own, kept, robot.weights, rows, worth)
+    error, without = _errors(robot, loaded, own, payload)
     return Payload(payload, std, factor, body, robot, error, without)
 
 
@@ -131,8 +137,11 @@ def _rows(blocks: Blocks, is_loaded, own: slice, kept, weights) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows):
-    """The payload that can exist, standard deviations (10,) and the factor of an interval."""
+def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, worth):
+    """The payload that can exist, standard deviations (10,) and the factor of an interval.
+
+    `worth(payload)`: how many independent errors the logs hold with it (`stretches`).
+    """
     count = len(kept)
     sigma = noise_level(condensed_rows(rows, blocks.count()))
     hold = _HOLD * np.maximum(np.linalg.norm(rows[:, :count], axis=0), 1e-12)
@@ -169,7 +178,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows):
         holds = int(is_loaded[blocks.logs[i]])
         grams.append(spreads[holds].T @ gram @ spreads[holds] / sigma**2)
         slopes.append(scores[holds, i] @ spreads[holds] / sigma**2)
-    groups = block_groups(len(blocks))
+    groups = block_groups(len(blocks), worth(payload))
     summed = [
         np.stack([np.sum([values[int(i)] for i in group], axis=0) for group in groups]) for values in (grams, slopes)
     ]
@@ -189,19 +198,20 @@ def _ball(numbers: np.ndarray) -> np.ndarray:
     return np.asarray(_inertia.displaced(jnp.asarray(_inertia.sphere(mass, _RADIUS)), centre))
 
 
-def _errors(model: Model, robot: RobotFit, loaded: Sequence[Log], own: slice, payload) -> tuple[float, float]:
-    change = np.zeros(10 * model.nb + 4 * model.nv)
-    change[own] = payload
-    measured, alone, both = [], [], []
+def _residuals(robot: RobotFit, loaded: Sequence[Log], own: slice, payload) -> tuple[list, list]:
+    """Errors (n, nv) along each loaded log, of robot and payload, and of the robot alone."""
+    inertias = robot.fit.model.inertias
     with_payload = eqx.tree_at(
         lambda fit: fit.model.inertias,
         robot.fit,
-        robot.fit.model.inertias.at[own.start // 10].add(jnp.asarray(payload)),
+        inertias.at[own.start // 10].add(jnp.asarray(payload, inertias.dtype)),
     )
-    for log in loaded:
-        measured.append(np.asarray(log.tau, np.float64))
-        alone.append(robot.fit.torques(log))
-        both.append(with_payload.torques(log))
-    size = np.linalg.norm(np.concatenate(measured))
-    off = [100 * float(np.linalg.norm(np.concatenate(x) - np.concatenate(measured)) / size) for x in (both, alone)]
-    return off[0], off[1]
+    return tuple(  # pyright: ignore[reportReturnType]
+        [fit.torques(log) - np.asarray(log.tau, np.float64) for log in loaded] for fit in (with_payload, robot.fit)
+    )
+
+
+def _errors(robot: RobotFit, loaded: Sequence[Log], own: slice, payload) -> tuple[float, float]:
+    size = np.linalg.norm(np.concatenate([np.asarray(log.tau, np.float64) for log in loaded]))
+    both, alone = (np.concatenate(parts) for parts in _residuals(robot, loaded, own, payload))
+    return 100 * float(np.linalg.norm(both) / size), 100 * float(np.linalg.norm(alone) / size)

@@ -207,7 +207,7 @@ def cause_of(problem: Problem, estimate: Unknowns, logs: Sequence[Log]) -> str |
     A parameter is named when the errors are finite with it where it started, all others as they are.
     """
     problem = gathered(problem)
-    samples, before = _first_samples(problem, logs), 0
+    samples, before = first_samples(problem, logs), 0
     slopes = slopes_of(problem, estimate)
     for batch, (_, by_y, _) in zip(problem.batches, slopes, strict=True):
         errors = np.asarray(_errors_at(problem, batch, estimate.y, estimate.start))
@@ -231,7 +231,7 @@ def cause_of(problem: Problem, estimate: Unknowns, logs: Sequence[Log]) -> str |
     return None if np.isfinite(residual).all() else "the prior's residuals are not finite"
 
 
-def _first_samples(problem: Problem, logs: Sequence[Log]) -> list[tuple[int, int]]:
+def first_samples(problem: Problem, logs: Sequence[Log]) -> list[tuple[int, int]]:
     """Log and first sample of every piece."""
     # Pieces of one sample are all samples; others share their ends.
     length = problem.batches[0].t.shape[1]

@@ -14,6 +14,7 @@ from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
 from jaxdyn.identify.jackknife import block_groups, jackknife, student
 from jaxdyn.identify.logs import Log, as_logs, check_log
 from jaxdyn.identify.threads import on_one_thread
+from jaxdyn.identify.whiteness import stretches
 from jaxdyn.model.arguments import as_array, check_shapes
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, integrate, neutral
@@ -66,6 +67,12 @@ def regressor(model: Model, q, v, a, *, v_s=0.01) -> np.ndarray:
         part = _regressor_block(model, q[rows], v[rows], a[rows], jnp.asarray(v_s, model.home.dtype))
         parts.append(np.asarray(part, np.float64)[: n - start])
     return np.concatenate(parts)
+
+
+def _torques(model: Model, log: Log, x: np.ndarray, v_s: float) -> np.ndarray:
+    """Torques (n, nv) of all parameters x along a log; no more than some samples' regressor is held at a time."""
+    pieces = [log[start : start + 4 * _BLOCK] for start in range(0, len(log), 4 * _BLOCK)]
+    return np.concatenate([regressor(model, part.q, part.v, part.a, v_s=v_s) @ x for part in pieces])
 
 
 @eqx.filter_jit
@@ -252,7 +259,7 @@ class LeastSquares(eqx.Module):
     def torques(self, log: Log) -> np.ndarray:
         """Torques (n, nv) that the fit predicts along a log."""
         check_log(log, self.model)
-        return regressor(self.model, log.q, log.v, log.a, v_s=self.v_s) @ self.parameters
+        return _torques(self.model, log, self.parameters, self.v_s)
 
     def error(self, log: Log) -> float:
         """Torque error along a log, in per cent of the measured torque: 100 |tau_fit - tau| / |tau| over all joints."""
@@ -328,7 +335,8 @@ def least_squares(
     places = columns[base.independent]
     fitted = x0.copy()
     fitted[places] += fit.change
-    std, factor = _scatter(parts, fitted, places, fit.half, weights)
+    worth = stretches([_torques(model, log, fitted, v_s) - np.asarray(log.tau, np.float64) for log in logs])
+    std, factor = _scatter(parts, fitted, places, fit.half, weights, worth)
     std = np.where(fit.unknown, np.inf, std)
     nominal = base.values(x0[columns])
     parameters = x0.copy()
@@ -350,12 +358,14 @@ def least_squares(
     )
 
 
-def _scatter(blocks: Blocks, x: np.ndarray, places, half: np.ndarray, weights) -> tuple[np.ndarray, float]:
+def _scatter(
+    blocks: Blocks, x: np.ndarray, places, half: np.ndarray, weights, worth: float
+) -> tuple[np.ndarray, float]:
     """Standard deviations of x[places] from groups of blocks left out in turn, and the factor of a 95 % interval.
 
     In coordinates y with x[places] = half y, in which all samples together have the curvature 1.
     """
-    groups = block_groups(len(blocks))
+    groups = block_groups(len(blocks), worth)
     slopes = blocks.scores(x, weights)[:, places] @ half
     grams = np.einsum("pi,bpq,qj->bij", half, blocks.grams(weights)[:, places][:, :, places], half, optimize=True)
     slopes, grams = (np.stack([part[group].sum(axis=0) for group in groups]) for part in (slopes, grams))

@@ -136,8 +136,10 @@ class ParameterFit(AbstractFit):
 
     - `system`: the system or the scene, as given, with what was fitted; `nominal`: the same as the fit started.
     - `names` (p,): where the fitted numbers stand, as one writes it after the system: "parameters['mass']".
-    - `deviation` (p,): standard deviation of each, for independent noise of one size in all that was compared, in the
-      fit's units; infinite for what the log does not determine. None where the method finds none.
+    - `deviation` (p,): standard deviation of each, infinite for what the log does not determine, None where the method finds
+      none: the larger of that for independent errors of one size, and that by groups of samples left out in turn, which are
+      stretches of a log as long as errors last, or whole logs where there are twenty or more. `factor`: a 95 % interval is plus
+      and minus this many of them (Student's t).
     - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps", "stopped" or "not_finite";
       `cause` then says in which log, at which sample and by which parameters.
     """
@@ -152,6 +154,7 @@ class ParameterFit(AbstractFit):
     result: str = eqx.field(static=True)
     method: str = eqx.field(static=True)
     cause: str | None = eqx.field(static=True, default=None)
+    factor: float = np.nan
 
     @property
     def scene(self) -> Scene:

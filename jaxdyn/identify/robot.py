@@ -154,7 +154,7 @@ def fit_robot(
     if is_found and delays is not None and delays.seconds.any():
         spread, delays = with_delays(problem, setting, estimate, fit, delays)
     else:
-        spread = problem.intervals(setting, estimate)
+        spread = problem.intervals(setting, estimate, fit)
     used = dict(setting.extra)
     chosen = (*basic, *((term, used[term.name]) for term in extra if term.name in used))
     return RobotFit(fit, problem.weights, Choice(setting, trials, by), spread, chosen, delays)

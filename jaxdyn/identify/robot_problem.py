@@ -12,6 +12,7 @@ from jaxdyn.identify.one_fit import Data, Estimate, Setting, fit_condensed, gath
 from jaxdyn.identify.regression import regressor
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.torque_terms import ExtraTorque, TorqueTerm
+from jaxdyn.identify.whiteness import stretches
 from jaxdyn.model.tree import Model
 
 
@@ -92,10 +93,11 @@ class RobotProblem:
         kept = [np.where(weight < 1, 0.0, 1.0) for weight in weights]
         return gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, kept)
 
-    def intervals(self, setting: Setting, estimate: Estimate) -> Intervals:
-        """Standard deviations of a fit."""
+    def intervals(self, setting: Setting, estimate: Estimate, fit: Fit) -> Intervals:
+        """Standard deviations of an estimate, which is this fit."""
         data, curved = self.data(setting), self.curved(setting)
-        return intervals(self.model, data, setting, estimate, self.weights, self.basic, curved)
+        worth = stretches([fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs])
+        return intervals(self.model, data, setting, estimate, self.weights, self.basic, worth, curved)
 
     def with_term(self, term: TorqueTerm) -> "RobotProblem":
         """The same logs and weights with the columns of one more term, behind all others."""

@@ -18,9 +18,10 @@ from jaxdyn.identify import (
     parameter_names,
     torque_error,
 )
-from jaxdyn.identify.identifiability import Identifiability, Whiteness, whiteness
+from jaxdyn.identify.identifiability import Identifiability
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
+from jaxdyn.identify.whiteness import Whiteness, whiteness
 from jaxdyn.model.tree import Model
 
 
