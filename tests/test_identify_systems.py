@@ -5,12 +5,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from jax.tree_util import Partial
 
 from jaxdyn import identify, scenes
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.forces.elements import JointDamping
 from jaxdyn.identify.chart import check_bodies
+from jaxdyn.identify.jackknife import block_groups
+from jaxdyn.identify.whiteness import stretches
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -161,7 +164,7 @@ def test_linear_parameters_and_their_deviations_are_those_of_least_squares(oscil
 
 
 def test_deviations_count_errors_that_last(oscillation):
-    """Linear, so that numpy fits again without each group: six of 81 samples, whose errors last for a third of the log."""
+    """Linear, so that numpy fits again without each group of samples, whose errors last."""
     log, noise = oscillation, np.random.default_rng(4).normal(size=81)
     for i in range(1, 81):
         noise[i] = 0.97 * noise[i - 1] + 0.24 * noise[i]
@@ -172,16 +175,19 @@ def test_deviations_count_errors_that_last(oscillation):
     )
     t, q, v, a, tau = (np.asarray(x).reshape(-1) for x in (noisy.t, noisy.q, noisy.v, noisy.a, noisy.tau))
     A = np.stack([-np.sin(3 * t), a, -np.ones_like(t), q, v], axis=1)
-    edges = np.linspace(0, 81, 21).astype(int)  # twenty blocks, four or three of which make a group
-    groups = [np.arange(edges[part[0]], edges[part[-1] + 1]) for part in np.array_split(np.arange(20), 6)]
-    without = [np.linalg.lstsq(np.delete(A, group, 0), np.delete(tau, group), rcond=None)[0] for group in groups]
-    scatter = np.sqrt(5 / 6 * np.sum((np.array(without) - np.mean(without, axis=0)) ** 2, axis=0))
     best, (rest,) = np.linalg.lstsq(A, tau, rcond=None)[:2]
+    edges = np.linspace(0, 81, 21).astype(int)  # twenty blocks, some of which make a group
+    parts = block_groups(20, stretches([(A @ best - tau)[:, None]]))
+    groups = [np.arange(edges[part[0]], edges[part[-1] + 1]) for part in parts]
+    without = [np.linalg.lstsq(np.delete(A, group, 0), np.delete(tau, group), rcond=None)[0] for group in groups]
+    scatter = np.sqrt(
+        (len(groups) - 1) / len(groups) * np.sum((np.array(without) - np.mean(without, axis=0)) ** 2, axis=0)
+    )
     independent = np.sqrt(rest / 76 * np.diag(np.linalg.inv(A.T @ A)))
-    assert np.any(scatter > 1.2 * independent)
+    assert np.any(scatter > 1.02 * independent) and np.any(scatter < independent)
     np.testing.assert_allclose(fit.values, best, rtol=1e-7)
     np.testing.assert_allclose(fit.deviation, np.maximum(scatter, independent), rtol=1e-6)
-    assert fit.factor == pytest.approx(2.5706, abs=1e-4)  # Student's t, five degrees of freedom
+    assert fit.factor == pytest.approx(scipy.stats.t.ppf(0.975, len(groups) - 1), rel=1e-9)
 
 
 def test_logs_of_their_own_are_left_out_whole():
