@@ -25,7 +25,7 @@ from jaxdyn.identify import minimise
 jax.config.update("jax_enable_x64", True)
 COLLECTIVES = "all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast"
 AUTO, EXPLICIT = jax.sharding.AxisType.Auto, jax.sharding.AxisType.Explicit
-model = jd.robots.chain(3)
+model = jd.robots.iiwa()
 states = tuple(jax.random.normal(jax.random.key(0), (3, 16, model.nv)))
 
 
