@@ -36,15 +36,6 @@ install_import_hook([f"jaxdyn.{room}" for room in ROOMS], "beartype.beartype")
 gc.set_threshold(200_000, 20, 50)
 
 
-def _freeze_survivors(phase: str, info: dict[str, int]) -> None:
-    """What a full collection leaves is not looked at by the next one."""
-    if phase == "stop" and info["generation"] == 2:
-        gc.freeze()
-
-
-gc.callbacks.append(_freeze_survivors)
-
-
 def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("jaxdyn")
     group.addoption("--data", type=Path, default=ROOT.parent / "shared" / "data", help="directory of recorded data")

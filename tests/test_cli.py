@@ -390,14 +390,14 @@ def test_identify_finds_delays_from_a_file_of_options(arm, tmp_path, capsys):
     assert main(["identify", str(file)]) == 0
     assert "Delays of the torques against the positions (ms)" in capsys.readouterr().out
     report = json.loads((tmp_path / "fit.json").read_text())
-    found = report["delays"]
-    off, half = np.abs(np.array(found["seconds"]) - 0.02), found["interval_factor"] * np.array(found["std"])
-    assert found["by"] == "auto" and np.all(off <= half) and np.all(half < 0.005)
+    delays = report["delays"]
+    off, half = np.abs(np.array(delays["seconds"]) - 0.02), delays["interval_factor"] * np.array(delays["std"])
+    assert delays["by"] == "auto" and np.all(off <= half) and np.all(half < 0.005)
     name = f"{truth.joint_names[0]}.delay"
-    assert report["parameters"][name]["fitted"] == found["seconds"][0]
+    assert report["parameters"][name]["fitted"] == delays["seconds"][0]
     assert report["test_logs"]["B.csv"]["percent"] < 1 and abs(report["payload"]["mass"] - 0.7) < 0.02
     assert "How late torques were recorded" in (tmp_path / "fit.html").read_text()
-    given = [str(x) for x in found["seconds"]]
+    given = [str(x) for x in delays["seconds"]]
     assert main(["identify", str(file), "--delay", *given]) == 0
     again = json.loads((tmp_path / "fit.json").read_text())
     assert again["delays"]["by"] == "given" and again["delays"]["std"] == [None] * 3
@@ -468,10 +468,10 @@ def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys
     assert "Drives, torque = gain * what the logs hold" in capsys.readouterr().out
     assert "Drives, torque = gain" in (tmp_path / "fit.html").read_text()
     report = json.loads((tmp_path / "fit.json").read_text())
-    found = report["drive_gains"]
-    told = np.array([name in found["told"] for name in truth.joint_names])
-    off = np.abs(np.array(found["gains"]) - gains)
-    assert told.any() and np.all(off <= 4 * np.array(found["std"]))
+    drives = report["drive_gains"]
+    told = np.array([name in drives["told"] for name in truth.joint_names])
+    off = np.abs(np.array(drives["gains"]) - gains)
+    assert told.any() and np.all(off <= 4 * np.array(drives["std"]))
     assert np.all(off[told] < 0.05) and abs(report["payload"]["mass"] - 0.7) < 0.03
     assert report["torque_error"]["test_percent"] < 2
     for option, words in ((known[:2], "gains need --payload-log"), (known[2:], "without --payload-mass")):

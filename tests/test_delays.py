@@ -116,8 +116,8 @@ def test_intervals_of_delays_cover():
     inside = []
     for seed in range(20):
         truth = np.random.default_rng(seed).uniform(-0.01, 0.01, 2)
-        found = identify.fit_robot(arm(), late(seed, truth), delay="auto", **GIVEN).delays
-        inside.append(np.abs(found.seconds - truth) <= found.factor * found.std)
+        delays = identify.fit_robot(arm(), late(seed, truth), delay="auto", **GIVEN).delays
+        inside.append(np.abs(delays.seconds - truth) <= delays.factor * delays.std)
     assert np.mean(inside) >= 0.85
 
 

@@ -278,8 +278,8 @@ def test_numbers_of_a_controlled_arm_by_its_motion_in_closed_loop():
     tree = jd.identify.Parameters(wrong).positive(lambda s: s.forces[0]).inertias(["link2"], shape="mass", metric=None)
     options = {"error": "closed-loop", "horizon": 25, "substeps": 8, "control": law}
     fit = jd.identify.fit_parameters(wrong, log, tree, tolerance=1e-10, **options)
-    found = dict(zip(fit.names, fit.values, strict=True))
-    damping = [value for name, value in found.items() if name.startswith("forces")]
+    computed = dict(zip(fit.names, fit.values, strict=True))
+    damping = [value for name, value in computed.items() if name.startswith("forces")]
     np.testing.assert_allclose(damping, [0.3, 0.2, 0.1], rtol=2e-3)
     np.testing.assert_allclose(fit.scene.system.inertias[2, 0], 0.5, rtol=1e-4)
     # Per cent; what steps of 5 ms leave.

@@ -26,10 +26,10 @@ def raw(seed=0, rate=200.0, duration=20.0, top=5, vibration=None, noise=1e-4, sl
 def test_the_cutoff_is_ten_times_the_band_of_the_motion():
     """Five harmonics of 0.1 Hz with equal velocities: 99 % of the power needs all five. Noise and sampling change nothing."""
     for log in (raw(), raw(1, noise=1e-3), raw(2, rate=1000.0), raw(3, rate=61.0, duration=33.0)):
-        found = identify.choose_cutoff(log)
+        chosen = identify.choose_cutoff(log)
         # The window is two lines wide, of 1 / duration each.
-        assert found.motion == pytest.approx(0.5, abs=2 / 20)
-        assert found.frequency == pytest.approx(10 * found.motion) and found.vibration is None
+        assert chosen.motion == pytest.approx(0.5, abs=2 / 20)
+        assert chosen.frequency == pytest.approx(10 * chosen.motion) and chosen.vibration is None
     assert identify.choose_cutoff(raw(slow=0.25)).motion == pytest.approx(2.0, abs=0.1)
     # A way that does not come back, and jitter of the time stamps.
     log = raw(4)
@@ -40,16 +40,16 @@ def test_the_cutoff_is_ten_times_the_band_of_the_motion():
 
 
 def test_several_logs_get_the_highest_band_and_the_lowest_rate():
-    found = identify.choose_cutoff([raw(), raw(slow=0.5)])
-    assert found.motion == identify.choose_cutoff(raw(slow=0.5)).motion == pytest.approx(1.0, abs=0.1)
+    chosen = identify.choose_cutoff([raw(), raw(slow=0.5)])
+    assert chosen.motion == identify.choose_cutoff(raw(slow=0.5)).motion == pytest.approx(1.0, abs=0.1)
     assert identify.choose_cutoff([raw(rate=10.0)]).frequency == pytest.approx(4.0, rel=1e-3)  # of 10 Hz
 
 
 def test_a_vibration_close_to_the_motion_lowers_it():
     """Amplitude 0.2 at 4.2 Hz, where friction has some 0.02: the cut-off lies between five times the motion and the vibration."""
-    found = identify.choose_cutoff(raw(vibration=(4.2, 0.2)))
-    assert found.vibration == pytest.approx(4.2, abs=0.5)
-    assert 2.4 < found.frequency < 3.8
+    chosen = identify.choose_cutoff(raw(vibration=(4.2, 0.2)))
+    assert chosen.vibration == pytest.approx(4.2, abs=0.5)
+    assert 2.4 < chosen.frequency < 3.8
     # One above ten times the motion is cut off anyway.
     assert identify.choose_cutoff(raw(vibration=(8.0, 0.5))).vibration is None
 

@@ -56,13 +56,13 @@ def deviations(end: Linear, slopes: np.ndarray, groups: np.ndarray) -> np.ndarra
 
     Source: Bell & McCaffrey (2002), CR3; Angrist & Pischke (2009), "Mostly harmless econometrics", section 8.2, the maximum.
     """
-    found = determined(end, slopes)
-    if found is None:
+    told = determined(end, slopes)
+    if told is None:
         return np.full(len(slopes), np.nan)
-    independent = np.sum(found.numbers**2, axis=1)
-    curvature = found.prior.T @ found.prior
-    parts = [(found.data[groups == k], found.errors[groups == k]) for k in range(groups.max(initial=0) + 1)]
+    independent = np.sum(told.numbers**2, axis=1)
+    curvature = told.prior.T @ told.prior
+    parts = [(told.data[groups == k], told.errors[groups == k]) for k in range(groups.max(initial=0) + 1)]
     grams = np.stack([part.T @ part for part, _ in parts])
     changes, _ = jackknife(grams, np.stack([part.T @ error for part, error in parts]), curvature)
-    variance = np.sum((found.numbers @ changes) ** 2, axis=1) + np.sum((found.numbers @ found.prior.T) ** 2, axis=1)
-    return np.where(found.idle, np.inf, np.sqrt(np.maximum(variance, independent)))
+    variance = np.sum((told.numbers @ changes) ** 2, axis=1) + np.sum((told.numbers @ told.prior.T) ** 2, axis=1)
+    return np.where(told.idle, np.inf, np.sqrt(np.maximum(variance, independent)))
