@@ -5,7 +5,6 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -30,14 +29,10 @@ OF_DIFFRAX = (
 
 
 def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
-    """The code of the first case (condition, code) whose condition holds, else the one given.
-
-    Looked up in a table: of a chain of `RESULTS.where` XLA copies the beginning into every computation that reads the end, and
-    takes a second to compile a run for that.
-    """
-    conditions, codes = zip(*cases, strict=True)
-    place = jnp.argmax(jnp.stack([*map(jnp.asarray, conditions), jnp.asarray(True)]))
-    return jax.tree.map(lambda *each: jnp.stack(each)[place], *codes, otherwise)
+    """The code of the first case (condition, code) whose condition holds, else the one given."""
+    for condition, code in reversed(cases):
+        otherwise = RESULTS.where(condition, code, otherwise)
+    return otherwise
 
 
 def rows_where(kept, rows, otherwise):
