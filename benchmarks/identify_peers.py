@@ -6,8 +6,7 @@ The arm is a Franka Emika Panda and the log has its recorded motion; torques are
 1 % of noise. Free are the ten numbers of the last bodies, without a prior, from the URDF's. Compared are torques at every sample
 ("torque"), or the motion of pieces of ten steps of RK4 with the torque held over each step ("motion"). Sums of squares are told
 as shares of that where the fit starts, and the time is that of the first point within 1 % of the minimum: of torques of the lower
-one of both, as the losses are the same to rounding; of motions of each one's own, as RK4 looks at the torque where a step ends,
-which is the last one in MuJoCo and the next one here.
+one of both, as the losses are the same to rounding; of motions of each one's own.
 
 Each program runs in a process of its own. "cold" is its first fit there, compilation and all, with an empty folder of object
 files; "warm" the second fit of the same numbers. sysid compiles nothing, so that its time is one number; it stops after `--limit`
