@@ -50,6 +50,18 @@ def accelerate(which) -> Callable:
     return lambda: run(*state)
 
 
+def gradient_of_g1() -> Callable:
+    """Derivative of the sum of a G1's accelerations by q, v and tau."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    model, *state = robot(*G1)
+    run = jax.jit(jax.grad(lambda *x: jnp.sum(jd.forward_dynamics(model, *x)), (0, 1, 2)))
+    return lambda: run(*state)
+
+
 def simulate_panda() -> Callable:
     """One second of the arm as it falls, adaptive steps."""
     import jax.numpy as jnp
@@ -83,6 +95,24 @@ def simulate_four_bar() -> Callable:
     return lambda: jd.simulate(scene, q, v, jnp.linspace(0.0, 1.0, 11)).q
 
 
+def gradient_of_path() -> Callable:
+    """Derivative of eight assembled positions of a four-bar by the lengths of its bars."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    q, v = jd.scenes.four_bar.start()
+
+    def path(lengths):
+        scene = jd.scenes.four_bar(lengths=lengths)
+        cranks = jnp.linspace(0.3, 0.6, 8)
+        return jnp.sum(jax.vmap(lambda crank: jd.assemble(scene, q.at[0].set(crank), v).q)(cranks) ** 2)
+
+    run = jax.jit(jax.grad(path))
+    return lambda: run(jnp.array([1.0, 3.0, 2.5, 3.5]))
+
+
 def stewart():
     """A Stewart platform and a guess of a position: a plate on six legs with universal, prismatic and ball joints."""
     import jax.numpy as jnp
@@ -114,6 +144,18 @@ def stewart():
     return jd.Scene(model, tuple(loops)), jnp.asarray(q)
 
 
+def accelerate_stewart() -> Callable:
+    """Accelerations under six loops, under jit, at a guess of a position."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    scene, q = stewart()
+    run = jax.jit(lambda q, v: jd.constrained_dynamics(scene, q, v).acceleration)
+    return lambda: run(q, jnp.zeros(scene.nv))
+
+
 def assemble_stewart() -> Callable:
     """From a guess onto six loops."""
     import jax.numpy as jnp
@@ -138,9 +180,12 @@ def simulate_stewart() -> Callable:
 CASES: dict[str, tuple[str, Callable[[], Callable]]] = {
     "panda": ("forward dynamics of a Panda, under jit", lambda: accelerate(PANDA)),
     "g1": ("forward dynamics of a G1, under jit", lambda: accelerate(G1)),
+    "g1_gradient": ("gradient of forward dynamics of a G1, under jit", gradient_of_g1),
     "panda_motion": ("simulate a Panda", simulate_panda),
     "panda_gradient": ("gradient through 100 fixed steps of a Panda", gradient_of_panda),
     "four_bar": ("simulate a four-bar", simulate_four_bar),
+    "path": ("gradient of a four-bar's path by its lengths, under jit", gradient_of_path),
+    "stewart": ("accelerations of a Stewart platform, under jit", accelerate_stewart),
     "stewart_assembly": ("assemble a Stewart platform", assemble_stewart),
     "stewart_motion": ("simulate a Stewart platform", simulate_stewart),
 }
