@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import diffrax
@@ -85,26 +86,32 @@ def four_bars(samples: int, out, **options):
     return jd.scale.run(build, (np.asarray(q), np.asarray(v)), draw, ts, **options)
 
 
-def store(folder: Path, samples: int) -> None:
-    """Storing and the meter against computing alone."""
-    kept: dict = {}
-    drive = driver.drive
+def with_program(run: Callable, *args, **options):
+    """A run of `jd.scale`, and the program of its batches."""
+    kept, drive = [], driver.drive
 
     def noted(job, program, *rest):
-        kept.update(job=job, program=program)
+        kept.append(program)
         return drive(job, program, *rest)
 
     batch.driver.drive = noted
+    try:
+        return run(*args, **options), kept[-1]
+    finally:
+        batch.driver.drive = drive
+
+
+def store(folder: Path, samples: int) -> None:
+    """Storing and the meter against computing alone."""
     whole, alone = [], []
     for k in range(3):
-        run = arm(samples, folder / f"store{k}.zarr", progress=True)
+        run, program = with_program(arm, samples, folder / f"store{k}.zarr", progress=True)
         whole.append(run.seconds)
         before = time.perf_counter()
         for first in range(0, samples, run.chunk):
             numbers = np.arange(first, min(first + run.chunk, samples))
-            driver.compute(kept["program"], numbers)
+            driver.compute(program, numbers)
         alone.append(time.perf_counter() - before)
-    batch.driver.drive = drive
     print(
         f"store: {samples} arms, chunks of {run.chunk}: {min(whole):.3g} s with the store, {min(alone):.3g} s without "
         f"({samples / min(whole):.3g} rollouts/s); cost {100 * (min(whole) / min(alone) - 1):.1f} %"
@@ -177,16 +184,7 @@ def cost(folder: Path, samples: int) -> None:
 
 def hosts(folder: Path, samples: int) -> None:
     """To many hosts, on paper, from what is measured here."""
-    programs = []
-    drive = driver.drive
-
-    def noted(job, program, *rest):
-        programs.append(program)
-        return drive(job, program, *rest)
-
-    batch.driver.drive = noted
-    run = arm(samples, folder / "hosts.zarr")
-    batch.driver.drive = drive
+    run, program = with_program(arm, samples, folder / "hosts.zarr")
     files = [path for path in (folder / "hosts.zarr").rglob("*") if path.is_file()]
     chunks = -(-samples // run.chunk)
     bytes_each, files_each = sum(path.stat().st_size for path in files) / samples, len(files) / chunks
@@ -194,7 +192,7 @@ def hosts(folder: Path, samples: int) -> None:
     counted = operations(lambda *x: jd.forward_dynamics(model, *x), *[jnp.zeros(7)] * 3)
     evaluations = 4 * round(0.4 / 1e-3)
     flops = evaluations * (counted.all if counted else float("nan"))
-    exchanged = len(re.findall(rf" ({COLLECTIVES})(-start)?\(", programs[-1].compiled.as_text()))
+    exchanged = len(re.findall(rf" ({COLLECTIVES})(-start)?\(", program.compiled.as_text()))
     cores = len(os.sched_getaffinity(0))
     pace = samples / run.seconds / cores
     print(
@@ -234,7 +232,7 @@ def main() -> None:
         return
     many = 1_000_000 if args.full else args.samples
     sizes = {"store": args.samples, "memory": many, "resume": many, "cores": args.samples, "cost": 4096}
-    sizes["hosts"] = args.samples
+    sizes |= {"hosts": args.samples}
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     for name in args.what:
         with tempfile.TemporaryDirectory(dir="out" if Path("out").is_dir() else None) as folder:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-CODES: list[str] = []  # names; their places stand for the codes in arrays and files
+_names: list[str] = []
 
 
 class RESULTS(eqx.Enumeration):
@@ -61,7 +61,11 @@ class RESULTS(eqx.Enumeration):
     unnormalized_start = "A quaternion of the initial state is not of unit length."
 
     # An enumeration of equinox does not tell its names.
-    CODES.extend(name for name in vars() if not name.startswith("_"))
+    _names.extend(name for name in vars() if not name.startswith("_"))
+
+
+# Their places stand for the codes in arrays and files.
+CODES = tuple(_names)
 
 
 def code_of(result: Any) -> Array:

@@ -72,9 +72,9 @@ def described_motion(
         if name.startswith("parameter_") or name in steps:
             unit = steps.get(name) or units.get(name.removeprefix("parameter_"))
             variables[name] = _variable(name, shapes, None, {"units": unit} if unit else {})
-    variables["result"] = _codes(tuple(CODES))
+    variables["result"] = _codes(CODES)
     axes["t"] = (ts, {"units": "s"})
-    return Described(rows, traced, True, variables, tuple(CODES), axes)
+    return Described(rows, traced, True, variables, CODES, axes)
 
 
 def described_function(

@@ -16,7 +16,7 @@ from jaxdyn.simulation.equations import equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, start_limit
 from jaxdyn.simulation.outputs import at_save_point
-from jaxdyn.simulation.solution import RESULTS, Solution, first_of, rows_where
+from jaxdyn.simulation.solution import RESULTS, Solution, faults_of_inputs, first_of, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
 from jaxdyn.simulation.solvers.choice import (
     is_fixed,
@@ -137,13 +137,13 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     # Fixed steps go on from what is not finite: all that is known is the last state before it that was kept.
     kept = jnp.max(jnp.where(reached, ts, ts[0]))
     time_reached = jnp.where(nonfinite | (result == RESULTS.nonfinite_state), kept, time_reached)
-    failures = [
-        (~in_order, RESULTS.unordered_times),
-        (~fine_steps, RESULTS.bad_stepsize),
-        (~fine_tolerances, RESULTS.bad_tolerance),
-        (~finite_start, RESULTS.nonfinite_start),
-        (~unit_start, RESULTS.unnormalized_start),
-    ]
+    failures = faults_of_inputs(
+        in_order=in_order,
+        fine_steps=fine_steps,
+        fine_tolerances=fine_tolerances,
+        finite_start=finite_start,
+        unit_start=unit_start,
+    )
     angles = turning(system)
     if angles.size and not is_fixed(steps[-1]):
         coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)

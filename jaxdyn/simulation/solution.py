@@ -35,6 +35,18 @@ def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
     return otherwise
 
 
+def faults_of_inputs(*, in_order, fine_steps, fine_tolerances, finite_start, unit_start) -> list[tuple[Any, Any]]:
+    """Cases for `first_of` of what was given, each () bool, the one that hides the others first."""
+    codes: Any = RESULTS
+    return [
+        (~in_order, codes.unordered_times),
+        (~fine_steps, codes.bad_stepsize),
+        (~fine_tolerances, codes.bad_tolerance),
+        (~finite_start, codes.nonfinite_start),
+        (~unit_start, codes.unnormalized_start),
+    ]
+
+
 def rows_where(kept, rows, otherwise):
     """Rows (nt, ...) where the mask (nt,) holds, elsewhere what fits their shape."""
     return jnp.where(kept.reshape(-1, *[1] * (rows.ndim - 1)), rows, jnp.asarray(otherwise, rows.dtype))

@@ -24,7 +24,7 @@ from jaxdyn.simulation.hybrid.modes import Mode, elements_of, extended, force_at
 from jaxdyn.simulation.hybrid.replay import Hybrid
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
-from jaxdyn.simulation.solution import Solution, first_of, rows_where
+from jaxdyn.simulation.solution import Solution, faults_of_inputs, first_of, rows_where
 from jaxdyn.simulation.solvers.choice import is_fixed, label, unwrapped
 from jaxdyn.simulation.solvers.fixed_steps import too_coarse
 from jaxdyn.simulation.solvers.inputs import has_unit_quaternions
@@ -162,14 +162,10 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     values = lax.map(partial(run, report, unknown), (y, modes, ts))
 
     codes: Any = RESULTS
-    cases = [
-        (~in_order, codes.unordered_times),
-        (~fine_steps, codes.bad_stepsize),
-        (~fine, codes.bad_tolerance),
-        (~finite_start, codes.nonfinite_start),
-        (~unit_start, codes.unnormalized_start),
-        (~start_ok, codes.inconsistent_start),
-    ]
+    cases = faults_of_inputs(
+        in_order=in_order, fine_steps=fine_steps, fine_tolerances=fine, finite_start=finite_start, unit_start=unit_start
+    )
+    cases.append((~start_ok, codes.inconsistent_start))
     for code, name in _CODES.items():
         if code == machine.SHORT and stepsize is not None:
             name = "nonfinite_state"
