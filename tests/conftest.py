@@ -58,6 +58,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
+    # pytest collects garbage ten times at its end, and Python once more: what a first collection leaves stays to the end.
+    gc.collect()
+    gc.freeze()
     folder = config.stash.get(_CACHE, None)
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)

@@ -20,13 +20,20 @@ pytestmark = pytest.mark.native
 LONGEST = 20.0  # s that a test waits for another thread
 
 
-@pytest.fixture
-def usual(monkeypatch):
-    """The environment in which all of this is off."""
-    monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", "usual")
-    calls.quick_options.cache_clear()
-    yield
-    calls.quick_options.cache_clear()
+def options(name):
+    """A fixture: the environment asks for these options."""
+
+    def in_force(monkeypatch):
+        monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", name)
+        calls.quick_options.cache_clear()
+        yield
+        calls.quick_options.cache_clear()
+
+    return pytest.fixture(in_force, name=name)
+
+
+usual = options("usual")  # in which all of this is off
+least = options("least")
 
 
 def native(function):
@@ -207,3 +214,29 @@ def test_both_ways_agree(request):
     quick = backend.compiled(function)(q, v)
     request.getfixturevalue("usual")
     np.testing.assert_allclose(backend.compiled(lambda q, v: function(q, v))(q, v), quick, rtol=1e-13, atol=1e-13)
+
+
+# --- code that compiles fast and runs slowly ---
+
+
+def test_the_least_optimisation_gives_other_code_and_the_same_numbers(request):
+    """Most tests of the package run so, beside references that know nothing of it."""
+    model, q = jd.robots.chain(3), jnp.asarray([0.4, 0.3, -0.5])
+    text = "define double @f(double %x) {\n  %y = fadd double %x, 1.0\n  ret double %y\n}"
+
+    def torque(scale):  # of a program of its own for each scale
+        scaled = model.replace(gravity=model.gravity * scale)
+        return np.asarray(backend.compiled(native(lambda q: jd.gravity_force(scaled, q)))(q))
+
+    one, key = torque(1.0), objects.Code(text, stored=False).key
+    request.getfixturevalue("least")
+    np.testing.assert_allclose(torque(2.0), 2 * one, rtol=1e-14)
+    assert objects.Code(text, stored=False).key != key
+    options = calls.quick_options()
+    assert options is not None and options["xla_backend_optimization_level"] == 0
+
+
+def test_options_that_do_not_exist_are_refused(monkeypatch):
+    monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", "fast")
+    with pytest.raises(ValueError, match="JAXDYN_COMPILATION_OPTIONS is 'fast'; choose from 'usual', 'least'"):
+        backend.compiled(native(lambda x: jnp.sin(x)))(jnp.ones(2))

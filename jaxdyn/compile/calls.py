@@ -48,6 +48,7 @@ _jit: Any = eqx.filter_jit
 # compile it and bring nothing at run time: `python -m benchmarks.first_calls`, and again with
 # JAXDYN_COMPILATION_OPTIONS=usual in the environment.
 _QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+_LEAST = _QUICK | {"xla_backend_optimization_level": 0}
 
 
 @functools.cache
@@ -58,11 +59,12 @@ def quick_options() -> dict[str, Any] | None:
     """
     if mode.wants_usual_options():
         return None
+    options = _LEAST if mode.wants_least_optimisation() else _QUICK
     try:
-        jax.jit(lambda: 0.0, compiler_options=_QUICK)()
+        jax.jit(lambda: 0.0, compiler_options=options)()
     except jax.errors.JaxRuntimeError:
         return None
-    return _QUICK
+    return options
 
 
 def glue_options(platform: str) -> dict[str, Any] | None:

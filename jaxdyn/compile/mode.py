@@ -7,6 +7,7 @@ import os
 
 logger = logging.getLogger("jaxdyn")
 MODES = ("auto", "general", "plain")
+OPTIONS = ("", "usual", "least")
 # LLVM takes some 50 microseconds an operation: three seconds.
 MAX_OPERATIONS = 60_000
 
@@ -88,7 +89,20 @@ def called_at_once(whether: bool):
 
 def wants_usual_options() -> bool:
     """Whether the environment asks for compilation without what shortens a first call."""
-    return os.environ.get("JAXDYN_COMPILATION_OPTIONS") == "usual"
+    return _options() == "usual"
+
+
+def wants_least_optimisation() -> bool:
+    """Whether the environment asks for code that compiles fast and runs slowly, as most tests do."""
+    return _options() == "least"
+
+
+def _options() -> str:
+    options = os.environ.get("JAXDYN_COMPILATION_OPTIONS", "")
+    if options not in OPTIONS:
+        shown = ", ".join(map(repr, OPTIONS[1:]))
+        raise ValueError(f"the environment's JAXDYN_COMPILATION_OPTIONS is {options!r}; choose from {shown}, or leave it out")
+    return options
 
 
 def say_once(message: str) -> None:

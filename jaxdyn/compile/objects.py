@@ -1,9 +1,9 @@
 """Machine code from LLVM IR, kept on disk: a second start of a script compiles no kernel again.
 
-An object file is found by the hash of the IR, of LLVM's version and of the processor's name and features. Files are written
-beside their final name and moved there, so that two processes that build one at once do not disturb each other; each ends
-with a checksum, and one that is damaged is built anew. Where the folder cannot be written, code is kept in memory alone,
-and that is said once.
+An object file is found by the hash of the IR, of LLVM's version and level, and of the processor's name and features. Files
+are written beside their final name and moved there, so that two processes that build one at once do not disturb each other;
+each ends with a checksum, and one that is damaged is built anew. Where the folder cannot be written, code is kept in memory
+alone, and that is said once.
 """
 
 import contextlib
@@ -16,6 +16,8 @@ from pathlib import Path
 
 import llvmlite
 import llvmlite.binding as llvm
+
+from jaxdyn.compile.mode import wants_least_optimisation
 
 logger = logging.getLogger("jaxdyn")
 MAX_CACHE_BYTES = 512 * 2**20
@@ -39,13 +41,15 @@ def target_machine():
     """LLVM's description of this processor; not shared, as each engine takes its own."""
     initialize()
     target = llvm.Target.from_triple(llvm.get_process_triple())
-    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features(), opt=2, jit=True, reloc="pic")
+    level = 0 if wants_least_optimisation() else 2
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features(), opt=level, jit=True, reloc="pic")
 
 
 def key_of(text: str) -> bytes:
     """Hash of a kernel's IR and of everything else that its machine code depends on."""
     version = ".".join(map(str, llvm.llvm_version_info))
-    parts = (text, version, llvmlite.__version__, llvm.get_host_cpu_name(), features(), llvm.get_process_triple())
+    level = "least" if wants_least_optimisation() else ""
+    parts = (text, version, llvmlite.__version__, llvm.get_host_cpu_name(), features(), llvm.get_process_triple(), level)
     return hashlib.sha256("\0".join(parts).encode()).digest()
 
 
@@ -85,6 +89,8 @@ def _compiled(text: str) -> bytes:
     """The object file of a kernel."""
     machine = target_machine()
     module = _module(text, machine)
+    if wants_least_optimisation():
+        return machine.emit_object(module)
     options = llvm.create_pipeline_tuning_options(speed_level=1)
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
     builder = llvm.create_pass_builder(machine, options)
