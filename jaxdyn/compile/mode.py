@@ -101,7 +101,9 @@ def _options() -> str:
     options = os.environ.get("JAXDYN_COMPILATION_OPTIONS", "")
     if options not in OPTIONS:
         shown = ", ".join(map(repr, OPTIONS[1:]))
-        raise ValueError(f"the environment's JAXDYN_COMPILATION_OPTIONS is {options!r}; choose from {shown}, or leave it out")
+        raise ValueError(
+            f"the environment's JAXDYN_COMPILATION_OPTIONS is {options!r}; choose from {shown}, or leave it out"
+        )
     return options
 
 

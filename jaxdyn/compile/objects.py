@@ -42,14 +42,24 @@ def target_machine():
     initialize()
     target = llvm.Target.from_triple(llvm.get_process_triple())
     level = 0 if wants_least_optimisation() else 2
-    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features(), opt=level, jit=True, reloc="pic")
+    return target.create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=features(), opt=level, jit=True, reloc="pic"
+    )
 
 
 def key_of(text: str) -> bytes:
     """Hash of a kernel's IR and of everything else that its machine code depends on."""
     version = ".".join(map(str, llvm.llvm_version_info))
     level = "least" if wants_least_optimisation() else ""
-    parts = (text, version, llvmlite.__version__, llvm.get_host_cpu_name(), features(), llvm.get_process_triple(), level)
+    parts = (
+        text,
+        version,
+        llvmlite.__version__,
+        llvm.get_host_cpu_name(),
+        features(),
+        llvm.get_process_triple(),
+        level,
+    )
     return hashlib.sha256("\0".join(parts).encode()).digest()
 
 
