@@ -13,6 +13,7 @@ from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
 from jaxdyn.lie import se3
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia, robots
+from jaxdyn.model.arguments import Checked, Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.tree import Model
@@ -100,14 +101,14 @@ def _check_contact(contact):
 @named(_sphere_arm_start)
 def sphere_arm(
     *,
-    contact="frictionless",
-    links=_LINKS,
-    masses=_MASSES,
-    height=_HEIGHT,
-    center=_CENTER,
-    radius=_RADIUS,
-    tip_radius=_TIP_RADIUS,
-    gravity=9.81,
+    contact: str = "frictionless",
+    links: Row = _LINKS,
+    masses: Row = _MASSES,
+    height: Number = _HEIGHT,
+    center: Row = _CENTER,
+    radius: Number = _RADIUS,
+    tip_radius: Number = _TIP_RADIUS,
+    gravity: Number = 9.81,
 ) -> Scene:
     """An arm of six joints whose tip, a ball, stays in touch with a sphere that stands still.
 
@@ -160,7 +161,14 @@ def _lifting_start(count=2, radius=0.3, twist=(0.05, 0.0, 0.1, 0.0, 0.2, 0.3)):
 
 
 @named(_lifting_start)
-def coordinated_lifting(*, count=2, radius=0.3, mass=4.0, thickness=0.04, gravity=9.81) -> Grasp:
+def coordinated_lifting(
+    *,
+    count: Checked[int] = 2,
+    radius: Number = 0.3,
+    mass: Number = 4.0,
+    thickness: Number = 0.04,
+    gravity: Number = 9.81,
+) -> Grasp:
     """`count` arms (KUKA iiwa, seven joints each) around a round plate that all of them hold by its rim, rigidly.
 
     q = (joints of arm 1, of arm 2, ..., the plate's free joint), 7 count + 7 numbers. Each grip has six rows (B = 1): the

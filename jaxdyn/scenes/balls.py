@@ -9,6 +9,7 @@ from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Holonomic, rolling_sphere
 from jaxdyn.lie import so3
 from jaxdyn.model import inertia
+from jaxdyn.model.arguments import Number
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems.scene import Scene
@@ -32,7 +33,7 @@ def _turntable_start(radius=0.2, rate=3.0, position=(1.0, 0.0), velocity=(0.0, 0
 
 
 @named(_turntable_start)
-def ball_on_turntable(*, mass=1.0, radius=0.2, rate=3.0, gravity=9.81) -> Scene:
+def ball_on_turntable(*, mass: Number = 1.0, radius: Number = 0.2, rate: Number = 3.0, gravity: Number = 9.81) -> Scene:
     """Solid ball that rolls on a turntable driven at a constant rate: vdot = (2/7) rate e_z x v, a circle.
 
     q = (table angle, the ball's free joint). The drive is a moving holonomic constraint, the contact rolls on a body.
@@ -54,7 +55,9 @@ def _incline_start(radius=0.1, velocity=(0.0, 0.5)):
 
 
 @named(_incline_start)
-def ball_on_incline(*, mass=1.0, radius=0.1, slope=np.pi / 6, gravity=9.81) -> Scene:
+def ball_on_incline(
+    *, mass: Number = 1.0, radius: Number = 0.1, slope: Number = np.pi / 6, gravity: Number = 9.81
+) -> Scene:
     """Solid ball that rolls on an inclined plane, x down the slope, z along its normal: a parabola.
 
     vdot = (5/7) g sin(slope) e_x. Start: `velocity` (m/s) of the centre, without spin about the normal.
@@ -97,7 +100,14 @@ def _bowling_start(radius=0.10795, velocity=(8.0, 0.0), spin=(-8 * np.pi, 0.0, 0
 
 
 @named(_bowling_start)
-def bowling_ball(*, mass=6.35, radius=0.10795, moment=0.0296, friction=0.12, gravity=9.8) -> Scene:
+def bowling_ball(
+    *,
+    mass: Number = 6.35,
+    radius: Number = 0.10795,
+    moment: Number = 0.0296,
+    friction: Number = 0.12,
+    gravity: Number = 9.8,
+) -> Scene:
     """Bowling ball that slides with Coulomb friction, up to the time at which it rolls.
 
     The velocity u of the point that touches the lane keeps its direction, so that the centre moves on a parabola:

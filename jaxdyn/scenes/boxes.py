@@ -12,6 +12,7 @@ from jaxdyn.contact.wrench_cones import wrench_cone
 from jaxdyn.grasp import Grasp, contact, point_contacts
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia, robots
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.names import frame_index
 from jaxdyn.scenes._named import named
@@ -107,7 +108,7 @@ def _cube_start(
 
 
 @named(_cube_start)
-def allegro_with_cube(*, size=0.06, mass=0.1, mu=0.8, gravity=9.81) -> Grasp:
+def allegro_with_cube(*, size: Number = 0.06, mass: Number = 0.1, mu: Number = 0.8, gravity: Number = 9.81) -> Grasp:
     """The Allegro hand, its palm upright, with a cube between index finger, ring finger and thumb; the middle finger is free.
 
     q = (joints of the index finger, of the thumb, of the middle and of the ring finger, four each, the cube's free joint): 22
@@ -140,7 +141,14 @@ def _table_start(tilt=0.02, rate=0.0, height=0.025, size=(0.2, 0.16, 0.24)):
 
 @named(_table_start)
 def box_on_table(
-    *, size=(0.2, 0.16, 0.24), mass=1.0, table=(1.0, 0.6, 0.05), table_mass=20.0, height=0.025, mu=0.4, gravity=9.81
+    *,
+    size: Row = (0.2, 0.16, 0.24),
+    mass: Number = 1.0,
+    table: Row = (1.0, 0.6, 0.05),
+    table_mass: Number = 20.0,
+    height: Number = 0.025,
+    mu: Number = 0.4,
+    gravity: Number = 9.81,
 ) -> Grasp:
     """A box that stands on a table by its whole base: six rows, and the wrench cone of a rectangle in place of a friction cone.
 

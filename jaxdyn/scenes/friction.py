@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints import rolling_sphere
 from jaxdyn.contact.unilateral import UnilateralContact, gap_contact, ground_contact
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.systems.scene import Scene
@@ -23,7 +24,9 @@ def _rough_start(speed=3.0, place=0.1, link_place=0.0, tilt=0.0):
 
 
 @named(_rough_start)
-def rough_disk_and_link(*, masses=(1.0, 0.6), moments=(0.5, 0.2), friction=(0.3, 0.2), gravity=9.81) -> Scene:
+def rough_disk_and_link(
+    *, masses: Row = (1.0, 0.6), moments: Row = (0.5, 0.2), friction: Row = (0.3, 0.2), gravity: Number = 9.81
+) -> Scene:
     """Disk of radius 1 m on the ground under a thin link that lies on it, both contacts with friction that sticks and slides.
 
     The bodies of `disk_and_link`, free in their plane: q = (x, y, angle) of the disk and of the link's centre of mass, angles
@@ -76,18 +79,18 @@ def _woodpecker_start(gap=0.0006, half_height=0.0058, bird=-0.2788, velocity=(-0
 @named(_woodpecker_start)
 def woodpecker(
     *,
-    masses=(0.0003, 0.0045),
-    moments=(5.0e-9, 7.0e-7),
-    stiffness=0.0056,
-    pole_radius=0.0025,
-    sleeve_radius=0.0031,
-    half_height=0.0058,
-    to_spring=0.010,
-    to_bird=0.015,
-    beak=(0.020, 0.0201),
-    friction=0.3,
-    restitution=0.5,
-    gravity=9.81,
+    masses: Row = (0.0003, 0.0045),
+    moments: Row = (5.0e-9, 7.0e-7),
+    stiffness: Number = 0.0056,
+    pole_radius: Number = 0.0025,
+    sleeve_radius: Number = 0.0031,
+    half_height: Number = 0.0058,
+    to_spring: Number = 0.010,
+    to_bird: Number = 0.015,
+    beak: Row = (0.020, 0.0201),
+    friction: Number = 0.3,
+    restitution: Number = 0.5,
+    gravity: Number = 9.81,
 ) -> Scene:
     """Woodpecker toy: a sleeve with play on a pole, from which a bird hangs on a spring, and comes down pecking.
 

@@ -9,6 +9,7 @@ from jaxdyn.contact.cones import friction_cone
 from jaxdyn.grasp import Grasp, contact
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.scenes.linkages import _circles, thin_bar
@@ -93,7 +94,15 @@ def _bar_start(center=(0.02, 0.38), angle=0.1, velocity=(0.2, -0.1, 0.5), links=
 
 @named(_bar_start)
 def hand_with_bar(
-    *, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, length=0.3, gravity=9.81, kind="hard-finger", mu=0.8
+    *,
+    links: Row = _LINKS,
+    masses: Row = (0.4, 0.3),
+    palm: Number = _PALM,
+    mass: Number = 0.5,
+    length: Number = 0.3,
+    gravity: Number = 9.81,
+    kind: str = "hard-finger",
+    mu: Number = 0.8,
 ) -> Grasp:
     """Two fingers of two joints each, in the x-y plane, whose tips hold the ends of a bar.
 
@@ -138,7 +147,16 @@ def _disk_start(
 
 
 @named(_disk_start)
-def hand_with_disk(*, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, radius=0.1, gravity=9.81, mu=0.8) -> Grasp:
+def hand_with_disk(
+    *,
+    links: Row = _LINKS,
+    masses: Row = (0.4, 0.3),
+    palm: Number = _PALM,
+    mass: Number = 0.5,
+    radius: Number = 0.1,
+    gravity: Number = 9.81,
+    mu: Number = 0.8,
+) -> Grasp:
     """The hand of `hand_with_bar` with a disk that rolls between the flat inner faces of the outer links.
 
     q = (joints of finger 1, of finger 2, x, y and angle of the disk). Each contact has a holonomic row, the gap, and a
@@ -243,7 +261,14 @@ def _ball_start(
 
 @named(_ball_start)
 def hand_with_ball(
-    *, links=_SPATIAL_LINKS, masses=(0.1, 0.2, 0.15), circle=_CIRCLE, mass=0.4, radius=0.1, gravity=9.81, mu=0.8
+    *,
+    links: Row = _SPATIAL_LINKS,
+    masses: Row = (0.1, 0.2, 0.15),
+    circle: Number = _CIRCLE,
+    mass: Number = 0.4,
+    radius: Number = 0.1,
+    gravity: Number = 9.81,
+    mu: Number = 0.8,
 ) -> Grasp:
     """Three fingers of three joints each, whose tips hold a ball at three points of its equator, with friction.
 
@@ -276,14 +301,14 @@ def _rolling_start(
 @named(_rolling_start)
 def hand_rolling_ball(
     *,
-    links=_SPATIAL_LINKS,
-    masses=(0.1, 0.2, 0.15),
-    circle=_CIRCLE,
-    mass=0.4,
-    radius=0.1,
-    tip_radius=0.02,
-    gravity=9.81,
-    mu=0.8,
+    links: Row = _SPATIAL_LINKS,
+    masses: Row = (0.1, 0.2, 0.15),
+    circle: Number = _CIRCLE,
+    mass: Number = 0.4,
+    radius: Number = 0.1,
+    tip_radius: Number = 0.02,
+    gravity: Number = 9.81,
+    mu: Number = 0.8,
 ) -> Grasp:
     """The hand of `hand_with_ball` with spherical fingertips, between which the ball rolls: truly nonholonomic.
 

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Holonomic
+from jaxdyn.model.arguments import Number
 from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
@@ -36,7 +37,7 @@ def _plane_start(length=1.0, angle=-np.pi / 2, rate=0.0):
 
 
 @named(_plane_start)
-def pendulum_in_plane(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+def pendulum_in_plane(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Plane pendulum in x and y (up): L = m |v|^2/2 - m g y, phi = (x^2 + y^2 - l^2)/2.
 
     lam = -(m/l^2)(|v|^2 - g y); the tension of the rod is -l lam. Start: `angle` from the downward vertical and `rate`;
@@ -56,7 +57,7 @@ def _sphere_start(length=1.0, theta=1.0, phi=0.0, theta_rate=0.0, phi_rate=1.0):
 
 
 @named(_sphere_start)
-def spherical_pendulum(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+def spherical_pendulum(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Spherical pendulum in x, y and z (up): L = m |v|^2/2 - m g z, phi = (|q|^2 - l^2)/2.
 
     lam = (m/l^2)(g z - |v|^2). Start by angles: theta from the downward vertical, phi about it.

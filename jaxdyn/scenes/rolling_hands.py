@@ -9,6 +9,7 @@ from jaxdyn.contact import Ellipsoid, RollingModel, rolling_contact
 from jaxdyn.grasp import Grasp
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.scenes._named import named
 from jaxdyn.scenes.hands import (
     _CIRCLE,
@@ -84,14 +85,14 @@ def _egg_start(
 @named(_egg_start)
 def hand_rolling_egg(
     *,
-    links=_SPATIAL_LINKS,
-    masses=(0.1, 0.2, 0.15),
-    circle=_CIRCLE,
-    mass=0.4,
-    semi_axes=_EGG,
-    tip_semi_axes=_TIP,
-    gravity=9.81,
-    mu=0.8,
+    links: Row = _SPATIAL_LINKS,
+    masses: Row = (0.1, 0.2, 0.15),
+    circle: Number = _CIRCLE,
+    mass: Number = 0.4,
+    semi_axes: Row = _EGG,
+    tip_semi_axes: Row = _TIP,
+    gravity: Number = 9.81,
+    mu: Number = 0.8,
 ) -> Grasp:
     """Three fingers of three joints each, whose tips, ellipsoids, roll on an ellipsoid that they hold: truly nonholonomic.
 

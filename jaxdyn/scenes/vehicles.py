@@ -5,6 +5,7 @@ import numpy as np
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import knife_edge, rolling_wheel
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.systems.scene import Scene
@@ -32,16 +33,16 @@ def _bicycle_start(
 @named(_bicycle_start)
 def bicycle(
     *,
-    wheel_base=1.02,
-    trail=0.08,
-    tilt=np.pi / 10,
-    rear_radius=0.3,
-    front_radius=0.35,
-    rear_wheel=(2.0, (0.0603, 0.12, 0.0603)),
-    rear_frame=(85.0, (0.3, 0.0, 0.9), (9.2, 11.0, 2.8, -2.4)),
-    front_frame=(4.0, (0.9, 0.0, 0.7), (0.05892, 0.06, 0.00708, 0.00756)),
-    front_wheel=(3.0, (0.1405, 0.28, 0.1405)),
-    gravity=9.81,
+    wheel_base: Number = 1.02,
+    trail: Number = 0.08,
+    tilt: Number = np.pi / 10,
+    rear_radius: Number = 0.3,
+    front_radius: Number = 0.35,
+    rear_wheel: Row = (2.0, (0.0603, 0.12, 0.0603)),
+    rear_frame: Row = (85.0, (0.3, 0.0, 0.9), (9.2, 11.0, 2.8, -2.4)),
+    front_frame: Row = (4.0, (0.9, 0.0, 0.7), (0.05892, 0.06, 0.00708, 0.00756)),
+    front_wheel: Row = (3.0, (0.1405, 0.28, 0.1405)),
+    gravity: Number = 9.81,
 ) -> Scene:
     """Bicycle on level ground, ridden by nobody or by a rigid rider: Whipple's model, by default the benchmark's.
 
@@ -102,7 +103,15 @@ def _add_wheel(builder, name, parent, mass, radius, place):
 
 
 @named(_drive_start)
-def differential_drive(*, mass=8.0, moment=0.3, offset=0.05, wheel_mass=0.5, radius=0.1, half_track=0.25) -> Scene:
+def differential_drive(
+    *,
+    mass: Number = 8.0,
+    moment: Number = 0.3,
+    offset: Number = 0.05,
+    wheel_mass: Number = 0.5,
+    radius: Number = 0.1,
+    half_track: Number = 0.25,
+) -> Scene:
     """Mobile robot with two driven wheels on one axle, on a level floor; a castor without friction holds it up.
 
     q = (x, y, heading, left, right wheel angle), of the axle's middle; tau = (0, 0, 0, left, right motor torque).
@@ -142,14 +151,14 @@ def _car_start(speed=2.0, steer=0.2, steer_rate=0.0, radius=0.15, half_track=0.4
 @named(_car_start)
 def car(
     *,
-    mass=60.0,
-    moment=12.0,
-    offset=0.5,
-    fork_moment=0.2,
-    wheel_mass=2.0,
-    radius=0.15,
-    half_track=0.4,
-    wheel_base=1.2,
+    mass: Number = 60.0,
+    moment: Number = 12.0,
+    offset: Number = 0.5,
+    fork_moment: Number = 0.2,
+    wheel_mass: Number = 2.0,
+    radius: Number = 0.15,
+    half_track: Number = 0.4,
+    wheel_base: Number = 1.2,
 ) -> Scene:
     """Car-like robot on a level floor: two wheels on the rear axle that turn freely, a steered wheel in front.
 
@@ -186,7 +195,14 @@ def _snakeboard_start(speed=1.0, angles=(0.3, -0.2), rates=(0.0, 0.0), rotor_rat
 
 
 @named(_snakeboard_start)
-def snakeboard(*, mass=6.0, moment=0.1, rotor_moment=0.16, truck_moment=0.02, half_length=0.3) -> Scene:
+def snakeboard(
+    *,
+    mass: Number = 6.0,
+    moment: Number = 0.1,
+    rotor_moment: Number = 0.16,
+    truck_moment: Number = 0.02,
+    half_length: Number = 0.3,
+) -> Scene:
     """Snakeboard on a level floor: a board with a truck at each end that turns, and a rotor for the rider's body.
 
     q = (x, y, heading, front truck, back truck, rotor angle), of the board's middle, angles relative to the board.
