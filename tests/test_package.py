@@ -305,6 +305,10 @@ def test_public_signatures_say_what_they_take_and_return():
     for home, node in public():
         if isinstance(node, ast.FunctionDef):
             functions[f"{home}:{node.name}"] = vague(node, is_method=False)
+            for mark in node.decorator_list:  # the start of a named scene, `jd.scenes.<name>.start`
+                if isinstance(mark, ast.Call) and name_of(mark.func) == "named":
+                    _, start = definition(f"jaxdyn.{home}.{name_of(mark.args[0])}")
+                    functions[f"{home}:{node.name}.start"] = vague(start, is_method=False)
             continue
         for module, owner in bases(home, node):
             for method in owner.body:
@@ -312,7 +316,7 @@ def test_public_signatures_say_what_they_take_and_return():
                     not method.name.startswith("_") or method.name in ("__init__", "__call__")
                 ):
                     functions[f"{module}:{owner.name}.{method.name}"] = vague(method, is_method=True)
-    assert {"simulation.run:simulate", "model.tree:Model.replace", "scenes.linkages:four_bar"} <= functions.keys()
+    assert {"simulation.run:simulate", "model.tree:Model.replace", "scenes.linkages:four_bar.start"} <= functions.keys()
     wrong = [f"{place}: {', '.join(names)}" for place, names in functions.items() if names]
     assert not wrong, "\n".join(wrong)
 

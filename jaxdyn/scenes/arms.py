@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import rolling_sphere
@@ -65,17 +66,17 @@ def _joint_angles(pose, links, height):
 
 
 def _sphere_arm_start(
-    contact="frictionless",
-    eta=_ETA,
-    rolling=(0.5, -0.3),
-    slide=(0.0, 0.0),
-    spin=0.0,
-    links=_LINKS,
-    height=_HEIGHT,
-    center=_CENTER,
-    radius=_RADIUS,
-    tip_radius=_TIP_RADIUS,
-):
+    contact: str = "frictionless",
+    eta: Row = _ETA,
+    rolling: Row = (0.5, -0.3),
+    slide: Row = (0.0, 0.0),
+    spin: Number = 0.0,
+    links: Row = _LINKS,
+    height: Number = _HEIGHT,
+    center: Row = _CENTER,
+    radius: Number = _RADIUS,
+    tip_radius: Number = _TIP_RADIUS,
+) -> tuple[Array, Array]:
     _check_contact(contact)
     if contact == "rolling" and is_concrete(slide, spin) and (np.any(slide) or spin):
         raise ValueError(f"slide is {slide}, spin is {spin}; a rolling contact has neither, leave them out")
@@ -150,7 +151,9 @@ _HOLDING = (0.0, 0.6, 0.0, -1.2, 0.0, np.pi / 2 - 1.8, 0.0)
 _FLANGE = "iiwa_link_7"
 
 
-def _lifting_start(count=2, radius=0.3, twist=(0.05, 0.0, 0.1, 0.0, 0.2, 0.3)):
+def _lifting_start(
+    count: Checked[int] = 2, radius: Number = 0.3, twist: Row = (0.05, 0.0, 0.1, 0.0, 0.2, 0.3)
+) -> tuple[Array, Array]:
     scene: Any = coordinated_lifting(count=count, radius=radius)
     height = frame_pose(robots.iiwa(), jnp.asarray(_HOLDING), _FLANGE)[2, 3]
     q = jnp.asarray([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])

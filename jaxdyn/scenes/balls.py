@@ -9,7 +9,7 @@ from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Holonomic, rolling_sphere
 from jaxdyn.lie import so3
 from jaxdyn.model import inertia
-from jaxdyn.model.arguments import Number
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems.scene import Scene
@@ -24,7 +24,9 @@ class _Steady(eqx.Module):
         return q[0] - self.rate.astype(q.dtype) * t
 
 
-def _turntable_start(radius=0.2, rate=3.0, position=(1.0, 0.0), velocity=(0.0, 0.5)):
+def _turntable_start(
+    radius: Number = 0.2, rate: Number = 3.0, position: Row = (1.0, 0.0), velocity: Row = (0.0, 0.5)
+) -> tuple[Array, Array]:
     # The contact point of the ball moves with the table: v + w x (-r e_z) = rate e_z x p.
     slip = -rate * position[1] - velocity[0], rate * position[0] - velocity[1]
     spin = slip[1] / radius, -slip[0] / radius, 0.0
@@ -47,7 +49,7 @@ def ball_on_turntable(*, mass: Number = 1.0, radius: Number = 0.2, rate: Number 
     return Scene(builder.build(), (Holonomic(_Steady(rate), name="drive"), rolling))
 
 
-def _incline_start(radius=0.1, velocity=(0.0, 0.5)):
+def _incline_start(radius: Number = 0.1, velocity: Row = (0.0, 0.5)) -> tuple[Array, Array]:
     # Rolling: v + w x (-r e_z) = 0.
     x, y = velocity
     q = [0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]
@@ -95,7 +97,9 @@ class _Sliding(eqx.Module):
         return jnp.concatenate([push, so3.cross(down, push)])
 
 
-def _bowling_start(radius=0.10795, velocity=(8.0, 0.0), spin=(-8 * np.pi, 0.0, 0.0)):
+def _bowling_start(
+    radius: Number = 0.10795, velocity: Row = (8.0, 0.0), spin: Row = (-8 * np.pi, 0.0, 0.0)
+) -> tuple[Array, Array]:
     return jnp.asarray([0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]), jnp.asarray([*velocity, 0.0, *spin])
 
 

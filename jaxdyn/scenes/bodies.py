@@ -1,6 +1,7 @@
 """A rigid body without forces."""
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from jaxdyn.model.arguments import Row
 from jaxdyn.model.builder import ModelBuilder
@@ -8,7 +9,7 @@ from jaxdyn.scenes._named import named
 from jaxdyn.systems.scene import Scene
 
 
-def _free_start(rates=(0.3, 0.8, -0.5)):
+def _free_start(rates: Row = (0.3, 0.8, -0.5)) -> tuple[Array, Array]:
     return jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray(rates, float)
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.contact.cones import friction_cone, surface_cone
@@ -81,8 +82,11 @@ def _reached(model, joints, offset, guess, target):
 
 
 def _cube_start(
-    size=0.06, position=(0.108, 0.013, 0.004), turned=(0.404, -1.79, -0.078), twist=(0.02, 0.0, -0.01, 0.1, 0.2, -0.1)
-):
+    size: Number = 0.06,
+    position: Row = (0.108, 0.013, 0.004),
+    turned: Row = (0.404, -1.79, -0.078),
+    twist: Row = (0.02, 0.0, -0.01, 0.1, 0.2, -0.1),
+) -> tuple[Array, Array]:
     model = robots.allegro()
     quaternion, rotation = _quaternion(turned)
     xp = numpy_for(size, position, turned, twist)
@@ -96,7 +100,7 @@ def _cube_start(
         place, jacobian = _tip(model, joints, offset, reached)
         if is_concrete(target) and not np.linalg.norm(target - place) < 1e-12:
             raise ValueError(
-                f"size is {size}, position {position.tolist()}, turned {list(turned)}: {name} cannot reach its place on the "
+                f"size is {size}, position {np.asarray(position).tolist()}, turned {list(turned)}: {name} cannot reach its place on the "
                 "cube; give a place nearer to the default one"
             )
         velocity = _carried(position, rotation @ twist[:3], rotation @ twist[3:], target)
@@ -130,7 +134,9 @@ def allegro_with_cube(*, size: Number = 0.06, mass: Number = 0.1, mu: Number = 0
     return Grasp(robots.allegro(gravity=fall), cube.build(), point_contacts(places), cones=cones)
 
 
-def _table_start(tilt=0.02, rate=0.0, height=0.025, size=(0.2, 0.16, 0.24)):
+def _table_start(
+    tilt: Number = 0.02, rate: Number = 0.0, height: Number = 0.025, size: Row = (0.2, 0.16, 0.24)
+) -> tuple[Array, Array]:
     xp = numpy_for(tilt)
     s, c = xp.sin(tilt), xp.cos(tilt)
     center = height + size[2] / 2

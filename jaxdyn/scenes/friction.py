@@ -15,7 +15,9 @@ from jaxdyn.systems.system import MetricSystem
 _UP, _DOWN = ((0, 0, 0), (-jnp.pi / 2, 0, 0)), ((0, 0, 0), (jnp.pi / 2, 0, 0))  # z of a plane along y, and against it
 
 
-def _rough_start(speed=3.0, place=0.1, link_place=0.0, tilt=0.0):
+def _rough_start(
+    speed: Number = 3.0, place: Number = 0.1, link_place: Number = 0.0, tilt: Number = 0.0
+) -> tuple[Array, Array]:
     # The link touches the disk of radius 1 from above, tilted clockwise.
     height = 1 + (1 + jnp.sin(tilt) * (place - link_place)) / jnp.cos(tilt)
     q = jnp.stack([jnp.asarray(x, float) for x in (place, 1.0, 0.0, link_place, height, -tilt)])
@@ -72,7 +74,9 @@ def _toy_potential(q, t, p):
     return jnp.sum(p["weight"] * q) + 0.5 * p["stiffness"] * (q[1] - q[2]) ** 2
 
 
-def _woodpecker_start(gap=0.0006, half_height=0.0058, bird=-0.2788, velocity=(-0.3411, 0.0, -7.4583)):
+def _woodpecker_start(
+    gap: Number = 0.0006, half_height: Number = 0.0058, bird: Number = -0.2788, velocity: Row = (-0.3411, 0.0, -7.4583)
+) -> tuple[Array, Array]:
     return jnp.asarray([0.0, -gap / half_height, bird]), jnp.asarray(velocity)
 
 

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import rolling_sphere, rolling_wheel
@@ -80,7 +81,14 @@ def _planar_state(fingers, center, angle, velocity):
     return jnp.asarray([*q, *center, angle]), jnp.asarray([*v, *velocity])
 
 
-def _bar_start(center=(0.02, 0.38), angle=0.1, velocity=(0.2, -0.1, 0.5), links=_LINKS, palm=_PALM, length=0.3):
+def _bar_start(
+    center: Row = (0.02, 0.38),
+    angle: Number = 0.1,
+    velocity: Row = (0.2, -0.1, 0.5),
+    links: Row = _LINKS,
+    palm: Number = _PALM,
+    length: Number = 0.3,
+) -> tuple[Array, Array]:
     xp = numpy_for(center, angle, links, palm, length)
     along = xp.asarray(_turn(angle))[:, 0]
     fingers = []
@@ -125,13 +133,13 @@ def hand_with_bar(
 
 
 def _disk_start(
-    center=(0.01, 0.45),
-    tilts=(0.12, -0.05),
-    velocity=(0.1, -0.15, 1.0),
-    links=_LINKS,
-    palm=_PALM,
-    radius=0.1,
-):
+    center: Row = (0.01, 0.45),
+    tilts: Row = (0.12, -0.05),
+    velocity: Row = (0.1, -0.15, 1.0),
+    links: Row = _LINKS,
+    palm: Number = _PALM,
+    radius: Number = 0.1,
+) -> tuple[Array, Array]:
     xp = numpy_for(center, tilts, links, palm, radius)
     fingers = []
     for side, tilt in zip((-1.0, 1.0), tilts, strict=True):
@@ -249,13 +257,13 @@ def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
 
 
 def _ball_start(
-    position=(0.01, -0.02, 0.28),
-    turned=(0.1, -0.15, 0.2),
-    twist=(0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
-    links=_SPATIAL_LINKS,
-    circle=_CIRCLE,
-    radius=0.1,
-):
+    position: Row = (0.01, -0.02, 0.28),
+    turned: Row = (0.1, -0.15, 0.2),
+    twist: Row = (0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
+    links: Row = _SPATIAL_LINKS,
+    circle: Number = _CIRCLE,
+    radius: Number = 0.1,
+) -> tuple[Array, Array]:
     return _ball_state(position, turned, twist, links, circle, radius, radius, True)
 
 
@@ -287,14 +295,14 @@ def hand_with_ball(
 
 
 def _rolling_start(
-    position=(0.01, -0.02, 0.28),
-    turned=(0.1, -0.15, 0.2),
-    twist=(0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
-    links=_SPATIAL_LINKS,
-    circle=_CIRCLE,
-    radius=0.1,
-    tip_radius=0.02,
-):
+    position: Row = (0.01, -0.02, 0.28),
+    turned: Row = (0.1, -0.15, 0.2),
+    twist: Row = (0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
+    links: Row = _SPATIAL_LINKS,
+    circle: Number = _CIRCLE,
+    radius: Number = 0.1,
+    tip_radius: Number = 0.02,
+) -> tuple[Array, Array]:
     return _ball_state(position, turned, twist, links, circle, radius, radius + tip_radius, False)
 
 

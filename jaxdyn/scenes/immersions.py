@@ -111,7 +111,9 @@ def _builder(formulation):
     return _FORMULATIONS[formulation]
 
 
-def _double_start(formulation="lagrangian", angles=(0.6, -0.2), rates=(1.1, -0.7), length=1.0):
+def _double_start(
+    formulation: str = "lagrangian", angles: Row = (0.6, -0.2), rates: Row = (1.1, -0.7), length: Number = 1.0
+) -> tuple[Array, Array]:
     _builder(formulation)
     (theta, phi), (theta_rate, phi_rate) = jnp.asarray(angles, float), jnp.asarray(rates, float)
     if formulation == "model":
@@ -174,7 +176,13 @@ class _Applied(eqx.Module):
         return disk, jnp.stack([-f1 * c, f1 * s, self.torque.astype(s.dtype)])
 
 
-def _disk_start(place=0.1, turn=0.0, link_place=-0.2, tilt=0.3, rates=(0.4, 0.2, -0.1, 0.3)):
+def _disk_start(
+    place: Number = 0.1,
+    turn: Number = 0.0,
+    link_place: Number = -0.2,
+    tilt: Number = 0.3,
+    rates: Row = (0.4, 0.2, -0.1, 0.3),
+) -> tuple[Array, Array]:
     return jnp.asarray([place, turn, link_place, tilt]), jnp.asarray(rates)
 
 

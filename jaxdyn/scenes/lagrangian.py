@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.contact.unilateral import DryFriction
@@ -19,7 +20,7 @@ def _given(position, velocity):
     return jnp.asarray(position, float), jnp.asarray(velocity, float)
 
 
-def _particle_start(position=(0.0, 0.0), velocity=(1.0, 2.0)):
+def _particle_start(position: Row = (0.0, 0.0), velocity: Row = (1.0, 2.0)) -> tuple[Array, Array]:
     return _given(position, velocity)
 
 
@@ -41,7 +42,7 @@ def particle_in_plane(*, mass: Number = 1.0, gravity: Number = 9.81) -> Scene:
     return Scene(LagrangianSystem(_quadratic, 2, parameters=parameters, potential=_height_energy))
 
 
-def _pendulum_start(angle=-np.pi / 2, rate=0.0):
+def _pendulum_start(angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:
     return _given([angle], [rate])
 
 
@@ -66,7 +67,9 @@ def pendulum(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81
     return Scene(LagrangianSystem(_swing, 1, parameters=parameters, potential=_swing_potential))
 
 
-def _sphere_start(theta=1.0, phi=0.0, theta_rate=0.0, phi_rate=1.0):
+def _sphere_start(
+    theta: Number = 1.0, phi: Number = 0.0, theta_rate: Number = 0.0, phi_rate: Number = 1.0
+) -> tuple[Array, Array]:
     return _given([theta, phi], [theta_rate, phi_rate])
 
 
@@ -90,7 +93,7 @@ def spherical_pendulum_in_angles(*, mass: Number = 1.0, length: Number = 1.0, gr
     return Scene(LagrangianSystem(_sphere, 2, parameters=parameters, potential=_sphere_potential))
 
 
-def _arm_start(angles=(0.3, 1.1), rates=(0.7, -0.4)):
+def _arm_start(angles: Row = (0.3, 1.1), rates: Row = (0.7, -0.4)) -> tuple[Array, Array]:
     return _given(angles, rates)
 
 
@@ -134,7 +137,7 @@ def planar_arm(
     return Scene(LagrangianSystem(_arm, 2, parameters=parameters, potential=potential))
 
 
-def _spatial_start(angles=(0.3, 0.4, -0.7), rates=(0.5, -0.6, 0.8)):
+def _spatial_start(angles: Row = (0.3, 0.4, -0.7), rates: Row = (0.5, -0.6, 0.8)) -> tuple[Array, Array]:
     return _given(angles, rates)
 
 
@@ -165,7 +168,7 @@ def spatial_arm(
     return Scene(builder.build())
 
 
-def _euler_start(angles=(0.4, 1.1, -0.3), rates=(0.5, -0.8, 1.3)):
+def _euler_start(angles: Row = (0.4, 1.1, -0.3), rates: Row = (0.5, -0.8, 1.3)) -> tuple[Array, Array]:
     return _given(angles, rates)
 
 
@@ -194,8 +197,11 @@ def rigid_body_in_euler_angles(*, moments: Row = (1.0, 2.0, 3.0)) -> Scene:
 
 
 def _box_start(
-    position=(0.0, 0.0, 0.0), orientation=(1.0, 0.0, 0.0, 0.0), velocity=(0.0,) * 3, turning=(0.1, 4.0, 0.2)
-):
+    position: Row = (0.0, 0.0, 0.0),
+    orientation: Row = (1.0, 0.0, 0.0, 0.0),
+    velocity: Row = (0.0,) * 3,
+    turning: Row = (0.1, 4.0, 0.2),
+) -> tuple[Array, Array]:
     return _given((*position, *orientation), (*velocity, *turning))
 
 
@@ -220,7 +226,7 @@ def free_box(
     return Scene(builder.add_body("box", None, "free", numbers).build())
 
 
-def _block_start(position=0.0, velocity=2.0):
+def _block_start(position: Number = 0.0, velocity: Number = 2.0) -> tuple[Array, Array]:
     return _given([position], [velocity])
 
 

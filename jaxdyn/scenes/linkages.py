@@ -4,6 +4,7 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import loop
@@ -51,7 +52,9 @@ def _solved(one, other, right):
     ) / determinant
 
 
-def _four_bar_start(lengths=(1.0, 3.0, 2.5, 3.5), angle=1.0, rate=1.0, in_plane=True):
+def _four_bar_start(
+    lengths: Row = (1.0, 3.0, 2.5, 3.5), angle: Number = 1.0, rate: Number = 1.0, in_plane: bool = True
+) -> tuple[Array, Array]:
     crank, coupler, rocker, ground = lengths
     xp = numpy_for(lengths, angle, rate)
     a = crank * xp.stack([xp.cos(angle), xp.sin(angle)])
@@ -87,7 +90,9 @@ def four_bar(
     return Scene(builder.build(), (closing,))
 
 
-def _slider_crank_start(crank=1.0, rod=2.5, angle=1.0, rate=1.0):
+def _slider_crank_start(
+    crank: Number = 1.0, rod: Number = 2.5, angle: Number = 1.0, rate: Number = 1.0
+) -> tuple[Array, Array]:
     xp = numpy_for(crank, rod, angle, rate)
     lean = -xp.arcsin(crank * xp.sin(angle) / rod)
     leaning = -crank * xp.cos(angle) * rate / (rod * xp.cos(lean))
@@ -119,7 +124,7 @@ def _names(count: int) -> tuple[list[str], list[str]]:
     return uprights, [f"coupler{i:0{width}d}" for i in range(count)]
 
 
-def _windows_start(count=2, rate=1.0):
+def _windows_start(count: Checked[int] = 2, rate: Number = 1.0) -> tuple[Array, Array]:
     # Depth-first: each upright but the last one is followed by the coupler that it carries, which does not turn.
     v = [sign * rate for _ in range(count) for sign in (-1.0, 1.0)] + [-rate]
     return jnp.zeros(2 * count + 1), jnp.asarray(v)
@@ -154,7 +159,13 @@ def windows(
 _BASES = ((0.0, 1.2), (-1.04, -0.6), (1.04, -0.6))
 
 
-def _parallel_start(point=(0.1, 0.05), velocity=(0.3, -0.2), length=1.0, bases=_BASES, elbows=(1, 1, 1)):
+def _parallel_start(
+    point: Row = (0.1, 0.05),
+    velocity: Row = (0.3, -0.2),
+    length: Number = 1.0,
+    bases: Row = _BASES,
+    elbows: Row = (1, 1, 1),
+) -> tuple[Array, Array]:
     xp = numpy_for(point, velocity, length, bases)
     q, v = [], []
     for base, elbow in zip(bases, elbows, strict=True):
@@ -190,7 +201,7 @@ def parallel_manipulator(
     return Scene(builder.build(), [loop("a2", tip, leg, tip, "point", in_plane=True) for leg in ("b2", "c2")])
 
 
-def _ring_start(count=6, length=1.0, rate=1.0):
+def _ring_start(count: Checked[int] = 6, length: Number = 1.0, rate: Number = 1.0) -> tuple[Array, Array]:
     middle = length / 2, length / 2 / np.tan(np.pi / count)
     q = [-middle[0], -middle[1], 0.0, *[2 * np.pi / count] * (count - 1)]
     return jnp.asarray(q), jnp.asarray([rate * middle[1], -rate * middle[0], rate, *[0.0] * (count - 1)])

@@ -31,7 +31,7 @@ def _scene(dimension: int, mass, length, gravity) -> Scene:
     return Scene(system, (Holonomic(_Rod(length), name="rod"),))
 
 
-def _plane_start(length=1.0, angle=-np.pi / 2, rate=0.0):
+def _plane_start(length: Number = 1.0, angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:
     s, c = numpy_for(angle).sin(angle), numpy_for(angle).cos(angle)
     return length * jnp.asarray([s, -c]), length * rate * jnp.asarray([c, s])
 
@@ -48,7 +48,9 @@ def pendulum_in_plane(*, mass: Number = 1.0, length: Number = 1.0, gravity: Numb
     return _scene(2, mass, length, gravity)
 
 
-def _sphere_start(length=1.0, theta=1.0, phi=0.0, theta_rate=0.0, phi_rate=1.0):
+def _sphere_start(
+    length: Number = 1.0, theta: Number = 1.0, phi: Number = 0.0, theta_rate: Number = 0.0, phi_rate: Number = 1.0
+) -> tuple[Array, Array]:
     xp = numpy_for(theta, phi)
     s, c, sp, cp = xp.sin(theta), xp.cos(theta), xp.sin(phi), xp.cos(phi)
     q = length * jnp.asarray([s * cp, s * sp, -c])

@@ -34,7 +34,9 @@ def _disk(q, v, t, p):
     return 0.5 * (p["mass"] * (v[0] ** 2 + v[1] ** 2) + p["steer"] * v[2] ** 2 + p["roll"] * v[3] ** 2)
 
 
-def _disk_start(radius=0.5, heading=0.0, steering=1.0, rolling=2.0):
+def _disk_start(
+    radius: Number = 0.5, heading: Number = 0.0, steering: Number = 1.0, rolling: Number = 2.0
+) -> tuple[Array, Array]:
     xp = numpy_for(heading)
     c, s = xp.cos(heading), xp.sin(heading)
     speed = radius * rolling
@@ -57,7 +59,7 @@ def rolling_disk(
     return Scene(LagrangianSystem(_disk, 4, parameters=parameters), (Pfaffian(_DiskRows(radius), name="rolling"),))
 
 
-def _sleigh_start(speed=0.2, yaw_rate=1.5):
+def _sleigh_start(speed: Number = 0.2, yaw_rate: Number = 1.5) -> tuple[Array, Array]:
     return jnp.zeros(3), jnp.asarray([speed, 0.0, yaw_rate])
 
 
@@ -76,7 +78,7 @@ def chaplygin_sleigh(*, mass: Number = 1.0, inertia_com: Number = 0.5, offset: N
     return Scene(builder.build(), (knife_edge("sleigh", contact=False, name="blade"),))
 
 
-def _incline_start(yaw_rate=2.0):
+def _incline_start(yaw_rate: Number = 2.0) -> tuple[Array, Array]:
     return jnp.zeros(3), jnp.asarray([0.0, 0.0, yaw_rate])
 
 
@@ -98,7 +100,9 @@ def knife_edge_on_incline(
     return Scene(builder.build(), (knife_edge("skate", contact=False, name="blade"),))
 
 
-def _coin_start(radius=0.05, circle=0.5, lean=np.pi / 36, gravity=9.81):
+def _coin_start(
+    radius: Number = 0.05, circle: Number = 0.5, lean: Number = np.pi / 36, gravity: Number = 9.81
+) -> tuple[Array, Array]:
     xp = numpy_for(radius, circle, lean, gravity)
     rho = radius / circle
     sine, cosine = xp.sin(lean), xp.cos(lean)
@@ -134,7 +138,7 @@ class _NoTurn(eqx.Module):
         return jnp.asarray([0.0, 0.0, 1.0], q.dtype)
 
 
-def _suslov_start(across=1.0, along=-0.5):
+def _suslov_start(across: Number = 1.0, along: Number = -0.5) -> tuple[Array, Array]:
     return jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray([across, along, 0.0])
 
 

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.contact import Ellipsoid, RollingModel, rolling_contact
@@ -59,14 +60,14 @@ def _held(base, links, tip_axes, point, normal, velocity):
 
 
 def _egg_start(
-    position=(0.01, -0.02, 0.28),
-    turned=(0.1, -0.15, 0.2),
-    twist=(0.02, -0.01, 0.02, 0.2, -0.1, 0.15),
-    links=_SPATIAL_LINKS,
-    circle=_CIRCLE,
-    semi_axes=_EGG,
-    tip_semi_axes=_TIP,
-):
+    position: Row = (0.01, -0.02, 0.28),
+    turned: Row = (0.1, -0.15, 0.2),
+    twist: Row = (0.02, -0.01, 0.02, 0.2, -0.1, 0.15),
+    links: Row = _SPATIAL_LINKS,
+    circle: Number = _CIRCLE,
+    semi_axes: Row = _EGG,
+    tip_semi_axes: Row = _TIP,
+) -> tuple[Array, Array]:
     quaternion, rotation = _quaternion(turned)
     xp = numpy_for(position, turned, twist, links, circle, semi_axes, tip_semi_axes)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)

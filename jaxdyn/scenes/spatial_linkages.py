@@ -1,6 +1,7 @@
 """Linkages in space that move although counting their joints says that they cannot."""
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import loop
@@ -28,7 +29,9 @@ def _second(length, twist, other):
     return xp.arcsin(sine)
 
 
-def _bennett_start(lengths=(1.0, 0.7), twist=1.1, angle=0.8, rate=1.0):
+def _bennett_start(
+    lengths: Row = (1.0, 0.7), twist: Number = 1.1, angle: Number = 0.8, rate: Number = 1.0
+) -> tuple[Array, Array]:
     first, second = twist, _second(lengths[0], twist, lengths[1])
     xp = numpy_for(lengths, twist, angle, rate)
     # tan(q1/2) tan(q2/2) = k, and q3 = -q1 up to a turn.

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import knife_edge, rolling_wheel
@@ -14,15 +15,15 @@ _AXLE = (np.zeros(3), (-np.pi / 2, 0.0, 0.0))  # z of the wheel along y of the b
 
 
 def _bicycle_start(
-    speed=4.6,
-    roll_rate=0.0,
-    steer_rate=0.0,
-    wheel_base=1.02,
-    trail=0.08,
-    tilt=np.pi / 10,
-    rear_radius=0.3,
-    front_radius=0.35,
-):
+    speed: Number = 4.6,
+    roll_rate: Number = 0.0,
+    steer_rate: Number = 0.0,
+    wheel_base: Number = 1.02,
+    trail: Number = 0.08,
+    tilt: Number = np.pi / 10,
+    rear_radius: Number = 0.3,
+    front_radius: Number = 0.35,
+) -> tuple[Array, Array]:
     # The steer axis points down, so steering turns the front wheel's contact, behind the axis, to the left.
     yaw_rate = -trail * numpy_for(tilt).cos(tilt) / wheel_base * steer_rate
     q = [0.0, 0.0, rear_radius, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -89,7 +90,9 @@ def bicycle(
     return Scene(builder.build(), rolling)
 
 
-def _drive_start(speed=0.5, yaw_rate=0.4, radius=0.1, half_track=0.25):
+def _drive_start(
+    speed: Number = 0.5, yaw_rate: Number = 0.4, radius: Number = 0.1, half_track: Number = 0.25
+) -> tuple[Array, Array]:
     speed_difference = yaw_rate * half_track
     spins = [(speed - speed_difference) / radius, (speed + speed_difference) / radius]
     return jnp.zeros(5), jnp.asarray([speed, 0.0, yaw_rate, *spins])
@@ -135,7 +138,14 @@ def differential_drive(
     return Scene(builder.build(), rolling)
 
 
-def _car_start(speed=2.0, steer=0.2, steer_rate=0.0, radius=0.15, half_track=0.4, wheel_base=1.2):
+def _car_start(
+    speed: Number = 2.0,
+    steer: Number = 0.2,
+    steer_rate: Number = 0.0,
+    radius: Number = 0.15,
+    half_track: Number = 0.4,
+    wheel_base: Number = 1.2,
+) -> tuple[Array, Array]:
     xp = numpy_for(steer)
     yaw_rate = speed * xp.tan(steer) / wheel_base
     speed_difference = yaw_rate * half_track
@@ -188,7 +198,13 @@ def car(
     return Scene(builder.build(), rolling)
 
 
-def _snakeboard_start(speed=1.0, angles=(0.3, -0.2), rates=(0.0, 0.0), rotor_rate=1.0, half_length=0.3):
+def _snakeboard_start(
+    speed: Number = 1.0,
+    angles: Row = (0.3, -0.2),
+    rates: Row = (0.0, 0.0),
+    rotor_rate: Number = 1.0,
+    half_length: Number = 0.3,
+) -> tuple[Array, Array]:
     front, back = (numpy_for(angle).tan(angle) for angle in angles)
     sideways, yaw_rate = speed * (front + back) / 2, speed * (front - back) / (2 * half_length)
     return jnp.asarray([0.0, 0.0, 0.0, *angles, 0.0]), jnp.asarray([speed, sideways, yaw_rate, *rates, rotor_rate])
