@@ -12,6 +12,8 @@ class Wrapped(diffrax.AbstractWrappedSolver):
 
     solver: diffrax.AbstractSolver
 
+    # Settings that are passed on may stand for others while equinox takes a tree apart: `PyTree`.
+
     @property
     def term_structure(self) -> PyTree:
         """As the wrapped method's."""
@@ -24,12 +26,12 @@ class Wrapped(diffrax.AbstractWrappedSolver):
         return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
-    def root_find_max_steps(self) -> int:
+    def root_find_max_steps(self) -> PyTree:
         """Of the wrapped method, if it is implicit."""
         return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
-    def scan_kind(self) -> str | None:
+    def scan_kind(self) -> PyTree:
         """Of the wrapped method, if it is of Runge-Kutta type."""
         return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
 
