@@ -100,8 +100,8 @@ def _cube_start(
         place, jacobian = _tip(model, joints, offset, reached)
         if is_concrete(target) and not np.linalg.norm(target - place) < 1e-12:
             raise ValueError(
-                f"size is {size}, position {np.asarray(position).tolist()}, turned {list(turned)}: {name} cannot reach its place on the "
-                "cube; give a place nearer to the default one"
+                f"size is {size}, position {np.asarray(position).tolist()}, turned {list(turned)}: {name} cannot reach its "
+                "place on the cube; give a place nearer to the default one"
             )
         velocity = _carried(position, rotation @ twist[:3], rotation @ twist[3:], target)
         moving = _least(jacobian, velocity)
