@@ -164,7 +164,7 @@ def main(argv=None) -> dict[str, float]:
     model = jd.robots.iiwa()
     mass = float(np.sum(model.inertias[:, 0]))
     print(f"Arm: {model.name}, {model.nb} bodies, {model.nv} joints, {mass:.2f} kg", flush=True)
-    jd.draw(model, np.array(HOME)).figure.savefig(options.out / "arm.png")
+    jd.draw(model, np.array(HOME)).figure.savefig(options.out / "arm.png")  # pyright: ignore[reportAttributeAccessIssue]
     print(f"   drawn after {time.perf_counter() - began:.1f} s: {options.out / 'arm.png'}", flush=True)
 
     print(

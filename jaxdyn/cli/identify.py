@@ -16,6 +16,7 @@ from jaxdyn.cli.identify_tables import gains_text, judged_table, payload_text, t
 from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.identify.identifiability import base_terms
+from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.spectra import vibration
 from jaxdyn.identify.suspicions import at_rest, suspicions
 from jaxdyn.identify.threads import on_one_thread
@@ -350,7 +351,7 @@ def _judged(model: Model, result, names: list[str], logs: list[Log]) -> list[Jud
     fit = result.fit if isinstance(result, RobotFit) else result
     logs = [result.aligned(log) for log in logs] if isinstance(result, RobotFit) else logs
     return [
-        Judged(name, log, fit.torques(log), identify.regressor(model, log.q, log.v, log.a) @ nominal)
+        Judged(name, log, fit.torques(log), log_regressor(model, log) @ nominal)
         for name, log in zip(names, logs, strict=True)
     ]
 

@@ -4,6 +4,7 @@ import contextlib
 import contextvars
 import logging
 import os
+from collections.abc import Iterator
 
 logger = logging.getLogger("jaxdyn")
 MODES = ("auto", "general", "plain")
@@ -29,7 +30,7 @@ def _checked(mode, what: str) -> str:
 
 
 @contextlib.contextmanager
-def compilation(mode: str):
+def compilation(mode: str) -> Iterator[None]:
     """While functions are traced inside: how they become machine code.
 
     **Arguments:** `mode`:

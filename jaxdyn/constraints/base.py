@@ -8,7 +8,7 @@ residual w(q, v, t), linear in v up to a term without v, that is to be zero (non
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import run
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Function, Numbers, batch_hint, check_state, state_dtype
+from jaxdyn.model.arguments import DType, Function, Number, Numbers, SystemLike, batch_hint, check_state, state_dtype
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -35,15 +35,15 @@ class Constraint(eqx.Module):
             warnings.warn(f"{cls.__name__}.slip is called `velocity` now; rename it", DeprecationWarning, stacklevel=2)
             cls.velocity = cls.__dict__["slip"]
 
-    def position(self, system, q, t):
+    def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """Residual phi(q, t) (nh,) of the holonomic part, or None when there is none."""
         return None
 
-    def velocity(self, system, q, v, t):
+    def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
         """Residual w(q, v, t) (np,) of the nonholonomic part, linear in v, or None when there is none."""
         return None
 
-    def sizes(self, system, dtype) -> tuple[int, int]:
+    def sizes(self, system: SystemLike, dtype: DType) -> tuple[int, int]:
         """Numbers of holonomic and of nonholonomic rows, from shapes alone."""
         q, v = (jax.ShapeDtypeStruct((n,), dtype) for n in (system.nq, system.nv))
         t = jax.ShapeDtypeStruct((), dtype)
@@ -58,17 +58,26 @@ class Constraint(eqx.Module):
         """
         return None
 
-    def group(self):
+    def group(self) -> Hashable:
         """Constraints whose groups are equal and not None are evaluated together, by the functions below."""
         return None
 
     @classmethod
-    def grouped_position(cls, members: Sequence["Constraint"], system, q, t) -> list:
+    def grouped_position(
+        cls, members: Sequence["Constraint"], system: SystemLike, q: Float[Array, " nq"], t: Number
+    ) -> list:
         """Residuals (nh,) of each of the constraints of one group, None without a holonomic part."""
         raise NotImplementedError
 
     @classmethod
-    def grouped_motion(cls, members: Sequence["Constraint"], system, q, v, t) -> list:
+    def grouped_motion(
+        cls,
+        members: Sequence["Constraint"],
+        system: SystemLike,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+    ) -> list:
         """A (n, nv), gamma (n,) and A v - b (n,) of each of the constraints of one group."""
         raise NotImplementedError
 
@@ -99,7 +108,7 @@ class Holonomic(Constraint):
         self.phi = as_pytree(phi, f"constraint {self.name!r}: phi")
         self.with_system = bool(with_system)
 
-    def position(self, system, q, t):
+    def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """phi(q, t), (n,)."""
         value = self.phi(system, q, t) if self.with_system else self.phi(q, t)
         if jnp.ndim(value) > 1:
@@ -129,13 +138,13 @@ class Pfaffian(Constraint):
     with_system: bool = eqx.field(static=True)
     name: str = eqx.field(static=True)
 
-    def __init__(self, A, b=None, with_system: bool = False, name: str | None = None):
+    def __init__(self, A: Function, b: Function | None = None, with_system: bool = False, name: str | None = None):
         self.name = _own_name(name, A, "pfaffian")
         self.A = as_pytree(A, f"constraint {self.name!r}: A")
         self.b = None if b is None else as_pytree(b, f"constraint {self.name!r}: b")
         self.with_system = bool(with_system)
 
-    def velocity(self, system, q, v, t):
+    def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
         """A v - b, (n,)."""
         place = (system, q, t) if self.with_system else (q, t)
         rows = jnp.asarray(self.A(*place), q.dtype)

@@ -12,7 +12,7 @@ Coordinates that move both frames drop out of A exactly. A velocity residual w(R
 gamma = -dw/dt.
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import equinox as eqx
 import jax
@@ -25,6 +25,7 @@ from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import Carried, carried, take
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 
@@ -75,7 +76,7 @@ class Pair(Constraint):
         """Frames A and B, each a body or frame (None: the world) and a pose (4, 4) in it."""
         raise NotImplementedError
 
-    def declared(self, system) -> "Pair":
+    def declared(self, system: SystemLike) -> "Pair":
         """The constraint as it was given to the system, where its rows are known by a number alone."""
         return self
 
@@ -87,7 +88,7 @@ class Pair(Constraint):
         """Residual (np,) of the nonholonomic part, linear in U, or None without one."""
         return None
 
-    def at(self, system, q: Float[Array, " nq"]) -> "Pair":
+    def at(self, system: SystemLike, q: Float[Array, " nq"]) -> "Pair":
         """The constraint with what it reads from the system and from q itself, beside the poses of its frames."""
         return self
 
@@ -95,20 +96,20 @@ class Pair(Constraint):
         """Members of one class with equal keys differ in numbers alone; they are evaluated as one batch."""
         raise NotImplementedError
 
-    def group(self):
+    def group(self) -> Hashable:
         """All are evaluated on one pass of the kinematics."""
         return "pairs"
 
-    def position(self, system, q, t):
+    def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """Residual of the holonomic part, (nh,)."""
         return self.grouped_position([self], system, q, t)[0]
 
-    def velocity(self, system, q, v, t):
+    def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
         """Residual of the nonholonomic part, (np,)."""
         holonomic, nonholonomic = self.sizes(system, q.dtype)
         return self.grouped_motion([self], system, q, v, t)[0][2][holonomic:] if nonholonomic else None
 
-    def wrench(self, R, p, lam) -> Float[Array, "6"]:
+    def wrench(self, R: Float[Array, "3 3"], p: Float[Array, "3"], lam: Float[Array, " r"]) -> Float[Array, "6"]:
         """Wrench (f, tau) (6,) on body B for the multipliers lam, at the origin and in the axes of frame A.
 
         `R` (3, 3), `p` (3,): pose of frame B seen from frame A. The wrench on body A is the negative of it.
@@ -116,12 +117,14 @@ class Pair(Constraint):
         return _product(lam, _directions(self, R, p))
 
     @classmethod
-    def grouped_position(cls, members: Sequence["Pair"], system, q, t):
+    def grouped_position(cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], t: Number) -> list:
         """Residuals (nh,) of each constraint, None without one."""
         return (_positions_of if is_expanding() else _positions)(tuple(members), system, q)
 
     @classmethod
-    def grouped_motion(cls, members: Sequence["Pair"], system, q, v, t):
+    def grouped_motion(
+        cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> list:
         """A (r, nv), gamma (r,) and velocity (r,) of each constraint."""
         return (_motions_of if is_expanding() else _motions)(tuple(members), system, q, v)
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
-from jaxdyn.model.arguments import Numbers, pose_leaf
+from jaxdyn.model.arguments import Checked, DType, Number, Numbers, pose_leaf
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_difference
 from jaxdyn.model.names import body_index
 from jaxdyn.model.tree import Model
@@ -239,7 +239,7 @@ class Gear(Constraint):
     ratio: Float[Array, ""]
     offset: Float[Array, ""]
 
-    def sizes(self, system, dtype):
+    def sizes(self, system: Checked[Model], dtype: DType) -> tuple[int, int]:
         """One row."""
         for joint in (self.joint_a, self.joint_b):
             kind = system.topology.kinds[joint_index(self.name, system, joint)]
@@ -247,7 +247,7 @@ class Gear(Constraint):
                 raise ValueError(f"{self.name!r}: joint {joint!r} is {kind}; couple joints of one degree of freedom")
         return 1, 0
 
-    def position(self, system, q, t):
+    def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, "1"]:
         """q_a - ratio q_b - offset, (1,)."""
         starts = [
             system.topology.q_slices[joint_index(self.name, system, j)].start for j in (self.joint_a, self.joint_b)
@@ -275,7 +275,7 @@ class JointLock(Constraint):
     joint: str = eqx.field(static=True)
     value: Float[Array, " nqj"]
 
-    def sizes(self, system, dtype):
+    def sizes(self, system: Checked[Model], dtype: DType) -> tuple[int, int]:
         """One row per degree of freedom of the joint."""
         i = joint_index(self.name, system, self.joint)  # refuses systems without joints
         kind = system.topology.kinds[i]
@@ -286,7 +286,7 @@ class JointLock(Constraint):
             )
         return KINDS[kind].nv, 0
 
-    def position(self, system, q, t):
+    def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, " nvj"]:
         """Displacement of the joint from its value, on the joint's manifold, (nv of the joint,)."""
         i = joint_index(self.name, system, self.joint)
         return joint_difference(system.topology.kinds[i], self.value.astype(q.dtype), q[system.topology.q_slices[i]])

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.lie.so3 import _product, cross
-from jaxdyn.model.arguments import Numbers, pose_leaf
+from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
 
 
 class TouchingPoint(NamedTuple):
@@ -46,40 +46,44 @@ class Touching(Pair):
     spin: eqx.AbstractVar[bool]
     count: eqx.AbstractVar[int]
 
-    def ends(self):
+    def ends(self) -> tuple[tuple[str | None, Array], tuple[str | None, Array]]:
         """Frame A on the surface, frame B on the body."""
         return (self.surface_body, self.surface), (self.body, self.pose)
 
-    def touching(self, R, p) -> TouchingPoint:
+    def touching(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> TouchingPoint:
         """The contact for the pose of the body's frame seen from the surface's."""
         raise NotImplementedError
 
-    def contact_point(self, R, p) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    def contact_point(
+        self, R: Float[Array, "3 3"], p: Float[Array, "3"]
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Point of contact (m) and normal from the surface to the body, (3,) each, in frame A; `R`, `p` as in `wrench`."""
         touch = self.touching(R, p)
         return touch.point, touch.normal
 
-    def sizes(self, system, dtype):
+    def sizes(self, system: SystemLike, dtype: DType) -> tuple[int, int]:
         """The height, and the rows without slip and spin."""
         check_bodies(self.name, system, (self.body, self.surface_body))
         return int(self.contact), self.count + int(self.spin)
 
-    def wrench_components(self):
+    def wrench_components(self) -> tuple[int, ...] | None:
         """The rows are the normal force, those that do not slip, and the torque that does not spin."""
         if not self.contact:
             return None
         slips = self.count
         return (*range(1, 1 + slips), 0, *((1 + slips,) if self.spin else ()))
 
-    def structure_key(self):
+    def structure_key(self) -> tuple:
         """Which rows there are."""
         return self.contact, self.spin, self.count
 
-    def pose_residual(self, R, p):
+    def pose_residual(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Float[Array, " nh"] | None:
         """Gap between body and surface, (1,), m; None when the height is not constrained."""
         return self.touching(R, p).gap[None] if self.contact else None
 
-    def twist_residual(self, R, p, U):
+    def twist_residual(
+        self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]
+    ) -> Float[Array, " np"] | None:
         """Velocities of slipping (m/s), and of spinning (rad/s) where it is resisted."""
         touch = self.touching(R, p)
         if not self.count:
@@ -265,7 +269,7 @@ def rolling_sphere(
     radius: Numbers,
     *,
     on: str = "plane",
-    surface=None,
+    surface: Numbers | None = None,
     surface_body: str | None = None,
     surface_radius: Numbers | None = None,
     inside: bool = False,

@@ -6,6 +6,7 @@ strictly inside the cones, G f = 0 with f in int(FC). So that is what is looked 
 Source: Murray, Li & Sastry (1994), definition 5.2 and proposition 5.3; EQUATIONS section 10.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from jaxtyping import Float
 from jaxdyn.compile import is_concrete
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.cones import SIDES, FrictionCone, surface_cone
-from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.arguments import Checked, Numbers
 
 _FIRST_FACES = 8
 _ROUNDS = 60
@@ -55,7 +56,13 @@ class _Rows(NamedTuple):
     kept: np.ndarray
 
 
-def force_closure(G: Numbers, cones, *, faces: int | None = None, side="inscribed") -> ForceClosure:
+def force_closure(
+    G: Numbers,
+    cones: Checked[Sequence[FrictionCone | Numbers]],
+    *,
+    faces: int | None = None,
+    side: Checked[str] = "inscribed",
+) -> ForceClosure:
     """Whether the grasp with map G has force closure, with a margin, or with a wrench that it cannot resist.
 
     Round cones are taken as they are: a linear program (HiGHS) with faces around them is solved, and faces are added where

@@ -12,6 +12,9 @@ object, so that f_n >= 0 presses. With friction coefficient mu and, for soft fin
 Source: Murray, Li & Sastry (1994), section 5.2; EQUATIONS sections 10 and 11.
 """
 
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -101,7 +104,7 @@ class FrictionCone(eqx.Module):
         along = jnp.zeros((faces, self.size), self.mu.dtype).at[:, 2].set(-shrink * self.mu)
         return jnp.concatenate([jnp.asarray(normals, self.mu.dtype) + along, linear])
 
-    def margins(self, force, smoothing: Numbers = 0.0) -> Float[Array, " k"]:
+    def margins(self, force: Numbers, smoothing: Numbers = 0.0) -> Float[Array, " k"]:
         """How far the force is from violating each inequality, (j + k,): mu f_n - |(fx, fy)|, then -L f.
 
         Inside the cone all are positive, on its boundary the least is zero. Units are those of the rows: N for forces,
@@ -121,7 +124,7 @@ class FrictionCone(eqx.Module):
             cone_margins.append((first - _length(rest, smoothing))[None])
         return jnp.concatenate([*cone_margins, -_product(self.linear_rows().astype(force.dtype), force)])
 
-    def margin(self, force, smoothing: Numbers = 0.0) -> Float[Array, ""]:
+    def margin(self, force: Numbers, smoothing: Numbers = 0.0) -> Float[Array, ""]:
         """Least of `margins`, () : positive inside the cone, zero on its boundary, infinite for a rigid contact.
 
         With `smoothing` > 0 it is -s log(sum exp(-margins / s)), smooth and at most the least margin, by no more than
@@ -135,7 +138,7 @@ class FrictionCone(eqx.Module):
         scale = jnp.asarray(smoothing, every.dtype)
         return -scale * logsumexp(-every / scale)
 
-    def normal_force(self, force) -> Float[Array, ""]:
+    def normal_force(self, force: Numbers) -> Float[Array, ""]:
         """f_n (), N: force along the contact's normal; positive where it presses."""
         force = as_float(force, "force", (self.size,))
         z = 2 if self.kind == "surface" else components(self.kind, self.in_plane, "cone").index(2)
@@ -187,7 +190,7 @@ def friction_cone(
     return FrictionCone(kind, bool(in_plane), mu, gamma, None)
 
 
-def surface_cone(rows) -> FrictionCone:
+def surface_cone(rows: Numbers) -> FrictionCone:
     """The cone of wrenches U w <= 0 that a surface in contact can transmit.
 
     **Arguments:** `rows` U (k, 6), from `wrench_cone` or `wrench_cone_of_polygon`. Rows that bound a torque (their
@@ -199,3 +202,10 @@ def surface_cone(rows) -> FrictionCone:
     if rows.shape[0] == 0:
         raise ValueError("rows has shape (0, 6); give at least one row, or take friction_cone('rigid')")
     return FrictionCone("surface", False, None, None, rows)
+
+
+if TYPE_CHECKING:
+    # Of all contacts, of each of them, or by their names.
+    Cones = FrictionCone | Sequence[FrictionCone] | Mapping[str, FrictionCone] | None
+else:
+    Cones = Any  # `coned_contacts` looks at them

@@ -12,11 +12,12 @@ from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.surfaces import Plane, Sphere, Surface, check_surface, geometry_at
 from jaxdyn.contact.touching import newton_steps, patch_at
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Numbers
 
 _ROUNDS, _DIFFERENTIATED = 12, 2
 
 
-def contact_coordinates(surface_o: Surface, surface_f: Surface, pose) -> Float[Array, "5"]:
+def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -> Float[Array, "5"]:
     """Contact coordinates eta (5,) of the places where two surfaces are next to each other.
 
     Surfaces that touch are in contact there. Of others these are the places with opposite normals on one line, and

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import layout
-from jaxdyn.contact.cones import FrictionCone
+from jaxdyn.contact.cones import Cones, FrictionCone
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, state_dtype
 from jaxdyn.systems.scene import Scene
 
@@ -35,7 +35,7 @@ class ConedContact(NamedTuple):
 
 
 def contact_forces(
-    scene: Scene, multipliers: Float[Array, " nc"], cones=None, smoothing: Numbers = 0.0
+    scene: Scene, multipliers: Float[Array, " nc"], cones: Cones = None, smoothing: Numbers = 0.0
 ) -> ContactForces:
     """The force of each contact, and its margin in its friction cone.
 

@@ -1,18 +1,20 @@
 """Contact forces of least size that add up to a wrench and keep a margin from the boundary of every cone."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.cones import FrictionCone
 from jaxdyn.contact.qp import QPSolution, solve_qp
-from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.arguments import Checked, Numbers
 
 
 def optimal_forces(
     G: Numbers,
     wrench: Numbers,
-    cones,
+    cones: Checked[Sequence[FrictionCone]],
     *,
     preload: Numbers = 0.0,
     target: Numbers | None = None,

@@ -6,7 +6,8 @@ their matrix and P = 1 - A^+ A, x = A^+ b + P y satisfies them however many of t
 the same in y, with y^T (1 - P) y / 2 added, which y = P y makes zero.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -53,18 +54,24 @@ class QPSolution(eqx.Module):
     result: Any
 
 
+if TYPE_CHECKING:
+    ConeRows = tuple[Numbers, Numbers]  # S (k, d, n) and c (k, d)
+else:
+    ConeRows = Any  # `solve_qp` looks at them
+
+
 def solve_qp(
     Q: Numbers,
     q: Numbers,
     G: Numbers | None = None,
     h: Numbers | None = None,
-    A=None,
-    b=None,
+    A: Numbers | None = None,
+    b: Numbers | None = None,
     *,
-    cones=(),
+    cones: ConeRows | Sequence[ConeRows] = (),
     tol: float | None = None,
     max_steps: int = 50,
-):
+) -> QPSolution:
     """Minimise x^T Q x / 2 + q^T x with G x <= h, A x = b, and c - S x in second-order cones.
 
     An interior point, each step of it a kernel (see `compilation`): it compiles, batches (`jax.vmap`) and is
@@ -105,7 +112,7 @@ def solve_qp(
     given = G  # as it was given: what becomes an array while a program is traced is not known any more
     G, h = _pair(G, h, "G", "h", n, Q.dtype)
     A, b = _pair(A, b, "A", "b", n, Q.dtype)
-    pairs = [cones] if len(cones) == 2 and hasattr(cones[0], "ndim") else list(cones)
+    pairs: list[Any] = [cones] if len(cones) == 2 and hasattr(cones[0], "ndim") else list(cones)
     checked = []
     for i, pair in enumerate(pairs):
         if not isinstance(pair, (tuple, list)) or len(pair) != 2:

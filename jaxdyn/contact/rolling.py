@@ -1,6 +1,7 @@
 """Two surfaces that touch and roll: the rows of a contact at a place that the configuration holds (see `rolling_model`)."""
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,7 +13,7 @@ from jaxdyn.constraints.rolling import Touching, TouchingPoint, tangents
 from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.contact.touching import Patch, Steps, newton_steps, patch_at
 from jaxdyn.lie.so3 import _product, cross
-from jaxdyn.model.arguments import Numbers, pose_leaf
+from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
 
 
 class RollingContact(Touching):
@@ -41,11 +42,11 @@ class RollingContact(Touching):
         size = self.shape_a.place_size
         return dataclasses.replace(self, places=(place[:size], place[size:]), about=None)
 
-    def structure_key(self):
+    def structure_key(self) -> tuple:
         """Which rows there are, and on what kinds of surfaces."""
         return self.contact, self.spin, self.count, jax.tree.structure((self.shape_a, self.shape_b))
 
-    def touching(self, R, p):
+    def touching(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> TouchingPoint:
         """The points next to each other, by one step of Newton's method from the places."""
         a, b = self.patches()
         steps = newton_steps(a, b, R, p)
@@ -66,11 +67,11 @@ class RollingContact(Touching):
         """The same with the surfaces about their places computed."""
         return dataclasses.replace(self, about=self.patches())
 
-    def steps(self, R, p) -> Steps:
+    def steps(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Steps:
         """Steps on both surfaces toward the points next to each other."""
         return newton_steps(*self.patches(), R, p)
 
-    def followed(self, R, p, count: int) -> Float[Array, " n"]:
+    def followed(self, R: Float[Array, "3 3"], p: Float[Array, "3"], count: int) -> Float[Array, " n"]:
         """The place after some steps of Newton's method."""
         contact = self
         for _ in range(count):
@@ -78,12 +79,12 @@ class RollingContact(Touching):
             contact = contact.put(contact.stepped(steps.on_a, steps.on_b))
         return jnp.concatenate(contact.placed())
 
-    def stepped(self, on_a, on_b) -> Float[Array, " n"]:
+    def stepped(self, on_a: Float[Array, "2"], on_b: Float[Array, "2"]) -> Float[Array, " n"]:
         """The place at steps on both surfaces."""
         place_a, place_b = self.placed()
         return jnp.concatenate([self.shape_a.moved(place_a, on_a), self.shape_b.moved(place_b, on_b)])
 
-    def place_rate(self, R, p, U) -> Float[Array, " n"]:
+    def place_rate(self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]) -> Float[Array, " n"]:
         """Rate of the place for a twist U of B against A."""
         patches = self.patches()
 
@@ -94,7 +95,7 @@ class RollingContact(Touching):
         on, rate = jax.jvp(along, (jnp.zeros_like(U),), (U,))
         return jax.jvp(self.stepped, on, rate)[1]
 
-    def coordinates(self, R, p) -> Float[Array, "5"]:
+    def coordinates(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Float[Array, "5"]:
         """Contact coordinates (u_a, v_a, u_b, v_b, psi) of the place in the charts of the surfaces."""
         from_charts = []
         for shape, place in zip((self.shape_a, self.shape_b), self.placed(), strict=True):
@@ -129,7 +130,7 @@ class Rolling(Pair):
     spin: bool = eqx.field(static=True)
     count: int = eqx.field(static=True)
 
-    def at(self, system, q):
+    def at(self, system: Any, q: Float[Array, " nq"]) -> "RollingContact":
         """The contact at its place in q."""
         contact = self._of(system)
         return contact.put(q[system.place_slices[self.index]]).prepared()
@@ -157,9 +158,9 @@ class Rolling(Pair):
 
 def rolling_contact(
     body_a: str | None,
-    surface_a,
+    surface_a: Checked[Surface],
     body_b: str | None,
-    surface_b,
+    surface_b: Checked[Surface],
     *,
     pose_a: Numbers | None = None,
     pose_b: Numbers | None = None,

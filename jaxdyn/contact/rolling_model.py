@@ -18,14 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.compile import is_known, run
 from jaxdyn.constraints.frames import each, relative_motions, relative_poses
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.contact.rolling import Rolling, RollingContact
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, check_shapes
+from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_shapes
 from jaxdyn.model.tree import Model
 
 # Newton steps where the joints have moved by a step of an integration.
@@ -55,7 +55,7 @@ class RollingModel(Model):
 
     contacts: tuple[RollingContact, ...] = ()
 
-    def __init__(self, model: Any = None, contacts: Sequence = (), **fields):
+    def __init__(self, model: Checked[Model | None] = None, contacts: Sequence = (), **fields: Any):
         if fields:  # of `dataclasses.replace`, with fields that have been looked at
             for name, value in fields.items():
                 setattr(self, name, value)
@@ -74,7 +74,7 @@ class RollingModel(Model):
             check_bodies(one.name, model, (one.body, one.surface_body))
         self.contacts = tuple(contacts)
 
-    def replace(self, **leaves) -> "RollingModel":
+    def replace(self, **leaves: PyTree) -> "RollingModel":
         """A copy with some leaves of the model replaced; the contacts stay."""
         model = Model(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Model)})
         return RollingModel(model.replace(**leaves), self.contacts)
@@ -102,7 +102,7 @@ class RollingModel(Model):
         """The contacts at their places in q."""
         return tuple(one.put(q[at]) for one, at in zip(self.contacts, self.place_slices, strict=True))
 
-    def place(self, joints: Any, near: Any = None) -> Float[Array, " nq"]:
+    def place(self, joints: Numbers, near: Numbers | None = None) -> Float[Array, " nq"]:
         """q (nq,) for the coordinates of the joints: with the places where the surfaces are next to each other.
 
         **Arguments:**
@@ -141,25 +141,27 @@ class RollingModel(Model):
         contacts = self.placed(q)
         return jnp.stack(each(contacts, RollingContact.coordinates, *relative_poses(contacts, self, q)))
 
-    def check_start(self, q, v, t) -> None:
+    def check_start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> None:
         """Refuse places at which a motion cannot start.
 
         **Raises:** ValueError, on concrete numbers, that names the contact, as `place` does.
         """
         _check_places(self, q, "q0", "take system.place(q0[: system.topology.nq])")
 
-    def follows(self, q):
+    def follows(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
         """Whether all surfaces are next to each other at their places, in one point each."""
         strict, left = _closeness(self, q)
         return jnp.all(strict & (left <= float(jnp.finfo(q.dtype).eps) ** 0.4))
 
-    def followed(self, q, joints):
+    def followed(self, q: Float[Array, " nq"], joints: Float[Array, "..."]) -> Float[Array, "..."]:
         """q with the places where the surfaces are next to each other for other coordinates of the joints."""
         if not self.contacts:
             return joints
         return run(_followed, self, q, joints, otherwise=_followed)
 
-    def followed_rate(self, q, v, rate):
+    def followed_rate(
+        self, q: Float[Array, " nq"], v: Float[Array, " nv"], rate: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
         """dq/dt, with the rates of the places."""
         if not self.contacts:
             return rate

@@ -25,7 +25,7 @@ from jaxdyn.compile import compiled, is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.lie.so3 import _product, cross
-from jaxdyn.model.arguments import Function, Numbers
+from jaxdyn.model.arguments import Checked, Function, Numbers
 from jaxdyn.systems.scene import as_pytree
 
 
@@ -72,11 +72,11 @@ class Surface(eqx.Module):
 class Plane(Surface):
     """The plane z = 0 of the body, f = (u, v, 0); outward is +z."""
 
-    def point(self, alpha):
+    def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
         """(u, v, 0), m."""
         return jnp.concatenate([alpha, jnp.zeros_like(alpha[:1])])
 
-    def toward(self, point):
+    def toward(self, point: Float[Array, "3"]) -> Float[Array, " n"]:
         """The place below the point."""
         return point[:2]
 
@@ -109,11 +109,11 @@ class Ellipsoid(Surface):
             raise ValueError(f"semi_axes is {np.asarray(self.semi_axes).tolist()}; give three positive lengths (m)")
         self.poles = _checked_poles(poles)
 
-    def point(self, alpha):
+    def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
         """f(u, v), m."""
         return self.point_at(self.place_of(alpha))
 
-    def chart_margin(self, alpha):
+    def chart_margin(self, alpha: Float[Array, "2"]) -> Float[Array, ""]:
         """Angle between u and the end of the chart, rad."""
         return jnp.pi / 2 - jnp.abs(alpha[0])
 
@@ -123,29 +123,29 @@ class Ellipsoid(Surface):
         return jnp.stack([jnp.arctan2(z, jnp.sqrt(x * x + y * y)), jnp.arctan2(-y, x)])
 
     @property
-    def place_size(self):
+    def place_size(self) -> int:
         """3, of a unit vector."""
         return 3
 
-    def place_of(self, alpha):
+    def place_of(self, alpha: Float[Array, "2"]) -> Float[Array, " n"]:
         """The unit vector n (3,) with f = (a, b, c) n."""
         u, v = jnp.unstack(alpha)
         unit = jnp.stack([jnp.cos(u) * jnp.cos(v), -jnp.cos(u) * jnp.sin(v), jnp.sin(u)])
         return unit[np.argsort(_POLES[self.poles])]
 
-    def coordinates_at(self, place):
+    def coordinates_at(self, place: Float[Array, " n"]) -> Float[Array, "2"]:
         """alpha (2,) of a place."""
         return self.coordinates(self.point_at(place))
 
-    def moved(self, place, step):
+    def moved(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
         """The unit vector at `step` in the plane that touches the unit sphere there."""
         return unit_or(place + _product(step, tangents(place)), place)
 
-    def point_at(self, place):
+    def point_at(self, place: Float[Array, " n"]) -> Float[Array, "3"]:
         """(a, b, c) n, m."""
         return self.semi_axes.astype(place.dtype) * place
 
-    def toward(self, point):
+    def toward(self, point: Float[Array, "3"]) -> Float[Array, " n"]:
         """The unit vector to the point in the stretched space; any one to the centre."""
         return unit_or(point / self.semi_axes.astype(point.dtype), jnp.asarray([1.0, 0.0, 0.0], point.dtype))
 
@@ -182,13 +182,13 @@ class Cylinder(Surface):
     def __init__(self, radius: Numbers):
         self.radius = as_number(radius, "radius", "m", zero=False)
 
-    def point(self, alpha):
+    def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
         """(R cos u, R sin u, v), m."""
         u, v = jnp.unstack(alpha)
         radius = self.radius.astype(alpha.dtype)
         return jnp.stack([radius * jnp.cos(u), radius * jnp.sin(u), v])
 
-    def toward(self, point):
+    def toward(self, point: Float[Array, "3"]) -> Float[Array, " n"]:
         """The place at the angle and the height of the point."""
         x, y, z = jnp.unstack(point)
         on_axis = (x == 0) & (y == 0)
@@ -218,7 +218,7 @@ class Parametrised(Surface):
         self.f = as_pytree(f, "surface: f")
         self.flip = bool(flip)
 
-    def point(self, alpha):
+    def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
         """f(alpha), m; with u and v exchanged if f was to be flipped."""
         # Exchanging the coordinates turns f_u x f_v around.
         value = jnp.asarray(self.f(alpha[::-1] if self.flip else alpha), alpha.dtype)
@@ -249,7 +249,7 @@ class SurfaceGeometry(eqx.Module):
         return jnp.concatenate([top, jnp.eye(4, dtype=top.dtype)[3:]])
 
 
-def surface_geometry(surface, alpha: Numbers) -> SurfaceGeometry:
+def surface_geometry(surface: Checked[Surface], alpha: Numbers) -> SurfaceGeometry:
     """Gauss frame, metric, curvature and torsion of a surface at alpha, by differentiating its parametrisation.
 
     **Arguments:** `alpha` (2,): (u, v).

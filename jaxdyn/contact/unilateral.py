@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint, Pfaffian
 from jaxdyn.constraints.rolling import RollingSphere
-from jaxdyn.model.arguments import Numbers, as_array, pose_leaf
+from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, as_array, pose_leaf
 from jaxdyn.systems.scene import Scene, as_pytree
 
 
@@ -24,7 +24,9 @@ class WithModes(eqx.Module):
 
     name: eqx.AbstractVar[str]
 
-    def __call__(self, system, q, v, t):
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         """There is no force without a mode. **Raises:** ValueError."""
         raise ValueError(
             f"{type(self).__name__} {self.name!r} has modes, which jd.simulate follows; for a force that is a function of the "
@@ -70,8 +72,8 @@ class DryFriction(WithModes):
     def __init__(
         self,
         coefficient: Numbers,
-        normal,
-        along: Any = 0,
+        normal: Checked[Number | str | Function],
+        along: Checked[int | Function | Constraint] = 0,
         *,
         static: Numbers | None = None,
         smoothing: Numbers | None = None,
@@ -128,8 +130,8 @@ class UnilateralContact(WithModes):
 
     def __init__(
         self,
-        contact: Any,
-        friction=0.0,
+        contact: Checked[Constraint],
+        friction: Numbers = 0.0,
         *,
         static: Numbers | None = None,
         restitution: Numbers = 0.0,
@@ -153,13 +155,13 @@ class UnilateralContact(WithModes):
 def ground_contact(
     body: str,
     point: Numbers | None = None,
-    friction=0.0,
+    friction: Numbers = 0.0,
     *,
     static: Numbers | None = None,
     restitution: Numbers = 0.0,
     radius: Numbers = 0.0,
     plane: Numbers | None = None,
-    plane_body=None,
+    plane_body: str | None = None,
     name: str | None = None,
 ) -> UnilateralContact:
     """Contact of a point of a body, or a sphere on it, with the ground, which holds on one side.
@@ -198,7 +200,13 @@ def ground_contact(
 
 
 def gap_contact(
-    gap: Any, along: Any = None, friction=0.0, *, static=None, restitution=0.0, name: str = "contact"
+    gap: Function,
+    along: Function | None = None,
+    friction: Numbers = 0.0,
+    *,
+    static: Numbers | None = None,
+    restitution: Numbers = 0.0,
+    name: str = "contact",
 ) -> UnilateralContact:
     """Contact by functions of the coordinates, of systems without bodies too, which holds on one side.
 

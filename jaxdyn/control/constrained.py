@@ -9,14 +9,14 @@ With q = psi(x), qdot = J xdot, a is  J (xdd_d - Kv ed - Kp e) + Jdot xdot,  as 
 The force loop goes through the integral z alone, so tau does not depend on lam of the same moment.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
 from jaxdyn.constraints.dynamics import projections
@@ -35,7 +35,7 @@ from jaxdyn.control.gains import as_matrix, gain, non_negative, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Function, Numbers, as_array, batch_hint, check_state
+from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, batch_hint, check_state
 from jaxdyn.reduction.gauge_invariant import gauge_invariant
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.scene import Scene, as_pytree
@@ -49,15 +49,22 @@ class _ForceLoop(Controller):
     force: eqx.AbstractVar[Callable | None]
     ki: eqx.AbstractVar[Array | None]
 
-    def start(self, q, v, t):
+    def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nc"] | None:
         """No integral yet."""
         return None if self.ki is None else jnp.zeros((_count(self.scene),), q.dtype)
 
-    def rate(self, q, v, t, state, multipliers):
+    def rate(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: PyTree,
+        multipliers: Float[Array, " nc"],
+    ) -> Float[Array, " nc"]:
         """lam - lam_d."""
         return multipliers - self.wanted_force(q, t)
 
-    def wanted_force(self, q, t) -> Float[Array, " nc"]:
+    def wanted_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nc"]:
         """lam_d (nc,)."""
         count = _count(self.scene)
         if self.force is None:
@@ -70,7 +77,7 @@ class _ForceLoop(Controller):
             )
         return jnp.asarray(force, q.dtype)
 
-    def pressed(self, q, t, state) -> Float[Array, " nc"]:
+    def pressed(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
         """-lam_d + KI z."""
         wanted = -self.wanted_force(q, t)
         return wanted if state is None or self.ki is None else wanted + times(self.ki, state, "ki")
@@ -125,11 +132,11 @@ class HybridForce(_ForceLoop):
         kd: Numbers | None = None,
         *,
         of: str = "position",
-        force: Any = None,
+        force: Target | None = None,
         ki: Numbers | None = None,
-        actuated: Any = None,
-        internal: Any = None,
-        least_regularity: Any = None,
+        actuated: Checked[Sequence[int] | None] = None,
+        internal: Numbers | None = None,
+        least_regularity: Numbers | None = None,
     ):
         self.scene = constrained(scene)
         self.kp, self.kd = gain(kp, "kp"), None if kd is None else gain(kd, "kd")
@@ -146,20 +153,20 @@ class HybridForce(_ForceLoop):
         if self.internal is not None and self.internal.shape != (len(self.actuated or ()),):
             raise ValueError(f"internal has shape {self.internal.shape}; give one torque per motor of {self.actuated}")
 
-    def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " nv"]:
+    def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """The acceleration that the law asks for, (nv,): on the constraints, and towards the target."""
         t = jnp.asarray(t, q.dtype)
         A, wanted = self._rows(q, v, t)
         return least_acceleration(self.scene.system, q, t, A, wanted, jnp.zeros_like(v))
 
-    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Bool[Array, ""]:
+    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
         """Whether the constraints leave all of the task free, so that the law can do what it promises."""
         t = jnp.asarray(t, q.dtype)
         A = constraint_jacobian(self.scene, q, t)
         both, _ = self._rows(q, v, t)
         return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
 
-    def regularity(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, ""]:
+    def regularity(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, ""]:
         """How far the law is from where task and constraints lose rank, 1 to 0.
 
         The least sine of the angle, in the metric M^-1, between a row of the task and the span of the constraints' and
@@ -170,13 +177,20 @@ class HybridForce(_ForceLoop):
         count = _count(self.scene)
         return regularity(self.scene.system, q, t, both[:count], both[count:])
 
-    def allowance(self, q, v, t):
+    def allowance(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""] | None:
         """Of `regularity`, above the least one."""
         if self.least_regularity is None:
             return None
         return self.regularity(q, v, t) - self.least_regularity.astype(q.dtype)
 
-    def __call__(self, q, v, t=0.0, state=None, multipliers=None) -> Float[Array, " nv"]:
+    def __call__(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number = 0.0,
+        state: PyTree = None,
+        multipliers: Float[Array, " nc"] | None = None,
+    ) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N."""
         t = jnp.asarray(t, q.dtype)
         tau = torque_for(self.scene, q, v, self.acceleration(q, v, t), t)
@@ -238,7 +252,7 @@ class GaugeInvariant(_ForceLoop):
         kp: Numbers,
         kd: Numbers,
         *,
-        force: Any = None,
+        force: Target | None = None,
         ki: Numbers | None = None,
     ):
         self.scene = constrained(scene)
@@ -247,7 +261,14 @@ class GaugeInvariant(_ForceLoop):
         self.force = None if force is None else as_target(force, "force")
         self.ki = None if ki is None else gain(ki, "ki")
 
-    def __call__(self, q, v, t=0.0, state=None, multipliers=None) -> Float[Array, " nv"]:
+    def __call__(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number = 0.0,
+        state: PyTree = None,
+        multipliers: Float[Array, " nc"] | None = None,
+    ) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N."""
         scene, system, t = self.scene, self.scene.system, jnp.asarray(t, q.dtype)
         J, along, change = self._reference_motion(q, v, t)
@@ -264,7 +285,7 @@ class GaugeInvariant(_ForceLoop):
         potential, force = bias_force(system, q, v, t) - _product(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
         return tau + potential if force is None else tau + potential - force
 
-    def composite_error(self, q, v, t=0.0) -> Float[Array, " nr"]:
+    def composite_error(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nr"]:
         """The composite error eps = B (ed + Kp e) = V2^T W^T (v - J (xd_d - Kp e)), (nr,), in sqrt(J).
 
         |eps|^2 / 2 is the kinetic energy of the velocity error ed + Kp e. The components depend on the gauge, the norm not.
@@ -278,7 +299,9 @@ class GaugeInvariant(_ForceLoop):
         J, along, _ = self._reference_motion(q, v, t)
         return _product(self._to_quasi_velocities(q, t, J.shape[1]), v - along)
 
-    def equivalent_gains(self, q, t=0.0) -> tuple[Float[Array, "nr nr"], Float[Array, "nr nr"]]:
+    def equivalent_gains(
+        self, q: Float[Array, " nq"], t: Number = 0.0
+    ) -> tuple[Float[Array, "nr nr"], Float[Array, "nr nr"]]:
         """Gains (Kp', Kd') with which this law is  xdd_d - Kd' ed - Kp' e  in task coordinates, as `HybridForce` writes it:
 
             Kp' = B^-1 Kd B Kp,   Kd' = Kp + B^-1 Kd B,   B = V2^T W^T J.

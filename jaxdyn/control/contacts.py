@@ -1,7 +1,5 @@
 """Tasks in contact coordinates, for the tip of an arm that slides or rolls on a surface."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 from jaxtyping import Array, Float
@@ -11,7 +9,7 @@ from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import pose_leaf
+from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.system import velocity_to_rate
@@ -50,7 +48,14 @@ class ContactCoordinates(eqx.Module):
     finger: Surface
     pose: Float[Array, "4 4"]
 
-    def __init__(self, model: Any, frame: str, object: Any, finger: Any, pose: Any = None):
+    def __init__(
+        self,
+        model: Checked[Model],
+        frame: str,
+        object: Checked[Surface],
+        finger: Checked[Surface],
+        pose: Numbers | None = None,
+    ):
         if not isinstance(model, Model):
             raise ValueError(f"model is a {type(model).__name__}, which has no named frames; pass a Model")
         frame_index(model, frame)

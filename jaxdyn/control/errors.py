@@ -24,7 +24,7 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint
+from jaxdyn.model.arguments import Number, Numbers, as_array, batch_hint
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor
@@ -86,7 +86,7 @@ class FrameError(Constraint):
     task: str = eqx.field(static=True)
     name: str = eqx.field(static=True, default="frame")
 
-    def position(self, system, q, t):
+    def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, " m"]:
         """(3,) m, (3,) rad, or both."""
         pose, target = frame_pose(system, q, self.frame), placed(self.target, t, TASKS[self.task], q)
         if self.task == "position":

@@ -15,7 +15,7 @@ from jaxdyn.contact.kinds import wrench_basis
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, as_array
+from jaxdyn.model.arguments import Checked, Numbers, as_array
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 
@@ -76,7 +76,9 @@ class Foot(eqx.Module):
         return HeldFoot(**{part.name: getattr(hold_loop, part.name) for part in dataclasses.fields(hold_loop)})
 
 
-def foot(frame: str, cone: Any, *, pose: Numbers | None = None, ground: Numbers | None = None) -> Foot:
+def foot(
+    frame: str, cone: Checked[FrictionCone], *, pose: Numbers | None = None, ground: Numbers | None = None
+) -> Foot:
     """A place on a body that touches the ground, and the cone of forces that it may take from it.
 
     **Arguments:**

@@ -12,11 +12,10 @@ Sources: Murray, Li & Sastry (1994), section 6.4 (eqs 6.39-6.41); Li, Hsu & Sast
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
 from jaxdyn.control.errors import Target, as_target, least_acceleration, row_rank, wanted_rows
@@ -26,7 +25,7 @@ from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import velocity_rows
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, batch_hint
+from jaxdyn.model.arguments import Checked, Number, Numbers, batch_hint
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.system import displacement
 
@@ -98,7 +97,7 @@ class GraspForce(Controller):
 
     def __init__(
         self,
-        grasp: Any,
+        grasp: Checked[Grasp],
         target: Target,
         kp: Numbers,
         kd: Numbers,
@@ -115,33 +114,47 @@ class GraspForce(Controller):
         self.ki = None if ki is None else gain(ki, "ki")
         self.damping = non_negative(damping, "damping")
 
-    def start(self, q, v, t):
+    def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nc"] | None:
         """No integral yet."""
         return None if self.ki is None else jnp.zeros((layout(self.grasp)[-1].end,), q.dtype)
 
-    def rate(self, q, v, t, state, multipliers):
+    def rate(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: PyTree,
+        multipliers: Float[Array, " nc"],
+    ) -> Float[Array, " nc"]:
         """The internal part of lam - lam_0, (nc,)."""
         return self._internal(q, t, multipliers - as_preload(self.grasp, self.preload(t), q.dtype))
 
-    def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " nv"]:
+    def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """The acceleration that the law asks for, (nv,): on the contacts, and of the object towards its target."""
         t = jnp.asarray(t, q.dtype)
         A, wanted = self._rows(q, v, t)
         return least_acceleration(self.grasp.system, q, t, A, wanted, -self.damping.astype(v.dtype) * v)
 
-    def wanted_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " nc"]:
+    def wanted_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
         """lam_d (nc,): contact forces that carry the object, with the internal part of the preload."""
         t = jnp.asarray(t, q.dtype)
         return self._forces(q, t, torque_for(self.grasp, q, v, self.acceleration(q, v, t), t), None)
 
-    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Bool[Array, ""]:
+    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
         """Whether the fingers can follow every motion of the object, so that the law can do what it promises."""
         t = jnp.asarray(t, q.dtype)
         both, _ = self._rows(q, v, t)
         A = constraint_jacobian(self.grasp, q, t)
         return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
 
-    def __call__(self, q, v, t=0.0, state=None, multipliers=None) -> Float[Array, " nv"]:
+    def __call__(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number = 0.0,
+        state: PyTree = None,
+        multipliers: Float[Array, " nc"] | None = None,
+    ) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N: those of the fingers, and zero on the object."""
         t = jnp.asarray(t, q.dtype)
         hands, _ = velocity_rows(self.grasp)

@@ -6,6 +6,7 @@ The rows without a motor say which forces balance the motion, the others give th
 w = (M a + h)_base,  G f = w  and  tau = (M a + h - J^T f)_motors, so that a quadratic program in f alone is left.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -17,11 +18,11 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.optimal import cone_bounds
 from jaxdyn.contact.qp import RESULTS, solve_qp
-from jaxdyn.control.feet import check_feet
+from jaxdyn.control.feet import Foot, check_feet
 from jaxdyn.control.gains import non_negative
 from jaxdyn.dynamics.quantities import inverse_dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, check_shapes
+from jaxdyn.model.arguments import Checked, Numbers, check_shapes
 from jaxdyn.model.tree import Model
 
 
@@ -57,7 +58,7 @@ def underactuated_inverse_dynamics(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     a: Float[Array, " nv"],
-    contacts,
+    contacts: Checked[Sequence[Foot]],
     *,
     passive: tuple[int, ...] | None = None,
     preload: Numbers = 0.0,
@@ -145,7 +146,7 @@ def missing_wrench(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
     a: Float[Array, " nv"],
-    contacts,
+    contacts: Checked[Sequence[Foot]],
     *,
     passive: tuple[int, ...] | None = None,
 ) -> Float[Array, " np"]:
@@ -173,7 +174,7 @@ def missing_wrench(
     return needed - _product(G, solve_qp(Q, -_product(G.T, needed), **bounds).x)
 
 
-def passive_velocities(model: Model, passive: tuple[int, ...] | None) -> np.ndarray:
+def passive_velocities(model: Model, passive: Sequence[int] | None) -> np.ndarray:
     """Indices of the velocities without a motor. **Raises:** ValueError for none, and for indices that there are not."""
     top = model.topology
     if passive is None:

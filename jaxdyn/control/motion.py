@@ -24,7 +24,7 @@ from jaxdyn.control.errors import (
 from jaxdyn.control.gains import gain, non_negative, times
 from jaxdyn.dynamics.quantities import gravity_force, inverse_dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, state_dtype
+from jaxdyn.model.arguments import Number, Numbers, SystemLike, state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displacement
@@ -64,7 +64,7 @@ class ComputedTorque(eqx.Module):
         self.target = as_target(target)
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
 
-    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " nv"]:
+    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N."""
         t = jnp.asarray(t, q.dtype)
         system = self.scene.system
@@ -127,7 +127,7 @@ class OperationalSpace(eqx.Module):
         if self.posture is not None and self.posture.shape != (self.scene.nq,):
             raise ValueError(f"posture has shape {self.posture.shape}, expected {(self.scene.nq,)} = (nq,)")
 
-    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " nv"]:
+    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N."""
         system, t = self.scene.system, jnp.asarray(t, q.dtype)
         A, wanted = wanted_rows(system, self.error, self.kp, self.kd, q, v, t)
@@ -164,7 +164,7 @@ class CartesianStiffness(eqx.Module):
 
     def __init__(
         self,
-        model: Any,
+        model: SystemLike,
         frame: str,
         target: Target,
         stiffness: Numbers,
@@ -178,7 +178,7 @@ class CartesianStiffness(eqx.Module):
         self.stiffness, self.damping = gain(stiffness, "stiffness"), gain(damping, "damping")
         self.joint_damping = non_negative(joint_damping, "joint_damping")
 
-    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " nv"]:
+    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N."""
         scene, t = Scene(self.model, (self.error,)), jnp.asarray(t, q.dtype)
         row, error = rows(scene, q, v, t), position_residual(scene, q, t)

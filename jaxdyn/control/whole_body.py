@@ -9,8 +9,7 @@ The acceleration is asked for in three orders, each as far as those before leave
 Torques and forces of the feet follow from it (`jaxdyn.control.legs`), the forces inside their cones.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,9 +23,9 @@ from jaxdyn.control.gains import gain, non_negative
 from jaxdyn.control.legs import LeggedDynamics, missing_wrench, passive_velocities, underactuated_inverse_dynamics
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.arguments import Checked, Number, Numbers
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.scene import Force, Scene
 from jaxdyn.systems.system import displacement
 
 
@@ -36,7 +35,7 @@ class CenterError(Constraint):
     target: Callable
     name: str = eqx.field(static=True, default="centre of mass")
 
-    def position(self, system, q, t):
+    def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, "3"]:
         """c(q) - c_d(t)."""
         return center_of_mass(system, q) - placed(self.target, t, (3,), q)
 
@@ -92,8 +91,8 @@ class WholeBody(eqx.Module):
 
     def __init__(
         self,
-        model: Any,
-        contacts: Any,
+        model: Checked[Model],
+        contacts: Checked[Sequence[Foot]],
         com: Numbers,
         kp: Numbers,
         kd: Numbers,
@@ -109,7 +108,7 @@ class WholeBody(eqx.Module):
         torque_weight: Numbers = 1.0,
         force_weight: Numbers = 1e-3,
         effort_limit: Numbers | None = None,
-        passive: Any = None,
+        passive: Checked[Sequence[int] | None] = None,
     ):
         self.feet, self.model = check_feet(model, contacts), model
         if not self.feet:
@@ -133,7 +132,7 @@ class WholeBody(eqx.Module):
         if self.posture is not None and self.posture.shape != (model.nq,):
             raise ValueError(f"posture has shape {self.posture.shape}, expected {(model.nq,)} = (nq,)")
 
-    def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " nv"]:
+    def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """The acceleration that the law asks for, (nv,)."""
         t = jnp.asarray(t, q.dtype)
         rest = -self.damping.astype(v.dtype) * v
@@ -141,7 +140,7 @@ class WholeBody(eqx.Module):
             rest = rest - self.stiffness.astype(v.dtype) * displacement(self.model, self.posture, q)
         return ordered_acceleration(self.model, q, t, self._orders(q, v, t), rest)
 
-    def shortfall(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " m"]:
+    def shortfall(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " m"]:
         """What the acceleration leaves of the tasks, (m,): rows of the centre of mass (m/s^2), then of the attitude (rad/s^2).
 
         Zero where the feet and the joints leave the tasks free, so that the law can do what it promises.
@@ -150,7 +149,7 @@ class WholeBody(eqx.Module):
         A, wanted = self._orders(q, v, t)[1]
         return wanted - _product(A, self.acceleration(q, v, t))
 
-    def dynamics(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> LeggedDynamics:
+    def dynamics(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> LeggedDynamics:
         """Torques, forces of the feet and their margins, and whether the feet can carry what is asked (`result`)."""
         return underactuated_inverse_dynamics(
             self.model,
@@ -165,11 +164,11 @@ class WholeBody(eqx.Module):
             effort_limit=self.effort_limit,
         )
 
-    def missing_wrench(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " np"]:
+    def missing_wrench(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " np"]:
         """What feet in their cones leave of the generalised force at the base, (np,): `jd.control.missing_wrench`."""
         return missing_wrench(self.model, q, v, self.acceleration(q, v, t), list(self.feet), passive=self.passive)
 
-    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Float[Array, " nv"]:
+    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Torques (nv,), N m or N: zero where there is no motor."""
         return self.dynamics(q, v, t).tau
 
@@ -183,7 +182,13 @@ class WholeBody(eqx.Module):
         return (feet.A, feet.gamma), (A, wanted)
 
 
-def standing(model: Any, q: Float[Array, " nq"], contacts: Any, *, forces: Any = ()) -> Scene:
+def standing(
+    model: Checked[Model],
+    q: Float[Array, " nq"],
+    contacts: Checked[Sequence[Foot]],
+    *,
+    forces: Checked[Sequence[Force]] = (),
+) -> Scene:
     """A scene in which feet are held where they are at q (nq,), with their friction cones.
 
     A simulation ends with `contact_lost` where one of them pulls or slips; outputs "contact_forces" and "contact_margins" are

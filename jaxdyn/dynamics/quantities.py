@@ -141,9 +141,9 @@ def forward_dynamics(
     Lagrangian that is not finite, an immersion of too low a rank.
     """
     if isinstance(model, System):
-        q, v, tau, t, _ = check_state(model, q=q, v=v, tau=tau, t=t, external=external)
-        model.check_start(q, v, t)
-        return _of_system(model, "forward_dynamics", q, v, tau, t)
+        q, v, tau, time, _ = check_state(model, q=q, v=v, tau=tau, t=t, external=external)
+        model.check_start(q, v, time)
+        return _of_system(model, "forward_dynamics", q, v, tau, time)
     q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
     if external is not None:
         tau = tau + generalized_force(model, q, external)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.model.arguments import Function, Numbers
+from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike
 from jaxdyn.systems.scene import as_pytree
 
 
@@ -30,7 +30,9 @@ class RayleighDissipation(eqx.Module):
     def __init__(self, function: Function):
         self.function = as_pytree(function, "RayleighDissipation: function")
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         def value(v):
             R = self.function(q, v, t)
             if jnp.shape(R) != ():
@@ -68,7 +70,13 @@ class SlidingFriction(eqx.Module):
     direction: int = eqx.field(static=True)
     along: Any
 
-    def __init__(self, coefficient: Numbers, normal, direction: int, along: Any = 0):
+    def __init__(
+        self,
+        coefficient: Numbers,
+        normal: Checked[Number | Function],
+        direction: int,
+        along: Checked[int | Function] = 0,
+    ):
         if direction not in (1, -1):
             raise ValueError(
                 f"SlidingFriction: direction is {direction!r}; give the sign of the sliding velocity, 1 or -1"
@@ -82,7 +90,9 @@ class SlidingFriction(eqx.Module):
         self.direction = direction
         self.along = as_pytree(along, "SlidingFriction: along") if callable(along) else _Coordinate(along)
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         row: Any = self.along.row(v) if isinstance(self.along, _Coordinate) else self.along(q, t)
         normal: Any = self.normal(system, q, v, t) if callable(self.normal) else self.normal
         if jnp.shape(row) != v.shape or jnp.shape(normal) != ():

@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, take
-from jaxdyn.model.arguments import batch_hint
+from jaxdyn.model.arguments import Number, SystemLike, batch_hint
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model, difference, neutral
 
@@ -105,7 +105,9 @@ class JointDamping(eqx.Module):
     coefficient: Float[Array, "..."] | None = eqx.field(converter=_leaf, default=None)
     joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         places = _places(system, self.joints, "JointDamping")
         value = _own_or_model(self.coefficient, system, places, "damping", "JointDamping")
         rate = take(v, places.v)
@@ -135,7 +137,9 @@ class CoulombFriction(eqx.Module):
         if not _all_positive(self.v_s):
             raise ValueError(f"CoulombFriction: v_s is {self.v_s}; give a positive smoothing velocity, e.g. 0.01 rad/s")
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         places = _places(system, self.joints, "CoulombFriction")
         level = _own_or_model(self.level, system, places, "friction", "CoulombFriction")
         rate = take(v, places.v)
@@ -161,7 +165,9 @@ class JointSpring(eqx.Module):
     rest: Float[Array, "..."] | None = eqx.field(converter=_leaf, default=None)
     joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         places = _places(system, self.joints, "JointSpring")
         rest = self.rest
         if rest is None:
@@ -197,7 +203,9 @@ class Drive(eqx.Module):
         if self.effort_limit is not None and not _all_positive(self.effort_limit):
             raise ValueError(f"Drive: effort_limit is {self.effort_limit}; give positive limits, or None for no limit")
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         places = _places(system, self.joints, "Drive")
         size = places.v.size
         kp, kd, rate = (
@@ -236,7 +244,9 @@ class ExternalWrench(eqx.Module):
         if self.axes not in ("world", "body"):
             raise ValueError(f"ExternalWrench: axes is {self.axes!r}; choose 'world' or 'body'")
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         if not isinstance(system, Model):
             raise ValueError(f"ExternalWrench: needs a Model with named frames, not a {type(system).__name__}")
         frame_index(system, self.frame)

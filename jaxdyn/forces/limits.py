@@ -1,5 +1,6 @@
 """Limits of joints: stops that push back, and the largest effort that actuators give."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxdyn.model.arguments import Numbers, as_array
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array
 from jaxdyn.model.tree import Model
 
 
@@ -34,12 +35,16 @@ class JointStops(eqx.Module):
     damping: Float[Array, ""]
     joints: tuple[str, ...] | None = eqx.field(static=True)
 
-    def __init__(self, stiffness: Numbers = 1e4, damping: Numbers = 0.0, joints: Any = None):
+    def __init__(
+        self, stiffness: Numbers = 1e4, damping: Numbers = 0.0, joints: Checked[str | Sequence[str] | None] = None
+    ):
         self.stiffness = _number(stiffness, "JointStops: stiffness", least=0.0, strict=True)
         self.damping = _number(damping, "JointStops: damping", least=0.0, strict=False)
         self.joints = (joints,) if isinstance(joints, str) else joints if joints is None else tuple(joints)
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: Checked[Model], q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         places = self._places(system)
         at_q, at_v = (np.array(x, int) for x in zip(*places, strict=True)) if places else (np.zeros(0, int),) * 2
         place, rate = q[at_q], v[at_v]
@@ -97,10 +102,12 @@ class EffortLimits(eqx.Module):
                 f"EffortLimits: limit is {limit}; give limits that are not negative, or None for the model's"
             )
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         return jnp.zeros_like(v)
 
-    def limited(self, system: Any, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    def limited(self, system: SystemLike, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
         """tau cut off."""
         limit: Any = getattr(system, "effort_limit", None) if self.limit is None else self.limit
         if limit is None:

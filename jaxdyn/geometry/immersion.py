@@ -9,10 +9,10 @@ Several systems, each a unit of its own, add their sides: rho = sum of J_i^T M_i
 matrix of all units is formed. Source: EQUATIONS section 12; Loparo & Vakalis on interacting bodies, after Kron.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import add
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,10 +23,10 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import is_known
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Function, Numbers, check_state
+from jaxdyn.model.arguments import Checked, Function, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
 from jaxdyn.systems.start import place_of
-from jaxdyn.systems.system import System, checked_size, rate_to_velocity
+from jaxdyn.systems.system import SceneLike, System, checked_size, rate_to_velocity
 
 
 class PullBack(eqx.Module):
@@ -198,7 +198,14 @@ class PulledForce(eqx.Module):
         return pull(tuple(self.on_units(system, system.configurations(s, t), system.velocities(s, v, t), t)))[0]
 
 
-def constrain_by_immersion(system: Any, xi: Callable, nq: int, *, moving: bool = False, force: Any = None) -> Any:
+def constrain_by_immersion(
+    system: Checked[SceneLike | Sequence[SceneLike]],
+    xi: Callable,
+    nq: int,
+    *,
+    moving: bool = False,
+    force: Function | None = None,
+) -> ImmersedSystem | Scene:
     """The motion of a system held on q = xi(s), or of several independent ones joined by it, as a system in s.
 
     M becomes rho = J^T M J, forces become J^T F, and the reaction forces are gone; `reaction_force` gives them. Equal to
@@ -251,8 +258,12 @@ def constrain_by_immersion(system: Any, xi: Callable, nq: int, *, moving: bool =
 
 
 def reaction_force(
-    system: Any, q: Float[Array, " nq"], v: Float[Array, " nq"], force: Any = None, t: Numbers = 0.0
-) -> Any:
+    system: SceneLike,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nq"],
+    force: Numbers | None = None,
+    t: Numbers = 0.0,
+) -> Array | tuple[Array, ...]:
     """Force R = M a + h - F with which an immersion holds its system, in the coordinates of the system; J^T R = 0.
 
     **Arguments:**

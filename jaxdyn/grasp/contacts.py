@@ -20,7 +20,7 @@ from jaxdyn.constraints.loops import attitude, check_bodies
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.kinds import components
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import Numbers, pose_leaf
+from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
 
 
 class Contact(Pair):
@@ -34,7 +34,7 @@ class Contact(Pair):
     pose: Float[Array, "4 4"]
     finger_pose: Float[Array, "4 4"]
 
-    def ends(self):
+    def ends(self) -> tuple[tuple[str | None, Array], tuple[str | None, Array]]:
         """Frame A on the object, frame B on the finger."""
         return (self.object, self.pose), (self.finger, self.finger_pose)
 
@@ -48,26 +48,28 @@ class Contact(Pair):
         # Turning about the normal alone is not the rate of a function of the configuration.
         return self.kind == "soft-finger"
 
-    def sizes(self, system, dtype):
+    def sizes(self, system: SystemLike, dtype: DType) -> tuple[int, int]:
         """All rows are holonomic but the one of a soft finger's torque."""
         check_bodies(self.name, system, (self.object, self.finger))
         return len(self.components) - int(self._spins), int(self._spins)
 
-    def wrench_components(self):
+    def wrench_components(self) -> tuple[int, ...] | None:
         """The rows are the components themselves."""
         return tuple(range(len(self.components)))
 
-    def structure_key(self):
+    def structure_key(self) -> tuple:
         """The kind of contact."""
         return self.kind, self.in_plane
 
-    def pose_residual(self, R, p):
+    def pose_residual(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Float[Array, " nh"] | None:
         """Position, and where the contact constrains it orientation, of the contact frame in the fingertip's, (n,), m and rad."""
         # The fingertip moves against the object as the object moves against the fingertip, with the other sign.
         residual = p if self.kind != "rigid" else jnp.concatenate([p, jnp.stack(attitude(R))])
         return -residual[np.array([i for i in self.components if i < residual.shape[0]])]
 
-    def twist_residual(self, R, p, U):
+    def twist_residual(
+        self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]
+    ) -> Float[Array, " np"] | None:
         """Angular velocity of the object against the finger about the normal, (1,), rad/s, for a soft finger."""
         return -U[5:] if self._spins else None
 

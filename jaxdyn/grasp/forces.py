@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import compiled, is_known
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
@@ -19,6 +19,7 @@ from jaxdyn.constraints.dynamics import applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.closure import ForceClosure
 from jaxdyn.contact.closure import force_closure as _closure
+from jaxdyn.contact.cones import Cones
 from jaxdyn.contact.forces import ConedContact, coned_contacts
 from jaxdyn.contact.kinds import components
 from jaxdyn.contact.optimal import optimal_forces
@@ -47,7 +48,7 @@ class HandForces(eqx.Module):
     layout: tuple[Layout, ...] = eqx.field(static=True)
 
     @property
-    def success(self):
+    def success(self) -> Bool[Array, ""]:
         """Whether `result` is successful."""
         return self.result == RESULTS.successful
 
@@ -155,7 +156,7 @@ def hold(
     q: Float[Array, " nq"],
     wrench: Float[Array, " no"] | None = None,
     *,
-    cones: Any = None,
+    cones: Cones = None,
     preload: Numbers = 0.0,
     t: Numbers = 0.0,
 ) -> HandForces:
@@ -211,7 +212,7 @@ def _static(grasp: Grasp, q, t):
 
 
 def force_closure(
-    grasp: Grasp, q: Float[Array, " nq"], *, cones: Any = None, t: Numbers = 0.0, required: bool = False
+    grasp: Grasp, q: Float[Array, " nq"], *, cones: Cones = None, t: Numbers = 0.0, required: bool = False
 ) -> ForceClosure:
     """Whether the contacts of the grasp can resist every wrench on the object; see `jd.contact.force_closure`.
 

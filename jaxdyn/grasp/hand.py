@@ -9,14 +9,15 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.contact.cones import Cones
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint
+from jaxdyn.model.arguments import Checked, Numbers, as_array, batch_hint
 from jaxdyn.model.joining import joined
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.scene import Force, Scene
 
 
 class Grasp(Scene):
@@ -48,7 +49,12 @@ class Grasp(Scene):
     object: str = eqx.field(static=True, kw_only=True)
 
     def __init__(
-        self, fingers: Model | Sequence[Model], object: Model | str, contacts: Sequence, forces=(), cones=None
+        self,
+        fingers: Model | Sequence[Model],
+        object: Model | str,
+        contacts: Sequence,
+        forces: Checked[Sequence[Force]] = (),
+        cones: Cones = None,
     ):
         models = [fingers] if isinstance(fingers, Model) else list(fingers)
         if not models or not all(isinstance(model, Model) for model in models):

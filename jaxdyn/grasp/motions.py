@@ -22,8 +22,9 @@ from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import eps_of, pseudo_inverse, tolerance
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, check_state
+from jaxdyn.model.arguments import Number, Numbers, check_state
 from jaxdyn.reduction.bases import Basis, Parametrization, orthonormal, split_directions
+from jaxdyn.systems.scene import Scene
 
 
 class HandMotions(Basis):
@@ -40,11 +41,11 @@ class HandMotions(Basis):
     object: Float[Array, "no nw"]
     internal: Float[Array, "nh nk"]
 
-    def size(self, scene):
+    def size(self, scene: Scene) -> int:
         """nw + nk."""
         return self.object.shape[1] + self.internal.shape[1]
 
-    def at(self, scene, q, t):
+    def at(self, scene: Scene, q: Float[Array, " nq"], t: Number) -> Parametrization:
         """N (nv, nw + nk): H in the rows of the object, (J_h^+ G^T H, K) in those of the joints."""
         hands, objects = velocity_rows(scene)
         A = constraint_jacobian(scene, q, t)
@@ -80,7 +81,7 @@ class HandMotions(Basis):
         H, pivot, _ = orthonormal(reference - _product(across, _product(lost, reference)))
         return H, pivot, fits
 
-    def advice(self, scene, q, t):
+    def advice(self, scene: Scene, q: Float[Array, " nq"], t: Number) -> str:
         """The basis of this place."""
         return "take jd.grasp.hand_motions(grasp, q) for it"
 

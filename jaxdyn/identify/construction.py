@@ -6,8 +6,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
+from jaxdyn.model.arguments import Function
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 
 
@@ -35,7 +36,7 @@ class Construction(eqx.Module):
     build: Callable[[Any], Any]
     numbers: Any
 
-    def __init__(self, build: Any, numbers: Any):
+    def __init__(self, build: Function, numbers: PyTree):
         if not callable(build):
             raise ValueError(f"build is {build!r}; give a function of the numbers that returns a scene")
         self.build = as_pytree(build, "build")

@@ -17,6 +17,7 @@ from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem
 from jaxdyn.identify.selection import folds, helped
 from jaxdyn.identify.torque_terms import TorqueTerm
+from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model
 
 # Shifts smaller than this (s) are none; the largest of one step, and how many steps are made.
@@ -40,7 +41,7 @@ class Delays(NamedTuple):
     squares: tuple[np.ndarray, np.ndarray] | None = None
 
 
-def shift_torques(log: Log, delay) -> Log:
+def shift_torques(log: Log, delay: Numbers) -> Log:
     """A log whose torques are those recorded `delay` later (s), a number or one for each torque (nv,).
 
     The torques are interpolated by cubic splines; samples whose torque lies beyond the ends of the log are dropped. A log that

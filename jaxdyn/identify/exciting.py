@@ -12,9 +12,10 @@ from jaxtyping import Array, Float
 from jaxdyn.dynamics.quantities import inverse_dynamics, torque_regressor
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.excitation import FourierMotion, random_motion
-from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
+from jaxdyn.identify.friction import TERMS, Terms, check_terms, friction_regressor
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.regression import base_parameters, free_columns
+from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model, neutral
 
 OBJECTIVES = ("logdet", "condition")
@@ -72,14 +73,14 @@ class _Task(eqx.Module):
 
 def exciting_motion(
     model: Model,
-    terms=TERMS,
+    terms: Terms = TERMS,
     *,
     period: float = 10.0,
     harmonics: int = 5,
     objective: str = "logdet",
     margin: float = 0.9,
-    velocity=None,
-    torque=None,
+    velocity: Numbers | None = None,
+    torque: Numbers | None = None,
     v_s: float = 0.1,
     seed: int = 0,
     starts: int = 8,

@@ -1,7 +1,6 @@
 """Physically feasible inertias and friction by torque error."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,14 +12,15 @@ from jaxtyping import Array, Float
 from jaxdyn.identify import interior
 from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart
 from jaxdyn.identify.condensed import Condensed, condensed_rows
-from jaxdyn.identify.friction import TERMS, check_terms
+from jaxdyn.identify.friction import TERMS, Terms, check_terms
 from jaxdyn.identify.logs import Log, as_logs, as_measured, root_mean_square
-from jaxdyn.identify.minimise import METHODS, minimise
+from jaxdyn.identify.minimise import METHODS, Optimizer, minimise
 from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.regression import check_weights, condense_model, noise_level
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import coulomb_column
+from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
 
 # A fit is never trusted beyond this share of the torque: rounding and noise-free logs stay well posed.
@@ -48,14 +48,14 @@ def torque_loss(point: Coordinates, problem: Problem) -> Float[Array, ""]:
 def fit_torques(
     model: Model,
     log: Log | Sequence[Log],
-    terms=TERMS,
+    terms: Terms = TERMS,
     *,
     v_s: float = 0.01,
     inertia: str = "full",
-    weights=None,
+    weights: Numbers | None = None,
     prior: float = 1.0,
     sigma: float | None = None,
-    method: Any = "newton",
+    method: Checked[str | Optimizer] = "newton",
     steps: int | None = None,
     learning_rate: float = 0.1,
     tolerance: float = 1e-6,

@@ -3,15 +3,24 @@
 tau_f = viscous v + coulomb tanh(v / v_s) + offset, and armature a for the rotors.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdyn.model.arguments import Number, SystemLike
+
 TERMS = ("viscous", "coulomb", "offset", "armature")
 # Terms that are physical only when they are not negative.
 POSITIVE = ("viscous", "coulomb", "armature")
+
+
+if TYPE_CHECKING:
+    Terms = str | Sequence[str]  # names of `TERMS`
+else:
+    Terms = Any  # `check_terms` looks at them
 
 
 class Friction(eqx.Module):
@@ -33,7 +42,9 @@ class Friction(eqx.Module):
         """tau_f (nv,) at the velocity v (nv,)."""
         return self.viscous * v + self.coulomb * jnp.tanh(v / self.v_s) + self.offset
 
-    def __call__(self, system: Any, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         return -self.torque(v)
 
 
@@ -44,7 +55,7 @@ def friction_regressor(v: Float[Array, " nv"], a: Float[Array, " nv"], terms, v_
     return jnp.concatenate(blocks, axis=1) if blocks else jnp.zeros((v.shape[0], 0), v.dtype)
 
 
-def check_terms(terms, v_s) -> tuple[str, ...]:
+def check_terms(terms: Terms, v_s: Number) -> tuple[str, ...]:
     """The terms as a tuple. **Raises:** ValueError for an unknown or repeated term, or a v_s that is not positive."""
     terms = (terms,) if isinstance(terms, str) else tuple(terms)
     unknown = [term for term in terms if term not in TERMS]

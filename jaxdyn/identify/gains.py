@@ -16,14 +16,21 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.identify.condensed import Blocks
-from jaxdyn.identify.friction import TERMS, check_terms
+from jaxdyn.identify.friction import TERMS, Terms, check_terms
 from jaxdyn.identify.jackknife import block_groups, jackknife, student
 from jaxdyn.identify.logs import Log, as_logs, as_measured
-from jaxdyn.identify.regression import base_parameters, condense_model, free_columns, parameter_names, regressor
+from jaxdyn.identify.regression import (
+    base_parameters,
+    condense_model,
+    free_columns,
+    log_regressor,
+    parameter_names,
+)
 from jaxdyn.identify.selection import VELOCITIES
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import coulomb_column
 from jaxdyn.model import inertia as _inertia
+from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model
 
 _STEPS, _ROUNDS = 50, 3
@@ -65,11 +72,11 @@ def fit_gains(
     unloaded: Log | Sequence[Log],
     loaded: Log | Sequence[Log],
     mass: float,
-    centre,
+    centre: Numbers,
     *,
-    inertia=None,
+    inertia: Numbers | None = None,
     body: str | None = None,
-    terms=TERMS,
+    terms: Terms = TERMS,
     v_s: float | str = "auto",
     blocks: int = 20,
 ) -> DriveGains:
@@ -110,7 +117,7 @@ def fit_gains(
     own = slice(10 * number, 10 * number + 10)
     carried = []
     for log, holds in zip(logs, is_loaded, strict=True):
-        columns = holds * regressor(model, log.q, log.v, log.a)[:, :, own]
+        columns = holds * log_regressor(model, log)[:, :, own]
         free = columns[:, :, 4:] if inertia is None else columns[:, :, :0]
         carried.append(np.concatenate([(columns @ known)[:, :, None], free], axis=2))
     best = None

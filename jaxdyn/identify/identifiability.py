@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.friction import TERMS
+from jaxdyn.identify.friction import TERMS, Terms
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import BaseParameters, base_parameters, condense, free_columns
 from jaxdyn.model.tree import Model
@@ -53,7 +53,13 @@ class Identifiability(NamedTuple):
 
 
 def identifiability(
-    model: Model, log: Log | Sequence[Log], terms=TERMS, *, v_s: float = 0.01, rcond: float = 1e-6, count: int = 3
+    model: Model,
+    log: Log | Sequence[Log],
+    terms: Terms = TERMS,
+    *,
+    v_s: float = 0.01,
+    rcond: float = 1e-6,
+    count: int = 3,
 ) -> Identifiability:
     """What logs tell of the bodies and the terms of a model, whatever the torques in them.
 

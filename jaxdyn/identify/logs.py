@@ -1,6 +1,7 @@
 """Logs: measured motion and torque, checked, and what their low-pass does to other signals."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,6 +9,7 @@ import jax.core
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
 
 
@@ -34,7 +36,17 @@ class Log(eqx.Module):
     joint_names: tuple[str, ...] | None = eqx.field(static=True)
     cutoff: float | None = eqx.field(static=True)
 
-    def __init__(self, t, q, v=None, a=None, tau=None, *, joint_names=None, cutoff=None):
+    def __init__(
+        self,
+        t: Numbers,
+        q: Numbers,
+        v: Numbers | None = None,
+        a: Numbers | None = None,
+        tau: Numbers | None = None,
+        *,
+        joint_names: Checked[Sequence[str] | None] = None,
+        cutoff: Checked[float | None] = None,
+    ):
         if tau is None:
             raise ValueError("Log: tau is missing; give the measured joint torques, zeros for a free motion")
         for name, value in (("t", t), ("q", q), ("v", v), ("a", a), ("tau", tau)):
@@ -172,7 +184,7 @@ def _check_signals(signals: dict) -> None:
 
 def _select(log: Log, rows) -> Log:
     values = {name: getattr(log, name) for name in ("t", "q", "v", "a", "tau")}
-    sliced = {k: None if x is None else x[rows] for k, x in values.items()}
+    sliced: dict[str, Any] = {k: None if x is None else x[rows] for k, x in values.items()}
     return Log(**sliced, joint_names=log.joint_names, cutoff=log.cutoff)
 
 

@@ -14,11 +14,11 @@ from jaxdyn.constraints.base import layout, position_residual, rows
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.mobility import degrees_of_freedom
 from jaxdyn.identify.logs import Log
-from jaxdyn.model.arguments import as_array, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.model.names import columns_in_v
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import displace, displacement
+from jaxdyn.systems.system import SceneLike, displace, displacement
 
 # Gauss-Newton steps towards what was measured; constraints count so many times as much as a measured coordinate, and
 # staying where it is so little that only coordinates that nothing tells do.
@@ -77,7 +77,7 @@ def _least_squares(A, picked, left):
     return jnp.linalg.solve(both.T @ both + _STAYS * jnp.eye(both.shape[1], dtype=both.dtype), both.T @ left)
 
 
-def completed(scene: Any, t, measured: dict[Any, Any], tau, guess) -> Log:
+def completed(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbers, guess: Numbers) -> Log:
     """A log of all joints of a mechanism, from those that were measured and the constraints.
 
     Positions of the others are those next to the ones before (the first next to `guess`) with which the constraints hold;

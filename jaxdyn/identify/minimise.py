@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +11,13 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxdyn.identify.progress import Watch
+
+if TYPE_CHECKING:
+    import optax
+
+    Optimizer = optax.GradientTransformation
+else:
+    Optimizer = Any  # optax is imported when a fit runs
 
 METHODS = ("lbfgs", "adam")
 # Weak Wolfe conditions: enough decrease, and a slope that has flattened enough for a positive curvature pair.

@@ -7,14 +7,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.identify.blocks import Block, Directions, Inertias, Numbers, Poses, Tied
 from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.distances import METRICS
-from jaxdyn.identify.picking import across, entries_taken, free_bodies, models_of, root_of, rows_of
-from jaxdyn.identify.sensors import with_sensors
-from jaxdyn.model.arguments import state_dtype
+from jaxdyn.identify.picking import Rows, across, entries_taken, free_bodies, models_of, root_of, rows_of
+from jaxdyn.identify.sensors import FitSystem, with_sensors
+from jaxdyn.model.arguments import Function, Number, state_dtype
+from jaxdyn.model.arguments import Numbers as Values
 from jaxdyn.model.inertia import pseudo_inertia
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
@@ -56,13 +57,21 @@ class Parameters(eqx.Module):
     given: Any
     blocks: tuple[Block, ...]
 
-    def __init__(self, system: Any, blocks: tuple[Block, ...] = ()):
+    def __init__(self, system: FitSystem, blocks: tuple[Block, ...] = ()):
         self.given = system
         self.blocks = tuple(blocks)
 
     # What can be changed.
 
-    def free(self, where: Any, *, rows=None, mean=None, std=None, covariance=None) -> "Parameters":
+    def free(
+        self,
+        where: Function,
+        *,
+        rows: Rows = None,
+        mean: Values | None = None,
+        std: Values | None = None,
+        covariance: Values | None = None,
+    ) -> "Parameters":
         """Numbers of any sign. `where`: a function that picks leaves, `lambda scene: scene.system.parameters["mass"]`.
 
         `rows`: indices along the leaf's first axis, or names of bodies or joints where it has one row for each; all by
@@ -70,15 +79,33 @@ class Parameters(eqx.Module):
         """
         return self._numbers("free", where, rows, mean, std, covariance)
 
-    def positive(self, where: Any, *, rows=None, mean=None, std=None, covariance=None) -> "Parameters":
+    def positive(
+        self,
+        where: Function,
+        *,
+        rows: Rows = None,
+        mean: Values | None = None,
+        std: Values | None = None,
+        covariance: Values | None = None,
+    ) -> "Parameters":
         """Numbers that stay above zero at every iterate, searched by their logarithm. Arguments as of `free`."""
         return self._numbers("positive", where, rows, mean, std, covariance)
 
-    def bounded(self, where: Any, lower, upper, *, rows=None, mean=None, std=None, covariance=None) -> "Parameters":
+    def bounded(
+        self,
+        where: Function,
+        lower: Values,
+        upper: Values,
+        *,
+        rows: Rows = None,
+        mean: Values | None = None,
+        std: Values | None = None,
+        covariance: Values | None = None,
+    ) -> "Parameters":
         """Numbers that stay between `lower` and `upper` (numbers, or one each) at every iterate. Other arguments as of `free`."""
         return self._numbers("bounded", where, rows, mean, std, covariance, lower, upper)
 
-    def directions(self, where: Any, *, rows=None, std=None) -> "Parameters":
+    def directions(self, where: Function, *, rows: Rows = None, std: Values | None = None) -> "Parameters":
         """Vectors (..., 3), or screws (..., 6), that turn and keep their length: gravity, axes of joints.
 
         `std`: of a prior on the angle from where they are, rad.
@@ -102,7 +129,7 @@ class Parameters(eqx.Module):
             blocks.append(Directions(labels, leaf, tuple(index), *self._arrays(vectors, bases, root)))
         return self._with(blocks)
 
-    def poses(self, where: Any, *, rows=None, std=None) -> "Parameters":
+    def poses(self, where: Function, *, rows: Rows = None, std: Values | None = None) -> "Parameters":
         """Poses (..., 4, 4), which stay rigid motions: home poses, frames. `std`: of a prior on all six numbers, m and rad."""
         blocks = list(self.blocks)
         for leaf, value, name in self._picked(where, "poses"):
@@ -156,7 +183,16 @@ class Parameters(eqx.Module):
             raise ValueError(f"weight is {weight}; give a positive number, or metric=None")
         return self._with([*self.blocks, Inertias(tuple(names), leaf, metric, chart, *parts)])
 
-    def tied(self, where: Any, to: Any, *, scale=1.0, offset=0.0, rows=None, to_rows=None) -> "Parameters":
+    def tied(
+        self,
+        where: Function,
+        to: Function,
+        *,
+        scale: Number = 1.0,
+        offset: Number = 0.0,
+        rows: Rows = None,
+        to_rows: Rows = None,
+    ) -> "Parameters":
         """Numbers that follow others: x = scale x_other + offset, entry by entry. Others may be free, or tied before."""
         (leaf, value, name), *rest = self._picked(where, "tied")
         (other, source, other_name), *more = self._picked(to, "to", twice=True)
@@ -193,7 +229,7 @@ class Parameters(eqx.Module):
         return jnp.zeros((self.size,), self.dtype)
 
     @property
-    def dtype(self):
+    def dtype(self) -> np.dtype:
         """Floating-point type of the coordinates."""
         return state_dtype(with_sensors(self.given).scene.system)
 
@@ -208,7 +244,7 @@ class Parameters(eqx.Module):
             block.write(part, leaves)
         return jax.tree.unflatten(structure, leaves), visited
 
-    def system(self, y: Float[Array, " p"]) -> Any:
+    def system(self, y: Float[Array, " p"]) -> PyTree:
         """What was given, with the numbers of y."""
         return self._walk(y, lambda *_: None)[0]
 

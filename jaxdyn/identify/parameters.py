@@ -14,7 +14,7 @@ from jaxdyn.identify.gauss_newton import Linear, Unknowns, gauss_newton, linear,
 from jaxdyn.identify.jackknife import student
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.mechanisms import observed_columns
-from jaxdyn.identify.minimise import METHODS, minimise
+from jaxdyn.identify.minimise import METHODS, Optimizer, minimise
 from jaxdyn.identify.objectives import ERRORS, SIMULATED, Objective
 from jaxdyn.identify.parameter_tree import Parameters, picked
 from jaxdyn.identify.problem import (
@@ -31,29 +31,31 @@ from jaxdyn.identify.problem import (
 from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.replay import HOLDS, INITIAL, check_replay, simulation_options
 from jaxdyn.identify.result import ParameterFit
-from jaxdyn.identify.sensors import with_sensors
+from jaxdyn.identify.sensors import FitSystem, with_sensors
 from jaxdyn.identify.starts import best_start
 from jaxdyn.identify.stepwise import SOLVERS, stepwise
+from jaxdyn.model.arguments import Checked, FilePath, Function
+from jaxdyn.simulation.controls import Control
 
 _GAUSS_NEWTON = "gauss-newton"
 
 
 def fit_parameters(
-    system: Any,
+    system: FitSystem,
     log: Log | Sequence[Log],
     parameters: Parameters | None = None,
     *,
-    positive: Any = None,
-    free: Any = None,
+    positive: Function | None = None,
+    free: Function | None = None,
     error: str = "trajectory",
     horizon: int | None = None,
     initial: str = "measured",
     hold: str = "linear",
     substeps: int | None = None,
-    control: Any = None,
+    control: Control = None,
     observed: Sequence[Any] | None = None,
     noise: float = 0.01,
-    method: Any = "gauss-newton",
+    method: Checked[str | Optimizer] = "gauss-newton",
     steps: int = 200,
     learning_rate: float = 0.1,
     tolerance: float = 1e-9,
@@ -64,10 +66,10 @@ def fit_parameters(
     callback: Callable[[int, float, Any], Any] | None = None,
     progress: bool = False,
     seconds: float | None = None,
-    checkpoint: Any = None,
+    checkpoint: FilePath | None = None,
     every: int | float = 30.0,
     resume: bool = True,
-    **simulation,
+    **simulation: Any,
 ) -> ParameterFit:
     """Numbers of a model, a Lagrangian, a force, a sensor, ..., by what they make of one or several logs.
 
@@ -251,8 +253,14 @@ def _tree(system, parameters, positive, free) -> Parameters:
 
 
 def parameter_error(
-    system: Any, log: Log | Sequence[Log], *, error: str = "trajectory", horizon=None, control=None, **options
-):
+    system: FitSystem,
+    log: Log | Sequence[Log],
+    *,
+    error: str = "trajectory",
+    horizon: Checked[int | None] = None,
+    control: Control = None,
+    **options: Any,
+) -> float:
     """The error that `fit_parameters` minimises, in per cent of the root mean square, without a fit.
 
     **Arguments:** as of `fit_parameters`. **Raises:** as there.

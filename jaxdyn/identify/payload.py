@@ -1,6 +1,7 @@
 """What a robot holds, from logs without it and logs with it."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,10 +15,10 @@ from jaxdyn.identify.interior import STRETCHES
 from jaxdyn.identify.jackknife import block_groups, jackknife, student
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.one_fit import eliminate, gather
-from jaxdyn.identify.regression import noise_level, regressor, truncated
+from jaxdyn.identify.regression import log_regressor, noise_level, truncated
 from jaxdyn.identify.robot import RobotFit, fit_robot
 from jaxdyn.identify.threads import on_one_thread
-from jaxdyn.identify.torque_terms import split_terms
+from jaxdyn.identify.torque_terms import RobotTerms, split_terms
 from jaxdyn.identify.whiteness import stretches
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model import inertia as _inertia
@@ -72,10 +73,10 @@ def fit_payload(
     unloaded: Log | Sequence[Log],
     loaded: Log | Sequence[Log],
     body: str | None = None,
-    terms="auto",
+    terms: RobotTerms = "auto",
     *,
     robot: RobotFit | None = None,
-    **options,
+    **options: Any,
 ) -> Payload:
     """The ten inertial numbers of what the last body holds in some logs and not in others.
 
@@ -119,7 +120,7 @@ def fit_payload(
         for log, holds in zip(logs, is_loaded, strict=True):
             carried = x.copy()
             carried[own] += holds * payload
-            loads.append(regressor(model, log.q, log.v, log.a) @ carried)
+            loads.append(log_regressor(model, log) @ carried)
         data = gather(model, logs, setting.v_s, extra, loads, _BLOCKS)
         kept = np.concatenate([np.arange(data.basic), data.places(setting.extra)]).astype(int)
         rows = _rows(data.blocks, is_loaded, own, kept, robot.weights)

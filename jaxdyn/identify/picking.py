@@ -1,5 +1,8 @@
 """Which leaves, rows and priors the words of a user stand for: names of bodies and joints, deviations, covariances."""
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
 import jax
 import numpy as np
 
@@ -24,7 +27,13 @@ def free_bodies(model: Model, chart) -> list[str]:
     return [model.body_names[i] for i in chart.bodies]
 
 
-def rows_of(system, name: str, count: int, rows) -> tuple[list[int], list[str]]:
+if TYPE_CHECKING:
+    Rows = str | int | Sequence[str | int] | None  # by index, or by the names of bodies or joints; None for all
+else:
+    Rows = Any  # `rows_of` looks at them
+
+
+def rows_of(system, name: str, count: int, rows: Rows) -> tuple[list[int], list[str]]:
     """Indices of rows given by index or by the names of bodies or joints, and what to call them; all for None."""
     models = models_of(system)
     sets: list[tuple[str, ...]] = []

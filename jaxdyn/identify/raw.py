@@ -1,13 +1,24 @@
 """Logs from raw samples: uniform in time, low-passed without delay, differentiated."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.spectra import choose_cutoff
+from jaxdyn.model.arguments import Checked, Numbers
 
 
 def from_raw(
-    t, q, tau, *, cutoff: float | str = 8.0, order: int = 4, trim: int = 200, every: int = 8, joint_names=None
+    t: Numbers,
+    q: Numbers,
+    tau: Numbers,
+    *,
+    cutoff: float | str = 8.0,
+    order: int = 4,
+    trim: int = 200,
+    every: int = 8,
+    joint_names: Checked[Sequence[str] | None] = None,
 ) -> Log:
     """A log for torque fits from raw positions and torques: uniform time, low-pass without delay, numerical rates.
 
@@ -37,9 +48,7 @@ def from_raw(
         raise ValueError(f'cutoff is {cutoff!r}; give a frequency in Hz, or "auto"')
     raw = Log(t, q, tau=tau, joint_names=joint_names)
     cutoff = choose_cutoff(raw).frequency if isinstance(cutoff, str) else cutoff
-    t = np.asarray(raw.t, np.float64)
-    q = np.asarray(raw.q, np.float64)
-    tau = np.asarray(raw.tau, np.float64)
+    t, q, tau = (np.asarray(x, np.float64) for x in (raw.t, raw.q, raw.tau))
     if q.shape[1] != tau.shape[1]:
         raise ValueError(
             f"q has {q.shape[1]} columns and tau {tau.shape[1]}: rates by differences need one coordinate per joint; "
@@ -70,9 +79,8 @@ def from_raw(
     def low(x):
         return filtfilt(numerator, denominator, x, axis=0)
 
-    q = low(uniform(q))
-    v = low(np.gradient(q, grid, axis=0))
+    positions, torques = low(uniform(q)), low(uniform(tau))
+    v = low(np.gradient(positions, grid, axis=0))
     a = low(np.gradient(v, grid, axis=0))
-    tau = low(uniform(tau))
     keep = slice(trim, n - trim, every)
-    return Log(grid[keep], q[keep], v[keep], a[keep], tau[keep], joint_names=raw.joint_names, cutoff=cutoff)
+    return Log(grid[keep], positions[keep], v[keep], a[keep], torques[keep], joint_names=raw.joint_names, cutoff=cutoff)

@@ -10,12 +10,12 @@ import numpy as np
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.condensed import Blocks, Condensed, condense_blocks, condensed_rows
-from jaxdyn.identify.friction import TERMS, check_terms, friction_regressor
+from jaxdyn.identify.friction import TERMS, Terms, check_terms, friction_regressor
 from jaxdyn.identify.jackknife import block_groups, jackknife, student
 from jaxdyn.identify.logs import Log, as_logs, check_log
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.whiteness import stretches
-from jaxdyn.model.arguments import as_array, check_shapes
+from jaxdyn.model.arguments import Number, Numbers, as_array, check_shapes
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, integrate, neutral
 
@@ -28,7 +28,7 @@ _KEPT_LAST = (6, 3, 0)
 _BLOCK = 256
 
 
-def parameter_names(model: Model, terms=TERMS) -> tuple[str, ...]:
+def parameter_names(model: Model, terms: Terms = TERMS) -> tuple[str, ...]:
     """Names of x: the ten numbers of each body (`body.m`, `body.mcx`, ...), then the terms (`joint.viscous`)."""
     joints = []
     for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
@@ -53,7 +53,7 @@ def free_columns(nb: int, nv: int, terms) -> np.ndarray:
     return np.concatenate([np.arange(start), *blocks]).astype(int)
 
 
-def regressor(model: Model, q, v, a, *, v_s=0.01) -> np.ndarray:
+def regressor(model: Model, q: Numbers, v: Numbers, a: Numbers, *, v_s: Number = 0.01) -> np.ndarray:
     """Rows [Y(q, v, a), friction and rotor columns] for samples (n, nq), (n, nv), (n, nv): (n, nv, 10 nb + 4 nv).
 
     Computed in the model's dtype in blocks of equal size (one compilation for logs of any length), returned in float64.
@@ -69,10 +69,17 @@ def regressor(model: Model, q, v, a, *, v_s=0.01) -> np.ndarray:
     return np.concatenate(parts)
 
 
+def log_regressor(model: Model, log: Log, *, v_s: Number = 0.01) -> np.ndarray:
+    """`regressor` of a log's samples. **Raises:** ValueError for a log without v or a."""
+    if log.v is None or log.a is None:
+        raise ValueError("the log has no v or no a; measure them, or make them from q with jd.identify.from_raw")
+    return regressor(model, log.q, log.v, log.a, v_s=v_s)
+
+
 def _torques(model: Model, log: Log, x: np.ndarray, v_s: float) -> np.ndarray:
     """Torques (n, nv) of all parameters x along a log; no more than some samples' regressor is held at a time."""
     pieces = [log[start : start + 4 * _BLOCK] for start in range(0, len(log), 4 * _BLOCK)]
-    return np.concatenate([regressor(model, part.q, part.v, part.a, v_s=v_s) @ x for part in pieces])
+    return np.concatenate([log_regressor(model, part, v_s=v_s) @ x for part in pieces])
 
 
 @eqx.filter_jit
@@ -116,7 +123,7 @@ def condense_model(
 
     def rows(which, piece):
         log = logs[which][piece]
-        W = regressor(model, log.q, log.v, log.a, v_s=v_s)
+        W = log_regressor(model, log, v_s=v_s)
         if coulomb is not None:
             joints = np.arange(model.nv)
             W[:, joints, start + joints] = coulomb[which][piece]
@@ -166,12 +173,12 @@ class BaseParameters(eqx.Module):
         used = np.any(self.matrix != 0, axis=0)
         return tuple(name for name, u in zip(self.parameter_names, used, strict=True) if not u)
 
-    def values(self, parameters) -> np.ndarray:
+    def values(self, parameters: Numbers) -> np.ndarray:
         """Values (nbase,) of the combinations for parameters x (p,)."""
         return self.matrix @ np.asarray(parameters, np.float64).reshape(-1)
 
 
-def base_parameters(model: Model, terms=(), *, v_s: float = 0.01, seed: int = 0) -> BaseParameters:
+def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed: int = 0) -> BaseParameters:
     """Base inertial parameters: the smallest set of combinations that determines every joint torque of the model.
 
     The regressor is stacked over random states. A column that depends linearly on the columns before it is grouped into
@@ -291,10 +298,10 @@ class LeastSquares(eqx.Module):
 def least_squares(
     model: Model,
     log: Log | Sequence[Log],
-    terms=TERMS,
+    terms: Terms = TERMS,
     *,
     v_s: float = 0.01,
-    weights=None,
+    weights: Numbers | None = None,
     rcond: float = 1e-6,
     blocks: int = 20,
 ) -> LeastSquares:
@@ -416,7 +423,7 @@ def truncated(A: np.ndarray, b: np.ndarray, rcond: float) -> Truncated:
     return Truncated(change, float(np.sum((b - A @ change) ** 2)), half, unknown, condition, rank)
 
 
-def torque_error(predicted, measured) -> float:
+def torque_error(predicted: Numbers, measured: Numbers) -> float:
     """100 |predicted - measured| / |measured| over all samples and joints (Frobenius norms), in per cent."""
     measured = np.asarray(measured, np.float64)
     return float(100 * np.linalg.norm(np.asarray(predicted, np.float64) - measured) / np.linalg.norm(measured))

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.identify.friction import Friction
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.mechanisms import on_constraints
-from jaxdyn.model.arguments import state_dtype
+from jaxdyn.identify.sensors import FitSystem
+from jaxdyn.model.arguments import Checked, Number, state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import Scene, as_scene
@@ -35,10 +37,10 @@ class SampledTorque(eqx.Module):
     tau: Float[Array, "n nv"]
     hold: str = eqx.field(static=True, default="linear")
 
-    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t) -> Float[Array, " nv"]:
+    def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
         return self.at(t)
 
-    def at(self, t) -> Float[Array, " nv"]:
+    def at(self, t: Number) -> Float[Array, " nv"]:
         """Torque (nv,) at a time (s); before the first sample and behind the last one that of these."""
         last = self.t.shape[0] - 2
         i = jnp.clip(jnp.searchsorted(self.t, t, side="right") - 1, 0, last)
@@ -97,7 +99,16 @@ def _segments(log: Log, horizon: int | None, dtype, restart: bool) -> Segments:
     return Segments(*(jnp.asarray(part, dtype) for part in parts))
 
 
-def rollout(system: Any, log: Log, friction: Any = None, *, horizon=None, hold="linear", substeps=None, **simulation):
+def rollout(
+    system: FitSystem,
+    log: Log,
+    friction: Checked[Friction | None] = None,
+    *,
+    horizon: Checked[int | None] = None,
+    hold: Checked[str] = "linear",
+    substeps: Checked[int | None] = None,
+    **simulation: Any,
+) -> tuple[Array, Array]:
     """Simulate a log's segments with its torques from its measured states: q (segments, n, nq) and v (segments, n, nv).
 
     `system` is a `Model`, another system or a `Scene`; `friction` a force besides its own. The other arguments are as in
@@ -109,8 +120,15 @@ def rollout(system: Any, log: Log, friction: Any = None, *, horizon=None, hold="
 
 
 def trajectory_error(
-    system: Any, log: Log, friction: Any = None, *, horizon=None, hold="linear", substeps=None, **simulation
-):
+    system: FitSystem,
+    log: Log,
+    friction: Checked[Friction | None] = None,
+    *,
+    horizon: Checked[int | None] = None,
+    hold: Checked[str] = "linear",
+    substeps: Checked[int | None] = None,
+    **simulation: Any,
+) -> tuple[float, float]:
     """Error of the simulated motion along a log, of positions and of velocities, each in per cent of the motion.
 
     100 sqrt(mean(((q_sim - q) / q_rms)^2)), and the same of v. Arguments as in `rollout`.
@@ -120,7 +138,8 @@ def trajectory_error(
     q, v = _rollout(scene, data, hold, spaced(simulation_options(substeps, simulation), data))
     scale = motion_scale(scene.system, data)
     errors = _batched_errors(scene.system, data, q, v, scale)
-    return tuple(100 * float(jnp.sqrt(jnp.mean(error**2))) for error in errors)
+    of_q, of_v = (100 * float(jnp.sqrt(jnp.mean(error**2))) for error in errors)
+    return of_q, of_v
 
 
 def replayed(

@@ -1,7 +1,6 @@
 """A robot from one log or several: terms, prior and smoothing chosen by cross-validation, joints weighted by their noise."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -18,7 +17,8 @@ from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, folds, search
 from jaxdyn.identify.threads import on_one_thread
-from jaxdyn.identify.torque_terms import EXTRA, split_terms
+from jaxdyn.identify.torque_terms import EXTRA, RobotTerms, split_terms
+from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
 
 _BLOCKS = 20
@@ -55,13 +55,13 @@ class RobotFit(eqx.Module):
 def fit_robot(
     model: Model,
     log: Log | Sequence[Log],
-    terms: Any = "auto",
+    terms: RobotTerms = "auto",
     *,
     v_s: float | str = "auto",
     prior: float | str = "auto",
-    weights: Any = "auto",
+    weights: Checked[Numbers | str | None] = "auto",
     robust: float | str | None = "auto",
-    delay: Any = 0.0,
+    delay: Numbers | str = 0.0,
     inertia: str = "full",
     blocks: int = _BLOCKS,
     callback: Callable | None = None,

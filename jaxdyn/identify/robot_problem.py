@@ -9,7 +9,7 @@ from jaxdyn.identify.feasible import placed, signal_sizes
 from jaxdyn.identify.intervals import Intervals, intervals
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.one_fit import Data, Estimate, Setting, fit_condensed, gather
-from jaxdyn.identify.regression import regressor
+from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.torque_terms import ExtraTorque, TorqueTerm
 from jaxdyn.identify.whiteness import stretches
@@ -123,7 +123,7 @@ class RobotProblem:
     def _load(self, log: Log, x: np.ndarray) -> np.ndarray:
         bodies = x[: 10 * self.model.nb + 4 * self.model.nv].copy()
         bodies[10 * self.model.nb : -self.model.nv] = 0  # all but the bodies and the rotors
-        return regressor(self.model, log.q, log.v, log.a) @ bodies
+        return log_regressor(self.model, log) @ bodies
 
     def result(self, setting: Setting, estimate: Estimate, data: Data) -> Fit:
         """The fit as others are given."""

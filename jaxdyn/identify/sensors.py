@@ -1,14 +1,20 @@
 """How a scene's motion was measured: gains, biases and the delay of its sensors and drives, as numbers that a fit may change."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.identify.construction import Construction, built
-from jaxdyn.model.arguments import as_array, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.systems.scene import as_scene
+from jaxdyn.systems.system import SceneLike
+
+if TYPE_CHECKING:
+    FitSystem: TypeAlias = "SceneLike | Measured | Construction"  # what fits take
+else:
+    FitSystem = Any  # `with_sensors` makes a `Measured` of it
 
 
 class Measured(eqx.Module):
@@ -42,7 +48,15 @@ class Measured(eqx.Module):
     torque_bias: Float[Array, " nv"]
     delay: Float[Array, ""]
 
-    def __init__(self, scene: Any, *, position_bias=None, torque_gain=None, torque_bias=None, delay=0.0):
+    def __init__(
+        self,
+        scene: FitSystem,
+        *,
+        position_bias: Numbers | None = None,
+        torque_gain: Numbers | None = None,
+        torque_bias: Numbers | None = None,
+        delay: Numbers = 0.0,
+    ):
         self.scene = scene if isinstance(scene, Construction) else as_scene(scene)
         own = built(scene)
         dtype, nv = state_dtype(own.system), own.nv

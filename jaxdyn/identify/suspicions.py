@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxdyn.identify.logs import Log
-from jaxdyn.identify.regression import nominal_parameters, regressor
+from jaxdyn.identify.regression import log_regressor, nominal_parameters
 from jaxdyn.model.tree import Model
 
 # Angles beyond this many turns, and torques this many times off what the nominal bodies need, are worth a question.
@@ -34,7 +34,7 @@ def suspicions(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
             lines.append(
                 f"positions of {names} reach {q[:, far].max():.0f} rad, beyond three turns: are they in degrees?"
             )
-    needed = _rms(regressor(model, log.q, log.v, log.a) @ nominal_parameters(model))
+    needed = _rms(log_regressor(model, log) @ nominal_parameters(model))
     measured = _rms(np.asarray(log.tau, np.float64))
     tells = (needed > 0.1 * needed.max(initial=0)) & (measured > 0)
     ratio = measured[tells] / needed[tells]

@@ -10,7 +10,8 @@ Source: Dahl (1968), "A solid friction model"; Hamon, Gautier & Garrec (2010), l
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
@@ -99,8 +100,15 @@ EXTRA = {
 }
 
 
+if TYPE_CHECKING:
+    Term = str | TorqueTerm
+    RobotTerms = Term | Sequence[Term | tuple[Term, Iterable[int]]]  # names of `TERMS` and `EXTRA`, and terms
+else:
+    RobotTerms = Any  # `split_terms` looks at them
+
+
 def split_terms(
-    terms, nv: int
+    terms: RobotTerms, nv: int
 ) -> tuple[tuple[str, ...], tuple[TorqueTerm, ...], tuple[tuple[str, tuple[int, ...]], ...]]:
     """Names of `TERMS`; `TorqueTerm`s; and (name, numbers of the torques that have it) of these.
 

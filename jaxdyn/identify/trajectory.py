@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart
 from jaxdyn.identify.divided import shared_out, summed
-from jaxdyn.identify.friction import check_terms
+from jaxdyn.identify.friction import Terms, check_terms
 from jaxdyn.identify.logs import Log, as_logs, root_mean_square
-from jaxdyn.identify.minimise import METHODS, minimise
+from jaxdyn.identify.minimise import METHODS, Optimizer, minimise
 from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.regression import regressor
 from jaxdyn.identify.replay import (
@@ -30,6 +30,7 @@ from jaxdyn.identify.replay import (
     spaced,
 )
 from jaxdyn.identify.result import Fit
+from jaxdyn.model.arguments import Checked
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
@@ -55,7 +56,7 @@ class _Problem(eqx.Module):
 def fit_trajectory(
     model: Model,
     log: Log | Sequence[Log],
-    terms=(),
+    terms: Terms = (),
     *,
     v_s: float = 0.01,
     inertia: str = "full",
@@ -64,13 +65,13 @@ def fit_trajectory(
     hold: str = "linear",
     substeps: int | None = None,
     prior: float = 1e-6,
-    method: Any = "lbfgs",
+    method: Checked[str | Optimizer] = "lbfgs",
     steps: int = 200,
     learning_rate: float = 0.1,
     tolerance: float = 1e-9,
     devices: Sequence[Any] | None = None,
     callback: Callable[[int, float, Model], None] | None = None,
-    **simulation,
+    **simulation: Any,
 ) -> Fit:
     """Physically feasible inertias and friction by the error of simulated motion, differentiated through `jd.simulate`.
 

@@ -5,7 +5,8 @@ import difflib
 import importlib
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +18,7 @@ from jaxdyn.io.mjcf import load_mjcf
 from jaxdyn.io.sdf import load_sdf
 from jaxdyn.io.urdf import urdf_model
 from jaxdyn.io.urdf_loops import closing, closures_of, motors_of
-from jaxdyn.model.arguments import DType, as_path
+from jaxdyn.model.arguments import Checked, DType, FilePath, Numbers, as_path
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.tree import neutral
 
@@ -83,7 +84,13 @@ def load(
 
 
 def load_urdf_scene(
-    path: pathlib.Path, *, floating_base: bool = False, lock=(), gravity=GRAVITY, loops=None, dtype=None
+    path: pathlib.Path,
+    *,
+    floating_base: bool = False,
+    lock: Iterable[str] | Mapping[str, Any] = (),
+    gravity: Numbers | None = GRAVITY,
+    loops: Checked[FilePath | bool | None] = None,
+    dtype: DType | None = None,
 ) -> LoadedScene:
     """The scene of a URDF file: as `load` says, with the options of `load_urdf`."""
     closures = closures_of(path, loops)

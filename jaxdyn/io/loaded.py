@@ -1,17 +1,19 @@
 """What a file gives beyond the mechanism: starts, named actuators, and a list of what was not taken."""
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import body_jacobian
 from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import Checked
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.scene import Force, Scene
 
 
 class NotTakenWarning(UserWarning):
@@ -61,7 +63,9 @@ class Actuators(eqx.Module):
     force_range: Float[Array, "nu 2"]
     effort_range: Float[Array, "nv 2"]
 
-    def __call__(self, system, q: Float[Array, " nq"], v: Float[Array, " nv"], control) -> Float[Array, " nv"]:
+    def __call__(
+        self, system: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], control: Float[Array, " nu"]
+    ) -> Float[Array, " nv"]:
         """Generalised force (nv,) in N m or N of the controls (nu,), in the order of `names`.
 
         **Raises:** ValueError for controls of another shape.
@@ -105,7 +109,16 @@ class LoadedScene(Scene):
     actuators: Actuators | None = None
     not_taken: tuple[str, ...] = eqx.field(static=True, default=())
 
-    def __init__(self, system, constraints=(), forces=(), *, starts: Mapping, actuators=None, not_taken=()):
+    def __init__(
+        self,
+        system: Model,
+        constraints: Checked[Sequence[Constraint]] = (),
+        forces: Checked[Sequence[Force]] = (),
+        *,
+        starts: Mapping,
+        actuators: "Actuators | None" = None,
+        not_taken: Sequence[str] = (),
+    ):
         super().__init__(system, constraints, forces)
         self.starts = dict(starts)
         self.actuators = actuators

@@ -2,17 +2,25 @@
 
 import csv
 import re
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from jaxdyn.identify.logs import Log
-from jaxdyn.model.arguments import FilePath, as_path
+from jaxdyn.model.arguments import Checked, FilePath, as_path
 
 _SIGNALS = ("q", "v", "a", "tau")
 _NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit behind a column's name
 
 
-def read_log(path: FilePath, *, joint_names=None, rename=None, rollout: int | None = None) -> Log:
+def read_log(
+    path: FilePath,
+    *,
+    joint_names: Checked[Sequence[str] | None] = None,
+    rename: Checked[Mapping[str, str] | None] = None,
+    rollout: int | None = None,
+) -> Log:
     """Read a log from a CSV file with one header line, or from an NPZ archive.
 
     Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1,
@@ -181,7 +189,9 @@ def _assemble(columns: dict[str, np.ndarray], joint_names) -> Log:
     if len(lengths) > 1:
         sizes = {name: len(column) for name, column in columns.items()}
         raise ValueError(f"unequal lengths: {', '.join(f'{name} has {n} rows' for name, n in sizes.items())}")
-    stacked = {signal: None if group is None else np.stack(group, axis=1) for signal, group in arrays.items()}
+    stacked: dict[str, Any] = {
+        signal: None if group is None else np.stack(group, axis=1) for signal, group in arrays.items()
+    }
     return Log(columns["t"], **stacked, joint_names=None if by_number else labels)
 
 

@@ -3,7 +3,7 @@
 import os
 import pathlib
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,18 +16,37 @@ from jaxdyn.compile import is_concrete
 from jaxdyn.lie import se3
 from jaxdyn.model import float64 as f64
 
+_T = TypeVar("_T")
 _OPTIONAL = ("a", "external")
 
 if TYPE_CHECKING:
     Numbers = ArrayLike | Sequence[Any]  # what `as_array` takes
     Given = Array  # what it returns, which may be an array of numpy
+    Number = float | Array  # one number, which may be traced
+    Row = Sequence[Any] | np.ndarray | Array  # several numbers, or rows of them, that are taken one by one
     FilePath = str | os.PathLike[str]
     DType = DTypeLike
     Function = Callable[..., Any]
+
+    class SystemLike(Protocol):
+        """What is taken as a system: a `Model`, a `System`, or anything else of which `check_system` finds the sizes."""
+
+        @property
+        def nq(self) -> int: ...
+
+        @property
+        def nv(self) -> int: ...
+
+    Checked = Annotated[_T, "looked at by the function, whose ValueError names the argument"]
 else:
-    Numbers = Given = FilePath = DType = Function = (
-        Any  # `as_array` and others look at them, and their errors name the argument
-    )
+    # `as_array` and others look at them, and their errors name the argument
+    Numbers = Given = Number = Row = FilePath = DType = Function = SystemLike = Any
+
+    class Checked:
+        """`Checked[T]` is T to a type checker and anything at run time: the function looks at it, and its error names it."""
+
+        def __class_getitem__(cls, _) -> Any:
+            return Any
 
 
 def as_array(value: Any, name: str, dtype=None) -> Given:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia as _inertia
+from jaxdyn.model.arguments import DType, Number, Numbers
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model, Topology
 
@@ -69,7 +70,7 @@ class ModelBuilder:
     ```
     """
 
-    def __init__(self, name: str = "mechanism", *, gravity=GRAVITY, dtype=None):
+    def __init__(self, name: str = "mechanism", *, gravity: Numbers | None = GRAVITY, dtype: DType | None = None):
         self._name = name
         three = {(3,): "three numbers (3,) or None"}
         self._gravity = None if gravity is None else f64.numbers(gravity, three, "gravity")
@@ -84,20 +85,20 @@ class ModelBuilder:
         name: str,
         parent: str | None = None,
         joint: str = "revolute",
-        inertia=None,
+        inertia: Numbers | None = None,
         *,
         joint_name: str | None = None,
-        pose=None,
-        axis=(0.0, 0.0, 1.0),
-        pitch=0.0,
-        screw=None,
-        armature=None,
-        damping=None,
-        friction=None,
-        lower=None,
-        upper=None,
-        velocity_limit=None,
-        effort_limit=None,
+        pose: Numbers | None = None,
+        axis: Numbers = (0.0, 0.0, 1.0),
+        pitch: Number = 0.0,
+        screw: Numbers | None = None,
+        armature: Numbers | None = None,
+        damping: Numbers | None = None,
+        friction: Numbers | None = None,
+        lower: Numbers | None = None,
+        upper: Numbers | None = None,
+        velocity_limit: Numbers | None = None,
+        effort_limit: Numbers | None = None,
     ) -> "ModelBuilder":
         """Add a body and the joint that carries it. Returns the builder.
 
@@ -160,7 +161,7 @@ class ModelBuilder:
         self._joints[joint_name] = name
         return self
 
-    def add_frame(self, name: str, parent: str | None = None, pose=None) -> "ModelBuilder":
+    def add_frame(self, name: str, parent: str | None = None, pose: Numbers | None = None) -> "ModelBuilder":
         """Name a frame on a body: `pose` (as in `add_body`) in the frame of the body `parent`, None for the world.
 
         Returns the builder. **Raises:** ValueError for a name in use, an unknown parent or a bad pose.
@@ -169,7 +170,7 @@ class ModelBuilder:
         self._frames[name] = (parent, f64.pose_matrix(pose, f"frame {name!r}: pose"))
         return self
 
-    def add_coupling(self, joint: str, source: str, multiplier=1.0, offset=0.0) -> "ModelBuilder":
+    def add_coupling(self, joint: str, source: str, multiplier: Number = 1.0, offset: Number = 0.0) -> "ModelBuilder":
         """Record that q[joint] = multiplier q[source] + offset for two one-degree-of-freedom joints (a gear, a mimic).
 
         The joint stays free in the model; a scene takes the coupling as a constraint. Returns the builder.

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import numpy_for as _numpy_for
 from jaxdyn.lie import so3
+from jaxdyn.model.arguments import Number, Numbers, Row
 
 # Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
 _SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
@@ -33,7 +34,7 @@ def parameters_from_spatial(matrix: Float[Array, "6 6"]) -> Float[Array, "10"]:
     return jnp.concatenate([matrix[:1, 0], so3.vee(matrix[3:, :3]), matrix[3:, 3:][_TRIANGLE]])
 
 
-def inertial_parameters(mass, com, inertia_com) -> Float[Array, "10"]:
+def inertial_parameters(mass: Number, com: Numbers, inertia_com: Numbers) -> Float[Array, "10"]:
     """The ten numbers from mass (kg), centre of mass (3,) (m) and rotational inertia (3, 3) about it (kg m^2).
 
     Steiner's theorem: I_origin = I_com - m hat(c)^2.
@@ -45,7 +46,7 @@ def inertial_parameters(mass, com, inertia_com) -> Float[Array, "10"]:
     return jnp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
 
 
-def mass_com_inertia(parameters: Float[Array, "10"]):
+def mass_com_inertia(parameters: Float[Array, "10"]) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
     """Mass (), centre of mass (3,) and rotational inertia about it (3, 3). A massless body has its centre at the origin."""
     mass, first = parameters[0], parameters[1:4]
     massless = mass == 0
@@ -128,14 +129,14 @@ def to_log_cholesky(parameters: Float[Array, "10"]) -> Float[Array, "10"]:
     return jnp.concatenate([alpha[None], diagonal, off, unit[:3, 3]])
 
 
-def is_feasible(parameters, *, tolerance: float = 0.0) -> bool:
+def is_feasible(parameters: Numbers, *, tolerance: float = 0.0) -> bool:
     """Whether concrete parameters (10,) belong to a physical body: pseudo-inertia positive semidefinite to `tolerance`
     (relative to its largest eigenvalue)."""
     values = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(parameters)), np.float64))
     return bool(values[0] >= -tolerance * max(values[-1], 0.0))
 
 
-def nearest_feasible(parameters, *, floor: float = 1e-6) -> np.ndarray:
+def nearest_feasible(parameters: Numbers, *, floor: float = 1e-6) -> np.ndarray:
     """Feasible parameters close to infeasible ones: pseudo-inertia eigenvalues raised to `floor` times the largest.
 
     **Raises:** ValueError when the mass is not positive, because then there is no body to repair.
@@ -153,41 +154,41 @@ def nearest_feasible(parameters, *, floor: float = 1e-6) -> np.ndarray:
 # Bodies of simple shapes. Their numbers may be traced; of known ones they are arrays of numpy, in float64.
 
 
-def box(mass, size) -> Array | np.ndarray:
+def box(mass: Number, size: Row) -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform box with edges `size` (3,) (m) about its centre (EQUATIONS section 1)."""
     x, y, z = (mass / 12 * edge**2 for edge in size)
     return _centred(mass, (y + z, x + z, x + y))
 
 
-def sphere(mass, radius) -> Array | np.ndarray:
+def sphere(mass: Number, radius: Number) -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform solid ball about its centre; kg, m."""
     return _centred(mass, (0.4 * mass * radius**2,) * 3)
 
 
-def ellipsoid(mass, semi_axes) -> Array | np.ndarray:
+def ellipsoid(mass: Number, semi_axes: Row) -> Array | np.ndarray:
     """Inertial parameters (10,) of a solid ellipsoid about its centre; `semi_axes` (3,) along x, y, z in m."""
     x, y, z = (0.2 * mass * axis**2 for axis in semi_axes)
     return _centred(mass, (y + z, x + z, x + y))
 
 
-def cylinder(mass, radius, length) -> Array | np.ndarray:
+def cylinder(mass: Number, radius: Number, length: Number) -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform solid cylinder along z about its centre, a disk for length 0; kg, m."""
     across = mass * (3 * radius**2 + length**2) / 12
     return _centred(mass, (across, across, 0.5 * mass * radius**2))
 
 
-def rod(mass, length, axis: str = "x") -> Array | np.ndarray:
+def rod(mass: Number, length: Number, axis: str = "x") -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform thin rod along an axis, "x", "y" or "z", about its centre; kg, m."""
     along = "xyz".index(axis)
     return _centred(mass, [0.0 if i == along else mass * length**2 / 12 for i in range(3)])
 
 
-def point_mass(mass, position=(0.0, 0.0, 0.0)) -> Array | np.ndarray:
+def point_mass(mass: Number, position: Numbers = (0.0, 0.0, 0.0)) -> Array | np.ndarray:
     """Inertial parameters (10,) of a point mass (kg) at a position (3,) in the body frame (m)."""
     return displaced(_centred(mass, (0.0, 0.0, 0.0)), position)
 
 
-def displaced(parameters, position, rotation=None) -> Array | np.ndarray:
+def displaced(parameters: Numbers, position: Numbers, rotation: Numbers | None = None) -> Array | np.ndarray:
     """Parameters (10,) of the same body placed at `position` (3,), turned by `rotation` (3, 3), in a new frame."""
     xp = _numpy_for(parameters, position, rotation)
     turned = xp.eye(3) if rotation is None else xp.asarray(rotation, float)

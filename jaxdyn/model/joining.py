@@ -9,13 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, pose_leaf
+from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, Topology
 
 
 def join(
-    left: Any, right: Any, *, prefix: Any = ("", ""), pose: Numbers | None = None, name: str | None = None
+    left: Checked[Model],
+    right: Checked[Model],
+    *,
+    prefix: Checked[str | Sequence[str]] = ("", ""),
+    pose: Numbers | None = None,
+    name: str | None = None,
 ) -> Model:
     """Two models in one: their trees side by side, in one world and with one gravity.
 

@@ -1,8 +1,12 @@
 """Built-in mechanisms: real arms, a real hand, a robot with legs, and generators of chains and random trees."""
 
+from collections.abc import Sequence
+
 import jax
 import numpy as np
+from jaxtyping import Array
 
+from jaxdyn.model.arguments import DType, Number, Numbers
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.inertia import box, cylinder, displaced, sphere
 from jaxdyn.model.joints import KINDS
@@ -41,7 +45,7 @@ _IIWA_DEGREES_PER_SECOND = (85, 85, 100, 75, 130, 135, 135)
 _IIWA_TORQUES = (320, 320, 176, 176, 110, 40, 40)
 
 
-def iiwa(*, gravity=GRAVITY, dtype=None) -> Model:
+def iiwa(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Model:
     """The arm KUKA LBR iiwa 14: seven revolute joints on a fixed base.
 
     Joints iiwa_joint_1 .. 7 move bodies iiwa_link_1 .. 7 about their z axes; the frame iiwa_link_0 is the base.
@@ -137,7 +141,7 @@ _ALLEGRO = (
 _ALLEGRO_TIP = (0.0168, (0, 0, 0), (9.68e-07,) * 3)
 
 
-def allegro(*, gravity=GRAVITY, dtype=None) -> Model:
+def allegro(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Model:
     """The right Allegro hand: index, middle and ring finger and a thumb of four revolute joints each on a fixed palm.
 
     Joints joint_0.0 .. 3.0 are those of the index finger from the palm outwards, 4 .. 7 of the middle finger, 8 .. 11 of the ring
@@ -187,7 +191,7 @@ _UR5 = (
 )
 
 
-def ur5(*, gravity=GRAVITY, dtype=None) -> Model:
+def ur5(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Model:
     """The arm Universal Robots UR5: six revolute joints on a fixed base.
 
     Joints shoulder_pan, shoulder_lift, elbow, wrist_1, wrist_2, wrist_3 move bodies of the same names with _link behind; the
@@ -217,7 +221,7 @@ def ur5(*, gravity=GRAVITY, dtype=None) -> Model:
     return builder.add_frame("tool0", parent, ((0, 0.0823, 0), (-_QUARTER, 0, 0))).build()
 
 
-def quadruped(*, floating_base: bool = True, gravity=GRAVITY, dtype=None) -> Model:
+def quadruped(*, floating_base: bool = True, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Model:
     """A robot with four legs of no particular make, some 12 kg: a trunk and, for each leg, hip, thigh and shank.
 
     Legs are FL, FR, RL, RR; joints LEG_hip turn about x, LEG_thigh and LEG_knee about y; feet are frames LEG_foot. At q = 0 legs
@@ -253,7 +257,9 @@ def quadruped(*, floating_base: bool = True, gravity=GRAVITY, dtype=None) -> Mod
     return builder.build()
 
 
-def chain(n: int, *, length=1.0, mass=1.0, gravity=GRAVITY, dtype=None) -> Model:
+def chain(
+    n: int, *, length: Number = 1.0, mass: Number = 1.0, gravity: Numbers | None = GRAVITY, dtype: DType | None = None
+) -> Model:
     """A hanging chain of n uniform thin rods on revolute joints about y: a planar n-fold pendulum, at rest at q = 0.
 
     **Arguments:** `n`: number of rods; `length` (m) and `mass` (kg) of each rod.
@@ -272,15 +278,15 @@ def chain(n: int, *, length=1.0, mass=1.0, gravity=GRAVITY, dtype=None) -> Model
 
 
 def random_tree(
-    seed,
+    seed: int | Array,
     nb: int,
     *,
-    branching=1.5,
-    skew=1.0,
-    taper=0.95,
-    kinds=tuple(KINDS),
-    gravity=GRAVITY,
-    dtype=None,
+    branching: Number = 1.5,
+    skew: Number = 1.0,
+    taper: Number = 0.95,
+    kinds: Sequence[str] = tuple(KINDS),
+    gravity: Numbers | None = GRAVITY,
+    dtype: DType | None = None,
 ) -> Model:
     """A random tree of bodies with physical inertias and every kind of joint (after autoTree of spatial_v2).
 

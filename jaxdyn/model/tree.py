@@ -9,7 +9,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.compile import is_concrete, is_expanding
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes
@@ -101,7 +101,7 @@ class Model(eqx.Module):
         """Names of all frames: bodies, links merged into them, and frames added by hand."""
         return self.topology.frame_names
 
-    def replace(self, **leaves) -> "Model":
+    def replace(self, **leaves: PyTree) -> "Model":
         """A copy with some leaves replaced, e.g. `model.replace(gravity=None)`.
 
         **Raises:** ValueError for a name that is not a leaf or for a shape that differs from the present one.
@@ -133,7 +133,7 @@ class Model(eqx.Module):
             joints = [name for name, kind in named if kind != "free"]
         return jnp.asarray(np.eye(self.nv)[:, columns_in_v(self, joints)], self.home.dtype)
 
-    def with_payload(self, frame: str, inertia: Any) -> "Model":
+    def with_payload(self, frame: str, inertia: Numbers) -> "Model":
         """The model carrying a body at a frame: its inertia is added to that of the body with the frame.
 
         **Arguments:** `frame`, one of `model.frame_names` or of `model.joint_names`; `inertia`, in the frame's axes: the ten

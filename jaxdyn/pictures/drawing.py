@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.constraints.base import layout
-from jaxdyn.model.arguments import Numbers, as_array, as_path
+from jaxdyn.model.arguments import Checked, Numbers, as_array, as_path
 from jaxdyn.pictures.inferred import place_of
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, joint_axes, marks, motion_of
-from jaxdyn.pictures.solids import finer, simplified
+from jaxdyn.pictures.solids import Shapes, finer, simplified
 from jaxdyn.pictures.stage import AXIS, FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
+from jaxdyn.reports.plotting import Axes
+from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
 
 _MOST_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
@@ -21,7 +23,14 @@ _LONGEST = 0.1  # side of a triangle, as a share of the mechanism's size: by its
 _LIGHT = np.array([0.4, -0.5, 0.77])
 
 
-def draw(scene: SceneLike, q: Numbers, ax=None, *, shapes=None, multipliers: Numbers | None = None) -> Any:
+def draw(
+    scene: SceneLike,
+    q: Numbers,
+    ax: Checked[Axes | None] = None,
+    *,
+    shapes: Checked[Shapes | None] = None,
+    multipliers: Numbers | None = None,
+) -> Axes:
     """Draw a mechanism at a configuration: its bodies, joints with their axes, loops and contacts with their friction cones.
 
     **Arguments:**
@@ -57,7 +66,13 @@ def draw(scene: SceneLike, q: Numbers, ax=None, *, shapes=None, multipliers: Num
 
 
 def animate(
-    scene: SceneLike, solution, path: str | os.PathLike, *, fps: int = 25, speed: float = 1.0, shapes=None
+    scene: SceneLike,
+    solution: Checked[Solution],
+    path: str | os.PathLike,
+    *,
+    fps: int = 25,
+    speed: float = 1.0,
+    shapes: Checked[Shapes | None] = None,
 ) -> None:
     """Write a motion as an animated picture: GIF (by pillow, which matplotlib brings) or MP4 (by ffmpeg, where installed).
 

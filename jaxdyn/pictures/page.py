@@ -16,13 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.model.arguments import as_path
+from jaxdyn.model.arguments import Checked, Numbers, as_path
 from jaxdyn.model.float64 import quaternion
 from jaxdyn.pictures.drawing import CONE_HEIGHT, arrow_length, cone_sides, scaled
 from jaxdyn.pictures.inferred import place_of
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, marks, motion_of
 from jaxdyn.pictures.solids import Shapes, by_frame, joined, sharpened, simplified
 from jaxdyn.pictures.stage import FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
+from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
 
 MOST_BYTES = 2_000_000  # of a file
@@ -37,7 +38,13 @@ _PICTURES = 30  # a second
 
 
 def view(
-    scene: SceneLike, solution, *, shapes=None, port: int | None = None, browser: bool = True, block: bool | None = None
+    scene: SceneLike,
+    solution: Checked[Solution | Numbers],
+    *,
+    shapes: Checked[Shapes | None] = None,
+    port: int | None = None,
+    browser: bool = True,
+    block: bool | None = None,
 ) -> "Viewer":
     """Show a motion in the browser: a page on this machine with a slider over time and a button to play.
 
@@ -74,7 +81,13 @@ def view(
     return viewer
 
 
-def save_html(path: str | os.PathLike, scene: SceneLike, solution, *, shapes=None) -> None:
+def save_html(
+    path: str | os.PathLike,
+    scene: SceneLike,
+    solution: Checked[Solution | Numbers],
+    *,
+    shapes: Checked[Shapes | None] = None,
+) -> None:
     """Write a motion as one HTML file under 2 MB that needs nothing else: no network, no Python.
 
     It plays in the browser as the page of `view` does. Meshes are simplified, and rows and trajectories left out, until it is

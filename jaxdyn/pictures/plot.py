@@ -11,17 +11,23 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.constraints.base import layout
+from jaxdyn.model.arguments import Checked
 from jaxdyn.model.columns import columns_of
 from jaxdyn.reports.page import panel
-from jaxdyn.reports.plotting import BLUE, RED, SERIES, bands, new_figure, style
+from jaxdyn.reports.plotting import BLUE, RED, SERIES, Axes, bands, new_figure, style
+from jaxdyn.reports.records import Record
 from jaxdyn.simulation.export import times
+from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.scene import as_scene
+from jaxdyn.systems.system import SceneLike
 
 _SMALLEST = 1e-17  # a logarithmic axis has no zero
 _LABELS = 16  # lines beyond these have no entry in the legend
 
 
-def states(scene, solution, axes=None) -> Any:
+def states(
+    scene: SceneLike, solution: Checked[Solution], axes: Checked[Sequence[Axes] | np.ndarray | None] = None
+) -> np.ndarray:
     """Positions and velocities over time, each with its joint's name and unit.
 
     **Arguments:** `scene`, `solution`; `axes`: two matplotlib axes, or None.
@@ -49,7 +55,7 @@ def states(scene, solution, axes=None) -> Any:
     return axes
 
 
-def energy(scene, solution, ax=None) -> Any:
+def energy(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | None] = None) -> Axes:
     """Energy over time against its start; where the solution has `work`, also what remains without it: the error.
 
     **Arguments:** `scene`, `solution` with `outputs=("energy",)` or `("energy", "work")`; `ax`, matplotlib axes or None.
@@ -68,7 +74,7 @@ def energy(scene, solution, ax=None) -> Any:
     return _finished(ax, as_scene(scene), rows, "energy (J)")
 
 
-def residuals(scene, solution, ax=None) -> Any:
+def residuals(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | None] = None) -> Axes:
     """Largest residual of the constraints over time: |phi| and |A v - b|, on a logarithmic axis.
 
     **Arguments:** `scene`, `solution` with `outputs=("constraint_residual",)`; `ax`, matplotlib axes or None.
@@ -84,7 +90,7 @@ def residuals(scene, solution, ax=None) -> Any:
     return _finished(ax, as_scene(scene), rows, "largest residual (m, rad; m/s, rad/s)")
 
 
-def forces(scene, solution, ax=None) -> Any:
+def forces(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | None] = None) -> Axes:
     """Multipliers of the constraints over time, and torques of the control, with the names of constraints and joints.
 
     Multipliers are the forces of the constraints' rows: N along a distance, N m about an axis.
@@ -118,7 +124,13 @@ def forces(scene, solution, ax=None) -> Any:
     return _finished(ax, scene, values, _with_units("force", units))
 
 
-def work_precision(records: Any, ax=None, *, error: str = "error_path", cost: str = "seconds_best") -> Any:
+def work_precision(
+    records: Checked[Sequence[Record]],
+    ax: Checked[Axes | None] = None,
+    *,
+    error: str = "error_path",
+    cost: str = "seconds_best",
+) -> Axes:
     """Cost against error of several integrators on one scene: further left is more exact, further down is cheaper.
 
     **Arguments:**
@@ -168,7 +180,7 @@ def _rows(values, count: int, name: str) -> np.ndarray:
     return values.reshape(-1, *values.shape[-2:])
 
 
-def _axes(ax) -> Any:
+def _axes(ax: Axes | None) -> Axes:
     if ax is None:
         return new_figure(7.0, 3.6)[1][0, 0]
     style(ax)

@@ -4,8 +4,8 @@ N comes from the user, from a choice of independent velocities, or as an orthono
 Source: Murray, Li & Sastry (1994), section 6.1; EQUATIONS section 6.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from jaxdyn.compile import compiled, is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, batch_hint, check_state
+from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_factored, solve_lower
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
@@ -43,11 +43,11 @@ class Basis(eqx.Module):
         """Number of minimal velocities, or None where only N itself tells."""
         return None
 
-    def at(self, scene: Scene, q, t) -> Parametrization:
+    def at(self, scene: Scene, q: Float[Array, " nq"], t: Number) -> Parametrization:
         """N, v0 and their quality at a place."""
         raise NotImplementedError
 
-    def along(self, scene: Scene, q, nu, t) -> "Moving":
+    def along(self, scene: Scene, q: Float[Array, " nq"], nu: Float[Array, " nr"], t: Number) -> "Moving":
         """v = N nu + v0 and its rate Ndot nu + v0dot, by differentiation of `at`."""
 
         def velocity(q, t):
@@ -57,7 +57,7 @@ class Basis(eqx.Module):
         v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
         return Moving(v, push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t)), N, quality)
 
-    def advice(self, scene: Scene, q, t) -> str:
+    def advice(self, scene: Scene, q: Float[Array, " nq"], t: Number) -> str:
         """What to do where N is singular, for concrete places."""
         raise NotImplementedError
 
@@ -207,7 +207,13 @@ class Whole(Basis):
         return Parametrization(jnp.eye(scene.nv, dtype=q.dtype), jnp.zeros((scene.nv,), q.dtype), jnp.ones((), q.dtype))
 
 
-def as_basis(basis: Any, scene: Scene) -> Basis:
+if TYPE_CHECKING:
+    BasisLike = Basis | Sequence[int] | np.ndarray | Array | Callable[[Array, Array], Any]
+else:
+    BasisLike = Any  # `as_basis` takes them
+
+
+def as_basis(basis: BasisLike | None, scene: Scene) -> Basis:
     """A `Basis` from indices of independent velocities, a reference matrix or a function.
 
     **Raises:** ValueError for anything else, and for indices and shapes that do not fit.
@@ -305,7 +311,7 @@ def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return lax.stop_gradient(jnp.linalg.eigh(lax.stop_gradient(0.5 * (projection + projection.T)))[1])
 
 
-def independent_velocities(scene: Scene, q, t=0.0) -> tuple[int, ...]:
+def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:
     """Indices of velocities that determine the others at a concrete place: those left by the pivots of A's columns."""
     A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
     rest, pivots = A.copy(), []

@@ -21,7 +21,7 @@ from jaxdyn.constraints.dynamics import applied
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
-from jaxdyn.reduction.bases import Basis, Moving, Whole, as_basis, least_quality, moving
+from jaxdyn.reduction.bases import Basis, BasisLike, Moving, Whole, as_basis, least_quality, moving
 from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
 from jaxdyn.systems.scene import Scene, as_scene
 
@@ -52,7 +52,7 @@ def reduced_dynamics(
     tau: Float[Array, " nv"] | None = None,
     t: Numbers = 0.0,
     *,
-    basis: Any = None,
+    basis: BasisLike | None = None,
 ) -> ReducedDynamics:
     """Motion in minimal velocities: N^T M N nudot + N^T (M (Ndot nu + v0dot) + h) = N^T (tau + forces).
 
@@ -76,7 +76,7 @@ def reduced_dynamics(
     """
     scene = as_scene(scene)
     tau = or_zeros(tau, scene.nv)
-    q, tau, t = check_state(scene.system, q=q, tau=tau, t=t)
+    q, tau, time = check_state(scene.system, q=q, tau=tau, t=t)
     nu = as_array(nu, "nu", q.dtype)
     if layout(scene):
         choice = as_basis(basis, scene)
@@ -87,10 +87,10 @@ def reduced_dynamics(
     size = choice.size(scene)
     if size is not None and nu.shape != (size,):
         raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns{batch_hint(nu, (1,))}")
-    dynamics = _reduce_compiled(scene, choice, q, nu, tau, t)
+    dynamics = _reduce_compiled(scene, choice, q, nu, tau, time)
     singular = dynamics.result == RESULTS.singular_basis
     if is_concrete(singular) and bool(singular):
-        raise ValueError(f"basis does not serve at this q: {choice.advice(scene, q, t)}")
+        raise ValueError(f"basis does not serve at this q: {choice.advice(scene, q, time)}")
     return dynamics
 
 

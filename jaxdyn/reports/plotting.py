@@ -4,12 +4,17 @@ Every function returns a `matplotlib.figure.Figure`, to be saved with `figure.sa
 global setting is touched.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+else:
+    Axes = Any  # matplotlib is imported when a figure is drawn
 
 # Colours that stay apart in print and for colour-blind readers (Okabe & Ito 2008).
 BLUE, ORANGE, GREEN, RED, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#7f7f7f"

@@ -4,12 +4,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
-from jaxdyn.model.arguments import as_array, as_path
+from jaxdyn.model.arguments import Numbers, as_array, as_path
 from jaxdyn.scale import driver, program
 from jaxdyn.scale.described import Described, version
 from jaxdyn.scale.locks import Lock
@@ -22,6 +22,13 @@ from jaxdyn.scale.store import Store, full_disk, zarr_package
 
 LISTED = 1000  # failures that a result lists
 PROGRAM = "program of a rollout (scene, control, solver, functions)"  # how a store names its hash
+if TYPE_CHECKING:
+    import xarray
+
+    Cost = Callable[[Any], Any] | Numbers | str | None
+else:
+    Cost = Any  # `whole` and `_order` look at it
+
 MEASURED = "measured"  # of a cost that nobody has to know
 BATCHES = 16  # of a chunk at least, where rollouts are put in order within chunks
 LEAST_LANES = 64  # of a device then
@@ -60,7 +67,7 @@ class Run:
         """Whether every rollout succeeded."""
         return set(self.codes) <= {"successful"}
 
-    def dataset(self) -> Any:
+    def dataset(self) -> "xarray.Dataset":
         """The store as an `xarray.Dataset`, read as it is used."""
         import xarray
 
@@ -82,7 +89,7 @@ class Options:
     out: Any
     reductions: Any
     rows: bool | Sequence[str]
-    cost: Any
+    cost: Cost
     process: Any
     devices: Sequence[Any] | None
     lanes: int | None
@@ -206,7 +213,7 @@ def _kept(described: Described, rows: bool | Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*rows, "result"]))
 
 
-def _order(cost: Any, batch: Members) -> np.ndarray | None:
+def _order(cost: Cost, batch: Members) -> np.ndarray | None:
     """Numbers of the rollouts by falling cost."""
     if cost is None:
         return None

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxdyn.model.arguments import as_array
 
@@ -81,7 +82,7 @@ def members(named: dict[str, Any], draw: Callable | None, samples: int | None, s
     return Members(size, rows, draw, int(seed))
 
 
-def member(parameters: Any, number: int, seed: int = 0) -> Any:
+def member(parameters: PyTree, number: int, seed: int = 0) -> PyTree:
     """The parameters of rollout `number`, as `jd.scale.run` and `jd.scale.evaluate` give them: to look at one again.
 
     **Arguments:** `parameters` and `seed` as they were passed there.

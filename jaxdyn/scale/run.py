@@ -5,33 +5,37 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, PyTree
 
-from jaxdyn.model.arguments import Numbers, as_array
+from jaxdyn.model.arguments import Checked, FilePath, Numbers, as_array
 from jaxdyn.model.printed import scene_lines
-from jaxdyn.scale.batch import Options, Run, whole
+from jaxdyn.scale.batch import Cost, Options, Run, whole
 from jaxdyn.scale.described import described_function, described_motion
 from jaxdyn.scale.driver import STEPS
 from jaxdyn.scale.members import digest, members
+from jaxdyn.scale.reductions import Reduction
+from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers.inputs import check_times
-from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.scene import as_scene
+from jaxdyn.systems.system import SceneLike
 
 SHARE = 0.05  # of the times that are simulated to measure what a rollout costs
 
 
 def run(
-    scene: Any,
-    states: Any,
-    parameters: Any,
+    scene: Checked[SceneLike | Callable[[Any], Any]],
+    states: Checked[tuple[Numbers, Numbers] | Callable[[Any], tuple[Array, Array]]],
+    parameters: PyTree,
     ts: Numbers,
     *,
-    out: Any,
+    out: FilePath,
     samples: int | None = None,
     seed: int = 0,
-    control: Any = None,
-    reductions: Any = None,
+    control: Control = None,
+    reductions: Checked[Mapping[str, Reduction] | None] = None,
     rows: bool | Sequence[str] = True,
-    cost: Any = None,
+    cost: Cost = None,
     units: Mapping[str, str] | None = None,
     process: tuple[int, int] | None = None,
     devices: Sequence[Any] | None = None,
@@ -108,6 +112,7 @@ def run(
     check_times(ts)
     for name in ("throw", "progress"):
         options.pop(name, None)
+    model: Any = scene
     builds = callable(scene) and jax.tree_util.all_leaves([scene])
     draw = parameters if callable(parameters) else None
     named: dict[str, Any] = {} if draw is not None or parameters is None else {"parameters": parameters}
@@ -122,7 +127,7 @@ def run(
 
     def begun(drawn: Any, row: Any) -> tuple[Any, Any, Any, Any]:
         own = drawn if draw is not None else row.get("parameters")
-        built = scene(own) if builds else scene
+        built = model(own) if builds else model
         law = control
         if isinstance(built, tuple):
             built, law = built
@@ -140,11 +145,11 @@ def run(
         solution = simulate(built, q0, v0, early, control=law, throw=False, **{**options, "outputs": ()})
         return {STEPS: solution.stats[STEPS]}
 
-    if not builds and not isinstance(scene, Scene):
-        scene = Scene(scene)
+    if not builds:
+        model = as_scene(model)
     given = {
         "ts": f"{ts[0]:g} to {ts[-1]:g} s, {len(ts)} points, {digest(ts)}",
-        "scene": "built by a function" if builds else scene_lines(scene),
+        "scene": "built by a function" if builds else scene_lines(model),
         "outputs": list(options.get("outputs", ())),
     }
     shared = Options(
@@ -158,14 +163,14 @@ def run(
 
 def evaluate(
     function: Callable[[Any], Mapping[str, Any]],
-    parameters: Any,
+    parameters: PyTree,
     *,
-    out: Any,
+    out: FilePath,
     samples: int | None = None,
     seed: int = 0,
-    reductions: Any = None,
+    reductions: Checked[Mapping[str, Reduction] | None] = None,
     rows: bool | Sequence[str] = True,
-    cost: Any = None,
+    cost: Cost = None,
     units: Mapping[str, str] | None = None,
     process: tuple[int, int] | None = None,
     devices: Sequence[Any] | None = None,

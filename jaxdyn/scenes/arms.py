@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import rolling_sphere
@@ -13,6 +14,7 @@ from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
 from jaxdyn.lie import se3
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia, robots
+from jaxdyn.model.arguments import Checked, Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.tree import Model
@@ -64,17 +66,17 @@ def _joint_angles(pose, links, height):
 
 
 def _sphere_arm_start(
-    contact="frictionless",
-    eta=_ETA,
-    rolling=(0.5, -0.3),
-    slide=(0.0, 0.0),
-    spin=0.0,
-    links=_LINKS,
-    height=_HEIGHT,
-    center=_CENTER,
-    radius=_RADIUS,
-    tip_radius=_TIP_RADIUS,
-):
+    contact: str = "frictionless",
+    eta: Row = _ETA,
+    rolling: Row = (0.5, -0.3),
+    slide: Row = (0.0, 0.0),
+    spin: Number = 0.0,
+    links: Row = _LINKS,
+    height: Number = _HEIGHT,
+    center: Row = _CENTER,
+    radius: Number = _RADIUS,
+    tip_radius: Number = _TIP_RADIUS,
+) -> tuple[Array, Array]:
     _check_contact(contact)
     if contact == "rolling" and is_concrete(slide, spin) and (np.any(slide) or spin):
         raise ValueError(f"slide is {slide}, spin is {spin}; a rolling contact has neither, leave them out")
@@ -100,14 +102,14 @@ def _check_contact(contact):
 @named(_sphere_arm_start)
 def sphere_arm(
     *,
-    contact="frictionless",
-    links=_LINKS,
-    masses=_MASSES,
-    height=_HEIGHT,
-    center=_CENTER,
-    radius=_RADIUS,
-    tip_radius=_TIP_RADIUS,
-    gravity=9.81,
+    contact: str = "frictionless",
+    links: Row = _LINKS,
+    masses: Row = _MASSES,
+    height: Number = _HEIGHT,
+    center: Row = _CENTER,
+    radius: Number = _RADIUS,
+    tip_radius: Number = _TIP_RADIUS,
+    gravity: Number = 9.81,
 ) -> Scene:
     """An arm of six joints whose tip, a ball, stays in touch with a sphere that stands still.
 
@@ -149,7 +151,9 @@ _HOLDING = (0.0, 0.6, 0.0, -1.2, 0.0, np.pi / 2 - 1.8, 0.0)
 _FLANGE = "iiwa_link_7"
 
 
-def _lifting_start(count=2, radius=0.3, twist=(0.05, 0.0, 0.1, 0.0, 0.2, 0.3)):
+def _lifting_start(
+    count: Checked[int] = 2, radius: Number = 0.3, twist: Row = (0.05, 0.0, 0.1, 0.0, 0.2, 0.3)
+) -> tuple[Array, Array]:
     scene: Any = coordinated_lifting(count=count, radius=radius)
     height = frame_pose(robots.iiwa(), jnp.asarray(_HOLDING), _FLANGE)[2, 3]
     q = jnp.asarray([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
@@ -160,7 +164,14 @@ def _lifting_start(count=2, radius=0.3, twist=(0.05, 0.0, 0.1, 0.0, 0.2, 0.3)):
 
 
 @named(_lifting_start)
-def coordinated_lifting(*, count=2, radius=0.3, mass=4.0, thickness=0.04, gravity=9.81) -> Grasp:
+def coordinated_lifting(
+    *,
+    count: Checked[int] = 2,
+    radius: Number = 0.3,
+    mass: Number = 4.0,
+    thickness: Number = 0.04,
+    gravity: Number = 9.81,
+) -> Grasp:
     """`count` arms (KUKA iiwa, seven joints each) around a round plate that all of them hold by its rim, rigidly.
 
     q = (joints of arm 1, of arm 2, ..., the plate's free joint), 7 count + 7 numbers. Each grip has six rows (B = 1): the

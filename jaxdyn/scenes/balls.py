@@ -9,6 +9,7 @@ from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Holonomic, rolling_sphere
 from jaxdyn.lie import so3
 from jaxdyn.model import inertia
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems.scene import Scene
@@ -23,7 +24,9 @@ class _Steady(eqx.Module):
         return q[0] - self.rate.astype(q.dtype) * t
 
 
-def _turntable_start(radius=0.2, rate=3.0, position=(1.0, 0.0), velocity=(0.0, 0.5)):
+def _turntable_start(
+    radius: Number = 0.2, rate: Number = 3.0, position: Row = (1.0, 0.0), velocity: Row = (0.0, 0.5)
+) -> tuple[Array, Array]:
     # The contact point of the ball moves with the table: v + w x (-r e_z) = rate e_z x p.
     slip = -rate * position[1] - velocity[0], rate * position[0] - velocity[1]
     spin = slip[1] / radius, -slip[0] / radius, 0.0
@@ -32,7 +35,7 @@ def _turntable_start(radius=0.2, rate=3.0, position=(1.0, 0.0), velocity=(0.0, 0
 
 
 @named(_turntable_start)
-def ball_on_turntable(*, mass=1.0, radius=0.2, rate=3.0, gravity=9.81) -> Scene:
+def ball_on_turntable(*, mass: Number = 1.0, radius: Number = 0.2, rate: Number = 3.0, gravity: Number = 9.81) -> Scene:
     """Solid ball that rolls on a turntable driven at a constant rate: vdot = (2/7) rate e_z x v, a circle.
 
     q = (table angle, the ball's free joint). The drive is a moving holonomic constraint, the contact rolls on a body.
@@ -46,7 +49,7 @@ def ball_on_turntable(*, mass=1.0, radius=0.2, rate=3.0, gravity=9.81) -> Scene:
     return Scene(builder.build(), (Holonomic(_Steady(rate), name="drive"), rolling))
 
 
-def _incline_start(radius=0.1, velocity=(0.0, 0.5)):
+def _incline_start(radius: Number = 0.1, velocity: Row = (0.0, 0.5)) -> tuple[Array, Array]:
     # Rolling: v + w x (-r e_z) = 0.
     x, y = velocity
     q = [0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]
@@ -54,7 +57,9 @@ def _incline_start(radius=0.1, velocity=(0.0, 0.5)):
 
 
 @named(_incline_start)
-def ball_on_incline(*, mass=1.0, radius=0.1, slope=np.pi / 6, gravity=9.81) -> Scene:
+def ball_on_incline(
+    *, mass: Number = 1.0, radius: Number = 0.1, slope: Number = np.pi / 6, gravity: Number = 9.81
+) -> Scene:
     """Solid ball that rolls on an inclined plane, x down the slope, z along its normal: a parabola.
 
     vdot = (5/7) g sin(slope) e_x. Start: `velocity` (m/s) of the centre, without spin about the normal.
@@ -92,12 +97,21 @@ class _Sliding(eqx.Module):
         return jnp.concatenate([push, so3.cross(down, push)])
 
 
-def _bowling_start(radius=0.10795, velocity=(8.0, 0.0), spin=(-8 * np.pi, 0.0, 0.0)):
+def _bowling_start(
+    radius: Number = 0.10795, velocity: Row = (8.0, 0.0), spin: Row = (-8 * np.pi, 0.0, 0.0)
+) -> tuple[Array, Array]:
     return jnp.asarray([0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]), jnp.asarray([*velocity, 0.0, *spin])
 
 
 @named(_bowling_start)
-def bowling_ball(*, mass=6.35, radius=0.10795, moment=0.0296, friction=0.12, gravity=9.8) -> Scene:
+def bowling_ball(
+    *,
+    mass: Number = 6.35,
+    radius: Number = 0.10795,
+    moment: Number = 0.0296,
+    friction: Number = 0.12,
+    gravity: Number = 9.8,
+) -> Scene:
     """Bowling ball that slides with Coulomb friction, up to the time at which it rolls.
 
     The velocity u of the point that touches the lane keeps its direction, so that the centre moves on a parabola:

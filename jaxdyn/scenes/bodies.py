@@ -1,18 +1,20 @@
 """A rigid body without forces."""
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
+from jaxdyn.model.arguments import Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.systems.scene import Scene
 
 
-def _free_start(rates=(0.3, 0.8, -0.5)):
+def _free_start(rates: Row = (0.3, 0.8, -0.5)) -> tuple[Array, Array]:
     return jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray(rates, float)
 
 
 @named(_free_start)
-def free_body(*, moments=(1.0, 2.0, 3.0)) -> Scene:
+def free_body(*, moments: Row = (1.0, 2.0, 3.0)) -> Scene:
     """Rigid body that turns freely about its centre of mass: I w' = (I w) x w, by Jacobi's elliptic functions.
 
     q = (w, x, y, z), a unit quaternion, v = angular velocity in the body's axes, principal ones; `moments`, kg m^2.

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.contact.cones import friction_cone, surface_cone
@@ -12,6 +13,7 @@ from jaxdyn.contact.wrench_cones import wrench_cone
 from jaxdyn.grasp import Grasp, contact, point_contacts
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia, robots
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.names import frame_index
 from jaxdyn.scenes._named import named
@@ -80,8 +82,11 @@ def _reached(model, joints, offset, guess, target):
 
 
 def _cube_start(
-    size=0.06, position=(0.108, 0.013, 0.004), turned=(0.404, -1.79, -0.078), twist=(0.02, 0.0, -0.01, 0.1, 0.2, -0.1)
-):
+    size: Number = 0.06,
+    position: Row = (0.108, 0.013, 0.004),
+    turned: Row = (0.404, -1.79, -0.078),
+    twist: Row = (0.02, 0.0, -0.01, 0.1, 0.2, -0.1),
+) -> tuple[Array, Array]:
     model = robots.allegro()
     quaternion, rotation = _quaternion(turned)
     xp = numpy_for(size, position, turned, twist)
@@ -95,8 +100,8 @@ def _cube_start(
         place, jacobian = _tip(model, joints, offset, reached)
         if is_concrete(target) and not np.linalg.norm(target - place) < 1e-12:
             raise ValueError(
-                f"size is {size}, position {position.tolist()}, turned {list(turned)}: {name} cannot reach its place on the "
-                "cube; give a place nearer to the default one"
+                f"size is {size}, position {np.asarray(position).tolist()}, turned {list(turned)}: {name} cannot reach its "
+                "place on the cube; give a place nearer to the default one"
             )
         velocity = _carried(position, rotation @ twist[:3], rotation @ twist[3:], target)
         moving = _least(jacobian, velocity)
@@ -107,7 +112,7 @@ def _cube_start(
 
 
 @named(_cube_start)
-def allegro_with_cube(*, size=0.06, mass=0.1, mu=0.8, gravity=9.81) -> Grasp:
+def allegro_with_cube(*, size: Number = 0.06, mass: Number = 0.1, mu: Number = 0.8, gravity: Number = 9.81) -> Grasp:
     """The Allegro hand, its palm upright, with a cube between index finger, ring finger and thumb; the middle finger is free.
 
     q = (joints of the index finger, of the thumb, of the middle and of the ring finger, four each, the cube's free joint): 22
@@ -129,7 +134,9 @@ def allegro_with_cube(*, size=0.06, mass=0.1, mu=0.8, gravity=9.81) -> Grasp:
     return Grasp(robots.allegro(gravity=fall), cube.build(), point_contacts(places), cones=cones)
 
 
-def _table_start(tilt=0.02, rate=0.0, height=0.025, size=(0.2, 0.16, 0.24)):
+def _table_start(
+    tilt: Number = 0.02, rate: Number = 0.0, height: Number = 0.025, size: Row = (0.2, 0.16, 0.24)
+) -> tuple[Array, Array]:
     xp = numpy_for(tilt)
     s, c = xp.sin(tilt), xp.cos(tilt)
     center = height + size[2] / 2
@@ -140,7 +147,14 @@ def _table_start(tilt=0.02, rate=0.0, height=0.025, size=(0.2, 0.16, 0.24)):
 
 @named(_table_start)
 def box_on_table(
-    *, size=(0.2, 0.16, 0.24), mass=1.0, table=(1.0, 0.6, 0.05), table_mass=20.0, height=0.025, mu=0.4, gravity=9.81
+    *,
+    size: Row = (0.2, 0.16, 0.24),
+    mass: Number = 1.0,
+    table: Row = (1.0, 0.6, 0.05),
+    table_mass: Number = 20.0,
+    height: Number = 0.025,
+    mu: Number = 0.4,
+    gravity: Number = 9.81,
 ) -> Grasp:
     """A box that stands on a table by its whole base: six rows, and the wrench cone of a rectangle in place of a friction cone.
 

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints import rolling_sphere
 from jaxdyn.contact.unilateral import UnilateralContact, gap_contact, ground_contact
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.systems.scene import Scene
@@ -14,7 +15,9 @@ from jaxdyn.systems.system import MetricSystem
 _UP, _DOWN = ((0, 0, 0), (-jnp.pi / 2, 0, 0)), ((0, 0, 0), (jnp.pi / 2, 0, 0))  # z of a plane along y, and against it
 
 
-def _rough_start(speed=3.0, place=0.1, link_place=0.0, tilt=0.0):
+def _rough_start(
+    speed: Number = 3.0, place: Number = 0.1, link_place: Number = 0.0, tilt: Number = 0.0
+) -> tuple[Array, Array]:
     # The link touches the disk of radius 1 from above, tilted clockwise.
     height = 1 + (1 + jnp.sin(tilt) * (place - link_place)) / jnp.cos(tilt)
     q = jnp.stack([jnp.asarray(x, float) for x in (place, 1.0, 0.0, link_place, height, -tilt)])
@@ -23,7 +26,9 @@ def _rough_start(speed=3.0, place=0.1, link_place=0.0, tilt=0.0):
 
 
 @named(_rough_start)
-def rough_disk_and_link(*, masses=(1.0, 0.6), moments=(0.5, 0.2), friction=(0.3, 0.2), gravity=9.81) -> Scene:
+def rough_disk_and_link(
+    *, masses: Row = (1.0, 0.6), moments: Row = (0.5, 0.2), friction: Row = (0.3, 0.2), gravity: Number = 9.81
+) -> Scene:
     """Disk of radius 1 m on the ground under a thin link that lies on it, both contacts with friction that sticks and slides.
 
     The bodies of `disk_and_link`, free in their plane: q = (x, y, angle) of the disk and of the link's centre of mass, angles
@@ -69,25 +74,27 @@ def _toy_potential(q, t, p):
     return jnp.sum(p["weight"] * q) + 0.5 * p["stiffness"] * (q[1] - q[2]) ** 2
 
 
-def _woodpecker_start(gap=0.0006, half_height=0.0058, bird=-0.2788, velocity=(-0.3411, 0.0, -7.4583)):
+def _woodpecker_start(
+    gap: Number = 0.0006, half_height: Number = 0.0058, bird: Number = -0.2788, velocity: Row = (-0.3411, 0.0, -7.4583)
+) -> tuple[Array, Array]:
     return jnp.asarray([0.0, -gap / half_height, bird]), jnp.asarray(velocity)
 
 
 @named(_woodpecker_start)
 def woodpecker(
     *,
-    masses=(0.0003, 0.0045),
-    moments=(5.0e-9, 7.0e-7),
-    stiffness=0.0056,
-    pole_radius=0.0025,
-    sleeve_radius=0.0031,
-    half_height=0.0058,
-    to_spring=0.010,
-    to_bird=0.015,
-    beak=(0.020, 0.0201),
-    friction=0.3,
-    restitution=0.5,
-    gravity=9.81,
+    masses: Row = (0.0003, 0.0045),
+    moments: Row = (5.0e-9, 7.0e-7),
+    stiffness: Number = 0.0056,
+    pole_radius: Number = 0.0025,
+    sleeve_radius: Number = 0.0031,
+    half_height: Number = 0.0058,
+    to_spring: Number = 0.010,
+    to_bird: Number = 0.015,
+    beak: Row = (0.020, 0.0201),
+    friction: Number = 0.3,
+    restitution: Number = 0.5,
+    gravity: Number = 9.81,
 ) -> Scene:
     """Woodpecker toy: a sleeve with play on a pole, from which a bird hangs on a spring, and comes down pecking.
 

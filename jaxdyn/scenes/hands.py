@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import rolling_sphere, rolling_wheel
@@ -9,6 +10,7 @@ from jaxdyn.contact.cones import friction_cone
 from jaxdyn.grasp import Grasp, contact
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.scenes.linkages import _circles, thin_bar
@@ -79,7 +81,14 @@ def _planar_state(fingers, center, angle, velocity):
     return jnp.asarray([*q, *center, angle]), jnp.asarray([*v, *velocity])
 
 
-def _bar_start(center=(0.02, 0.38), angle=0.1, velocity=(0.2, -0.1, 0.5), links=_LINKS, palm=_PALM, length=0.3):
+def _bar_start(
+    center: Row = (0.02, 0.38),
+    angle: Number = 0.1,
+    velocity: Row = (0.2, -0.1, 0.5),
+    links: Row = _LINKS,
+    palm: Number = _PALM,
+    length: Number = 0.3,
+) -> tuple[Array, Array]:
     xp = numpy_for(center, angle, links, palm, length)
     along = xp.asarray(_turn(angle))[:, 0]
     fingers = []
@@ -93,7 +102,15 @@ def _bar_start(center=(0.02, 0.38), angle=0.1, velocity=(0.2, -0.1, 0.5), links=
 
 @named(_bar_start)
 def hand_with_bar(
-    *, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, length=0.3, gravity=9.81, kind="hard-finger", mu=0.8
+    *,
+    links: Row = _LINKS,
+    masses: Row = (0.4, 0.3),
+    palm: Number = _PALM,
+    mass: Number = 0.5,
+    length: Number = 0.3,
+    gravity: Number = 9.81,
+    kind: str = "hard-finger",
+    mu: Number = 0.8,
 ) -> Grasp:
     """Two fingers of two joints each, in the x-y plane, whose tips hold the ends of a bar.
 
@@ -116,13 +133,13 @@ def hand_with_bar(
 
 
 def _disk_start(
-    center=(0.01, 0.45),
-    tilts=(0.12, -0.05),
-    velocity=(0.1, -0.15, 1.0),
-    links=_LINKS,
-    palm=_PALM,
-    radius=0.1,
-):
+    center: Row = (0.01, 0.45),
+    tilts: Row = (0.12, -0.05),
+    velocity: Row = (0.1, -0.15, 1.0),
+    links: Row = _LINKS,
+    palm: Number = _PALM,
+    radius: Number = 0.1,
+) -> tuple[Array, Array]:
     xp = numpy_for(center, tilts, links, palm, radius)
     fingers = []
     for side, tilt in zip((-1.0, 1.0), tilts, strict=True):
@@ -138,7 +155,16 @@ def _disk_start(
 
 
 @named(_disk_start)
-def hand_with_disk(*, links=_LINKS, masses=(0.4, 0.3), palm=_PALM, mass=0.5, radius=0.1, gravity=9.81, mu=0.8) -> Grasp:
+def hand_with_disk(
+    *,
+    links: Row = _LINKS,
+    masses: Row = (0.4, 0.3),
+    palm: Number = _PALM,
+    mass: Number = 0.5,
+    radius: Number = 0.1,
+    gravity: Number = 9.81,
+    mu: Number = 0.8,
+) -> Grasp:
     """The hand of `hand_with_bar` with a disk that rolls between the flat inner faces of the outer links.
 
     q = (joints of finger 1, of finger 2, x, y and angle of the disk). Each contact has a holonomic row, the gap, and a
@@ -231,19 +257,26 @@ def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
 
 
 def _ball_start(
-    position=(0.01, -0.02, 0.28),
-    turned=(0.1, -0.15, 0.2),
-    twist=(0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
-    links=_SPATIAL_LINKS,
-    circle=_CIRCLE,
-    radius=0.1,
-):
+    position: Row = (0.01, -0.02, 0.28),
+    turned: Row = (0.1, -0.15, 0.2),
+    twist: Row = (0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
+    links: Row = _SPATIAL_LINKS,
+    circle: Number = _CIRCLE,
+    radius: Number = 0.1,
+) -> tuple[Array, Array]:
     return _ball_state(position, turned, twist, links, circle, radius, radius, True)
 
 
 @named(_ball_start)
 def hand_with_ball(
-    *, links=_SPATIAL_LINKS, masses=(0.1, 0.2, 0.15), circle=_CIRCLE, mass=0.4, radius=0.1, gravity=9.81, mu=0.8
+    *,
+    links: Row = _SPATIAL_LINKS,
+    masses: Row = (0.1, 0.2, 0.15),
+    circle: Number = _CIRCLE,
+    mass: Number = 0.4,
+    radius: Number = 0.1,
+    gravity: Number = 9.81,
+    mu: Number = 0.8,
 ) -> Grasp:
     """Three fingers of three joints each, whose tips hold a ball at three points of its equator, with friction.
 
@@ -262,28 +295,28 @@ def hand_with_ball(
 
 
 def _rolling_start(
-    position=(0.01, -0.02, 0.28),
-    turned=(0.1, -0.15, 0.2),
-    twist=(0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
-    links=_SPATIAL_LINKS,
-    circle=_CIRCLE,
-    radius=0.1,
-    tip_radius=0.02,
-):
+    position: Row = (0.01, -0.02, 0.28),
+    turned: Row = (0.1, -0.15, 0.2),
+    twist: Row = (0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
+    links: Row = _SPATIAL_LINKS,
+    circle: Number = _CIRCLE,
+    radius: Number = 0.1,
+    tip_radius: Number = 0.02,
+) -> tuple[Array, Array]:
     return _ball_state(position, turned, twist, links, circle, radius, radius + tip_radius, False)
 
 
 @named(_rolling_start)
 def hand_rolling_ball(
     *,
-    links=_SPATIAL_LINKS,
-    masses=(0.1, 0.2, 0.15),
-    circle=_CIRCLE,
-    mass=0.4,
-    radius=0.1,
-    tip_radius=0.02,
-    gravity=9.81,
-    mu=0.8,
+    links: Row = _SPATIAL_LINKS,
+    masses: Row = (0.1, 0.2, 0.15),
+    circle: Number = _CIRCLE,
+    mass: Number = 0.4,
+    radius: Number = 0.1,
+    tip_radius: Number = 0.02,
+    gravity: Number = 9.81,
+    mu: Number = 0.8,
 ) -> Grasp:
     """The hand of `hand_with_ball` with spherical fingertips, between which the ball rolls: truly nonholonomic.
 

@@ -10,10 +10,11 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import is_concrete
 from jaxdyn.constraints import loop
 from jaxdyn.geometry.immersion import constrain_by_immersion
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import MetricSystem
 
 
@@ -110,7 +111,9 @@ def _builder(formulation):
     return _FORMULATIONS[formulation]
 
 
-def _double_start(formulation="lagrangian", angles=(0.6, -0.2), rates=(1.1, -0.7), length=1.0):
+def _double_start(
+    formulation: str = "lagrangian", angles: Row = (0.6, -0.2), rates: Row = (1.1, -0.7), length: Number = 1.0
+) -> tuple[Array, Array]:
     _builder(formulation)
     (theta, phi), (theta_rate, phi_rate) = jnp.asarray(angles, float), jnp.asarray(rates, float)
     if formulation == "model":
@@ -125,7 +128,13 @@ def _double_start(formulation="lagrangian", angles=(0.6, -0.2), rates=(1.1, -0.7
 
 @named(_double_start)
 def double_pendulum(
-    *, formulation="lagrangian", masses=(1.0, 0.5), length=1.0, reaches=(0.5, 0.35), moments=None, gravity=9.81
+    *,
+    formulation: str = "lagrangian",
+    masses: Row = (1.0, 0.5),
+    length: Number = 1.0,
+    reaches: Row = (0.5, 0.35),
+    moments: Row | None = None,
+    gravity: Number = 9.81,
 ) -> Scene:
     """Double pendulum in the x-y plane, y up, by absolute angles theta and phi from the downward vertical.
 
@@ -167,12 +176,25 @@ class _Applied(eqx.Module):
         return disk, jnp.stack([-f1 * c, f1 * s, self.torque.astype(s.dtype)])
 
 
-def _disk_start(place=0.1, turn=0.0, link_place=-0.2, tilt=0.3, rates=(0.4, 0.2, -0.1, 0.3)):
+def _disk_start(
+    place: Number = 0.1,
+    turn: Number = 0.0,
+    link_place: Number = -0.2,
+    tilt: Number = 0.3,
+    rates: Row = (0.4, 0.2, -0.1, 0.3),
+) -> tuple[Array, Array]:
     return jnp.asarray([place, turn, link_place, tilt]), jnp.asarray(rates)
 
 
 @named(_disk_start)
-def disk_and_link(*, masses=(1.0, 0.6), moments=(0.5, 0.2), torque=0.0, friction=(0.0, 0.0), gravity=9.81) -> Scene:
+def disk_and_link(
+    *,
+    masses: Row = (1.0, 0.6),
+    moments: Row = (0.5, 0.2),
+    torque: Number = 0.0,
+    friction: Row = (0.0, 0.0),
+    gravity: Number = 9.81,
+) -> Scene:
     """Disk of radius 1 m on the ground under a thin link that touches it: two bodies joined by an immersion.
 
     q = (z1, theta, y1, th2): abscissa of the disk, its angle counter-clockwise, abscissa of the link's centre of mass, the
@@ -182,4 +204,4 @@ def disk_and_link(*, masses=(1.0, 0.6), moments=(0.5, 0.2), torque=0.0, friction
     Source: EQUATIONS section 12 with erratum E57.
     """
     units = tuple(planar_body(m, moment, gravity) for m, moment in zip(masses, moments, strict=True))
-    return constrain_by_immersion(units, _tangent, 4, force=_Applied(torque, friction))
+    return as_scene(constrain_by_immersion(units, _tangent, 4, force=_Applied(torque, friction)))

@@ -2,10 +2,12 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.contact.unilateral import DryFriction
 from jaxdyn.forces.dissipation import SlidingFriction
+from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.inertia import box, displaced
 from jaxdyn.scenes._named import named
@@ -18,7 +20,7 @@ def _given(position, velocity):
     return jnp.asarray(position, float), jnp.asarray(velocity, float)
 
 
-def _particle_start(position=(0.0, 0.0), velocity=(1.0, 2.0)):
+def _particle_start(position: Row = (0.0, 0.0), velocity: Row = (1.0, 2.0)) -> tuple[Array, Array]:
     return _given(position, velocity)
 
 
@@ -31,7 +33,7 @@ def _height_energy(q, t, p):
 
 
 @named(_particle_start)
-def particle_in_plane(*, mass=1.0, gravity=9.81) -> Scene:
+def particle_in_plane(*, mass: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Particle in x and y (up): m xdd = F_x, m ydd = F_y - m g.
 
     Source: EQUATIONS section 1.
@@ -40,7 +42,7 @@ def particle_in_plane(*, mass=1.0, gravity=9.81) -> Scene:
     return Scene(LagrangianSystem(_quadratic, 2, parameters=parameters, potential=_height_energy))
 
 
-def _pendulum_start(angle=-np.pi / 2, rate=0.0):
+def _pendulum_start(angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:
     return _given([angle], [rate])
 
 
@@ -53,7 +55,7 @@ def _swing_potential(q, t, p):
 
 
 @named(_pendulum_start)
-def pendulum(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+def pendulum(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Pendulum by its angle from the downward vertical: m l^2 thetadd + m g l sin(theta) = tau.
 
     Without tau, sin(theta/2) = k sn(K(k) - w0 t), w0^2 = g/l, from rest at theta = -2 arcsin k. Start: `angle`, `rate`;
@@ -65,7 +67,9 @@ def pendulum(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
     return Scene(LagrangianSystem(_swing, 1, parameters=parameters, potential=_swing_potential))
 
 
-def _sphere_start(theta=1.0, phi=0.0, theta_rate=0.0, phi_rate=1.0):
+def _sphere_start(
+    theta: Number = 1.0, phi: Number = 0.0, theta_rate: Number = 0.0, phi_rate: Number = 1.0
+) -> tuple[Array, Array]:
     return _given([theta, phi], [theta_rate, phi_rate])
 
 
@@ -78,7 +82,7 @@ def _sphere_potential(q, t, p):
 
 
 @named(_sphere_start)
-def spherical_pendulum_in_angles(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+def spherical_pendulum_in_angles(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Spherical pendulum by theta from the downward vertical and phi about it; m l^2 sin^2(theta) phid is conserved.
 
     Singular at sin(theta) = 0; `spherical_pendulum` is not.
@@ -89,7 +93,7 @@ def spherical_pendulum_in_angles(*, mass=1.0, length=1.0, gravity=9.81) -> Scene
     return Scene(LagrangianSystem(_sphere, 2, parameters=parameters, potential=_sphere_potential))
 
 
-def _arm_start(angles=(0.3, 1.1), rates=(0.7, -0.4)):
+def _arm_start(angles: Row = (0.3, 1.1), rates: Row = (0.7, -0.4)) -> tuple[Array, Array]:
     return _given(angles, rates)
 
 
@@ -110,7 +114,14 @@ def _arm_potential(q, t, p):
 
 
 @named(_arm_start)
-def planar_arm(*, masses=(1.0, 0.8), length=1.0, reaches=(0.5, 0.4), moments=(0.1, 0.05), gravity=None) -> Scene:
+def planar_arm(
+    *,
+    masses: Row = (1.0, 0.8),
+    length: Number = 1.0,
+    reaches: Row = (0.5, 0.4),
+    moments: Row = (0.1, 0.05),
+    gravity: Number | None = None,
+) -> Scene:
     """Planar arm with two revolute joints, q = (th1, th2), th1 from the x axis and th2 relative to the first link.
 
     M = [[alpha + 2 beta c2, delta + beta c2], [delta + beta c2, delta]] with alpha = I1 + I2 + m1 r1^2 + m2 (l1^2 + r2^2),
@@ -126,18 +137,18 @@ def planar_arm(*, masses=(1.0, 0.8), length=1.0, reaches=(0.5, 0.4), moments=(0.
     return Scene(LagrangianSystem(_arm, 2, parameters=parameters, potential=potential))
 
 
-def _spatial_start(angles=(0.3, 0.4, -0.7), rates=(0.5, -0.6, 0.8)):
+def _spatial_start(angles: Row = (0.3, 0.4, -0.7), rates: Row = (0.5, -0.6, 0.8)) -> tuple[Array, Array]:
     return _given(angles, rates)
 
 
 @named(_spatial_start)
 def spatial_arm(
     *,
-    lengths=(0.5, 0.4),
-    reaches=(0.2, 0.25, 0.15),
-    masses=(3.0, 2.0, 1.0),
-    moments=((0.01, 0.02, 0.03), (0.03, 0.01, 0.04), (0.02, 0.015, 0.025)),
-    gravity=9.81,
+    lengths: Row = (0.5, 0.4),
+    reaches: Row = (0.2, 0.25, 0.15),
+    masses: Row = (3.0, 2.0, 1.0),
+    moments: Row = ((0.01, 0.02, 0.03), (0.03, 0.01, 0.04), (0.02, 0.015, 0.025)),
+    gravity: Number = 9.81,
 ) -> Scene:
     """Arm with a yaw and two parallel pitch axes, its links along +y at zero, z up; positive pitch angles lower it.
 
@@ -157,7 +168,7 @@ def spatial_arm(
     return Scene(builder.build())
 
 
-def _euler_start(angles=(0.4, 1.1, -0.3), rates=(0.5, -0.8, 1.3)):
+def _euler_start(angles: Row = (0.4, 1.1, -0.3), rates: Row = (0.5, -0.8, 1.3)) -> tuple[Array, Array]:
     return _given(angles, rates)
 
 
@@ -174,7 +185,7 @@ def _euler_metric(q, t, p):
 
 
 @named(_euler_start)
-def rigid_body_in_euler_angles(*, moments=(1.0, 2.0, 3.0)) -> Scene:
+def rigid_body_in_euler_angles(*, moments: Row = (1.0, 2.0, 3.0)) -> Scene:
     """Body that turns freely about its centre, q = (phi, theta, psi) with R = Rz(phi) Ry(theta) Rz(psi): a geodesic.
 
     The metric is rho = E^T diag(I1, I2, I3) E with w = E qd in body axes; tau are the torques about the Euler axes,
@@ -186,13 +197,18 @@ def rigid_body_in_euler_angles(*, moments=(1.0, 2.0, 3.0)) -> Scene:
 
 
 def _box_start(
-    position=(0.0, 0.0, 0.0), orientation=(1.0, 0.0, 0.0, 0.0), velocity=(0.0,) * 3, turning=(0.1, 4.0, 0.2)
-):
+    position: Row = (0.0, 0.0, 0.0),
+    orientation: Row = (1.0, 0.0, 0.0, 0.0),
+    velocity: Row = (0.0,) * 3,
+    turning: Row = (0.1, 4.0, 0.2),
+) -> tuple[Array, Array]:
     return _given((*position, *orientation), (*velocity, *turning))
 
 
 @named(_box_start)
-def free_box(*, mass=1.0, size=(0.3, 0.2, 0.1), frame=None, gravity=None) -> Scene:
+def free_box(
+    *, mass: Number = 1.0, size: Row = (0.3, 0.2, 0.1), frame: Numbers | None = None, gravity: Number | None = None
+) -> Scene:
     """Box in free motion, its edges `size` (3,) along x, y, z: M = diag(m, m, m, Ix, Iy, Iz), Ix = m (y^2 + z^2)/12.
 
     `frame` (4, 4): pose of the body's frame in that of the centre, which makes it M' = Ad^T M Ad; None for the centre. The start,
@@ -203,14 +219,14 @@ def free_box(*, mass=1.0, size=(0.3, 0.2, 0.1), frame=None, gravity=None) -> Sce
     """
     numbers = box(mass, size)
     if frame is not None:
-        frame = numpy_for(frame).asarray(frame, float)
-        rotation, place = frame[:3, :3], frame[:3, 3]
+        pose = numpy_for(frame).asarray(frame, float)
+        rotation, place = pose[:3, :3], pose[:3, 3]
         numbers = displaced(numbers, -rotation.T @ place, rotation.T)
     builder = ModelBuilder("box", gravity=None if gravity is None else (0.0, 0.0, -gravity))
     return Scene(builder.add_body("box", None, "free", numbers).build())
 
 
-def _block_start(position=0.0, velocity=2.0):
+def _block_start(position: Number = 0.0, velocity: Number = 2.0) -> tuple[Array, Array]:
     return _given([position], [velocity])
 
 
@@ -219,7 +235,14 @@ def _block(q, v, t, p):
 
 
 @named(_block_start)
-def sliding_block(*, mass=1.0, friction=0.3, static=None, gravity=9.81, direction=None) -> Scene:
+def sliding_block(
+    *,
+    mass: Number = 1.0,
+    friction: Number = 0.3,
+    static: Checked[Number | None] = None,
+    gravity: Number = 9.81,
+    direction: int | None = None,
+) -> Scene:
     """Block that slides on a table with Coulomb friction, m xdd = u - sign(xd) mu m g, and sticks under |u| <= `static` m g.
 
     Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on, where it sticks (`jd.DryFriction`, whose events say

@@ -4,9 +4,11 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import loop
+from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.systems.scene import Scene
@@ -50,7 +52,9 @@ def _solved(one, other, right):
     ) / determinant
 
 
-def _four_bar_start(lengths=(1.0, 3.0, 2.5, 3.5), angle=1.0, rate=1.0, in_plane=True):
+def _four_bar_start(
+    lengths: Row = (1.0, 3.0, 2.5, 3.5), angle: Number = 1.0, rate: Number = 1.0, in_plane: bool = True
+) -> tuple[Array, Array]:
     crank, coupler, rocker, ground = lengths
     xp = numpy_for(lengths, angle, rate)
     a = crank * xp.stack([xp.cos(angle), xp.sin(angle)])
@@ -62,7 +66,13 @@ def _four_bar_start(lengths=(1.0, 3.0, 2.5, 3.5), angle=1.0, rate=1.0, in_plane=
 
 
 @named(_four_bar_start)
-def four_bar(*, lengths=(1.0, 3.0, 2.5, 3.5), masses=(1.0, 3.0, 2.5), gravity=_DOWN, in_plane=True) -> Scene:
+def four_bar(
+    *,
+    lengths: Row = (1.0, 3.0, 2.5, 3.5),
+    masses: Row = (1.0, 3.0, 2.5),
+    gravity: Numbers | None = _DOWN,
+    in_plane: bool = True,
+) -> Scene:
     """Four-bar linkage in the x-y plane: crank and coupler as a chain, rocker on the ground, closed by a joint.
 
     q = (crank angle, coupler angle relative to the crank, rocker angle). `lengths`: crank, coupler, rocker, ground (m);
@@ -80,7 +90,9 @@ def four_bar(*, lengths=(1.0, 3.0, 2.5, 3.5), masses=(1.0, 3.0, 2.5), gravity=_D
     return Scene(builder.build(), (closing,))
 
 
-def _slider_crank_start(crank=1.0, rod=2.5, angle=1.0, rate=1.0):
+def _slider_crank_start(
+    crank: Number = 1.0, rod: Number = 2.5, angle: Number = 1.0, rate: Number = 1.0
+) -> tuple[Array, Array]:
     xp = numpy_for(crank, rod, angle, rate)
     lean = -xp.arcsin(crank * xp.sin(angle) / rod)
     leaning = -crank * xp.cos(angle) * rate / (rod * xp.cos(lean))
@@ -90,7 +102,9 @@ def _slider_crank_start(crank=1.0, rod=2.5, angle=1.0, rate=1.0):
 
 
 @named(_slider_crank_start)
-def slider_crank(*, crank=1.0, rod=2.5, masses=(1.0, 2.0, 1.5), gravity=_DOWN) -> Scene:
+def slider_crank(
+    *, crank: Number = 1.0, rod: Number = 2.5, masses: Row = (1.0, 2.0, 1.5), gravity: Numbers | None = _DOWN
+) -> Scene:
     """Slider-crank in the x-y plane: crank and rod as a chain, the slider on the x axis, closed by a revolute joint.
 
     q = (crank angle, rod angle relative to the crank, slider's x). `masses` (kg) of crank, rod and slider.
@@ -110,14 +124,16 @@ def _names(count: int) -> tuple[list[str], list[str]]:
     return uprights, [f"coupler{i:0{width}d}" for i in range(count)]
 
 
-def _windows_start(count=2, rate=1.0):
+def _windows_start(count: Checked[int] = 2, rate: Number = 1.0) -> tuple[Array, Array]:
     # Depth-first: each upright but the last one is followed by the coupler that it carries, which does not turn.
     v = [sign * rate for _ in range(count) for sign in (-1.0, 1.0)] + [-rate]
     return jnp.zeros(2 * count + 1), jnp.asarray(v)
 
 
 @named(_windows_start)
-def windows(*, count=2, mass=1.0, length=1.0, gravity=_DOWN) -> Scene:
+def windows(
+    *, count: Checked[int] = 2, mass: Number = 1.0, length: Number = 1.0, gravity: Numbers | None = _DOWN
+) -> Scene:
     """N four-bar windows in a row (problem A02 of the IFToMM benchmark library), N = `count`.
 
     N + 1 uprights on the ground at x = 0, 1 .. N lengths, N couplers between their tops, all uniform bars of one `mass`
@@ -143,7 +159,13 @@ def windows(*, count=2, mass=1.0, length=1.0, gravity=_DOWN) -> Scene:
 _BASES = ((0.0, 1.2), (-1.04, -0.6), (1.04, -0.6))
 
 
-def _parallel_start(point=(0.1, 0.05), velocity=(0.3, -0.2), length=1.0, bases=_BASES, elbows=(1, 1, 1)):
+def _parallel_start(
+    point: Row = (0.1, 0.05),
+    velocity: Row = (0.3, -0.2),
+    length: Number = 1.0,
+    bases: Row = _BASES,
+    elbows: Row = (1, 1, 1),
+) -> tuple[Array, Array]:
     xp = numpy_for(point, velocity, length, bases)
     q, v = [], []
     for base, elbow in zip(bases, elbows, strict=True):
@@ -157,7 +179,9 @@ def _parallel_start(point=(0.1, 0.05), velocity=(0.3, -0.2), length=1.0, bases=_
 
 
 @named(_parallel_start)
-def parallel_manipulator(*, length=1.0, bases=_BASES, mass=1.0, gravity=None) -> Scene:
+def parallel_manipulator(
+    *, length: Number = 1.0, bases: Row = _BASES, mass: Number = 1.0, gravity: Numbers | None = None
+) -> Scene:
     """Three legs of two links in the x-y plane that carry one point: q = (a1, a2, b1, b2, c1, c2), two freedoms.
 
     All links are uniform bars of one `length` (m) and `mass` (kg); the legs turn about the `bases` (3 points, m), the
@@ -177,14 +201,16 @@ def parallel_manipulator(*, length=1.0, bases=_BASES, mass=1.0, gravity=None) ->
     return Scene(builder.build(), [loop("a2", tip, leg, tip, "point", in_plane=True) for leg in ("b2", "c2")])
 
 
-def _ring_start(count=6, length=1.0, rate=1.0):
+def _ring_start(count: Checked[int] = 6, length: Number = 1.0, rate: Number = 1.0) -> tuple[Array, Array]:
     middle = length / 2, length / 2 / np.tan(np.pi / count)
     q = [-middle[0], -middle[1], 0.0, *[2 * np.pi / count] * (count - 1)]
     return jnp.asarray(q), jnp.asarray([rate * middle[1], -rate * middle[0], rate, *[0.0] * (count - 1)])
 
 
 @named(_ring_start)
-def closed_ring(*, count=6, mass=1.0, length=1.0, gravity=None) -> Scene:
+def closed_ring(
+    *, count: Checked[int] = 6, mass: Number = 1.0, length: Number = 1.0, gravity: Numbers | None = None
+) -> Scene:
     """Ring of `count` equal uniform bars joined end to end, free in the x-y plane: `count` freedoms.
 
     q = (x, y, angle of the first bar, angles of the others relative to the one before). Bars of one `mass` (kg) and

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Holonomic
+from jaxdyn.model.arguments import Number
 from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
@@ -30,13 +31,13 @@ def _scene(dimension: int, mass, length, gravity) -> Scene:
     return Scene(system, (Holonomic(_Rod(length), name="rod"),))
 
 
-def _plane_start(length=1.0, angle=-np.pi / 2, rate=0.0):
+def _plane_start(length: Number = 1.0, angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:
     s, c = numpy_for(angle).sin(angle), numpy_for(angle).cos(angle)
     return length * jnp.asarray([s, -c]), length * rate * jnp.asarray([c, s])
 
 
 @named(_plane_start)
-def pendulum_in_plane(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+def pendulum_in_plane(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Plane pendulum in x and y (up): L = m |v|^2/2 - m g y, phi = (x^2 + y^2 - l^2)/2.
 
     lam = -(m/l^2)(|v|^2 - g y); the tension of the rod is -l lam. Start: `angle` from the downward vertical and `rate`;
@@ -47,7 +48,9 @@ def pendulum_in_plane(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
     return _scene(2, mass, length, gravity)
 
 
-def _sphere_start(length=1.0, theta=1.0, phi=0.0, theta_rate=0.0, phi_rate=1.0):
+def _sphere_start(
+    length: Number = 1.0, theta: Number = 1.0, phi: Number = 0.0, theta_rate: Number = 0.0, phi_rate: Number = 1.0
+) -> tuple[Array, Array]:
     xp = numpy_for(theta, phi)
     s, c, sp, cp = xp.sin(theta), xp.cos(theta), xp.sin(phi), xp.cos(phi)
     q = length * jnp.asarray([s * cp, s * sp, -c])
@@ -56,7 +59,7 @@ def _sphere_start(length=1.0, theta=1.0, phi=0.0, theta_rate=0.0, phi_rate=1.0):
 
 
 @named(_sphere_start)
-def spherical_pendulum(*, mass=1.0, length=1.0, gravity=9.81) -> Scene:
+def spherical_pendulum(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Spherical pendulum in x, y and z (up): L = m |v|^2/2 - m g z, phi = (|q|^2 - l^2)/2.
 
     lam = (m/l^2)(g z - |v|^2). Start by angles: theta from the downward vertical, phi about it.

@@ -143,7 +143,7 @@ class _AndrewsLoops(eqx.Module):
         )
 
 
-def _andrews_start():
+def _andrews_start() -> tuple[Array, Array]:
     q = (
         -0.0617138900142764496358948458001,
         0.0,
@@ -178,7 +178,7 @@ class _AndrewsPotential(eqx.Module):
         return -jax.grad(self.energy, argnums=1)(system, q)
 
 
-def _andrews_bodies_start():
+def _andrews_bodies_start() -> tuple[Array, Array]:
     q, v = _andrews_start()
     return q[jnp.asarray(ANDREWS_ORDER)], v
 
@@ -254,7 +254,7 @@ class _CarRows(eqx.Module):
         return jnp.stack([xb * xl + yb * yl, (xl - xr) ** 2 + (yl - yr) ** 2 - self.parameters["length"] ** 2])
 
 
-def _car_start():
+def _car_start() -> tuple[Array, Array]:
     return jnp.asarray([0.0, 0.5, 1.0, 0.5]), jnp.asarray([-0.5, 0.0, -0.5, 0.0])
 
 

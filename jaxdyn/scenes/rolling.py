@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -33,7 +34,9 @@ def _disk(q, v, t, p):
     return 0.5 * (p["mass"] * (v[0] ** 2 + v[1] ** 2) + p["steer"] * v[2] ** 2 + p["roll"] * v[3] ** 2)
 
 
-def _disk_start(radius=0.5, heading=0.0, steering=1.0, rolling=2.0):
+def _disk_start(
+    radius: Number = 0.5, heading: Number = 0.0, steering: Number = 1.0, rolling: Number = 2.0
+) -> tuple[Array, Array]:
     xp = numpy_for(heading)
     c, s = xp.cos(heading), xp.sin(heading)
     speed = radius * rolling
@@ -41,7 +44,9 @@ def _disk_start(radius=0.5, heading=0.0, steering=1.0, rolling=2.0):
 
 
 @named(_disk_start)
-def rolling_disk(*, mass=2.0, radius=0.5, steer_inertia=0.125, roll_inertia=0.25) -> Scene:
+def rolling_disk(
+    *, mass: Number = 2.0, radius: Number = 0.5, steer_inertia: Number = 0.125, roll_inertia: Number = 0.25
+) -> Scene:
     """Upright disk rolling on a plane, q = (x, y, heading theta, roll angle phi); tau = (0, 0, tau_theta, tau_phi).
 
     I1 thetadd = tau_theta, (I2 + m rho^2) phidd = tau_phi; multipliers
@@ -54,12 +59,12 @@ def rolling_disk(*, mass=2.0, radius=0.5, steer_inertia=0.125, roll_inertia=0.25
     return Scene(LagrangianSystem(_disk, 4, parameters=parameters), (Pfaffian(_DiskRows(radius), name="rolling"),))
 
 
-def _sleigh_start(speed=0.2, yaw_rate=1.5):
+def _sleigh_start(speed: Number = 0.2, yaw_rate: Number = 1.5) -> tuple[Array, Array]:
     return jnp.zeros(3), jnp.asarray([speed, 0.0, yaw_rate])
 
 
 @named(_sleigh_start)
-def chaplygin_sleigh(*, mass=1.0, inertia_com=0.5, offset=0.3) -> Scene:
+def chaplygin_sleigh(*, mass: Number = 1.0, inertia_com: Number = 0.5, offset: Number = 0.3) -> Scene:
     """Chaplygin sleigh on a horizontal plane: a blade at the body's origin, the centre of mass `offset` ahead of it.
 
     One body on a planar joint, q = (x, y, theta) of the contact point, v = (forward, sideways, yaw rate).
@@ -73,12 +78,14 @@ def chaplygin_sleigh(*, mass=1.0, inertia_com=0.5, offset=0.3) -> Scene:
     return Scene(builder.build(), (knife_edge("sleigh", contact=False, name="blade"),))
 
 
-def _incline_start(yaw_rate=2.0):
+def _incline_start(yaw_rate: Number = 2.0) -> tuple[Array, Array]:
     return jnp.zeros(3), jnp.asarray([0.0, 0.0, yaw_rate])
 
 
 @named(_incline_start)
-def knife_edge_on_incline(*, mass=1.0, moment=0.2, slope=np.pi / 6, gravity=9.81) -> Scene:
+def knife_edge_on_incline(
+    *, mass: Number = 1.0, moment: Number = 0.2, slope: Number = np.pi / 6, gravity: Number = 9.81
+) -> Scene:
     """A skate that turns while it slides on an inclined plane, x down the slope; q = (x, y, theta).
 
     With theta = w t and from rest: x = (G/2w^2) sin^2(w t), y = (G/2w^2)(w t - sin(2 w t)/2), G = g sin(slope): a
@@ -93,7 +100,9 @@ def knife_edge_on_incline(*, mass=1.0, moment=0.2, slope=np.pi / 6, gravity=9.81
     return Scene(builder.build(), (knife_edge("skate", contact=False, name="blade"),))
 
 
-def _coin_start(radius=0.05, circle=0.5, lean=np.pi / 36, gravity=9.81):
+def _coin_start(
+    radius: Number = 0.05, circle: Number = 0.5, lean: Number = np.pi / 36, gravity: Number = 9.81
+) -> tuple[Array, Array]:
     xp = numpy_for(radius, circle, lean, gravity)
     rho = radius / circle
     sine, cosine = xp.sin(lean), xp.cos(lean)
@@ -108,7 +117,7 @@ def _coin_start(radius=0.05, circle=0.5, lean=np.pi / 36, gravity=9.81):
 
 
 @named(_coin_start)
-def rolling_coin(*, mass=0.3048, radius=0.05, gravity=9.81) -> Scene:
+def rolling_coin(*, mass: Number = 0.3048, radius: Number = 0.05, gravity: Number = 9.81) -> Scene:
     """Thin disk that rolls on a plane, leaning freely: one free body, its axle the body's y axis.
 
     Start: steady rolling on a `circle` (m, of the contact point) at a `lean` (rad) from the vertical.
@@ -129,12 +138,12 @@ class _NoTurn(eqx.Module):
         return jnp.asarray([0.0, 0.0, 1.0], q.dtype)
 
 
-def _suslov_start(across=1.0, along=-0.5):
+def _suslov_start(across: Number = 1.0, along: Number = -0.5) -> tuple[Array, Array]:
     return jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray([across, along, 0.0])
 
 
 @named(_suslov_start)
-def suslov(*, moments=(1.0, 1.5, 2.0), product=0.4) -> Scene:
+def suslov(*, moments: Row = (1.0, 1.5, 2.0), product: Number = 0.4) -> Scene:
     """Suslov's problem: a rigid body turns freely about a fixed point, but not about its own z axis.
 
     `moments` (I11, I22, I33) and `product` I13, the entry of the inertia matrix, kg m^2. With I12 = I23 = 0

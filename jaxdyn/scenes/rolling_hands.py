@@ -3,12 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.contact import Ellipsoid, RollingModel, rolling_contact
 from jaxdyn.grasp import Grasp
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.scenes._named import named
 from jaxdyn.scenes.hands import (
     _CIRCLE,
@@ -58,14 +60,14 @@ def _held(base, links, tip_axes, point, normal, velocity):
 
 
 def _egg_start(
-    position=(0.01, -0.02, 0.28),
-    turned=(0.1, -0.15, 0.2),
-    twist=(0.02, -0.01, 0.02, 0.2, -0.1, 0.15),
-    links=_SPATIAL_LINKS,
-    circle=_CIRCLE,
-    semi_axes=_EGG,
-    tip_semi_axes=_TIP,
-):
+    position: Row = (0.01, -0.02, 0.28),
+    turned: Row = (0.1, -0.15, 0.2),
+    twist: Row = (0.02, -0.01, 0.02, 0.2, -0.1, 0.15),
+    links: Row = _SPATIAL_LINKS,
+    circle: Number = _CIRCLE,
+    semi_axes: Row = _EGG,
+    tip_semi_axes: Row = _TIP,
+) -> tuple[Array, Array]:
     quaternion, rotation = _quaternion(turned)
     xp = numpy_for(position, turned, twist, links, circle, semi_axes, tip_semi_axes)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
@@ -84,14 +86,14 @@ def _egg_start(
 @named(_egg_start)
 def hand_rolling_egg(
     *,
-    links=_SPATIAL_LINKS,
-    masses=(0.1, 0.2, 0.15),
-    circle=_CIRCLE,
-    mass=0.4,
-    semi_axes=_EGG,
-    tip_semi_axes=_TIP,
-    gravity=9.81,
-    mu=0.8,
+    links: Row = _SPATIAL_LINKS,
+    masses: Row = (0.1, 0.2, 0.15),
+    circle: Number = _CIRCLE,
+    mass: Number = 0.4,
+    semi_axes: Row = _EGG,
+    tip_semi_axes: Row = _TIP,
+    gravity: Number = 9.81,
+    mu: Number = 0.8,
 ) -> Grasp:
     """Three fingers of three joints each, whose tips, ellipsoids, roll on an ellipsoid that they hold: truly nonholonomic.
 

@@ -1,10 +1,12 @@
 """Linkages in space that move although counting their joints says that they cannot."""
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import loop
 from jaxdyn.model import float64 as f64
+from jaxdyn.model.arguments import Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.scenes.linkages import thin_bar
@@ -27,7 +29,9 @@ def _second(length, twist, other):
     return xp.arcsin(sine)
 
 
-def _bennett_start(lengths=(1.0, 0.7), twist=1.1, angle=0.8, rate=1.0):
+def _bennett_start(
+    lengths: Row = (1.0, 0.7), twist: Number = 1.1, angle: Number = 0.8, rate: Number = 1.0
+) -> tuple[Array, Array]:
     first, second = twist, _second(lengths[0], twist, lengths[1])
     xp = numpy_for(lengths, twist, angle, rate)
     # tan(q1/2) tan(q2/2) = k, and q3 = -q1 up to a turn.
@@ -38,7 +42,9 @@ def _bennett_start(lengths=(1.0, 0.7), twist=1.1, angle=0.8, rate=1.0):
 
 
 @named(_bennett_start)
-def bennett(*, lengths=(1.0, 0.7), twist=1.1, mass=1.0, gravity=(0.0, 0.0, -9.81)) -> Scene:
+def bennett(
+    *, lengths: Row = (1.0, 0.7), twist: Number = 1.1, mass: Number = 1.0, gravity: Numbers | None = (0.0, 0.0, -9.81)
+) -> Scene:
     """Bennett's linkage: four links, opposite ones equal, joined by four revolute joints whose axes never meet.
 
     Links of `lengths` (a, b) (m) and twists (alpha, beta) (rad) with a/sin(alpha) = b/sin(beta); `twist` is alpha.

@@ -2,9 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import knife_edge, rolling_wheel
+from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import named
 from jaxdyn.systems.scene import Scene
@@ -13,15 +15,15 @@ _AXLE = (np.zeros(3), (-np.pi / 2, 0.0, 0.0))  # z of the wheel along y of the b
 
 
 def _bicycle_start(
-    speed=4.6,
-    roll_rate=0.0,
-    steer_rate=0.0,
-    wheel_base=1.02,
-    trail=0.08,
-    tilt=np.pi / 10,
-    rear_radius=0.3,
-    front_radius=0.35,
-):
+    speed: Number = 4.6,
+    roll_rate: Number = 0.0,
+    steer_rate: Number = 0.0,
+    wheel_base: Number = 1.02,
+    trail: Number = 0.08,
+    tilt: Number = np.pi / 10,
+    rear_radius: Number = 0.3,
+    front_radius: Number = 0.35,
+) -> tuple[Array, Array]:
     # The steer axis points down, so steering turns the front wheel's contact, behind the axis, to the left.
     yaw_rate = -trail * numpy_for(tilt).cos(tilt) / wheel_base * steer_rate
     q = [0.0, 0.0, rear_radius, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -32,16 +34,16 @@ def _bicycle_start(
 @named(_bicycle_start)
 def bicycle(
     *,
-    wheel_base=1.02,
-    trail=0.08,
-    tilt=np.pi / 10,
-    rear_radius=0.3,
-    front_radius=0.35,
-    rear_wheel=(2.0, (0.0603, 0.12, 0.0603)),
-    rear_frame=(85.0, (0.3, 0.0, 0.9), (9.2, 11.0, 2.8, -2.4)),
-    front_frame=(4.0, (0.9, 0.0, 0.7), (0.05892, 0.06, 0.00708, 0.00756)),
-    front_wheel=(3.0, (0.1405, 0.28, 0.1405)),
-    gravity=9.81,
+    wheel_base: Number = 1.02,
+    trail: Number = 0.08,
+    tilt: Number = np.pi / 10,
+    rear_radius: Number = 0.3,
+    front_radius: Number = 0.35,
+    rear_wheel: Row = (2.0, (0.0603, 0.12, 0.0603)),
+    rear_frame: Row = (85.0, (0.3, 0.0, 0.9), (9.2, 11.0, 2.8, -2.4)),
+    front_frame: Row = (4.0, (0.9, 0.0, 0.7), (0.05892, 0.06, 0.00708, 0.00756)),
+    front_wheel: Row = (3.0, (0.1405, 0.28, 0.1405)),
+    gravity: Number = 9.81,
 ) -> Scene:
     """Bicycle on level ground, ridden by nobody or by a rigid rider: Whipple's model, by default the benchmark's.
 
@@ -88,7 +90,9 @@ def bicycle(
     return Scene(builder.build(), rolling)
 
 
-def _drive_start(speed=0.5, yaw_rate=0.4, radius=0.1, half_track=0.25):
+def _drive_start(
+    speed: Number = 0.5, yaw_rate: Number = 0.4, radius: Number = 0.1, half_track: Number = 0.25
+) -> tuple[Array, Array]:
     speed_difference = yaw_rate * half_track
     spins = [(speed - speed_difference) / radius, (speed + speed_difference) / radius]
     return jnp.zeros(5), jnp.asarray([speed, 0.0, yaw_rate, *spins])
@@ -102,7 +106,15 @@ def _add_wheel(builder, name, parent, mass, radius, place):
 
 
 @named(_drive_start)
-def differential_drive(*, mass=8.0, moment=0.3, offset=0.05, wheel_mass=0.5, radius=0.1, half_track=0.25) -> Scene:
+def differential_drive(
+    *,
+    mass: Number = 8.0,
+    moment: Number = 0.3,
+    offset: Number = 0.05,
+    wheel_mass: Number = 0.5,
+    radius: Number = 0.1,
+    half_track: Number = 0.25,
+) -> Scene:
     """Mobile robot with two driven wheels on one axle, on a level floor; a castor without friction holds it up.
 
     q = (x, y, heading, left, right wheel angle), of the axle's middle; tau = (0, 0, 0, left, right motor torque).
@@ -126,7 +138,14 @@ def differential_drive(*, mass=8.0, moment=0.3, offset=0.05, wheel_mass=0.5, rad
     return Scene(builder.build(), rolling)
 
 
-def _car_start(speed=2.0, steer=0.2, steer_rate=0.0, radius=0.15, half_track=0.4, wheel_base=1.2):
+def _car_start(
+    speed: Number = 2.0,
+    steer: Number = 0.2,
+    steer_rate: Number = 0.0,
+    radius: Number = 0.15,
+    half_track: Number = 0.4,
+    wheel_base: Number = 1.2,
+) -> tuple[Array, Array]:
     xp = numpy_for(steer)
     yaw_rate = speed * xp.tan(steer) / wheel_base
     speed_difference = yaw_rate * half_track
@@ -142,14 +161,14 @@ def _car_start(speed=2.0, steer=0.2, steer_rate=0.0, radius=0.15, half_track=0.4
 @named(_car_start)
 def car(
     *,
-    mass=60.0,
-    moment=12.0,
-    offset=0.5,
-    fork_moment=0.2,
-    wheel_mass=2.0,
-    radius=0.15,
-    half_track=0.4,
-    wheel_base=1.2,
+    mass: Number = 60.0,
+    moment: Number = 12.0,
+    offset: Number = 0.5,
+    fork_moment: Number = 0.2,
+    wheel_mass: Number = 2.0,
+    radius: Number = 0.15,
+    half_track: Number = 0.4,
+    wheel_base: Number = 1.2,
 ) -> Scene:
     """Car-like robot on a level floor: two wheels on the rear axle that turn freely, a steered wheel in front.
 
@@ -179,14 +198,27 @@ def car(
     return Scene(builder.build(), rolling)
 
 
-def _snakeboard_start(speed=1.0, angles=(0.3, -0.2), rates=(0.0, 0.0), rotor_rate=1.0, half_length=0.3):
+def _snakeboard_start(
+    speed: Number = 1.0,
+    angles: Row = (0.3, -0.2),
+    rates: Row = (0.0, 0.0),
+    rotor_rate: Number = 1.0,
+    half_length: Number = 0.3,
+) -> tuple[Array, Array]:
     front, back = (numpy_for(angle).tan(angle) for angle in angles)
     sideways, yaw_rate = speed * (front + back) / 2, speed * (front - back) / (2 * half_length)
     return jnp.asarray([0.0, 0.0, 0.0, *angles, 0.0]), jnp.asarray([speed, sideways, yaw_rate, *rates, rotor_rate])
 
 
 @named(_snakeboard_start)
-def snakeboard(*, mass=6.0, moment=0.1, rotor_moment=0.16, truck_moment=0.02, half_length=0.3) -> Scene:
+def snakeboard(
+    *,
+    mass: Number = 6.0,
+    moment: Number = 0.1,
+    rotor_moment: Number = 0.16,
+    truck_moment: Number = 0.02,
+    half_length: Number = 0.3,
+) -> Scene:
     """Snakeboard on a level floor: a board with a truck at each end that turns, and a rotor for the rider's body.
 
     q = (x, y, heading, front truck, back truck, rotor angle), of the board's middle, angles relative to the board.

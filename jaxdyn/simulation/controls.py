@@ -13,7 +13,7 @@ In the state of the equation (`Method`) the entry "control" holds z, and "held" 
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -21,13 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, as_array, state_dtype
+from jaxdyn.model.arguments import Function, Number, Numbers, as_array, state_dtype
 from jaxdyn.systems.scene import Scene, as_pytree, check_callback, checked_force
 
 STATE, HELD = "control", "held"
@@ -59,19 +59,33 @@ class Controller(eqx.Module):
 
     takes_multipliers: ClassVar[bool] = False
 
-    def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Float[Array, ""]) -> Any:
+    def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Float[Array, ""]) -> PyTree:
         """The state at the start."""
         return None
 
     @abc.abstractmethod
-    def __call__(self, q, v, t, state=None, multipliers=None) -> Float[Array, " nv"]:
+    def __call__(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: PyTree = None,
+        multipliers: Float[Array, " nc"] | None = None,
+    ) -> Float[Array, " nv"]:
         """tau (nv,), N m or N."""
 
-    def rate(self, q, v, t, state, multipliers) -> Any:
+    def rate(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: PyTree,
+        multipliers: Float[Array, " nc"] | None,
+    ) -> PyTree:
         """Rate of the state, of its structure. `multipliers` (nc,), under the torque that the law gives."""
         return None
 
-    def allowance(self, q, v, t) -> Float[Array, ""] | None:
+    def allowance(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""] | None:
         """How far the law is from where it cannot do what it promises; None: not known, or not to be looked at.
 
         Where this number falls to zero a simulation ends, with the code `control_singular`.
@@ -105,7 +119,7 @@ class Sampled(eqx.Module):
     state: Any
     period: Array
 
-    def __init__(self, law: Any, state: Any, period: Numbers):
+    def __init__(self, law: Function, state: PyTree, period: Numbers):
         self.law = as_pytree(law, "Sampled: law")
         self.state = jax.tree.map(lambda x: jnp.asarray(as_array(x, "Sampled: state")), state)
         seconds = as_array(period, "Sampled: period")
@@ -113,7 +127,7 @@ class Sampled(eqx.Module):
             raise ValueError(f"Sampled: period is {period!r}; give one positive number (s)")
         self.period = jnp.asarray(seconds, float)
 
-    def called(self, q, v, t, state) -> tuple[Array, Any]:
+    def called(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, state: PyTree) -> tuple[Array, Any]:
         """The torque and the next state."""
         return (self.law(q, v, t), None) if self.state is None else self.law(q, v, t, state)
 
@@ -294,3 +308,9 @@ def _check_state(state, returned, name: str) -> None:
     shapes = [jax.tree.map(jnp.shape, x) for x in (state, returned)]
     if shapes[0] != shapes[1]:
         raise ValueError(f"{name} returned a state of shapes {shapes[1]}, expected {shapes[0]}; keep its structure")
+
+
+if TYPE_CHECKING:
+    Control = Callable[[Array, Array, Array], Array] | Controller | Sampled | None
+else:
+    Control = Any  # `as_control` looks at it

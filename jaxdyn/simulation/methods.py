@@ -25,9 +25,10 @@ from jaxdyn.constraints.rank import checked_tolerance
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.arguments import Number, Numbers
 from jaxdyn.reduction.bases import (
     Basis,
+    BasisLike,
     Given,
     Orthonormal,
     as_basis,
@@ -39,9 +40,11 @@ from jaxdyn.reduction.bases import (
 from jaxdyn.reduction.minimal import solve_reduced
 from jaxdyn.simulation import variational
 from jaxdyn.simulation.solvers import Stepper
-from jaxdyn.simulation.solvers.choice import is_fixed
+from jaxdyn.simulation.solvers.choice import Solver, Stepsize, is_fixed
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import rate_to_velocity, retract, retracts, velocity_to_rate
+
+State = dict[str, Any]  # arrays, and pytrees of them, by name
 
 
 class Method(eqx.Module):
@@ -50,37 +53,53 @@ class Method(eqx.Module):
     name: ClassVar[str] = "free"
     projects: ClassVar[bool] = False
 
-    def stepper(self, solver: Any, stepsize: Any) -> Any:
+    def stepper(self, solver: Solver, stepsize: Stepsize) -> Solver:
         """The solver to take: the one given, or the method's own."""
         return solver
 
-    def start(self, scene: Scene, q, v, t) -> dict[str, Array]:
+    def start(self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> State:
         """State of the equation at (q, v)."""
         return {"q": q, "v": v}
 
-    def to_qv(self, scene: Scene, y, t) -> tuple[Array, Array]:
+    def to_qv(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array]:
         """q, with unit quaternions, and v of a state."""
         return retract(scene.system, y["q"]), y["v"]
 
-    def rates(self, scene: Scene, y, q, v, t, force) -> dict[str, Array]:
+    def rates(
+        self,
+        scene: Scene,
+        y: State,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        force: Float[Array, " nv"] | None,
+    ) -> State:
         """dy/dt; q and v are those of `to_qv`, `force` (nv,) is tau plus the scene's forces, or None."""
         return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
 
-    def evaluated(self, scene: Scene, y, t, generalized_force) -> tuple[dict[str, Array], Array | None, Array]:
+    def evaluated(
+        self, scene: Scene, y: State, t: Number, generalized_force: Callable[[Array, Array, Number], Array | None]
+    ) -> tuple[State, Array | None, Array]:
         """dy/dt with effort(q, v, t) for the force; the force (nv,) or None; and v (nv,)."""
         q, v = self.to_qv(scene, y, t)
         force = generalized_force(q, v, t)
         return self.rates(scene, y, q, v, t, force), force, v
 
-    def acceleration(self, scene: Scene, q, v, t, force) -> Array:
+    def acceleration(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
+    ) -> Array:
         """Rate of v, (nv,)."""
         return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force, t)
 
-    def multipliers(self, scene: Scene, q, v, t, force) -> Array:
+    def multipliers(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
+    ) -> Array:
         """Constraint forces along the rows, (nc,)."""
         return dynamics(scene, q, v, t, force).multipliers
 
-    def satisfies(self, scene: Scene, q, v, t, force) -> Array:
+    def satisfies(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
+    ) -> Array:
         """Whether some acceleration meets all rows, ()."""
         return jnp.asarray(True)
 
@@ -88,19 +107,21 @@ class Method(eqx.Module):
         """Whether `stepped` and `corrected` change a state."""
         return self.projects or retracts(scene.system)
 
-    def corrected(self, scene: Scene, y, t) -> dict[str, Array]:
+    def corrected(self, scene: Scene, y: State, t: Number) -> State:
         """The state put back between steps, where it is saved."""
         return self.stepped(scene, y, t, None)[0]
 
-    def onto_constraints(self, scene: Scene, q, v, t) -> tuple[Array, Array]:
+    def onto_constraints(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> tuple[Array, Array]:
         """q and v by the least change on the constraints, where the motion starts."""
         return project_state(scene, q, v, t)
 
-    def stepped(self, scene: Scene, y, t, error):
+    def stepped(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
         """The state put back after a step, and its estimated error (a state, or None) less what constraints remove."""
         return y | {"q": retract(scene.system, y["q"])}, error
 
-    def continued(self, scene: Scene, y, t) -> dict[str, Array]:
+    def continued(self, scene: Scene, y: State, t: Number) -> State:
         """The state as the next step starts from it: entries in `step_constants` may have changed."""
         return y
 
@@ -109,7 +130,7 @@ class Method(eqx.Module):
         """Entries of the state that are constant during a step."""
         return ()
 
-    def quality(self, scene: Scene, y, t) -> Array | None:
+    def quality(self, scene: Scene, y: State, t: Number) -> Array | None:
         """How far the state is from where the method fails (`Parametrization.quality`), None when it never does."""
         return None
 
@@ -131,15 +152,21 @@ class Multipliers(Method):
     def __check_init__(self):
         checked_tolerance(self.rank_tol)
 
-    def acceleration(self, scene, q, v, t, force):
+    def acceleration(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
+    ) -> Array:
         """From `constrained_dynamics`."""
         return dynamics(scene, q, v, t, force, self.rank_tol).acceleration
 
-    def multipliers(self, scene, q, v, t, force):
+    def multipliers(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
+    ) -> Array:
         """From `constrained_dynamics`."""
         return dynamics(scene, q, v, t, force, self.rank_tol).multipliers
 
-    def satisfies(self, scene, q, v, t, force):
+    def satisfies(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
+    ) -> Array:
         """From `constrained_dynamics`."""
         return dynamics(scene, q, v, t, force, self.rank_tol).result != RESULTS.contradictory_rows
 
@@ -153,7 +180,7 @@ class Projected(Multipliers):
     name: ClassVar[str] = "projected"
     projects: ClassVar[bool] = True
 
-    def stepped(self, scene, y, t, error):
+    def stepped(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
         """q and v on the constraints, quaternions of unit length; the error without its part normal to the constraints."""
         errors = () if error is None else (_error_of_place(scene, y["q"], error), error["v"])
         q, v, errors = project_step(scene, y["q"], y["v"], t, errors, self.rank_tol)
@@ -161,12 +188,14 @@ class Projected(Multipliers):
             error = error | {"q": velocity_to_rate(scene.system, q, errors[0]), "v": errors[1]}
         return y | {"q": q, "v": v}, error
 
-    def corrected(self, scene, y, t):
+    def corrected(self, scene: Scene, y: State, t: Number) -> State:
         """q and v on the constraints."""
         q, v = self.onto_constraints(scene, y["q"], y["v"], t)
         return y | {"q": q, "v": v}
 
-    def onto_constraints(self, scene, q, v, t):
+    def onto_constraints(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> tuple[Array, Array]:
         """By the programs that correct a step."""
         none = jnp.zeros_like(v)
         return project_step(scene, q, v, t, (none, none), self.rank_tol)[:2]
@@ -189,7 +218,9 @@ class Baumgarte(Multipliers):
     def __init__(self, alpha: Numbers = 10.0, beta: Numbers = 10.0):
         self.alpha, self.beta = jnp.asarray(alpha, float), jnp.asarray(beta, float)
 
-    def acceleration(self, scene, q, v, t, force):
+    def acceleration(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
+    ) -> Array:
         """Under the rows A a = gamma - 2 alpha psi - beta^2 phi."""
         row, holonomic = rows(scene, q, v, t), holonomic_rows(layout(scene))
         alpha, beta = self.alpha.astype(q.dtype), self.beta.astype(q.dtype)
@@ -218,7 +249,7 @@ class Reduced(Method):
     name: ClassVar[str] = "reduced"
     projects: ClassVar[bool] = True
 
-    def __init__(self, basis: Any = None, *, dof: int | None = None):
+    def __init__(self, basis: BasisLike | None = None, *, dof: int | None = None):
         given = callable(basis) and not isinstance(basis, Basis)
         self.basis = Given(as_pytree(basis, "basis")) if given else basis
         self.dof = dof
@@ -229,7 +260,7 @@ class Reduced(Method):
         return Reduced(basis, dof=dof if self.dof is None else self.dof)
 
     @property
-    def step_constants(self):
+    def step_constants(self) -> tuple[str, ...]:
         """The reference of an orthonormal basis."""
         return ("frame",) if self.basis is None or isinstance(self.basis, Orthonormal) else ()
 
@@ -239,7 +270,7 @@ class Reduced(Method):
     def _at(self, scene, y, q, t):
         return self._basis(y).at(scene, q, t)
 
-    def start(self, scene, q, v, t):
+    def start(self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> State:
         """q, nu and, for an orthonormal basis, its reference."""
         y = {"q": q}
         if self.step_constants:
@@ -247,20 +278,30 @@ class Reduced(Method):
             y["frame"] = reference.astype(q.dtype)
         return y | {"nu": minimal_velocity(self._at(scene, y, q, t), v)}
 
-    def to_qv(self, scene, y, t):
+    def to_qv(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array]:
         """q, with unit quaternions, and v = N nu + v0."""
         q = retract(scene.system, y["q"])
         basis = self._at(scene, y, q, t)
         return q, _product(basis.N, y["nu"]) + basis.v0
 
-    def evaluated(self, scene, y, t, generalized_force):
+    def evaluated(
+        self, scene: Scene, y: State, t: Number, generalized_force: Callable[[Array, Array, Number], Array | None]
+    ) -> tuple[State, Array | None, Array]:
         """From the reduced equations, which share one factorisation of the rows with v."""
         q = retract(scene.system, y["q"])
         motion = moving(scene, self._basis(y), q, y["nu"], t)
         force = generalized_force(q, motion.v, t)
         return self._rates(scene, y, motion, q, t, force), force, motion.v
 
-    def rates(self, scene, y, q, v, t, force):
+    def rates(
+        self,
+        scene: Scene,
+        y: State,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        force: Float[Array, " nv"] | None,
+    ) -> State:
         """From the reduced equations; v is found anew."""
         return self._rates(scene, y, moving(scene, self._basis(y), q, y["nu"], t), q, t, force)
 
@@ -269,15 +310,17 @@ class Reduced(Method):
         fixed = {name: jnp.zeros_like(y[name]) for name in self.step_constants}
         return {"q": velocity_to_rate(scene.system, q, motion.v), "nu": reduced.nu_rate} | fixed
 
-    def acceleration(self, scene, q, v, t, force):
+    def acceleration(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
+    ) -> Array:
         """Rate of v."""
         return dynamics(scene, q, v, t, force).acceleration
 
-    def corrects(self, scene):
+    def corrects(self, scene: Scene) -> bool:
         """Where there are holonomic rows, quaternions, or a reference to be renewed."""
         return bool(holonomic_rows(layout(scene)).size or self.step_constants or retracts(scene.system))
 
-    def stepped(self, scene, y, t, error):
+    def stepped(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
         """q on the holonomic constraints, its error without the part normal to them; nu stays."""
         if not holonomic_rows(layout(scene)).size:
             return super().stepped(scene, y, t, error)
@@ -287,11 +330,11 @@ class Reduced(Method):
             error = error | {"q": velocity_to_rate(scene.system, q, errors[0])}
         return y | {"q": q}, error
 
-    def continued(self, scene, y, t):
+    def continued(self, scene: Scene, y: State, t: Number) -> State:
         """N(q) as the new reference, which leaves N(q) and nu as they are."""
         return y | {"frame": self._at(scene, y, y["q"], t).N} if self.step_constants else y
 
-    def quality(self, scene, y, t):
+    def quality(self, scene: Scene, y: State, t: Number) -> Array | None:
         """Of N at the state."""
         return self._at(scene, y, retract(scene.system, y["q"]), t).quality
 
@@ -321,7 +364,7 @@ class Variational(Multipliers):
     name: ClassVar[str] = "variational"
     projects: ClassVar[bool] = True
 
-    def stepper(self, solver, stepsize):
+    def stepper(self, solver: Solver, stepsize: Stepsize) -> Solver:
         """Its own. **Raises:** ValueError for another one, and for steps that are not fixed."""
         if solver is not None:
             raise ValueError(
@@ -334,11 +377,13 @@ class Variational(Multipliers):
             )
         return Stepper()
 
-    def begin(self, scene: Scene, y, t) -> variational.Carried:
+    def begin(self, scene: Scene, y: State, t: Number) -> variational.Carried:
         """What the first step takes beside y."""
         return variational.begin(scene, *self.to_qv(scene, y, t), t, self.rank_tol)
 
-    def advance(self, scene: Scene, y, t0, t1, carried: variational.Carried, generalized_force: Callable):
+    def advance(
+        self, scene: Scene, y: State, t0: Number, t1: Number, carried: variational.Carried, generalized_force: Callable
+    ) -> tuple[State, Array, variational.Carried, Array]:
         """y at t1, the mean velocity of the step, the state of the method, and whether the step succeeded."""
         stepped = variational.step(scene, y["q"], y["v"], carried, t0, t1, generalized_force, self.rank_tol)
         mean, y1 = stepped.carried.mean, {"q": stepped.q, "v": stepped.v}
@@ -347,15 +392,17 @@ class Variational(Multipliers):
             y1 = y1 | {"work": y["work"] + done}
         return y1, mean, stepped.carried, stepped.solved
 
-    def acceleration(self, scene, q, v, t, force):
+    def acceleration(
+        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
+    ) -> Array:
         """Of the continuous motion."""
         return (super() if scene.constraints else Free()).acceleration(scene, q, v, t, force)
 
-    def corrects(self, scene):
+    def corrects(self, scene: Scene) -> bool:
         """No: steps end on the constraints."""
         return False
 
-    def corrected(self, scene, y, t):
+    def corrected(self, scene: Scene, y: State, t: Number) -> State:
         """Between steps: q and v on the constraints."""
         if not scene.constraints:
             return y

@@ -5,15 +5,13 @@ returned to unit length at the end of every step (`ProjectedSolver`), which keep
 without quaternions gets no projection at all.
 """
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, is_known, specialized
 from jaxdyn.contact.unilateral import has_modes
@@ -21,6 +19,7 @@ from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
+from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.hybrid import motion as hybrid
 from jaxdyn.simulation.methods import Method
 from jaxdyn.simulation.motion import motion
@@ -28,6 +27,8 @@ from jaxdyn.simulation.outputs import checked_outputs
 from jaxdyn.simulation.solution import Solution, raise_failure
 from jaxdyn.simulation.solvers import Stepper
 from jaxdyn.simulation.solvers.choice import (
+    Solver,
+    Stepsize,
     checked_adjoint,
     checked_method,
     checked_step_limit,
@@ -44,13 +45,6 @@ from jaxdyn.simulation.start import checked_start, chosen_method
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, System, has_followers
 
-if TYPE_CHECKING:
-    Control = Callable[[Array, Array, Array], Array] | controls.Controller | controls.Sampled | None
-    Solver = diffrax.AbstractSolver | Stepper | None
-    Stepsize = ArrayLike | diffrax.AbstractStepSizeController | None
-else:
-    Control = Solver = Stepsize = Any  # looked at below, by errors that name the argument
-
 
 def simulate(
     scene: SceneLike,
@@ -58,10 +52,10 @@ def simulate(
     v0: Numbers,
     ts: Numbers,
     *,
-    control: "Control" = None,
+    control: Control = None,
     method: str | Method = "auto",
-    solver: "Solver" = None,
-    stepsize: "Stepsize" = None,
+    solver: Solver = None,
+    stepsize: Stepsize = None,
     rtol: Numbers = 1e-8,
     atol: Numbers = 1e-8,
     adjoint: str | diffrax.AbstractAdjoint | None = None,

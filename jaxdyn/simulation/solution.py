@@ -1,7 +1,7 @@
 """What a simulation gives back: the motion, how it ended, and in words what to do when it ended early."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
@@ -13,12 +13,17 @@ from jaxdyn.constraints.codes import RESULTS as RESULTS
 from jaxdyn.constraints.codes import Outcome, name_of
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.forces.dissipation import SlidingFriction
+from jaxdyn.model.arguments import FilePath
 from jaxdyn.model.printed import solution_lines
 from jaxdyn.simulation.controls import at_start
 from jaxdyn.simulation.export import as_xarray, write_csv, write_npz
 from jaxdyn.simulation.limits import joint_of
 from jaxdyn.simulation.solvers.choice import for_stiff, known_stiffness, unwrapped
 from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import SceneLike
+
+if TYPE_CHECKING:
+    import xarray
 
 # Names of the codes of diffrax, each also one of ours.
 OF_DIFFRAX = (
@@ -133,7 +138,7 @@ class Solution(Outcome):
     def __str__(self) -> str:
         return solution_lines(self)
 
-    def to_csv(self, path, scene) -> None:
+    def to_csv(self, path: FilePath, scene: SceneLike) -> None:
         """Write the motion as CSV: one row a save point, columns with names and units, every number at full precision.
 
         Columns are `t [s]`, then of each signal that there is: `q_JOINT [rad]`, `v_...`, `a_...` (acceleration), `tau_...`
@@ -147,7 +152,7 @@ class Solution(Outcome):
         """
         write_csv(self, path, scene)
 
-    def to_npz(self, path, scene) -> None:
+    def to_npz(self, path: FilePath, scene: SceneLike) -> None:
         """Write the motion as an archive of NumPy: arrays `t`, `q`, `v`, `a`, `tau`, `multipliers`, `energy`, `pose_FRAME`, ...
 
         Shapes are those of the solution, batched or not. `names` and `units` are JSON texts, by array: `json.loads(str(file
@@ -159,7 +164,7 @@ class Solution(Outcome):
         """
         write_npz(self, path, scene)
 
-    def to_xarray(self, scene) -> Any:
+    def to_xarray(self, scene: SceneLike) -> "xarray.Dataset":
         """The motion as an `xarray.Dataset` over `t` (s), with names as coordinates and units as attributes.
 
         **Arguments:** `scene` as in `to_csv`.

@@ -1,6 +1,7 @@
 """How stiff a scene is: the rates of its linearised motion."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -13,7 +14,7 @@ from jaxdyn.compile import compiled, is_known
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, check_state
+from jaxdyn.model.arguments import Checked, Numbers, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
@@ -67,7 +68,13 @@ def _longest_step(values) -> Array:
     return jnp.min(jnp.where(rest, jnp.inf, stable / jnp.where(rest, jnp.ones_like(size), size)), initial=jnp.inf)
 
 
-def stiffness(scene: SceneLike, q: Numbers, v: Numbers, t: Numbers = 0.0, control: Any = None) -> Stiffness:
+def stiffness(
+    scene: SceneLike,
+    q: Numbers,
+    v: Numbers,
+    t: Numbers = 0.0,
+    control: Checked[Callable[[Array, Array, Array], Array] | None] = None,
+) -> Stiffness:
     """Fastest rates of the motion M da + D dv + K dq = 0 near a state, D = -df/dv and K = -df/dq.
 
     f is the sum of the scene's forces, of `control(q, v, t)` and, for a system that is not a `Model`, of -dV/dq. What

@@ -7,8 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.compile import is_known
+from jaxdyn.model.arguments import Checked, Function, Number
 from jaxdyn.systems.scene import as_pytree
 from jaxdyn.systems.start import check_mass_matrix, place_of
 from jaxdyn.systems.system import System, as_parameter, called, checked_size
@@ -48,13 +50,15 @@ class LagrangianSystem(System):
     parameters: Any = None
     potential: Callable | None = None
 
-    def __init__(self, lagrangian, nq, *, parameters=None, potential=None):
+    def __init__(
+        self, lagrangian: Function, nq: Checked[int], *, parameters: PyTree = None, potential: Function | None = None
+    ):
         self.lagrangian = as_pytree(lagrangian, "lagrangian")
         self.potential = None if potential is None else as_pytree(potential, "potential")
         self.nq = checked_size(nq)
         self.parameters = jax.tree.map(as_parameter, parameters)
 
-    def value(self, q, v, t):
+    def value(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
         """L(q, v, t), (), J; less the potential that is split off."""
         value = self._moving(q, v, t)
         return value if self.potential is None else value - self._held(q, t)
@@ -68,11 +72,11 @@ class LagrangianSystem(System):
     def _momentum(self, q, v, t):
         return jax.grad(self._moving, argnums=1)(q, v, t)
 
-    def mass_matrix(self, q, t):
+    def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv"]:
         """M = d2L/dv2 at v = 0, (nv, nv)."""
         return jax.jacfwd(self._momentum, argnums=1)(q, jnp.zeros_like(q), t)
 
-    def bias_force(self, q, v, t):
+    def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
         """h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq, (nv,)."""
         if self.parameters is None:  # then L knows no time
             _, rate = jax.jvp(lambda q: self._momentum(q, v, t), (q,), (v,))
@@ -81,11 +85,11 @@ class LagrangianSystem(System):
         force = rate - jax.grad(self._moving)(q, v, t)
         return force if self.potential is None else force + jax.grad(self._held)(q, t)
 
-    def gravity_force(self, q, t):
+    def gravity_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nv"]:
         """dV/dq where the potential is split off, else the bias force at rest, (nv,)."""
         return super().gravity_force(q, t) if self.potential is None else jax.grad(self._held)(q, t)
 
-    def coriolis_matrix(self, q, v, t):
+    def coriolis_matrix(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, "nv nv"]:
         """C with C v = h - h(v = 0), (nv, nv): that of the Christoffel symbols, plus the matrix of terms linear in v.
 
         The latter is skew where M does not depend on t: gyroscopic forces of terms of L linear in v.
@@ -94,16 +98,16 @@ class LagrangianSystem(System):
         slope = jax.jacfwd(self.bias_force, argnums=1)
         return 0.5 * (slope(q, v, t) + slope(q, jnp.zeros_like(v), t))
 
-    def kinetic_energy(self, q, v, t):
+    def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
         """v . dL/dv - L(q, v) + L(q, 0), (), J."""
         energy = jnp.sum(v * self._momentum(q, v, t)) - self._moving(q, v, t)
         return energy if self.potential is not None else energy + self._moving(q, jnp.zeros_like(v), t)
 
-    def potential_energy(self, q, t):
+    def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
         """-L(q, 0), or V as split off, (), J."""
         return -self._moving(q, jnp.zeros_like(q), t) if self.potential is None else self._held(q, t)
 
-    def check_start(self, q, v, t) -> None:
+    def check_start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> None:
         """As for any system; also that L is finite, fits nq, and is quadratic in v."""
         if not is_known(self, q, v, t):
             return

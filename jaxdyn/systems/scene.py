@@ -3,17 +3,22 @@
 import functools
 import inspect
 import types
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.model.arguments import as_array, batch_hint, check_system
+from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system
 from jaxdyn.model.printed import scene_lines
+
+if TYPE_CHECKING:
+    Force = Callable[[Any, Array, Array, Array], Array]  # f(system, q, v, t) -> (nv,)
+else:
+    Force = Any  # `as_pytree` looks at it
 
 _FUNCTIONS = types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type, np.ufunc
 
@@ -91,7 +96,13 @@ class Scene(eqx.Module):
     forces: tuple = ()
     cones: Any = None
 
-    def __init__(self, system, constraints=(), forces=(), cones=None):
+    def __init__(
+        self,
+        system: SystemLike,
+        constraints: Checked[Sequence[Any]] = (),
+        forces: Checked[Sequence[Force]] = (),
+        cones: PyTree = None,
+    ):
         check_system(system, "system")
         self.system = system
         self.constraints = _sequence(constraints, "constraints")
@@ -111,7 +122,9 @@ class Scene(eqx.Module):
         """Number of velocity coordinates."""
         return self.system.nv
 
-    def applied_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t=0.0) -> Float[Array, " nv"] | None:
+    def applied_force(
+        self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0
+    ) -> Float[Array, " nv"] | None:
         """Sum of the scene's forces (nv,) in N m or N, or None when it lists none.
 
         **Raises:** ValueError that names a force whose result is not (nv,).

@@ -13,11 +13,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.compile import is_known, run
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Function, batch_hint
+from jaxdyn.model.arguments import Checked, Function, Number, batch_hint
 from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, joint_rates, normalize
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_pytree
@@ -35,45 +35,49 @@ class System(eqx.Module):
         return self.nq
 
     @abc.abstractmethod
-    def mass_matrix(self, q, t) -> Array:
+    def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Array:
         """M(q, t), (nv, nv), symmetric."""
 
     @abc.abstractmethod
-    def bias_force(self, q, v, t) -> Array:
+    def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array:
         """h(q, v, t) in M a + h = tau, (nv,)."""
 
     @abc.abstractmethod
-    def kinetic_energy(self, q, v, t) -> Array:
+    def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array:
         """Kinetic energy, (), J."""
 
     @abc.abstractmethod
-    def potential_energy(self, q, t) -> Array:
+    def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Array:
         """Potential energy, (), J."""
 
-    def gravity_force(self, q, t):
+    def gravity_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nv"]:
         """Bias force at rest, (nv,)."""
         return self.bias_force(q, jnp.zeros_like(q), t)
 
-    def christoffel_symbols(self, q, t):
+    def christoffel_symbols(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv nv"]:
         """Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i), of the first kind, (nv, nv, nv)."""
         return symbols(jax.jacfwd(self.mass_matrix)(q, t))
 
-    def coriolis_matrix(self, q, v, t):
+    def coriolis_matrix(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, "nv nv"]:
         """C_ij = sum_k Gamma_ijk v_k with the Christoffel symbols of M, (nv, nv): dM/dt = C + C^T for constant t."""
         derivative = jax.jacfwd(self.mass_matrix)(q, t)
         rate = jnp.einsum("ijk,k->ij", derivative, v)
         turned = jnp.einsum("ikj,k->ij", derivative, v)
         return 0.5 * (rate + turned - turned.T)
 
-    def inverse_dynamics(self, q, v, a, t):
+    def inverse_dynamics(
+        self, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         """M a + h, (nv,)."""
         return _product(self.mass_matrix(q, t), a) + self.bias_force(q, v, t)
 
-    def forward_dynamics(self, q, v, tau, t):
+    def forward_dynamics(
+        self, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
         """M^-1 (tau - h), (nv,)."""
         return run(_acceleration, self, q, v, tau, t, otherwise=_acceleration)
 
-    def check_start(self, q, v, t) -> None:
+    def check_start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> None:
         """Refuse a state from which no motion can be computed. Nothing is done where a number is traced.
 
         **Raises:** ValueError for a mass matrix that is not finite or not positive definite, with its rank.
@@ -114,17 +118,19 @@ class MetricSystem(System):
     potential: Callable | None = None
     parameters: Any = None
 
-    def __init__(self, metric: Function, nq, *, potential=None, parameters=None):
+    def __init__(
+        self, metric: Function, nq: Checked[int], *, potential: Function | None = None, parameters: PyTree = None
+    ):
         self.metric = as_pytree(metric, "metric")
         self.potential = None if potential is None else as_pytree(potential, "potential")
         self.nq = checked_size(nq)
         self.parameters = jax.tree.map(as_parameter, parameters)
 
-    def mass_matrix(self, q, t):
+    def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv"]:
         """M as given, (nv, nv)."""
         return called(self.metric, (self.nq, self.nq), "metric", (q,), t, self.parameters)
 
-    def bias_force(self, q, v, t):
+    def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
         """h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq, (nv,)."""
 
         def momentum(q, t):
@@ -135,15 +141,15 @@ class MetricSystem(System):
         force = rate - 0.5 * pull(v)[0]
         return force if self.potential is None else force + self.gravity_force(q, t)
 
-    def gravity_force(self, q, t):
+    def gravity_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nv"]:
         """dV/dq, (nv,)."""
         return jnp.zeros_like(q) if self.potential is None else jax.grad(self.potential_energy)(q, t)
 
-    def kinetic_energy(self, q, v, t):
+    def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
         """v . M v / 2, (), J."""
         return 0.5 * jnp.sum(v * _product(self.mass_matrix(q, t), v))
 
-    def potential_energy(self, q, t):
+    def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
         """V as given, (), J; zero when there is none."""
         if self.potential is None:
             return jnp.zeros((), q.dtype)
@@ -171,26 +177,34 @@ class ExplicitSystem(System):
     parameters: Any = None
     _potential: Callable | None = None
 
-    def __init__(self, mass_matrix, bias_force, nq, *, parameters=None, potential=None):
+    def __init__(
+        self,
+        mass_matrix: Function,
+        bias_force: Function,
+        nq: Checked[int],
+        *,
+        parameters: PyTree = None,
+        potential: Function | None = None,
+    ):
         self._mass_matrix = as_pytree(mass_matrix, "mass_matrix")
         self._bias_force = as_pytree(bias_force, "bias_force")
         self._potential = None if potential is None else as_pytree(potential, "potential")
         self.nq = checked_size(nq)
         self.parameters = jax.tree.map(as_parameter, parameters)
 
-    def mass_matrix(self, q, t):
+    def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv"]:
         """M as given, (nv, nv)."""
         return called(self._mass_matrix, (self.nq, self.nq), "mass_matrix", (q,), t, self.parameters)
 
-    def bias_force(self, q, v, t):
+    def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
         """h as given, (nv,)."""
         return called(self._bias_force, (self.nq,), "bias_force", (q, v), t, self.parameters)
 
-    def kinetic_energy(self, q, v, t):
+    def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
         """v . M v / 2, (), J."""
         return 0.5 * jnp.sum(v * _product(self.mass_matrix(q, t), v))
 
-    def potential_energy(self, q, t):
+    def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
         """V as given, (), J. **Raises:** ValueError when it was not."""
         if self._potential is None:
             raise ValueError("this ExplicitSystem has no potential energy; pass potential= when making it")

@@ -1,13 +1,14 @@
 """What to integrate with: the user's options checked and turned into diffrax's objects."""
 
 import importlib.util
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix
+from jax.typing import ArrayLike
 
 from jaxdyn.compile import is_concrete, is_known
 from jaxdyn.model.arguments import batch_hint
@@ -16,8 +17,15 @@ from jaxdyn.simulation.solvers.fixed_steps import ErrorMonitoredSteps
 from jaxdyn.simulation.solvers.lie import LieGroup
 from jaxdyn.simulation.solvers.rk4 import RK4
 from jaxdyn.simulation.solvers.rosenbrock import Rodas5P
+from jaxdyn.simulation.solvers.stepper import Stepper
 from jaxdyn.simulation.time_scales import Stiffness, stiffness
 from jaxdyn.systems.scene import Scene
+
+if TYPE_CHECKING:
+    Solver = diffrax.AbstractSolver | Stepper | None
+    Stepsize = ArrayLike | diffrax.AbstractStepSizeController | None
+else:
+    Solver = Stepsize = Any  # `checked_method` looks at them
 
 ADJOINTS = ("reverse", "direct", "forward", "backsolve")
 # Degree of the dense output of methods that do not bring their own.

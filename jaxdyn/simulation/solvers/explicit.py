@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Bool, PyTree
 
 from jaxdyn.compile import along, any_in_batch, implicit, recompute_unless, run
 from jaxdyn.constraints.projection import enlarged
+from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.projected import ProjectedInterpolation, ProjectedSolver
 
 
@@ -60,22 +61,31 @@ class ExplicitSteps(ProjectedSolver):
     field: Callable = eqx.field(static=True, kw_only=True)
 
     @property
-    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Dense output of the wrapped method, ending at the projected point if there is one."""
         interpolation = partial(_Interpolation, self.solver.interpolation_cls)
         return interpolation if self.project is None else partial(ProjectedInterpolation, interpolation)
 
-    def plan(self, y0) -> "Plan":
+    def plan(self, y0: PyTree) -> "Plan":
         """How steps of states like this one are made."""
         leaves, tree = jax.tree.flatten(y0)
         shapes = tuple(x.shape for x in leaves)
         return Plan(type(self.solver), self.field, self.project, self.step_constants, self.branching, tree, shapes)
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
         """The last stage of the step before, and whether there is one."""
         return jnp.zeros_like(ravel_pytree(y0)[0]), jnp.asarray(False)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: PyTree,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree], PyTree, diffrax.RESULTS]:
         """One step, projected where it ends."""
         start, structure = ravel_pytree(y0)
         plan = self.plan(y0)

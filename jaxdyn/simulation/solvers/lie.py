@@ -1,15 +1,18 @@
 """Steps in the local coordinates of a manifold: any method of an `ODETerm` as a Lie-group method."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, PyTree
 
 from jaxdyn.lie import se2, se3, so3
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.joints import SCREW_KINDS, joint_integrate, joint_rate
 from jaxdyn.model.tree import Model, Topology, _per_joint
 from jaxdyn.simulation.solvers.wrapped import Wrapped
@@ -35,27 +38,37 @@ class LieGroup(Wrapped):
 
     topology: Topology | None = eqx.field(static=True, default=None)
 
-    def fitted(self, system) -> diffrax.AbstractSolver:
+    def fitted(self, system: SystemLike) -> diffrax.AbstractSolver:
         """The method for a system. **Raises:** ValueError for one whose q holds more than the coordinates of joints."""
         if has_followers(system):
             raise ValueError(
                 f"solver is LieGroup and the system a {type(system).__name__}, whose contacts have no local coordinates; "
                 "pass the wrapped method itself"
             )
-        flat = not isinstance(system, Model) or all(kind in SCREW_KINDS for kind in system.topology.kinds)
-        return self.solver if flat else LieGroup(self.solver, system.topology)
+        if isinstance(system, Model) and not all(kind in SCREW_KINDS for kind in system.topology.kinds):
+            return LieGroup(self.solver, system.topology)
+        return self.solver
 
     @property
-    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Dense output of the wrapped method in the coordinates of the step."""
         return functools.partial(_Interpolation, self.solver.interpolation_cls, self.topology)
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
         """State of the wrapped method."""
         terms, z0 = self._local(terms, y0)
         return self.solver.init(terms, t0, t1, z0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: PyTree,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree], PyTree, diffrax.RESULTS]:
         """One step of the wrapped method in the coordinates about its start."""
         topology: Any = self.topology
         local, z0 = self._local(terms, y0)

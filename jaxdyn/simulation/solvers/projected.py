@@ -8,8 +8,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, PyTree
 
 from jaxdyn.constraints.projection import enlarged
+from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.wrapped import Wrapped
 
 _EXPECTED = 10  # times the normal part of the estimated error a projection may move a step
@@ -64,16 +66,18 @@ class ProjectedSolver(Wrapped):
     branching: bool = eqx.field(static=True, default=True)
 
     @property
-    def term_compatible_contr_kwargs(self):
+    def term_compatible_contr_kwargs(self) -> PyTree:
         """As the wrapped method's."""
         return self.solver.term_compatible_contr_kwargs
 
     @property
-    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Dense output of the wrapped method, ending at the projected point."""
         return functools.partial(ProjectedInterpolation, self.solver.interpolation_cls)
 
-    def ended(self, t, y, error, args):
+    def ended(
+        self, t: Number, y: PyTree, error: PyTree, args: PyTree
+    ) -> tuple[PyTree, PyTree, PyTree, diffrax.RESULTS]:
         """A step's result y projected, what that adds to it (zero in `step_constants`), its error, and a result."""
         projected, left, result = self.project(t, y, error, args)
         shift = jax.tree.map(lambda a, b: a - b, projected, y)
@@ -84,11 +88,20 @@ class ProjectedSolver(Wrapped):
             )
         return projected, shift, left, result
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
         """State of the wrapped method."""
         return self.solver.init(terms, t0, t1, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: PyTree,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree], PyTree, diffrax.RESULTS]:
         """One step of the wrapped method, projected."""
         # A first-same-as-last method carries the vector field at the point before projection. It is evaluated anew.
         y1, error, dense_info, solver_state, result = self.solver.step(

@@ -7,6 +7,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxdyn.simulation.solvers.interpolation import StageInterpolation
 
@@ -39,10 +40,10 @@ class RK4(diffrax.AbstractERK):
     )
     interpolation_cls: ClassVar[Callable[..., _Interpolation]] = _Interpolation
 
-    def order(self, terms):
+    def order(self, terms: PyTree) -> int:
         """Order of convergence."""
         return 4
 
-    def error_order(self, terms):
+    def error_order(self, terms: PyTree) -> int:
         """Power of h that the error estimate goes with."""
         return 3

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import lu_factor, lu_solve
+from jaxtyping import Array, Bool, PyTree
 
 from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.interpolation import StageInterpolation
 
 _GAMMA = 0.21193756319429014
@@ -86,19 +88,28 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., _Interpolation]] = _Interpolation
 
-    def order(self, terms):
+    def order(self, terms: PyTree) -> int:
         """Order of convergence."""
         return 5
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
         """There is no state between steps."""
         return None
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: PyTree, t0: Number, y0: PyTree, args: PyTree) -> PyTree:
         """Vector field at one point."""
         return terms.vf(t0, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: PyTree,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree], PyTree, diffrax.RESULTS]:
         """One step from t0 to t1."""
         start, unravel = ravel_pytree(y0)
         h, control = t1 - t0, terms.contr(t0, t1)

@@ -6,6 +6,9 @@ from typing import Any, ClassVar
 import diffrax
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, PyTree
+
+from jaxdyn.model.arguments import Number
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
@@ -52,7 +55,7 @@ class Stepper(diffrax.AbstractSolver):
     term_structure: ClassVar = diffrax.AbstractTerm
 
     @property
-    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Dense output from the step's ends and its mean velocity."""
 
         def interpolation(**given):
@@ -60,19 +63,28 @@ class Stepper(diffrax.AbstractSolver):
 
         return interpolation
 
-    def order(self, terms):
+    def order(self, terms: PyTree) -> int:
         """Order of convergence."""
         return 2
 
-    def init(self, terms, t0, t1, y0, args) -> Any:
+    def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
         """What the first step takes."""
         return self.begin(t0, y0, args)  # pyright: ignore[reportOptionalCall]
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: PyTree, t0: Number, y0: PyTree, args: PyTree) -> PyTree:
         """Vector field at one point."""
         return terms.vf(t0, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: PyTree,
+        t0: Number,
+        t1: Number,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: bool | Bool[Array, ""],
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree], PyTree, diffrax.RESULTS]:
         """One step from t0 to t1; NaN where it failed."""
         y1, mean, carried, solved = self.advance(t0, t1, y0, args, solver_state)  # pyright: ignore[reportOptionalCall]
         y1 = jax.tree.map(lambda y: jnp.where(solved, y, jnp.full_like(y, jnp.nan)), y1)
