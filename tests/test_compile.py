@@ -961,9 +961,9 @@ import jaxdyn as jd
 from jaxdyn.compile import objects
 count, compiled = [], objects._compiled
 objects._compiled = lambda *args: count.append(args) or compiled(*args)
-model = jd.robots.chain(2)
+model = jd.robots.chain(2, mass=1.2345)
 a = jax.jit(lambda *x: jd.forward_dynamics(model, *x))(*[jnp.full(2, 0.1 * k) for k in range(3)])
-told = {"compiled": len(count), "sum": float(a.sum()), "refused": ""}
+told = {"compiled": len(count), "acceleration": a.tolist(), "refused": ""}
 stored = sys.stdin.buffer.read()
 if stored:
     try:
@@ -975,25 +975,34 @@ print(json.dumps(told))
 
 
 @pytest.fixture(scope="module")
-def other_processes(tmp_path_factory):
-    """What two processes say that share a new folder of machine code; the second is given an exported program of this one."""
-    env, told = os.environ | {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}, []
-    is_stored = importlib.util.find_spec("flatbuffers") is not None
-    for stored in (b"", bytes(_exported().serialize()) if is_stored else b""):
-        done = subprocess.run([sys.executable, "-c", SECOND], input=stored, env=env, capture_output=True, timeout=300)
-        assert done.returncode == 0, done.stderr.decode()[-2000:]
-        told.append(json.loads(done.stdout))
-    return told
+def second_process(tmp_path_factory):
+    """An acceleration that this process computed by a kernel, the files that it left in a new folder of machine code, and what
+    a second process says that has the same folder and is given an exported program of this one.
+    """
+    cache, before = tmp_path_factory.mktemp("cache"), (objects._folder, objects._is_off)
+    model = jd.robots.chain(2, mass=1.2345)  # of no other test
+    objects.set_cache_folder(cache / "jaxdyn" / "kernels")
+    try:
+        own = jax.jit(lambda *x: jd.forward_dynamics(model, *x))(*[jnp.full(2, 0.1 * k) for k in range(3)]).tolist()
+    finally:
+        objects._folder, objects._is_off = before
+    files = sorted(path.name for path in cache.rglob("*.o"))
+    stored = bytes(_exported().serialize()) if importlib.util.find_spec("flatbuffers") else b""
+    env, command = os.environ | {"XDG_CACHE_HOME": str(cache)}, [sys.executable, "-c", SECOND]
+    done = subprocess.run(command, input=stored, env=env, capture_output=True, timeout=300)
+    assert done.returncode == 0, done.stderr.decode()[-2000:]
+    assert sorted(path.name for path in cache.rglob("*.o")) == files
+    return own, files, json.loads(done.stdout)
 
 
-def test_exported_programs(other_processes):
+def test_exported_programs(second_process):
     """They run in the process that has their kernels; in another one they say what is missing."""
     x, exported = jnp.linspace(0.1, 0.3, 3), _exported()
     wanted = jnp.sin(x) * 1.234567
     assert_same(exported.call(x), wanted)
     pytest.importorskip("flatbuffers")
     assert_same(jax.export.deserialize(bytearray(exported.serialize())).call(x), wanted)
-    assert "compiled by another process" in other_processes[1]["refused"]
+    assert "compiled by another process" in second_process[2]["refused"]
 
 
 def test_exported_programs_of_a_batch_of_any_size():
@@ -1175,11 +1184,11 @@ def test_the_folder_is_the_users_unless_set(monkeypatch, tmp_path):
         objects._folder, objects._is_off = before
 
 
-def test_a_second_process_compiles_no_kernel(other_processes):
-    first, second = other_processes
+def test_a_second_process_compiles_no_kernel(second_process):
+    own, files, told = second_process
     # The handler holds addresses of its process and is always built.
-    assert first["compiled"] == 2 and second["compiled"] == 1
-    assert first["sum"] == second["sum"]
+    assert len(files) == 1 and told["compiled"] == 1
+    assert own == told["acceleration"]
 
 
 def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
