@@ -36,7 +36,8 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("turning", "in p
 
 def mechanism(name):
     """A scene with loops that are open where the states are: the equations hold there as well."""
-    model = random_tree(5, KINDS, parents=PARENTS)
+    bodies = 7 if name == "few" else 8  # none of whose loops is at the last one
+    model = random_tree(5, KINDS[:bodies], parents=PARENTS[:bodies])
     loops = [loop(a, POSE, b, OTHER, joint, in_plane=name == "in plane") for a, b, joint in JOINTS[name]]
     return Scene(model, loops)
 
@@ -61,7 +62,13 @@ def solved(request):
 
     def wanted(q, v, tau):
         row = rows(scene, q, v)
-        return dense(scene, q, v, tau), mass_matrix(scene.system, q), bias_force(scene.system, q, v), row.A, row.gamma
+        return (
+            solve_rows(scene, q, v, tau, 0.0, row),
+            mass_matrix(scene.system, q),
+            bias_force(scene.system, q, v),
+            row.A,
+            row.gamma,
+        )
 
     program = quick(jax.vmap(computed)).lower(q, v, tau)
     assert "jaxdyn_kernel" in program.as_text()
