@@ -117,18 +117,20 @@ def test_distances_of_bodies_are_those_of_their_eigenvalues():
 
 
 def test_logarithm_of_a_matrix_with_equal_eigenvalues():
-    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+    turn, h = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0], 1e-4
+
+    @jax.jit
+    def compute(matrix, step):
+        here, slope = jax.jvp(distances.symmetric_log, (matrix,), (step,))
+        ahead, behind = (distances.symmetric_log(matrix + s * h * step) for s in (1, -1))
+        return (ahead - behind) / (2 * h), slope, jax.scipy.linalg.expm(here)
+
     for values in ([1.0, 1.0, 1.0, 1.0], [2.0, 2.0, 2.0 + 1e-9, 5.0], [0.1, 0.1, 3.0, 3.1]):
-        matrix = jnp.asarray(turn * np.array(values) @ turn.T)
-        step = jnp.asarray(np.random.default_rng(1).normal(size=(4, 4)))
-        step = step + step.T
-        h = 1e-4
-        ahead, behind = (np.asarray(distances.symmetric_log(matrix + s * h * step)) for s in (1, -1))
-        slope = jax.jvp(distances.symmetric_log, (matrix,), (step,))[1]
-        np.testing.assert_allclose(
-            slope, (ahead - behind) / (2 * h), atol=1e-4
-        )  # differences of second order, 1/0.1^3 h^2
-        np.testing.assert_allclose(jax.scipy.linalg.expm(distances.symmetric_log(matrix)), matrix, atol=1e-13)
+        matrix = turn * np.array(values) @ turn.T
+        step = np.random.default_rng(1).normal(size=(4, 4))
+        difference, slope, back = compute(matrix, step + step.T)
+        np.testing.assert_allclose(slope, difference, atol=1e-4)  # differences of second order, 1/0.1^3 h^2
+        np.testing.assert_allclose(back, matrix, atol=1e-13)
 
 
 def test_barrier_residual_has_one_branch():
