@@ -55,8 +55,14 @@ def rollout(q, v):
     return jd.simulate(model, q, v, times, stepsize=0.01, throw=False).q[-1]
 
 
+many = jax.vmap(dynamics)
+
+
 def size(q, v, tau):
     return jnp.sum(dynamics(q, v, tau) ** 2)
+
+
+gradient = jax.vmap(jax.grad(size, (0, 1, 2)))
 
 
 def fit(scale, q, v, a):
@@ -94,15 +100,15 @@ def compare_all():
     for kind, axis in (("", AUTO), (" explicit", EXPLICIT)):
         mesh = jax.make_mesh((8,), ("batch",), axis_types=(axis,))
         rows = divided(mesh)
-        compare("dynamics" + kind, jax.vmap(dynamics), *rows)
-        compare("gradient" + kind, jax.vmap(jax.grad(size, (0, 1, 2))), *rows)
+        compare("dynamics" + kind, many, *rows)
+        compare("gradient" + kind, gradient, *rows)
         compare("fit" + kind, fit, scale, *rows)
     mesh = jax.make_mesh((8,), ("batch",), axis_types=(AUTO,))
     q, v, _ = rows = divided(mesh)
     compare("rollout", jax.vmap(rollout), q, v)
     compare("shared torque", shared, q, v, states[2][0])
     everywhere = jax.NamedSharding(mesh, jax.P())
-    compare("one of three", jax.vmap(dynamics), jax.device_put(states[0], everywhere), v, states[2])
+    compare("one of three", many, jax.device_put(states[0], everywhere), v, states[2])
     compare("fit in shard_map", local_fit(mesh), scale, *rows)
     here = jax.NamedSharding(mesh, jax.P("batch"))
     factors = jnp.linspace(1.0, 2.0, 16)[:, None]
@@ -114,9 +120,7 @@ def compare_all():
     compare("four-bar in shard_map", local, *start)
     plane = jax.make_mesh((2, 4), ("one", "other"), axis_types=(AUTO, AUTO))
     grid = jax.NamedSharding(plane, jax.P("one", "other"))
-    compare(
-        "two axes", jax.vmap(jax.vmap(dynamics)), *(jax.device_put(x.reshape(4, 4, model.nv), grid) for x in states)
-    )
+    compare("two axes", jax.vmap(many), *(jax.device_put(x.reshape(4, 4, model.nv), grid) for x in states))
 
 
 def compare_cached():

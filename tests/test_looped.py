@@ -79,7 +79,7 @@ def test_long_chains(count, links):
     """With the most bodies of a kernel and more, against the matrix form; which way was taken."""
     model = planar_chain(links)
     q, v, tau = (jnp.asarray(x) for x in np.random.default_rng(0).normal(size=(3, count, links)))
-    run = jax.jit(jax.vmap(lambda *state: dynamics.forward_dynamics(model, *state)))
+    run = quick(jax.vmap(lambda *state: dynamics.forward_dynamics(model, *state)))
     assert ("jaxdyn_kernel" in run.lower(q, v, tau).as_text()) == (links <= dynamics.MAX_BODIES)
     by_matrices = quick(
         jax.vmap(lambda *x: (world_frame.forward_dynamics(model, *x), world_frame.mass_matrix(model, x[0])))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pinocchio_bridge import quick
 
 import jaxdyn as jd
 from jaxdyn.compile import shared
@@ -42,7 +43,7 @@ def test_numbers_that_do_not_vary(monkeypatch, least):
 
     a, b = jnp.array([0.7, -0.3, 2.0]), jnp.asarray(np.random.default_rng(0).normal(size=(11, 2)))
     assert len(called(batch, a, b)) == (2 if least == 1 else 1)
-    for x, y in zip(jax.jit(batch)(a, b), jax.vmap(lambda b: numbers(least, a, b))(b), strict=True):
+    for x, y in zip(jax.jit(batch)(a, b), quick(jax.vmap(lambda b: numbers(least, a, b)))(b), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-14)
     assert len(called(jax.vmap(compute), jnp.stack([a] * 11), b)) == 1  # nothing is shared
 
@@ -62,14 +63,14 @@ def test_dynamics_of_one_model_given_to_a_batch(dtype):
     tolerance = (
         {"rtol": 1e-12, "atol": 1e-11} if dtype == jnp.float64 else {"rtol": 1e-4, "atol": 1e-2}
     )  # of 1e3 rad/s^2
-    one, many = jax.jit(of_one)(arrays, q, v, tau), jax.jit(of_each)(each, q, v, tau)
+    one, many = quick(of_one)(arrays, q, v, tau), quick(of_each)(each, q, v, tau)
     np.testing.assert_allclose(one, many, **tolerance)
 
     def change(masses):
         return jnp.sum(jnp.sin(of_one(eqx.tree_at(lambda m: m.inertias, arrays, masses), q, v, tau)))
 
     if dtype == jnp.float64:
-        gradient = jax.jit(jax.grad(change))(arrays.inertias)
-        step = jnp.asarray(np.random.default_rng(2).normal(size=gradient.shape))
-        forward = jax.jit(lambda x, dx: jax.jvp(change, (x,), (dx,))[1])(arrays.inertias, step)
-        np.testing.assert_allclose(jnp.vdot(gradient, step), forward, rtol=1e-10)
+        step = jnp.asarray(np.random.default_rng(2).normal(size=arrays.inertias.shape))
+        both = quick(lambda x, dx: (jax.grad(change)(x), jax.jvp(change, (x,), (dx,))[1]))
+        gradient, forward = both(arrays.inertias, step)
+        np.testing.assert_allclose(np.vdot(gradient, step), forward, rtol=1e-10)

@@ -109,12 +109,13 @@ def test_constraints_are_closed_after_every_step():
 def test_stop_holds_a_joint_and_never_pulls():
     """Rest is tau/k beyond the limit; leaving, the damper does not hold it back."""
     model, stops = arm(), jd.JointStops(2e3, 20.0)
-    q = jnp.asarray([0.51, 3.0])
-    np.testing.assert_allclose(stops(model, q, jnp.zeros(2), 0.0), [-20.0, 0.0], rtol=1e-12)
-    np.testing.assert_allclose(stops(model, -q, jnp.asarray([-0.1, 0]), 0.0), [22.0, 0.0], rtol=1e-12)
-    np.testing.assert_array_equal(stops(model, q, jnp.asarray([-2.0, 0]), 0.0), [0.0, 0.0])
-    np.testing.assert_array_equal(stops(model, jnp.asarray([0.49, 0.0]), jnp.ones(2), 0.0), [0.0, 0.0])
-    slopes = jax.jacfwd(lambda q: stops(model, q, jnp.zeros(2), 0.0))(q)
+    q, still = np.array([0.51, 3.0]), np.zeros(2)
+    push = jax.jit(lambda q, v: stops(model, q, v, 0.0))
+    np.testing.assert_allclose(push(q, still), [-20.0, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(push(-q, np.array([-0.1, 0])), [22.0, 0.0], rtol=1e-12)
+    np.testing.assert_array_equal(push(q, np.array([-2.0, 0])), [0.0, 0.0])
+    np.testing.assert_array_equal(push(np.array([0.49, 0.0]), np.ones(2)), [0.0, 0.0])
+    slopes = jax.jit(jax.jacfwd(push))(q, still)
     np.testing.assert_allclose(slopes, [[-2e3, 0], [0, 0]])
 
 

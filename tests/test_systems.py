@@ -145,11 +145,11 @@ def test_small_systems_are_solved_without_lapack():
     """Equal to numpy, NaN where not positive definite; in kernels there is no call for each sample."""
     root = np.random.default_rng(5).normal(size=(7, 7))
     whole = root @ root.T + np.eye(7)
+    solve = quick(solve_positive)
     for n in (1, 2, 3, 6, 7):
         right = root[:n, :3]
-        solution = solve_positive(jnp.asarray(whole[:n, :n]), jnp.asarray(right))
-        assert_close(solution, np.linalg.solve(whole[:n, :n], right), 1e-13)
-    assert np.isnan(solve_positive(jnp.asarray([[1.0, 2.0], [2.0, 1.0]]), jnp.ones(2))).all()
+        assert_close(solve(whole[:n, :n], right), np.linalg.solve(whole[:n, :n], right), 1e-13)
+    assert np.isnan(solve(np.asarray([[1.0, 2.0], [2.0, 1.0]]), np.ones(2))).all()
     system, batch = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS), jnp.ones((3, 2))
     motion = jax.jit(jax.vmap(lambda q: dynamics.forward_dynamics(system, q, q, q)))
     assert "lapack" not in motion.lower(batch).as_text()
