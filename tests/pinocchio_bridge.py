@@ -263,9 +263,10 @@ def as_dtype(model: Model, dtype) -> Model:
 
 def _model(topology: Topology, leaves: dict, dtype) -> Model:
     leaves = {name: None if x is None else jnp.asarray(x, dtype) for name, x in leaves.items()}
-    limits = {name: jnp.full((topology.nv,), jnp.inf, dtype) for name in ("velocity_limit", "effort_limit")}
-    for name, bound in (("lower", -jnp.inf), ("upper", jnp.inf)):
-        limits[name] = jnp.full((topology.nq,), bound, dtype)
+    # By numpy, as all of this: XLA would compile a program for every size.
+    limits = {name: jnp.asarray(np.full(topology.nv, np.inf), dtype) for name in ("velocity_limit", "effort_limit")}
+    for name, bound in (("lower", -np.inf), ("upper", np.inf)):
+        limits[name] = jnp.asarray(np.full(topology.nq, bound), dtype)
     return Model(**leaves, **limits, damping=None, friction=None, topology=topology)
 
 

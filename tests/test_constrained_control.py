@@ -60,8 +60,13 @@ def test_wrong_mass_shifts_the_force_by_the_stated_error(pendulum):
     """lam - lam_d = -(A M^-1 A^T)^-1 A M^-1 ((M' - M) a + h' - h), which bounds it."""
     plant, q, v = pendulum
     law = jd.control.HybridForce(scenes.spherical_pendulum(mass=1.6), first_two, circle, KP, KD, force=PRESS)
-    lam = jd.constrained_dynamics(plant, q, v, law(q, v, 0.3), 0.3).multipliers
-    a, A = np.asarray(law.acceleration(q, v, 0.3)), np.asarray(jd.constraint_jacobian(plant, q))
+
+    @quick
+    def compute(q, v):
+        lam = jd.constrained_dynamics(plant, q, v, law(q, v, 0.3), 0.3).multipliers
+        return lam, law.acceleration(q, v, 0.3), jd.constraint_jacobian(plant, q)
+
+    lam, a, A = (np.asarray(x) for x in compute(q, v))
     # M = m 1 and h = (0, 0, m g).
     wrong = 0.3 * a + np.array([0.0, 0.0, 0.3 * 9.81])
     normal = np.linalg.inv(A @ A.T / 1.3) @ A / 1.3
@@ -169,14 +174,16 @@ def test_geometric_and_gauge_invariant_laws_are_equal_for_matched_gains(pendulum
         """J: columns of motions of unit rates of the first two coordinates."""
         return jnp.linalg.inv(jnp.concatenate([q[None], jnp.eye(3)[:2]]))[:, 1:]
 
-    slow = v[:2] - jax.jacfwd(circle)(0.3) + p * (q[:2] - circle(0.3))
-    turning = jax.jvp(motion, (q,), (v,))[1]
-    # M = 1.3 and C = 0, of which the part along the sphere.
-    difference = 1.3 * turning @ slow
-    difference = difference - q * (q @ difference) / (q @ q)
-    np.testing.assert_allclose(hybrid - gauge, difference, atol=1e-10)
+    @quick
+    def compute(q, v):
+        wanted = jax.jacfwd(circle)(0.3) - p * (q[:2] - circle(0.3))
+        # M = 1.3 and C = 0, of which the part along the sphere.
+        difference = 1.3 * jax.jvp(motion, (q,), (v,))[1] @ (v[:2] - wanted)
+        return difference - q * (q @ difference) / (q @ q), motion(q) @ wanted
+
+    difference, v = compute(q, v)
+    np.testing.assert_allclose(np.asarray(hybrid) - np.asarray(gauge), difference, atol=1e-10)
     assert np.abs(difference).max() > 0.01
-    v = motion(q) @ (jax.jacfwd(circle)(0.3) - p * (q[:2] - circle(0.3)))
     np.testing.assert_allclose(*both(q, v, 0.3), atol=1e-10)
 
 
@@ -203,16 +210,17 @@ def test_gauge_invariant_law_gives_its_own_u(pendulum):
         gauge = gauge_invariant(scene, q, v, law(q, v, t), t, dof=2)
         J = jnp.linalg.inv(jnp.concatenate([q[None], jnp.eye(3)[:2]]))[:, 1:]
         s = jax.jacfwd(circle)(t) - p * (q[:2] - circle(t))
-        return gauge, gauge.W.T @ J @ s, gauge.W.T @ J @ (v[:2] - s)
+        a = jd.constrained_dynamics(scene, q, v, law(q, v, t), t).acceleration
+        return gauge, gauge.W.T @ J @ s, gauge.W.T @ J @ (v[:2] - s), a
 
-    gauge, _, eps = at(q, v, t)
-    a = jd.constrained_dynamics(scene, q, v, law(q, v, t), t).acceleration
-    ahead, behind = (at(q + h * v + 0.5 * h * h * a, v + h * a, t + h)[1] for h in (step, -step))
+    gauge, own, eps, a = jax.tree.map(np.asarray, at(q, v, t))
+    q, v = np.asarray(q), np.asarray(v)
+    ahead, behind = (np.asarray(at(q + h * v + 0.5 * h * h * a, v + h * a, t + h)[1]) for h in (step, -step))
     # V2 is carried along: V2^T d/dt (V2 s) = sdot, and Gamma_r = V2^T Gamma V2.
-    want = gauge.V2.T @ ((ahead - behind) / (2 * step) + gauge.Gamma @ gauge.V2 @ gauge.V2.T @ at(q, v, t)[1] - k * eps)
+    want = gauge.V2.T @ ((ahead - behind) / (2 * step) + gauge.Gamma @ gauge.V2 @ gauge.V2.T @ own - k * eps)
     np.testing.assert_allclose(gauge.reduced_force, want, rtol=1e-7)  # of differences
     np.testing.assert_allclose(
-        gauge.Gamma_o @ gauge.reduced_velocity - gauge.Lambda_r.T @ PRESS, gauge.normal_force, rtol=1e-10
+        gauge.Gamma_o @ gauge.reduced_velocity - gauge.Lambda_r.T @ np.asarray(PRESS), gauge.normal_force, rtol=1e-10
     )
 
 
@@ -220,11 +228,10 @@ def test_rank_loss_is_told(pendulum):
     """At the equator the first two coordinates do not tell the motion, and the law says so."""
     scene = pendulum[0]
     law = jd.control.HybridForce(scene, first_two, circle, KP, KD)
-    told = quick(lambda q, v: law.is_regular(q, v))
-    assert bool(told(pendulum[1], pendulum[2]))
-    equator = jnp.asarray([0.6, 0.8, 0.0])
-    assert not bool(told(equator, jnp.zeros(3)))
-    assert np.isfinite(law(equator, jnp.zeros(3))).all()
+    told = quick(lambda q, v: (law.is_regular(q, v), law(q, v)))
+    assert bool(told(pendulum[1], pendulum[2])[0])
+    is_regular, torque = told(jnp.asarray([0.6, 0.8, 0.0]), jnp.zeros(3))
+    assert not bool(is_regular) and np.isfinite(torque).all()
 
 
 def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
@@ -235,14 +242,15 @@ def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
     solution = jd.simulate(scene, q0, v0, TS, control=law, throw=False)
     assert solution.result == jd.RESULTS.control_singular and not bool(solution.success)
     # The row of x is at the angle to the sphere's normal whose sine is |z|.
-    np.testing.assert_allclose(law.regularity(q0, v0), 0.8, rtol=1e-12)
+    np.testing.assert_allclose(quick(lambda q, v: law.regularity(q, v))(q0, v0), 0.8, rtol=1e-12)
 
     def beside(t):
         return 1.5 + decayed(np.array([t]), np.array([-0.9]), np.zeros(1))[0, 0] - np.sqrt(1 - 0.1**2)
 
     time = brentq(beside, 0.0, 2.0, xtol=1e-14)
     np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-7)
-    assert np.isfinite(solution.q[TS < time]).all() and np.isnan(solution.q[TS > time]).all()
+    q, ts = np.asarray(solution.q), np.asarray(TS)
+    assert np.isfinite(q[ts < time]).all() and np.isnan(q[ts > time]).all()
     with pytest.raises(RuntimeError, match=r"lose rank.*least_regularity"):
         jd.simulate(scene, q0, v0, TS, control=law)
 

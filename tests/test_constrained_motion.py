@@ -215,7 +215,7 @@ def test_gradients_through_the_projected_motion():
         return simulate(scene, q * (1.0 + x[1]), speed, ts, stepsize=0.02, adjoint=adjoint).q[-1]
 
     x = jnp.zeros(4)
-    reverse = quick(jax.jacrev(final))(x)
+    reverse = np.asarray(quick(jax.jacrev(final))(x))
 
     @quick
     @jax.vmap
@@ -223,9 +223,11 @@ def test_gradients_through_the_projected_motion():
         """Value, which differences are of, and slope along a direction: one program for both."""
         return jax.jvp(lambda x: final(x, "forward"), (x,), (along,))
 
-    np.testing.assert_allclose(reverse, forward(jnp.zeros((4, 4)), jnp.eye(4))[1].T, atol=1e-12)
-    h = 1e-4
-    run = [forward(k * h * jnp.eye(4), jnp.eye(4))[0] for k in (-2, -1, 1, 2)]
+    h, units = 1e-4, np.eye(4)
+    places = h * np.array([0.0, -2.0, -1.0, 1.0, 2.0])[:, None, None] * units
+    ends, rates = (np.asarray(x).reshape(5, 4, 2) for x in forward(places.reshape(20, 4), np.tile(units, (5, 1))))
+    np.testing.assert_allclose(reverse, rates[0].T, atol=1e-12)
+    run = ends[1:]
     slopes = (8 * (run[2] - run[1]) - (run[3] - run[0])) / (12 * h)
     for k, slope in enumerate(slopes):
         np.testing.assert_allclose(reverse[:, k], slope, atol=1e-9)

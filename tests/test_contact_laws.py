@@ -106,12 +106,13 @@ def test_law_of_a_tip_that_rolls_is_the_printed_one():
         eta, rates = jax.jvp(task, (q,), (v,))
         J_f, J_f_rate = jax.jvp(printed_J_f, (eta,), (rates,))
         pose, J = jd.frame_pose(scene.system, q, "tip"), jd.body_jacobian(scene.system, q, "tip")
-        return law(q, v, t), rates[2:4], J_f, J_f_rate, pose, J, jd.constraint_jacobian(scene, q)
+        rows, contact = jd.constraint_jacobian(scene, q), se3.Ad(se3.inverse(at_contact(ETA).finger.pose))
+        return law(q, v, t), rates[2:4], J_f, J_f_rate, pose, J, rows, contact
 
-    tau, rates, J_f, J_f_rate, pose, J, rows = (np.asarray(x) for x in compute(q, v))
+    tau, rates, J_f, J_f_rate, pose, J, rows, contact = (np.asarray(x) for x in compute(q, v))
     M, turning, weight = body_forces(J_f @ rates, pose)
     wanted = np.array([np.cos(t), 0.2]) - kp * (rates - np.asarray(rates_goal(t)))
-    A = A1 @ np.asarray(se3.Ad(se3.inverse(at_contact(ETA).finger.pose)))
+    A = A1 @ contact
     # The same forces by the printed rows, which span those of the scene.
     printed = np.linalg.lstsq((A @ J).T, rows.T @ np.asarray(lam), rcond=None)[0]
     np.testing.assert_allclose((A @ J).T @ printed, rows.T @ np.asarray(lam), atol=1e-12)

@@ -31,7 +31,7 @@ def problems(count, seed, *, cones=True, feasible=True):
     S = random.normal(size=(count, CONES, 3, N)) * (1.0 if cones else 0.0)
     y = random.normal(size=(count, CONES, 3))
     y[..., 0] = np.linalg.norm(y[..., 1:], axis=-1) + 0.3 * random.exponential(size=y.shape[:2])
-    return tuple(map(jnp.asarray, (Q, q, G, h, A, b, S, np.einsum("bkdn,bn->bkd", S, inside) + y)))
+    return Q, q, G, h, A, b, S, np.einsum("bkdn,bn->bkd", S, inside) + y
 
 
 def one(Q, q, G, h, A, b, S, c):
@@ -43,7 +43,7 @@ many = quick(jax.vmap(one))
 
 def largest_residual(data, computed):
     """Largest violation of the conditions of optimality, of numbers of order one to ten."""
-    Q, q, G, h, A, b, S, c = (np.asarray(x) for x in data)
+    Q, q, G, h, A, b, S, c = data
     x, z, y, w = (
         np.asarray(v)
         for v in (computed.x, computed.multipliers, computed.equality_multipliers, computed.cone_multipliers[0])
@@ -84,7 +84,7 @@ def test_agrees_with_clarabel():
     settings.verbose, settings.tol_gap_abs, settings.tol_gap_rel, settings.tol_feas = False, 1e-12, 1e-12, 1e-12
     kinds = [clarabel.ZeroConeT(2), clarabel.NonnegativeConeT(ROWS), *[clarabel.SecondOrderConeT(3)] * CONES]
     for i in range(100):
-        Q, q, G, h, A, b, S, c = (np.asarray(x[i]) for x in data)
+        Q, q, G, h, A, b, S, c = (part[i] for part in data)
         rows = sparse.csc_matrix(np.concatenate([A[:2], G, S.reshape(-1, N)]))
         level = np.concatenate([b[:2], h, c.ravel()])
         other = clarabel.DefaultSolver(sparse.csc_matrix(np.triu(Q)), q, rows, level, kinds, settings).solve()
@@ -100,12 +100,13 @@ def test_agrees_with_quadprog():
     data = problems(200, 2, cones=False)
     computed = many(*data)
     assert (computed.result == RESULTS.successful).all()
+    x, multipliers = np.asarray(computed.x), np.asarray(computed.multipliers)
     for i in range(200):
-        Q, q, G, h, A, b, _, _ = (np.array(x[i]) for x in data)
+        Q, q, G, h, A, b, _, _ = (part[i] for part in data)
         rows = np.concatenate([A[:2], -G]).T.copy()
         other = quadprog.solve_qp(Q, -q, rows, np.concatenate([b[:2], -h]), 2)
-        np.testing.assert_allclose(computed.x[i], other[0], rtol=1e-9, atol=1e-10)
-        np.testing.assert_allclose(computed.multipliers[i], other[4][2:], rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(x[i], other[0], rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(multipliers[i], other[4][2:], rtol=1e-7, atol=1e-8)
 
 
 def test_infeasible_lanes_are_told_and_leave_the_others_alone():
@@ -113,7 +114,7 @@ def test_infeasible_lanes_are_told_and_leave_the_others_alone():
     computed = many(*data)
     is_feasible = []
     for i in range(200):
-        _, _, G, h, A, b, _, _ = (np.asarray(x[i]) for x in data)
+        _, _, G, h, A, b, _, _ = (part[i] for part in data)
         is_feasible.append(linprog(np.zeros(N), G, h, A[:2], b[:2], bounds=(None, None)).status == 0)
     is_feasible = np.array(is_feasible)
     assert 10 < is_feasible.sum() < 190
@@ -122,7 +123,9 @@ def test_infeasible_lanes_are_told_and_leave_the_others_alone():
     assert np.isfinite(computed.x).all()
     # Contradicting equality rows, and a matrix that is not positive definite, in single lanes of a batch.
     Q, q, G, h, A, b, S, c = problems(3, 4)
-    computed = many(Q.at[1].multiply(-1), q, G, h, A, b.at[2, 2].add(1.0), S, c)
+    Q[1] *= -1
+    b[2, 2] += 1.0
+    computed = many(Q, q, G, h, A, b, S, c)
     assert [str(computed.result == code) for code in (RESULTS.successful, RESULTS.indefinite, RESULTS.infeasible)] == [
         str(np.arange(3) == i) for i in range(3)
     ]
@@ -131,11 +134,11 @@ def test_infeasible_lanes_are_told_and_leave_the_others_alone():
 def test_derivatives_are_those_of_differences():
     data = problems(200, 1)
     random = np.random.default_rng(5)
-    change = [jnp.asarray(0.3 * random.normal(size=x.shape)) for x in data]
+    change = [0.3 * random.normal(size=x.shape) for x in data]
     # Equality rows stay consistent, or there is no solution to differentiate.
-    change[4] = change[4].at[:, 2].set(change[4][:, 0] + change[4][:, 1])
-    change[5] = change[5].at[:, 2].set(change[5][:, 0] + change[5][:, 1])
-    change, weights = tuple(change), jnp.asarray(random.normal(size=(200, N)))
+    for rows in change[4:6]:
+        rows[:, 2] = rows[:, 0] + rows[:, 1]
+    change, weights = tuple(change), random.normal(size=(200, N))
 
     @quick
     @jax.vmap
@@ -144,12 +147,13 @@ def test_derivatives_are_those_of_differences():
         return jax.jvp(value, data, change)[1], jax.grad(lambda data: value(*data))(data)
 
     forward, gradients = slopes(data, change, weights)
-    reverse = sum(np.sum((g * d).reshape(200, -1), 1) for g, d in zip(gradients, change, strict=True))
+    forward = np.asarray(forward)
+    reverse = sum(np.sum((np.asarray(g) * d).reshape(200, -1), 1) for g, d in zip(gradients, change, strict=True))
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9)
 
     def at(step):
         computed = many(*(x + step * d for x, d in zip(data, change, strict=True)))
-        return np.sum(weights * computed.x, 1)
+        return np.sum(weights * np.asarray(computed.x), 1)
 
     def difference(step):
         return (8 * (at(step) - at(-step)) - at(2 * step) + at(-2 * step)) / (12 * step)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pinocchio_bridge import random_tree
+from pinocchio_bridge import quick, random_tree
 
 import jaxdyn as jd
 from jaxdyn import scenes
@@ -111,11 +111,14 @@ def test_feedback_of_the_multipliers_is_solved():
     q0, v0 = scenes.spherical_pendulum.start()
     law = Feedback(scene, jnp.asarray(0.8))
     solution = jd.simulate(scene, q0, v0, TS, control=law, outputs=("multipliers", "torque"), stepsize=0.01)
-    again = jax.vmap(lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).multipliers)(
-        solution.q, solution.v, solution.torque
-    )
+
+    @quick
+    @jax.vmap
+    def compute(q, v, tau, lam):
+        return jd.constrained_dynamics(scene, q, v, tau).multipliers, law(q, v, 0.0, None, lam)
+
+    again, told = compute(solution.q, solution.v, solution.torque, solution.multipliers)
     np.testing.assert_allclose(solution.multipliers, again, rtol=1e-10)
-    told = jax.vmap(lambda q, v, lam: law(q, v, 0.0, None, lam))(solution.q, solution.v, solution.multipliers)
     np.testing.assert_allclose(solution.torque, told, rtol=1e-10)
 
 

@@ -373,7 +373,7 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
         jaxpr = str(jax.make_jaxpr(lambda m, q, f=function: f(m, q))(bare, q))
         assert "dot_general" not in jaxpr and "sin" not in jaxpr
         np.testing.assert_array_equal(
-            function(bare, q), jnp.zeros(model.nv if function is dynamics.gravity_force else ())
+            function(bare, q), np.zeros(model.nv if function is dynamics.gravity_force else ())
         )
 
 
@@ -457,12 +457,14 @@ def test_every_quantity_has_derivatives_in_every_leaf():
     def moved(step):
         return jax.tree.map(lambda x, d: jnp.asarray(np.asarray(x) + step * np.asarray(d)), at, along)
 
-    value = quick(function)
-    ahead, back = value(*moved(h)), value(*moved(-h))
-    forward = quick(lambda at, along: jax.jvp(function, at, along)[1])(at, along)
+    @quick
+    def first(at, along):
+        return *jax.jvp(function, at, along), jax.vjp(function, *at)[1](weights)
+
+    ahead, back = (np.asarray(first(moved(step), along)[0]) for step in (h, -h))
+    _, forward, gradient = first(at, along)
     # Central differences: h^2 and eps / h, both about 1e-10, times third derivatives and values of some hundred.
     assert_close(forward, (ahead - back) / (2 * h), 1e-7)
-    gradient = quick(lambda at: jax.vjp(function, *at)[1](weights))(at)
     pairs = zip(jax.tree.leaves(gradient), jax.tree.leaves(along), strict=True)
     assert_close(sum(np.vdot(g, d) for g, d in pairs), weights @ forward, 1e-10)
     for name, part in gradient[0].items():
@@ -475,7 +477,7 @@ def test_every_quantity_has_derivatives_in_every_leaf():
 
     _, hessian = second(at, along)
     (ahead, _), (back, _) = second(moved(h), along), second(moved(-h), along)
-    differences = jax.tree.map(lambda a, b: np.asarray(a - b) / (2 * h), ahead, back)
+    differences = jax.tree.map(lambda a, b: (np.asarray(a) - np.asarray(b)) / (2 * h), ahead, back)
     for got, want in zip(jax.tree.leaves(hessian), jax.tree.leaves(differences), strict=True):
         assert_close(got, want, 1e-5)
 

@@ -46,6 +46,10 @@ def evaluate(force, model, q, v):
     return force(model, q, v, 0.0)
 
 
+APPLIED = quick(lambda scene, q, v: scene.applied_force(q, v))
+DIFFERENCE = quick(difference)
+
+
 def push(system, q, v, t):
     return jnp.zeros_like(v).at[system.joint_names.index("shake")].set(0.9 * jnp.cos(2.3 * t))
 
@@ -147,11 +151,12 @@ def test_spring_and_drive_move_along_the_manifold(arm):
     q, v = sample(arm, 3)
     rest, _ = sample(arm, 7)
     np.testing.assert_allclose(
-        evaluate(JointSpring(2.0, rest), arm, q, v), -2 * quick(difference)(arm, rest, q), rtol=1e-14
+        evaluate(JointSpring(2.0, rest), arm, q, v), -2 * np.asarray(DIFFERENCE(arm, rest, q)), rtol=1e-14
     )
     # A drive pulls along the twist from q to the target; the spring's twist from its rest is the opposite one.
     drive = evaluate(Drive(2.0, 0.3, rest, target_velocity=0.7), arm, q, v)
-    np.testing.assert_allclose(drive, 2 * quick(difference)(arm, q, rest) + 0.3 * (0.7 - v), rtol=0, atol=1e-13)
+    along = np.asarray(DIFFERENCE(arm, q, rest))
+    np.testing.assert_allclose(drive, 2 * along + 0.3 * (0.7 - np.asarray(v)), rtol=0, atol=1e-13)
     place = slice(6, 10)  # the spherical and the revolute joint
 
     def energy(step):
@@ -253,23 +258,21 @@ def test_derivatives():
 def test_scenes_are_arguments_and_batches(arm):
     """A scene of library forces is an array pytree for jit, and vmap reaches its leaves."""
     q, v = sample(arm, 11)
-    applied = quick(lambda scene: scene.applied_force(q, v))
-    coefficients = jnp.asarray([0.0, 0.3, 2.0])
-    scenes = jax.vmap(lambda c: all_forces(arm, c))(coefficients)
+    coefficients = np.array([0.0, 0.3, 2.0])
+    scenes = jax.vmap(lambda c: all_forces(arm, c))(jnp.asarray(coefficients))
     axes = jax.tree.map(lambda x, y: 0 if x.ndim > y.ndim else None, scenes, all_forces(arm, 0.0))
     batch = quick(jax.vmap(lambda scene: scene.applied_force(q, v), (axes,)))(scenes)
-    one_by_one = [applied(all_forces(arm, c)) for c in coefficients]
+    one_by_one = [APPLIED(all_forces(arm, c), q, v) for c in coefficients]
     np.testing.assert_allclose(batch, one_by_one, rtol=1e-13)
 
 
 def test_float32(arm):
-    applied = quick(lambda scene, q, v: scene.applied_force(q, v))
     single = jax.tree.map(lambda x: x.astype(jnp.float32), arm)
     q, v = sample(arm, 11)
     scene = all_forces(single, 0.7)
-    value = applied(scene, q.astype(jnp.float32), v.astype(jnp.float32))
+    value = APPLIED(scene, q.astype(jnp.float32), v.astype(jnp.float32))
     assert value.dtype == jnp.float32
-    reference = applied(all_forces(arm, 0.7), q, v)
+    reference = np.asarray(APPLIED(all_forces(arm, 0.7), q, v))
     np.testing.assert_allclose(value, reference, rtol=0, atol=2e-5 * np.abs(reference).max())
 
 

@@ -239,11 +239,12 @@ def test_outputs_are_those_of_the_saved_states(driven, leg):
     computed = solution.energy, solution.power, solution.acceleration, solution.poses["foot"]
     for x, y in zip(computed, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-12)
-    rate = (solution.v[:-4] - 8 * solution.v[1:-3] + 8 * solution.v[3:-1] - solution.v[4:]) / (12 * 0.005)
-    scale = np.abs(solution.acceleration[102:]).max()
-    np.testing.assert_allclose(rate[100:], solution.acceleration[102:-2], rtol=0, atol=1e-4 * scale)
-    np.testing.assert_allclose(np.linalg.norm(solution.q[:, :4], axis=1), 1, rtol=4e-16)
-    np.testing.assert_array_equal(solution.q[0, 4:], Q0[4:])
+    q, v, acceleration = (np.asarray(x) for x in (solution.q, solution.v, solution.acceleration))
+    rate = (v[:-4] - 8 * v[1:-3] + 8 * v[3:-1] - v[4:]) / (12 * 0.005)
+    scale = np.abs(acceleration[102:]).max()
+    np.testing.assert_allclose(rate[100:], acceleration[102:-2], rtol=0, atol=1e-4 * scale)
+    np.testing.assert_allclose(np.linalg.norm(q[:, :4], axis=1), 1, rtol=4e-16)
+    np.testing.assert_array_equal(q[0, 4:], Q0[4:])
     assert float(solution.stats["time_reached"]) == 2.0
 
 

@@ -34,6 +34,10 @@ def at_contact(eta):
     return montana(Sphere(RADIUS, poles="y"), Sphere(TIP), eta)
 
 
+# For numbers: one program.
+touching = quick(at_contact)
+
+
 @pytest.fixture(scope="module")
 def solved():
     """What the library computes of both scenes at the start: rows, maps, projections, accelerations."""
@@ -69,13 +73,13 @@ WRENCH = jnp.array([0.4, -1.2, 2.1, 0.03, -0.05, 0.02])
 @pytest.mark.parametrize("kind", KINDS)
 def test_start_is_at_its_contact_coordinates(solved, kind):
     at = solved[kind]
-    pose = np.array(at_contact(ETA).g_of)
+    contact = touching(ETA)
+    pose = np.array(contact.g_of)
     pose[:3, 3] += [0.5, 0.0, 0.0]
     np.testing.assert_allclose(at["pose"], pose, atol=1e-14)
     sliding = (*SLIDE, 0.0, *ROLLING, SPIN) if kind == "frictionless" else (0.0, 0.0, 0.0, *ROLLING, 0.0)
-    np.testing.assert_allclose(
-        se3.Ad_inv_apply(at_contact(ETA).finger.pose, jnp.asarray(at["twist"])), sliding, atol=1e-13
-    )
+    twist = quick(se3.Ad_inv_apply)(contact.finger.pose, jnp.asarray(at["twist"]))
+    np.testing.assert_allclose(twist, sliding, atol=1e-13)
 
 
 def test_rows_are_the_printed_ones(solved):
@@ -139,9 +143,15 @@ def printed_J_f(eta):
 
 def test_rolling_motion_is_that_of_the_printed_equations(solved):
     """Equation E22: the two rates of the contact's place on the tip, and four multipliers."""
-    at, kinematics = solved["rolling"], at_contact(ETA)
-    eta_rate = kinematics.rolling @ jnp.asarray(ROLLING)
-    J, J_rate = jax.jvp(printed_J_f, (ETA,), (eta_rate,))
+
+    @quick
+    def compute(eta):
+        kinematics = at_contact(eta)
+        eta_rate = kinematics.rolling @ jnp.asarray(ROLLING)
+        contact = se3.Ad(se3.inverse(kinematics.finger.pose))
+        return eta_rate, *jax.jvp(printed_J_f, (eta,), (eta_rate,)), contact
+
+    at, (eta_rate, J, J_rate, contact) = solved["rolling"], (np.asarray(x) for x in compute(ETA))
     rates = np.asarray(eta_rate[2:4])
     np.testing.assert_allclose(J @ rates, at["twist"], atol=1e-13)
     # alpha_o_dot = M_o^-1 R_psi M_f alpha_f_dot.
@@ -149,8 +159,7 @@ def test_rolling_motion_is_that_of_the_printed_equations(solved):
     c, s = np.cos(ETA[4]), np.sin(ETA[4])
     along = np.diag([1.0, 1.0 / np.cos(ETA[0])]) / RADIUS @ np.array([[c, -s], [-s, -c]]) @ metric @ rates
     np.testing.assert_allclose(eta_rate[:2], along, atol=1e-13)
-    contact = se3.Ad(se3.inverse(kinematics.finger.pose))
-    _, twist_rate, lam = newton_euler(np.asarray(J), np.asarray(J_rate), rates, A1 @ np.asarray(contact), at["pose"])
+    _, twist_rate, lam = newton_euler(J, J_rate, rates, A1 @ contact, at["pose"])
     np.testing.assert_allclose(at["rate"], twist_rate, atol=1e-10)
     # The forces in the tip's axes are the same, whatever the directions without slip.
     np.testing.assert_allclose(at["multipliers"] @ at["rows"], lam @ A1, atol=1e-10)
