@@ -131,7 +131,7 @@ def make_chart(
     numbers = np.asarray(model.inertias, np.float64)
     massive = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()
     bodies = massive if bodies is None else tuple(i for i in massive if i in tuple(bodies))
-    matrices = [_pseudo_inertia(numbers[i]) for i in bodies]
+    matrices = [_f64.pseudo_inertia(numbers[i]) for i in bodies]
     bad = [model.body_names[i] for i, P in zip(bodies, matrices, strict=True) if not _is_feasible(P, inertia)]
     if bad:
         raise ValueError(
@@ -178,13 +178,6 @@ def _own_terms(model: Model) -> dict[str, Array]:
 def positive_terms(terms) -> np.ndarray:
     """(terms, 1) of bool: which terms are zero or above."""
     return np.array([[term in POSITIVE] for term in terms], bool).reshape(len(terms), 1)
-
-
-def _pseudo_inertia(numbers: np.ndarray) -> np.ndarray:
-    """`inertia.pseudo_inertia` in float64: factors of float32 models keep their digits."""
-    rotational = _f64.rotational_inertia(numbers)
-    sigma = 0.5 * np.trace(rotational) * np.eye(3) - rotational
-    return np.block([[sigma, numbers[1:4, None]], [numbers[None, 1:4], numbers[:1, None]]])
 
 
 def _is_feasible(matrix: np.ndarray, inertia: str) -> bool:

@@ -14,8 +14,8 @@ from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.distances import METRICS
 from jaxdyn.identify.picking import across, entries_taken, free_bodies, models_of, root_of, rows_of
 from jaxdyn.identify.sensors import with_sensors
+from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import state_dtype
-from jaxdyn.model.inertia import pseudo_inertia
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
@@ -266,7 +266,7 @@ class Parameters(eqx.Module):
             centre, inverse = np.asarray(centre, float), np.diag(1 / np.asarray(semi_axes, float) ** 2)
             quadrics[k, :3, :3], quadrics[k, :3, 3] = -inverse, inverse @ centre
             quadrics[k, 3, :3], quadrics[k, 3, 3] = inverse @ centre, 1 - centre @ inverse @ centre
-            P = np.asarray(pseudo_inertia(model.inertias[chart.bodies[k]]), np.float64)
+            P = f64.pseudo_inertia(np.asarray(model.inertias, np.float64)[chart.bodies[k]])
             if not np.sum(P * quadrics[k]) > 0:
                 raise ValueError(
                     f"the ellipsoid of {body!r} does not hold the body as it is now; give larger semi-axes"
