@@ -69,7 +69,8 @@ def _rates(values) -> tuple:
     stable = xp.interp(angles, *(xp.asarray(x, size.dtype) for x in _stable_radii()))
     rest = size <= 0
     step = xp.min(xp.where(rest, xp.inf, stable / xp.where(rest, xp.ones_like(size), size)), initial=xp.inf)
-    return xp.max(-values.real, initial=0.0), xp.max(values.imag, initial=0.0), step
+    decay, frequency = (xp.max(x, initial=0.0) + 0.0 for x in (-values.real, values.imag))  # and no -0.0
+    return decay, frequency, step
 
 
 def stiffness(scene: SceneLike, q: Numbers, v: Numbers, t: Numbers = 0.0, control: Any = None) -> Stiffness:
