@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import compiled
 from jaxdyn.identify.friction import POSITIVE, TERMS, Friction, check_terms
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model import inertia as _inertia
@@ -48,12 +49,14 @@ class Chart(eqx.Module):
     terms: tuple[str, ...] = eqx.field(static=True)
     inertia: str = eqx.field(static=True)
 
+    @compiled
     def relative_factors(self, theta: Float[Array, "bodies n"]) -> Float[Array, "bodies 4 4"]:
         """U of every body, relative to the nominal one."""
         fill = jnp.zeros((theta.shape[0], 10 - theta.shape[1]), theta.dtype)  # "mass": alpha alone moves
         steps = jax.vmap(_inertia.log_cholesky_factor)(jnp.concatenate([theta, fill], axis=1))
         return jnp.einsum("bij,bjk->bik", self.origin, steps)
 
+    @compiled
     def inertias(self, theta: Float[Array, "bodies n"]) -> Float[Array, "nb 10"]:
         """The ten numbers of every body."""
         if not self.bodies:
@@ -62,6 +65,7 @@ class Chart(eqx.Module):
         fitted = jax.vmap(_inertia.parameters_from_pseudo)(jnp.einsum("bij,bkj->bik", upper, upper))
         return self.nominal_inertias.at[np.array(self.bodies)].set(fitted)
 
+    @compiled
     def term_values(self, s: Float[Array, "terms nv"]) -> Float[Array, "4 nv"]:
         """Values of all `TERMS`: those fitted at s, the others at the model's value."""
         fitted = self.scale * jnp.where(positive_terms(self.terms), s * s, s)
@@ -71,6 +75,7 @@ class Chart(eqx.Module):
         ]
         return jnp.stack(rows)
 
+    @compiled
     def parameters(self, point: Coordinates) -> Float[Array, " p"]:
         """x (10 nb + 4 nv,), in the order of `parameter_names`."""
         return jnp.concatenate([self.inertias(point.theta).reshape(-1), self.term_values(point.s).reshape(-1)])
@@ -88,6 +93,7 @@ class Chart(eqx.Module):
         )
         return model, Friction(viscous, coulomb, offset, self.v_s)
 
+    @compiled
     def divergence(self, theta: Float[Array, "bodies n"]) -> Float[Array, ""]:
         """Log-det divergence of all bodies from the nominal ones, sum of tr(P0^-1 P) - log det(P0^-1 P) - 4.
 
@@ -97,6 +103,7 @@ class Chart(eqx.Module):
         diagonal = jnp.diagonal(upper, axis1=1, axis2=2)
         return jnp.sum(upper**2) - 2 * jnp.sum(jnp.log(diagonal)) - 4.0 * len(self.bodies)
 
+    @compiled
     def settled(self, point: Coordinates) -> Coordinates:
         """The point with terms below a millionth of their unit at zero, which fits approach without end."""
         tiny = positive_terms(self.terms) & (point.s**2 < 1e-6)
