@@ -10,7 +10,7 @@ from jaxdyn.constraints import Holonomic, rolling_sphere
 from jaxdyn.lie import so3
 from jaxdyn.model import inertia
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.scene import Scene
 
 
@@ -28,7 +28,7 @@ def _turntable_start(radius=0.2, rate=3.0, position=(1.0, 0.0), velocity=(0.0, 0
     slip = -rate * position[1] - velocity[0], rate * position[0] - velocity[1]
     spin = slip[1] / radius, -slip[0] / radius, 0.0
     q = [0.0, *position, radius, 1.0, 0.0, 0.0, 0.0]
-    return jnp.asarray(q), jnp.asarray([rate, *velocity, 0.0, *spin])
+    return as_state(q), as_state([rate, *velocity, 0.0, *spin])
 
 
 @named(_turntable_start)
@@ -50,7 +50,7 @@ def _incline_start(radius=0.1, velocity=(0.0, 0.5)):
     # Rolling: v + w x (-r e_z) = 0.
     x, y = velocity
     q = [0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]
-    return jnp.asarray(q), jnp.asarray([x, y, 0.0, -y / radius, x / radius, 0.0])
+    return as_state(q), as_state([x, y, 0.0, -y / radius, x / radius, 0.0])
 
 
 @named(_incline_start)
@@ -93,7 +93,7 @@ class _Sliding(eqx.Module):
 
 
 def _bowling_start(radius=0.10795, velocity=(8.0, 0.0), spin=(-8 * np.pi, 0.0, 0.0)):
-    return jnp.asarray([0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]), jnp.asarray([*velocity, 0.0, *spin])
+    return as_state([0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]), as_state([*velocity, 0.0, *spin])
 
 
 @named(_bowling_start)

@@ -11,7 +11,7 @@ from jaxdyn.compile import is_concrete
 from jaxdyn.constraints import loop
 from jaxdyn.geometry.immersion import constrain_by_immersion
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import MetricSystem
@@ -112,7 +112,7 @@ def _builder(formulation):
 
 def _double_start(formulation="lagrangian", angles=(0.6, -0.2), rates=(1.1, -0.7), length=1.0):
     _builder(formulation)
-    (theta, phi), (theta_rate, phi_rate) = jnp.asarray(angles, float), jnp.asarray(rates, float)
+    (theta, phi), (theta_rate, phi_rate) = as_leaf(angles), as_leaf(rates)
     if formulation == "model":
         return jnp.stack([theta, phi - theta]), jnp.stack([theta_rate, phi_rate - theta_rate])
     if formulation == "loop":
@@ -168,7 +168,7 @@ class _Applied(eqx.Module):
 
 
 def _disk_start(place=0.1, turn=0.0, link_place=-0.2, tilt=0.3, rates=(0.4, 0.2, -0.1, 0.3)):
-    return jnp.asarray([place, turn, link_place, tilt]), jnp.asarray(rates)
+    return as_state([place, turn, link_place, tilt]), as_state(rates)
 
 
 @named(_disk_start)

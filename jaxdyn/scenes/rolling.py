@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 
@@ -37,7 +37,7 @@ def _disk_start(radius=0.5, heading=0.0, steering=1.0, rolling=2.0):
     xp = numpy_for(heading)
     c, s = xp.cos(heading), xp.sin(heading)
     speed = radius * rolling
-    return jnp.asarray([0.0, 0.0, heading, 0.0]), jnp.asarray([speed * c, speed * s, steering, rolling])
+    return as_state([0.0, 0.0, heading, 0.0]), as_state([speed * c, speed * s, steering, rolling])
 
 
 @named(_disk_start)
@@ -55,7 +55,7 @@ def rolling_disk(*, mass=2.0, radius=0.5, steer_inertia=0.125, roll_inertia=0.25
 
 
 def _sleigh_start(speed=0.2, yaw_rate=1.5):
-    return jnp.zeros(3), jnp.asarray([speed, 0.0, yaw_rate])
+    return as_state(np.zeros(3)), as_state([speed, 0.0, yaw_rate])
 
 
 @named(_sleigh_start)
@@ -74,7 +74,7 @@ def chaplygin_sleigh(*, mass=1.0, inertia_com=0.5, offset=0.3) -> Scene:
 
 
 def _incline_start(yaw_rate=2.0):
-    return jnp.zeros(3), jnp.asarray([0.0, 0.0, yaw_rate])
+    return as_state(np.zeros(3)), as_state([0.0, 0.0, yaw_rate])
 
 
 @named(_incline_start)
@@ -104,7 +104,7 @@ def _coin_start(radius=0.05, circle=0.5, lean=np.pi / 36, gravity=9.81):
     center = (0.0, circle - radius * sine, radius * cosine)
     omega = (0.0, turn * sine + spin, turn * cosine)
     forward = -turn * (circle - radius * sine)
-    return jnp.asarray([*center, *turned]), jnp.asarray([forward, 0.0, 0.0, *omega])
+    return as_state([*center, *turned]), as_state([forward, 0.0, 0.0, *omega])
 
 
 @named(_coin_start)
@@ -130,7 +130,7 @@ class _NoTurn(eqx.Module):
 
 
 def _suslov_start(across=1.0, along=-0.5):
-    return jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray([across, along, 0.0])
+    return as_state([1.0, 0.0, 0.0, 0.0]), as_state([across, along, 0.0])
 
 
 @named(_suslov_start)

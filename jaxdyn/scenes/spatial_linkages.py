@@ -1,12 +1,10 @@
 """Linkages in space that move although counting their joints says that they cannot."""
 
-import jax.numpy as jnp
-
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import loop
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_state, named
 from jaxdyn.scenes.linkages import thin_bar
 from jaxdyn.systems.scene import Scene
 
@@ -34,7 +32,7 @@ def _bennett_start(lengths=(1.0, 0.7), twist=1.1, angle=0.8, rate=1.0):
     k = xp.sin((second + first) / 2) / xp.sin((second - first) / 2)
     follower = 2 * xp.arctan2(k, xp.tan(angle / 2))
     following = -rate * xp.sin(follower) / xp.sin(angle)
-    return jnp.asarray([angle, follower, -angle]), jnp.asarray([rate, following, -rate])
+    return as_state([angle, follower, -angle]), as_state([rate, following, -rate])
 
 
 @named(_bennett_start)

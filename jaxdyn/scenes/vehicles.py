@@ -1,12 +1,11 @@
 """Vehicles on wheels that roll without slipping, or on blades, built from their bodies."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import knife_edge, rolling_wheel
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_state, named
 from jaxdyn.systems.scene import Scene
 
 _AXLE = (np.zeros(3), (-np.pi / 2, 0.0, 0.0))  # z of the wheel along y of the body
@@ -26,7 +25,7 @@ def _bicycle_start(
     yaw_rate = -trail * numpy_for(tilt).cos(tilt) / wheel_base * steer_rate
     q = [0.0, 0.0, rear_radius, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     v = [speed, -rear_radius * roll_rate, 0.0, roll_rate, 0.0, yaw_rate]
-    return jnp.asarray(q), jnp.asarray([*v, speed / rear_radius, steer_rate, speed / front_radius])
+    return as_state(q), as_state([*v, speed / rear_radius, steer_rate, speed / front_radius])
 
 
 @named(_bicycle_start)
@@ -91,7 +90,7 @@ def bicycle(
 def _drive_start(speed=0.5, yaw_rate=0.4, radius=0.1, half_track=0.25):
     speed_difference = yaw_rate * half_track
     spins = [(speed - speed_difference) / radius, (speed + speed_difference) / radius]
-    return jnp.zeros(5), jnp.asarray([speed, 0.0, yaw_rate, *spins])
+    return as_state(np.zeros(5)), as_state([speed, 0.0, yaw_rate, *spins])
 
 
 def _add_wheel(builder, name, parent, mass, radius, place):
@@ -136,7 +135,7 @@ def _car_start(speed=2.0, steer=0.2, steer_rate=0.0, radius=0.15, half_track=0.4
         steer_rate,
         speed / xp.cos(steer) / radius,
     ]
-    return jnp.asarray([0.0, 0.0, 0.0, 0.0, 0.0, steer, 0.0]), jnp.asarray([speed, 0.0, yaw_rate, *spins])
+    return as_state([0.0, 0.0, 0.0, 0.0, 0.0, steer, 0.0]), as_state([speed, 0.0, yaw_rate, *spins])
 
 
 @named(_car_start)
@@ -182,7 +181,7 @@ def car(
 def _snakeboard_start(speed=1.0, angles=(0.3, -0.2), rates=(0.0, 0.0), rotor_rate=1.0, half_length=0.3):
     front, back = (numpy_for(angle).tan(angle) for angle in angles)
     sideways, yaw_rate = speed * (front + back) / 2, speed * (front - back) / (2 * half_length)
-    return jnp.asarray([0.0, 0.0, 0.0, *angles, 0.0]), jnp.asarray([speed, sideways, yaw_rate, *rates, rotor_rate])
+    return as_state([0.0, 0.0, 0.0, *angles, 0.0]), as_state([speed, sideways, yaw_rate, *rates, rotor_rate])
 
 
 @named(_snakeboard_start)
