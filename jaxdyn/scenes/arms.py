@@ -82,10 +82,15 @@ def _sphere_arm_start(
     kinematics = montana(*_surfaces(radius, tip_radius), as_leaf(eta))
     g_of = numpy_for(kinematics.g_of).asarray(kinematics.g_of)
     pose = f64.pose_of(g_of[:3, :3], g_of[:3, 3] + numpy_for(center).asarray(center, float))
-    q = jnp.asarray(_joint_angles(pose, links, height))
-    twist = se3.Ad_apply(kinematics.finger.pose, as_leaf([*slide, 0.0, *rolling, spin]))
+    q = as_state(_joint_angles(pose, links, height))
+    twist = as_leaf([*slide, 0.0, *rolling, spin])
     arm = _six_joints(links, _MASSES, height, tip_radius, 0.0)
-    return q, jnp.linalg.solve(body_jacobian(arm, q, "tip"), twist)
+    return q, _rates_of_tip(arm, q, kinematics, twist)
+
+
+@compiled
+def _rates_of_tip(arm: Model, q, kinematics, twist):
+    return jnp.linalg.solve(body_jacobian(arm, q, "tip"), se3.Ad_apply(kinematics.finger.pose, twist))
 
 
 def _surfaces(radius, tip_radius):
