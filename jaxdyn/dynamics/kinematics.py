@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import is_expanding, numpy_for, run
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.arguments import Given, check_shapes
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model, Topology, geometry
@@ -259,7 +259,7 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
 def _pose_in_body(body: int, tree, q):
     model, offset = tree
     frames = carried(model, q, [body])
-    return _moved(_product(frames.pose[0], offset), frames.origin[0])
+    return _moved(_product(frames.pose[0], jnp.asarray(offset)), frames.origin[0])
 
 
 def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -377,9 +377,9 @@ def _moving(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array,
     return jnp.where(on_path[:, None], rows, jnp.zeros_like(rows))
 
 
-def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Array, rows: Array) -> Float[Array, "nv 6"]:
+def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Given, rows: Array) -> Float[Array, "nv 6"]:
     """Twists of the tree frame (one per coordinate) seen from a frame that stands at `offset` in a body."""
     if body < 0:
         return jnp.zeros_like(rows)
-    pose = _product(tree.pose[body], offset)
+    pose = _product(tree.pose[body], jnp.asarray(offset))
     return jax.vmap(se3.Ad_inv_apply, (None, 0))(pose, _moving(model, body, rows))

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
 from jaxdyn.identify.friction import POSITIVE, TERMS, Friction, check_terms
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model import inertia as _inertia
@@ -49,14 +48,14 @@ class Chart(eqx.Module):
     terms: tuple[str, ...] = eqx.field(static=True)
     inertia: str = eqx.field(static=True)
 
-    @compiled
+    @eqx.filter_jit
     def relative_factors(self, theta: Float[Array, "bodies n"]) -> Float[Array, "bodies 4 4"]:
         """U of every body, relative to the nominal one."""
         fill = jnp.zeros((theta.shape[0], 10 - theta.shape[1]), theta.dtype)  # "mass": alpha alone moves
         steps = jax.vmap(_inertia.log_cholesky_factor)(jnp.concatenate([theta, fill], axis=1))
         return jnp.einsum("bij,bjk->bik", self.origin, steps)
 
-    @compiled
+    @eqx.filter_jit
     def inertias(self, theta: Float[Array, "bodies n"]) -> Float[Array, "nb 10"]:
         """The ten numbers of every body."""
         if not self.bodies:
@@ -65,7 +64,7 @@ class Chart(eqx.Module):
         fitted = jax.vmap(_inertia.parameters_from_pseudo)(jnp.einsum("bij,bkj->bik", upper, upper))
         return self.nominal_inertias.at[np.array(self.bodies)].set(fitted)
 
-    @compiled
+    @eqx.filter_jit
     def term_values(self, s: Float[Array, "terms nv"]) -> Float[Array, "4 nv"]:
         """Values of all `TERMS`: those fitted at s, the others at the model's value."""
         fitted = self.scale * jnp.where(positive_terms(self.terms), s * s, s)
@@ -75,7 +74,7 @@ class Chart(eqx.Module):
         ]
         return jnp.stack(rows)
 
-    @compiled
+    @eqx.filter_jit
     def parameters(self, point: Coordinates) -> Float[Array, " p"]:
         """x (10 nb + 4 nv,), in the order of `parameter_names`."""
         return jnp.concatenate([self.inertias(point.theta).reshape(-1), self.term_values(point.s).reshape(-1)])
@@ -93,7 +92,7 @@ class Chart(eqx.Module):
         )
         return model, Friction(viscous, coulomb, offset, self.v_s)
 
-    @compiled
+    @eqx.filter_jit
     def divergence(self, theta: Float[Array, "bodies n"]) -> Float[Array, ""]:
         """Log-det divergence of all bodies from the nominal ones, sum of tr(P0^-1 P) - log det(P0^-1 P) - 4.
 
@@ -103,7 +102,7 @@ class Chart(eqx.Module):
         diagonal = jnp.diagonal(upper, axis1=1, axis2=2)
         return jnp.sum(upper**2) - 2 * jnp.sum(jnp.log(diagonal)) - 4.0 * len(self.bodies)
 
-    @compiled
+    @eqx.filter_jit
     def settled(self, point: Coordinates) -> Coordinates:
         """The point with terms below a millionth of their unit at zero, which fits approach without end."""
         tiny = positive_terms(self.terms) & (point.s**2 < 1e-6)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
 from jaxdyn.dynamics.quantities import bias_force, inverse_dynamics
 from jaxdyn.model.tree import Model
 
@@ -47,7 +46,7 @@ def random_torque(key: Array, size, *, period=2.0, harmonics: int = 3, carry: Mo
     return FourierTorque(cosine, sine, jnp.asarray(period, size.dtype), carry)
 
 
-@compiled
+@eqx.filter_jit
 def _amplitudes(key, size, harmonics: int):
     amplitudes = jax.random.normal(key, (2, harmonics, size.shape[0]), size.dtype) * size[None, None]
     return tuple(amplitudes / np.sqrt(harmonics).astype(size.dtype))
@@ -94,7 +93,7 @@ def random_motion(key: Array, center, size, *, period=10.0, harmonics: int = 5) 
     return FourierMotion(center, cosine, sine, jnp.asarray(period, center.dtype))
 
 
-@compiled
+@eqx.filter_jit
 def _falling_amplitudes(key, size, harmonics: int):
     k = jnp.arange(1, harmonics + 1, dtype=size.dtype)[:, None]
     weight = size[None] / k

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
 from jaxdyn.identify.blocks import Block, Directions, Inertias, Numbers, Poses, Tied
 from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.distances import METRICS
@@ -364,7 +363,7 @@ def picked(system: Any, positive=None, free=None) -> Parameters:
     return tree if free is None else tree.free(free)
 
 
-@compiled
+@eqx.filter_jit
 def _walked(parameters: Parameters, y, asked: str | None):
     """The leaves with the numbers of y, by their places, and what each block says to what it is asked, one after the other."""
     leaves = jax.tree.leaves(parameters.given)
