@@ -13,7 +13,7 @@ from jaxdyn.compile import compiled, is_known, numpy_for
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, check_state
+from jaxdyn.model.arguments import Numbers, check_state, stored
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
@@ -106,7 +106,7 @@ def stiffness(scene: SceneLike, q: Numbers, v: Numbers, t: Numbers = 0.0, contro
         values = np.linalg.eigvals(known)
     else:
         values = jnp.linalg.eigvals(matrix)
-    return Stiffness(*(jnp.asarray(x, matrix.dtype) for x in _rates(values)))
+    return Stiffness(*(stored(x, matrix.dtype) for x in _rates(values)))
 
 
 @compiled
