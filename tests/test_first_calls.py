@@ -218,7 +218,7 @@ def programs():
     """Names of what XLA compiles, as it does."""
     names = []
 
-    def seen(event, _, **of):
+    def seen(event: str, duration_secs: float, **of):
         if event.endswith("backend_compile_duration"):
             names.append(of.get("fun_name"))
 
