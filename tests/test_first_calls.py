@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import monitoring
 
 import jaxdyn as jd
 from jaxdyn import compile as backend
@@ -240,3 +241,68 @@ def test_options_that_do_not_exist_are_refused(monkeypatch):
     monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", "fast")
     with pytest.raises(ValueError, match="JAXDYN_COMPILATION_OPTIONS is 'fast'; choose from 'usual', 'least'"):
         backend.compiled(native(lambda x: jnp.sin(x)))(jnp.ones(2))
+
+
+# --- what is called outside of any trace ---
+
+
+@pytest.fixture
+def programs():
+    """Names of what XLA compiles, as it does."""
+    names = []
+
+    def seen(event: str, duration_secs: float, **of):
+        if event.endswith("backend_compile_duration"):
+            names.append(of.get("fun_name"))
+
+    calls.quick_options()
+    monitoring.register_event_duration_secs_listener(seen)
+    yield names
+    monitoring.unregister_event_duration_listener(seen)
+
+
+def chain(name: str) -> jd.Model:
+    """Two bodies and a frame whose numbers are those of no other test."""
+    builder = jd.ModelBuilder(name, gravity=(0.0, 0.1, -9.7))
+    builder.add_body("one", None, "revolute", (1.3, (0.1, 0.0, 0.2), (0.2, 0.3, 0.25)), pose=(0.0, 0.1, 0.2))
+    builder.add_body("two", "one", "revolute", (0.7, (0.3, 0.0, 0.1), (0.1, 0.2, 0.15)), axis=(0.0, 1.0, 0.0))
+    return builder.add_frame("hand", "two", (0.1, 0.2, 0.3)).build()
+
+
+def test_models_are_built_joined_and_repaired_without_a_program(programs):
+    model = chain("known")
+    both = jd.join(model, model, prefix=("left_", "right_"), pose=(0.0, 1.7, 0.0))
+    flat = both.replace(inertias=np.asarray(both.inertias) * np.where(np.arange(10) < 4, 1.0, 0.1))
+    assert len(jd.inertia_report(flat)) and not jd.inertia_report(jd.repair_inertias(flat))
+    assert programs == []
+
+
+@pytest.mark.parametrize(
+    "of",
+    [
+        lambda model, q: jd.mass_matrix(model, q),
+        lambda model, q: jd.frame_pose(model, q, "hand"),
+        lambda model, q: jd.newton_euler_matrices(model, q, q).G,
+        lambda model, q: jd.geometry.christoffel_symbols(model, q),
+        lambda model, q: jd.geometry.riemann_tensor(model, q),
+    ],
+)
+def test_a_quantity_of_known_numbers_is_one_program(programs, of):
+    """Once: a second call compiles nothing."""
+    model, q = chain("quantities"), jnp.array([0.31, -0.47])
+    programs.clear()
+    first = of(model, q)
+    assert len(programs) == 1, programs
+    programs.clear()
+    np.testing.assert_array_equal(of(model, q), first)
+    assert programs == []
+
+
+def test_degrees_of_freedom_and_rates_are_one_program_each(programs):
+    scene, (q, v) = jd.scenes.slider_crank(), jd.scenes.slider_crank.start()
+    programs.clear()
+    assert jd.degrees_of_freedom(scene, q) == 1 and jd.degrees_of_freedom(scene, q + 0.01) == 1
+    assert programs.count("jit(program)") <= 1 and len(programs) <= 2, programs
+    programs.clear()
+    jd.stiffness(scene, q, v)
+    assert programs.count("jit(program)") <= 1 and len(programs) <= 2, programs

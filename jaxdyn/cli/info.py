@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> None:
 def describe(model: Model, source: str) -> str:
     """The model in words and tables."""
     base = "floating base" if "free" in model.topology.kinds[:1] else "fixed base"
-    mass = float(np.sum(model.inertias[:, 0]))
+    mass = float(np.asarray(model.inertias)[:, 0].sum())
     quaternions = "" if model.nq == model.nv else f" (q has {model.nq} numbers, v has {model.nv})"
     lines = [
         f"{source}: robot {model.name!r}, {base}, {model.nb} moving bodies, {model.nv} degrees of freedom{quaternions}",
@@ -144,19 +144,20 @@ def _gap(constraint, scene: LoadedScene, q) -> str:
 
 
 def _joint_table(model: Model) -> str:
-    topology = model.topology
+    topology, screws = model.topology, np.asarray(model.screws)
+    lower, upper = np.asarray(model.lower), np.asarray(model.upper)
     leaves = {key: getattr(model, key) for key in ("velocity_limit", "effort_limit", "damping", "friction", "armature")}
     shown = {key: np.asarray(value) for key, value in leaves.items() if value is not None}
     rows = []
     for i, (name, kind) in enumerate(zip(model.joint_names, topology.kinds, strict=True)):
         in_q, in_v = topology.q_slices[i], topology.v_slices[i]
-        screw = np.asarray(model.screws[i])
+        screw = screws[i]
         axis = "" if KINDS[kind].nv > 1 else " ".join(f"{x + 0.0:.4g}" for x in screw[:3] if kind == "prismatic")
         axis = axis or ("" if KINDS[kind].nv > 1 else " ".join(f"{x + 0.0:.4g}" for x in screw[3:]))
         parent = "world" if topology.parents[i] < 0 else model.body_names[topology.parents[i]]
         span = f"{in_q.start}" if KINDS[kind].nq == 1 else f"{in_q.start}..{in_q.stop - 1}"
         single = KINDS[kind].nv == 1
-        limits = [short(float(x[in_q.start])) if single else "-" for x in (model.lower, model.upper)]
+        limits = [short(float(x[in_q.start])) if single else "-" for x in (lower, upper)]
         numbers = [short(float(values[in_v.start])) if single else "-" for values in shown.values()]
         rows.append(
             [span, name, kind, UNITS.get(kind, ""), axis, f"{parent} -> {model.body_names[i]}", *limits, *numbers]

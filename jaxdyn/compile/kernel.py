@@ -24,7 +24,7 @@ from jaxdyn.compile import derive, mode, sharding
 from jaxdyn.compile.expand import expand
 from jaxdyn.compile.garbage import uncollected
 from jaxdyn.compile.graph import inlined
-from jaxdyn.compile.known import Known, partition, partition_traced
+from jaxdyn.compile.known import Known, is_known, partition, partition_traced
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
 from jaxdyn.compile.rows import is_row
 from jaxdyn.compile.shared import divided
@@ -84,15 +84,32 @@ def run(
             mode.say_once(f"{_name_of(function)} runs on JAX's own operations: {expanded}")
         return by_jax()
     program, out_structure = expanded
-    results = kernel_p.bind(*(x.reshape(-1) if x.ndim != 1 else x for x in leaves), program=program, rows=0)
-    shaped = [
-        x if len(array.shape) == 1 else x.reshape(array.shape)
-        for x, array in zip(results, program.outputs, strict=True)
-    ]
+    changes_shapes = any(x.ndim != 1 for x in leaves) or any(len(x.shape) != 1 for x in program.outputs)
+    shaped = _at_once(program, leaves) if changes_shapes and is_known(leaves) else _shaped(program, leaves)
     if not served:
         return jax.tree.unflatten(out_structure, shaped)
     entry = program.results[-1][0]
     return jax.tree.unflatten(out_structure, shaped[:-1]), shaped[-1] if type(entry) is not Constant else entry.value
+
+
+def _shaped(program, leaves) -> list:
+    """Results of the program in their shapes, of inputs in any shape."""
+    results = kernel_p.bind(*(x.reshape(-1) if x.ndim != 1 else x for x in leaves), program=program, rows=0)
+    return [
+        x if len(array.shape) == 1 else x.reshape(array.shape)
+        for x, array in zip(results, program.outputs, strict=True)
+    ]
+
+
+def _at_once(program, leaves) -> list:
+    """`_shaped` of known numbers as one program: outside of a trace the kernel and each change of a shape would be one each."""
+    with jax.disable_jit(False):
+        return _jitted_shaped(program)(*leaves)
+
+
+@functools.lru_cache(maxsize=1024)
+def _jitted_shaped(program):
+    return jax.jit(lambda *leaves: _shaped(program, leaves))
 
 
 def compute(function: Callable, tree, *args, static: tuple = (), given: bool = False):

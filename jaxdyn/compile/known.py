@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import Primitive
+from jax.interpreters import mlir
 
 
 def is_concrete(*trees) -> bool:
@@ -20,14 +22,21 @@ def numpy_for(*trees) -> Any:
     return np if is_concrete(*trees) else jnp
 
 
+# Nothing but False, without an operand. Every call outside of a trace asks, which must not cost an operation of XLA.
+_asked_p = Primitive("jaxdyn_asked")
+_asked_p.def_impl(lambda: np.False_)
+_asked_p.def_abstract_eval(lambda: ShapedArray((), np.dtype(bool)))
+mlir.register_lowering(_asked_p, mlir.lower_fun(lambda: jnp.zeros((), bool), multiple_results=False))
+
+
 def is_staged() -> bool:
     """Whether a program is being traced, so that operations on known numbers are traced too."""
-    return isinstance(jnp.zeros(()), Tracer)
+    return isinstance(_asked_p.bind(), Tracer)
 
 
 def is_known(*trees) -> bool:
     """Whether no number is traced, nor would be when computed with."""
-    return not is_staged() and is_concrete(*trees)
+    return is_concrete(*trees) and not is_staged()
 
 
 def constant(tree):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile import is_concrete, specialized
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import checked_tolerance, pseudo_inverse, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes
@@ -42,11 +42,17 @@ def degrees_of_freedom(
     rank_tol = checked_tolerance(rank_tol)
     if not layout(scene):
         return scene.nv
-    A = _scaled_rows(scene, q, t)
-    rank = jnp.round(jnp.trace(_product(A, pseudo_inverse(A, tolerance(rank_tol, A), True)))).astype(jnp.int32)
+    rank = _rank(scene, q, t, rank_tol)
     return scene.nv - int(rank) if is_concrete(rank) else scene.nv - rank
 
 
+@specialized
+def _rank(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
+    A = _scaled_rows(scene, q, t)
+    return jnp.round(jnp.trace(_product(A, pseudo_inverse(A, tolerance(rank_tol, A), True)))).astype(jnp.int32)
+
+
+@specialized
 def _scaled_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     """Rows with distances in units of the mechanism's length, each scaled down to length 1."""
     sizes, length = coordinate_sizes(scene.system, q.dtype)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_concrete
+from jaxdyn.model.arguments import stored
 
 
 def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[Array, "..."]:
@@ -18,11 +19,9 @@ def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[A
     if known is not None and known.dtype == object:
         raise ValueError(f"{what} is {value!r}; give numbers")
     array = value if isinstance(value, jax.Array) else jnp.asarray(value) if known is None else known
-    if like is not None:
-        array = jnp.asarray(array, like)
-    elif not jnp.issubdtype(array.dtype, jnp.floating):
-        array = jnp.asarray(array, float)
-    array = jnp.asarray(array)
+    if like is None:
+        like = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float
+    array = jnp.asarray(array, like) if isinstance(array, jax.Array) else stored(array, like)
     if shape is not None and (
         array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
     ):

@@ -48,7 +48,7 @@ def _jacobian(body: int, tree, q):
     model, offset = tree
     frame = tree_frame(model, q)
     columns = twist_columns(model, frame, body, offset, frame.subspace)
-    turn = _product(frame.pose[body], offset)[:3, :3]
+    turn = _product(frame.pose[body], jnp.asarray(offset))[:3, :3]
     return jnp.concatenate([_product(turn, columns[:, :3].T), _product(turn, columns[:, 3:].T)])
 
 
@@ -75,7 +75,7 @@ def frame_velocity(
 def _velocity(body: int, tree, q, v):
     model, offset = tree
     frame = tree_frame(model, q)
-    twist, lever = body_twists(model, frame, v)[body], _product(frame.pose[body], offset)[:3, 3]
+    twist, lever = body_twists(model, frame, v)[body], _product(frame.pose[body], jnp.asarray(offset))[:3, 3]
     return jnp.concatenate([twist[:3] + cross(twist[3:], lever), twist[3:]])
 
 
@@ -115,6 +115,6 @@ def _acceleration(body: int, tree, q, v, a):
     # The tree's axes are the world's, and its origin is fixed: rates of the twist taken there.
     rate = jnp.sum(twist_columns(model, frame, body, offset, rows), axis=0)
     twist = jnp.sum(twist_columns(model, frame, body, offset, frame.subspace * v[:, None]), axis=0)
-    turn = _product(frame.pose[body], offset)[:3, :3]
+    turn = _product(frame.pose[body], jnp.asarray(offset))[:3, :3]
     linear = rate[:3] + cross(twist[3:], twist[:3])
     return jnp.concatenate([_product(turn, linear[:, None])[:, 0], _product(turn, rate[3:, None])[:, 0]])

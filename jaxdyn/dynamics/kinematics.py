@@ -12,17 +12,17 @@ world's origin is computed exactly as one at home.
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_expanding, run
+from jaxdyn.compile import is_expanding, numpy_for, run
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.arguments import Given, check_shapes
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model, Topology, geometry
@@ -251,13 +251,15 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
     """
     (q,) = check_shapes(model, q=q)
     body, offset = named_frame(model, name)
-    return offset if body < 0 else run(_pose_in_body, (kinematic_part(model), offset), q, static=(body,))
+    if body < 0:
+        return jnp.asarray(offset, model.home.dtype)
+    return run(_pose_in_body, (kinematic_part(model), offset), q, static=(body,))
 
 
 def _pose_in_body(body: int, tree, q):
     model, offset = tree
     frames = carried(model, q, [body])
-    return _moved(_product(frames.pose[0], offset), frames.origin[0])
+    return _moved(_product(frames.pose[0], jnp.asarray(offset)), frames.origin[0])
 
 
 def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -359,12 +361,14 @@ def _groups(topology: Topology) -> list[tuple[str, np.ndarray]]:
     return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]
 
 
-def named_frame(model: Model, name: str | None) -> tuple[int, Float[Array, "4 4"]]:
-    """Body that carries a frame (-1: the world) and the frame's pose in it."""
+def named_frame(model: Model, name: str | None) -> tuple[int, Any]:
+    """Body that carries a frame (-1: the world) and the frame's pose in it, of numpy where it is known."""
     if name is None:
-        return -1, jnp.eye(4, dtype=model.home.dtype)
+        return -1, np.eye(4, dtype=model.home.dtype)
     index = frame_index(model, name)
-    return model.topology.frame_bodies[index], model.frame_poses[index]
+    # A known pose is one of numpy, which is the same number in every call: programs are kept by it.
+    poses = model.frame_poses
+    return model.topology.frame_bodies[index], numpy_for(poses).asarray(poses)[index]
 
 
 def _moving(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:
@@ -373,9 +377,9 @@ def _moving(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array,
     return jnp.where(on_path[:, None], rows, jnp.zeros_like(rows))
 
 
-def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Array, rows: Array) -> Float[Array, "nv 6"]:
+def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Given, rows: Array) -> Float[Array, "nv 6"]:
     """Twists of the tree frame (one per coordinate) seen from a frame that stands at `offset` in a body."""
     if body < 0:
         return jnp.zeros_like(rows)
-    pose = _product(tree.pose[body], offset)
+    pose = _product(tree.pose[body], jnp.asarray(offset))
     return jax.vmap(se3.Ad_inv_apply, (None, 0))(pose, _moving(model, body, rows))

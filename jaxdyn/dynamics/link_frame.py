@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import specialized
 from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
@@ -113,6 +114,11 @@ def newton_euler_matrices(
     Source: EQUATIONS section 4; Park, Bobrow & Ploen (1995), Murray, Li & Sastry (1994) section 4.3.
     """
     q, v = check_shapes(model, q=q, v=v)
+    return _matrices(model, q, v, tip)
+
+
+@specialized
+def _matrices(model: Model, q, v, tip: str | None) -> NewtonEulerMatrices:
     topology, n = model.topology, model.nb
     tip_selector = None if tip is None else _tip_selector(model, tip)
     to_child = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))(relative_poses(model, q))

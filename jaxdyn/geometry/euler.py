@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import compiled
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint
@@ -26,7 +27,7 @@ def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Ar
     section 12.
     """
     given = as_array(inertia, "inertia")
-    inertia = jnp.asarray(given, given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else float)
+    inertia = as_array(given, "inertia", given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else float)
     c, a = as_array(c, "c", inertia.dtype), as_array(a, "a", inertia.dtype)
     if inertia.shape not in ((3, 3), (6, 6)):
         raise ValueError(f"inertia has shape {inertia.shape}; give (3, 3) or (6, 6){batch_hint(inertia, (3, 3))}")
@@ -35,6 +36,11 @@ def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Ar
             raise ValueError(
                 f"{name} has shape {value.shape}, expected {inertia.shape[:1]}{batch_hint(value, inertia.shape[:1])}"
             )
+    return _arnold_form(inertia, c, a)
+
+
+@compiled
+def _arnold_form(inertia, c, a):
     momentum = _product(inertia, c)
     force = so3.cross(momentum, a) if a.shape[0] == 3 else se3.adT_apply(a, momentum)
     return solve_positive(inertia, force)

@@ -9,6 +9,7 @@ Newton's law in these terms: flat(nabla_v v) = F, with a one-form F. Source: EQU
 (1992), Riemannian Geometry, chapters 2 to 4.
 """
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import specialized
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint, check_state, check_system, state_dtype
@@ -33,6 +35,17 @@ else:
     Metric = Any  # `_at` looks at it
 
 
+def _whole(function: Callable) -> Callable:
+    """`function(metric, *args)`, one program for a system. What a plain function captures may change: it is called each time."""
+    program = specialized(function)
+
+    @functools.wraps(function)
+    def call(metric, *args):
+        return (program if isinstance(metric, (Model, System)) else function)(metric, *args)
+
+    return call
+
+
 def flat(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
     """One-form of a vector, g(q) v: the momentum of a velocity, the force of an acceleration.
 
@@ -47,7 +60,11 @@ def sharp(metric: Metric, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float
 
     **Arguments:** `metric` as above; `q`, `p` (n,). **Returns:** (n,); NaN where g is not positive definite.
     """
-    q, p = _vectors(metric, q=q, p=p)
+    return _sharp(metric, *_vectors(metric, q=q, p=p))
+
+
+@_whole
+def _sharp(metric, q, p):
     return solve_positive(_at(metric)(q), p)
 
 
@@ -62,7 +79,11 @@ def christoffel_symbols(metric: Metric, q: Float[Array, " n"], kind: str = "seco
     """
     if kind not in KINDS:
         raise ValueError(f"kind is {kind!r}; choose from {', '.join(KINDS)}")
-    (q,) = _vectors(metric, q=q)
+    return _symbols(metric, *_vectors(metric, q=q), kind)
+
+
+@_whole
+def _symbols(metric, q, kind):
     g = _at(metric)
     first = symbols(jax.jacfwd(g)(q))
     return first if kind == "first" else solve_positive(g(q), first.reshape(q.shape[0], -1)).reshape(first.shape)
@@ -75,7 +96,11 @@ def connection(
 
     **Arguments:** `metric` as above; `q`, `v`, `w` (n,). **Returns:** (n,).
     """
-    q, v, w = _vectors(metric, q=q, v=v, w=w)
+    return _connection(metric, *_vectors(metric, q=q, v=v, w=w))
+
+
+@_whole
+def _connection(metric, q, v, w):
     g = _at(metric)
     _, along_v = jax.jvp(lambda q: _product(g(q), w), (q,), (v,))
     _, along_w = jax.jvp(lambda q: _product(g(q), v), (q,), (w,))
@@ -126,9 +151,13 @@ def riemann_tensor(metric: Metric, q: Float[Array, " n"]) -> Float[Array, "n n n
 
     Source: do Carmo (1992), chapter 4, with the opposite sign of R.
     """
-    (q,) = _vectors(metric, q=q)
-    gamma = christoffel_symbols(metric, q)
-    slope = jax.jacfwd(lambda q: christoffel_symbols(metric, q))(q)
+    return _curvature(metric, *_vectors(metric, q=q))
+
+
+@_whole
+def _curvature(metric, q):
+    gamma = _symbols(metric, q, "second")
+    slope = jax.jacfwd(lambda q: _symbols(metric, q, "second"))(q)
     half = slope.transpose(0, 2, 3, 1) + jnp.einsum("ikm,mlj->ijkl", gamma, gamma)
     return half - half.transpose(0, 1, 3, 2)
 
@@ -140,9 +169,13 @@ def sectional_curvature(
 
     **Arguments:** `metric` as above; `q`, `u`, `w` (n,), u and w independent. **Returns:** ().
     """
-    q, u, w = _vectors(metric, q=q, u=u, w=w)
+    return _sectional(metric, *_vectors(metric, q=q, u=u, w=w))
+
+
+@_whole
+def _sectional(metric, q, u, w):
     g = _at(metric)(q)
-    turned = jnp.einsum("ijkl,j,k,l->i", riemann_tensor(metric, q), w, u, w)
+    turned = jnp.einsum("ijkl,j,k,l->i", _curvature(metric, q), w, u, w)
     dot = lambda a, b: jnp.sum(a * _product(g, b))  # noqa: E731
     return dot(turned, u) / (dot(u, u) * dot(w, w) - dot(u, w) ** 2)
 

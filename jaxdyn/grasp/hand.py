@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile import is_concrete, specialized
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.cones import Cones
@@ -95,7 +95,7 @@ def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Flo
     Source: Murray, Li & Sastry (1994), eq. 5.28; EQUATIONS section 10.
     """
     check_grasp(grasp)
-    return -constraint_jacobian(grasp, q, t)[:, np.array(grasp.hand_velocities, int)]
+    return -_columns(grasp, q, t, grasp.hand_velocities)
 
 
 def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "no nc"]:
@@ -107,7 +107,12 @@ def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[A
     Source: Murray, Li & Sastry (1994), eq. 5.11; EQUATIONS section 10.
     """
     check_grasp(grasp)
-    return constraint_jacobian(grasp, q, t)[:, np.array(grasp.object_velocities, int)].T
+    return _columns(grasp, q, t, grasp.object_velocities).T
+
+
+@specialized
+def _columns(grasp: Grasp, q, t, columns: tuple[int, ...]) -> Float[Array, "nc k"]:
+    return constraint_jacobian(grasp, q, t)[:, np.array(columns, int)]
 
 
 def internal_forces(

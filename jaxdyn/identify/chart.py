@@ -48,12 +48,14 @@ class Chart(eqx.Module):
     terms: tuple[str, ...] = eqx.field(static=True)
     inertia: str = eqx.field(static=True)
 
+    @eqx.filter_jit
     def relative_factors(self, theta: Float[Array, "bodies n"]) -> Float[Array, "bodies 4 4"]:
         """U of every body, relative to the nominal one."""
         fill = jnp.zeros((theta.shape[0], 10 - theta.shape[1]), theta.dtype)  # "mass": alpha alone moves
         steps = jax.vmap(_inertia.log_cholesky_factor)(jnp.concatenate([theta, fill], axis=1))
         return jnp.einsum("bij,bjk->bik", self.origin, steps)
 
+    @eqx.filter_jit
     def inertias(self, theta: Float[Array, "bodies n"]) -> Float[Array, "nb 10"]:
         """The ten numbers of every body."""
         if not self.bodies:
@@ -62,6 +64,7 @@ class Chart(eqx.Module):
         fitted = jax.vmap(_inertia.parameters_from_pseudo)(jnp.einsum("bij,bkj->bik", upper, upper))
         return self.nominal_inertias.at[np.array(self.bodies)].set(fitted)
 
+    @eqx.filter_jit
     def term_values(self, s: Float[Array, "terms nv"]) -> Float[Array, "4 nv"]:
         """Values of all `TERMS`: those fitted at s, the others at the model's value."""
         fitted = self.scale * jnp.where(positive_terms(self.terms), s * s, s)
@@ -71,6 +74,7 @@ class Chart(eqx.Module):
         ]
         return jnp.stack(rows)
 
+    @eqx.filter_jit
     def parameters(self, point: Coordinates) -> Float[Array, " p"]:
         """x (10 nb + 4 nv,), in the order of `parameter_names`."""
         return jnp.concatenate([self.inertias(point.theta).reshape(-1), self.term_values(point.s).reshape(-1)])
@@ -88,6 +92,7 @@ class Chart(eqx.Module):
         )
         return model, Friction(viscous, coulomb, offset, self.v_s)
 
+    @eqx.filter_jit
     def divergence(self, theta: Float[Array, "bodies n"]) -> Float[Array, ""]:
         """Log-det divergence of all bodies from the nominal ones, sum of tr(P0^-1 P) - log det(P0^-1 P) - 4.
 
@@ -97,6 +102,7 @@ class Chart(eqx.Module):
         diagonal = jnp.diagonal(upper, axis1=1, axis2=2)
         return jnp.sum(upper**2) - 2 * jnp.sum(jnp.log(diagonal)) - 4.0 * len(self.bodies)
 
+    @eqx.filter_jit
     def settled(self, point: Coordinates) -> Coordinates:
         """The point with terms below a millionth of their unit at zero, which fits approach without end."""
         tiny = positive_terms(self.terms) & (point.s**2 < 1e-6)
@@ -131,7 +137,7 @@ def make_chart(
     numbers = np.asarray(model.inertias, np.float64)
     massive = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()
     bodies = massive if bodies is None else tuple(i for i in massive if i in tuple(bodies))
-    matrices = [_pseudo_inertia(numbers[i]) for i in bodies]
+    matrices = [_f64.pseudo_inertia(numbers[i]) for i in bodies]
     bad = [model.body_names[i] for i, P in zip(bodies, matrices, strict=True) if not _is_feasible(P, inertia)]
     if bad:
         raise ValueError(
@@ -178,13 +184,6 @@ def _own_terms(model: Model) -> dict[str, Array]:
 def positive_terms(terms) -> np.ndarray:
     """(terms, 1) of bool: which terms are zero or above."""
     return np.array([[term in POSITIVE] for term in terms], bool).reshape(len(terms), 1)
-
-
-def _pseudo_inertia(numbers: np.ndarray) -> np.ndarray:
-    """`inertia.pseudo_inertia` in float64: factors of float32 models keep their digits."""
-    rotational = _f64.rotational_inertia(numbers)
-    sigma = 0.5 * np.trace(rotational) * np.eye(3) - rotational
-    return np.block([[sigma, numbers[1:4, None]], [numbers[None, 1:4], numbers[:1, None]]])
 
 
 def _is_feasible(matrix: np.ndarray, inertia: str) -> bool:

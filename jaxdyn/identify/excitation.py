@@ -42,9 +42,14 @@ def random_torque(key: Array, size, *, period=2.0, harmonics: int = 3, carry: Mo
     size = jnp.asarray(size)
     if size.ndim != 1 or harmonics < 1:
         raise ValueError(f"size has shape {size.shape}, harmonics is {harmonics}; give size (nv,) and harmonics >= 1")
-    amplitudes = jax.random.normal(key, (2, harmonics, size.shape[0]), size.dtype) * size[None, None]
-    cosine, sine = amplitudes / np.sqrt(harmonics).astype(size.dtype)
+    cosine, sine = _amplitudes(key, size, harmonics)
     return FourierTorque(cosine, sine, jnp.asarray(period, size.dtype), carry)
+
+
+@eqx.filter_jit
+def _amplitudes(key, size, harmonics: int):
+    amplitudes = jax.random.normal(key, (2, harmonics, size.shape[0]), size.dtype) * size[None, None]
+    return tuple(amplitudes / np.sqrt(harmonics).astype(size.dtype))
 
 
 class FourierMotion(eqx.Module):
@@ -84,13 +89,18 @@ def random_motion(key: Array, center, size, *, period=10.0, harmonics: int = 5) 
         raise ValueError(
             f"center has shape {center.shape}, size {size.shape}, harmonics is {harmonics}; give (nq,), (nq,) and >= 2"
         )
-    k = jnp.arange(1, harmonics + 1, dtype=center.dtype)[:, None]
+    cosine, sine = _falling_amplitudes(key, size, harmonics)
+    return FourierMotion(center, cosine, sine, jnp.asarray(period, center.dtype))
+
+
+@eqx.filter_jit
+def _falling_amplitudes(key, size, harmonics: int):
+    k = jnp.arange(1, harmonics + 1, dtype=size.dtype)[:, None]
     weight = size[None] / k
-    cosine, sine = jax.random.normal(key, (2, harmonics, center.shape[0]), center.dtype) * weight[None]
+    cosine, sine = jax.random.normal(key, (2, harmonics, size.shape[0]), size.dtype) * weight[None]
     # Position and velocity of the sum vanish at t = 0: shares of both conditions are taken from all harmonics alike.
     cosine = cosine - jnp.mean(cosine, axis=0, keepdims=True)
-    sine = sine - jnp.mean(k * sine, axis=0, keepdims=True) / k
-    return FourierMotion(center, cosine, sine, jnp.asarray(period, center.dtype))
+    return cosine, sine - jnp.mean(k * sine, axis=0, keepdims=True) / k
 
 
 class Tracking(eqx.Module):

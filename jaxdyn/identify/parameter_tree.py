@@ -1,6 +1,6 @@
 """What a fit may change of a system, a scene or a `Measured` one, and what is known of it beforehand: one tree of parameters."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -14,9 +14,9 @@ from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.distances import METRICS
 from jaxdyn.identify.picking import Rows, across, entries_taken, free_bodies, models_of, root_of, rows_of
 from jaxdyn.identify.sensors import FitSystem, with_sensors
+from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Function, Number, state_dtype
 from jaxdyn.model.arguments import Numbers as Values
-from jaxdyn.model.inertia import pseudo_inertia
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
@@ -233,20 +233,13 @@ class Parameters(eqx.Module):
         """Floating-point type of the coordinates."""
         return state_dtype(with_sensors(self.given).scene.system)
 
-    def _walk(self, y, visit: Callable):
-        leaves, structure = jax.tree.flatten(self.given)
-        begin, visited = 0, []
-        for block in self.blocks:
-            part = y[begin : begin + block.size]
-            begin += block.size
-            leaves[block.place] = jnp.asarray(leaves[block.place])  # pyright: ignore[reportAttributeAccessIssue]
-            visited.append(visit(block, part, leaves))
-            block.write(part, leaves)
-        return jax.tree.unflatten(structure, leaves), visited
-
     def system(self, y: Float[Array, " p"]) -> PyTree:
         """What was given, with the numbers of y."""
-        return self._walk(y, lambda *_: None)[0]
+        leaves, structure = jax.tree.flatten(self.given)
+        # Leaves that nothing changes stay the same objects, by which they are known.
+        for place, leaf in _walked(self, y, None)[0].items():
+            leaves[place] = leaf
+        return jax.tree.unflatten(structure, leaves)
 
     def scene(self, y: Float[Array, " p"]) -> Scene:
         """The scene with the numbers of y."""
@@ -254,13 +247,11 @@ class Parameters(eqx.Module):
 
     def values(self, y: Float[Array, " p"]) -> Float[Array, " m"]:
         """The numbers (m,) that `names` names."""
-        parts = self._walk(y, lambda block, part, leaves: block.values(part, leaves))[1]
-        return jnp.concatenate([jnp.zeros((0,), y.dtype), *(part.astype(y.dtype) for part in parts)])
+        return _walked(self, y, "values")[1]
 
     def residual(self, y: Float[Array, " p"]) -> Float[Array, " k"]:
         """What is known beforehand, as residuals of unit deviation (k,): half of their sum of squares is -log of the prior."""
-        parts = self._walk(y, lambda block, part, leaves: block.residual(part, leaves))[1]
-        return jnp.concatenate([jnp.zeros((0,), y.dtype), *(part.astype(y.dtype) for part in parts)])
+        return _walked(self, y, "residual")[1]
 
     # How it is put together.
 
@@ -302,7 +293,7 @@ class Parameters(eqx.Module):
             centre, inverse = np.asarray(centre, float), np.diag(1 / np.asarray(semi_axes, float) ** 2)
             quadrics[k, :3, :3], quadrics[k, :3, 3] = -inverse, inverse @ centre
             quadrics[k, 3, :3], quadrics[k, 3, 3] = inverse @ centre, 1 - centre @ inverse @ centre
-            P = np.asarray(pseudo_inertia(model.inertias[chart.bodies[k]]), np.float64)
+            P = f64.pseudo_inertia(np.asarray(model.inertias, np.float64)[chart.bodies[k]])
             if not np.sum(P * quadrics[k]) > 0:
                 raise ValueError(
                     f"the ellipsoid of {body!r} does not hold the body as it is now; give larger semi-axes"
@@ -406,3 +397,19 @@ def picked(system: Any, positive=None, free=None) -> Parameters:
     if positive is not None:
         tree = tree.positive(positive)
     return tree if free is None else tree.free(free)
+
+
+@eqx.filter_jit
+def _walked(parameters: Parameters, y, asked: str | None):
+    """The leaves with the numbers of y, by their places, and what each block says to what it is asked, one after the other."""
+    leaves = jax.tree.leaves(parameters.given)
+    begin, parts = 0, [jnp.zeros((0,), y.dtype)]
+    for block in parameters.blocks:
+        part = y[begin : begin + block.size]
+        begin += block.size
+        leaves[block.place] = jnp.asarray(leaves[block.place])  # pyright: ignore[reportAttributeAccessIssue]
+        if asked is not None:
+            parts.append(getattr(block, asked)(part, leaves).astype(y.dtype))
+        block.write(part, leaves)
+    places = {block.place for block in parameters.blocks}  # pyright: ignore[reportAttributeAccessIssue]
+    return {place: leaves[place] for place in sorted(places)}, jnp.concatenate(parts)

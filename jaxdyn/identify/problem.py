@@ -104,7 +104,7 @@ def _scale(objective: Objective, system, pieces):
 
 def gathered(problem: Problem) -> Problem:
     """The problem on one device."""
-    batches = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), problem.batches)
+    batches = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), x.dtype), problem.batches)
     return dataclasses.replace(problem, batches=batches, meshes=(None,) * len(batches))
 
 

@@ -254,7 +254,7 @@ def _gazebo_mimic(file: XmlFile, plugin, model: Model) -> Gear:
 def _placed(model: Model, frame: str) -> np.ndarray:
     """World pose (4, 4) of a frame where all coordinates are zero, in float64."""
     k = model.frame_names.index(frame)
-    pose, body = np.asarray(model.frame_poses[k], np.float64), model.topology.frame_bodies[k]
+    pose, body = np.asarray(model.frame_poses, np.float64)[k], model.topology.frame_bodies[k]
     while body >= 0:
-        pose, body = np.asarray(model.home[body], np.float64) @ pose, model.topology.parents[body]
+        pose, body = np.asarray(model.home, np.float64)[body] @ pose, model.topology.parents[body]
     return pose

@@ -145,7 +145,7 @@ def _has_floating_base(model: Model) -> bool:
         and topology.kinds[0] == "free"
         and topology.joint_names[0] == ROOT_JOINT
         and -1 not in topology.frame_bodies
-        and np.array_equal(model.home[0], np.eye(4))
+        and np.array_equal(np.asarray(model.home)[0], np.eye(4))
     )
 
 
@@ -197,7 +197,7 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
     if kind in ("helical", "spherical"):
         raise ValueError(f"{what} is {kind}; URDF has no such joint")
     if kind != "free":
-        screw = np.asarray(model.screws[edge.body], np.float64)
+        screw = np.asarray(model.screws, np.float64)[edge.body]
         axis = {"planar": np.array([0.0, 0.0, 1.0]), "prismatic": screw[:3]}.get(kind, screw[3:])
         ET.SubElement(joint, "axis", xyz=_text(axis))
     _write_limits(joint, model, edge.body, what)
@@ -215,7 +215,7 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
         ET.SubElement(joint, "dynamics", dynamics)
     for n, (i, source) in enumerate(model.topology.couplings):
         if i == edge.body and model.coupling_values is not None:
-            multiplier, offset = np.asarray(model.coupling_values[n], np.float64)
+            multiplier, offset = np.asarray(model.coupling_values, np.float64)[n]
             values = {"joint": model.joint_names[source], "multiplier": _text([multiplier]), "offset": _text([offset])}
             ET.SubElement(joint, "mimic", values)
 

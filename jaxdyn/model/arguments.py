@@ -13,7 +13,6 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_concrete
-from jaxdyn.lie import se3
 from jaxdyn.model import float64 as f64
 
 _T = TypeVar("_T")
@@ -68,7 +67,13 @@ def as_array(value: Any, name: str, dtype=None) -> Given:
         raise ValueError(f"{name} is {value!r}; pass an array of numbers")
     if dtype is None or (isinstance(value, jax.Array) and value.dtype == dtype):
         return value  # pyright: ignore[reportReturnType]
-    return jnp.asarray(value, dtype)
+    return jnp.asarray(_cast(value, dtype) if isinstance(value, np.ndarray) else value, dtype)
+
+
+def _cast(value: Any, dtype) -> np.ndarray:
+    # By numpy, as JAX compiles a program for each shape; what is too large becomes infinite without a warning there too.
+    with np.errstate(over="ignore"):
+        return np.asarray(value).astype(jax.dtypes.canonicalize_dtype(dtype), copy=False)
 
 
 def or_zeros(value: Any, size: int) -> Any:
@@ -172,5 +177,13 @@ def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
     if isinstance(pose, jax.Array) and pose.shape == (4, 4):
         return pose
     if isinstance(pose, jax.Array) and pose.shape == (3,):
-        return se3.from_parts(jnp.eye(3, dtype=pose.dtype), pose)
-    return jnp.asarray(f64.pose_matrix(pose, what), float)
+        return stored(f64.pose_of(np.eye(3), pose), pose.dtype)
+    return stored(f64.pose_matrix(pose, what), float)
+
+
+def stored(value, dtype) -> jax.Array:
+    """Numbers as a leaf of this dtype. Within a trace, too, what is known stays known, and nothing is compiled for it."""
+    if not is_concrete(value):
+        return jnp.asarray(value, dtype)
+    with jax.ensure_compile_time_eval():
+        return jnp.asarray(_cast(value, dtype), dtype)

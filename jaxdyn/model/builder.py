@@ -16,7 +16,7 @@ import numpy as np
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia as _inertia
-from jaxdyn.model.arguments import DType, Number, Numbers
+from jaxdyn.model.arguments import DType, Number, Numbers, stored
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model, Topology
 
@@ -228,15 +228,11 @@ class ModelBuilder:
         leaves["frame_poses"] = _rows([np.eye(4)] * len(moving) + [pose for *_, pose in others], (4, 4))
         values = [couplings[pair] for pair in topology.couplings]
         leaves["coupling_values"] = _rows(values, (2,)) if couplings else None
-        stored: dict[str, Any] = {key: self._leaf(value) for key, value in leaves.items()}
+        kept: dict[str, Any] = {
+            key: None if value is None else stored(value, self._dtype) for key, value in leaves.items()
+        }
         fixed_joints = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
-        return Model(**stored, topology=topology, fixed_joints=fixed_joints)
-
-    def _leaf(self, value) -> jax.Array | None:
-        if value is None or not is_concrete(value):
-            return None if value is None else value.astype(self._dtype)
-        with jax.ensure_compile_time_eval():  # within a trace, too, what is known stays known
-            return jnp.asarray(value, self._dtype)
+        return Model(**kept, topology=topology, fixed_joints=fixed_joints)
 
     def _check_new(self, name, parent) -> None:
         if not isinstance(name, str) or not name:
@@ -334,11 +330,11 @@ def repair_inertias(model: Model) -> Model:
     for i, parameters in enumerate(inertias):
         if parameters[0] > 0 and inertia_problems(parameters):
             inertias[i] = _inertia.nearest_feasible(parameters)
-    return model.replace(inertias=jnp.asarray(inertias))
+    return model.replace(inertias=stored(inertias, inertias.dtype))
 
 
 def _float_dtype(dtype):
-    default = jnp.zeros(()).dtype
+    default = jnp.dtype(jax.dtypes.canonicalize_dtype(float))
     if dtype is None:
         return default
     if not jnp.issubdtype(dtype, jnp.floating):

@@ -239,6 +239,19 @@ def spatial_inertia(parameters: np.ndarray) -> np.ndarray:
     return np.block([[parameters[0] * np.eye(3), -first], [first, rotational_inertia(parameters)]])
 
 
+def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
+    """`inertia.pseudo_inertia` (4, 4) in float64: what is decided and factored of float32 models keeps its digits."""
+    rotational = rotational_inertia(parameters)
+    sigma = 0.5 * np.trace(rotational) * np.eye(3) - rotational
+    return np.block([[sigma, parameters[1:4, None]], [parameters[None, 1:4], parameters[:1, None]]])
+
+
+def parameters_from_pseudo(matrix: np.ndarray) -> np.ndarray:
+    """The ten numbers of a pseudo-inertia (4, 4)."""
+    sigma = matrix[:3, :3]
+    return np.concatenate([matrix[3:, 3], matrix[:3, 3], (np.trace(sigma) * np.eye(3) - sigma)[_TRIANGLE]])
+
+
 def move_inertia(pose: Values, parameters: Values) -> Values:
     """The ten numbers in frame a of a body given in frame b; `pose` T_ab (`inertia.transform_inertia` in float64)."""
     xp = numpy_for(pose, parameters)

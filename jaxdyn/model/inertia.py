@@ -6,10 +6,12 @@ The ten numbers are (m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) about th
 
 import jax.numpy as jnp
 import numpy as np
+from jax import dtypes as _dtypes
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import numpy_for as _numpy_for
 from jaxdyn.lie import so3
+from jaxdyn.model import float64 as _f64
 from jaxdyn.model.arguments import Number, Numbers, Row
 
 # Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
@@ -132,7 +134,7 @@ def to_log_cholesky(parameters: Float[Array, "10"]) -> Float[Array, "10"]:
 def is_feasible(parameters: Numbers, *, tolerance: float = 0.0) -> bool:
     """Whether concrete parameters (10,) belong to a physical body: pseudo-inertia positive semidefinite to `tolerance`
     (relative to its largest eigenvalue)."""
-    values = np.linalg.eigvalsh(np.asarray(pseudo_inertia(jnp.asarray(parameters)), np.float64))
+    values = np.linalg.eigvalsh(_f64.pseudo_inertia(np.asarray(parameters, np.float64)))
     return bool(values[0] >= -tolerance * max(values[-1], 0.0))
 
 
@@ -144,11 +146,11 @@ def nearest_feasible(parameters: Numbers, *, floor: float = 1e-6) -> np.ndarray:
     parameters = np.asarray(parameters, np.float64)
     if not parameters[0] > 0:
         raise ValueError(f"mass is {parameters[0]}, cannot be repaired; give the body a positive mass")
-    values, vectors = np.linalg.eigh(np.asarray(pseudo_inertia(jnp.asarray(parameters)), np.float64))
+    values, vectors = np.linalg.eigh(_f64.pseudo_inertia(parameters))
     values = np.maximum(values, floor * values[-1])
     repaired = (vectors * values) @ vectors.T
     repaired *= parameters[0] / repaired[3, 3]
-    return np.asarray(parameters_from_pseudo(jnp.asarray(repaired)))
+    return _f64.parameters_from_pseudo(repaired).astype(_dtypes.canonicalize_dtype(float))
 
 
 # Bodies of simple shapes. Their numbers may be traced; of known ones they are arrays of numpy, in float64.
@@ -190,11 +192,8 @@ def point_mass(mass: Number, position: Numbers = (0.0, 0.0, 0.0)) -> Array | np.
 
 def displaced(parameters: Numbers, position: Numbers, rotation: Numbers | None = None) -> Array | np.ndarray:
     """Parameters (10,) of the same body placed at `position` (3,), turned by `rotation` (3, 3), in a new frame."""
-    xp = _numpy_for(parameters, position, rotation)
-    turned = xp.eye(3) if rotation is None else xp.asarray(rotation, float)
-    upper = xp.concatenate([turned, xp.asarray(position, float)[:, None]], axis=1)
-    pose = jnp.concatenate([jnp.asarray(upper, float), jnp.eye(4)[3:]])
-    return xp.asarray(transform_inertia(pose, jnp.asarray(parameters, float)))
+    pose = _f64.pose_of(np.eye(3) if rotation is None else rotation, position)
+    return _f64.move_inertia(pose, _numpy_for(parameters).asarray(parameters, float))
 
 
 def _centred(mass, moments) -> Array | np.ndarray:

@@ -4,12 +4,14 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import numpy_for
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
+from jaxdyn.model.arguments import Checked, Numbers, pose_leaf, stored
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, Topology
 
@@ -76,13 +78,15 @@ def renamed(model: Model, prefix: Any) -> Model:
 
 def _moved(model: Model, pose) -> Model:
     """The model in a world that stands at a pose: what hangs on the world, and its named frames, are moved."""
-    pose, top = pose_leaf(pose, "pose").astype(model.home.dtype), model.topology
-    home, frames = model.home, model.frame_poses
-    for i in np.flatnonzero(np.array(top.parents) < 0):
-        home = home.at[i].set(_product(pose, home[i]))
-    for i in np.flatnonzero(np.array(top.frame_bodies) < 0):
-        frames = frames.at[i].set(_product(pose, frames[i]))
-    return model.replace(home=home, frame_poses=frames)
+    pose, top = pose_leaf(pose, "pose"), model.topology
+
+    def moved(poses, carriers):
+        xp = numpy_for(pose, poses)
+        poses, by = xp.asarray(poses), xp.asarray(pose, poses.dtype)
+        product = by @ poses if xp is np else _product(by, poses)
+        return stored(xp.where((np.array(carriers, int) < 0)[:, None, None], product, poses), poses.dtype)
+
+    return model.replace(home=moved(model.home, top.parents), frame_poses=moved(model.frame_poses, top.frame_bodies))
 
 
 def joined(models: Sequence[Model], name: str) -> Model:
@@ -128,7 +132,7 @@ def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -
         for i in range(top.nb, len(top.frame_names)):
             body = top.frame_bodies[i]
             others.append((int(place[first[k] + body]) if body >= 0 else -1, top.frame_names[i], len(poses)))
-            poses.append(model.frame_poses[i])
+            poses.append(_numbers(model.frame_poses)[i])
     others.sort(key=lambda frame: frame[:2])
     couplings = [
         ((int(place[first[k] + pair[0]]), int(place[first[k] + pair[1]])), k, row)
@@ -152,10 +156,10 @@ def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -
     index |= dict.fromkeys(("velocity_limit", "effort_limit", "armature", "damping", "friction"), along["nv"])
     leaves: dict[str, Any] = {leaf: _stacked(models, leaf, rows) for leaf, rows in index.items()}
     home = leaves["home"]
-    unit = jnp.broadcast_to(jnp.eye(4, dtype=home.dtype), home.shape)
-    leaves["frame_poses"] = jnp.concatenate([unit, *(poses[i][None] for *_, i in others)])
-    values = [models[k].coupling_values[row] for _, k, row in couplings]  # pyright: ignore[reportOptionalSubscript]
-    leaves["coupling_values"] = jnp.stack(values) if values else None
+    unit = np.broadcast_to(np.eye(4), home.shape)
+    leaves["frame_poses"] = _concatenated([unit, *(poses[i][None] for *_, i in others)], home.dtype)
+    values = [_numbers(models[k].coupling_values)[row][None] for _, k, row in couplings]
+    leaves["coupling_values"] = _concatenated(values, jnp.result_type(*values)) if values else None
     fixed = tuple(pair for model in models for pair in model.fixed_joints)
     return Model(**leaves, gravity=_common_gravity(models), topology=topology, fixed_joints=fixed)
 
@@ -172,11 +176,20 @@ def _stacked(models, leaf: str, rows):
     values = [getattr(model, leaf) for model in models]
     if all(value is None for value in values):
         return None
-    values = [
-        jnp.zeros((model.nv,), model.home.dtype) if value is None else value
-        for model, value in zip(models, values, strict=True)
-    ]
-    return jnp.concatenate(values)[rows]
+    dtype = jnp.result_type(*(value for value in values if value is not None))
+    values = [np.zeros(model.nv) if value is None else value for model, value in zip(models, values, strict=True)]
+    return _concatenated(values, dtype, rows)
+
+
+def _numbers(leaf):
+    """A leaf, of numpy where it is known."""
+    return numpy_for(leaf).asarray(leaf)
+
+
+def _concatenated(values: list, dtype, rows: Any = slice(None)) -> jax.Array:
+    """The arrays, one after the other, and rows of what they are."""
+    xp = numpy_for(values)
+    return stored(xp.concatenate([xp.asarray(value, dtype) for value in values])[rows], dtype)
 
 
 def _common_gravity(models):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn.compile import is_concrete, is_expanding
+from jaxdyn.compile import is_concrete, is_expanding, numpy_for
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes
 from jaxdyn.model.inertia import inertial_parameters, transform_inertia
 from jaxdyn.model.joints import (
@@ -314,14 +314,16 @@ def random_configuration(model: Model, key: Array) -> Float[Array, " nq"]:
     check_shapes(model)
     topology = model.topology
     keys = jax.random.split(key, topology.nb)
+    xp = numpy_for(model.lower, model.upper)
+    lower, upper = xp.asarray(model.lower), xp.asarray(model.upper)
     parts = []
     for i, kind in enumerate(topology.kinds):
         place = topology.q_slices[i]
         reach = np.full(KINDS[kind].nq, 1.0 if kind in ("prismatic", "planar", "free") else np.pi)
         if kind == "planar":
             reach[2] = np.pi
-        low, high = model.lower[place], model.upper[place]
-        low = jnp.where(jnp.isfinite(low), low, jnp.asarray(-reach, low.dtype))
-        high = jnp.where(jnp.isfinite(high), high, jnp.asarray(reach, high.dtype))
+        low, high = lower[place], upper[place]
+        low = xp.where(xp.isfinite(low), low, xp.asarray(-reach, low.dtype))
+        high = xp.where(xp.isfinite(high), high, xp.asarray(reach, high.dtype))
         parts.append(joint_random(kind, keys[i], low, high, model.home.dtype))
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), model.home.dtype)

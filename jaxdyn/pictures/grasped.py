@@ -32,7 +32,7 @@ def grasped_solids(scene: Grasp, solids: list[Shape], thin: float) -> list[Shape
     model, name = scene.system, scene.object
     places = [np.asarray(one.pose, float)[:3, 3] for one in scene.constraints if isinstance(one, Contact)]
     body = model.body_names.index(name)
-    mass, com, moment = f64.about_com(np.asarray(model.inertias[body], float))
+    mass, com, moment = f64.about_com(np.asarray(model.inertias, float)[body])
     if places and model.topology.kinds[body] == "planar":
         return [rod(name, com, place, 1.5 * thin, source="inertia") for place in places]
     ball = solids[0] if len(solids) == 1 and solids[0].kind == "ellipsoid" and len(set(solids[0].size)) == 1 else None

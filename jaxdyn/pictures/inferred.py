@@ -64,7 +64,7 @@ def extent(scene: Scene) -> float:
     poses = home_poses(model)
     points = [np.zeros(3)] if (np.array(model.topology.parents) == -1).all() and model.nb > 1 else []
     for i in range(model.nb):
-        mass, com, moment = f64.about_com(np.asarray(model.inertias[i], float))
+        mass, com, moment = f64.about_com(np.asarray(model.inertias, float)[i])
         points += [poses[i, :3, 3], poses[i, :3, :3] @ com + poses[i, :3, 3]]
         if mass > 0:
             reach = np.sqrt(np.abs(np.trace(moment)) / mass)
@@ -90,7 +90,7 @@ def place_of(model: Model, poses: np.ndarray, frame: str | None) -> np.ndarray:
     if frame is None:
         return np.broadcast_to(np.eye(4), (*poses.shape[:-3], 4, 4))
     index = frame_index(model, frame)
-    body, offset = model.topology.frame_bodies[index], np.asarray(model.frame_poses[index], float)
+    body, offset = model.topology.frame_bodies[index], np.asarray(model.frame_poses, float)[index]
     if body < 0:
         return np.broadcast_to(offset, (*poses.shape[:-3], 4, 4))
     return poses[..., body, :, :] @ offset
@@ -121,7 +121,7 @@ def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
         for body, pose in constraint.ends() if _has_middles(constraint) else constraint.ends()[1:]:
             if body is not None:
                 index = frame_index(model, body)
-                offset = np.asarray(model.frame_poses[index], float) @ np.asarray(pose, float)
+                offset = np.asarray(model.frame_poses, float)[index] @ np.asarray(pose, float)
                 points[model.topology.frame_bodies[index]].append(offset[:3, 3])
     return points
 
@@ -135,7 +135,7 @@ def _has_middles(constraint: Pair) -> bool:
 def _rods(model: Model, i: int, points: list[np.ndarray], thin: float) -> list[Shape]:
     """From a body's own joint to all that it carries, and to its centre of mass where it carries nothing."""
     name = model.body_names[i]
-    mass, com, _ = f64.about_com(np.asarray(model.inertias[i], float))
+    mass, com, _ = f64.about_com(np.asarray(model.inertias, float)[i])
     start = points[0] if points else com
     # A rod ends where the next body begins, at the place of that joint at rest.
     ends = points[1:] if len(points) > 1 or not mass else [com]
@@ -152,7 +152,7 @@ def _or_mark(solid: Shape, longest: float, thin: float) -> Shape:
 
 def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
     """A uniform solid with a body's mass, centre of mass and inertia."""
-    parameters = np.asarray(model.inertias[i], float)
+    parameters = np.asarray(model.inertias, float)[i]
     mass, com, moment = f64.about_com(parameters)
     name = model.body_names[i]
     if mass <= 0 or rolls:
@@ -207,8 +207,8 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
             shapes.append(Shape(constraint.body, "cylinder", (radius, 0.12 * radius), pose, source="constraint"))
         else:
             shapes.append(Shape(constraint.body, "ellipsoid", (radius,) * 3, pose, source="constraint"))
-        centre = (np.asarray(model.frame_poses[index], float) @ pose)[:3, 3]
-        if body >= 0 and np.linalg.norm(f64.about_com(np.asarray(model.inertias[body], float))[1] - centre) < radius:
+        centre = (np.asarray(model.frame_poses, float)[index] @ pose)[:3, 3]
+        if body >= 0 and np.linalg.norm(f64.about_com(np.asarray(model.inertias, float)[body])[1] - centre) < radius:
             bodies.add(body)
         reach = getattr(constraint, "surface_radius", None)
         if reach is not None and not constraint.inside and constraint.surface_body is not None:  # pyright: ignore[reportAttributeAccessIssue]

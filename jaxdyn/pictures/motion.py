@@ -206,7 +206,7 @@ def forces(motion: Motion) -> list[Force]:
         for i, kind in enumerate(top.kinds):
             if kind not in SCREW_KINDS:
                 continue
-            screw = np.asarray(model.screws[i], float)
+            screw = np.asarray(model.screws, float)[i]
             axis = screw[:3] if kind == "prismatic" else screw[3:]
             direction = motion.poses[:, :, i, :3, :3] @ axis
             size = motion.torque[:, :, top.v_slices[i]]
@@ -262,7 +262,7 @@ def joint_axes(motion: Motion) -> list[tuple[str, str, np.ndarray, np.ndarray | 
     for i, (name, kind) in enumerate(zip(model.joint_names, model.topology.kinds, strict=True)):
         axis = None
         if kind in SCREW_KINDS or kind == "planar":
-            screw = np.asarray(model.screws[i], float)
+            screw = np.asarray(model.screws, float)[i]
             local = np.eye(3)[2] if kind == "planar" else screw[:3] if kind == "prismatic" else screw[3:]
             axis = motion.poses[:, :, i, :3, :3] @ local
         axes.append((name, kind, motion.poses[:, :, i, :3, 3], axis))

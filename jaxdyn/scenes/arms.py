@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import is_concrete, numpy_for
+from jaxdyn.compile import compiled, is_concrete, numpy_for
 from jaxdyn.constraints import rolling_sphere
 from jaxdyn.contact import Sphere, montana
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
@@ -14,11 +14,11 @@ from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
 from jaxdyn.lie import se3
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia, robots
-from jaxdyn.model.arguments import Checked, Number, Row
+from jaxdyn.model.arguments import Checked, Number, Row, stored
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.tree import Model
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.scenes.hands import _spatial_finger, _turn
 from jaxdyn.scenes.linkages import thin_bar
 from jaxdyn.systems.scene import Scene
@@ -80,13 +80,18 @@ def _sphere_arm_start(
     _check_contact(contact)
     if contact == "rolling" and is_concrete(slide, spin) and (np.any(slide) or spin):
         raise ValueError(f"slide is {slide}, spin is {spin}; a rolling contact has neither, leave them out")
-    kinematics = montana(*_surfaces(radius, tip_radius), jnp.asarray(eta, float))
+    kinematics = montana(*_surfaces(radius, tip_radius), as_leaf(eta))
     g_of = numpy_for(kinematics.g_of).asarray(kinematics.g_of)
     pose = f64.pose_of(g_of[:3, :3], g_of[:3, 3] + numpy_for(center).asarray(center, float))
-    q = jnp.asarray(_joint_angles(pose, links, height))
-    twist = se3.Ad_apply(kinematics.finger.pose, jnp.asarray([*slide, 0.0, *rolling, spin], float))
+    q = as_state(_joint_angles(pose, links, height))
+    twist = as_leaf([*slide, 0.0, *rolling, spin])
     arm = _six_joints(links, _MASSES, height, tip_radius, 0.0)
-    return q, jnp.linalg.solve(body_jacobian(arm, q, "tip"), twist)
+    return q, _rates_of_tip(arm, q, kinematics, twist)
+
+
+@compiled
+def _rates_of_tip(arm: Model, q, kinematics, twist):
+    return jnp.linalg.solve(body_jacobian(arm, q, "tip"), se3.Ad_apply(kinematics.finger.pose, twist))
 
 
 def _surfaces(radius, tip_radius):
@@ -137,7 +142,7 @@ def sphere_arm(
         None,
         tip_radius,
         on="sphere",
-        surface=jnp.asarray(center, float),
+        surface=as_leaf(center),
         surface_radius=radius,
         slip=free,
         spin=not free,
@@ -155,12 +160,18 @@ def _lifting_start(
     count: Checked[int] = 2, radius: Number = 0.3, twist: Row = (0.05, 0.0, 0.1, 0.0, 0.2, 0.3)
 ) -> tuple[Array, Array]:
     scene: Any = coordinated_lifting(count=count, radius=radius)
-    height = frame_pose(robots.iiwa(), jnp.asarray(_HOLDING), _FLANGE)[2, 3]
-    q = jnp.asarray([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
-    twist = jnp.asarray(twist, float)
+    flange = frame_pose(robots.iiwa(), as_leaf(_HOLDING), _FLANGE)
+    height = numpy_for(flange).asarray(flange)[2, 3]
+    q = as_state([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
+    twist = as_leaf(twist)
     # Of all joint velocities that move the flanges with the plate, the smallest.
+    return q, _least_rates(scene, q, twist)
+
+
+@compiled
+def _least_rates(scene, q, twist):
     rates = jnp.linalg.pinv(hand_jacobian(scene, q)) @ (grasp_map(scene, q).T @ twist)
-    return q, jnp.concatenate([rates, twist])
+    return jnp.concatenate([rates, twist])
 
 
 @named(_lifting_start)
@@ -185,7 +196,7 @@ def coordinated_lifting(
         raise ValueError(f"count is {count!r}; give the number of arms, a positive integer")
     fall = (0.0, 0.0, -gravity)
     arm = robots.iiwa(gravity=fall)
-    flange = frame_pose(robots.iiwa(gravity=None), jnp.asarray(_HOLDING, arm.home.dtype), _FLANGE)
+    flange = frame_pose(robots.iiwa(gravity=None), stored(_HOLDING, arm.home.dtype), _FLANGE)
     xp = numpy_for(flange, radius)
     flange = xp.asarray(flange)
     whole, grips = ModelBuilder("no arm", gravity=fall).build(), []

@@ -11,7 +11,7 @@ from jaxdyn.lie import so3
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.scene import Scene
 
 
@@ -31,7 +31,7 @@ def _turntable_start(
     slip = -rate * position[1] - velocity[0], rate * position[0] - velocity[1]
     spin = slip[1] / radius, -slip[0] / radius, 0.0
     q = [0.0, *position, radius, 1.0, 0.0, 0.0, 0.0]
-    return jnp.asarray(q), jnp.asarray([rate, *velocity, 0.0, *spin])
+    return as_state(q), as_state([rate, *velocity, 0.0, *spin])
 
 
 @named(_turntable_start)
@@ -53,7 +53,7 @@ def _incline_start(radius: Number = 0.1, velocity: Row = (0.0, 0.5)) -> tuple[Ar
     # Rolling: v + w x (-r e_z) = 0.
     x, y = velocity
     q = [0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]
-    return jnp.asarray(q), jnp.asarray([x, y, 0.0, -y / radius, x / radius, 0.0])
+    return as_state(q), as_state([x, y, 0.0, -y / radius, x / radius, 0.0])
 
 
 @named(_incline_start)
@@ -100,7 +100,7 @@ class _Sliding(eqx.Module):
 def _bowling_start(
     radius: Number = 0.10795, velocity: Row = (8.0, 0.0), spin: Row = (-8 * np.pi, 0.0, 0.0)
 ) -> tuple[Array, Array]:
-    return jnp.asarray([0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]), jnp.asarray([*velocity, 0.0, *spin])
+    return as_state([0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]), as_state([*velocity, 0.0, *spin])
 
 
 @named(_bowling_start)

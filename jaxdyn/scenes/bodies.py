@@ -1,16 +1,15 @@
 """A rigid body without forces."""
 
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdyn.model.arguments import Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.scene import Scene
 
 
 def _free_start(rates: Row = (0.3, 0.8, -0.5)) -> tuple[Array, Array]:
-    return jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray(rates, float)
+    return as_state([1.0, 0.0, 0.0, 0.0]), as_leaf(rates)
 
 
 @named(_free_start)

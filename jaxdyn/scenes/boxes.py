@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -16,7 +15,7 @@ from jaxdyn.model import inertia, robots
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.names import frame_index
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_state, named
 from jaxdyn.scenes.hands import _carried, _quaternion
 
 # Where the fingertips touch the cube, in half edges, and the normals into it: index and ring finger on one face, the thumb on the
@@ -78,7 +77,7 @@ def _reached(model, joints, offset, guess, target):
             guess, _ = nearer(guess, None)
         return guess
     # A finger has a joint more than its tip needs: where it ends is decided by all steps, which are differentiated as they are.
-    return jax.lax.scan(nearer, jnp.asarray(guess), None, length=_ROUNDS)[0]
+    return jax.lax.scan(nearer, as_state(guess), None, length=_ROUNDS)[0]
 
 
 def _cube_start(
@@ -108,7 +107,7 @@ def _cube_start(
         for k, i in enumerate(joints):
             angles[i], rates[i] = reached[k], moving[k]
     # The cube's joint comes last: its name does.
-    return jnp.asarray([*angles, *position, *quaternion]), jnp.asarray([*rates, *twist])
+    return as_state([*angles, *position, *quaternion]), as_state([*rates, *twist])
 
 
 @named(_cube_start)
@@ -142,7 +141,7 @@ def _table_start(
     center = height + size[2] / 2
     place = [center * s, 0.0, center * c, xp.cos(tilt / 2), 0.0, xp.sin(tilt / 2), 0.0]
     moving = [center * rate, 0.0, 0.0, 0.0, rate, 0.0]
-    return jnp.asarray([*place, tilt]), jnp.asarray([*moving, rate])
+    return as_state([*place, tilt]), as_state([*moving, rate])
 
 
 @named(_table_start)

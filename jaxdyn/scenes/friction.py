@@ -8,7 +8,7 @@ from jaxdyn.constraints import rolling_sphere
 from jaxdyn.contact.unilateral import UnilateralContact, gap_contact, ground_contact
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import MetricSystem
 
@@ -20,9 +20,9 @@ def _rough_start(
 ) -> tuple[Array, Array]:
     # The link touches the disk of radius 1 from above, tilted clockwise.
     height = 1 + (1 + jnp.sin(tilt) * (place - link_place)) / jnp.cos(tilt)
-    q = jnp.stack([jnp.asarray(x, float) for x in (place, 1.0, 0.0, link_place, height, -tilt)])
+    q = as_leaf([place, 1.0, 0.0, link_place, height, -tilt])
     # Along itself, so that the contact stays closed; velocities are in the link's axes.
-    return q, jnp.zeros(6).at[3].set(speed)
+    return q, as_leaf([0.0, 0.0, 0.0, speed, 0.0, 0.0])
 
 
 @named(_rough_start)
@@ -77,7 +77,7 @@ def _toy_potential(q, t, p):
 def _woodpecker_start(
     gap: Number = 0.0006, half_height: Number = 0.0058, bird: Number = -0.2788, velocity: Row = (-0.3411, 0.0, -7.4583)
 ) -> tuple[Array, Array]:
-    return jnp.asarray([0.0, -gap / half_height, bird]), jnp.asarray(velocity)
+    return as_state([0.0, -gap / half_height, bird]), as_state(velocity)
 
 
 @named(_woodpecker_start)
@@ -115,16 +115,16 @@ def woodpecker(
     Source: Glocker (1995), pp. 162; Leine, Glocker & van Campen (2001).
     """
     sleeve, bird = masses
-    arms = jnp.asarray([1.0, to_spring, to_bird], float)
-    mass = bird * jnp.outer(arms, arms) + jnp.diag(jnp.asarray([sleeve, moments[0], moments[1]], float))
-    weight = gravity * (bird * arms + jnp.asarray([sleeve, 0.0, 0.0], float))
-    numbers = {"mass": mass, "weight": weight, "stiffness": jnp.asarray(stiffness, float)}
+    arms = as_leaf([1.0, to_spring, to_bird])
+    mass = bird * jnp.outer(arms, arms) + jnp.diag(as_leaf([sleeve, moments[0], moments[1]]))
+    weight = gravity * (bird * arms + as_leaf([sleeve, 0.0, 0.0]))
+    numbers = {"mass": mass, "weight": weight, "stiffness": as_leaf(stiffness)}
     system = MetricSystem(_toy_metric, 3, potential=_toy_potential, parameters=numbers)
     play, reach = sleeve_radius - pole_radius, to_spring + to_bird - beak[1]
 
     def contact(name, rate, constant, along, e):
-        gap = _Toy(jnp.asarray(rate, float), jnp.asarray(constant, float))
-        return gap_contact(gap, _Row(jnp.asarray(along, float)), friction, restitution=e, name=name)
+        gap = _Toy(as_leaf(rate), as_leaf(constant))
+        return gap_contact(gap, _Row(as_leaf(along)), friction, restitution=e, name=name)
 
     edge = (1.0, sleeve_radius, 0.0)
     contacts = (

@@ -1,6 +1,5 @@
 """Hands that hold an object: planar ones with two fingers, and three fingers around a ball. Each scene is a `Grasp`."""
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -12,7 +11,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_state, named
 from jaxdyn.scenes.linkages import _circles, thin_bar
 
 _LINKS = (0.3, 0.25)
@@ -78,7 +77,7 @@ def _planar_state(fingers, center, angle, velocity):
         q += [low, high - low]
         axes, origins = np.stack([_UP, _UP]), xp.stack([base, knee])
         v += [*_rates(axes, origins, point, _carried(*moving, point))]
-    return jnp.asarray([*q, *center, angle]), jnp.asarray([*v, *velocity])
+    return as_state([*q, *center, angle]), as_state([*v, *velocity])
 
 
 def _bar_start(
@@ -253,7 +252,7 @@ def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
         velocity = _carried(*moving, point)
         angles, rates = _spatial_finger(_base(direction, circle), links, tip, point, velocity)
         q, v = [*q, *angles], [*v, *rates]
-    return jnp.asarray([*q, *position, *quaternion]), jnp.asarray([*v, *twist])
+    return as_state([*q, *position, *quaternion]), as_state([*v, *twist])
 
 
 def _ball_start(

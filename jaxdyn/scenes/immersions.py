@@ -12,7 +12,7 @@ from jaxdyn.constraints import loop
 from jaxdyn.geometry.immersion import constrain_by_immersion
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import MetricSystem
@@ -115,7 +115,7 @@ def _double_start(
     formulation: str = "lagrangian", angles: Row = (0.6, -0.2), rates: Row = (1.1, -0.7), length: Number = 1.0
 ) -> tuple[Array, Array]:
     _builder(formulation)
-    (theta, phi), (theta_rate, phi_rate) = jnp.asarray(angles, float), jnp.asarray(rates, float)
+    (theta, phi), (theta_rate, phi_rate) = as_leaf(angles), as_leaf(rates)
     if formulation == "model":
         return jnp.stack([theta, phi - theta]), jnp.stack([theta_rate, phi_rate - theta_rate])
     if formulation == "loop":
@@ -183,7 +183,7 @@ def _disk_start(
     tilt: Number = 0.3,
     rates: Row = (0.4, 0.2, -0.1, 0.3),
 ) -> tuple[Array, Array]:
-    return jnp.asarray([place, turn, link_place, tilt]), jnp.asarray(rates)
+    return as_state([place, turn, link_place, tilt]), as_state(rates)
 
 
 @named(_disk_start)

@@ -10,14 +10,14 @@ from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.inertia import box, displaced
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_leaf, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import MetricSystem
 
 
 def _given(position, velocity):
-    return jnp.asarray(position, float), jnp.asarray(velocity, float)
+    return as_leaf(position), as_leaf(velocity)
 
 
 def _particle_start(position: Row = (0.0, 0.0), velocity: Row = (1.0, 2.0)) -> tuple[Array, Array]:

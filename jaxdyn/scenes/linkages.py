@@ -10,7 +10,7 @@ from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import loop
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_state, named
 from jaxdyn.systems.scene import Scene
 
 _DOWN = (0.0, -9.81, 0.0)
@@ -62,7 +62,7 @@ def _four_bar_start(
     coupling, rocking = xp.arctan2(*(b - a)[::-1]), xp.arctan2(b[1], b[0] - ground)
     # Velocities of B as carried by the coupler and by the rocker agree.
     first, second = _solved(_across(coupler, coupling), -_across(rocker, rocking), -rate * _across(crank, angle))
-    return jnp.asarray([angle, coupling - angle, rocking]), jnp.asarray([rate, first - rate, second])
+    return as_state([angle, coupling - angle, rocking]), as_state([rate, first - rate, second])
 
 
 @named(_four_bar_start)
@@ -98,7 +98,7 @@ def _slider_crank_start(
     leaning = -crank * xp.cos(angle) * rate / (rod * xp.cos(lean))
     place = crank * xp.cos(angle) + rod * xp.cos(lean)
     sliding = -crank * xp.sin(angle) * rate - rod * xp.sin(lean) * leaning
-    return jnp.asarray([angle, lean - angle, place]), jnp.asarray([rate, leaning - rate, sliding])
+    return as_state([angle, lean - angle, place]), as_state([rate, leaning - rate, sliding])
 
 
 @named(_slider_crank_start)
@@ -127,7 +127,7 @@ def _names(count: int) -> tuple[list[str], list[str]]:
 def _windows_start(count: Checked[int] = 2, rate: Number = 1.0) -> tuple[Array, Array]:
     # Depth-first: each upright but the last one is followed by the coupler that it carries, which does not turn.
     v = [sign * rate for _ in range(count) for sign in (-1.0, 1.0)] + [-rate]
-    return jnp.zeros(2 * count + 1), jnp.asarray(v)
+    return as_state(np.zeros(2 * count + 1)), as_state(v)
 
 
 @named(_windows_start)
@@ -175,7 +175,7 @@ def _parallel_start(
         rates = _solved(_across(length, first), _across(length, second), velocity)
         q += [first, second - first]
         v += [rates[0], rates[1] - rates[0]]
-    return jnp.asarray(q), jnp.asarray(v)
+    return as_state(q), as_state(v)
 
 
 @named(_parallel_start)
@@ -204,7 +204,7 @@ def parallel_manipulator(
 def _ring_start(count: Checked[int] = 6, length: Number = 1.0, rate: Number = 1.0) -> tuple[Array, Array]:
     middle = length / 2, length / 2 / np.tan(np.pi / count)
     q = [-middle[0], -middle[1], 0.0, *[2 * np.pi / count] * (count - 1)]
-    return jnp.asarray(q), jnp.asarray([rate * middle[1], -rate * middle[0], rate, *[0.0] * (count - 1)])
+    return as_state(q), as_state([rate * middle[1], -rate * middle[0], rate, *[0.0] * (count - 1)])
 
 
 @named(_ring_start)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Holonomic
 from jaxdyn.model.arguments import Number
-from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 
@@ -33,7 +33,7 @@ def _scene(dimension: int, mass, length, gravity) -> Scene:
 
 def _plane_start(length: Number = 1.0, angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:
     s, c = numpy_for(angle).sin(angle), numpy_for(angle).cos(angle)
-    return length * jnp.asarray([s, -c]), length * rate * jnp.asarray([c, s])
+    return length * as_state([s, -c]), length * rate * as_state([c, s])
 
 
 @named(_plane_start)

@@ -5,12 +5,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints import Holonomic, loop
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem
@@ -53,7 +54,7 @@ def _numbers(parameters):
     """The printed parameters as leaves."""
     if isinstance(parameters, dict):
         return {key: _numbers(value) for key, value in parameters.items()}
-    return jnp.asarray(parameters, float)
+    return as_leaf(parameters)
 
 
 def _andrews_mass(q, t, p):
@@ -153,7 +154,7 @@ def _andrews_start() -> tuple[Array, Array]:
         -0.222668390165885884674473185609,
         1.23054744454982119249735015568,
     )
-    return jnp.asarray(q), jnp.zeros(7)
+    return as_state(q), as_state(np.zeros(7))
 
 
 # Place of each joint of the tree in the printed coordinates: beta, Theta, gamma, delta, Phi, epsilon, Omega.
@@ -180,7 +181,7 @@ class _AndrewsPotential(eqx.Module):
 
 def _andrews_bodies_start() -> tuple[Array, Array]:
     q, v = _andrews_start()
-    return q[jnp.asarray(ANDREWS_ORDER)], v
+    return as_state(np.asarray(q)[np.array(ANDREWS_ORDER)]), v
 
 
 @named(_andrews_bodies_start)
@@ -255,7 +256,7 @@ class _CarRows(eqx.Module):
 
 
 def _car_start() -> tuple[Array, Array]:
-    return jnp.asarray([0.0, 0.5, 1.0, 0.5]), jnp.asarray([-0.5, 0.0, -0.5, 0.0])
+    return as_state([0.0, 0.5, 1.0, 0.5]), as_state([-0.5, 0.0, -0.5, 0.0])
 
 
 @named(_car_start)

@@ -9,7 +9,7 @@ from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.scenes._named import as_leaf, as_state, named
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 
@@ -40,7 +40,7 @@ def _disk_start(
     xp = numpy_for(heading)
     c, s = xp.cos(heading), xp.sin(heading)
     speed = radius * rolling
-    return jnp.asarray([0.0, 0.0, heading, 0.0]), jnp.asarray([speed * c, speed * s, steering, rolling])
+    return as_state([0.0, 0.0, heading, 0.0]), as_state([speed * c, speed * s, steering, rolling])
 
 
 @named(_disk_start)
@@ -60,7 +60,7 @@ def rolling_disk(
 
 
 def _sleigh_start(speed: Number = 0.2, yaw_rate: Number = 1.5) -> tuple[Array, Array]:
-    return jnp.zeros(3), jnp.asarray([speed, 0.0, yaw_rate])
+    return as_state(np.zeros(3)), as_state([speed, 0.0, yaw_rate])
 
 
 @named(_sleigh_start)
@@ -79,7 +79,7 @@ def chaplygin_sleigh(*, mass: Number = 1.0, inertia_com: Number = 0.5, offset: N
 
 
 def _incline_start(yaw_rate: Number = 2.0) -> tuple[Array, Array]:
-    return jnp.zeros(3), jnp.asarray([0.0, 0.0, yaw_rate])
+    return as_state(np.zeros(3)), as_state([0.0, 0.0, yaw_rate])
 
 
 @named(_incline_start)
@@ -113,7 +113,7 @@ def _coin_start(
     center = (0.0, circle - radius * sine, radius * cosine)
     omega = (0.0, turn * sine + spin, turn * cosine)
     forward = -turn * (circle - radius * sine)
-    return jnp.asarray([*center, *turned]), jnp.asarray([forward, 0.0, 0.0, *omega])
+    return as_state([*center, *turned]), as_state([forward, 0.0, 0.0, *omega])
 
 
 @named(_coin_start)
@@ -139,7 +139,7 @@ class _NoTurn(eqx.Module):
 
 
 def _suslov_start(across: Number = 1.0, along: Number = -0.5) -> tuple[Array, Array]:
-    return jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray([across, along, 0.0])
+    return as_state([1.0, 0.0, 0.0, 0.0]), as_state([across, along, 0.0])
 
 
 @named(_suslov_start)

@@ -1,7 +1,6 @@
 """Hands whose fingertips roll on the object as surfaces do, whatever their shapes."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -11,7 +10,7 @@ from jaxdyn.grasp import Grasp
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_state, named
 from jaxdyn.scenes.hands import (
     _CIRCLE,
     _SPATIAL_LINKS,
@@ -80,7 +79,7 @@ def _egg_start(
         angles, rates = _held(_base(direction, circle), links, tip_semi_axes, point, normal, velocity)
         q, v = [*q, *angles], [*v, *rates]
     scene = hand_rolling_egg(links=links, circle=circle, semi_axes=semi_axes, tip_semi_axes=tip_semi_axes)
-    return scene.system.place(jnp.asarray([*q, *position, *quaternion])), jnp.asarray([*v, *twist])
+    return scene.system.place(as_state([*q, *position, *quaternion])), as_state([*v, *twist])
 
 
 @named(_egg_start)

@@ -1,6 +1,5 @@
 """Linkages in space that move although counting their joints says that they cannot."""
 
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete, numpy_for
@@ -8,7 +7,7 @@ from jaxdyn.constraints import loop
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_state, named
 from jaxdyn.scenes.linkages import thin_bar
 from jaxdyn.systems.scene import Scene
 
@@ -38,7 +37,7 @@ def _bennett_start(
     k = xp.sin((second + first) / 2) / xp.sin((second - first) / 2)
     follower = 2 * xp.arctan2(k, xp.tan(angle / 2))
     following = -rate * xp.sin(follower) / xp.sin(angle)
-    return jnp.asarray([angle, follower, -angle]), jnp.asarray([rate, following, -rate])
+    return as_state([angle, follower, -angle]), as_state([rate, following, -rate])
 
 
 @named(_bennett_start)

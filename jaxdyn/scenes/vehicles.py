@@ -1,6 +1,5 @@
 """Vehicles on wheels that roll without slipping, or on blades, built from their bodies."""
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -8,7 +7,7 @@ from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import named
+from jaxdyn.scenes._named import as_state, named
 from jaxdyn.systems.scene import Scene
 
 _AXLE = (np.zeros(3), (-np.pi / 2, 0.0, 0.0))  # z of the wheel along y of the body
@@ -28,7 +27,7 @@ def _bicycle_start(
     yaw_rate = -trail * numpy_for(tilt).cos(tilt) / wheel_base * steer_rate
     q = [0.0, 0.0, rear_radius, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     v = [speed, -rear_radius * roll_rate, 0.0, roll_rate, 0.0, yaw_rate]
-    return jnp.asarray(q), jnp.asarray([*v, speed / rear_radius, steer_rate, speed / front_radius])
+    return as_state(q), as_state([*v, speed / rear_radius, steer_rate, speed / front_radius])
 
 
 @named(_bicycle_start)
@@ -95,7 +94,7 @@ def _drive_start(
 ) -> tuple[Array, Array]:
     speed_difference = yaw_rate * half_track
     spins = [(speed - speed_difference) / radius, (speed + speed_difference) / radius]
-    return jnp.zeros(5), jnp.asarray([speed, 0.0, yaw_rate, *spins])
+    return as_state(np.zeros(5)), as_state([speed, 0.0, yaw_rate, *spins])
 
 
 def _add_wheel(builder, name, parent, mass, radius, place):
@@ -155,7 +154,7 @@ def _car_start(
         steer_rate,
         speed / xp.cos(steer) / radius,
     ]
-    return jnp.asarray([0.0, 0.0, 0.0, 0.0, 0.0, steer, 0.0]), jnp.asarray([speed, 0.0, yaw_rate, *spins])
+    return as_state([0.0, 0.0, 0.0, 0.0, 0.0, steer, 0.0]), as_state([speed, 0.0, yaw_rate, *spins])
 
 
 @named(_car_start)
@@ -207,7 +206,7 @@ def _snakeboard_start(
 ) -> tuple[Array, Array]:
     front, back = (numpy_for(angle).tan(angle) for angle in angles)
     sideways, yaw_rate = speed * (front + back) / 2, speed * (front - back) / (2 * half_length)
-    return jnp.asarray([0.0, 0.0, 0.0, *angles, 0.0]), jnp.asarray([speed, sideways, yaw_rate, *rates, rotor_rate])
+    return as_state([0.0, 0.0, 0.0, *angles, 0.0]), as_state([speed, sideways, yaw_rate, *rates, rotor_rate])
 
 
 @named(_snakeboard_start)

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_known
+from jaxdyn.compile import compiled, is_known, numpy_for
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Checked, Numbers, check_state
+from jaxdyn.model.arguments import Checked, Numbers, check_state, stored
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
@@ -59,13 +59,19 @@ def _stable_radii() -> tuple[np.ndarray, np.ndarray]:
     return angles, radii[np.argmax(growth > 1 + _GROWTH, axis=1)]
 
 
-def _longest_step(values) -> Array:
-    """Of Dopri8, for the eigenvalues of a motion; what grows by itself counts as an oscillation."""
-    size = jnp.abs(values)
-    angles = jnp.arctan2(jnp.abs(values.imag), jnp.maximum(-values.real, 0.0))
-    stable = jnp.interp(angles, *(jnp.asarray(x, size.dtype) for x in _stable_radii()))
+def _rates(values) -> tuple:
+    """Fastest decay and oscillation among the eigenvalues of a motion, and the longest step of Dopri8.
+
+    What grows by itself counts as an oscillation there.
+    """
+    xp = numpy_for(values)
+    size = xp.abs(values)
+    angles = xp.arctan2(xp.abs(values.imag), xp.maximum(-values.real, 0.0))
+    stable = xp.interp(angles, *(xp.asarray(x, size.dtype) for x in _stable_radii()))
     rest = size <= 0
-    return jnp.min(jnp.where(rest, jnp.inf, stable / jnp.where(rest, jnp.ones_like(size), size)), initial=jnp.inf)
+    step = xp.min(xp.where(rest, xp.inf, stable / xp.where(rest, xp.ones_like(size), size)), initial=xp.inf)
+    decay, frequency = (xp.max(x, initial=0.0) + 0.0 for x in (-values.real, values.imag))  # and no -0.0
+    return decay, frequency, step
 
 
 def stiffness(
@@ -100,15 +106,14 @@ def stiffness(
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     matrix = _linearised(scene, q, v, t, control)
     if is_known(matrix):
-        # LAPACK by numpy, which compiles nothing.
+        # All by numpy, which compiles nothing.
         known = np.asarray(matrix, float)
         if not np.isfinite(known).all():
             raise ValueError(f"forces or masses are not finite at q = {q}, v = {v}, t = {t}; look at another state")
         values = np.linalg.eigvals(known)
     else:
         values = jnp.linalg.eigvals(matrix)
-    fastest = (jnp.max(jnp.asarray(x), initial=0.0) for x in (-values.real, values.imag))
-    return Stiffness(*(x.astype(matrix.dtype) for x in (*fastest, _longest_step(jnp.asarray(values)))))
+    return Stiffness(*(stored(x, matrix.dtype) for x in _rates(values)))
 
 
 @compiled

@@ -12,6 +12,8 @@ from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
+from jaxdyn.compile import compiled
+
 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower triangular L with L L^T = matrix, of which the lower triangle is read; NaN where it is not positive definite."""
@@ -45,6 +47,7 @@ def solve_factored(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> 
     return solve_lower(factor, solve_lower(factor, right), transposed=True)
 
 
+@compiled
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """matrix^-1 right by Cholesky's factorisation; NaN where the matrix is not positive definite."""
     return solve_factored(cholesky(matrix), right)
