@@ -24,6 +24,8 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# Nobody reads where in the source an operation of a compiled program comes from, and to write it down takes 4 % of the time.
+jax.config.update("jax_traceback_in_locations_limit", 0)
 
 # From here on annotations are checked, so this precedes the first import of jaxdyn. Those of `compile/`, whose functions are
 # called a million times a test, are left to pyright: checked here they would double the time of many tests.
