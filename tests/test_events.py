@@ -72,7 +72,6 @@ def test_steps_of_fixed_length_end_at_events_and_go_on(shaken):
     assert 10 < errors[0] / errors[1] < 24
 
 
-@pytest.mark.slow
 def test_steps_of_fixed_length_have_gradients_through_events():
     ts = jnp.asarray([0.0, 2.5, 4.0])
 

@@ -66,7 +66,6 @@ def tree(scene):
     return whole.directions(lambda s: s.system.gravity, std=0.1).directions(lambda s: s.system.screws, rows=["link2"])
 
 
-@pytest.mark.slow
 def test_every_point_is_a_system_that_can_exist():
     model = arm().replace(lower=-jnp.ones(3), upper=jnp.ones(3))
     scene, points = scene_of(model), tree(scene_of(model))

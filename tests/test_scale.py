@@ -843,7 +843,6 @@ def test_sweep_refuses(tmp_path, capsys, old, new, error):
     assert not (tmp_path / "study.zarr").exists()
 
 
-@pytest.mark.slow
 def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     from jaxdyn.cli import main
 
