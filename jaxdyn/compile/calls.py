@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxdyn.compile import mode
+from jaxdyn.compile import jax_adapter, mode
 from jaxdyn.compile.garbage import uncollected
 from jaxdyn.compile.known import Known, is_concrete, is_staged, partition_traced
 
@@ -55,16 +55,11 @@ _LEAST = _QUICK | {"xla_backend_optimization_level": 0}
 def quick_options() -> dict[str, Any] | None:
     """Options with which XLA compiles glue quickly.
 
-    None where the environment asks for the usual ones, or XLA does not know these.
+    None where the environment asks for the usual ones.
     """
     if mode.wants_usual_options():
         return None
-    options = _LEAST if mode.wants_least_optimisation() else _QUICK
-    try:
-        jax.jit(lambda: 0.0, compiler_options=options)()
-    except jax.errors.JaxRuntimeError:
-        return None
-    return options
+    return jax_adapter.known_options(_LEAST if mode.wants_least_optimisation() else _QUICK)
 
 
 def glue_options(platform: str) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
-from jaxdyn.compile import matrices
+from jaxdyn.compile import jax_adapter, matrices
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bound, computed, of_nothing
 from jaxdyn.compile.graph import Graph, Number, as_objects, objects
@@ -254,17 +254,17 @@ class _Expansion:
         return [np.moveaxis(sums, 0, params["axis"])]
 
     def _scan(self, params, args, eqn):
-        consts, carry = args[: params["num_consts"]], args[params["num_consts"] :][: params["num_carry"]]
-        rows = args[params["num_consts"] + params["num_carry"] :]
+        count, carried = jax_adapter.scan_counts(params)
+        consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
         saved: list[list] = []
         length = params["length"]
         for i in reversed(range(length)) if params["reverse"] else range(length):
             results = self.closed(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
-            carry = results[: params["num_carry"]]
-            saved.append(results[params["num_carry"] :])
+            carry = results[:carried]
+            saved.append(results[carried:])
         if params["reverse"]:
             saved.reverse()
-        outs = [x.aval for x in eqn.outvars[params["num_carry"] :]]
+        outs = [x.aval for x in eqn.outvars[carried:]]
         if not length:
             return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
         return [*carry, *(_stacked(column) for column in zip(*saved, strict=True))]

@@ -20,9 +20,9 @@ def unless(flag: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def _batched(args, axes):
-    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not batching.not_mapped)
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
     moved = [
-        jnp.broadcast_to(x, (size, *x.shape)) if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0)
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(args, axes, strict=True)
     ]
     return unless_p.bind(*moved), 0

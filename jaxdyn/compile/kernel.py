@@ -291,9 +291,9 @@ def _(*avals, program, rows):
 
 def _batched(args, axes, *, program, rows):
     """A new leading axis for what varies; what all samples share stays a row."""
-    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not batching.not_mapped)
-    moved = [x if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
-    varies = [axis is not batching.not_mapped for axis in axes]
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+    moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
+    varies = [axis is not None for axis in axes]
     inner = max((x.shape[v:-1] for x, v in zip(moved, varies, strict=True)), key=len)
     full = []
     for x, v in zip(moved, varies, strict=True):

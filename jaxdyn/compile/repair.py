@@ -35,7 +35,7 @@ mlir.register_lowering(_any_in_batch_p, lambda ctx, flag: [flag])
 
 
 def _over_samples(arrays, axes):
-    return _any_in_batch_p.bind(jnp.any(arrays[0], axis=axes[0])), batching.not_mapped
+    return _any_in_batch_p.bind(jnp.any(arrays[0], axis=axes[0])), None
 
 
 batching.primitive_batchers[_any_in_batch_p] = _over_samples

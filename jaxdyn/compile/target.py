@@ -27,7 +27,7 @@ SLOTS = 1 << 16
 # (0.1 us) and short beside the wait for the last one.
 OPERATIONS_PER_CHUNK = 40_000
 ANNOUNCED_AFTER = 5.0  # seconds of compilation
-_VERSION = (0, 3)  # of XLA's FFI, whose structures `handler.ll` describes
+_VERSIONS = ((0, 3), (0, 5))  # of XLA's FFI, between which structures that `handler.ll` describes only grew
 _MISSING = "jaxdyn: this program was compiled by another process, which had its kernel; trace it again here"
 _FAILED = "jaxdyn: a kernel could not be compiled; the error was logged"
 _MISFIT = "jaxdyn: a buffer of a kernel has another size than the kernel was written for"
@@ -78,8 +78,8 @@ def interface_version() -> tuple[int, int]:
 def register() -> None:
     """Compile the handler and tell XLA of it, once in a process. **Raises:** `Unsupported`."""
     version = interface_version()
-    if version != _VERSION:
-        raise Unsupported(f"jaxlib has version {version} of XLA's FFI, and kernels are written for {_VERSION}")
+    if not _VERSIONS[0] <= version <= _VERSIONS[1]:
+        raise Unsupported(f"jaxlib has version {version} of XLA's FFI, and kernels are written for {_VERSIONS[0]} to {_VERSIONS[1]}")
     architecture = _architecture()
     if architecture not in _RELAX:
         raise Unsupported(f"the processor is {architecture}, and kernels are written for {', '.join(_RELAX)}")

@@ -4,7 +4,7 @@ import warnings
 
 import jax
 
-TESTED = ((0, 10), (0, 10))  # the first and the last minor version
+TESTED = ((0, 10), (0, 12))  # the first and the last minor version
 
 
 def warn_of_version(version: tuple[int, ...] | None = None) -> None:
