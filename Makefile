@@ -10,7 +10,7 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 # The files with tests of native kernels: a run of those alone need not import the others.
 NATIVE := $(shell grep -l "mark.native" tests/test_*.py)
 # Most of a test of mechanics is compiling, by XLA and by LLVM. These options leave a third of that out, and change no more than rounding.
-QUICK := XLA_FLAGS="--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1" \
+QUICK = XLA_FLAGS="$$($(BIN)/python tests/xla_options.py)" \
 	JAXDYN_COMPILATION_OPTIONS=least
 
 .DEFAULT_GOAL := help
