@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxdyn.compile.versions import warn_of_version
 
 import jaxdyn
-from jaxdyn.compile.versions import warn_of_version
 
 PACKAGE = Path(jaxdyn.__file__).parent
 

@@ -1,7 +1,7 @@
 """Options with which XLA compiles fast code that runs slowly, for tests that compile much and run little.
 
-LLVM's optimiser and XLA's newer fusion emitters are most of a compile; neither changes what is computed. Options that the installed
-XLA does not have are left out: a compiler option would be refused, and an unknown flag ends the process.
+LLVM's optimiser and XLA's newer fusion emitters are most of a compile; neither changes what is computed. Options that the
+installed XLA does not have are left out: a compiler option would be refused, and an unknown flag ends the process.
 
 `python tests/xla_options.py` prints the flags of whole test runs.
 """

@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxdyn.compile import jax_adapter, mode
+from jaxdyn.compile import mode
 from jaxdyn.compile.garbage import uncollected
+from jaxdyn.compile.jax_adapter import known_options
 from jaxdyn.compile.known import Known, is_concrete, is_staged, partition_traced
 
 _MOST_NUMBERS = 10_000  # beyond which a tree is no input of mechanics, but data that no program should contain
@@ -59,7 +60,7 @@ def quick_options() -> dict[str, Any] | None:
     """
     if mode.wants_usual_options():
         return None
-    return jax_adapter.known_options(_LEAST if mode.wants_least_optimisation() else _QUICK)
+    return known_options(_LEAST if mode.wants_least_optimisation() else _QUICK)
 
 
 def glue_options(platform: str) -> dict[str, Any] | None:
