@@ -68,7 +68,7 @@ def _kernels_or_none() -> Iterator[None]:
     except Exception as error:
         if not forgive(error):
             raise
-        _against_kernels = str(error)
+        _against_kernels = _against_kernels or f"{type(error).__name__}: {error}"
 
 
 def try_first(trial: Callable) -> None:

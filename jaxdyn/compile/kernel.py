@@ -115,7 +115,7 @@ def shaped_results(program, leaves) -> list:
 
 
 def _at_once(program, leaves) -> list:
-    """`shaped_results` of known numbers as one program: outside of a trace the kernel and each change of a shape would be one each."""
+    """The same of known numbers as one program: outside of a trace the kernel and each change of a shape would be one each."""
     with jax.disable_jit(False):
         return _jitted_shaped(program)(*leaves)
 
