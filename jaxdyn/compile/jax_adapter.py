@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jax.core import ShapedArray as ShapedArray
 from jax.core import Tracer as Tracer
+from jax.core import eval_jaxpr
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 logger = logging.getLogger("jaxdyn")
@@ -92,14 +93,17 @@ def reason_against_kernels() -> str | None:
 
 # --- extension points ---
 
-ClosedJaxpr: Any = None
-Literal: Any = None
-with _kernels_or_none():
+try:
     from jax.extend.core import ClosedJaxpr as ClosedJaxpr
     from jax.extend.core import Literal as Literal
     from jax.extend.core import Primitive
     from jax.extend.mlir.dialects import sdy
     from jax.interpreters import ad, batching, mlir
+except ImportError as _error:
+    if not forgive(_error):
+        raise
+    _against_kernels = f"{type(_error).__name__}: {_error}"
+    ClosedJaxpr = Literal = object  # which nothing asks for then
 
 
 def define_primitive(
@@ -165,7 +169,7 @@ def lower_function(function: Callable, context, *operands, **params) -> Any:
 
 def function_of(closed) -> Callable:
     """The function of a closed jaxpr, from a flat list of arrays to one."""
-    return functools.partial(jax.core.eval_jaxpr, closed.jaxpr, closed.consts)
+    return functools.partial(eval_jaxpr, closed.jaxpr, closed.consts)
 
 
 # --- parameters of primitives in jaxprs ---
@@ -323,8 +327,9 @@ def _structures(header: str) -> dict[str, dict[str, int]]:
             size, alignment = kind
             at = -(-at // alignment) * alignment
             fields[field.group(3)], at, widest = at, at + size, max(widest, alignment)
+        else:
+            sizes[name] = -(-at // widest) * widest, widest
         structures[name] = fields
-        sizes[name] = -(-at // widest) * widest, widest
     return structures
 
 
