@@ -246,12 +246,12 @@ import casadi
 import numpy as np
 
 f = casadi.external("{exported.name}", "./{exported.name}.so")
-results = f({arguments})
+results = f(*map(casadi.DM, [{arguments}]))
 results = results if isinstance(results, (tuple, list)) else [results]
 worst = 0.0
 for got, expected in zip(results, [{expected}], strict=True):
     expected = np.asarray(expected)
-    got = np.asarray(got).reshape(expected.shape)
+    got = got.full().reshape(expected.shape)
     worst = max(worst, abs(got - expected).max() / max(abs(expected).max(), 1e-300))
 print(f"largest relative difference {{worst:.3g}}")
 raise SystemExit(worst > {TOLERANCE:g})
