@@ -1,5 +1,6 @@
 """Operations on numbers as lines of LLVM's intermediate representation: every number is a vector over W samples of a batch."""
 
+import functools
 import struct
 from collections.abc import Sequence
 
@@ -112,6 +113,12 @@ class Emitter:
             return self.sine_and_cosine(args[0], kind)[op == "cos"]
         if op == "sign" and kind in FLOATS:
             return self.sign(args[0], kind)
+        if op in ("reduce_max", "reduce_min"):
+            pick = op.removeprefix("reduce_")
+            return functools.reduce(lambda a, b: self.operation(pick, kind, (a, b), kind), args)
+        if op == "clamp":
+            low, x, high = args
+            return self.operation("min", kind, (self.operation("max", kind, (x, low), kind), high), kind)
         if op in ("max", "min") and kind == "b1":
             return self.put(f"{'or' if op == 'max' else 'and'} {of} {args[0]}, {args[1]}")
         if op in ("max", "min") and kind not in FLOATS:
