@@ -39,6 +39,15 @@ def _own_rule(x):
 _own_rule.defjvp(lambda primals, tangents: (_own_rule(primals[0]), tangents[0] * (1 - _own_rule(primals[0]) ** 2)))
 
 
+def _halve_and_add(_, pair):
+    y, x = pair
+    return 0.5 * y + x, x
+
+
+def _running(carry, row):
+    return carry * row, carry + row
+
+
 def _all(x):
     return jnp.broadcast_to(x, (SIZE,))
 
@@ -53,8 +62,8 @@ UNARY: dict[str, Callable] = {
     "sum": lambda x: _all(x.sum()), "prod": lambda x: _all(x.prod()), "max": lambda x: _all(x.max()), "min": lambda x: _all(x.min()),
     "cumsum": jnp.cumsum, "reversed": lambda x: x[::-1], "matrix": lambda x: jnp.asarray(MATRIX, x.dtype) @ x, "norm": lambda x: _all(jnp.sqrt(x @ x)),
     "taken": lambda x: x[np.array([2, 0, 0])], "added": lambda x: x.at[np.array([0, 0, 2])].add(x),
-    "loop": lambda x: lax.fori_loop(0, 3, lambda i, y: 0.5 * y + x, x),
-    "scan": lambda x: lax.scan(lambda c, row: (c * row, c + row), x[0], x)[1],
+    "loop": lambda x: lax.fori_loop(0, 3, _halve_and_add, (x, x))[0],
+    "scan": lambda x: lax.scan(_running, x[0], x)[1],
     "stopped": lambda x: x * lax.stop_gradient(x),
     "whole": lambda x: (jnp.clip(x, -9.0, 9.0).astype(jnp.int32) * 3 + 1).astype(x.dtype),
     "safe root": lambda x: jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.5),
@@ -204,7 +213,10 @@ def _spread(function: Callable, args, wanted) -> list[np.ndarray]:
     pattern = jnp.asarray([1, -1, 1], x.dtype)
     changes = [by_jax(function, (x * (1 + sign * eps * pattern), *more)) for sign in (4, -4)]
     with np.errstate(invalid="ignore"):
-        return [np.nan_to_num(np.maximum(*(np.abs(c[k] - wanted[k]).max(-1, keepdims=True) for c in changes))) for k in range(len(wanted))]
+        return [
+            np.nan_to_num(np.maximum(*(np.abs(c[k] - wanted[k]).max(-1, keepdims=True) for c in changes)))
+            for k in range(len(wanted))
+        ]
 
 
 def compare(seed: int, is_through_xla: bool) -> collections.Counter:
@@ -219,7 +231,9 @@ def compare(seed: int, is_through_xla: bool) -> collections.Counter:
     for verdict in verdicts:
         if isinstance(verdict, tuple):
             k = NAMES.index(verdict[1])
-            print(f"seed {seed}: {function.steps}, {dtype.__name__}, {verdict[1:]} at {np.asarray(args[0][verdict[2]])}:")
+            print(
+                f"seed {seed}: {function.steps}, {dtype.__name__}, {verdict[1:]} at {np.asarray(args[0][verdict[2]])}:"
+            )
             print(f"    kernel {computed[k][verdict[2]]}\n    JAX    {wanted[k][verdict[2]]}", flush=True)
     return verdicts
 
@@ -229,7 +243,9 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=10_000, help="functions (default: 10000)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first function (default: 0)")
-    parser.add_argument("--through-xla", type=int, default=50, metavar="N", help="each Nth function within XLA (default: 50)")
+    parser.add_argument(
+        "--through-xla", type=int, default=50, metavar="N", help="each Nth function within XLA (default: 50)"
+    )
     options = parser.parse_args(argv)
     from jaxdyn.compile import objects
 

@@ -198,9 +198,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
     return framed(e, f"{count} {sizes}", uniform, len(program.outputs), body.allocated())
 
 
-def framed(
-    e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocated: Sequence[str]
-) -> str:
+def framed(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocated: Sequence[str]) -> str:
     """The text of a whole kernel around the lines that `e` holds for the W samples from %base on, which may have labels.
 
     `uniform` says which arguments are the same for all samples; so many `outputs` follow them. `title` is a comment on top, and

@@ -5,8 +5,8 @@ and multiply them. Known numbers carry their type: a Python float is a float64 a
 of numpy. So known integers wrap, and known float32 numbers round, as they would in XLA.
 
 Sums and products with 0, 1 and -1 are not written, and signs are moved outwards, so that they meet and cancel. Four of these
-rules change results, and no others may: docs/algorithms.md lists them, and tests/test_folding.py holds the rest to JAX bit by
-bit up to rounding. Each has its comment "Listed" here. What no output needs is dropped when a graph is finished to a `Program`.
+rules change results: docs/algorithms.md lists them, and `python -m benchmarks.random_functions` compares all the rest with JAX.
+Each has its comment "Listed" here. What no output needs is dropped when a graph is finished to a `Program`.
 """
 
 import functools
@@ -176,7 +176,9 @@ class Graph:
             a, b = b, a
         if type(b) is not Number:
             if b == 0:
-                return as_kind(0, a.kind)  # Listed: 0 inf and 0 times what is not a number. The sparsity of mechanics is this.
+                return as_kind(
+                    0, a.kind
+                )  # Listed: 0 inf and 0 times what is not a number. The sparsity of mechanics is this.
             if b == 1:
                 return a
             if b == -1:
@@ -238,7 +240,8 @@ class Graph:
         """One of `FUNCTIONS_OF_TWO`."""
         if type(a) is not Number and type(b) is not Number:
             return _with_type(FUNCTIONS_OF_TWO[op](a, b))
-        return a if a is b and op in ("max", "min") else self.make(op, a.kind if type(a) is Number else b.kind, a, b)
+        # The larger of x and x is written: where x is not a number JAX's derivative of it is zero, and that of x is not.
+        return self.make(op, a.kind if type(a) is Number else b.kind, a, b)
 
     def extreme(self, op: str, entries: Sequence):
         """The "reduce_max" or "reduce_min" of at least one entry.

@@ -361,9 +361,13 @@ def _change_of_transposed(program, linear, given, backwards, avals, moving) -> P
             handed = [is_given for is_given, is_float in zip(given, floats, strict=True) if is_float]
             of_change = [*linear, *[False] * sum(moving[:count])]
             by_fixed = _transposed(first, tuple(of_change), tuple(handed))
-            total = kernel_p.bind(*fixed, *(x for x in steps[:count] if x is not None), *cotangents, program=by_fixed, rows=0)
+            total = kernel_p.bind(
+                *fixed, *(x for x in steps[:count] if x is not None), *cotangents, program=by_fixed, rows=0
+            )
         if any(moving[count:]):
-            of_cotangents = [jnp.zeros_like(c) if d is None else d for c, d in zip(cotangents, steps[count:], strict=True)]
+            of_cotangents = [
+                jnp.zeros_like(c) if d is None else d for c, d in zip(cotangents, steps[count:], strict=True)
+            ]
             by_cotangents = kernel_p.bind(*fixed, *of_cotangents, program=backwards, rows=0)
             total = by_cotangents if total is None else [a + b for a, b in zip(total, by_cotangents, strict=True)]
         return total
