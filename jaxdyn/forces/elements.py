@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, take
-from jaxdyn.model.arguments import Number, SystemLike, batch_hint
+from jaxdyn.model.arguments import Number, SystemLike, batch_hint, is_concrete
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model, difference, neutral
 

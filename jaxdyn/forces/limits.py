@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete
-from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete
 from jaxdyn.model.tree import Model
 
 

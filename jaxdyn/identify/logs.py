@@ -8,8 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete
-from jaxdyn.model.arguments import Checked, Numbers
+from jaxdyn.model.arguments import Checked, Numbers, is_concrete
 from jaxdyn.model.tree import Model
 
 
