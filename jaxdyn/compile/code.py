@@ -218,7 +218,7 @@ def framed(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, alloca
             "  %some = icmp ult i64 %begin, %end",
             "  br i1 %some, label %block, label %done",
             "block:",
-            f"  %base = phi i64 [ %begin, %entry ], [ %next, %following ]",
+            "  %base = phi i64 [ %begin, %entry ], [ %next, %following ]",
             *e.lines,
             "  br label %following",
             "following:",

@@ -24,7 +24,7 @@ _NUMPY_REDUCTIONS: dict[str, Callable] = {
 def of_nothing(name: str, dtype):
     """A reduction of no entries."""
     if name in ("reduce_max", "reduce_min"):
-        if dtype == bool:
+        if dtype.kind == "b":
             return name == "reduce_min"
         ends = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
         return ends[name == "reduce_min"]

@@ -12,13 +12,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Literal
 
 from jaxdyn.compile import matrices
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bound, computed, converted, of_nothing
 from jaxdyn.compile.graph import Graph, Number, as_objects, objects
+from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts
 from jaxdyn.compile.program import Array, NotNumbers, Program, as_kind, kind_of
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS, written
 
@@ -70,6 +69,10 @@ class _Expansion:
         unary = {"neg": graph.neg, "not": graph.invert, "is_finite": graph.is_finite}
         unary |= {name: functools.partial(graph.function, name) for name in numbers.FUNCTIONS}
         unary |= {"square": lambda x: graph.mul(x, x), "rsqrt": lambda x: graph.div(1.0, graph.function("sqrt", x))}
+        unary |= {
+            "log2": lambda x: graph.div(graph.function("log", x), math.log(2.0)),
+            "one_minus_square": self._one_less,
+        }
         self.elementwise = {name: np.frompyfunc(f, 2, 1) for name, f in binary.items()}
         self.elementwise |= {name: np.frompyfunc(f, 1, 1) for name, f in unary.items()}
         self.divide = np.frompyfunc(graph.div, 2, 1)
@@ -101,7 +104,7 @@ class _Expansion:
         if name in _INNER:
             inner = params[_INNER[name]]
             self.has_rules |= name.startswith("custom_")
-            if self.calls and name in ("jit", "pjit"):
+            if self.calls and name == "jit":
                 return self._called(inner, args)
             return self.closed(inner, args) if isinstance(inner, ClosedJaxpr) else self.evaluate(inner, (), args)
         rule = _OTHER.get(name)
@@ -164,6 +167,19 @@ class _Expansion:
             return g.mul(g.function("sign", x), g.select(up, whole, g.add(whole, 1.0), _kind(dtype)))
 
         return objects([rounded(x) for x in array.ravel().tolist()], array.shape)
+
+    def _one_less(self, x):
+        """1 - x^2; the square where its rounding is small, else the product that is exact near one."""
+        g = self.graph
+        is_small = g.compare("lt", g.function("abs", x), 0.5)
+        return g.select(is_small, g.mul(g.add(1.0, x), g.sub(1.0, x)), g.sub(1.0, g.mul(x, x)), x.kind)
+
+    def _polynomial(self, params, args, eqn):
+        """Horner's rule; the coefficients follow x, that of the highest power last."""
+        shape = eqn.outvars[0].aval.shape
+        x, *coefficients = (np.broadcast_to(as_objects(y), shape) for y in args)
+        add, mul = self.elementwise["add"], self.elementwise["mul"]
+        return [as_objects(functools.reduce(lambda value, c: add(mul(value, x), c), reversed(coefficients)))]
 
     def _same(self, params, args, eqn):
         return args
@@ -259,17 +275,17 @@ class _Expansion:
         return [np.moveaxis(sums, 0, params["axis"])]
 
     def _scan(self, params, args, eqn):
-        consts, carry = args[: params["num_consts"]], args[params["num_consts"] :][: params["num_carry"]]
-        rows = args[params["num_consts"] + params["num_carry"] :]
+        count, carried = scan_counts(params)
+        consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
         saved: list[list] = []
         length = params["length"]
         for i in reversed(range(length)) if params["reverse"] else range(length):
             results = self.closed(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
-            carry = results[: params["num_carry"]]
-            saved.append(results[params["num_carry"] :])
+            carry = results[:carried]
+            saved.append(results[carried:])
         if params["reverse"]:
             saved.reverse()
-        outs = [x.aval for x in eqn.outvars[params["num_carry"] :]]
+        outs = [x.aval for x in eqn.outvars[carried:]]
         if not length:
             return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
         return [*carry, *(_stacked(column) for column in zip(*saved, strict=True))]
@@ -350,13 +366,11 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
 
 
 _INNER = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr",
-    "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
-    "custom_vjp_call_jaxpr": "fun_jaxpr",
+    "jit": "jaxpr", "closed_call": "call_jaxpr", "eval_jaxpr": "call_jaxpr", "remat2": "jaxpr",
+    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
 }  # fmt: skip
 _OTHER: dict[str, Callable] = {
     "copy": _Expansion._same,
-    "copy_p": _Expansion._same,
     "optimization_barrier": _Expansion._same,
     "pvary": _Expansion._same,
     "convert_element_type": _Expansion._convert,
@@ -365,9 +379,9 @@ _OTHER: dict[str, Callable] = {
     "clamp": _Expansion._clamp,
     "dot_general": _Expansion._dot_general,
     "scatter-add": _Expansion._scatter,
-    "scatter_add": _Expansion._scatter,
     "scatter": _Expansion._scatter,
     "cumsum": _Expansion._cumsum,
+    "polynomial": _Expansion._polynomial,
     "scan": _Expansion._scan,
     "while": _Expansion._while,
     "cond": _Expansion._cond,
@@ -379,7 +393,11 @@ _OTHER: dict[str, Callable] = {
 }
 
 # Maxima and minima are of integers too.
-_OF_FLOATS = {*numbers.FUNCTIONS, *numbers.FUNCTIONS_OF_TWO} - {"max", "min", "stop_gradient"}
+_OF_FLOATS = {*numbers.FUNCTIONS, *numbers.FUNCTIONS_OF_TWO, "log2", "one_minus_square"} - {
+    "max",
+    "min",
+    "stop_gradient",
+}
 
 
 def _constant(x) -> np.ndarray:

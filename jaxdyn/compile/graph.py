@@ -18,7 +18,6 @@ import numpy as np
 
 from jaxdyn.compile.program import (
     COMPARISONS,
-    FLOATS,
     FUNCTIONS,
     FUNCTIONS_OF_TWO,
     Array,

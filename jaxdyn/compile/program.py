@@ -54,6 +54,7 @@ class Program:
     - `subprograms`: what is called, written once however often it is.
     - `derivative`: None, or a function (which inputs move) -> the `Program` of the change of all outputs, of the inputs and the
       changes of those that move.
+    - `fallback`: None, or the function of which this is the program, from flat arrays of one sample to flat arrays.
     """
 
     turns = 1  # how often the operations are carried out
@@ -68,6 +69,7 @@ class Program:
         self.subprograms: tuple[Program, ...] = tuple(subprograms)
         self.derivative = derivative
         self.name = name
+        self.fallback: Callable | None = None
         self.derived: dict = {}
 
     def __repr__(self):

@@ -10,9 +10,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import Constraint, Pfaffian
 from jaxdyn.constraints.rolling import RollingSphere
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, as_array, pose_leaf
@@ -147,7 +147,7 @@ class UnilateralContact(WithModes):
         owner = f"UnilateralContact {self.name!r}"
         self.coefficient, self.static = _coefficients(friction, static, owner)
         self.restitution = jnp.asarray(as_array(restitution, f"{owner}: restitution"), float)
-        known = None if isinstance(self.restitution, Tracer) else np.asarray(self.restitution)
+        known = np.asarray(self.restitution) if is_concrete(self.restitution) else None
         if known is not None and not ((known >= 0) & (known <= 1)).all():
             raise ValueError(f"{owner}: restitution is {restitution}; give a number from 0 to 1")
 
@@ -181,7 +181,7 @@ def ground_contact(
     """
     name = f"{body} on the ground" if name is None else name
     size = jnp.asarray(as_array(radius, f"ground_contact {name!r}: radius"), float)
-    if size.shape != () or not (isinstance(size, Tracer) or 0 <= float(size) < np.inf):
+    if size.shape != () or (is_concrete(size) and not 0 <= float(size) < np.inf):
         raise ValueError(f"ground_contact {name!r}: radius is {radius}; give one number (m), 0 for a point")
     touching = RollingSphere(
         name=name,
@@ -278,7 +278,7 @@ def _coefficients(sliding: Any, static: Any, owner: str):
         jnp.asarray(as_array(x, f"{owner}: coefficient"), float)
         for x in (sliding, sliding if static is None else static)
     ]
-    if not any(isinstance(x, Tracer) for x in both):
+    if is_concrete(both):
         mu, mu_s = (np.asarray(x) for x in both)
         if not (np.isfinite(mu).all() and (mu >= 0).all() and np.isfinite(mu_s).all() and (mu_s >= mu).all()):
             raise ValueError(f"{owner}: coefficients are {mu} sliding and {mu_s} at rest; give 0 <= sliding <= static")
@@ -289,6 +289,6 @@ def _positive(value: Any, what: str):
     if value is None:
         return None
     number = jnp.asarray(as_array(value, what), float)
-    if not isinstance(number, Tracer) and not (np.asarray(number) > 0).all():
+    if is_concrete(number) and not (np.asarray(number) > 0).all():
         raise ValueError(f"{what} is {value}; give a positive velocity (m/s), or None for friction that sticks")
     return number

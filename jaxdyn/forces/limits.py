@@ -6,10 +6,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete
 from jaxdyn.model.tree import Model
 
 
@@ -97,7 +96,7 @@ class EffortLimits(eqx.Module):
 
     def __init__(self, limit: Numbers | None = None):
         self.limit = None if limit is None else jnp.asarray(as_array(limit, "EffortLimits: limit"), float)
-        if self.limit is not None and not isinstance(self.limit, Tracer) and not (np.asarray(self.limit) >= 0).all():
+        if self.limit is not None and is_concrete(self.limit) and not (np.asarray(self.limit) >= 0).all():
             raise ValueError(
                 f"EffortLimits: limit is {limit}; give limits that are not negative, or None for the model's"
             )
@@ -122,7 +121,7 @@ class EffortLimits(eqx.Module):
 
 def _number(value: Any, what: str, least: float, strict: bool):
     number = jnp.asarray(as_array(value, what), float)
-    fine = isinstance(number, Tracer) or (
+    fine = not is_concrete(number) or (
         number.shape == () and np.isfinite(number) and (number > least if strict else number >= least)
     )
     if not fine:

@@ -8,9 +8,8 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
-from jaxdyn.compile import is_expanding, is_rank_safe, partition_traced
+from jaxdyn.compile import is_concrete, is_expanding, is_rank_safe, partition_traced
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
@@ -54,13 +53,13 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
             "jd.simulate, or jd.CoulombFriction in their place"
         )
     seconds = as_array(dt, "stepper: dt")
-    if seconds.shape != () or not (isinstance(seconds, Tracer) or 0 < float(seconds) < np.inf):
+    if seconds.shape != () or (is_concrete(seconds) and not 0 < float(seconds) < np.inf):
         raise ValueError(f"stepper: dt is {dt!r}; give one positive number (s)")
     if isinstance(substeps, bool) or not isinstance(substeps, (int, np.integer)) or substeps < 1:
         raise ValueError(f"stepper: substeps is {substeps!r}; give a positive integer")
     method, system, dtype = chosen_method(scene, "auto"), scene.system, state_dtype(scene.system)
     unknown, known = partition_traced(scene)
-    length = jnp.asarray(seconds, dtype) if isinstance(seconds, Tracer) else np.asarray(seconds, dtype)
+    length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
 
     # Traced once for each mode of `jd.compilation`.
     @functools.partial(jax.jit, static_argnums=0)
