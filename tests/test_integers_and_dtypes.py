@@ -22,7 +22,7 @@ def by_kernel(function, *args):
 
 @pytest.mark.parametrize("dtype", [np.int32, np.int64], ids=["int32", "int64"])
 def test_known_integers_wrap(dtype):
-    """Sums, products, powers, shifts, quotients, remainders and conversions of the ends of the range, known and beside numbers."""
+    """All arithmetic and conversions of the ends of the range, known alone and beside a number that is not."""
     ends = np.iinfo(dtype)
     known = np.array([ends.max, ends.min, 7, -7, 0], dtype)
 
