@@ -15,10 +15,10 @@ import numpy as np
 
 from jaxdyn.compile import matrices
 from jaxdyn.compile import program as numbers
-from jaxdyn.compile.constants import bound, computed, of_nothing
+from jaxdyn.compile.constants import bound, computed, converted, of_nothing
 from jaxdyn.compile.graph import Graph, Number, as_objects, objects
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts
-from jaxdyn.compile.program import Array, NotNumbers, Program, kind_of
+from jaxdyn.compile.program import Array, NotNumbers, Program, as_kind, kind_of
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS, written
 
 # A function of fewer operations is written where it is called.
@@ -76,14 +76,9 @@ class _Expansion:
         self.elementwise = {name: np.frompyfunc(f, 2, 1) for name, f in binary.items()}
         self.elementwise |= {name: np.frompyfunc(f, 1, 1) for name, f in unary.items()}
         self.divide = np.frompyfunc(graph.div, 2, 1)
-        self.reductions = {
-            "reduce_sum": graph.add,
-            "reduce_prod": graph.mul,
-            "reduce_max": functools.partial(graph.function_of_two, "max"),
-            "reduce_min": functools.partial(graph.function_of_two, "min"),
-            "reduce_and": graph.both,
-            "reduce_or": graph.either,
-        }
+        chains = {"sum": graph.add, "prod": graph.mul, "and": graph.both, "or": graph.either}
+        self.reductions = {f"reduce_{name}": functools.partial(functools.reduce, f) for name, f in chains.items()}
+        self.reductions |= {name: functools.partial(graph.extreme, name) for name in ("reduce_max", "reduce_min")}
 
     def evaluate(self, jaxpr, consts, args) -> list:
         values = dict(zip(jaxpr.constvars, (_constant(x) for x in consts), strict=True))
@@ -129,11 +124,12 @@ class _Expansion:
         if name in self.elementwise:
             if name in _OF_FLOATS and any(x.aval.dtype.kind != "f" for x in eqn.invars):
                 raise NotNumbers(f"{name} of integers")
-            return [as_objects(self.elementwise[name](*args))]
+            # numpy would make Python's numbers of entries, which forget their type.
+            return [as_objects(self.elementwise[name](*(as_objects(x) for x in args)))]
         if name == "div":
             if out.dtype.kind != "f":
                 raise NotNumbers("division of integers")
-            return [as_objects(self.divide(*args))]
+            return [as_objects(self.divide(*(as_objects(x) for x in args)))]
         if name in self.reductions:
             return [self._reduced(name, args[0], params["axes"], out)]
         raise NotNumbers(name)
@@ -156,7 +152,7 @@ class _Expansion:
         if not count:
             return as_objects(np.full(out.shape, of_nothing(name, out.dtype), out.dtype))
         rows = np.moveaxis(as_objects(array), axes, range(len(axes))).reshape(count, math.prod(out.shape))
-        return objects([functools.reduce(fold, column) for column in rows.T.tolist()], out.shape)
+        return objects([fold(column) for column in rows.T.tolist()], out.shape)
 
     # --- rules that need more than the entries ---
 
@@ -197,17 +193,15 @@ class _Expansion:
         return [objects(chosen, args[1].shape)]
 
     def _convert(self, params, args, eqn):
-        if args[0].dtype.kind != "O":
-            return [args[0].astype(params["new_dtype"])]
-        kind = _kind(params["new_dtype"])
-        return [objects([self.graph.convert(x, kind) for x in args[0].ravel().tolist()], args[0].shape)]
+        return [self._as_dtype(args[0], params["new_dtype"])]
 
     def _integer_pow(self, params, args, eqn):
         if args[0].dtype.kind != "O":
             return [
                 np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)
             ]
-        return [objects([self.graph.power(x, params["y"]) for x in args[0].ravel().tolist()], args[0].shape)]
+        one = as_kind(1, _kind(eqn.outvars[0].aval.dtype))
+        return [objects([self.graph.power(x, params["y"], one) for x in args[0].ravel().tolist()], args[0].shape)]
 
     def _select(self, params, args, eqn):
         which, *cases = args
@@ -229,8 +223,7 @@ class _Expansion:
 
     def _clamp(self, params, args, eqn):
         low, x, high = (np.broadcast_to(as_objects(x), eqn.outvars[0].aval.shape).ravel().tolist() for x in args)
-        pick = self.graph.function_of_two
-        clamped = [pick("min", pick("max", b, a), c) for a, b, c in zip(low, x, high, strict=True)]
+        clamped = [self.graph.clamp(a, b, c) for a, b, c in zip(low, x, high, strict=True)]
         return [objects(clamped, eqn.outvars[0].aval.shape)]
 
     def _dot_general(self, params, args, eqn):
@@ -246,9 +239,21 @@ class _Expansion:
         b = np.moveaxis(b, (*batch_b, *sum_b), (*range(len(batch_b)), *range(-len(sum_b), 0))).reshape(
             count, columns, length
         )
+        # The result may be asked for in a wider type than that of the operands, and is summed in it.
+        a, b = (self._as_dtype(x, out.dtype) for x in (a, b))
+        if out.dtype == bool:
+            raise NotNumbers("a product of bools")
         if a.dtype.kind != "O" and b.dtype.kind != "O":
             return [np.asarray(a @ b.transpose(0, 2, 1), out.dtype).reshape(out.shape)]
-        return [objects(matrices.product(self.graph, a, b, 0.0 if out.dtype.kind == "f" else 0), out.shape)]
+        zero = as_kind(0, _kind(out.dtype))
+        return [objects(matrices.product(self.graph, as_objects(a), as_objects(b), zero), out.shape)]
+
+    def _as_dtype(self, x: np.ndarray, dtype) -> np.ndarray:
+        """An array, known or not, as one of a dtype."""
+        if x.dtype.kind != "O":
+            return converted(x, dtype)
+        kind = _kind(dtype)
+        return objects([self.graph.convert(y, kind) for y in x.ravel().tolist()], x.shape)
 
     def _scatter(self, params, args, eqn):
         operand, indices, updates = args

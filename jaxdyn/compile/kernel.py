@@ -259,7 +259,7 @@ def _by_rule(tangent: Callable, known: Known, count: int, structure, avals, serv
             args = jax.tree.unflatten(structure, primal[count:])
             return tangent(known(primal[:count]), *args, [*every, *given[count:]])
 
-        return _expanded_change(change, avals, moving, served)
+        return _change_program(change, avals, moving, served)
 
     return derivative
 
@@ -280,17 +280,24 @@ def _by_jax(flat: Callable, avals, served: bool):
 
             return jax.jvp(moved, [primal[i] for i in places], list(steps))[1]
 
-        return _expanded_change(change, avals, moving, served)
+        return _change_program(change, avals, moving, served)
 
     return derivative
 
 
-def _expanded_change(change: Callable, avals, moving, served: bool) -> Program:
-    """The change as a program; NaN at samples that are flagged, where whoever runs the function is told of them."""
-    steps = [aval for aval, varies in zip(avals, moving, strict=True) if varies]
+def _change_program(change: Callable, avals, moving, served: bool) -> Program:
+    """The change as a program; NaN at samples that are flagged, where whoever runs the function is told of them.
+
+    A rule may call functions with rules of their own, itself included, and then the change is differentiated by JAX again:
+    its numbers would give the derivative of how a value is computed, where the rule says another one.
+    """
+    avals = [*avals, *(aval for aval, varies in zip(avals, moving, strict=True) if varies)]
     with mode.expanding():
-        closed = jax.make_jaxpr(change)(*avals, *steps)
-    return expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=served)[0]
+        closed = jax.make_jaxpr(change)(*avals)
+    program, has_rules = expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=served)
+    if has_rules:
+        program.derivative = _by_jax(change, avals, served)
+    return program
 
 
 # --- the primitive ---
@@ -376,10 +383,53 @@ def _changes_by_jax(program, moving, primals, steps) -> list:
     return jax.jvp(moved, [primals[i] for i in places], steps)[1]
 
 
+def _transposed(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
+    """The transpose of a program (see `derive`), which honours the rules of the program when it is differentiated."""
+    backwards = derive.transposed(program, linear, given)
+    if program.derivative is not None and backwards.derivative is None:
+        avals = [jax.ShapeDtypeStruct((array.size,), array.dtype) for array in backwards.inputs]
+        backwards.derivative = functools.partial(_change_of_transposed, program, linear, given, backwards, avals)
+    return backwards
+
+
+def _change_of_transposed(program, linear, given, backwards, avals, moving) -> Program:
+    """The change of x, c -> L(x)^T c for a program L(x) s, linear in s, whose change with x is known by a rule.
+
+    It is (dL/dx dx)^T c + L(x)^T dc: the transpose of the change of the program where x moves and s does not, and the
+    transpose of the program itself.
+    """
+    count = linear.count(False)  # inputs that are fixed, which come before the cotangents
+
+    def change(*leaves):
+        fixed, cotangents = list(leaves[:count]), list(leaves[count : len(avals)])
+        following = iter(leaves[len(avals) :])
+        steps = [next(following) if varies else None for varies in moving]
+        total = None
+        if any(moving[:count]):
+            each = iter(moving[:count])
+            first = derive.tangent(program, [False if is_linear else next(each) for is_linear in linear])
+            floats = [x.dtype.kind == "f" for x in program.outputs]
+            handed = [is_given for is_given, is_float in zip(given, floats, strict=True) if is_float]
+            of_change = [*linear, *[False] * sum(moving[:count])]
+            by_fixed = _transposed(first, tuple(of_change), tuple(handed))
+            total = kernel_p.bind(
+                *fixed, *(x for x in steps[:count] if x is not None), *cotangents, program=by_fixed, rows=0
+            )
+        if any(moving[count:]):
+            of_cotangents = [
+                jnp.zeros_like(c) if d is None else d for c, d in zip(cotangents, steps[count:], strict=True)
+            ]
+            by_cotangents = kernel_p.bind(*fixed, *of_cotangents, program=backwards, rows=0)
+            total = by_cotangents if total is None else [a + b for a, b in zip(total, by_cotangents, strict=True)]
+        return total
+
+    return _change_program(change, avals, moving, served=False)
+
+
 def _transpose(cotangents, *operands, program, rows):
     linear = [is_linear(x) for x in operands]
     given = [not is_zero(x) for x in cotangents]
-    backwards = derive.transposed(program, linear, given)
+    backwards = _transposed(program, tuple(linear), tuple(given))
     fixed = [x for x, varies in zip(operands, linear, strict=True) if not varies]
     moved = [x for x in cotangents if not is_zero(x)]
     results = iter(kernel_p.bind(*fixed, *moved, program=backwards, rows=rows))
@@ -403,7 +453,8 @@ _OPERATIONS: dict[str, Callable] = {
     "cos": cosine, "tan": lax.tan, "asin": lax.asin, "acos": lax.acos, "atan": lax.atan, "sinh": lax.sinh, "cosh": lax.cosh,
     "tanh": lax.tanh, "exp": lax.exp, "exp2": lax.exp2, "expm1": lax.expm1, "log": lax.log, "log1p": lax.log1p, "abs": lax.abs,
     "floor": lax.floor, "ceil": lax.ceil, "sign": lax.sign, "cbrt": lax.cbrt, "stop_gradient": lax.stop_gradient,
-    "round": lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN),
+    "round": lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), "reduce_max": lambda *x: functools.reduce(lax.max, x),
+    "reduce_min": lambda *x: functools.reduce(lax.min, x), "clamp": lambda low, x, high: lax.min(lax.max(x, low), high),
 } | {name: getattr(lax, name) for name in COMPARISONS}  # fmt: skip
 
 
