@@ -21,6 +21,7 @@ from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
 from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.hybrid import motion as hybrid
+from jaxdyn.simulation.hybrid.machine import SEARCHED
 from jaxdyn.simulation.methods import Method
 from jaxdyn.simulation.motion import motion
 from jaxdyn.simulation.outputs import checked_outputs
@@ -196,7 +197,7 @@ def simulate(
         "max_events": max_events,
     }
     if modal and is_fixed(stepsize) and max_steps is None:
-        options["max_steps"] += hybrid.SEARCHED * max_events
+        options["max_steps"] += SEARCHED * max_events
     dtype = state_dtype(scene.system)
     numbers: list[Any] = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
     numbers.append(jnp.asarray(stepsize, dtype) if is_fixed(stepsize) else stepsize)

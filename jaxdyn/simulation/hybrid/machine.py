@@ -23,7 +23,8 @@ from jaxdyn.simulation.solvers.explicit import Plan, projected_output, step_in_t
 from jaxdyn.simulation.solvers.fixed_steps import accumulated, no_sums
 
 _SAFETY, _LEAST, _MOST, _AFTER_EVENT = 0.9, 0.2, 10.0, 0.3
-_SIMULTANEOUS, _REAL = 1e-9, 1e-6  # of the size of a condition in the step
+_SIMULTANEOUS, _REAL = 0.575, 0.383  # powers of eps, of the size of a condition in the step: 1e-9 and 1e-6 in float64
+SEARCHED = 40  # attempts at most to end a step at an event
 FINE, SHORT, PARADOX, NO_MODE, CROWDED = range(5)
 
 
@@ -78,8 +79,8 @@ class Steps(NamedTuple):
 
 
 class Laws(NamedTuple):
-    """The functions of a motion: `plan` of its steps, `judge(args, t, y)` -> conditions and their levels (n, CHANNELS), of flat
-    states; `transit(unknown, t, y, mode, slip, hit)` -> `Change`; `land(unknown, mode, slip, t, y)`, the state after
+    """The functions of a motion: `plan` of its steps, `judge(args, t, y)` -> conditions and their levels, of flat states: those of
+    the elements by CHANNELS, then those of the switching functions (see `Elements.split`); `transit(unknown, t, y, mode, slip, hit)` -> `Change`; `land(unknown, mode, slip, t, y)`, the state after
     an impact; `order` of the method and `error_order` of its estimate; `slip(y)` (n, 2) of a flat
     state, and `placed(y, v, slip)`, the flat state with these."""
 
@@ -125,7 +126,7 @@ def blank(elements: Elements, dtype, most: int) -> Records:
     """Before anything happened."""
     n, none = len(elements.each), jnp.zeros((most + 1,), jnp.int32)
     flags = jnp.zeros((most + 1, n), bool)
-    mode = Mode(flags, flags, flags)
+    mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool))
     slip = jnp.zeros((most + 1, n, 2), dtype)
     return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, mode, slip, mode, slip)
 
@@ -138,7 +139,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
     start, end, count = ts[0], ts[-1], ts.shape[0] - 1
     eps, dtype, n = float(jnp.finfo(ts.dtype).eps), y0.dtype, len(laws.elements.each)
     none, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    hit = jnp.zeros((n, CHANNELS), bool)
+    hit = jnp.zeros((n * CHANNELS + laws.elements.switches,), bool)
     begun: Change = laws.transit(unknown, start, y0, mode, slip, hit)
     y = laws.placed(y0, begun.v, begun.slip)
     conditions, _ = run(judged, (unknown, begun.mode), start, y, static=(laws,))
@@ -187,8 +188,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
 
 def _moving(laws: Laws, y) -> dict[str, Array]:
     """What moves of a flat state: not the directions of sliding."""
-    parts = laws.plan.structure(y)
-    return {"q": parts["q"], "v": parts["v"]}
+    return {name: part for name, part in laws.plan.structure(y).items() if name != "slip"}
 
 
 def _monitored(laws: Laws, origin, lane: Lane, after: Lane, kept, step) -> Lane:
@@ -243,8 +243,8 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float, steps: Steps 
     located = locating & (near | narrow) & ~inside
     kept = good & ((~violated & ~lane.locating) | located)
     # What the middle of a step showed may have been an error of the dense output.
-    real = located & (value <= _REAL)
-    hit = real & ((values <= _SIMULTANEOUS * scale) & (scale > 4 * level) | (values / scale <= value))
+    real = located & (value <= eps**_REAL)
+    hit = real & ((values <= eps**_SIMULTANEOUS * scale) & (scale > 4 * level) | (values / scale <= value))
 
     guided = (value_low > 64 * eps) & (value_high < 0) & (lane.tries < 30)
     slope = jnp.where(guided, value_high - value_low, 1.0)
@@ -260,7 +260,8 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float, steps: Steps 
         short, usual = ~good, lane.usual
         to_next = steps.to_next(jnp.where(kept, t1, lane.t))
         next_length = jnp.where(locating & ~located, secant, to_next)
-    pivot = jnp.min(lane.conditions[:, 2]) < 0.05  # friction that leaves no forces grows without bound before
+    pivots = laws.elements.split(lane.conditions)[0][:, 2]
+    pivot = jnp.min(pivots, initial=1.0) < 0.05  # friction that leaves no forces grows without bound before
     code = jnp.where(short, jnp.where(pivot, PARADOX, SHORT), lane.code).astype(jnp.int32)
     # Steps end on the run's end, or well before it.
     t = jnp.where(kept, t1, lane.t)
@@ -286,6 +287,7 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
     before, mode = lane.mode, change.mode
     y = laws.placed(lane.y, change.v, change.slip)
     conditions, _ = run(judged, (unknown, mode), lane.t, y, static=(laws,))
+    hit, switched = elements.split(hit)
     opened = hit.any(1)
     kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, 4))
     # A contact that is hit may let go at once.
@@ -294,12 +296,12 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
     differs = (mode.closed != before.closed) | (mode.stick != before.stick) | (mode.negative != before.negative)
     told = happens & (opened | differs)
     lost = hit[:, 2].any()  # of pivots: no mode follows
-    leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32)
-    rows, count = records, lane.count
+    leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32) if elements.each else jnp.zeros((), jnp.int32)
+    rows, count = _switched(elements, lane, records, switched & happens, change.slip, most)
     order = [(i, True) for i in range(len(elements.each))] + [(i, False) for i in range(len(elements.each))]
     for i, by_trigger in order:
         # First the one whose condition it was, which carries the impact; then what came with it.
-        mine = told[i] & ((leading // CHANNELS == i) == by_trigger)
+        mine = told[i] & ((hit.any() & (leading // CHANNELS == i)) == by_trigger)
         place = jnp.where(mine & (count < most), count, most)
         row = Records(
             lane.t,
@@ -314,9 +316,31 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
         count = count + mine.astype(jnp.int32)
     crowded = count > most
     code = jnp.where(change.settled, FINE, NO_MODE)
-    code = jnp.where(crowded, CROWDED, code)
+    # Of switching functions alone, a motion without room for its events goes on: it loses its derivatives.
+    code = jnp.where(crowded & bool(elements.each), CROWDED, code)
     code = jnp.where(change.paradox | lost, PARADOX, code)
-    after = lane._replace(
-        y=y, mode=mode, conditions=conditions, count=jnp.minimum(count, most), code=code.astype(jnp.int32)
-    )
+    # A switching function that changes back at once: on both sides of its zero the force drives the motion onto it.
+    last = jnp.maximum(jnp.minimum(lane.count, most) - 1, 0)
+    since = lane.t - records.time[last]
+    back = (jnp.arange(elements.switches) + len(elements.each) * len(KINDS) == records.name[last]) & switched
+    at_once = since <= 64 * float(jnp.finfo(lane.t.dtype).eps) * jnp.maximum(jnp.abs(lane.t), lane.usual)
+    code = jnp.where(back.any() & at_once, CROWDED, code)
+    after = lane._replace(y=y, mode=mode, conditions=conditions, count=count, code=code.astype(jnp.int32))
     return jax.tree.map(lambda a, b: jnp.where(happens, a, b), (after, rows), (lane, records))
+
+
+def _switched(elements: Elements, lane: Lane, records: Records, switched, slip, most: int):
+    """The records with a row for each switching function that changed its sign, one after the other, and their number."""
+    index = jnp.cumsum(switched) - 1
+    places = jnp.where(switched, jnp.minimum(lane.count + index, most), most)
+    # Each row has changed what stands in the rows before it and its own.
+    earlier = switched[None] & (index[None] <= index[:, None])
+    k, first = elements.switches, len(elements.each)
+    number = jnp.arange(k, dtype=jnp.int32)
+    modes, slip = jax.tree.map(lambda x: jnp.broadcast_to(x, (k, *x.shape)), (lane.mode, slip))
+    modes = modes._replace(positive=modes.positive ^ earlier)
+    rows = Records(
+        jnp.broadcast_to(lane.t, (k,)), first * len(KINDS) + number, first * CHANNELS + number, modes, slip, modes, slip
+    )  # fmt: skip
+    rows = jax.tree.map(lambda all_, new: all_.at[places].set(new.astype(all_.dtype)), records, rows)
+    return rows, lane.count + jnp.sum(switched).astype(jnp.int32)

@@ -134,9 +134,7 @@ def _(perturbed, moving, how: Drive):
 @_driven.def_bwd
 def _(history, gradients, perturbed, moving, how: Drive):
     count = moving[2].shape[0] - 1
-    rows = jax.tree.map(
-        lambda y, g: jnp.zeros((count, *y.shape), y.dtype) if g is None else g, moving[0], gradients[0]
-    )
+    rows = jax.tree.map(lambda y, g: jnp.zeros((count, *y.shape), y.dtype) if g is None else g, moving[0], gradients[0])
     return _pulled((moving, rows), jax.lax.stop_gradient(history), how, perturbed)
 
 
