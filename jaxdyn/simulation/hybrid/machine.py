@@ -64,6 +64,7 @@ class Lane(NamedTuple):
     code: Array
     count: Array
     sums: tuple[Array, Array]  # about steps of fixed length (`accumulated`)
+    loose: Array  # whether steps go across the zeros of switching functions, and pieces change where they end
 
 
 class Steps(NamedTuple):
@@ -151,7 +152,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
         steps = Steps(start, first)
     lane = Lane(
         start, y, first, first, begun.mode, conditions, no, zero, zero, zero, zero, none, none,
-        jnp.ones_like(conditions), none, none, code, none, no_sums(_moving(laws, y)),
+        jnp.ones_like(conditions), none, none, code, none, no_sums(_moving(laws, y)), no,
     )  # fmt: skip
     origin = y
     rows = jnp.broadcast_to(jnp.full_like(y, jnp.inf), (count, y.size))
@@ -168,13 +169,15 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
         after, kept, hit = _decided(laws, lane, t1, end, attempt, eps, steps)
         if steps is not None:
             after = _monitored(laws, origin, lane, after, kept, attempt[0])
+        if laws.elements.switches:
+            after = _across(laws.elements, after)
         after = jax.tree.map(lambda a, b: jnp.where(active, a, b), after, lane)
         kept, hit = kept & active, hit & active & kept
         saved, rows = save(laws.plan, ts, lane, after, kept, attempt[0], saved, rows)
         happens = hit.any()
         after, records = lax.cond(
             any_in_batch(happens),
-            lambda after, records: _crossed(laws, unknown, after, records, hit, happens, most),
+            lambda after, records: _crossed(laws, unknown, after, records, hit, happens, most, steps),
             lambda after, records: (after, records),
             after,
             records,
@@ -198,6 +201,14 @@ def _monitored(laws: Laws, origin, lane: Lane, after: Lane, kept, step) -> Lane:
     return after._replace(sums=jax.tree.map(lambda new, old: jnp.where(kept, new, old), sums, lane.sums))
 
 
+def _across(elements: Elements, lane: Lane) -> Lane:
+    """The lane in the pieces where its last step has ended, where steps go across the zeros of switching functions."""
+    first, switching = elements.split(lane.conditions)
+    crossed = lane.loose & (switching < 0)
+    conditions = jnp.concatenate([first.reshape(-1), jnp.where(crossed, -switching, switching)])
+    return lane._replace(mode=lane.mode._replace(positive=lane.mode.positive ^ crossed), conditions=conditions)
+
+
 def judged(laws: Laws, args, t, y):
     """Conditions and levels."""
     return laws.judge(args, t, y)
@@ -212,9 +223,9 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float, steps: Steps 
     factor = jnp.where(jnp.isnan(factor), _LEAST, factor)
     factor = jnp.clip(factor, jnp.where(good, 1.0, _LEAST), jnp.where(good, _MOST, _SAFETY)).astype(length.dtype)
 
-    violated = (values < -levels).any()
+    violated = (values < -levels).any() & ~lane.loose
     # In the middle alone: the step is halved first.
-    inside = good & ~lane.locating & (between < -levels_between).any()
+    inside = good & ~lane.locating & ~lane.loose & (between < -levels_between).any()
     violated = violated | inside
     at = jnp.where(inside, between, values)
     high = jnp.where(inside, length / 2, length)
@@ -273,14 +284,14 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float, steps: Steps 
             t, jnp.where(kept, step.projected, lane.y), next_length, usual, lane.mode,
             jnp.where(kept, values, lane.conditions), locating & ~located, low, high_, value_low, value_high, side,
             jnp.where(locating & ~located, lane.tries + one, 0), scale, lane.taken + one, lane.kept + kept.astype(jnp.int32),
-            code, lane.count, lane.sums,
+            code, lane.count, lane.sums, lane.loose,
         ),
         kept,
         hit,
     )  # fmt: skip
 
 
-def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, most: int):
+def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, most: int, steps: Steps | None):
     """The lane in the mode behind an event, and the records with it."""
     elements = laws.elements
     change: Change = laws.transit(unknown, lane.t, lane.y, lane.mode, laws.slip(lane.y), hit)
@@ -297,7 +308,9 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
     told = happens & (opened | differs)
     lost = hit[:, 2].any()  # of pivots: no mode follows
     leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32) if elements.each else jnp.zeros((), jnp.int32)
-    rows, count = _switched(elements, lane, records, switched & happens, change.slip, most)
+    rows, count = records, lane.count
+    if elements.switches:
+        rows, count = _switched(elements, lane, records, switched & happens, change.slip, most)
     order = [(i, True) for i in range(len(elements.each))] + [(i, False) for i in range(len(elements.each))]
     for i, by_trigger in order:
         # First the one whose condition it was, which carries the impact; then what came with it.
@@ -319,19 +332,21 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
     # Of switching functions alone, a motion without room for its events goes on: it loses its derivatives.
     code = jnp.where(crowded & bool(elements.each), CROWDED, code)
     code = jnp.where(change.paradox | lost, PARADOX, code)
-    # A switching function that changes back at once: on both sides of its zero the force drives the motion onto it.
-    last = jnp.maximum(jnp.minimum(lane.count, most) - 1, 0)
-    since = lane.t - records.time[last]
-    back = (jnp.arange(elements.switches) + len(elements.each) * len(KINDS) == records.name[last]) & switched
-    at_once = since <= 64 * float(jnp.finfo(lane.t.dtype).eps) * jnp.maximum(jnp.abs(lane.t), lane.usual)
-    code = jnp.where(back.any() & at_once, CROWDED, code)
-    after = lane._replace(y=y, mode=mode, conditions=conditions, count=count, code=code.astype(jnp.int32))
+    loose = jnp.zeros((), bool)
+    if elements.switches:
+        is_held = _changes_back(elements, lane, records, switched, most)
+        # Steps of fixed length go on about it.
+        loose = is_held & bool(steps is not None and not elements.each)
+        code = jnp.where(is_held & ~loose, CROWDED, code)
+        count = jnp.where(loose, most + 1, count)
+    code = code.astype(jnp.int32)
+    after = lane._replace(y=y, mode=mode, conditions=conditions, count=count, code=code, loose=lane.loose | loose)
     return jax.tree.map(lambda a, b: jnp.where(happens, a, b), (after, rows), (lane, records))
 
 
 def _switched(elements: Elements, lane: Lane, records: Records, switched, slip, most: int):
     """The records with a row for each switching function that changed its sign, one after the other, and their number."""
-    index = jnp.cumsum(switched) - 1
+    index = jnp.cumsum(switched, dtype=jnp.int32) - 1
     places = jnp.where(switched, jnp.minimum(lane.count + index, most), most)
     # Each row has changed what stands in the rows before it and its own.
     earlier = switched[None] & (index[None] <= index[:, None])
@@ -343,4 +358,12 @@ def _switched(elements: Elements, lane: Lane, records: Records, switched, slip, 
         jnp.broadcast_to(lane.t, (k,)), first * len(KINDS) + number, first * CHANNELS + number, modes, slip, modes, slip
     )  # fmt: skip
     rows = jax.tree.map(lambda all_, new: all_.at[places].set(new.astype(all_.dtype)), records, rows)
-    return rows, lane.count + jnp.sum(switched).astype(jnp.int32)
+    return rows, lane.count + jnp.sum(switched, dtype=jnp.int32)
+
+
+def _changes_back(elements: Elements, lane: Lane, records: Records, switched, most: int):
+    """Whether a switching function changes back at once: on both sides of its zero the force drives the motion onto it."""
+    last = jnp.maximum(jnp.minimum(lane.count, most) - 1, 0)
+    names = jnp.arange(elements.switches, dtype=jnp.int32) + len(elements.each) * len(KINDS)
+    least = 64 * float(jnp.finfo(lane.t.dtype).eps) * jnp.maximum(jnp.abs(lane.t), lane.usual)
+    return ((names == records.name[last]) & switched).any() & (lane.t - records.time[last] <= least)
