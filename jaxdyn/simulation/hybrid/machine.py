@@ -209,6 +209,11 @@ def _across(elements: Elements, lane: Lane) -> Lane:
     return lane._replace(mode=lane.mode._replace(positive=lane.mode.positive ^ crossed), conditions=conditions)
 
 
+def _put_back(laws: Laws, args, t, y):
+    """A state on the rows that act."""
+    return laws.plan.ended(args, t, y, jnp.zeros_like(y))[0]
+
+
 def judged(laws: Laws, args, t, y):
     """Conditions and levels."""
     return laws.judge(args, t, y)
@@ -297,6 +302,9 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
     change: Change = laws.transit(unknown, lane.t, lane.y, lane.mode, laws.slip(lane.y), hit)
     before, mode = lane.mode, change.mode
     y = laws.placed(lane.y, change.v, change.slip)
+    if elements.each:
+        # A gap is closed where it has fallen below zero by its level, which the first step behind would count as its error.
+        y = run(_put_back, (unknown, mode), lane.t, y, static=(laws,))
     conditions, _ = run(judged, (unknown, mode), lane.t, y, static=(laws,))
     hit, switched = elements.split(hit)
     opened = hit.any(1)

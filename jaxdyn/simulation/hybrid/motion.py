@@ -21,7 +21,7 @@ from jaxdyn.simulation.hybrid import machine
 from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, slides, terms_at
 from jaxdyn.simulation.hybrid.events import Events
 from jaxdyn.simulation.hybrid.laws import laws_of, put_back
-from jaxdyn.simulation.hybrid.modes import Mode, elements_of, extended, force_at
+from jaxdyn.simulation.hybrid.modes import KINDS, Mode, elements_of, extended, force_at
 from jaxdyn.simulation.hybrid.replay import Hybrid
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
@@ -191,7 +191,8 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
         "num_rejected_steps": lane.taken - lane.kept,
         "time_reached": jnp.where(good, lane.t, ts[0]),
     }
-    happened = Events(times, records.name[:most], elements.names)
+    struck = _struck(scene, elements, q0, v0, ts[0], mode)
+    happened = _events(elements, struck, ts[0], times, records.name[:most], good & start_ok)
     solver = label(options["solver"])
     shown = {"q": y["q"], "v": y["v"], **values}
     shown = jax.tree.map(lambda rows: rows_where(reached, rows, jnp.nan), shown)
@@ -215,6 +216,25 @@ def _guess(scene: Scene, elements, q, v, t):
     limit = float(jnp.finfo(q.dtype).eps) ** 0.4
     start_ok = (~opens | (gap >= -limit * reach)).all()
     return mode._replace(stick=mode.stick & ~smooth), lax.stop_gradient(unit), start_ok
+
+
+def _struck(scene: Scene, elements, q, v, t, mode: Mode):
+    """Which contacts are closed at the start by an impact, (n,)."""
+    rates = velocity_residual(extended(scene), q, v, t)
+    small = float(jnp.finfo(q.dtype).eps) ** 0.6 * (1 + jnp.max(jnp.abs(v)))
+    into = [rates[one.normal] < -small if one.opens else jnp.zeros((), bool) for one in elements.each]
+    return mode.closed & jnp.stack(into)
+
+
+def _events(elements, struck, start, times, index, good) -> Events:
+    """The events of a run, with the impacts at its start in front; none of a start that is refused."""
+    most = index.shape[0]
+    first = jnp.where(struck, jnp.arange(struck.shape[0], dtype=index.dtype) * len(KINDS), -1)
+    index = jnp.concatenate([first, index])
+    times = jnp.concatenate([jnp.where(struck, start, jnp.nan), times])
+    order = jnp.argsort(index < 0, stable=True)[:most]
+    index, times = index[order], times[order]
+    return Events(jnp.where(good, times, jnp.nan), jnp.where(good, index, -1), elements.names)
 
 
 def _forces(scene: Scene, elements, mode: Mode, terms, at_time, slip) -> dict:
