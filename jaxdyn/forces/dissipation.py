@@ -62,8 +62,8 @@ class SlidingFriction(PiecewiseForce):
     - `direction`: 1 or -1, the sign of A v where the motion starts and where it is zero.
     - `along`: index of the coordinate that slides, or a function A(q, t) -> (nv,).
 
-    **Raises:** ValueError for another direction, a negative coefficient or normal force, an index that is none; (when called) for one
-    beyond the system's velocities, and for shapes that do not fit.
+    **Raises:** ValueError for another direction, a negative coefficient or normal force, an index that is none; (when called)
+    for one beyond the system's velocities, and for shapes that do not fit.
 
     Source: EQUATIONS section 11 and erratum E42.
     """

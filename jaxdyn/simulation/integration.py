@@ -124,8 +124,8 @@ def undifferentiable(tree, reason: str):
     @same.defjvp
     def _(primals, tangents):
         raise ValueError(
-            "simulate: a force of the scene has a kink or a jump (jd.JointStops, jd.EffortLimits, a jd.PiecewiseForce), and steps "
-            f"that go across it have wrong derivatives. They end there for explicit steps alone: {reason}"
+            "simulate: a force of the scene has a kink or a jump (jd.JointStops, jd.EffortLimits, jd.SlidingFriction, another "
+            f"jd.PiecewiseForce). Steps that go across it have wrong derivatives, and here they cannot end there: {reason}"
         )
 
     return same(tree)

@@ -23,7 +23,6 @@ from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import as_scene, checked_force
 from jaxdyn.systems.system import SceneLike
 
-
 EVENTS = 8  # of a step, at most: a force that changes its piece more often leaves it without derivatives
 ADJOINTS = ("reverse", "forward", "direct")
 

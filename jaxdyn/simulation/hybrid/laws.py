@@ -40,8 +40,11 @@ _ROUNDS = 2
 
 
 def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
-    """`given(unknown, positive=None)` -> (scene, effort(q, v, t), switching functions(q, v, t)), of the numbers that are arguments,
-    with forces in the pieces where these are `positive`; `y0`, a state."""
+    """Functions of a motion with modes.
+
+    `given(unknown, positive=None)` -> (scene, generalized_force(q, v, t), switching(q, v, t)), of the numbers that are arguments,
+    with forces in the pieces where the switching functions are `positive`; `y0`, a state.
+    """
 
     def at(args, t, y):
         unknown, mode = args

@@ -80,10 +80,13 @@ class Steps(NamedTuple):
 
 
 class Laws(NamedTuple):
-    """The functions of a motion: `plan` of its steps, `judge(args, t, y)` -> conditions and their levels, of flat states: those of
-    the elements by CHANNELS, then those of the switching functions (see `Elements.split`); `transit(unknown, t, y, mode, slip, hit)` -> `Change`; `land(unknown, mode, slip, t, y)`, the state after
-    an impact; `order` of the method and `error_order` of its estimate; `slip(y)` (n, 2) of a flat
-    state, and `placed(y, v, slip)`, the flat state with these."""
+    """The functions of a motion.
+
+    `plan` of its steps; `judge(args, t, y)` -> conditions and their levels, of flat states: those of the elements by CHANNELS,
+    then those of the switching functions (see `Elements.split`); `transit(unknown, t, y, mode, slip, hit)` -> `Change`;
+    `land(unknown, mode, slip, t, y)`, the state after an impact; `order` of the method and `error_order` of its estimate;
+    `slip(y)` (n, 2) of a flat state, and `placed(y, v, slip)`, the flat state with these.
+    """
 
     plan: Plan
     elements: Elements

@@ -31,7 +31,7 @@ from jaxdyn.simulation.solvers.driver import Drive
 class Hybrid(eqx.Module):
     """How a motion is made: hybrid(y0, unknown, ts) -> rows of the state at ts[1:]; times of events; lane, records and start.
 
-    Derivatives reach y0, `unknown` and ts, through rows and times of events: those of a call in reverse mode, of `direct` in both.
+    Derivatives reach y0, `unknown` and ts through rows and times of events: of a call in reverse mode, of `direct` in both.
     """
 
     laws: Laws = eqx.field(static=True)

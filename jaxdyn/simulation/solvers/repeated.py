@@ -21,8 +21,8 @@ from jaxdyn.simulation.solvers.reverse import step_share
 def repeated_rows(plan: Plan, times, kept, count, y0, args, ts, steps):
     """Rows of the state (nt - 1, n) at ts[1:], flat; zero where the run did not come to.
 
-    **Arguments:** `times` (room, 2), `kept` (room,), `count` (): from where to where the steps went, which were kept, and how many
-    there were; `y0` (n,), flat; `steps`, the number of fixed ones, or None.
+    **Arguments:** `times` (room, 2), `kept` (room,), `count` (): from where to where the steps went, which were kept, and how
+    many there were; `y0` (n,), flat; `steps`, the number of fixed ones, or None.
     """
     times, kept, count, steps = lax.stop_gradient((times, kept, count, steps))
     room = kept.shape[0]
@@ -50,7 +50,7 @@ def repeated_rows(plan: Plan, times, kept, count, y0, args, ts, steps):
         after = lax.cond(any_in_batch(active), advanced, lambda args, y, *_: y, args, y, i, t0, t1)
         return jnp.where(active, after, y), y
 
-    number = jnp.arange(room)
+    number = jnp.arange(room, dtype=count.dtype)
     _, states = lax.scan(advance, y0, (number, times, kept))
     taken = kept & (number < count)
 
