@@ -338,6 +338,6 @@ def test_data_that_are_not_finite_have_a_code():
             changed[i].flat[0] = bad
             rows.append(changed)
     batch = [jnp.stack([row[i] for row in rows]) for i in range(6)]
-    results = jax.jit(jax.vmap(lambda *given: jd.contact.solve_qp(*given).result))(*batch)
-    finite = np.array([results[i] == jd.contact.RESULTS.nonfinite for i in range(len(rows))])
+    results = jax.jit(jax.vmap(lambda *given: solve_qp(*given).result))(*batch)
+    finite = np.array([results[i] == RESULTS.nonfinite for i in range(len(rows))])
     np.testing.assert_array_equal(np.flatnonzero(~finite), [0, 8])

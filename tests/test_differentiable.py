@@ -1,6 +1,7 @@
 """Reverse mode through adaptive steps takes the steps of the forward run, whatever controls them."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np

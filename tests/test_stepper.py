@@ -153,8 +153,7 @@ def test_second_derivatives_and_forward_mode_of_steps():
     system = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v - 0.5 * 9.0 * q @ q, 1)
 
     def after(adjoint, x):
-        q, v = jd.stepper(system, 0.1, adjoint=adjoint)((x[:1], x[1:]), jnp.zeros(1))
-        return q[0] ** 2
+        return jd.stepper(system, 0.1, adjoint=adjoint)((x[:1], x[1:]), jnp.zeros(1))[0][0] ** 2
 
     x, z = jnp.asarray([0.7, -0.4]), 0.3
     row = np.array([1 - z**2 / 2 + z**4 / 24, (z - z**3 / 6) / 3])

@@ -100,8 +100,8 @@ def simulate(
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to and besides the size of each entry of (q, v). Values below ten
       times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
-    - `adjoint`: "reverse" (default) for reverse mode with checkpoints; "forward" for jvp, jacfwd and Hessians by
-      forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
+    - `adjoint`: "reverse" (default) for reverse mode with checkpoints, and Hessians over it; "forward" for jvp, jacfwd and Hessians
+      by forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration"
       (the rate of v: of a free joint that of its body twist; `jd.frame_acceleration` gives those of frames in world axes),
@@ -115,8 +115,7 @@ def simulate(
       "report": the run goes on; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point, or
       -1, and a concrete run warns (`JointLimitWarning`).
     - `max_events`: of a scene with forces that have modes (`jd.DryFriction`, `jd.UnilateralContact`), after which the run ends
-      with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps, which end at events,
-      and are differentiated in reverse mode.
+      with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps, which end at events.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
       4096 with "direct", and where reverse mode goes through adaptive steps: it remembers where each one ends, at 8 bytes a
