@@ -100,8 +100,8 @@ def simulate(
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to and besides the size of each entry of (q, v). Values below ten
       times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
-    - `adjoint`: "reverse" (default) for reverse mode with checkpoints, and Hessians over it; "forward" for jvp, jacfwd and Hessians
-      by forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
+    - `adjoint`: "reverse" (default) for reverse mode with checkpoints, and Hessians over it; "forward" for jvp, jacfwd and
+      Hessians by forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration"
       (the rate of v: of a free joint that of its body twist; `jd.frame_acceleration` gives those of frames in world axes),

@@ -107,8 +107,8 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
         return values_and_levels(lambda q, v: guards(scene, q, v, t, None), *method.to_qv(scene, y, t))
 
     # tau is constant in a step, and so is where it is cut off.
-    origin = [jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv)]
-    pieces = pieces_of(scene, (), *origin, jnp.zeros((), dtype), None)
+    q, v = (jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv))
+    pieces = pieces_of(scene, (), q, v, jnp.zeros((), dtype), None)
 
     def advance(q, v, tau, t):
         y = method.start(scene, q, v, t)

@@ -120,8 +120,8 @@ def _pulled(given, facts, how: Hybrid, perturbed):
 
 @_pulled.def_jvp
 def _(primals, tangents):
-    given, *rest = primals
-    _, change = eqx.filter_jvp(lambda given: _pull(given, *rest, True), (given,), (tangents[0],))
+    given, facts, how, perturbed = primals
+    _, change = eqx.filter_jvp(lambda given: _pull(given, facts, how, perturbed, True), (given,), (tangents[0],))
     return _pulled(*primals), change
 
 

@@ -155,7 +155,8 @@ def _(primals, tangents):
 
 @eqx.filter_custom_jvp
 def _pulled(given, history, how: Drive, perturbed):
-    return how.pulled(*given, history, perturbed)
+    moving, rows = given
+    return how.pulled(moving, rows, history, perturbed)
 
 
 @_pulled.def_jvp
