@@ -8,6 +8,7 @@ import numpy as np
 import optimistix
 import pytest
 
+import jaxdyn as jd
 from jaxdyn.simulation.solvers import differentiable
 from jaxdyn.simulation.solvers.first_step import Adaptive
 
