@@ -82,6 +82,7 @@ from jaxdyn.forces.elements import JointDamping as JointDamping
 from jaxdyn.forces.elements import JointSpring as JointSpring
 from jaxdyn.forces.limits import EffortLimits as EffortLimits
 from jaxdyn.forces.limits import JointStops as JointStops
+from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
 from jaxdyn.geometry.immersion import constrain_by_immersion as constrain_by_immersion
 from jaxdyn.geometry.immersion import reaction_force as reaction_force
 from jaxdyn.io import Actuators as Actuators

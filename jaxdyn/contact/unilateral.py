@@ -43,16 +43,16 @@ class DryFriction(WithModes):
     **Arguments:**
 
     - `coefficient`: mu of sliding. `static`: mu_s of rest; None for the same.
-    - `normal`: N, in N: a number, a function normal(system, q, v, t) -> (), or the name of a constraint with one row, or of a
-      contact (its normal force).
+    - `normal`: N, in N: a number, a function normal(system, q, v, t) -> (), which holds nothing where it is negative, or the
+      name of a constraint with one row, or of a contact (its normal force).
     - `along`: what slides: the index of a velocity, a function A(q, t) -> (nv,) or (2, nv) with w = A v, or a constraint with
       one or two rows on the velocity, as `jd.Pfaffian(A, b)` for a belt that moves.
     - `smoothing`: v_s, m/s: instead of modes, f = -mu N tanh(|w|/v_s) w/|w|. It never sticks, it creeps, at the velocity
       v_s artanh(load/(mu N)) under a load below mu N; while it slides the force is within 1 % above 2.65 v_s.
     - `name`: of its events.
 
-    **Raises:** ValueError for coefficients that are negative or a static one below the other, an index that is none, a
-    constraint that holds positions, and smoothing that is not positive.
+    **Raises:** ValueError for coefficients and normal forces that are negative, a static one below the other, an index that is
+    none, a constraint that holds positions, and smoothing that is not positive.
 
     Source: EQUATIONS section 11 and erratum E42.
 
@@ -88,6 +88,10 @@ class DryFriction(WithModes):
             self.normal = as_pytree(normal, f"DryFriction {name!r}: normal")
         else:
             self.normal = jnp.asarray(as_array(normal, f"DryFriction {name!r}: normal"), float)
+            if is_concrete(self.normal) and not (np.asarray(self.normal) >= 0).all():
+                raise ValueError(
+                    f"DryFriction {name!r}: normal is {normal}; give the size of the normal force (N), zero or more"
+                )
         if isinstance(along, bool) or not (callable(along) or isinstance(along, (int, Constraint))):
             raise ValueError(
                 f"DryFriction {name!r}: along is {along!r}; give an index of v, a function A(q, t) -> (nv,), or a constraint"
