@@ -70,9 +70,8 @@ def run(args: argparse.Namespace) -> None:
         batch=args.batch,
     )
     folder = exported.save(args.out, args.target, args.abi, cpu=args.cpu, features=args.features)
-    print(
-        f"{exported} for {args.target}, in {folder}: {', '.join(sorted(x.name for x in folder.iterdir() if x.name.startswith(name)))}"
-    )
+    files = ", ".join(sorted(x.name for x in folder.iterdir() if x.name.startswith(name)))
+    print(f"{exported} for {args.target}, in {folder}: {files}")
 
 
 def _function_of(scene, name: str) -> Callable:

@@ -1,8 +1,8 @@
 """Programs as functions of C's calling convention, without JAX: their text, and object files for any target of LLVM.
 
-A function of the library becomes a program of single numbers (`scalar_program`), its Jacobian another one (`jacobian_program`), and
-each becomes `i32 name(ptr in0, ..., ptr out0, ...)` (`function_ir`): it reads each entry where the caller's array holds it, writes each
-result, and returns a status. It allocates nothing, calls nothing but functions of the C library, and has no state.
+A function becomes a program of single numbers (`scalar_program`), its Jacobian another one (`jacobian_program`), and each becomes
+`i32 name(ptr in0, ..., ptr out0, ...)` (`function_ir`): it reads each entry where the caller's array holds it, writes each result, and
+returns a status. It allocates nothing, calls nothing but functions of the C library, and has no state.
 """
 
 import functools
@@ -10,18 +10,16 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import llvmlite.binding as llvm
 import numpy as np
 
-from jaxdyn.compile import derive, mode
+from jaxdyn.compile import derive
 from jaxdyn.compile.code import ATTRIBUTES, Body
-from jaxdyn.compile.expand import expand
 from jaxdyn.compile.graph import Graph, inlined, objects
 from jaxdyn.compile.kernel import program_of
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.objects import features as host_features
-from jaxdyn.compile.program import Array, Constant, Program, kind_of
+from jaxdyn.compile.program import Array, Program, kind_of
 
 MAX_OPERATIONS = 2_000_000  # LLVM takes some 50 microseconds an operation, so this is two minutes
 DEGENERATE = 1  # status of a sample that needs a decision about rank, which straight-line code cannot take
@@ -105,8 +103,8 @@ def scalar_program(function: Callable, examples: Sequence[Any], name: str) -> tu
 def jacobian_program(program: Program, name: str) -> Program:
     """The derivatives of all float outputs of a program by all float inputs.
 
-    The outputs are, for each float output and each float input, an array (size of the output, size of the input), followed by the flag
-    of `program`. Entries that no number of the program can make other than zero are constants.
+    The outputs are an array (size of the output, size of the input) for each float output and each float input, followed by the
+    flag of `program`. Entries that no number of the program can make other than zero are constants.
     """
     moving = tuple(array.dtype.kind == "f" for array in program.inputs)
     change = inlined(derive.tangent(program, moving))
@@ -144,15 +142,15 @@ def function_ir(
     program: Program,
     inputs: Sequence[Field],
     *,
-    places: Mapping[int, Sequence[int]] | None = None,
-    results: Sequence[Sequence[int]] | None = None,
+    places: Mapping[int, np.ndarray] | None = None,
+    results: Sequence[np.ndarray] | None = None,
     internal: bool = False,
 ) -> str:
     """The text of `i32 name(ptr a0, ..., ptr r0, ...)`: status 0, or `DEGENERATE` where the flag of the program is not set.
 
-    **Arguments:** `inputs`: for each input of the program the place where it stands. `places`, `results`: for each entry of an input and
-    of an output, by rows, its index in the caller's memory (default: by rows); -1 for a result that is not stored. `internal`: whether
-    the function is seen in its module alone.
+    **Arguments:** `inputs`: for each input of the program the place where it stands. `places`, `results`: for each entry of an
+    input and of an output, by rows, its index in the caller's memory (default: by rows); -1 for a result that is not stored.
+    `internal`: whether the function is seen in its module alone.
     """
     e = Emitter(1)
 
@@ -178,7 +176,7 @@ def function_ir(
 
 
 def packed_ir(name: str, arguments: int, program: Program) -> str:
-    """The text of `i32 name_packed(ptr block)`, which takes the pointers of `name` from an array: one argument is passed fastest."""
+    """The text of `i32 name_packed(ptr block)`, which takes the pointers of `name` from an array (ctypes is slow by argument)."""
     lines, given = [], []
     for i in range(arguments + len(program.outputs) - 1):
         lines += [f"  %at{i} = getelementptr ptr, ptr %block, i64 {i}", f"  %x{i} = load ptr, ptr %at{i}"]
@@ -198,7 +196,7 @@ def module_ir(*functions: str) -> str:
 
 
 class ObjectFile(NamedTuple):
-    """A relocatable object file, the functions of the C library that it calls, and the bytes of stack that each function takes."""
+    """A relocatable object file, the functions of the C library that it calls, and the bytes of stack of each of its functions."""
 
     binary: bytes
     library: tuple[str, ...]

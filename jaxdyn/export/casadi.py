@@ -1,7 +1,7 @@
 """Functions behind CasADi's interface for external functions, so that `casadi.external` has exact first derivatives.
 
-CasADi stores matrices by columns, and sparse ones as the entries of a pattern: the pattern of a Jacobian leaves out what no number of
-the program can make other than zero. A null pointer stands for an argument that is zero, or for a result that is not asked for.
+CasADi stores matrices by columns, and sparse ones as the entries of a pattern. The pattern of a Jacobian leaves out structural zeros,
+which no input can make other than zero. A null pointer stands for an argument that is zero, or for a result that is not asked for.
 
 Source: CasADi's user guide, "Using the generated code", and the signatures that its code generator writes.
 """
@@ -17,7 +17,7 @@ from jaxdyn.export.arguments import fields_of
 
 
 class Pattern(NamedTuple):
-    """A sparse matrix of CasADi's: which of its places are stored, and for each entry of the program's array where it is stored."""
+    """A sparse matrix of CasADi's: its stored places, and for each entry of the program's array the place where it is stored."""
 
     stored: np.ndarray  # (rows, columns) of bools
     places: np.ndarray  # for each entry, by rows, its place among the stored ones by columns; -1 where it is not stored

@@ -41,23 +41,24 @@ def export(
     **Arguments:**
 
     - `function(*arrays)` -> array or tuple of arrays: any function of one sample that is a program of single numbers, such as
-      dynamics, kinematics, constrained dynamics, a projection, a step of an integrator or a control law. A model that it closes over is compiled
-      in; a model that is an argument becomes a structure of arrays with named fields.
-    - `examples`: arrays, or pytrees of arrays, that give shapes and dtypes (float64 or float32). Their values do not matter, but a
-      test program that `save` writes uses them as inputs.
+      dynamics, kinematics, constrained dynamics, a projection, a step of an integrator or a control law. A model that it closes
+      over is compiled in; a model that is an argument becomes a structure of arrays with named fields.
+    - `examples`: arrays, or pytrees of arrays, that give shapes and dtypes (float64 or float32). The test program that `save` writes
+      uses their values as inputs.
     - `name`: of the C function.
     - `derivatives`: ("jacobian",) adds `name_jacobian`, the derivatives of each result by each argument.
     - `batch`: whether to add `name_batch`, which takes many samples and computes several at once in vector registers.
 
     **Returns:** `Exported`. Called with numpy arrays it returns numpy arrays, without JAX.
 
-    **Raises:** ValueError for a function that is no such program (callbacks, loops or branches that depend on data), for integers and
-    complex numbers, and for a name that is no identifier of C.
+    **Raises:** ValueError for a function that is no such program (callbacks, loops or branches that depend on data), for integers
+    and complex numbers, and for a name that is no identifier of C.
 
     ```python
     model = jd.robots.iiwa()
     q = np.zeros(7)
-    exported = jd.export(lambda q, v, tau: jd.forward_dynamics(model, q, v, tau), q, q, q, name="arm_fd", derivatives=("jacobian",))
+    function = lambda q, v, tau: jd.forward_dynamics(model, q, v, tau)
+    exported = jd.export(function, q, q, q, name="arm_fd", derivatives=("jacobian",))
     acceleration = exported(q, q, q)
     by_q, by_v, by_tau = exported.jacobian(q, q, q)
     exported.save("arm_fd")  # arm_fd.o, arm_fd.h, arm_fd_test.c, CMakeLists.txt
@@ -212,9 +213,10 @@ class Exported:
 
         **Arguments:**
 
-        - `target`: "host", a short name ("x86_64", "x86_64-v3", "x86_64-v4", "aarch64", "cortex-m7", "riscv64", "wasm32"), or an LLVM
-          triple; `cpu` and `features` as LLVM writes them.
-        - `abi`: "c", or "casadi" for `casadi.external(name, "./name.so")`, with exact first derivatives where the Jacobian was exported.
+        - `target`: "host", a short name ("x86_64", "x86_64-v3", "x86_64-v4", "aarch64", "cortex-m7", "riscv64", "wasm32"), or a
+          triple of LLVM; `cpu` and `features` as LLVM writes them.
+        - `abi`: "c", or "casadi" for `casadi.external(name, "./name.so")`, with exact first derivatives where the function was
+          exported with its Jacobian.
 
         **Returns:** the folder. Either all files are written or none.
 

@@ -97,8 +97,8 @@ def header(exported: Any, made: ObjectFile, target: Triple) -> str:
         results = [(result, (), dtype) for result, _, dtype in exported.results()]
         lines += [
             "",
-            "/* n samples, one row of each array for each; structures are shared. The status is that of the worst sample, and the",
-            " * results of a degenerate sample are not numbers. */",
+            "/* n samples, one row of each array for each; structures are shared. The status is that of the worst sample, and",
+            " * the results of a degenerate sample are not numbers. */",
             f"int {name}_batch(int64_t n, {_parameters(exported, results, is_batch=True)});",
         ]
     lines += ["", "#ifdef __cplusplus", "}", "#endif", "", "#endif", ""]
@@ -147,7 +147,7 @@ def test_program(exported: Any) -> str:
     """A C program that compares the functions with reference results, and returns non-zero where they differ."""
     name = exported.name
     lines = [
-        f"/* Compares {name} with reference results of jaxdyn: prints the largest difference, and returns 1 above the tolerance. */",
+        f"/* Compares {name} with reference results of jaxdyn: prints the largest difference, returns 1 above the tolerance. */",
         "#include <math.h>",
         "#include <stdio.h>",
         "",

@@ -12,8 +12,8 @@ from jaxdyn.export.arguments import fields_of
 def batch_ir(exported: Any, width: int) -> str:
     """The text of `i32 name_batch(i64 n, ptr a0, ..., ptr r0, ...)` over the samples 0 .. n - 1.
 
-    Arrays have one row for each sample; a structure is the same for all. The status is 0, or `DEGENERATE` where a sample is degenerate;
-    the results of such samples are NaN.
+    Arrays have one row for each sample; a structure is the same for all. The status is 0, or `DEGENERATE` where a sample is
+    degenerate; the results of such samples are NaN.
     """
     e, program, fields = Emitter(width), exported.program, fields_of(exported.arguments)
     count = len(exported.arguments)
