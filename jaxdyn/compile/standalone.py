@@ -1,8 +1,8 @@
 """Programs as functions of C's calling convention, without JAX: their text, and object files for any target of LLVM.
 
-A function becomes a program of single numbers (`scalar_program`), its Jacobian another one (`jacobian_program`), and each becomes
-`i32 name(ptr in0, ..., ptr out0, ...)` (`function_ir`): it reads each entry where the caller's array holds it, writes each result, and
-returns a status. It allocates nothing, calls nothing but functions of the C library, and has no state.
+A function becomes a program of single numbers (`scalar_program`), its Jacobian another one (`jacobian_program`), and each
+becomes `i32 name(ptr in0, ..., ptr out0, ...)` (`function_ir`): it reads each entry where the caller's array holds it, writes
+each result, and returns a status. It allocates nothing, calls nothing but functions of the C library, and has no state.
 """
 
 import functools
@@ -130,6 +130,13 @@ def jacobian_program(program: Program, name: str) -> Program:
 # --- text ---
 
 
+class Text(NamedTuple):
+    """A function in LLVM's intermediate representation, and what it needs once in a module, by name."""
+
+    function: str
+    declared: dict[str, str]
+
+
 class Field(NamedTuple):
     """Where an array of a program stands: the pointer among a function's arguments, and the offset in bytes from it."""
 
@@ -145,7 +152,7 @@ def function_ir(
     places: Mapping[int, np.ndarray] | None = None,
     results: Sequence[np.ndarray] | None = None,
     internal: bool = False,
-) -> str:
+) -> Text:
     """The text of `i32 name(ptr a0, ..., ptr r0, ...)`: status 0, or `DEGENERATE` where the flag of the program is not set.
 
     **Arguments:** `inputs`: for each input of the program the place where it stands. `places`, `results`: for each entry of an
@@ -172,31 +179,30 @@ def function_ir(
     pointers = [f"ptr %a{i}" for i in range(count)] + [f"ptr %r{i}" for i in range(len(values))]
     linkage = "internal " if internal else ""
     head = f"define {linkage}i32 @{name}({', '.join(pointers)}) #0 {{"
-    return "\n".join([head, *e.lines, "  ret i32 %status", "}", *e.declared.values()])
+    return Text("\n".join([head, *e.lines, "  ret i32 %status", "}"]), e.declared)
 
 
-def packed_ir(name: str, arguments: int, program: Program) -> str:
+def packed_ir(name: str, arguments: int, program: Program) -> Text:
     """The text of `i32 name_packed(ptr block)`, which takes the pointers of `name` from an array (ctypes is slow by argument)."""
     lines, given = [], []
     for i in range(arguments + len(program.outputs) - 1):
         lines += [f"  %at{i} = getelementptr ptr, ptr %block, i64 {i}", f"  %x{i} = load ptr, ptr %at{i}"]
         given.append(f"ptr %x{i}")
     call = f"  %status = call i32 @{name}({', '.join(given)})"
-    return "\n".join([f"define i32 @{name}_packed(ptr %block) #0 {{", *lines, call, "  ret i32 %status", "}"])
+    return Text("\n".join([f"define i32 @{name}_packed(ptr %block) #0 {{", *lines, call, "  ret i32 %status", "}"]), {})
 
 
-def module_ir(*functions: str) -> str:
-    """A module of functions, each thing that they call declared once."""
-    lines = [line for text in functions for line in text.split("\n")]
-    declared = dict.fromkeys(line for line in lines if line.startswith("declare "))
-    return "\n".join([*(line for line in lines if not line.startswith("declare ")), *declared, *ATTRIBUTES])
+def module_ir(*functions: Text) -> str:
+    """A module of functions; what several of them need is declared once."""
+    declared = {name: line for text in functions for name, line in text.declared.items()}
+    return "\n".join([*(text.function for text in functions), *declared.values(), *ATTRIBUTES])
 
 
 # --- object files ---
 
 
 class ObjectFile(NamedTuple):
-    """A relocatable object file, the functions of the C library that it calls, and the bytes of stack of each of its functions."""
+    """A relocatable object file, the functions of the C library that it calls, and the bytes of stack of each function."""
 
     binary: bytes
     library: tuple[str, ...]

@@ -15,8 +15,8 @@ from jaxdyn.model.tree import Model
 
 C_TYPES = {"float64": "double", "float32": "float"}
 C_KEYWORDS = frozenset(
-    "alignas alignof and asm auto bool break case catch char class const constexpr continue decltype default delete do double else "
-    "enum "
+    "alignas alignof and asm auto bool break case catch char class const constexpr continue decltype default delete do double "
+    "else enum "
     "explicit export extern false float for friend goto if inline int long mutable namespace new not nullptr operator or private "
     "protected public register restrict return short signed sizeof static struct switch template this throw true try typedef "
     "typeid typename union unsigned using virtual void volatile wchar_t while xor".split()
@@ -45,8 +45,8 @@ def check_identifier(name: str, what: str) -> str:
     """The name. **Raises:** ValueError unless it is an identifier of C and C++ and no keyword of theirs."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) or name in C_KEYWORDS:
         raise ValueError(
-            f"{what} is {name!r}, which is no identifier of C and C++; use letters, digits and underscores, and no keyword, as in "
-            "'arm_fd'"
+            f"{what} is {name!r}, which is no identifier of C and C++; use letters, digits and underscores, and no keyword, "
+            "as in 'arm_fd'"
         )
     return name
 

@@ -1,7 +1,8 @@
 """Functions behind CasADi's interface for external functions, so that `casadi.external` has exact first derivatives.
 
-CasADi stores matrices by columns, and sparse ones as the entries of a pattern. The pattern of a Jacobian leaves out structural zeros,
-which no input can make other than zero. A null pointer stands for an argument that is zero, or for a result that is not asked for.
+CasADi stores matrices by columns, and sparse ones as the entries of a pattern. The pattern of a Jacobian leaves out
+structural zeros, which no input can make other than zero. A null pointer stands for an argument that is zero, or for a result
+that is not asked for.
 
 Source: CasADi's user guide, "Using the generated code", and the signatures that its code generator writes.
 """
@@ -13,6 +14,7 @@ import numpy as np
 
 from jaxdyn.compile import standalone
 from jaxdyn.compile.program import Array, Constant, Program
+from jaxdyn.compile.standalone import Text
 from jaxdyn.export.arguments import fields_of
 
 
@@ -77,16 +79,15 @@ def _functions(
     inputs: Sequence[Pattern],
     outputs: Sequence[Pattern],
     nominal: Sequence[Pattern],
-) -> str:
+) -> Text:
     """The text of one function of CasADi's interface; `nominal` are the results that a Jacobian is given as further arguments."""
     core, given = f"{name}_core", [*inputs, *nominal]
     places = {i: pattern.places for i, pattern in enumerate(inputs)}
     results = [pattern.places for pattern in outputs]
-    lines = [
-        standalone.function_ir(
-            core, program, fields_of(exported.arguments), places=places, results=results, internal=True
-        )
-    ]
+    text, declared = standalone.function_ir(
+        core, program, fields_of(exported.arguments), places=places, results=results, internal=True
+    )
+    lines = [text]
     lines += [f"@{name}_zero = internal constant [{max([1, *(x.count for x in inputs)])} x double] zeroinitializer"]
     for kind, patterns in (("in", given), ("out", outputs)):
         for i, pattern in enumerate(patterns):
@@ -122,4 +123,4 @@ def _functions(
         ]
     pointers = [f"ptr %a{i}" for i in range(len(inputs))] + [f"ptr %r{i}" for i in range(len(outputs))]
     lines += [f"  %status = call i32 @{core}({', '.join(pointers)})", "  ret i32 %status", "}"]
-    return "\n".join(lines)
+    return Text("\n".join(lines), declared)

@@ -4,7 +4,6 @@ import ctypes
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import llvmlite.binding as llvm
@@ -13,6 +12,8 @@ from jaxtyping import PyTree
 
 from jaxdyn.compile import standalone
 from jaxdyn.compile.program import Program
+from jaxdyn.compile.standalone import HOST as HOST
+from jaxdyn.compile.standalone import TARGETS as TARGETS
 from jaxdyn.export.arguments import (
     Argument,
     arguments_of,
@@ -24,6 +25,7 @@ from jaxdyn.export.arguments import (
 from jaxdyn.export.casadi import casadi_ir
 from jaxdyn.export.files import write_files
 from jaxdyn.export.lanes import batch_ir
+from jaxdyn.model.tree import Model
 
 DERIVATIVES = ("jacobian",)
 ABIS = ("c", "casadi")
@@ -43,8 +45,8 @@ def export(
     - `function(*arrays)` -> array or tuple of arrays: any function of one sample that is a program of single numbers, such as
       dynamics, kinematics, constrained dynamics, a projection, a step of an integrator or a control law. A model that it closes
       over is compiled in; a model that is an argument becomes a structure of arrays with named fields.
-    - `examples`: arrays, or pytrees of arrays, that give shapes and dtypes (float64 or float32). The test program that `save` writes
-      uses their values as inputs.
+    - `examples`: arrays, or pytrees of arrays, that give shapes and dtypes (float64 or float32). The test program that `save`
+      writes uses their values as inputs.
     - `name`: of the C function.
     - `derivatives`: ("jacobian",) adds `name_jacobian`, the derivatives of each result by each argument.
     - `batch`: whether to add `name_batch`, which takes many samples and computes several at once in vector registers.
@@ -87,12 +89,22 @@ def export(
 class Exported:
     """A function as machine code; see `export`."""
 
-    def __init__(self, name, arguments, program, structure, jacobian, batch, examples, system):
-        self.name: str = name
-        self.arguments: tuple[Argument, ...] = arguments
-        self.program: Program = program
-        self.jacobian_program: Program | None = jacobian
-        self.batch: bool = batch
+    def __init__(
+        self,
+        name: str,
+        arguments: tuple[Argument, ...],
+        program: Program,
+        structure: PyTree,
+        jacobian: Program | None,
+        batch: bool,
+        examples: PyTree,
+        system: Model | None,
+    ):
+        self.name = name
+        self.arguments = arguments
+        self.program = program
+        self.jacobian_program = jacobian
+        self.batch = batch
         self.examples = examples
         self._structure = structure
         self._system = system
@@ -144,7 +156,7 @@ class Exported:
         outputs = call(args)
         return outputs[0] if self._is_one_array else jax.tree.unflatten(self._structure, outputs)
 
-    def jacobian(self, *args: PyTree) -> Any:
+    def jacobian(self, *args: PyTree) -> tuple:
         """Derivatives (size of the result, size of the argument) of each result by each argument.
 
         **Returns:** of one result a tuple with one array for each array among the arguments; of several results a tuple of such.

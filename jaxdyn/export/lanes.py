@@ -5,11 +5,11 @@ from typing import Any
 from jaxdyn.compile.code import Body
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import kind_of
-from jaxdyn.compile.standalone import DEGENERATE
+from jaxdyn.compile.standalone import DEGENERATE, Text
 from jaxdyn.export.arguments import fields_of
 
 
-def batch_ir(exported: Any, width: int) -> str:
+def batch_ir(exported: Any, width: int) -> Text:
     """The text of `i32 name_batch(i64 n, ptr a0, ..., ptr r0, ...)` over the samples 0 .. n - 1.
 
     Arrays have one row for each sample; a structure is the same for all. The status is 0, or `DEGENERATE` where a sample is
@@ -53,7 +53,7 @@ def batch_ir(exported: Any, width: int) -> str:
     code = e.put(f"select i1 {regular}, i32 0, i32 {DEGENERATE}")
     after = e.put(f"or i32 %status, {code}")
     pointers = [f"ptr %a{i}" for i in range(count + len(outputs))]
-    return "\n".join(
+    text = "\n".join(
         [
             f"define i32 @{exported.name}_batch(i64 %n, {', '.join(pointers)}) #0 {{",
             "entry:",
@@ -61,9 +61,11 @@ def batch_ir(exported: Any, width: int) -> str:
             "  %some = icmp sgt i64 %n, 0",
             "  br i1 %some, label %block, label %none",
             "block:",
-            "  %base = phi i64 [ 0, %entry ], [ %next, %block ]",
-            f"  %status = phi i32 [ 0, %entry ], [ {after}, %block ]",
+            "  %base = phi i64 [ 0, %entry ], [ %next, %following ]",
+            f"  %status = phi i32 [ 0, %entry ], [ {after}, %following ]",
             *e.lines,
+            "  br label %following",
+            "following:",
             f"  %next = add i64 %base, {width}",
             "  %more = icmp slt i64 %next, %n",
             "  br i1 %more, label %block, label %done",
@@ -72,6 +74,6 @@ def batch_ir(exported: Any, width: int) -> str:
             "done:",
             f"  ret i32 {after}",
             "}",
-            *e.declared.values(),
         ]
     )
+    return Text(text, e.declared)
