@@ -12,7 +12,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.compile import standalone
-from jaxdyn.export.exported import _Code
+from jaxdyn.compile.objects import Code
 
 X = np.linspace(0.1, 0.7, 7)
 V, TAU = 0.3 * np.cos(X), np.sin(3 * X)
@@ -128,7 +128,7 @@ def test_header_names_joints_units_sizes_and_stack(exported, tmp_path):
 
 def test_batch_over_vector_lanes_equals_single_samples(exported):
     lanes = standalone.resolve_target("host").lanes
-    code = _Code(exported.module("c", lanes))
+    code = Code(exported.module("c", lanes))
     for n in (0, 1, 3, 13):
         rng = np.random.default_rng(n)
         q, v, tau = (np.ascontiguousarray(rng.normal(size=(n, 7))) for _ in range(3))

@@ -49,7 +49,7 @@ INDEPENDENT = [
 
 # Who may import what from outside. Packages not named here and not needed by all (LIGHT) are for nobody.
 USERS = {
-    "llvmlite": {"compile", "export"},
+    "llvmlite": {"compile"},
     "diffrax": FROM_SIMULATION,
     "optax": {"identify"} | PROGRAMS,
     "optimistix": {"constraints", "reduction", "simulation", "identify"} | PROGRAMS,

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
-import llvmlite.binding as llvm
 import numpy as np
 from jaxtyping import PyTree
 
 from jaxdyn.compile import standalone
+from jaxdyn.compile.objects import Code
 from jaxdyn.compile.program import Program
 from jaxdyn.compile.standalone import HOST as HOST
 from jaxdyn.compile.standalone import TARGETS as TARGETS
@@ -109,7 +109,7 @@ class Exported:
         self._structure = structure
         self._system = system
         self._is_one_array = jax.tree_util.treedef_is_leaf(structure)
-        self._code: _Code | None = None
+        self._code: Code | None = None
         self._local = threading.local()
 
     def __repr__(self):
@@ -177,7 +177,7 @@ class Exported:
         caller = getattr(self._local, which, None)
         if caller is None:
             if self._code is None:
-                self._code = _Code(self.module("packed"))
+                self._code = Code(self.module("packed"))
             program = self.program if which == "function" else self.jacobian_program
             symbol = self.name if which == "function" else f"{self.name}_jacobian"
             assert program is not None
@@ -243,23 +243,6 @@ class Exported:
         resolved = standalone.resolve_target(target, cpu, features)
         made = standalone.object_file(self.module(abi, resolved.lanes), resolved)
         return write_files(self, Path(folder), made, resolved, abi)
-
-
-class _Code:
-    """Machine code in this process."""
-
-    def __init__(self, text: str):
-        host = standalone.resolve_target("host")
-        binary = standalone.object_file(text, host).binary
-        machine = llvm.Target.from_triple(host.triple).create_target_machine(
-            cpu=host.cpu, features=host.features, jit=True, reloc="pic"
-        )
-        self.engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        self.engine.add_object_file(llvm.ObjectFileRef.from_data(binary))
-        self.engine.finalize_object()
-
-    def address(self, name: str) -> int:
-        return self.engine.get_function_address(name)
 
 
 def _make_caller(address: int, exported: Exported, program: Program) -> Callable[[tuple], list[np.ndarray]]:
