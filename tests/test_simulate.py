@@ -423,29 +423,6 @@ def test_other_numbers_do_not_compile_anew(pendulum):
     ]
     assert len(traces) == 2 * count
     assert len({float(x) for x in (first, again, second, *others)}) == 5
-    with jd.compilation("general"):
-        np.testing.assert_allclose(run(*numbers), first, rtol=1e-13)
-        assert len(traces) == 3 * count
-        run(2.0, 0.1, [0.2], 1.0, 0.02, 1e-8)
-    assert len(traces) == 3 * count
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param("four_bar", marks=pytest.mark.slow), "rolling_disk"])
-def test_numbers_that_are_compiled_in_change_nothing(name, monkeypatch):
-    """The motion and the assembled start of the first scene of its shape are those of the program for any numbers."""
-    scene, (q, v) = getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()
-    monkeypatch.setattr(calls, "_first", {})  # whatever other tests have run
-    ts = jnp.linspace(0.0, 0.3, 4)
-
-    def run():
-        solution = jd.simulate(scene, q, v, ts, stepsize=0.01)
-        return solution.q, solution.v, jd.assemble(scene, q + 1e-3, v).q
-
-    with jd.compilation("general"):
-        expected = run()
-    for x, y in zip(run(), expected, strict=True):
-        np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
 
 
 def test_known_numbers_stay_known_in_a_trace(pendulum):

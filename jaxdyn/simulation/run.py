@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import is_concrete, is_known, specialized
+from jaxdyn.compile import compiled, is_concrete, is_known
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.simulation import contacts as unilateral
@@ -213,12 +213,12 @@ def simulate(
     return solution
 
 
-@specialized
+@compiled
 def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     return motion(scene, control, method, numbers, options)
 
 
-@specialized
+@compiled
 def _run_with_events(scene: Scene, control, method: Method, numbers, options) -> Solution:
     return hybrid.motion(scene, control, numbers, options)
 

@@ -1,6 +1,5 @@
 """A motion one step at a time, for learning: the steps of `simulate` with a fixed length, as a function of state and torque."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxdyn.compile import is_expanding, is_rank_safe, partition_traced
+from jaxdyn.compile import partition_traced
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
@@ -62,9 +61,8 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     unknown, known = partition_traced(scene)
     length = jnp.asarray(seconds, dtype) if isinstance(seconds, Tracer) else np.asarray(seconds, dtype)
 
-    # Traced once for each mode of `jd.compilation`.
-    @functools.partial(jax.jit, static_argnums=0)
-    def traced(mode, t, y, args):
+    @jax.jit
+    def field(t, y, args):
         unknown, tau = args
         scene = known(unknown)
 
@@ -73,9 +71,6 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
             return given if force is None else given + force
 
         return method.evaluated(scene, y, t, generalized_force)[0]
-
-    def field(t, y, args):
-        return traced((is_expanding(), is_rank_safe()), t, y, args)
 
     def project(t, y, error, args):
         scene = known(args[0])
