@@ -241,7 +241,7 @@ def test_degrees_of_freedom_and_rates_are_one_program_each(programs):
     scene, (q, v) = jd.scenes.slider_crank(), jd.scenes.slider_crank.start()
     programs.clear()
     assert jd.degrees_of_freedom(scene, q) == 1 and jd.degrees_of_freedom(scene, q + 0.01) == 1
-    assert programs.count("jit(program)") <= 1 and len(programs) <= 2, programs
+    assert len(programs) <= 2, programs
     programs.clear()
     jd.stiffness(scene, q, v)
-    assert programs.count("jit(program)") <= 1 and len(programs) <= 2, programs
+    assert len(programs) <= 2, programs
