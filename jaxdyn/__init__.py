@@ -147,4 +147,4 @@ from jaxdyn.systems.scene import Scene as Scene
 from jaxdyn.systems.system import ExplicitSystem as ExplicitSystem
 from jaxdyn.systems.system import MetricSystem as MetricSystem
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
