@@ -44,7 +44,7 @@ def torque_loss(point: Coordinates, problem: Problem) -> Float[Array, ""]:
     return 0.5 * (residual @ residual + problem.rest) + problem.prior * problem.chart.divergence(point.theta)
 
 
-@on_one_thread()
+@on_one_thread
 def fit_torques(
     model: Model,
     log: Log | Sequence[Log],

@@ -66,7 +66,7 @@ class DriveGains(eqx.Module):
         return Log(log.t, log.q, log.v, log.a, tau, joint_names=log.joint_names, cutoff=log.cutoff)
 
 
-@on_one_thread()
+@on_one_thread
 def fit_gains(
     model: Model,
     unloaded: Log | Sequence[Log],

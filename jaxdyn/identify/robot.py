@@ -51,7 +51,7 @@ class RobotFit(eqx.Module):
         return log if self.delays is None else shift_torques(log, self.delays.seconds)
 
 
-@on_one_thread()
+@on_one_thread
 def fit_robot(
     model: Model,
     log: Log | Sequence[Log],
