@@ -49,6 +49,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # Files of others hold such inertias; those that tests write have names of their own folders.
+    config.addinivalue_line("filterwarnings", "ignore:.*example-robot-data.*No body has such an inertia")
     mode = config.getoption("--compilation")
     if mode is not None:
         os.environ["JAXDYN_COMPILATION"] = mode
