@@ -188,7 +188,6 @@ def test_plugins_that_mimic_fixed_joints(tmp_path):
     free = jd.load(write(tmp_path)).system
     held = jd.load(write(tmp_path, extra=fixed + plugin("still", "c"))).system
     assert set(free.joint_names) - set(held.joint_names) == {"c"}
-    np.testing.assert_allclose(held.inertias.sum(0)[0], free.inertias.sum(0)[0])
     reference = jd.load_urdf(tmp_path / "bars.urdf", lock={"c": 0.3})
     np.testing.assert_allclose(held.frame_poses, reference.frame_poses, atol=1e-15)
     still = jd.load(write(tmp_path, extra=fixed + plugin("c", "still")))
