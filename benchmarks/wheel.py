@@ -1,25 +1,31 @@
-"""The wheel, installed elsewhere and tried without the repository: `python -m benchmarks.wheel [--keep DIR]`.
+"""The wheel, installed elsewhere and tried without the repository.
 
-Builds the wheel, installs it alone in a fresh environment, and runs there: an import, a URDF, a motion, the commands, and what
-asks for extras that are not installed. Prints how long importing takes beside importing jax, the best of five fresh processes
-each, in seconds of the processor, which do not count what else the machine does; more than LIMIT beyond jax is a failure.
+    python -m benchmarks.wheel [--keep DIR] [--python NAME] [--oldest]
+
+Builds the wheel, installs it alone in a fresh environment, and runs there: an import, a URDF, a motion, the commands, and
+requests for extras that are missing; then, with the extra `plot`, the examples of the README and of docs/start.md as they
+are printed. Warnings and logged fallbacks are failures, so native kernels are in use. `--python` names another interpreter,
+`--oldest` takes the lowest versions that the wheel admits. Prints the time to import jaxdyn and jax, the best of five fresh
+processes each, in seconds of the processor, which do not count what else the machine does; more than LIMIT beyond jax is a
+failure.
 """
 
 import argparse
 import contextlib
 import os
+import re
 import subprocess
 import sys
 import tempfile
 import time
-import venv
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 LIMIT = 1.0  # s
 
 SMOKE = """
-import pathlib, jax
+import logging, pathlib, jax
+logging.getLogger("jaxdyn").addHandler(type("Fail", (logging.Handler,), {"emit": lambda _, record: exit(record.getMessage())})())
 jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import jaxdyn as jd
@@ -65,11 +71,27 @@ def seconds_to_import(python: Path, name: str, folder: Path) -> float:
     return min(rows)
 
 
-@contextlib.contextmanager
-def installed(keep: Path | None, extras: str = ""):
-    """The wheel with `extras` in a fresh environment: its folder, its Python, the wheel, and the seconds that pip took.
+def run_examples(python: Path, folder: Path) -> None:
+    """Run the blocks of Python of the README and of the first page, each page in one process."""
+    for page in ("README.md", "docs/start.md"):
+        blocks = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+        script = folder / f"{Path(page).stem}_examples.py"
+        script.write_text("\n".join(blocks), encoding="utf-8")
+        subprocess.run(
+            [python, "-W", "error::UserWarning", "-I", script],
+            cwd=folder,
+            check=True,
+            env=os.environ | {"MPLBACKEND": "agg"},
+        )
+        print(f"{len(blocks)} examples of {page} run")
 
-    All of it is made in `keep` and left there, or in a temporary folder that goes at the end.
+
+@contextlib.contextmanager
+def installed(keep: Path | None, extras: str = "", interpreter: str = sys.executable, oldest: bool = False):
+    """The wheel with `extras` in a fresh environment: its folder, its Python, the wheel, and the seconds that installing took.
+
+    All of it is made in `keep` and left there, or in a temporary folder that goes at the end. With `oldest` the dependencies have
+    the lowest versions that the wheel admits, which takes the package uv.
     """
     with contextlib.ExitStack() as stack:
         folder = (keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))).resolve()
@@ -77,20 +99,35 @@ def installed(keep: Path | None, extras: str = ""):
         pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
         subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, ROOT], check=True)
         wheel = max(folder.glob("jaxdyn-*.whl"), key=os.path.getmtime)
-        venv.create(folder / "env", with_pip=True)
+        subprocess.run([interpreter, "-m", "venv", folder / "env"], check=True)
         python = folder / "env" / ("Scripts" if os.name == "nt" else "bin") / "python"
         began = time.perf_counter()
-        install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", f"{wheel}{extras}"]
-        subprocess.run(install, check=True)
+        install(python, wheel, extras, oldest)
         yield folder, python, wheel, time.perf_counter() - began
+
+
+def install(python: Path, wheel: Path, extras: str, oldest: bool) -> None:
+    """Install the wheel by pip, or by uv with the lowest versions of all that it asks for, which pip cannot find."""
+    if oldest:
+        uv = ["uv", "pip", "install", "--quiet", "--python", python]
+        chosen = [x for name in re.findall(r"\w+", extras) for x in ("--extra", name)]
+        subprocess.run([*uv, "--resolution", "lowest-direct", "-r", ROOT / "pyproject.toml", *chosen], check=True)
+        subprocess.run([*uv, "--no-deps", wheel], check=True)
+    else:
+        pip = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        subprocess.run([*pip, f"{wheel}{extras}"], check=True)
 
 
 def main(argv=None) -> int:
     """Build, install, try; the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--keep", type=Path, help="make wheel and environment here and leave them")
+    parser.add_argument("--python", default=sys.executable, help="the interpreter of the fresh environment")
+    parser.add_argument(
+        "--oldest", action="store_true", help="with the lowest versions that the wheel admits (needs uv)"
+    )
     options = parser.parse_args(argv)
-    with installed(options.keep) as (folder, python, wheel, seconds):
+    with installed(options.keep, "", options.python, options.oldest) as (folder, python, wheel, seconds):
         print(f"built {wheel.name}, {wheel.stat().st_size / 1e3:.0f} kB; installed in {seconds:.0f} s")
         subprocess.run([python, "-I", "-c", SMOKE], cwd=folder, check=True)
         subprocess.run(
@@ -104,6 +141,8 @@ def main(argv=None) -> int:
         print(
             f"import jax: {jax:.2f} s, import jaxdyn: {ours:.2f} s, beyond jax {ours - jax:.2f} s (at most {LIMIT:g} s)"
         )
+        install(python, wheel, "[plot]", options.oldest)
+        run_examples(python, folder)
         return int(ours - jax > LIMIT)
 
 

@@ -80,6 +80,7 @@ from jaxdyn.forces.elements import JointDamping as JointDamping
 from jaxdyn.forces.elements import JointSpring as JointSpring
 from jaxdyn.forces.limits import EffortLimits as EffortLimits
 from jaxdyn.forces.limits import JointStops as JointStops
+from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
 from jaxdyn.geometry.immersion import constrain_by_immersion as constrain_by_immersion
 from jaxdyn.geometry.immersion import reaction_force as reaction_force
 from jaxdyn.io import Actuators as Actuators
@@ -147,4 +148,4 @@ from jaxdyn.systems.scene import Scene as Scene
 from jaxdyn.systems.system import ExplicitSystem as ExplicitSystem
 from jaxdyn.systems.system import MetricSystem as MetricSystem
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

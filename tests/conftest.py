@@ -11,8 +11,15 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, distribution
+from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
+
+if os.environ.get("JAXDYN_COMPILATION_OPTIONS") == "least" and "XLA_FLAGS" not in os.environ:
+    # As little work for XLA as for LLVM. A flag that XLA does not know ends the process, as that of the emitters does since 0.11.
+    flags = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
+    if version("jax") < "0.11":
+        flags.append("--xla_cpu_use_fusion_emitters=false")
+    os.environ["XLA_FLAGS"] = " ".join(flags)
 
 import jax
 import pytest

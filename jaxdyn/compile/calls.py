@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxdyn.compile import mode
 from jaxdyn.compile.garbage import uncollected
+from jaxdyn.compile.jax_adapter import known_options
 from jaxdyn.compile.known import Known, is_concrete, is_staged, partition_traced
 
 _MOST_NUMBERS = 10_000  # beyond which a tree is no input of mechanics, but data that no program should contain
@@ -55,16 +56,11 @@ _LEAST = _QUICK | {"xla_backend_optimization_level": 0}
 def quick_options() -> dict[str, Any] | None:
     """Options with which XLA compiles glue quickly.
 
-    None where the environment asks for the usual ones, or XLA does not know these.
+    None where the environment asks for the usual ones.
     """
     if mode.wants_usual_options():
         return None
-    options = _LEAST if mode.wants_least_optimisation() else _QUICK
-    try:
-        jax.jit(lambda: 0.0, compiler_options=options)()
-    except jax.errors.JaxRuntimeError:
-        return None
-    return options
+    return known_options(_LEAST if mode.wants_least_optimisation() else _QUICK)
 
 
 def glue_options(platform: str) -> dict[str, Any] | None:

@@ -6,6 +6,8 @@ import logging
 import os
 from collections.abc import Iterator
 
+from jaxdyn.compile import jax_adapter
+
 logger = logging.getLogger("jaxdyn")
 MODES = ("auto", "general", "plain")
 OPTIONS = ("", "usual", "least")
@@ -20,7 +22,8 @@ _said: set[str] = set()
 
 def current() -> str:
     """The mode in force. **Raises:** ValueError where the environment asks for one that does not exist."""
-    return _mode.get() or _checked(os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION")
+    mode = _mode.get() or _checked(os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION")
+    return mode if mode == "plain" or jax_adapter.reason_against_kernels() is None else "plain"
 
 
 def _checked(mode, what: str) -> str:
