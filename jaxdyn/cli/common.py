@@ -147,13 +147,13 @@ def whole(text: str) -> int:
     raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at most 18 digits")
 
 
-def check_least(args: argparse.Namespace, **least: float) -> None:
+def check_least(args: argparse.Namespace, **least: int) -> None:
     """Options, by their names in `args`, that must not be smaller than a number. **Raises:** ValueError that names one."""
     for name, bound in least.items():
         values = getattr(args, name)
         for value in values if isinstance(values, list) else [] if values is None else [values]:
             if value < bound:
-                raise ValueError(f"--{name.replace('_', '-')} is {value}; give at least {bound:g}")
+                raise ValueError(f"--{name.replace('_', '-')} is {value}; give at least {bound}")
 
 
 def check_memory(count: float, options: str) -> None:

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> None:
     model = load_model(args.urdf, args)
     rows = args.rate * args.period * args.periods
     check_memory(rows * (1 + model.nq + 3 * model.nv), f"--rate {args.rate:g} --period {args.period:g} --periods {args.periods}")
-    check_memory(100 * args.harmonics * (model.nv * 14) ** 2, f"--harmonics {args.harmonics}")
+    check_memory(100.0 * args.harmonics * (model.nv * 14) ** 2, f"--harmonics {args.harmonics}")
     velocity, torque = (
         None if value is None else per_coordinate(model, value, f"--{name}")
         for name, value in (("velocity", args.velocity), ("torque", args.torque))

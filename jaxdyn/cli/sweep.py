@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
             f"{path}: samples is {given}, duration {duration} s, points {points}; give at least one sample, a positive duration "
             "and at least two points"
         )
-    check_memory(points, f"{path}: points {points}")
+    check_memory(float(points), f"{path}: points {points}")
     out = path.parent / _required(study, path, "out") if args.out is None else as_path(args.out, "--out")
     parameters = study.get("parameters", {})
     draw = drawing(parameters)
