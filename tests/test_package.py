@@ -28,7 +28,7 @@ FLOORS = (
     "contact reduction",
     "grasp simulation",
     "control identify scenes",
-    "io reports scale",
+    "export io reports scale",
     "pictures",
     "cli demo",
     "__main__",
@@ -151,7 +151,7 @@ def test_rooms_use_those_below():
     }
     wrong = [f"{room} uses {used}" for room, used in arrows if room and RANK[used] >= RANK[room]]
     assert not wrong, "\n".join(sorted(wrong))
-    assert len([room for room, _ in arrows if room]) < 120
+    assert len([room for room, _ in arrows if room]) < 126  # six a room: more would make rooms meaningless
 
 
 def test_imports_have_no_cycle():

@@ -233,7 +233,7 @@ class Emitter:
 
     def _far_pair(self, kind: str) -> str:
         """Name of a function of this module for the sine and cosine of any angle, by the C library."""
-        name, of, inner = f"far_pair_{kind}", self.type(kind), Emitter(self.width)
+        name, of, inner = f"far_pair_{kind}_{self.width}", self.type(kind), Emitter(self.width)
         sine, cosine = (inner.library(function, kind, "%x") for function in ("sin", "cos"))
         first = inner.put(f"insertvalue {{{of}, {of}}} poison, {of} {sine}, 0")
         both = inner.put(f"insertvalue {{{of}, {of}}} {first}, {of} {cosine}, 1")

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import is_concrete
 from jaxdyn.forces.piecewise import PiecewiseForce
-from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike
+from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, is_concrete
 from jaxdyn.systems.scene import as_pytree
 
 
