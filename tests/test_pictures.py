@@ -502,7 +502,9 @@ def test_bodies_with_a_slash_in_their_names_are_where_they_are(monkeypatch):
             for step in handles[name].name.strip("/").split("/"):
                 path += f"/{step}"
                 if (handle := node(path)) is not None:
-                    placed = placed @ f64.joint_pose("free", np.zeros(6), np.concatenate([handle.position, handle.wxyz]))
+                    placed = placed @ f64.joint_pose(
+                        "free", np.zeros(6), np.concatenate([handle.position, handle.wxyz])
+                    )
             np.testing.assert_allclose(placed, jd.frame_pose(model, q, name), atol=1e-6)  # viser sends float32
             assert sum(handle.name == handles[name].name for handle in handles.values()) == 1
     finally:

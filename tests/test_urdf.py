@@ -323,6 +323,8 @@ def test_chains_of_mimic_joints(urdf):
 
 
 TREE = (link("a"), link("b"))
+
+
 def test_followers_of_fixed_joints_are_held_at_their_offset(urdf):
     follow = '<axis xyz="0 0 1"/><mimic joint="{}" multiplier="2" offset="{}"/>'
     path = urdf(
@@ -336,7 +338,9 @@ def test_followers_of_fixed_joints_are_held_at_their_offset(urdf):
     assert held.joint_names == ("root_joint",)
     pose = kinematics.frame_pose(held, jnp.array([0.0, 0, 0, 1, 0, 0, 0]), "d")
     angle = 0.3 + 2 * 0.3 + 0.1
-    np.testing.assert_allclose(pose[:2, :2], [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], atol=1e-14)
+    np.testing.assert_allclose(
+        pose[:2, :2], [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], atol=1e-14
+    )
 
 
 COUPLED = joint("j", "a", "b", '<mimic joint="k"/>'), joint("k", "b", "c", "", "{}"), link("c")
@@ -677,7 +681,10 @@ def test_encodings_that_the_declaration_names(encoding, tmp_path):
         (b'<?xml version="1.0" encoding="quux"?><robot/>', (":1: the encoding 'quux'", "unknown")),
         (b'<?xml version="1.0" encoding="utf-16"?><robot/>', (":1: the XML declaration says utf-16", "leave it out")),
         (b'<?xml version="1.0" encoding="hex"?><robot/>', (":1: the encoding 'hex'",)),
-        ('<?xml version="1.0" encoding="gbk"?>\n<robot name="机">\n<link name="a"></robot>'.encode("gbk"), (":3: malformed",)),
+        (
+            '<?xml version="1.0" encoding="gbk"?>\n<robot name="机">\n<link name="a"></robot>'.encode("gbk"),
+            (":3: malformed",),
+        ),
     ],
 )
 @pytest.mark.parametrize("reader", [load_urdf, load, shapes])
@@ -709,7 +716,9 @@ def test_warnings_point_at_the_line_of_the_caller(urdf):
             call()
         line = call.__code__.co_firstlineno
         assert {(one.filename, one.lineno) for one in caught} == {(__file__, line)}
-        assert len(caught) == (3 if line == call.__code__.co_firstlineno and "load_urdf" not in call.__code__.co_names else 2)
+        assert len(caught) == (
+            3 if line == call.__code__.co_firstlineno and "load_urdf" not in call.__code__.co_names else 2
+        )
         (inertia,) = (one for one in caught if "triangle inequality" in str(one.message))
         assert f"{path}:" in str(inertia.message)
 
@@ -744,14 +753,14 @@ def test_xacro_files_are_expanded(tmp_path, monkeypatch):
         load(path)
     plain = path.with_name("arm.urdf")
     plain.write_text("<robot name='a'><link name='b'/></robot>")
-    with pytest.raises(ValueError, match="arguments is .*no .xacro file"):
+    with pytest.raises(ValueError, match=r"arguments is .*no .xacro file"):
         load(plain, arguments={"length": 1})
 
 
 # Of 70 files that are URDF or make one, these are refused: by file, line and what to do, which is done below.
 MENDED = {
     "ur_description/urdf/ur3.urdf": ":6: the robot has no <link>; this is xacro: expand it",
-    "alex_description/urdf/alex_psyonic_hands.urdf": r":1030: joint 'Left_index_q2' follows 'index_q1'.*Left_index_q1.*mimic='ignore'",
+    "alex_description/urdf/alex_psyonic_hands.urdf": r":1030: joint 'Left_index_q2' follows 'index_q1'.*mimic='ignore'",
     "romeo_description/urdf/romeo.urdf": r":1647: joint 'RThumb3'.*lock=\[",
     "romeo_description/urdf/romeo_laas_small.urdf": r":1037: joint 'r_gripper_joint'.*lock=\[",
 }

@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="write the motion, .csv or .npz")
     parser.add_argument("--plot", metavar="FILE", help="draw it to FILE.png, .pdf or .svg")
     parser.add_argument("--period", type=real, default=10.0, metavar="S", help="of the motion, s (default: 10)")
-    parser.add_argument("--periods", type=whole, default=1, metavar="N", help="written one after the other (default: 1)")
+    parser.add_argument(
+        "--periods", type=whole, default=1, metavar="N", help="written one after the other (default: 1)"
+    )
     parser.add_argument("--harmonics", type=whole, default=5, metavar="N", help="of the series (default: 5)")
     parser.add_argument("--rate", type=real, default=100.0, metavar="HZ", help="rows a second (default: 100)")
     parser.add_argument("--terms", nargs="*", choices=TERMS, default=TERMS, help="to be identified beside the bodies")
@@ -71,7 +73,9 @@ def run(args: argparse.Namespace) -> None:
     check_least(args, harmonics=1, steps=0, seed=0)
     model = load_model(args.urdf, args)
     rows = args.rate * args.period * args.periods
-    check_memory(rows * (1 + model.nq + 3 * model.nv), f"--rate {args.rate:g} --period {args.period:g} --periods {args.periods}")
+    check_memory(
+        rows * (1 + model.nq + 3 * model.nv), f"--rate {args.rate:g} --period {args.period:g} --periods {args.periods}"
+    )
     check_memory(100.0 * args.harmonics * (model.nv * 14) ** 2, f"--harmonics {args.harmonics}")
     velocity, torque = (
         None if value is None else per_coordinate(model, value, f"--{name}")

@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 
 from jaxdyn import __version__, identify
-from jaxdyn.cli.common import Stopwatch, add_model_options, check_least, coordinate_labels, load_model, output_path, real, whole
+from jaxdyn.cli.common import (
+    Stopwatch,
+    add_model_options,
+    check_least,
+    coordinate_labels,
+    load_model,
+    output_path,
+    real,
+    whole,
+)
 from jaxdyn.cli.identify_file import with_file
 from jaxdyn.cli.identify_logs import filtered_log, log_cutoff, log_names, log_paths, raw_log
 from jaxdyn.cli.identify_options import find_gains, make_fit, parse_options, settled

@@ -63,9 +63,11 @@ def run(args: argparse.Namespace) -> None:
     body_problems = _of_the_file(inertia_report(model), source)
     print(describe(scene, args.file))
     print(constraint_lines(scene))
-    print(_problems(urdf_inertia_report(file, arguments=xacro_arguments(args)), body_problems) if is_urdf else _body_problems(body_problems))
     if is_urdf:
+        print(_problems(urdf_inertia_report(file, arguments=xacro_arguments(args)), body_problems))
         print(_unused(source))
+    else:
+        print(_body_problems(body_problems))
     if scene.not_taken or not is_urdf:
         print("\n".join(["\nNot taken from the file:", *(scene.not_taken or ["nothing"])]))
     if out is not None:
@@ -84,7 +86,9 @@ def _of_the_file(problems: list[tuple[str, str]], file: XmlFile) -> list[tuple[s
 def _base(scene: LoadedScene) -> str:
     """Whether the mechanism stands on the world: by its joints, or by constraints that hold a free root."""
     model, top = scene.system, scene.system.topology
-    free = [i for i, (parent, kind) in enumerate(zip(top.parents, top.kinds, strict=True)) if parent < 0 and kind == "free"]
+    free = [
+        i for i, (parent, kind) in enumerate(zip(top.parents, top.kinds, strict=True)) if parent < 0 and kind == "free"
+    ]
     held = []
     if free and scene.constraints:
         rows = np.asarray(constraint_jacobian(scene, scene.starts["reference"].q, jnp.zeros(())), np.float64)

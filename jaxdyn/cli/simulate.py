@@ -73,9 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", help=FILE)
     add_model_options(parser)
     motion = parser.add_argument_group("motion")
-    motion.add_argument(
-        "--duration", type=real, metavar="S", help="length of the motion, s (default: 2, or the log's)"
-    )
+    motion.add_argument("--duration", type=real, metavar="S", help="length of the motion, s (default: 2, or the log's)")
     motion.add_argument(
         "--sample", type=real, default=0.01, metavar="S", help="time between output rows, s (default: 0.01)"
     )
@@ -154,6 +152,7 @@ def run(args: argparse.Namespace) -> int:
     check_least(args, spread=0, max_steps=1, torque_size=0, damping=0, friction=0, rank_tol=0)
     loaded, file = load_scene(args.file, args)
     model = loaded.system
+    check_memory(8.0 * args.batch * (model.nq + 2 * model.nv + 3), f"--batch {args.batch}")
     control, q0, v0, duration = _excitation(loaded, args)
     if args.duration is not None:
         duration = args.duration
@@ -189,7 +188,8 @@ def run(args: argparse.Namespace) -> int:
         motion_figure(model, ts, solution.q, solution.v, tau).savefig(plot)
         print(f"Wrote {plot}.")
     if page is not None or args.view:
-        solids, moving = shapes(file, arguments=xacro_arguments(args)), eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
+        solids = shapes(file, arguments=xacro_arguments(args))
+        moving = eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
         if page is not None:
             save_html(page, scene, moving, shapes=solids)
             print(f"Wrote {page}.")

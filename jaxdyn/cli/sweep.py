@@ -83,8 +83,8 @@ _KEYS: dict[str, tuple[type, ...]] = {
     "reductions": (dict,),
 }
 # Options of `jd.simulate` that a file can say, and of `jd.scale.run`.
-_OPTIONS = set(inspect.signature(simulate).parameters) - {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint"}
-_OPTIONS |= {"lanes", "memory", "compress", "verify"}
+_OPTIONS = {"lanes", "memory", "compress", "verify", *inspect.signature(simulate).parameters}
+_OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "progress", "throw"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -104,10 +104,10 @@ def run(args: argparse.Namespace) -> int:
     path = as_path(args.study, "study")
     study = _read(path)
     if args.devices is not None:
-        if args.devices < 1:
-            raise ValueError(f"--devices is {args.devices}; give at least 1")
+        if not 1 <= args.devices <= 4096:
+            raise ValueError(f"--devices is {args.devices}; give 1 to 4096")
         jax.config.update("jax_num_cpu_devices", args.devices)
-    check_least(args, devices=1, chunk=1, samples=1)
+    check_least(args, chunk=1, samples=1)
     if args.process is not None and not 0 <= args.process[0] < args.process[1]:
         raise ValueError(f"--process is {args.process[0]} {args.process[1]}; give I N with 0 <= I < N")
     given = _required(study, path, "samples") if args.samples is None else args.samples
@@ -166,7 +166,9 @@ def drawing(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
         ends = given[kinds[0]] if len(kinds) == 1 else None
         numbers = isinstance(ends, list) and len(ends) == 2 and all(type(x) in (int, float) for x in ends)
         if not (numbers and np.all(np.isfinite(ends))):
-            raise ValueError(f"parameter {name} is {one!r}; give a finite number, or one of {', '.join(_DRAWS)} = [a, b]")
+            raise ValueError(
+                f"parameter {name} is {one!r}; give a finite number, or one of {', '.join(_DRAWS)} = [a, b]"
+            )
         size = given.get("size", 1)
         if type(size) is not int or not 1 <= size < 2**31:
             raise ValueError(f"parameter {name}: size is {size!r}; give a whole number of at least 1")
@@ -200,7 +202,9 @@ def _read(path: pathlib.Path) -> dict[str, Any]:
             raise ValueError(f"{path}: {name} is {value!r}; give names")
     options = study.get("options", {})
     if bad := [name for name, value in options.items() if name not in _OPTIONS or isinstance(value, (list, dict))]:
-        raise ValueError(f"{path}: [options] {bad[0]} is {options[bad[0]]!r}; options are {', '.join(sorted(_OPTIONS))}")
+        raise ValueError(
+            f"{path}: [options] {bad[0]} is {options[bad[0]]!r}; options are {', '.join(sorted(_OPTIONS))}"
+        )
     for name, one in study.get("parameters", {}).items():
         if isinstance(one, dict) and not isinstance(one.get("units", ""), str):
             raise ValueError(f"{path}: units of {name} are {one['units']!r}; give a text")
@@ -218,9 +222,9 @@ def _reduction(name: str, given: Any) -> scale.Reduction:
     if len(kinds) != 1:
         raise ValueError(f"reduction {name} is {given!r}; give one of {', '.join(_REDUCTIONS)} = NAME")
     options = {key: value for key, value in given.items() if key != kinds[0]}
-    if "probabilities" in options:
-        options["probabilities"] = tuple(options["probabilities"])
     try:
+        if "probabilities" in options:
+            options["probabilities"] = tuple(options["probabilities"])
         return _REDUCTIONS[kinds[0]](given[kinds[0]], **options)
     except TypeError as error:
         raise ValueError(f"reduction {name} is {given!r}: {error}") from error

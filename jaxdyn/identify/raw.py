@@ -37,8 +37,9 @@ def from_raw(
 
     **Returns:** `Log` with t, q, v, a, tau.
 
-    **Raises:** ValueError for all that `Log` refuses; an order, trim or every that is no whole number or too small; too few samples for the filter and the trimming; a cut-off above
-    half the sampling rate; a gap in time longer than half a period of the cut-off, which interpolation would invent.
+    **Raises:** ValueError for all that `Log` refuses; an `order`, `trim` or `every` that is no whole number or too small; too few
+    samples for the filter and the trimming; a cut-off above half the sampling rate; a gap in time longer than half a period of
+    the cut-off, which interpolation would invent.
 
     Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
     """

@@ -151,7 +151,9 @@ def urdf_model(
     return model
 
 
-def urdf_inertia_report(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = None) -> list[tuple[str, str]]:
+def urdf_inertia_report(
+    path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = None
+) -> list[tuple[str, str]]:
     """What is unphysical in the inertias that a URDF file states, as (link, problem), before links are merged.
 
     Links without `<inertial>` are listed only where a joint moves them: a fixed one is a mere frame. `arguments` are as for

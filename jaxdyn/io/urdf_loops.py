@@ -236,7 +236,7 @@ def _turned(file: XmlFile, joint, tag: str, world: np.ndarray, what: str) -> np.
 
 
 def plugin_followers(file: XmlFile) -> dict[str, tuple[Mimic, str]]:
-    """The joints that plugins in `<gazebo>` elements let follow others: mimicJoint = multiplier joint + offset; file:line of each.
+    """Joints that follow others by a plugin in a `<gazebo>` element, mimicJoint = multiplier joint + offset; file:line of each.
 
     **Raises:** ValueError with file and line for a plugin without the joints' names, bad numbers, a joint that follows twice.
     """

@@ -7,7 +7,6 @@ Python's codecs, since expat knows four encodings, and none of those of more tha
 import codecs
 import os
 import re
-import pathlib
 from collections.abc import Mapping
 from typing import Any, NoReturn
 from xml.etree import ElementTree
@@ -26,7 +25,12 @@ class Element(ElementTree.Element):
 
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"))
-_MARKS += ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"), (b"<\0", "utf-16-le"), (b"\0<", "utf-16-be"))
+_MARKS += (
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+    (b"<\0", "utf-16-le"),
+    (b"\0<", "utf-16-be"),
+)
 _DECLARED = re.compile(rb"""<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]+)["']""")
 
 
@@ -149,7 +153,7 @@ def _decode(path: str, data: bytes) -> tuple[str, str]:
         encoding = "utf-8" if declared is None else declared[1].decode(errors="replace")
         if re.match("(utf|ucs)[-_]?(16|32|2|4)", encoding.lower()):
             raise ValueError(
-                f"{path}:1: the XML declaration says {encoding}, in bytes that are not; write encoding=\"UTF-8\", or leave it out"
+                f'{path}:1: the XML declaration says {encoding}, in bytes that are not; write encoding="UTF-8", or leave it out'
             )
     try:
         text = data.decode(encoding)

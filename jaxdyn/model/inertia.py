@@ -62,7 +62,9 @@ def inertial_parameters(mass: Number, com: Numbers, inertia_com: Numbers) -> Flo
     return jnp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
 
 
-def mass_com_inertia(parameters: Checked[Float[Array, "10"]]) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
+def mass_com_inertia(
+    parameters: Checked[Float[Array, "10"]],
+) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
     """Mass (), centre of mass (3,) and rotational inertia about it (3, 3). A massless body has its centre at the origin."""
     _check_shapes(parameters=(parameters, (10,)))
     mass, first = parameters[0], parameters[1:4]

@@ -18,7 +18,7 @@ from jaxdyn.scale.processes import process_of
 from jaxdyn.scale.progress import Progress
 from jaxdyn.scale.reducer import Reducer
 from jaxdyn.scale.reductions import Arrays, checked_reductions, described
-from jaxdyn.scale.store import Store, full_disk, check_place, zarr_package
+from jaxdyn.scale.store import Store, check_place, full_disk, zarr_package
 
 LISTED = 1000  # failures that a result lists
 PROGRAM = "program of a rollout (scene, control, solver, functions)"  # how a store names its hash

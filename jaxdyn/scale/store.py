@@ -71,7 +71,9 @@ def check_place(path: Path) -> None:
         raise ValueError(f"out is {str(path)!r}: there is no directory {path.parent}")
     place = path if path.exists() else path.parent
     if not os.access(place, os.W_OK | os.X_OK):
-        raise ValueError(f"out is {str(path)!r}: {place} cannot be written; change its permissions, or name another place")
+        raise ValueError(
+            f"out is {str(path)!r}: {place} cannot be written; change its permissions, or name another place"
+        )
 
 
 class Store:
@@ -113,8 +115,8 @@ class Store:
     def _damaged(self, error: Exception) -> ValueError:
         reason = " ".join(str(error).split()) or type(error).__name__
         return ValueError(
-            f"out is {str(self.path)!r}, whose zarr.json is damaged ({type(error).__name__}: {reason}); put it back from a copy, or "
-            "name another store"
+            f"out is {str(self.path)!r}, whose zarr.json is damaged ({type(error).__name__}: {reason}); put it back from a "
+            "copy, or name another store"
         )
 
     @classmethod

@@ -41,8 +41,8 @@ def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
 
     `takes` names the arguments that it is called with, as "q, t".
 
-    **Raises:** ValueError when `function` cannot be called, or not with these arguments, and for an object with attributes that is no pytree: the
-    compiled program would keep their first values; `argument` says where it came from.
+    **Raises:** ValueError when `function` cannot be called, or not with these arguments, and for an object with attributes that
+    is no pytree: the compiled program would keep their first values; `argument` says where it came from.
     """
     if not callable(function):
         raise ValueError(f"{argument} is {function!r}, which cannot be called; pass a function or a callable Module")
