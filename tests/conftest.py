@@ -56,6 +56,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # Files of others, and what tests make of the kind, hold such inertias.
+    config.addinivalue_line("filterwarnings", "ignore:(?s).*No body has such an inertia")
     mode = config.getoption("--compilation")
     if mode is not None:
         os.environ["JAXDYN_COMPILATION"] = mode

@@ -1,5 +1,8 @@
 """ModelBuilder, the reports on inertias, and the built-in mechanisms."""
 
+import re
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import jaxdyn as jd
 from jaxdyn import inertia, robots
 from jaxdyn.dynamics import kinematics
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.io import load_urdf
+from jaxdyn.model import float64 as f64
 from jaxdyn.model import joints
 from jaxdyn.model import tree as mdl
 from jaxdyn.model.builder import ModelBuilder, inertia_report, repair_inertias
@@ -492,3 +497,49 @@ def test_mass_matrix_is_singular_exactly_where_a_build_is_refused(seed):
         else:
             assert regular
     assert 0 < refused < 25
+
+
+@pytest.mark.parametrize(
+    ("moments", "words"),
+    [
+        ((1, 1, -1), r"body 'a': a principal moment of inertia is negative \(-1 kg m\^2\)"),
+        ((1, 1, 5), "body 'a': its principal moments of inertia 1, 1, 5 kg m.2 break the triangle inequality"),
+        ((1, 1, 2), None),  # a plate
+        ((1, 1, 2.001), None),  # a plate, in a file's digits
+        ((1, 1, 0), None),  # a rod
+        ((0, 0, 0), None),  # a point
+    ],
+)
+def test_inertias_that_no_body_has_are_named(moments, words):
+    """However a model is made of them, at the line that makes it; limits of bodies are none of them."""
+    inertia = (1.0, (0.3, 0.2, 1.0), moments)
+    builder = jd.ModelBuilder().add_body("a", axis=(0, 1, 0), inertia=inertia)
+    numbers = np.asarray(f64.inertia_numbers(inertia, "a"))
+    sound = jd.ModelBuilder().add_body("a", inertia=jd.inertia.sphere(1.0, 1.0)).build()
+    for make in (builder.build, lambda: sound.replace(inertias=numbers[None])):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            make()
+        assert len(caught) == (words is not None)
+        if words:
+            assert re.match(words, str(caught[0].message)) and "jd.repair_inertias" in str(caught[0].message)
+            assert caught[0].filename == __file__
+
+
+@pytest.mark.parametrize("text", ["1_0", "1", 1j])
+def test_texts_are_no_numbers(text):
+    with pytest.raises(ValueError, match=r"body 'a': inertia: mass is .*, expected a number"):
+        jd.ModelBuilder().add_body("a", inertia=(text, (0, 0, 0), (1, 1, 1)))
+
+
+def test_swapped_arguments_of_inertias_are_named():
+    ball = jd.inertia.sphere(1.0, 0.1)
+    with pytest.raises(ValueError, match=r"pose has shape \(10,\), expected pose \(4, 4\), parameters \(10,\)"):
+        jd.inertia.transform_inertia(ball, jnp.eye(4))
+    with pytest.raises(ValueError, match=r"parameters has shape \(3,\), expected parameters \(10,\), position \(3,\)"):
+        jd.inertia.displaced(jnp.zeros(3), ball)
+    with pytest.raises(ValueError, match=r"com has shape \(3, 3\)"):
+        jd.inertia.inertial_parameters(1.0, jnp.eye(3), jnp.zeros(3))
+    for function in (jd.inertia.spatial_inertia, jd.inertia.pseudo_inertia, jd.inertia.to_log_cholesky):
+        with pytest.raises(ValueError, match=r"parameters has shape \(4, 4\), expected parameters \(10,\)"):
+            function(jnp.eye(4))

@@ -681,3 +681,107 @@ def test_simulate_a_file_with_a_loop(four_bar, tmp_path, capsys):
     with pytest.warns(jd.NotTakenWarning):
         assert main([*args, "--start", "home"]) == 2
     assert "--start is 'home'; the file names reference, open" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("simulate ARM --duration inf", "--duration: 'inf' is no finite number"),
+        ("simulate ARM --rtol nan", "--rtol: 'nan' is no finite number"),
+        ("simulate ARM --damping 1_0", "--damping: '1_0' is no finite number"),
+        ("simulate ARM --gravity 0 0 １", "--gravity: '１' is no finite number"),
+        ("simulate ARM --batch 1_0", "--batch: '1_0' is no whole number"),
+        ("simulate ARM --seed 99999999999999999999", "--seed: '99999999999999999999' is no whole number"),
+        ("simulate ARM --duration 1e9 --sample 1e-3", "--duration 1e+09 --sample 0.001: .* GB of results"),
+        ("simulate ARM --sample 1e-300", "--sample 1e-300: .* GB of results"),
+        ("simulate ARM --batch 999999999999999999 --spread 1", "--batch 999999999999999999: .* GB of results"),
+        ("simulate ARM --max-steps 0", "--max-steps is 0; give at least 1"),
+        ("simulate ARM --spread -1", "--spread is -1.0; give at least 0"),
+        ("simulate ARM --torque-size -1", "--torque-size is -1.0; give at least 0"),
+        ("simulate ARM --lock lift=1_0", "--lock lift=1_0: '1_0' is no finite number"),
+        ("simulate ARM --arguments a=1", "arguments is .* no .xacro file"),
+        ("simulate ARM --arguments a", "--arguments a: give NAME=VALUE"),
+        ("excite ARM --rate 1e300", "--rate 1e.300 .*GB of results"),
+        ("excite ARM --harmonics 0", "--harmonics is 0; give at least 1"),
+        ("excite ARM --period -1", "--period is -1.0 s; give a positive time"),
+        ("identify --urdf ARM --log x.csv --every 0", "--every is 0; give at least 1"),
+        ("identify --urdf ARM --log x.csv --payload-mass 0", "--payload-mass is 0.0; give a positive number"),
+        ("report four_bar --batch 0", "--batch is 0; give at least 1"),
+        ("report four_bar --rounds 0", "--rounds is 0; give at least 1"),
+        ("sweep x.toml --samples 0", "--samples is 0; give at least 1"),
+        ("sweep x.toml --process 2 2", "--process is 2 2; give I N with 0 <= I < N"),
+    ],
+)
+def test_numbers_of_options_end_in_a_line(arguments, words, arm, capsys):
+    try:
+        status = main([str(arm) if part == "ARM" else part for part in arguments.split()])
+    except SystemExit as error:  # of argparse, which prints the usage first
+        status = error.code
+    assert status == 2
+    assert re.search(words, capsys.readouterr().err.splitlines()[-1])
+
+
+STUDY = {"scene": '"pendulum"', "out": '"o.zarr"', "samples": "2", "duration": "0.1"}
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("duration = inf", "duration inf s"),
+        ("duration = [1]", r"duration is \[1\]"),
+        ("points = 1", "points 1;"),
+        ("points = 100000000000000", "points 100000000000000: .* GB of results"),
+        ("samples = 1e3", "samples is 1000.0; see"),
+        ("seed = 100000000000000000000", "seed is 1000"),
+        ("outputs = [1]", r"outputs is \[1\]; give names"),
+        ("parameters = 3", "parameters is 3; see"),
+        ("[options]\nfoo = 1", r"\[options\] foo is 1; options are atol, "),
+        ("[parameters]\nmass = nan", "parameter mass is nan; give a finite number"),
+        ("[parameters]\nmass = { uniform = [1.0, inf] }", "parameter mass is .*inf.*; give a finite number"),
+        ("[parameters]\nmass = { uniform = [1.0, 2.0], size = -1 }", "size is -1; give a whole number"),
+        ("[parameters]\nmass = { uniform = [1.0, 2.0], units = 3 }", "units of mass are 3; give a text"),
+    ],
+)
+def test_numbers_of_a_study_end_in_a_line(line, words, tmp_path, capsys):
+    pytest.importorskip("zarr")
+    lines = [f"{key} = {value}" for key, value in STUDY.items() if not line.startswith(f"{key} ")]
+    (tmp_path / "study.toml").write_text("\n".join([*lines, line]))
+    assert main(["sweep", str(tmp_path / "study.toml"), "--quiet"]) == 2
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1 and re.search(words, text), text
+
+
+MJCF = """<mujoco><worldbody>{}<body name="arm" pos="0 0 1"><joint name="j1" axis="0 1 0" pos="0 0 .1"/>
+<joint name="j2" axis="1 0 0"/><geom size="0.1" pos="0 0 -1"/></body></worldbody>{}</mujoco>"""
+BALL = '<body name="aa"><freejoint/><geom size="0.1"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("bodies", "rest", "base"),
+    [
+        ("", "", "fixed base, 2 moving bodies"),
+        (BALL, "", "fixed base beside free bodies aa, 3"),
+        (BALL, '<equality><weld body1="aa"/></equality>', r"fixed base \(held by constraints\), 3"),
+    ],
+)
+def test_info_says_what_stands_on_the_world(bodies, rest, base, tmp_path, capsys):
+    """The bodies that a loader puts between two joints of one body are no fault of the file."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(MJCF.format(bodies, rest))
+    assert main(["info", str(tmp_path / "arm.xml")]) == 0
+    text = capsys.readouterr().out
+    assert re.search(base, text.splitlines()[0])
+    assert "arm_j1" in text and "Inertias: every body that moves has a physical inertia." in text
+
+
+def test_info_and_simulate_expand_xacro(tmp_path, capsys):
+    pytest.importorskip("xacro")
+    path = tmp_path / "arm.urdf.xacro"
+    path.write_text(
+        '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arg name="mass" default="1.0"/><link name="a"/>'
+        '<link name="b"><inertial><mass value="$(arg mass)"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+        '</inertial></link><joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>'
+    )
+    for extra, mass in (([], "1 kg"), (["--arguments", "mass=2.5"], "2.5 kg")):
+        assert main(["info", str(path), *extra]) == 0
+        assert f"moving mass {mass}" in capsys.readouterr().out

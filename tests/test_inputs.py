@@ -396,3 +396,30 @@ def test_codes_of_a_batch_print_as_words():
     assert jd.RESULTS[lanes.result] == "['successful' 'successful' 'successful']" and lanes.success.all()
     one = jd.constrained_dynamics(CHAIN, jnp.zeros(2), jnp.zeros(2))
     assert jd.RESULTS[one.result] == "successful" and "successful" in str(one.result)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: jd.Holonomic(lambda q: q), r"phi takes \(q\), but is called as \(q, t\)"),
+        (lambda: jd.Holonomic(lambda q, t: q, with_system=True), r"called as \(system, q, t\)"),
+        (lambda: jd.Pfaffian(lambda q: q), r"A takes \(q\), but is called as \(q, t\)"),
+        (lambda: jd.Pfaffian(lambda q, t: q, lambda q: q), r"b takes \(q\)"),
+        (lambda: jd.LagrangianSystem(lambda q: q, 1), r"lagrangian takes \(q\), but is called as \(q, v\)"),
+        (lambda: jd.LagrangianSystem(lambda q, v: q, 1, parameters=1.0), r"called as \(q, v, t, parameters\)"),
+        (lambda: jd.MetricSystem(lambda q, v: q, 1), r"metric takes \(q, v\), but is called as \(q\)"),
+        (lambda: jd.RayleighDissipation(lambda v: v @ v), r"called as \(q, v, t\)"),
+        (lambda: hybrid(lambda q, v: q), r"task \(of position\) takes \(q, v\), but is called as \(q\)"),
+        (lambda: hybrid(lambda q: q, of="velocity"), r"task \(of velocity\) takes \(q\), but is called as \(q, v\)"),
+        (lambda: hybrid(lambda q: q, target=lambda t, x: x), r"target takes \(t, x\), but is called as \(t\)"),
+        (lambda: hybrid(lambda q: q, force=lambda: 0), r"force takes \(\), but is called as \(t\)"),
+    ],
+)
+def test_functions_of_other_arguments_are_refused_when_they_are_given(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def hybrid(task, of="position", target=(0.0,), **options):
+    kd = 1.0 if of == "position" else None
+    return jd.control.HybridForce(jd.scenes.four_bar(), task, target, 1.0, kd, of=of, **options)

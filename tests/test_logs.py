@@ -222,3 +222,39 @@ def test_from_raw_is_the_protocol_of_the_recorded_data(data_dir):
     np.testing.assert_array_equal(train.t, log.t[rows[0]])
     np.testing.assert_array_equal(test.t, log.t[rows[1]])
     assert identify.torque_error(1.1 * log.tau, log.tau) == pytest.approx(prepare.error_percent(1.1 * log.tau, log.tau))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"every": 0}, "every is 0; give a whole number of at least 1"),
+        ({"every": 1.5}, "every is 1.5; give a whole number"),
+        ({"trim": -1}, "trim is -1; give a whole number of at least 0"),
+        ({"order": 0}, "order is 0; give a whole number of at least 1"),
+    ],
+)
+def test_from_raw_refuses_counts(options, words):
+    t = np.linspace(0, 2, 2001)
+    with pytest.raises(ValueError, match=words):
+        identify.from_raw(t, t[:, None], t[:, None], **options)
+
+
+@pytest.mark.parametrize("cell", ["1_0", "１０", "0x1"])
+def test_cells_that_only_python_reads_are_refused(cell, tmp_path):
+    (tmp_path / "log.csv").write_text(f"t,q1,tau1\n0,0,0\n1,{cell},0\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=f"line 3, column q1: '{cell}' is no number"):
+        read_log(tmp_path / "log.csv")
+
+
+def test_logs_in_other_encodings_are_refused_with_their_line(tmp_path):
+    (tmp_path / "log.csv").write_bytes("t,q_机,tau_机\n0,0,0\n".encode("gbk"))
+    with pytest.raises(ValueError, match=r"log.csv: line 1 is not UTF-8 .*; save the file as UTF-8"):
+        read_log(tmp_path / "log.csv")
+    (tmp_path / "log.csv").write_text("t,q_机,tau_机\n0,0,0\n1,2,3\n", encoding="utf-8-sig")
+    np.testing.assert_array_equal(read_log(tmp_path / "log.csv").tau, [[0.0], [3.0]])
+
+
+@pytest.mark.parametrize("t", [np.array(["0", "1_0"]), np.array([0.0, 1j]), ["0", "1"]])
+def test_logs_of_texts_and_complex_numbers_are_refused(t):
+    with pytest.raises(ValueError, match=r"t holds .*; give real numbers"):
+        identify.Log(t, np.zeros((2, 1)), tau=np.zeros((2, 1)))

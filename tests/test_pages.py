@@ -1,5 +1,6 @@
 """The documents: links lead somewhere, exports are described, examples run as they are printed."""
 
+import ast
 import inspect
 import re
 from urllib.parse import unquote
@@ -84,6 +85,71 @@ def test_every_export_is_described():
             if arrays and not re.search(r"\((n\w*|\d)?,? ?[\w* ,]*\)", text):
                 wrong.append(f"{name}: no shape of {arrays[0].name}")
     assert len(exports()) > 300 and not wrong, "\n".join(wrong)
+
+
+SECTION = re.compile(
+    r"\*\*(?:Arguments|Fields):\*\*(.*?)(?=\n\s*\*\*[A-Z]|\n\s*```|\n\s*Source:|\n\n(?!\s*- )|\Z)", re.S
+)
+HEAD = re.compile(r"((?:`\w+`(?: \([^)]*\)){0,3}(?:, | and )?)+)")
+CALL = re.compile(r"(?<![\w.`])([a-z_]\w+)\((?:system, )?q(?:, v)?(?:, t)?\)")
+# Options that are passed on, behind the one that takes them.
+PASSED_ON = {"fit_parameters": {"adjoint"}, "run": {"parameter_NAME", "result", "num_steps", "time_reached"}}
+
+
+def arguments_in(text: str) -> list[str]:
+    """Names that open a part of the section on arguments."""
+    names = []
+    for section in SECTION.findall(text):
+        for part in re.split(r"\n\s*- |; (?=`)|(?<=\.) (?=`\w+`[:,] )", section):
+            words = " ".join(part.split())
+            head = HEAD.match(words)
+            if head and (head[1].endswith(", ") or words[head.end() :][:1] in ("", ":", ".", ";")):
+                names += re.findall(r"`(\w+)`", head[1])
+    return names
+
+
+def test_docstrings_name_arguments_that_exist():
+    """Every function, method and class of the package: what is described is an argument, a field, or a name of the module."""
+    wrong, count = [], 0
+    trees = {path: ast.parse(path.read_text()) for path in sorted((ROOT / "jaxdyn").rglob("*.py"))}
+    classes = {node.name: node for tree in trees.values() for node in tree.body if isinstance(node, ast.ClassDef)}
+    for path, tree in trees.items():
+        used = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)} | {
+            n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)
+        }
+        used |= {n.arg for n in ast.walk(tree) if isinstance(n, ast.arg)}
+        used |= {n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)}
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.FunctionDef | ast.ClassDef):
+                continue
+            text = ast.get_docstring(node) or ""
+            known = PASSED_ON.get(node.name, set()) | parameters(node, classes)
+            named = arguments_in(text)
+            count += len(named)
+            where = f"{path.relative_to(ROOT)}:{node.lineno}: {node.name}"
+            wrong += [f"{where} has no argument {name}" for name in named if name not in known]
+            wrong += [f"{where}: there is no {name}(...)" for name in CALL.findall(text) if name not in used | BUILT_IN]
+    assert count > 800 and not wrong, "\n".join(wrong)
+
+
+# Of the mathematics in docstrings.
+BUILT_IN = {"psi", "g_i", "g_j"}
+
+
+def parameters(node: ast.FunctionDef | ast.ClassDef, classes: dict[str, ast.ClassDef]) -> set[str]:
+    """Names of the arguments of a function, or of the constructor and fields of a class and those it is made of."""
+    if isinstance(node, ast.FunctionDef):
+        given = node.args
+        every = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
+        return {one.arg for one in every if one is not None}
+    names = {x.target.id for x in node.body if isinstance(x, ast.AnnAssign) and isinstance(x.target, ast.Name)}
+    for part in node.body:
+        if isinstance(part, ast.FunctionDef) and part.name in ("__init__", "__new__", "create"):
+            names |= parameters(part, classes)
+    for base in node.bases:
+        if isinstance(base, ast.Name) and base.id in classes:
+            names |= parameters(classes[base.id], classes)
+    return names
 
 
 @pytest.mark.slow

@@ -481,3 +481,31 @@ def test_page_shows_the_mechanism_in_a_browser(page, tmp_path):
     # Bodies are coloured, the ground and its grid are grey.
     coloured = np.ptp(middle, axis=2) > 25
     assert 0.005 < coloured.mean() < 0.5
+
+
+def test_bodies_with_a_slash_in_their_names_are_where_they_are(monkeypatch):
+    """By viser's own scene tree, where the pose of a node is the product of those of all that its path names."""
+    pytest.importorskip("viser")
+    builder = jd.ModelBuilder()
+    names = ("x", "x/y", "x%2Fy", "x/solid0", "world", "/", "x//y")
+    for k, name in enumerate(names):
+        inertia = jd.inertia.displaced(jd.inertia.sphere(1.0, 0.1), (0.2, 0.0, 0.0))
+        builder.add_body(name, joint_name=f"j{k}", pose=(1.0 + k, 0.5 * k, 0.0), inertia=inertia)
+    model = builder.build()
+    q = jnp.linspace(0.3, 1.0, model.nq)
+    viewer = jd.view(model, q, browser=False, block=False)
+    try:
+        node = viewer._server.scene.get_handle_by_name
+        handles = {frame: handle for _, frame, handle in viewer._content.bodies}
+        for name in names:
+            placed, path = np.eye(4), ""
+            for step in handles[name].name.strip("/").split("/"):
+                path += f"/{step}"
+                if (handle := node(path)) is not None:
+                    placed = placed @ f64.joint_pose(
+                        "free", np.zeros(6), np.concatenate([handle.position, handle.wxyz])
+                    )
+            np.testing.assert_allclose(placed, jd.frame_pose(model, q, name), atol=1e-6)  # viser sends float32
+            assert sum(handle.name == handles[name].name for handle in handles.values()) == 1
+    finally:
+        viewer.stop()

@@ -13,6 +13,8 @@ import pytest
 from pages import ROOT
 
 import jaxdyn as jd
+from jaxdyn.constraints.base import Constraint
+from jaxdyn.simulation.controls import Controller
 
 REFERENCE = ROOT / "docs" / "reference"
 PAGES = sorted(path.stem for path in REFERENCE.glob("*.md") if path.stem != "index")
@@ -155,18 +157,58 @@ def as_a_reader(tmp_path, monkeypatch):
     matplotlib.close("all")
 
 
-QUICK = ("files", "forces")
+def is_force(value) -> bool:
+    return type(value).__module__.startswith("jaxdyn.forces")
+
+
+def use(value, systems: list) -> None:
+    """Evaluate what an example made, as a scene will, on a system of its page that it fits. **Raises:** where it fits none."""
+    faults = []
+    for system in systems:
+        q, v = jd.neutral(system) if isinstance(system, jd.Model) else jnp.zeros(system.nq), jnp.zeros(system.nv)
+        try:
+            if isinstance(value, jd.Scene):
+                jd.constraint_jacobian(value, q)
+                value.applied_force(q, v)
+            elif isinstance(value, Constraint):
+                jd.constraint_jacobian(jd.Scene(system, [value]), q)
+            elif isinstance(value, Controller):
+                value(q, v, jnp.zeros(()))
+            else:
+                jd.Scene(system, forces=[value]).applied_force(q, v)
+            return
+        except ValueError as error:
+            faults.append(f"{system}: {error}"[:300])
+    raise AssertionError(f"{value} was made, and cannot be used on any system of the page: {faults}")
+
+
+def use_what_was_made(before: dict, names: dict) -> int:
+    """Use each constraint, force, control law and scene that a block has bound to a name; how many these are."""
+    scenes = [x for x in names.values() if isinstance(x, jd.Scene)]
+    systems = [x for x in names.values() if isinstance(x, jd.System | jd.Model)] + [scene.system for scene in scenes]
+    made = [x for name, x in names.items() if before.get(name) is not x]
+    wanted = [x for x in made if isinstance(x, Constraint | Controller | jd.Scene) or is_force(x)]
+    for value in wanted:
+        fixed = value if isinstance(value, jd.Scene) else getattr(value, "scene", None)
+        use(value, systems if fixed is None else [fixed.system])
+    return len(wanted)
+
+
+QUICK = ("constraints", "files", "forces")
 
 
 @pytest.mark.parametrize(
     "page", [pytest.param(page, marks=() if page in QUICK else pytest.mark.slow) for page in PAGES]
 )
 def test_examples_of_a_page_run(page, tmp_path, monkeypatch):
+    """And what they make is used: a constraint or a force that cannot be is found when its rows are asked for."""
     names: dict = {}
     with as_a_reader(tmp_path, monkeypatch):
         for name, blocks in entries(page):
             for block in blocks:
+                before = dict(names)
                 exec(compile(block, f"docs/reference/{page}.md: {name}", "exec"), names)
+                use_what_was_made(before, names)
     arrays = [x for x in names.values() if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)]
     assert all(np.isfinite(x).all() for x in arrays)
 
@@ -184,4 +226,6 @@ def test_examples_of_docstrings_run(page, tmp_path, monkeypatch):
             for block in documented(name) if name not in NOT_RUN else ():
                 names = dict(start)
                 for text in (NAMES.get(name, ""), block):
+                    before = dict(names)
                     exec(compile(text, f"{page}: {name}", "exec"), names)
+                use_what_was_made(before, names)

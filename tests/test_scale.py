@@ -866,3 +866,32 @@ def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     study.write_text(head + 'scene = "windows"\n[parameters]\ncount = { uniform = [1.0, 2.0] }\n')
     assert main(["sweep", str(study), "--quiet", "--out", str(tmp_path / "c.zarr")]) == 2
     assert "is built from known numbers, so that count cannot be drawn" in capsys.readouterr().err
+
+
+def test_stores_that_cannot_be_are_refused_with_the_cause(tmp_path, monkeypatch):
+    parameters = {"x": np.linspace(1.0, 2.0, 4)}
+    (tmp_path / "file").write_text("x")
+    for place, words in (
+        (tmp_path / "file", "which is a file"),
+        (tmp_path / "file" / "a.zarr", "there is no directory"),
+    ):
+        with pytest.raises(ValueError, match=f"out is '{place}'.*{words}"):
+            jd.scale.evaluate(square, parameters, out=place, **QUIET)
+    out = tmp_path / "a.zarr"
+    jd.scale.evaluate(square, parameters, out=out, **QUIET)
+    place = out / "zarr.json"
+    text = place.read_text()
+    for content in (text[:60], "", "[]", "null", "\x00", text.replace('"rollouts"', '"x"')):
+        place.write_text(content)
+        with pytest.raises(
+            ValueError, match=f"out is '{out}', whose zarr.json is damaged .*name another store|format is"
+        ):
+            jd.scale.evaluate(square, parameters, out=out, **QUIET)
+    place.write_text(text)
+    with monkeypatch.context() as patched:  # root may write anywhere
+        patched.setattr(os, "access", lambda *_: False)
+        with pytest.raises(ValueError, match=f"{out} cannot be written; change its permissions"):
+            jd.scale.evaluate(square, parameters, out=out, **QUIET)
+        with pytest.raises(ValueError, match=f"{tmp_path} cannot be written; change its permissions"):
+            jd.scale.evaluate(square, parameters, out=tmp_path / "b.zarr", **QUIET)
+    assert jd.scale.evaluate(square, parameters, out=out, **QUIET).success

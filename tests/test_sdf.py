@@ -11,6 +11,7 @@ from pinocchio_bridge import quick
 from scipy.linalg import expm
 
 import jaxdyn as jd
+from jaxdyn.constraints.loops import JointLock
 from jaxdyn.io import NotTakenWarning, UnitsWarning, load_sdf
 from jaxdyn.model import float64 as f64
 
@@ -290,6 +291,20 @@ def test_limits_dynamics_and_springs(tmp_path):
     assert [type(force).__name__ for force in scene.forces] == ["JointSpring", "JointDamping", "CoulombFriction"]
     spring, damping, _ = (force(model, jnp.array([0.4]), jnp.array([2.0]), 0.0) for force in scene.forces)
     np.testing.assert_allclose([spring[0], damping[0]], [-7 * 0.3, -0.4], atol=1e-15)
+
+
+def test_followers_of_fixed_joints_are_held_at_their_offset(tmp_path):
+    mimic = "<xyz>0 0 1</xyz><mimic joint='a'><multiplier>2</multiplier><offset>0.5</offset><reference>0.1</reference></mimic>"
+    text = (
+        link("x")
+        + link("y", "0 0 1 0 0 0")
+        + joint("a", "world", "x", "fixed", axis="")
+        + joint("b", "x", "y", axis=mimic)
+    )
+    (tmp_path / "a.sdf").write_text(f"<sdf version='1.11'><model name='m'>{text}</model></sdf>")
+    scene = load_sdf(tmp_path / "a.sdf")
+    assert isinstance(scene.constraints[0], JointLock) and scene.not_taken == ()
+    np.testing.assert_allclose(scene.constraints[0].value, [0.5 - 2 * 0.1], rtol=1e-15)
 
 
 def test_mimicked_axes_are_couplings(tmp_path):

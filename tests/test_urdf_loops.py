@@ -177,6 +177,37 @@ def test_mimicking_plugins_are_couplings(tmp_path):
     assert (row.joint_a, row.joint_b, float(row.ratio), float(row.offset)) == ("c", "a", -0.5, 0.2)
 
 
+def plugin(leader: str, follower: str, multiplier: float = 2.0, offset: float = 0.3) -> str:
+    return f"""<gazebo><plugin name="m" filename="mimic.so"><joint>{leader}</joint><mimicJoint>{follower}</mimicJoint>
+    <multiplier>{multiplier}</multiplier><offset>{offset}</offset></plugin></gazebo>"""
+
+
+def test_plugins_that_mimic_fixed_joints(tmp_path):
+    """A follower of a fixed joint is held at its offset, a fixed follower stays; with the options of the loader."""
+    fixed = '<joint name="still" type="fixed"><parent link="rod"/><child link="end"/></joint><link name="end"/>'
+    free = jd.load(write(tmp_path)).system
+    held = jd.load(write(tmp_path, extra=fixed + plugin("still", "c"))).system
+    assert set(free.joint_names) - set(held.joint_names) == {"c"}
+    reference = jd.load_urdf(tmp_path / "bars.urdf", lock={"c": 0.3})
+    np.testing.assert_allclose(held.frame_poses, reference.frame_poses, atol=1e-15)
+    still = jd.load(write(tmp_path, extra=fixed + plugin("c", "still")))
+    assert still.constraints == () and still.system.nv == free.nv
+    follows = jd.load(write(tmp_path, extra=plugin("a", "c")), lock={"a": 0.1}).system
+    reference = jd.load_urdf(tmp_path / "bars.urdf", lock={"a": 0.1, "c": 0.5})
+    np.testing.assert_allclose(follows.home, reference.home, atol=1e-15)
+    assert jd.load(tmp_path / "bars.urdf", mimic="ignore").constraints == ()
+    with pytest.raises(
+        ValueError, match=r"bars.urdf:\d+: joint 'c' follows 'z'; joint 'z' is unknown.*lock=.*mimic='ignore'"
+    ):
+        jd.load(write(tmp_path, extra=plugin("z", "c")))
+    assert jd.load(tmp_path / "bars.urdf", lock={"c": 0.3}).system.nv == free.nv - 1
+    with pytest.raises(ValueError, match=r"bars.urdf:\d+: joint 'c' follows 'a' already; keep one"):
+        jd.load(write(tmp_path, extra=plugin("a", "c") + plugin("b", "c")))
+    with pytest.raises(ValueError, match=r"mimic is 'couple', but .*MJCF"):
+        (tmp_path / "b.mjcf").write_text("<mujoco/>")
+        jd.load(tmp_path / "b.mjcf", mimic="couple")
+
+
 def test_what_of_the_conventions_is_not_taken_is_named(tmp_path):
     yaml = "closed_loop: []\ntype: []\njoint_name: [b]\njoint_type: [CARDAN]\n"
     damped = "<axis><xyz>0 1 0</xyz><dynamics><damping>1</damping></dynamics></axis>"

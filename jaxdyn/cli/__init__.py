@@ -57,12 +57,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except (ValueError, OSError, ImportError) as error:
         return _complain(error, 2, args.debug)
-    except RuntimeError as error:
+    except (RuntimeError, MemoryError, ArithmeticError) as error:
         return _complain(error, 1, args.debug)
+    except KeyboardInterrupt:
+        print("jaxdyn: interrupted", file=sys.stderr)
+        return 130
 
 
 def _complain(error: Exception, status: int, debug: bool) -> int:
     if debug:
         raise error
-    print(f"jaxdyn: {' '.join(str(error).split())}", file=sys.stderr)
+    text = " ".join(str(error).split()) or type(error).__name__
+    print(f"jaxdyn: {'not enough memory: ' * isinstance(error, MemoryError)}{text}", file=sys.stderr)
     return status

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import os
 import pathlib
 import time
 from collections.abc import Sequence
@@ -11,8 +12,8 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.io import LoadedScene, load_urdf
-from jaxdyn.io.load import described, format_of, load, load_urdf_scene
-from jaxdyn.model.arguments import as_path
+from jaxdyn.io.load import described, format_of, load
+from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.text_table import short as short
@@ -23,7 +24,7 @@ from jaxdyn.model.tree import Model
 UNITS = {"revolute": "rad", "continuous": "rad", "helical": "rad", "prismatic": "m"}
 
 
-FILE = "a URDF, MJCF or SDF file (expand xacro first), or a name of robot_descriptions such as go2_description"
+FILE = "a URDF, xacro, MJCF or SDF file, or a name of robot_descriptions such as go2_description"
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:
@@ -40,9 +41,22 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
         help="hold these joints of a URDF file, at neutral or at a value (rad, m)",
     )
     group.add_argument(
+        "--mimic",
+        choices=("couple", "ignore"),
+        help="joints of a URDF file that follow others: coupled (info and simulate: the default), or free",
+    )
+    group.add_argument(
+        "--arguments",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help="of a file .xacro, which is expanded first",
+    )
+    group.add_argument(
         "--gravity",
         nargs=3,
-        type=float,
+        type=real,
         metavar=("X", "Y", "Z"),
         help="m/s^2 (default: as the file says, of a URDF 0 0 -9.81 in axes of the root link)",
     )
@@ -50,7 +64,7 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
 
 def load_model(path: str, args: argparse.Namespace) -> Model:
     """The model of a URDF file under the options of `add_model_options`."""
-    return _movable(load_urdf(path, floating_base=args.floating_base, lock=_lock(args), gravity=_gravity(args)), path)
+    return _movable(load_urdf(path, mimic=args.mimic or "ignore", **_urdf_options(args)), path)
 
 
 def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathlib.Path]:
@@ -62,11 +76,14 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
     if args.floating_base and args.fixed_base:
         raise ValueError("--floating-base and --fixed-base contradict each other; give one of them")
     if kind == "urdf":
-        scene = load_urdf_scene(file, floating_base=args.floating_base, lock=_lock(args), gravity=_gravity(args))
+        scene = load(file, mimic=args.mimic, **_urdf_options(args))
         _movable(scene.system, path)
         return scene, file
     if args.lock:
         raise ValueError(f"--lock: joints of {kind.upper()} files cannot be held; change the file, or use a URDF")
+    if args.mimic or args.arguments:
+        option = "--mimic" if args.mimic else "--arguments"
+        raise ValueError(f"{option}: {file} is {kind.upper()}; leave it out")
     given = False if args.fixed_base else True if args.floating_base else None
     scene = load(file, floating_base=given)
     _movable(scene.system, path)
@@ -83,8 +100,21 @@ def _lock(args: argparse.Namespace) -> dict[str, Any]:
     return lock
 
 
-def _gravity(args: argparse.Namespace):
-    return GRAVITY if args.gravity is None else tuple(args.gravity)
+def xacro_arguments(args: argparse.Namespace) -> dict[str, str]:
+    """What the file's `<xacro:arg>` are set to. **Raises:** ValueError for what is no NAME=VALUE."""
+    if bad := [item for item in args.arguments if item.find("=") < 1]:
+        raise ValueError(f"--arguments {bad[0]}: give NAME=VALUE")
+    return {name: value for name, _, value in (item.partition("=") for item in args.arguments)}
+
+
+def _urdf_options(args: argparse.Namespace) -> dict[str, Any]:
+    gravity = GRAVITY if args.gravity is None else tuple(args.gravity)
+    return {
+        "floating_base": args.floating_base,
+        "lock": _lock(args),
+        "gravity": gravity,
+        "arguments": xacro_arguments(args),
+    }
 
 
 def _movable(model: Model, path: str) -> Model:
@@ -96,9 +126,47 @@ def _movable(model: Model, path: str) -> Model:
 def number(text: str, what: str) -> float:
     """A finite number, or a ValueError that says where it stood."""
     with contextlib.suppress(ValueError):
-        if np.isfinite(value := float(text)):
+        if np.isfinite(value := parse_number(text)):
             return value
     raise ValueError(f"{what}: {text!r} is no finite number")
+
+
+def real(text: str) -> float:
+    """The type of options that are numbers: finite, in decimal digits."""
+    with contextlib.suppress(ValueError):
+        if np.isfinite(value := parse_number(text)):
+            return value
+    raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
+
+
+def whole(text: str) -> int:
+    """The type of options that are whole numbers, of at most 63 bits."""
+    with contextlib.suppress(ValueError):
+        if "_" not in text and abs(value := int(text)) < 2**62:
+            return value
+    raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at most 18 digits")
+
+
+def check_least(args: argparse.Namespace, **least: int) -> None:
+    """Options, by their names in `args`, that must not be smaller than a number. **Raises:** ValueError that names one."""
+    for name, bound in least.items():
+        values = getattr(args, name)
+        for value in values if isinstance(values, list) else [] if values is None else [values]:
+            if value < bound:
+                raise ValueError(f"--{name.replace('_', '-')} is {value}; give at least {bound}")
+
+
+def check_memory(count: float, options: str) -> None:
+    """Refuse what would write more double-precision numbers than the machine has memory for.
+
+    **Raises:** ValueError that names the options.
+    """
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**36
+    if not 8 * count < memory:
+        raise ValueError(
+            f"{options}: {8 * count / 2**30:.3g} GB of results, and the machine has {memory / 2**30:.3g} GB; ask for fewer rows "
+            "or motions"
+        )
 
 
 def vector(model: Model, items: Sequence[str], start, what: str) -> np.ndarray:

@@ -5,7 +5,18 @@ import argparse
 import numpy as np
 
 from jaxdyn import identify
-from jaxdyn.cli.common import add_model_options, coordinate_labels, load_model, output_path, per_coordinate, table
+from jaxdyn.cli.common import (
+    add_model_options,
+    check_least,
+    check_memory,
+    coordinate_labels,
+    load_model,
+    output_path,
+    per_coordinate,
+    real,
+    table,
+    whole,
+)
 from jaxdyn.identify import TERMS
 from jaxdyn.identify.exciting import OBJECTIVES
 from jaxdyn.io import write_log
@@ -32,19 +43,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model_options(parser)
     parser.add_argument("--out", metavar="FILE", help="write the motion, .csv or .npz")
     parser.add_argument("--plot", metavar="FILE", help="draw it to FILE.png, .pdf or .svg")
-    parser.add_argument("--period", type=float, default=10.0, metavar="S", help="of the motion, s (default: 10)")
-    parser.add_argument("--periods", type=int, default=1, metavar="N", help="written one after the other (default: 1)")
-    parser.add_argument("--harmonics", type=int, default=5, metavar="N", help="of the series (default: 5)")
-    parser.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="rows a second (default: 100)")
+    parser.add_argument("--period", type=real, default=10.0, metavar="S", help="of the motion, s (default: 10)")
+    parser.add_argument(
+        "--periods", type=whole, default=1, metavar="N", help="written one after the other (default: 1)"
+    )
+    parser.add_argument("--harmonics", type=whole, default=5, metavar="N", help="of the series (default: 5)")
+    parser.add_argument("--rate", type=real, default=100.0, metavar="HZ", help="rows a second (default: 100)")
     parser.add_argument("--terms", nargs="*", choices=TERMS, default=TERMS, help="to be identified beside the bodies")
     parser.add_argument("--objective", choices=OBJECTIVES, default="logdet", help="what is best (default: logdet)")
-    parser.add_argument("--margin", type=float, default=0.9, help="share of all limits that is used (default: 0.9)")
+    parser.add_argument("--margin", type=real, default=0.9, help="share of all limits that is used (default: 0.9)")
     parser.add_argument(
-        "--velocity", nargs="+", type=float, metavar="V", help="limits instead of the file's, rad/s, m/s"
+        "--velocity", nargs="+", type=real, metavar="V", help="limits instead of the file's, rad/s, m/s"
     )
-    parser.add_argument("--torque", nargs="+", type=float, metavar="T", help="limits instead of the file's, N m, N")
-    parser.add_argument("--seed", type=int, default=0, help="of the random motions to start from (default: 0)")
-    parser.add_argument("--steps", type=int, default=300, metavar="N", help="of the search (default: 300)")
+    parser.add_argument("--torque", nargs="+", type=real, metavar="T", help="limits instead of the file's, N m, N")
+    parser.add_argument("--seed", type=whole, default=0, help="of the random motions to start from (default: 0)")
+    parser.add_argument("--steps", type=whole, default=300, metavar="N", help="of the search (default: 300)")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -55,7 +68,15 @@ def run(args: argparse.Namespace) -> None:
     )
     if not args.rate > 0 or args.periods < 1:
         raise ValueError(f"--rate is {args.rate}, --periods is {args.periods}; give positive numbers")
+    if not args.period > 0:
+        raise ValueError(f"--period is {args.period} s; give a positive time")
+    check_least(args, harmonics=1, steps=0, seed=0)
     model = load_model(args.urdf, args)
+    rows = args.rate * args.period * args.periods
+    check_memory(
+        rows * (1 + model.nq + 3 * model.nv), f"--rate {args.rate:g} --period {args.period:g} --periods {args.periods}"
+    )
+    check_memory(100.0 * args.harmonics * (model.nv * 14) ** 2, f"--harmonics {args.harmonics}")
     velocity, torque = (
         None if value is None else per_coordinate(model, value, f"--{name}")
         for name, value in (("velocity", args.velocity), ("torque", args.torque))

@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 
 from jaxdyn import __version__, identify
-from jaxdyn.cli.common import Stopwatch, add_model_options, coordinate_labels, load_model, output_path
+from jaxdyn.cli.common import (
+    Stopwatch,
+    add_model_options,
+    check_least,
+    coordinate_labels,
+    load_model,
+    output_path,
+    real,
+    whole,
+)
 from jaxdyn.cli.identify_file import with_file
 from jaxdyn.cli.identify_logs import filtered_log, log_cutoff, log_names, log_paths, raw_log
 from jaxdyn.cli.identify_options import find_gains, make_fit, parse_options, settled
@@ -109,14 +118,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--payload-body", metavar="LINK", help="the link that holds it (default: the last one)")
     parser.add_argument(
         "--payload-mass",
-        type=float,
+        type=real,
         metavar="KG",
         help="its mass, where known: the gains of the drives are then found too",
     )
     parser.add_argument(
         "--payload-centre",
         nargs=3,
-        type=float,
+        type=real,
         metavar=("X", "Y", "Z"),
         help="its centre of mass in the link's frame, m",
     )
@@ -135,7 +144,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     data = parser.add_argument_group("data")
     data.add_argument(
         "--train",
-        type=float,
+        type=real,
         default=0.7,
         metavar="SHARE",
         help="without --test-log: share of every log that is fitted to tell the error on the rest (default: 0.7)",
@@ -147,9 +156,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of the low-pass filter; auto, from the spectra of --log (default)",
     )
     data.add_argument(
-        "--every", type=int, metavar="N", help="keep each Nth filtered sample (default: 15 per cut-off period)"
+        "--every", type=whole, metavar="N", help="keep one of N filtered samples (default: 15 per cut-off period)"
     )
-    data.add_argument("--trim", type=int, metavar="N", help="samples to drop at each end (default: 25 times --every)")
+    data.add_argument("--trim", type=whole, metavar="N", help="samples to drop at each end (default: 25 times --every)")
     data.add_argument("--filtered", action="store_true", help="the logs are filtered already")
     fit = parser.add_argument_group("fit")
     fit.add_argument("--method", choices=METHODS, default="feasible", help="see below (default: feasible)")
@@ -189,10 +198,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "torque; or none (default)",
     )
     fit.add_argument(
-        "--horizon", type=float, default=0.25, metavar="S", help="length of the simulated pieces, s (default: 0.25)"
+        "--horizon", type=real, default=0.25, metavar="S", help="length of the simulated pieces, s (default: 0.25)"
     )
     fit.add_argument(
-        "--steps", type=int, default=100, metavar="N", help="most steps of the trajectory fit (default: 100)"
+        "--steps", type=whole, default=100, metavar="N", help="most steps of the trajectory fit (default: 100)"
     )
     files = parser.add_argument_group("output")
     files.add_argument("--out", metavar="FILE.urdf", help="write the fitted robot")
@@ -211,6 +220,10 @@ def run(args: argparse.Namespace) -> None:
         raise ValueError(
             f"{' and '.join(missing)}: missing; give the robot's URDF file and at least one log, or a file fit.toml"
         )
+    check_least(args, every=1, trim=0, steps=0)
+    for name in ("payload_mass", "horizon"):
+        if (value := getattr(args, name)) is not None and not value > 0:
+            raise ValueError(f"--{name.replace('_', '-')} is {value}; give a positive number")
     out = output_path(args.out, (".urdf",), "--out")
     json_path = output_path(args.report, (".json",), "--report")
     html = output_path(args.html, (".html",), "--html")

@@ -31,7 +31,7 @@ def with_file(args: argparse.Namespace, add_arguments) -> argparse.Namespace:
         raise FileNotFoundError(f"{path}: no such file")
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: {error}") from None
     parser = _Parser(add_help=False)
     add_arguments(parser)

@@ -96,7 +96,7 @@ def filtered_log(raw: Log, path: str, args, cutoff: float | None) -> Log:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     print(f"{span} at {rate:.4g} Hz; low-passed at {cutoff:g} Hz, {trim} samples dropped at each end, "
-          f"each {every}th kept: {len(log)}")  # fmt: skip
+          f"{'every sample' if every == 1 else f'one of {every}'} kept: {len(log)}")  # fmt: skip
     return log
 
 

@@ -8,8 +8,9 @@ import warnings
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.cli.common import FILE, UNITS, add_model_options, load_scene, output_path, short, table
+from jaxdyn.cli.common import FILE, UNITS, add_model_options, load_scene, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
+from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.constraints.mobility import degrees_of_freedom, nearly_dependent
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.load import format_of
@@ -58,12 +59,15 @@ def run(args: argparse.Namespace) -> None:
     model, is_urdf = scene.system, format_of(file) == "urdf"
     if out is not None and not is_urdf:
         raise ValueError(f"--repair {args.repair}: only URDF files can be repaired; change the inertias in {file}")
-    body_problems = inertia_report(model)
-    print(describe(model, args.file))
+    source = XmlFile(file, "robot", xacro_arguments(args))
+    body_problems = _of_the_file(inertia_report(model), source)
+    print(describe(scene, args.file))
     print(constraint_lines(scene))
-    print(_problems(urdf_inertia_report(file), body_problems) if is_urdf else _body_problems(body_problems))
     if is_urdf:
-        print(_unused(str(file)))
+        print(_problems(urdf_inertia_report(file, arguments=xacro_arguments(args)), body_problems))
+        print(_unused(source))
+    else:
+        print(_body_problems(body_problems))
     if scene.not_taken or not is_urdf:
         print("\n".join(["\nNot taken from the file:", *(scene.not_taken or ["nothing"])]))
     if out is not None:
@@ -73,9 +77,36 @@ def run(args: argparse.Namespace) -> None:
         print(f"\nWrote {out}: inertias of {len(changed)} bodies repaired{_listed(changed)}.")
 
 
-def describe(model: Model, source: str) -> str:
+def _of_the_file(problems: list[tuple[str, str]], file: XmlFile) -> list[tuple[str, str]]:
+    """The problems without the massless bodies that a loader puts between the joints of one body."""
+    names = {element.get("name") for element in file.root.iter() if element.tag in ("link", "body")}
+    return [(body, text) for body, text in problems if text != "massless" or body.rpartition("::")[2] in names]
+
+
+def _base(scene: LoadedScene) -> str:
+    """Whether the mechanism stands on the world: by its joints, or by constraints that hold a free root."""
+    model, top = scene.system, scene.system.topology
+    free = [
+        i for i, (parent, kind) in enumerate(zip(top.parents, top.kinds, strict=True)) if parent < 0 and kind == "free"
+    ]
+    held = []
+    if free and scene.constraints:
+        rows = np.asarray(constraint_jacobian(scene, scene.starts["reference"].q, jnp.zeros(())), np.float64)
+        _, singular, right = np.linalg.svd(rows)
+        rank = int(np.sum(singular > 1e-9 * singular.max(initial=0.0)))
+        held = [i for i in free if np.abs(right[rank:, top.v_slices[i]]).max(initial=0.0) < 1e-6]
+    floating = [model.body_names[i] for i in free if i not in held]
+    roots = top.parents.count(-1)
+    if not floating:
+        return "fixed base" + " (held by constraints)" * bool(held)
+    if len(free) == roots:
+        return "floating base" if roots == 1 else f"{len(floating)} floating bases"
+    return f"fixed base beside free bodies {', '.join(floating)}"
+
+
+def describe(scene: LoadedScene, source: str) -> str:
     """The model in words and tables."""
-    base = "floating base" if "free" in model.topology.kinds[:1] else "fixed base"
+    model, base = scene.system, _base(scene)
     mass = float(np.asarray(model.inertias)[:, 0].sum())
     quaternions = "" if model.nq == model.nv else f" (q has {model.nq} numbers, v has {model.nv})"
     lines = [
@@ -216,10 +247,10 @@ def _listed(names: list[str]) -> str:
     return f": {', '.join(names)}" if names else ""
 
 
-def _unused(path: str) -> str:
+def _unused(file: XmlFile) -> str:
     """What the file holds that the model does not, counted by element."""
     counts: collections.Counter[str] = collections.Counter()
-    for element in XmlFile(path, "URDF").root:
+    for element in file.root:
         if element.tag == "gazebo" and (
             element.find("joint") is not None or element.find("plugin/mimicJoint") is not None
         ):

@@ -6,6 +6,8 @@ import tempfile
 import xml.etree.ElementTree as ET
 
 from jaxdyn.cli.common import load_model
+from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model.arguments import parse_number
 from jaxdyn.model.tree import Model
 
 # What a link without inertia is given to start from: this share of the heaviest link's mass, as a ball of this radius (m).
@@ -21,15 +23,15 @@ def load_for_repair(path: str, args: argparse.Namespace) -> tuple[Model, list[st
         return load_model(path, args), []
     except ValueError:
         try:
-            tree = ET.parse(path)
-        except (ET.ParseError, OSError):
-            tree = None
-        names = [] if tree is None else _give_balls(tree.getroot())
+            tree = ET.ElementTree(XmlFile(path, "URDF").root)
+            names = _give_balls(tree.getroot())
+        except ValueError:
+            tree, names = None, []
         if tree is None or not names:
             raise
         with tempfile.TemporaryDirectory() as folder:
             file = pathlib.Path(folder) / pathlib.Path(path).name
-            tree.write(file)
+            tree.write(file, encoding="utf-8", xml_declaration=True)
             return load_model(str(file), args), names
 
 
@@ -41,12 +43,12 @@ def _give_balls(robot: ET.Element) -> list[str]:
         if joint.get("type") != "fixed"
         for child in joint.iterfind("child")
     }
-    masses = [float(mass.get("value", 0)) for mass in robot.iterfind("link/inertial/mass")]
+    masses = [parse_number(mass.get("value", "0")) for mass in robot.iterfind("link/inertial/mass")]
     mass = _SHARE * (max(masses, default=0) or 1.0)
     names = []
     for link in robot.iterfind("link"):
         given = link.find("inertial/mass")
-        if link.get("name") not in moved or (given is not None and float(given.get("value", 0)) > 0):
+        if link.get("name") not in moved or (given is not None and parse_number(given.get("value", "0")) > 0):
             continue
         for old in link.findall("inertial"):
             link.remove(old)

@@ -2,7 +2,7 @@
 
 import argparse
 
-from jaxdyn.cli.common import Stopwatch
+from jaxdyn.cli.common import Stopwatch, check_least, whole
 from jaxdyn.reports import cases, report
 
 HELP = "error against run time of scenes whose motion is known"
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", metavar="DIR", help="directory for the page, the data and the text")
     parser.add_argument("--dtype", nargs="+", metavar="T", help="float64, float32 (default: float64; both with --full)")
-    parser.add_argument("--batch", nargs="+", type=int, metavar="N", help="trajectories at once (default: 1; 1 256)")
+    parser.add_argument("--batch", nargs="+", type=whole, metavar="N", help="trajectories at once (default: 1; 1 256)")
     parser.add_argument(
         "--integrator",
         "--way",
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="I",
         help="method:solver, e.g. projected:Dopri8, in place of the usual ones (--way: its former name)",
     )
-    parser.add_argument("--rounds", type=int, default=20, metavar="N", help="timings of each run (default: 20)")
+    parser.add_argument("--rounds", type=whole, default=20, metavar="N", help="timings of each run (default: 20)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -58,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if not (args.scenes or args.full):
         raise ValueError(f"no scene is named; name one of {', '.join(known)}, or give --full for all")
+    check_least(args, batch=1, rounds=1)
     watch = Stopwatch()
     integrators = None if args.integrator is None else [tuple(pair.split(":")) for pair in args.integrator]
     options = {

@@ -13,10 +13,15 @@ from jaxdyn.cli.common import (
     FILE,
     Stopwatch,
     add_model_options,
+    check_least,
+    check_memory,
     load_scene,
     output_path,
     per_coordinate,
+    real,
     vector,
+    whole,
+    xacro_arguments,
 )
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.codes import RESULTS
@@ -68,11 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", help=FILE)
     add_model_options(parser)
     motion = parser.add_argument_group("motion")
+    motion.add_argument("--duration", type=real, metavar="S", help="length of the motion, s (default: 2, or the log's)")
     motion.add_argument(
-        "--duration", type=float, metavar="S", help="length of the motion, s (default: 2, or the log's)"
-    )
-    motion.add_argument(
-        "--sample", type=float, default=0.01, metavar="S", help="time between output rows, s (default: 0.01)"
+        "--sample", type=real, default=0.01, metavar="S", help="time between output rows, s (default: 0.01)"
     )
     motion.add_argument("--start", default="reference", metavar="NAME", help="a state that the file names (a keyframe)")
     motion.add_argument(
@@ -81,11 +84,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion.add_argument(
         "--v0", nargs="+", metavar="V", help="start velocity, in the same way (default: that of the start; rad/s, m/s)"
     )
-    motion.add_argument("--batch", type=int, default=1, metavar="N", help="number of motions (default: 1)")
+    motion.add_argument("--batch", type=whole, default=1, metavar="N", help="number of motions (default: 1)")
     motion.add_argument(
-        "--spread", type=float, default=0.0, metavar="D", help="standard deviation of the start around q0"
+        "--spread", type=real, default=0.0, metavar="D", help="standard deviation of the start around q0"
     )
-    motion.add_argument("--seed", type=int, default=0, help="of random torques and starts (default: 0)")
+    motion.add_argument("--seed", type=whole, default=0, help="of random torques and starts (default: 0)")
     forces = parser.add_argument_group("forces")
     forces.add_argument(
         "--torque", default="zero", metavar="KIND", help="zero, gravity, random, gravity+random or a log"
@@ -93,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     forces.add_argument(
         "--torque-size",
         nargs="+",
-        type=float,
+        type=real,
         metavar="T",
         help="standard deviation of random torques, N m or N, one number or one per coordinate "
         "(default: 1 %% of the effort limit, 1 where there is none)",
@@ -101,26 +104,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     forces.add_argument(
         "--damping",
         nargs="+",
-        type=float,
+        type=real,
         metavar="D",
         help="joint damping, N m s or N s, one number or one per coordinate (default: as the file states)",
     )
     forces.add_argument(
         "--friction",
         nargs="+",
-        type=float,
+        type=real,
         metavar="F",
         help="Coulomb friction, N m or N, smoothed below 0.01 rad/s (default: as the file states)",
     )
     solver = parser.add_argument_group("integration")
-    solver.add_argument("--dt", type=float, metavar="S", help="fixed steps (Runge-Kutta of order 4) of this length, s")
+    solver.add_argument("--dt", type=real, metavar="S", help="fixed steps (Runge-Kutta of order 4) of this length, s")
     solver.add_argument(
-        "--rtol", type=float, default=1e-8, help="tolerance of adaptive steps (order 8), the default: 1e-8"
+        "--rtol", type=real, default=1e-8, help="tolerance of adaptive steps (order 8), the default: 1e-8"
     )
-    solver.add_argument("--max-steps", type=int, metavar="N", help="give up after so many steps")
+    solver.add_argument("--max-steps", type=whole, metavar="N", help="give up after so many steps")
     solver.add_argument(
         "--rank-tol",
-        type=float,
+        type=real,
         metavar="R",
         help="rows of loops that say the same as others but for this part count once (default: 1e-9; `jaxdyn info` "
         "tells when a file needs more)",
@@ -146,14 +149,20 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--batch is {args.batch}; give at least 1")
     if args.dt is not None and not args.dt > 0:
         raise ValueError(f"--dt is {args.dt}; give a positive step, s")
+    check_least(args, spread=0, max_steps=1, torque_size=0, damping=0, friction=0, rank_tol=0)
     loaded, file = load_scene(args.file, args)
     model = loaded.system
+    check_memory(8.0 * args.batch * (model.nq + 2 * model.nv + 3), f"--batch {args.batch}")
     control, q0, v0, duration = _excitation(loaded, args)
     if args.duration is not None:
         duration = args.duration
     if not (duration > 0 and 0 < args.sample <= duration):
         raise ValueError(f"--duration is {duration} s, --sample {args.sample} s; give 0 < sample <= duration")
-    ts = np.linspace(0.0, duration, round(duration / args.sample) + 1)
+    size = f"--duration {duration:g} --sample {args.sample:g}" + f" --batch {args.batch}" * (args.batch > 1)
+    rows = float(duration) / args.sample
+    # Rows of q, v, torques, energy and work, and as much again while they are computed and written.
+    check_memory(2 * args.batch * (rows + 1) * (model.nq + 2 * model.nv + 3), size)
+    ts = np.linspace(0.0, duration, round(rows) + 1)
     scene = Scene(model, loaded.constraints, _forces(loaded, args))
     starts, speeds = _starts(scene, q0, v0, args)
     steps = {"stepsize": args.dt} if args.dt is not None else {"rtol": args.rtol, "atol": args.rtol}
@@ -179,7 +188,8 @@ def run(args: argparse.Namespace) -> int:
         motion_figure(model, ts, solution.q, solution.v, tau).savefig(plot)
         print(f"Wrote {plot}.")
     if page is not None or args.view:
-        solids, moving = shapes(file), eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
+        solids = shapes(file, arguments=xacro_arguments(args))
+        moving = eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
         if page is not None:
             save_html(page, scene, moving, shapes=solids)
             print(f"Wrote {page}.")

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import scale, scenes
-from jaxdyn.cli.common import Stopwatch
+from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
 from jaxdyn.io import load_urdf
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.tree import integrate, neutral
+from jaxdyn.simulation.run import simulate
 
 HELP = "simulate a study of many rollouts into a Zarr store, started again it goes on where it stopped"
 DESCRIPTION = """\
@@ -67,31 +68,34 @@ _REDUCTIONS = {
     "quantiles": scale.Quantiles,
     "worst": scale.Worst,
 }
-_KEYS = {
-    "scene",
-    "out",
-    "samples",
-    "seed",
-    "duration",
-    "points",
-    "outputs",
-    "rows",
-    "cost",
-    "parameters",
-    "options",
-    "reductions",
+_KEYS: dict[str, tuple[type, ...]] = {
+    "scene": (str,),
+    "out": (str,),
+    "samples": (int,),
+    "seed": (int,),
+    "duration": (int, float),
+    "points": (int,),
+    "outputs": (list,),
+    "rows": (bool, list),
+    "cost": (str,),
+    "parameters": (dict,),
+    "options": (dict,),
+    "reductions": (dict,),
 }
+# Options of `jd.simulate` that a file can say, and of `jd.scale.run`.
+_OPTIONS = {"lanes", "memory", "compress", "verify", *inspect.signature(simulate).parameters}
+_OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "progress", "throw"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("study", help="file .toml that describes the study, see below")
     parser.add_argument("--out", metavar="DIR", help="store, in place of the study's")
-    parser.add_argument("--samples", type=int, metavar="N", help="rollouts, in place of the study's")
-    parser.add_argument("--seed", type=int, metavar="N", help="in place of the study's")
-    parser.add_argument("--process", type=int, nargs=2, metavar=("I", "N"), help="this is process I of N, from 0")
-    parser.add_argument("--devices", type=int, metavar="N", help="CPU devices to share rollouts among (default: 1)")
-    parser.add_argument("--chunk", type=int, metavar="N", help="rollouts stored at once (default: two seconds' work)")
+    parser.add_argument("--samples", type=whole, metavar="N", help="rollouts, in place of the study's")
+    parser.add_argument("--seed", type=whole, metavar="N", help="in place of the study's")
+    parser.add_argument("--process", type=whole, nargs=2, metavar=("I", "N"), help="this is process I of N, from 0")
+    parser.add_argument("--devices", type=whole, metavar="N", help="CPU devices to share rollouts among (default: 1)")
+    parser.add_argument("--chunk", type=whole, metavar="N", help="rollouts stored at once (default: two seconds' work)")
     parser.add_argument("--quiet", action="store_true", help="no meter")
 
 
@@ -100,15 +104,25 @@ def run(args: argparse.Namespace) -> int:
     path = as_path(args.study, "study")
     study = _read(path)
     if args.devices is not None:
-        if args.devices < 1:
-            raise ValueError(f"--devices is {args.devices}; give at least 1")
+        if not 1 <= args.devices <= 4096:
+            raise ValueError(f"--devices is {args.devices}; give 1 to 4096")
         jax.config.update("jax_num_cpu_devices", args.devices)
+    check_least(args, chunk=1, samples=1)
+    if args.process is not None and not 0 <= args.process[0] < args.process[1]:
+        raise ValueError(f"--process is {args.process[0]} {args.process[1]}; give I N with 0 <= I < N")
     given = _required(study, path, "samples") if args.samples is None else args.samples
+    duration, points = float(_required(study, path, "duration")), study.get("points", 2)
+    if not 0 < duration < np.inf or points < 2 or given < 1:
+        raise ValueError(
+            f"{path}: samples is {given}, duration {duration} s, points {points}; give at least one sample, a positive duration "
+            "and at least two points"
+        )
+    check_memory(float(points), f"{path}: points {points}")
     out = path.parent / _required(study, path, "out") if args.out is None else as_path(args.out, "--out")
     parameters = study.get("parameters", {})
     draw = drawing(parameters)
     scene, states = _scene(_required(study, path, "scene"), path, tuple(parameters))
-    ts = np.linspace(0.0, float(_required(study, path, "duration")), int(study.get("points", 2)))
+    ts = np.linspace(0.0, duration, points)
     cost = study.get("cost")
     if cost is not None and cost not in parameters:
         raise ValueError(f"{path}: cost is {cost!r}; name one of the parameters {', '.join(parameters)}")
@@ -144,14 +158,20 @@ def drawing(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
     known: dict[str, float] = {}
     for name in sorted(parameters):
         one = parameters[name]
-        if type(one) in (int, float):
+        if type(one) in (int, float) and np.isfinite(one):
             known[name] = float(one)
             continue
         given: dict[str, Any] = one if isinstance(one, dict) else {}
         kinds = [kind for kind in _DRAWS if kind in given]
         ends = given[kinds[0]] if len(kinds) == 1 else None
-        if not (isinstance(ends, list) and len(ends) == 2 and all(isinstance(x, (int, float)) for x in ends)):
-            raise ValueError(f"parameter {name} is {one!r}; give a number, or one of {', '.join(_DRAWS)} = [a, b]")
+        numbers = isinstance(ends, list) and len(ends) == 2 and all(type(x) in (int, float) for x in ends)
+        if not (numbers and np.all(np.isfinite(ends))):
+            raise ValueError(
+                f"parameter {name} is {one!r}; give a finite number, or one of {', '.join(_DRAWS)} = [a, b]"
+            )
+        size = given.get("size", 1)
+        if type(size) is not int or not 1 <= size < 2**31:
+            raise ValueError(f"parameter {name}: size is {size!r}; give a whole number of at least 1")
         if kinds[0] == "log_uniform" and not min(ends) > 0:
             raise ValueError(f"parameter {name}: log_uniform = {ends}; give positive numbers")
         drawn[name] = (kinds[0], float(ends[0]), float(ends[1]), (int(given["size"]),) if "size" in given else ())
@@ -170,10 +190,24 @@ def drawing(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
 def _read(path: pathlib.Path) -> dict[str, Any]:
     try:
         study = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no TOML: {error}") from error
     if unknown := study.keys() - _KEYS:
         raise ValueError(f"{path} has {', '.join(sorted(unknown))}; a study has {', '.join(sorted(_KEYS))}")
+    for name, value in study.items():
+        kinds = _KEYS[name]
+        if type(value) not in kinds or (type(value) is int and abs(value) >= 2**62):
+            raise ValueError(f"{path}: {name} is {value!r}; see `jaxdyn sweep --help`")
+        if isinstance(value, list) and not all(isinstance(one, str) for one in value):
+            raise ValueError(f"{path}: {name} is {value!r}; give names")
+    options = study.get("options", {})
+    if bad := [name for name, value in options.items() if name not in _OPTIONS or isinstance(value, (list, dict))]:
+        raise ValueError(
+            f"{path}: [options] {bad[0]} is {options[bad[0]]!r}; options are {', '.join(sorted(_OPTIONS))}"
+        )
+    for name, one in study.get("parameters", {}).items():
+        if isinstance(one, dict) and not isinstance(one.get("units", ""), str):
+            raise ValueError(f"{path}: units of {name} are {one['units']!r}; give a text")
     return study
 
 
@@ -188,9 +222,9 @@ def _reduction(name: str, given: Any) -> scale.Reduction:
     if len(kinds) != 1:
         raise ValueError(f"reduction {name} is {given!r}; give one of {', '.join(_REDUCTIONS)} = NAME")
     options = {key: value for key, value in given.items() if key != kinds[0]}
-    if "probabilities" in options:
-        options["probabilities"] = tuple(options["probabilities"])
     try:
+        if "probabilities" in options:
+            options["probabilities"] = tuple(options["probabilities"])
         return _REDUCTIONS[kinds[0]](given[kinds[0]], **options)
     except TypeError as error:
         raise ValueError(f"reduction {name} is {given!r}: {error}") from error

@@ -92,7 +92,7 @@ class Holonomic(Constraint):
       function is static: define it once. An equinox Module or `jax.tree_util.Partial` carries numbers as leaves.
     - `name`: for errors and reports; by default that of the function.
 
-    **Raises:** ValueError when phi cannot be called; (when used) when it returns anything but one row or a vector.
+    **Raises:** ValueError when phi cannot be called so; (when used) when it returns anything but one row or a vector.
 
     ```python
     rod = jd.Holonomic(lambda q, t: q @ q - 1.0, name="rod")
@@ -105,8 +105,8 @@ class Holonomic(Constraint):
 
     def __init__(self, phi: Function, with_system: bool = False, name: str | None = None):
         self.name = _own_name(name, phi, "holonomic")
-        self.phi = as_pytree(phi, f"constraint {self.name!r}: phi")
         self.with_system = bool(with_system)
+        self.phi = as_pytree(phi, f"constraint {self.name!r}: phi", "system, q, t" if with_system else "q, t")
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """phi(q, t), (n,)."""
@@ -128,7 +128,7 @@ class Pfaffian(Constraint):
     - `b`: b(q, t) -> (n,) or (), or None for zero; with `with_system=True` b(system, q, t).
     - `name`: for errors and reports; by default that of the function.
 
-    **Raises:** ValueError when A or b cannot be called; (when used) when what they return does not fit.
+    **Raises:** ValueError when A or b cannot be called so; (when used) when what they return does not fit.
 
     Source: Murray, Li & Sastry (1994), chapter 6, eq. 6.4.
     """
@@ -140,8 +140,9 @@ class Pfaffian(Constraint):
 
     def __init__(self, A: Function, b: Function | None = None, with_system: bool = False, name: str | None = None):
         self.name = _own_name(name, A, "pfaffian")
-        self.A = as_pytree(A, f"constraint {self.name!r}: A")
-        self.b = None if b is None else as_pytree(b, f"constraint {self.name!r}: b")
+        takes = "system, q, t" if with_system else "q, t"
+        self.A = as_pytree(A, f"constraint {self.name!r}: A", takes)
+        self.b = None if b is None else as_pytree(b, f"constraint {self.name!r}: b", takes)
         self.with_system = bool(with_system)
 
     def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:

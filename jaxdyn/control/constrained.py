@@ -106,8 +106,8 @@ class HybridForce(_ForceLoop):
     - `least_regularity`: a number from 0 to 1. Where `regularity(q, v, t)` falls to it, a simulation ends, with the code
       `control_singular` and the time. None: it goes on, the task followed as near as can be.
 
-    **Raises:** ValueError for a scene without constraints, gains that are not positive definite, gains that do not fit the
-    kind of task; (when called) for shapes that do not fit.
+    **Raises:** ValueError for a scene without constraints, gains that are not positive definite, gains or a task that do not fit
+    `of`; (when called) for shapes that do not fit.
 
     Source: EQUATIONS section 8 (the documents' law for holonomic and for nonholonomic constraints, and for motors that are
     fewer than joints); Murray, Li & Sastry (1994), section 6.4.
@@ -256,7 +256,7 @@ class GaugeInvariant(_ForceLoop):
         ki: Numbers | None = None,
     ):
         self.scene = constrained(scene)
-        self.error = TaskError(as_pytree(task, "task"), as_target(target))  # pyright: ignore[reportCallIssue]
+        self.error = TaskError(as_pytree(task, "task", "q"), as_target(target))  # pyright: ignore[reportCallIssue]
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
         self.force = None if force is None else as_target(force, "force")
         self.ki = None if ki is None else gain(ki, "ki")
@@ -373,7 +373,7 @@ def _error(task: Any, target: Any, of: str, kd) -> Constraint:
         raise ValueError(
             f"kd is {'None' if kd is None else 'given'} for a task of {of}; positions take kp and kd, velocities kp"
         )
-    function = as_pytree(task, "task")
+    function = as_pytree(task, f"task (of {of})", "q" if of == "position" else "q, v")
     return TaskError(function, as_target(target)) if of == "position" else RateError(function, as_target(target))  # pyright: ignore[reportCallIssue]
 
 

@@ -51,10 +51,10 @@ class Fixed(eqx.Module):
 def as_target(target: Target, name: str = "target") -> Callable:
     """A target as a function of time: a function as it is, numbers as one that is constant.
 
-    **Raises:** ValueError for what is neither.
+    **Raises:** ValueError for what is neither, and for a function of anything but t.
     """
     if callable(target):
-        return as_pytree(target, name)
+        return as_pytree(target, name, "t")
     array = as_array(target, name)
     return Fixed(jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float))
 

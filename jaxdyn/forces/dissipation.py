@@ -30,7 +30,7 @@ class RayleighDissipation(eqx.Module):
     function: Callable
 
     def __init__(self, function: Function):
-        self.function = as_pytree(function, "RayleighDissipation: function")
+        self.function = as_pytree(function, "RayleighDissipation: function", "q, v, t")
 
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
@@ -92,9 +92,10 @@ class SlidingFriction(PiecewiseForce):
         if not callable(along) and (isinstance(along, bool) or not isinstance(along, int) or along < 0):
             raise ValueError(f"SlidingFriction: along is {along!r}; give an index of v or a function A(q, t) -> (nv,)")
         self.coefficient = jnp.asarray(coefficient)
-        self.normal = as_pytree(normal, "SlidingFriction: normal") if callable(normal) else jnp.asarray(normal)
+        takes = "system, q, v, t"
+        self.normal = as_pytree(normal, "SlidingFriction: normal", takes) if callable(normal) else jnp.asarray(normal)
         self.direction = direction
-        self.along = as_pytree(along, "SlidingFriction: along") if callable(along) else _Coordinate(along)
+        self.along = as_pytree(along, "SlidingFriction: along", "q, t") if callable(along) else _Coordinate(along)
 
     def guards(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number

@@ -24,7 +24,7 @@ class Log(eqx.Module):
     else is converted to float64. The arrays are leaves, so a log passes through `jax.vmap` and `jax.jit`.
 
     **Raises:** ValueError for wrong shapes, unequal lengths, the first NaN or infinity (signal, row and column) and the
-    first step back in time (row and both times).
+    first step back in time (row and both times); for texts and complex numbers.
     """
 
     t: Float[Array | np.ndarray, " n"]
@@ -49,7 +49,7 @@ class Log(eqx.Module):
         if tau is None:
             raise ValueError("Log: tau is missing; give the measured joint torques, zeros for a free motion")
         for name, value in (("t", t), ("q", q), ("v", v), ("a", a), ("tau", tau)):
-            setattr(self, name, _as_array(value))
+            setattr(self, name, _as_array(value, name))
         self.joint_names = None if joint_names is None else tuple(joint_names)
         self.cutoff = None if cutoff is None else float(cutoff)
 
@@ -140,10 +140,12 @@ def as_measured(log: Log, columns: np.ndarray, order: int = 4) -> np.ndarray:
     return filtfilt(numerator, denominator, columns, axis=0)
 
 
-def _as_array(value):
+def _as_array(value, name: str):
     if value is None or isinstance(value, jax.Array):
         return value
     value = np.asarray(value)
+    if value.dtype.kind not in "biuf":  # numpy reads texts as numbers, "1_0" as ten
+        raise ValueError(f"{name} holds {value.dtype.name}; give real numbers")
     return value if value.dtype in (np.float32, np.float64) else value.astype(np.float64)
 
 

@@ -37,13 +37,17 @@ def from_raw(
 
     **Returns:** `Log` with t, q, v, a, tau.
 
-    **Raises:** ValueError for all that `Log` refuses; too few samples for the filter and the trimming; a cut-off above
-    half the sampling rate; a gap in time longer than half a period of the cut-off, which interpolation would invent.
+    **Raises:** ValueError for all that `Log` refuses; an `order`, `trim` or `every` that is no whole number or too small; too few
+    samples for the filter and the trimming; a cut-off above half the sampling rate; a gap in time longer than half a period of
+    the cut-off, which interpolation would invent.
 
     Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
     """
     from scipy.signal import butter, filtfilt
 
+    for name, value, least in (("order", order, 1), ("trim", trim, 0), ("every", every, 1)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+            raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}")
     if isinstance(cutoff, str) and cutoff != "auto":
         raise ValueError(f'cutoff is {cutoff!r}; give a frequency in Hz, or "auto"')
     raw = Log(t, q, tau=tau, joint_names=joint_names)

@@ -52,7 +52,7 @@ def built(builder: ModelBuilder, path) -> Model:
     try:
         return builder.build()
     except ValueError as error:
-        raise ValueError(f"{path}: {re.sub(r' .load_urdf: lock=.*', '', str(error))}") from error
+        raise ValueError(f"{path}: {re.sub(r' .of a URDF: lock=.*', '', str(error))}") from error
 
 
 def add_chain(

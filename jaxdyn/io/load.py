@@ -1,6 +1,5 @@
 """One call for every format: the scene of a file, or of a robot that the package robot_descriptions knows by name."""
 
-import contextlib
 import difflib
 import importlib
 import os
@@ -17,12 +16,13 @@ from jaxdyn.io.loaded import LoadedScene, Start, warn_not_taken
 from jaxdyn.io.mjcf import load_mjcf
 from jaxdyn.io.sdf import load_sdf
 from jaxdyn.io.urdf import urdf_model
-from jaxdyn.io.urdf_loops import closing, closures_of, motors_of
+from jaxdyn.io.urdf_loops import closing, closures_of, motors_of, plugin_followers
+from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.arguments import Checked, DType, FilePath, Numbers, as_path
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.tree import neutral
 
-_BY_SUFFIX = {".urdf": "urdf", ".sdf": "sdf", ".world": "sdf", ".mjcf": "mjcf"}
+_BY_SUFFIX = {".urdf": "urdf", ".xacro": "urdf", ".sdf": "sdf", ".world": "sdf", ".mjcf": "mjcf"}
 _BY_ROOT = {"robot": "urdf", "sdf": "sdf", "gazebo": "sdf", "mujoco": "mjcf", "mujocoinclude": "mjcf"}
 
 
@@ -30,17 +30,21 @@ def load(
     source: str | os.PathLike,
     *,
     floating_base: bool | None = None,
+    lock: Iterable[str] | Mapping[str, Any] = (),
+    mimic: str | None = None,
+    gravity: Numbers | None = GRAVITY,
     loops: str | os.PathLike | bool | None = None,
+    arguments: Mapping[str, Any] | None = None,
     dtype: DType | None = None,
 ) -> LoadedScene:
-    """The scene of a URDF, MJCF or SDF file, or of a robot by its name in the package robot_descriptions.
+    """The scene of a URDF, xacro, MJCF or SDF file, or of a robot by its name in the package robot_descriptions.
 
     All formats give a `LoadedScene`, with the `Model` in `.system`. That of a URDF has the file's mimicked joints as
     couplings, its joint damping and dry friction (smoothed at 0.01 rad/s) as forces, and the start "reference", q = 0. A URDF
     is a tree; loops are taken from a YAML file beside it (`closed_loop`: pairs of frames, `type`: 3d or 6d; `name_mot`: motors,
     which become `.actuators`; `joint_name` and `joint_type`: joints that are balls or held), and from joints and mimicking
     plugins in `<gazebo>` elements (`jaxdyn.io.urdf_loops`). They close with `jd.assemble(scene, scene.starts["reference"].q)`.
-    `load_urdf`, which returns the `Model` of the tree alone, has more options, and so have `load_mjcf` and `load_sdf`.
+    `load_urdf` returns the `Model` of the tree alone.
 
     **Arguments:**
 
@@ -48,16 +52,20 @@ def load(
       cache. What it does not have there it fetches by git, once, if there is a network.
     - `floating_base`: whether the root moves freely. None: as the format has it: fixed in a URDF, free in SDF. MJCF says so
       itself.
+    - `lock`, `gravity`, of a URDF: as for `load_urdf`.
+    - `mimic`, of a URDF: "couple" (the default), "ignore" or "error", as for `load_urdf`; plugins in `<gazebo>` elements that
+      mimic a joint count too. "ignore" loads files whose joints follow some that are not there.
     - `loops`: the YAML file of a URDF's loops. None: the one with the URDF's name beside it, if there is one; False: no YAML
       file.
+    - `arguments`: of the `<xacro:arg>` elements of a file whose name ends in .xacro, {"prefix": "left_"}. The package xacro
+      expands it to a URDF; lines in errors are those of the expanded text.
     - `dtype`: as for `ModelBuilder`.
 
     **Returns:** `LoadedScene`.
 
     **Raises:** ValueError for a file that does not exist or is of no known format, an unknown name (near ones are listed), a
-    robot that could not be fetched, `floating_base` with MJCF, `loops` with other formats than URDF, loops between frames that
-    do not exist; and as the loader of the format does. ImportError
-    without the package that reads the format.
+    robot that could not be fetched, an option that the loader of the format does not have, loops between frames that
+    do not exist; and as the loader of the format does. ImportError without the package that reads the format.
 
     ```python
     scene = jd.load("robot.urdf")  # or jd.load("go2_mj_description")
@@ -68,44 +76,60 @@ def load(
     if not path.suffix and not path.exists():
         path = described(str(source))
     kind = format_of(path)
-    if loops is not None and kind != "urdf":
+    if kind == "urdf":
+        return _urdf_scene(
+            XmlFile(path, "URDF", arguments),
+            floating_base=bool(floating_base),
+            lock=lock,
+            mimic="couple" if mimic is None else mimic,
+            gravity=gravity,
+            loops=loops,
+            dtype=dtype,
+        )
+    if loops is not None:
         raise ValueError(
             f"loops is {loops!r}, but {path} is {kind.upper()}, which holds its loops itself; leave it out"
         )
+    of_urdf = {"lock": (lock or (), ()), "mimic": (mimic, None), "gravity": (gravity, GRAVITY)}
+    of_urdf["arguments"] = (arguments or None, None)
+    for name, (value, default) in of_urdf.items():
+        if value is not default:
+            raise ValueError(f"{name} is {value!r}, but {path} is {kind.upper()}: it is of URDF files; leave it out")
     if kind == "mjcf":
         if floating_base is not None:
             raise ValueError(
                 f"floating_base is {floating_base}, but {path} is MJCF, which says so by <freejoint>; leave it out"
             )
         return load_mjcf(path, dtype=dtype)
-    if kind == "sdf":
-        return load_sdf(path, floating_base=floating_base is not False, dtype=dtype)
-    return load_urdf_scene(path, floating_base=bool(floating_base), loops=loops, dtype=dtype)
+    return load_sdf(path, floating_base=floating_base is not False, dtype=dtype)
 
 
-def load_urdf_scene(
-    path: pathlib.Path,
+def _urdf_scene(
+    file: XmlFile,
     *,
-    floating_base: bool = False,
-    lock: Iterable[str] | Mapping[str, Any] = (),
-    gravity: Numbers | None = GRAVITY,
-    loops: Checked[FilePath | bool | None] = None,
-    dtype: DType | None = None,
+    floating_base: bool,
+    lock: Iterable[str] | Mapping[str, Any],
+    mimic: str,
+    gravity: Numbers | None,
+    loops: Checked[FilePath | bool | None],
+    dtype: DType | None,
 ) -> LoadedScene:
-    """The scene of a URDF file: as `load` says, with the options of `load_urdf`."""
-    closures = closures_of(path, loops)
+    closures = closures_of(file.source, loops)
+    if isinstance(lock, str):
+        raise ValueError(f"lock is {lock!r}; give a list of joint names or a mapping of name to value")
     locked = lock if isinstance(lock, Mapping) else dict.fromkeys(lock)
     model = urdf_model(
-        path,
+        file,
         floating_base=floating_base,
         lock={**dict.fromkeys(closures.locked), **locked},
-        mimic="couple",
+        mimic=mimic,
         gravity=gravity,
         dtype=dtype,
         balls=closures.balls,
+        followers=plugin_followers(file),
     )
-    rows, not_taken = closing(closures, path, model)
-    warn_not_taken(path, not_taken, stacklevel=4)
+    rows, not_taken = closing(closures, file, model)
+    warn_not_taken(file.path, not_taken)
     forces: list = []
     for leaf, force in ((model.damping, JointDamping), (model.friction, CoulombFriction)):
         if leaf is not None and np.any(np.asarray(leaf) != 0):
@@ -117,31 +141,18 @@ def load_urdf_scene(
 
 
 def format_of(path: pathlib.Path) -> str:
-    """ "urdf", "mjcf" or "sdf", by the suffix, and of .xml files by the name of the root element.
+    """ "urdf" (.xacro too), "mjcf" or "sdf", by the suffix, and of .xml files by the name of the root element.
 
     **Raises:** ValueError for a file that cannot be read, and for other suffixes and elements.
     """
     kind = _BY_SUFFIX.get(path.suffix.lower())
     if kind is None and path.suffix.lower() == ".xml":
-        kind = _BY_ROOT.get(_root_element(path))
+        kind = _BY_ROOT.get(XmlFile(path, "robot").root.tag)
     if kind is None:
         raise ValueError(
-            f"{path}: not a file of a known format; give .urdf, .sdf, .world, .mjcf, or .xml with one of them"
+            f"{path}: not a file of a known format; give .urdf, .xacro, .sdf, .world, .mjcf, or .xml with one of them"
         )
     return kind
-
-
-def _root_element(path: pathlib.Path) -> str:
-    import xml.etree.ElementTree as ET
-
-    try:
-        with path.open("rb") as file, contextlib.suppress(ET.ParseError):
-            # Nothing is read beyond the first element: no entity can expand.
-            for _, element in ET.iterparse(file, events=("start",)):
-                return element.tag
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror}); check the path") from error
-    return ""
 
 
 def described(name: str) -> pathlib.Path:
@@ -169,7 +180,7 @@ def described(name: str) -> pathlib.Path:
         raise ValueError(
             f"{name!r} is not in the cache of robot_descriptions and could not be fetched: {reason}"
         ) from error
-    for attribute in ("URDF_PATH", "MJCF_PATH"):
+    for attribute in ("URDF_PATH", "MJCF_PATH", "XACRO_PATH"):
         if (path := getattr(module, attribute, None)) is not None:
             return pathlib.Path(path)
-    raise ValueError(f"{name!r} has neither a URDF nor an MJCF file; robots in xacro have to be expanded first")
+    raise ValueError(f"{name!r} has neither a URDF, an MJCF nor a xacro file")

@@ -1,6 +1,5 @@
 """What a file gives beyond the mechanism: starts, named actuators, and a list of what was not taken."""
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 
 import equinox as eqx
@@ -11,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import body_jacobian
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import Checked
+from jaxdyn.model.arguments import Checked, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Force, Scene
 
@@ -134,10 +133,10 @@ def listed(what: str, names: Iterable[str], most: int = 8) -> list[str]:
     return [f"{what}: {', '.join(names[:most])}{more}"]
 
 
-def warn_not_taken(path, not_taken: Iterable[str], stacklevel: int = 3) -> None:
-    """Warn once, naming all that was not taken from a file; the caller of the loader is who is shown."""
+def warn_not_taken(path, not_taken: Iterable[str]) -> None:
+    """Warn once, naming all that was not taken from a file."""
     if not_taken:
-        warnings.warn(f"{path}: not taken from the file: {'; '.join(not_taken)}", NotTakenWarning, stacklevel)
+        warn(f"{path}: not taken from the file: {'; '.join(not_taken)}", NotTakenWarning)
 
 
 # A robot arm turns by two or three turns at most, and its links are shorter than this; ships and cranes are named too.
@@ -145,7 +144,7 @@ _MOST_TURNS, _LONGEST = 4.0, 100.0
 _NO_LIMIT = 1e15  # files write 1e16 where they mean none
 
 
-def warn_of_units(path, model: Model, stacklevel: int = 3) -> None:
+def warn_of_units(path, model: Model) -> None:
     """Warn where limits look like degrees, or places and inertias like millimetres; nothing is changed."""
     top, doubts = model.topology, []
     lower, upper = np.asarray(model.lower), np.asarray(model.upper)
@@ -162,4 +161,4 @@ def warn_of_units(path, model: Model, stacklevel: int = 3) -> None:
     if doubts:
         more = f"; and {len(doubts) - 5} more" if len(doubts) > 5 else ""
         text = f"{path}: numbers that look like other units than m, kg, rad: {'; '.join(doubts[:5])}{more}"
-        warnings.warn(text, UnitsWarning, stacklevel)
+        warn(text, UnitsWarning)

@@ -1,6 +1,7 @@
 """Logs as files: CSV or NPZ with named columns t, q1.., v1.., a1.., tau1.. (or q_<joint name> ...)."""
 
 import csv
+import io
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.identify.logs import Log
-from jaxdyn.model.arguments import Checked, FilePath, as_path
+from jaxdyn.model.arguments import Checked, FilePath, as_path, parse_number
 
 _SIGNALS = ("q", "v", "a", "tau")
 _NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit behind a column's name
@@ -101,14 +102,20 @@ def write_log(path: FilePath, log: Log) -> None:
 
 
 def _read_csv(path) -> dict[str, np.ndarray]:
-    with path.open(newline="") as file:
+    data = path.read_bytes()
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise ValueError(f"{path}: line {line} is not UTF-8 ({error.reason}); save the file as UTF-8") from error
+    with io.StringIO(text, newline="") as file:
         first = file.readline()
         file.seek(0)
         names = re.sub(r"\[[^\]]*\]", "", first)  # units may hold any sign
         # A semicolon beside commas is that of a country that writes 0,5.
         separator = next((sign for sign in ";,\t" if sign in names), ",")
         reader = csv.reader(file, delimiter=separator)
-        header = [_NOTE.sub("", name.strip().lstrip("\ufeff")) for name in next(reader, [])]
+        header = [_NOTE.sub("", name.strip()) for name in next(reader, [])]
         if not header:
             raise ValueError(f"{path}: the file is empty; the first line names the columns t, q1, ..., tau1, ...")
         if all(_is_number(name) for name in header):
@@ -126,7 +133,7 @@ def _read_csv(path) -> dict[str, np.ndarray]:
             if len(cells) != len(header):
                 raise ValueError(f"{path}: line {reader.line_num} has {len(cells)} cells, the header {len(header)}")
             try:
-                rows.append([float(cell) for cell in cells])
+                rows.append([parse_number(cell) for cell in cells])
             except ValueError:
                 name, cell = next((n, c) for n, c in zip(header, cells, strict=True) if not _is_number(c))
                 point = "; write decimal points" if _is_number(cell.replace(",", ".", 1)) else ""
@@ -139,7 +146,7 @@ def _read_csv(path) -> dict[str, np.ndarray]:
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        parse_number(cell)
     except ValueError:
         return False
     return True

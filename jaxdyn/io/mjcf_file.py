@@ -51,6 +51,8 @@ def compiled(mujoco, path: str):
             file.root,
             f"the root element is <{file.root.tag}>, expected <mujoco>; load_urdf and load_sdf read those formats",
         )
+    if not file.is_utf8:
+        raise ValueError(f"{path}:1: mujoco reads files in UTF-8 alone; save the file as UTF-8")
     try:
         spec = mujoco.MjSpec.from_file(path)
     except ValueError as error:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.constraints.base import Constraint
-from jaxdyn.constraints.loops import gear, loop
+from jaxdyn.constraints.loops import gear, lock_joint, loop
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, built
 from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of_units
@@ -97,6 +97,7 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
         )
         gravity = gravity if gravity.any() else None
     builder = ModelBuilder(name, gravity=gravity, dtype=dtype)
+    builder.places = {link: f"{file.path}:{element.line}" for link, (element, _) in file.links.items()}
     frames, names = Names(), Names()
     for link in file.links:
         frames.new(link)
@@ -244,10 +245,12 @@ def _mimic(file: SdfFile, joint: Joint, name: str, axis: Axis, tree: dict[str, J
     if leader not in file.joints:
         raise file.fault(element, f"joint {name!r} mimics {leader!r}, which is not a joint of the file; mend <mimic>")
     which = element.get("axis") or "axis"
-    if joint.name not in tree or leader not in tree or len(tree[leader].axes) < (2 if which == "axis2" else 1):
-        return None
     numbers = (file.number(element, tag, default, f"joint {name!r}") for tag, default in _MIMIC)
     multiplier, offset, reference = numbers
+    if joint.name in tree and leader in tree and tree[leader].kind == "fixed":
+        return lock_joint(name, offset - multiplier * reference, name=f"mimic {name}-{leader}")
+    if joint.name not in tree or leader not in tree or len(tree[leader].axes) < (2 if which == "axis2" else 1):
+        return None
     source = leader + (_SECOND if which == "axis2" else "")
     if source == name:
         raise file.fault(element, f"joint {name!r} mimics itself; name another joint")

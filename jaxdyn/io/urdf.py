@@ -5,7 +5,7 @@ numbers of it. Meshes and all that is only seen are never looked at.
 """
 
 import os
-import warnings
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -13,7 +13,8 @@ import numpy as np
 
 from jaxdyn.io.loaded import warn_of_units
 from jaxdyn.io.urdf_check import JOINTS
-from jaxdyn.io.urdf_parts import Inertial, Joint, read_parts
+from jaxdyn.io.urdf_parts import Inertial, Joint, Mimic, read_parts
+from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import DType, Numbers
 from jaxdyn.model.builder import GRAVITY, ModelBuilder, inertia_problems, unknown
@@ -42,9 +43,10 @@ def load_urdf(
     lock: Iterable[str] | Mapping[str, Any] = (),
     mimic: str = "ignore",
     gravity: Numbers = GRAVITY,
+    arguments: Mapping[str, Any] | None = None,
     dtype: DType | None = None,
 ) -> Model:
-    """The mechanism of a URDF file. Meshes are not read.
+    """The mechanism of a URDF file, or of a xacro file that expands to one. Meshes are not read.
 
     Links joined by fixed joints are merged; every link keeps a frame of its name. Joints stand in Pinocchio's order.
     The inertias are those of the file, physical or not (`urdf_inertia_report`, `repair_inertias`). `damping` and
@@ -60,22 +62,25 @@ def load_urdf(
     - `lock`: joints to hold, at neutral (names) or at given coordinates (name -> number or (nq of the joint,)).
       They become fixed and their links are merged.
     - `mimic`: what to do with joints that follow others. "ignore" leaves them free, "couple" leaves them free and
-      records the couplings for a scene to impose (and holds those that follow a locked joint), "error" refuses them.
+      records the couplings for a scene to impose (and holds those that follow a locked or a fixed joint: the latter at their
+      offset), "error" refuses them.
+    - `arguments`: of the `<xacro:arg>` elements of a file that ends in .xacro, which the package xacro expands.
     - `gravity`, `dtype`: as for `ModelBuilder`.
 
     **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, links that are not a tree,
     an unknown joint type, a bad number, a part that is given twice, a declared entity, a negative mass, a negative limit of
     velocity or effort, a zero axis; for names in `lock` that are not movable joints;
-    for a joint that moves no inertia.
+    for a joint that moves no inertia. ImportError for a xacro file without the package xacro.
 
-    **Warns:** UserWarning naming the links with a negative moment of inertia; `UnitsWarning` where limits look like degrees,
+    **Warns:** UserWarning naming the links with an inertia that no body has; `UnitsWarning` where limits look like degrees,
     or lengths and inertias like millimetres.
     """
-    return urdf_model(path, floating_base=floating_base, lock=lock, mimic=mimic, gravity=gravity, dtype=dtype)
+    file = XmlFile(path, "URDF", arguments)
+    return urdf_model(file, floating_base=floating_base, lock=lock, mimic=mimic, gravity=gravity, dtype=dtype)
 
 
 def urdf_model(
-    path: str | os.PathLike,
+    file: XmlFile,
     *,
     floating_base: bool,
     lock: Iterable[str] | Mapping[str, Any],
@@ -83,15 +88,16 @@ def urdf_model(
     gravity,
     dtype,
     balls: Iterable[str] = (),
+    followers: Mapping[str, tuple[Mimic, str]] | None = None,
 ) -> Model:
-    """As `load_urdf`; `balls` names joints that are spherical, a kind that a URDF cannot say.
+    """As `load_urdf`; `balls` names joints that are spherical, a kind that a URDF cannot say; `followers` are joints that follow
+    others besides those that say so by `<mimic>`, each with file:line.
 
     **Raises:** as `load_urdf`; ValueError for balls that are no moving joints of the file.
     """
     if mimic not in ("ignore", "couple", "error"):
         raise ValueError(f"mimic is {mimic!r}; give 'ignore', 'couple' or 'error'")
-    urdf = _read(path)
-    _warn_of_inertias(urdf)
+    urdf, path = _read(file), file.path
     root_joint = ROOT_JOINT
     while root_joint in urdf.joints:
         root_joint = f"_{root_joint}"
@@ -101,14 +107,21 @@ def urdf_model(
             raise ValueError(f"{path}: {unknown('joint', name, kinds)}; a ball takes the place of a joint that moves")
         kinds[name] = "spherical"
     locked = _locked({root_joint: "free", **kinds} if floating_base else kinds, lock, path)
-    couplings = {name: joint.mimic for name, joint in urdf.joints.items() if joint.mimic and kinds[name] != "fixed"}
+    couplings = {name: joint.mimic for name, joint in urdf.joints.items() if joint.mimic}
+    places = {name: urdf.places[f"joint {name}"] for name in couplings}
+    for name, (coupling, where) in (followers or {}).items():
+        if couplings.setdefault(name, coupling) != coupling:
+            raise ValueError(f"{where}: joint {name!r} follows {couplings[name].joint!r} already; keep one of them")
+        places.setdefault(name, where)
+    couplings = {name: coupling for name, coupling in couplings.items() if kinds.get(name) != "fixed"}
     if mimic == "error" and couplings:
         listed = ", ".join(f"{name} (follows {coupling.joint})" for name, coupling in couplings.items())
         raise ValueError(f"{path}: joints that follow others: {listed}; pass mimic='couple' or mimic='ignore'")
     if mimic == "couple":
-        couplings = _settle(couplings, kinds, locked, urdf.places)
+        couplings = _settle(couplings, kinds, locked, places)
 
     builder = ModelBuilder(urdf.name, gravity=gravity, dtype=dtype)
+    builder.places = {name: urdf.places[f"link {name}"] for name in urdf.links}
     free = floating_base and root_joint not in locked
     base = f64.joint_pose("free", np.zeros(6), locked[root_joint]) if root_joint in locked else None
     inertia = _inertia(urdf, urdf.root)
@@ -124,23 +137,31 @@ def urdf_model(
             raise ValueError(f"{urdf.places[f'joint {joint.name}']}: {error}") from error
     if mimic == "couple":
         for name, coupling in couplings.items():
-            builder.add_coupling(name, coupling.joint, coupling.multiplier, coupling.offset)
+            try:
+                builder.add_coupling(name, coupling.joint, coupling.multiplier, coupling.offset)
+            except ValueError as error:
+                raise ValueError(f"{places[name]}: {error}") from error
     try:
         model = builder.build()
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    warn_of_units(path, model, stacklevel=4)
+        named = re.match(r"joint '(.*?)' \(body", str(error))
+        where = urdf.places.get(f"joint {named[1]}", path) if named else path
+        raise ValueError(f"{where}: {error}") from error
+    warn_of_units(path, model)
     return model
 
 
-def urdf_inertia_report(path: str | os.PathLike) -> list[tuple[str, str]]:
+def urdf_inertia_report(
+    path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = None
+) -> list[tuple[str, str]]:
     """What is unphysical in the inertias that a URDF file states, as (link, problem), before links are merged.
 
-    Links without `<inertial>` are listed only where a joint moves them: a fixed one is a mere frame.
+    Links without `<inertial>` are listed only where a joint moves them: a fixed one is a mere frame. `arguments` are as for
+    `load_urdf`.
 
     **Raises:** ValueError as `load_urdf` does for a file that cannot be understood.
     """
-    urdf = _read(path)
+    urdf = _read(XmlFile(path, "URDF", arguments))
     moved = {joint.child for joint in urdf.joints.values() if joint.type != "fixed"}
     report = []
     for name, link in urdf.links.items():
@@ -149,19 +170,6 @@ def urdf_inertia_report(path: str | os.PathLike) -> list[tuple[str, str]]:
             continue
         report += [(name, problem) for problem in inertia_problems(_inertia(urdf, name))]
     return report
-
-
-def _warn_of_inertias(urdf: _Description) -> None:
-    for name, link in urdf.links.items():
-        if link is None or link.inertia is None:
-            continue
-        moments = np.linalg.eigvalsh(link.inertia)
-        if moments[0] < -1e-9 * np.abs(moments).max():
-            warnings.warn(
-                f"{urdf.places[f'link {name}']}: link {name!r}: a principal moment of inertia is negative "
-                f"({moments[0]:.6g} kg m^2); mend <inertia>, or take jd.repair_inertias(model)",
-                stacklevel=4,
-            )
 
 
 def _add_joint(
@@ -234,25 +242,29 @@ def _locked(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:
 
 
 def _settle(couplings: dict, kinds: dict[str, str], locked: dict[str, np.ndarray], places: dict[str, str]) -> dict:
-    """The couplings that remain once joints coupled to locked ones are locked too (added to `locked`)."""
+    """The couplings that remain once joints coupled to locked or fixed ones are locked too (added to `locked`)."""
     left = dict(couplings)
     for name, coupling in couplings.items():
-        where = places[f"joint {name}"]
-        for joint in (name, coupling.joint):
+        where, leader = places[name], coupling.joint
+        if leader not in kinds and name in locked:
+            del left[name]  # the caller says where it is
+            continue
+        for joint in (name, leader):
             if joint not in kinds:
-                raise ValueError(
-                    f"{where}: joint {name!r} follows {joint!r}, which is not a joint of the file; mend <mimic>"
-                )
-            if kinds[joint] not in SCREW_KINDS:
-                fault = f"joint {name!r} follows {coupling.joint!r}, but {joint!r} is {kinds[joint]}"
+                fault = f"joint {name!r} follows {leader!r}; {unknown('joint', joint, kinds)}"
+                hold = f", hold it by lock={{{name!r}: 0.0}}" if name in kinds else ""
+                raise ValueError(f"{where}: {fault}; mend the name{hold}, or pass mimic='ignore'")
+            if kinds[joint] not in (*SCREW_KINDS, "fixed"):
+                fault = f"joint {name!r} follows {leader!r}, but {joint!r} is {kinds[joint]}"
                 raise ValueError(f"{where}: {fault}; couple joints of one degree of freedom, or pass mimic='ignore'")
+    held = {name: np.zeros(1) for name, kind in kinds.items() if kind == "fixed"}
     settled = False
     while not settled:
         settled = True
         for name, coupling in list(left.items()):
-            if coupling.joint not in locked:
+            if coupling.joint not in locked and coupling.joint not in held:
                 continue
-            value = coupling.multiplier * locked[coupling.joint] + coupling.offset
+            value = coupling.multiplier * (locked | held)[coupling.joint] + coupling.offset
             if not np.allclose(locked.setdefault(name, value), value, rtol=1e-9, atol=1e-9):
                 raise ValueError(
                     f"lock: joint {name!r} is held at {locked[name]}, but follows {coupling.joint!r} to {value}"
@@ -265,12 +277,12 @@ def _settle(couplings: dict, kinds: dict[str, str], locked: dict[str, np.ndarray
     return left
 
 
-def _read(path) -> _Description:
-    parts = read_parts(path)
+def _read(file: XmlFile) -> _Description:
+    parts = read_parts(file)
     children: dict[str, list[str]] = {name: [] for name in parts.links}
     for joint in parts.joints.values():
         children[joint.parent].append(joint.name)
-    return _Description(*parts, children, _root(parts.joints, parts.links, parts.places, path))
+    return _Description(*parts, children, _root(parts.joints, parts.links, parts.places, file.path))
 
 
 def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str], path) -> str:

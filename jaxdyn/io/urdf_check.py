@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model.arguments import parse_number
 
 JOINTS = {"floating": "free", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar", "fixed")}}
 # Attributes that must hold so many finite numbers where they are given. The model needs no others.
@@ -24,7 +25,7 @@ _READ = {*NUMBERS, *REQUIRED, "inertial"}
 _PARENTS = ("link", "joint", "inertial")  # what holds each of the parts above at most once
 
 
-def check_elements(file: XmlFile, path) -> tuple[list, dict[str, str]]:
+def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
     """The link and joint elements, once names, references and numbers are found in order; file:line of each."""
     root: Any = file.root
     fault = file.fault
@@ -33,7 +34,8 @@ def check_elements(file: XmlFile, path) -> tuple[list, dict[str, str]]:
     elements = [element for element in root if element.tag in ("link", "joint")]
     if not elements or not root.get("name"):
         missing = "name" if elements else "<link>"
-        hint = "; expand this xacro file first: xacro IN > OUT" if "xmlns:xacro" in root.attrib else ""
+        is_xacro = "xmlns:xacro" in root.attrib and file.source.suffix.lower() != ".xacro"
+        hint = "; this is xacro: expand it (xacro IN > OUT), or rename it to end in .xacro" if is_xacro else ""
         raise fault(root, f"the robot has no {missing}{hint}")
     places: dict[str, str] = {}
     for element in elements:
@@ -42,7 +44,7 @@ def check_elements(file: XmlFile, path) -> tuple[list, dict[str, str]]:
             raise fault(element, f"a <{tag}> has no name")
         if f"{tag} {name}" in places:
             raise fault(element, f"the {tag} name {name!r} is taken at {places[f'{tag} {name}']}; rename one")
-        places[f"{tag} {name}"] = f"{path}:{element.line}"
+        places[f"{tag} {name}"] = f"{file.path}:{element.line}"
         for parent, part in _parts(element):
             _check_once(parent, part, f"{tag} {name!r}", fault)
             for key in REQUIRED.get(part.tag, ()):
@@ -90,7 +92,7 @@ def _check_once(parent, part, what: str, fault) -> None:
 
 def _are_numbers(text: str, count: int) -> bool:
     try:
-        values = [float(part) for part in text.split()]
+        values = [parse_number(part) for part in text.split()]
     except ValueError:
         return False
     return len(values) == count and bool(np.all(np.isfinite(values)))

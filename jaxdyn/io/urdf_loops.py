@@ -20,9 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.constraints.base import Constraint
-from jaxdyn.constraints.loops import Gear, gear, loop
+from jaxdyn.constraints.loops import loop
 from jaxdyn.io.loaded import Actuators, listed
 from jaxdyn.io.sdf_joints import LOOPS
+from jaxdyn.io.urdf_parts import Mimic
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import as_path
@@ -59,7 +60,8 @@ def closures_of(urdf: pathlib.Path, loops) -> Closures:
         return Closures("")
     if loops is not None:
         return _read(as_path(loops, "loops"), wanted=True)
-    beside = [path for suffix in _SUFFIXES if (path := urdf.with_suffix(suffix)).is_file()]
+    name = urdf.with_suffix("") if urdf.suffix == ".xacro" and len(urdf.suffixes) > 1 else urdf
+    beside = [path for suffix in _SUFFIXES if (path := name.with_suffix(suffix)).is_file()]
     return _read(beside[0], wanted=False) if beside else Closures("")
 
 
@@ -129,8 +131,8 @@ def _names(content: dict, key: str, path) -> list[str]:
     return value
 
 
-def closing(closures: Closures, urdf: pathlib.Path, model: Model) -> tuple[list[Constraint], list[str]]:
-    """The constraints of both conventions, and in words what of them was not taken.
+def closing(closures: Closures, urdf: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
+    """The constraints of both conventions but for plugins that mimic, and in words what of them was not taken.
 
     **Raises:** ValueError with the file for frames and joints that the model does not have, and for bad numbers.
     """
@@ -138,7 +140,7 @@ def closing(closures: Closures, urdf: pathlib.Path, model: Model) -> tuple[list[
     for a, b, kind in closures.pairs:
         ends = [model.frame_names[_named(frame_index, model, name, f"{closures.path}: closed_loop")] for name in (a, b)]
         taken.append(loop(ends[0], np.eye(4), ends[1], np.eye(4), kind, name=f"{a}-{b}"))
-    more, left = _gazebo(XmlFile(urdf, "URDF"), model)
+    more, left = _gazebo(urdf, model)
     return [*taken, *more], [*closures.not_taken, *left]
 
 
@@ -174,7 +176,7 @@ def _named(index, model: Model, name: str, where: str) -> int:
 
 
 def _gazebo(file: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
-    """Joints and mimicking plugins of `<gazebo>` elements."""
+    """Joints of `<gazebo>` elements."""
     taken: list[Constraint] = []
     left: dict[str, list[str]] = {}
     for element in file.root.iter("gazebo"):
@@ -187,10 +189,6 @@ def _gazebo(file: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
             taken.append(_gazebo_loop(file, joint, name, LOOPS[kind], model))
             if any(joint.find(f"axis/{tag}") is not None for tag in ("dynamics", "limit")):
                 left.setdefault("limits and damping of <gazebo> joints", []).append(name)
-        for plugin in element.findall("plugin"):
-            if plugin.find("mimicJoint") is None:
-                continue
-            taken.append(_gazebo_mimic(file, plugin, model))
     return taken, [line for reason, names in left.items() for line in listed(reason, names)]
 
 
@@ -237,18 +235,23 @@ def _turned(file: XmlFile, joint, tag: str, world: np.ndarray, what: str) -> np.
     return f64.turn_from_z(world[:3, :3] @ f64.unit(axis, what))[:3, :3]
 
 
-def _gazebo_mimic(file: XmlFile, plugin, model: Model) -> Gear:
-    """follower = multiplier leader + offset."""
-    ends = []
-    for tag in ("mimicJoint", "joint"):
-        try:
-            ends.append(model.joint_names[joint_index(model, file.word(plugin, tag))])
-        except ValueError as error:
-            raise file.fault(plugin, f"<{tag}> of a mimicking plugin: {error}") from error
-    ratio, offset = (
-        file.number(plugin, tag, value, "a mimicking plugin") for tag, value in (("multiplier", 1.0), ("offset", 0.0))
-    )
-    return gear(ends[0], ends[1], ratio, offset, name=f"mimic {ends[0]}-{ends[1]}")
+def plugin_followers(file: XmlFile) -> dict[str, tuple[Mimic, str]]:
+    """Joints that follow others by a plugin in a `<gazebo>` element, mimicJoint = multiplier joint + offset; file:line of each.
+
+    **Raises:** ValueError with file and line for a plugin without the joints' names, bad numbers, a joint that follows twice.
+    """
+    followers: dict[str, tuple[Mimic, str]] = {}
+    for plugin in file.root.iterfind(".//gazebo/plugin"):
+        if plugin.find("mimicJoint") is None:
+            continue
+        leader, follower = file.word(plugin, "joint"), file.word(plugin, "mimicJoint")
+        if not leader or not follower:
+            raise file.fault(plugin, "a mimicking plugin has no <joint> or no name in <mimicJoint>; give both")
+        ratio = file.number(plugin, "multiplier", 1.0, "a mimicking plugin")
+        coupling = Mimic(leader, ratio, file.number(plugin, "offset", 0.0, "a mimicking plugin"))
+        if followers.setdefault(follower, (coupling, f"{file.path}:{plugin.line}"))[0] != coupling:
+            raise file.fault(plugin, f"joint {follower!r} follows {followers[follower][0].joint!r} already; keep one")
+    return followers
 
 
 def _placed(model: Model, frame: str) -> np.ndarray:

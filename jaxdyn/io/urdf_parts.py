@@ -1,6 +1,5 @@
 """Links and joints of a URDF file as numbers, with the defaults that the format sets for what is left out."""
 
-import os
 from typing import NamedTuple
 
 import numpy as np
@@ -51,13 +50,12 @@ class Parts(NamedTuple):
     places: dict[str, str]  # "joint NAME" and "link NAME" -> file:line
 
 
-def read_parts(path: str | os.PathLike) -> Parts:
+def read_parts(file: XmlFile) -> Parts:
     """The links and joints of a file.
 
-    **Raises:** ValueError with file and line, for a file that cannot be read and all that `check_elements` refuses.
+    **Raises:** ValueError with file and line, for all that `check_elements` refuses.
     """
-    file = XmlFile(path, "URDF")
-    elements, places = check_elements(file, path)
+    elements, places = check_elements(file)
     links = {part.get("name"): _inertial(part.find("inertial")) for part in elements if part.tag == "link"}
     joints = {part.get("name"): _joint(part) for part in elements if part.tag == "joint"}
     return Parts(file.root.get("name") or "", links, joints, places)

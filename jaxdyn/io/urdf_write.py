@@ -9,8 +9,9 @@ import numpy as np
 
 from jaxdyn.io.files import replacing
 from jaxdyn.io.urdf import NO_LIMIT, ROOT_JOINT
+from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import as_path, check_shapes
+from jaxdyn.model.arguments import as_path, check_shapes, parse_number
 from jaxdyn.model.tree import Model
 
 _TYPES = {"free": "floating", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar")}}
@@ -35,7 +36,8 @@ def save_urdf(
     a free joint "root_joint" becomes the root link (load it with `floating_base=True`); otherwise the root is a frame
     that coincides with the world's, or a new link "world". Siblings that do not stand in the order of their joint names
     hang on frames of their parent, or on added ones "..._carrier". Couplings become `<mimic>` (load with
-    `mimic="couple"`), armature an attribute of `<dynamics>`; gravity has no place in the file. Infinite limits are
+    `mimic="couple"`), armature an attribute of `<dynamics>`, beside damping and friction, which are written as zero where the
+    model has none; gravity has no place in the file. Infinite limits are
     written as the largest double, because readers of URDF take no "inf".
 
     `torques`: of joints by name, numbers of torques that URDF has no place for, as {"shoulder": {"offset": 0.3}}. They go into
@@ -65,21 +67,17 @@ def save_urdf(
 def joint_torques(path: str | os.PathLike) -> dict[str, dict[str, float]]:
     """Numbers of joints' torques that `save_urdf` wrote beside what URDF has a place for; empty where the file has none.
 
-    **Raises:** ValueError for a file that is no XML, or a number that is none, with the joint.
+    **Raises:** ValueError with file and line for a file that is no XML, or a number that is none, with the joint.
     """
-    path = as_path(path)
-    try:
-        root = ET.parse(path).getroot()
-    except ET.ParseError as error:
-        raise ValueError(f"{path}: {error}") from None
+    file = XmlFile(path, "URDF")
     result: dict[str, dict[str, float]] = {}
-    for joint in root.iterfind("jaxdyn/joint"):
+    for joint in file.root.iterfind("jaxdyn/joint"):
         numbers = dict(joint.attrib)
         name = numbers.pop("name", "")
         try:
-            result[name] = {key: float(value) for key, value in numbers.items()}
+            result[name] = {key: parse_number(value) for key, value in numbers.items()}
         except ValueError as error:
-            raise ValueError(f"{path}: <jaxdyn> of joint {name!r}: {error}") from None
+            raise file.fault(joint, f"<jaxdyn> of joint {name!r}: {error}") from None
     return result
 
 
@@ -202,7 +200,8 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
         ET.SubElement(joint, "axis", xyz=_text(axis))
     _write_limits(joint, model, edge.body, what)
     given = {key: getattr(model, key) for key in ("damping", "friction", "armature")}
-    dynamics = {}
+    # Readers of URDF refuse <dynamics> without damping and friction.
+    dynamics = dict.fromkeys(("damping", "friction"), "0") if any(x is not None for x in given.values()) else {}
     for key, values in given.items():
         if values is not None:
             own = np.asarray(values, np.float64)[model.topology.v_slices[edge.body]]

@@ -1,17 +1,21 @@
 """XML as ElementTree elements that know their line, and reads that say where a file is wrong.
 
-Entity declarations are refused: robot files need none, and a few nested ones expand to gigabytes.
+Entity declarations are refused: robot files need none, and a few nested ones expand to gigabytes. A file is decoded here by
+Python's codecs, since expat knows four encodings, and none of those of more than one byte that files from East Asia have.
 """
 
+import codecs
 import os
-from typing import NoReturn
+import re
+from collections.abc import Mapping
+from typing import Any, NoReturn
 from xml.etree import ElementTree
 from xml.parsers import expat
 
 import numpy as np
 
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import as_path
+from jaxdyn.model.arguments import as_path, parse_number
 
 
 class Element(ElementTree.Element):
@@ -20,19 +24,42 @@ class Element(ElementTree.Element):
     line: int = 0
 
 
+_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"))
+_MARKS += (
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+    (b"<\0", "utf-16-le"),
+    (b"\0<", "utf-16-be"),
+)
+_DECLARED = re.compile(rb"""<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]+)["']""")
+
+
 class XmlFile:
     """An XML file: its root element, and reads of numbers and words that raise with file and line.
 
-    **Raises:** ValueError with file and line for a file that cannot be read, is malformed or declares entities.
+    The text is decoded as the XML declaration says, by any codec that Python knows, else as UTF-8. `is_utf8` says whether the
+    bytes are UTF-8. A file whose name ends in .xacro is expanded first, with `arguments` for its `<xacro:arg>`; lines are then
+    those of the expanded text.
+
+    **Raises:** ValueError with file and line for a file that cannot be read, decoded or expanded, is malformed or declares
+    entities; for `arguments` of a file that is no xacro. ImportError for a xacro file without the package xacro.
     """
 
-    def __init__(self, path: str | os.PathLike, kind: str):
-        self.path = str(as_path(path))
+    def __init__(self, path: str | os.PathLike, kind: str, arguments: Mapping[str, Any] | None = None):
+        self.source = as_path(path)
+        self.path = str(self.source)
+        is_xacro = self.source.suffix.lower() == ".xacro"
+        if arguments and not is_xacro:
+            raise ValueError(f"arguments is {dict(arguments)}, but {self.path} is no .xacro file; leave it out")
         try:
             with open(self.path, "rb") as file:
                 data = file.read()
         except OSError as error:
             raise ValueError(f"{kind} file {self.path!r} cannot be read ({error.strerror}); check the path") from error
+        text, encoding = (_expand(self.path, arguments or {}), "utf-8") if is_xacro else _decode(self.path, data)
+        self.path += " (expanded)" * is_xacro
+        self.is_utf8 = data.isascii() or encoding.lower().replace("_", "-") in ("utf-8", "utf8", "utf-8-sig")
+        # A text handed to expat is UTF-8, whatever it declares.
         parser = expat.ParserCreate()
 
         def element(tag, attributes) -> Element:
@@ -53,11 +80,11 @@ class XmlFile:
         parser.CharacterDataHandler = builder.data
         parser.EntityDeclHandler = entity
         try:
-            parser.Parse(data, True)
+            parser.Parse(text, True)
         except expat.ExpatError as error:
-            lines = data.splitlines()
-            text = lines[error.lineno - 1].decode(errors="replace").strip() if error.lineno <= len(lines) else ""
-            shown = f" at {text[:80]!r}" if text else ""
+            lines = text.split("\n")
+            line = lines[error.lineno - 1].strip() if error.lineno <= len(lines) else ""
+            shown = f" at {line[:80]!r}" if line else ""
             reason = f"malformed XML: {expat.ErrorString(error.code)}{shown}"
             raise ValueError(f"{self.path}:{error.lineno}: {reason}") from error
         self.root = builder.close()
@@ -81,7 +108,7 @@ class XmlFile:
         counts = (count,) if isinstance(count, int) else count
         text = (element.text or "").strip()
         try:
-            values = np.array([float(part) for part in text.split()])
+            values = np.array([parse_number(part) for part in text.split()])
         except ValueError:
             values = np.zeros(0)
         if len(values) not in counts or not np.isfinite(values).all():
@@ -116,3 +143,43 @@ class XmlFile:
         if text not in ("", "0", "1", "true", "false"):
             raise self.fault(child, f"<{tag}> of {what} is {text!r}; give true or false")
         return text in ("1", "true")
+
+
+def _decode(path: str, data: bytes) -> tuple[str, str]:
+    """The text of an XML file, and the encoding that it declares or that its first bytes show."""
+    encoding = next((name for mark, name in _MARKS if data.startswith(mark)), None)
+    if encoding is None:
+        declared = _DECLARED.match(data.lstrip())
+        encoding = "utf-8" if declared is None else declared[1].decode(errors="replace")
+        if re.match("(utf|ucs)[-_]?(16|32|2|4)", encoding.lower()):
+            raise ValueError(
+                f'{path}:1: the XML declaration says {encoding}, in bytes that are not; write encoding="UTF-8", or leave it out'
+            )
+    try:
+        text = data.decode(encoding)
+        text.encode("utf-8")  # expat takes no half of a surrogate pair
+    except LookupError as error:
+        raise ValueError(
+            f"{path}:1: the encoding {encoding!r} of the XML declaration is unknown; save the file as UTF-8"
+        ) from error
+    except UnicodeError as error:
+        line = data[: getattr(error, "start", 0)].count(b"\n") + 1
+        raise ValueError(
+            f"{path}:{line}: the text is not {encoding} ({getattr(error, 'reason', error)}); save the file as UTF-8, or name its "
+            "encoding in the XML declaration"
+        ) from error
+    return text, encoding
+
+
+def _expand(path: str, arguments: Mapping[str, Any]) -> str:
+    """The text that xacro makes of a file, with the lines of `xacro FILE`."""
+    try:
+        import xacro
+    except ImportError as error:
+        raise ImportError(f"{path}: reading xacro files needs the package xacro: pip install jaxdyn[xacro]") from error
+    words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
+    try:
+        return xacro.process_file(path, mappings=words).toprettyxml(indent="  ")
+    except Exception as error:  # expressions of a file raise anything
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path}: xacro: {reason}; mend the file, or give its arguments={{NAME: VALUE}}") from error

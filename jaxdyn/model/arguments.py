@@ -2,7 +2,9 @@
 
 import os
 import pathlib
-from collections.abc import Callable, Sequence
+import sys
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 import equinox as eqx
@@ -89,6 +91,41 @@ def as_path(path: Any, name: str = "path") -> pathlib.Path:
     if not isinstance(path, (str, os.PathLike)) or isinstance(path, bytes):
         raise ValueError(f"{name} is {path!r}; pass the path of a file, a string or a pathlib.Path")
     return pathlib.Path(path).expanduser()
+
+
+def parse_number(text: str) -> float:
+    """A decimal number as file formats write it.
+
+    **Raises:** ValueError for what is none, for underscores ("1_0" is ten to Python) and for digits of other scripts.
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(f"{text!r} is no number")
+    return float(text)
+
+
+# Frames between the caller and the package: run-time type checkers wrap public functions.
+_WRAPPERS = ("jaxdyn", "jaxtyping", "beartype", "equinox", "contextlib", "jax")
+
+
+def warn(text: str, category: type[Warning]) -> None:
+    """Warn at the line outside of the package from which it was called, however deep the warning arises."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _WRAPPERS:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(text, category, stacklevel=level)
+
+
+def warn_of_inertias(inertias: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:
+    """Warn of bodies with an inertia (10,) that no body has, once and of all; `places` gives file:line of bodies."""
+    faults = []
+    for name, parameters in inertias.items():
+        if is_concrete(parameters) and (fault := f64.inertia_fault(np.asarray(parameters))):
+            place = f"{places[name]}: " if places and name in places else ""
+            faults.append(f"{place}body {name!r}: {fault}")
+    if faults:
+        more = f"; and {len(faults) - 5} more bodies" if len(faults) > 5 else ""
+        fix = "mend the numbers, or take jd.repair_inertias(model)"
+        warn(f"{'; '.join(faults[:5])}{more}. No body has such an inertia: {fix}", UserWarning)
 
 
 def state_dtype(system, q=None):

@@ -16,7 +16,7 @@ import numpy as np
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia as _inertia
-from jaxdyn.model.arguments import DType, Number, Numbers, stored
+from jaxdyn.model.arguments import DType, Number, Numbers, stored, warn_of_inertias
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model, Topology
 
@@ -53,8 +53,8 @@ class ModelBuilder:
 
     Every number of `add_body`, `add_frame`, `add_coupling` and of the gravity may be traced, so that `jax.grad` and `jax.vmap`
     go through the construction. Names, kinds, and which numbers are given at all are structure and stay known. What
-    cannot be seen in traced numbers is not refused: an infeasible body, a zero axis or a mass matrix without inverse then shows
-    in results (NaN, or a result code of `simulate`).
+    cannot be seen in traced numbers is not refused: a zero axis or a mass matrix without inverse then shows in results (NaN, or
+    a result code of `simulate`). Nor is a warning given of an inertia that no body has.
 
     **Raises:** ValueError for a gravity that is not three finite numbers, and for float64 while jax runs in 32 bits.
 
@@ -79,6 +79,7 @@ class ModelBuilder:
         self._joints: dict[str, str] = {}  # joint name -> body name
         self._frames: dict[str, tuple[str | None, f64.Values]] = {}
         self._couplings: dict[str, tuple[str, f64.Values]] = {}
+        self.places: dict[str, str] = {}  # file:line of bodies that come from a file, for messages
 
     def add_body(
         self,
@@ -202,7 +203,11 @@ class ModelBuilder:
 
         **Raises:** ValueError that names a joint which moves no inertia, so that the mass matrix is singular in every
         configuration: S^T I S = 0 with the composite or the articulated inertia I of what it carries.
+
+        **Warns:** UserWarning naming bodies with an inertia that no body has: a negative principal moment, or one that exceeds
+        the sum of the other two (`repair_inertias`).
         """
+        warn_of_inertias({name: body.inertia for name, body in self._bodies.items()}, self.places)
         moving, carriers, parents, home, inertias = self._merged()
         others = [(carriers[b][0], name, _chained(carriers[b][1], pose)) for name, (b, pose) in self._frames.items()]
         fixed = [name for name, body in self._bodies.items() if body.kind == "fixed"]
@@ -440,5 +445,5 @@ def _check_regular(topology: Topology, home, screws, inertias, armature) -> None
     others = "" if len(idle) == 1 else f" (so it is, in all, with {', '.join(names)})"
     raise ValueError(
         f"joint {topology.joint_names[i]!r} (body {topology.body_names[i]!r}) {fault}, so the mass matrix is singular"
-        f"{others}; give the bodies an inertia, give the joints an armature, or fix them (load_urdf: lock={names})"
+        f"{others}; give the bodies an inertia, give the joints an armature, or fix them (of a URDF: lock={names})"
     )

@@ -32,6 +32,8 @@ def numbers(value, shapes: dict[tuple[int, ...], str], what: str, *, finite: boo
     expected = " or ".join(shapes.values())
     known = is_concrete(value)
     try:
+        if known and np.asarray(value).dtype.kind not in "biuf":  # numpy reads texts as numbers, "1_0" as ten
+            raise TypeError
         array = np.asarray(value, np.float64) if known else jnp.asarray(value, float)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what} is {value!r}, expected {expected}") from error
@@ -218,6 +220,29 @@ def inertia_numbers(inertia, what: str) -> Values:
     if is_concrete(parameters) and parameters[0] < 0:
         raise ValueError(f"{what}: the mass is {parameters[0]} kg; it must not be negative")
     return parameters
+
+
+# Files give moments with few digits: those of a plate are often a little more than their sum.
+_DIGITS = 1e-3
+
+
+def inertia_fault(parameters: np.ndarray) -> str:
+    """In words, why no body has these inertial parameters (10,); empty where one may, or a limit of one (point, rod, plate)."""
+    mass, _, moment = about_com(np.asarray(parameters, np.float64))
+    if mass == 0 and np.any(parameters[1:4]):
+        return f"it has first moments {np.asarray(parameters[1:4]).tolist()} kg m and no mass"
+    low, middle, high = np.linalg.eigvalsh(moment)
+    # The shift to the centre of mass leaves a few roundings of the precision that the numbers came in.
+    rounding = np.finfo(parameters.dtype).eps if parameters.dtype.kind == "f" else 0.0
+    slack = 64 * rounding * np.abs(parameters[4:]).max() + 1e-9 * max(high, -low)
+    if low < -slack:
+        return f"a principal moment of inertia is negative ({low:.6g} kg m^2)"
+    if high - low - middle > slack + _DIGITS * high:
+        return (
+            f"its principal moments of inertia {low:.6g}, {middle:.6g}, {high:.6g} kg m^2 break the triangle inequality: one is "
+            "more than the sum of the others"
+        )
+    return ""
 
 
 def rotational_inertia(parameters: Values) -> Values:

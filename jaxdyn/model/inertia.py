@@ -2,6 +2,8 @@
 
 The ten numbers are (m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) about the body frame's origin and in its axes
 (the order of Pinocchio's regressors): dynamics is linear in them.
+
+All functions raise ValueError for an argument of another shape, with the shapes that they take.
 """
 
 import jax.numpy as jnp
@@ -12,27 +14,38 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import numpy_for as _numpy_for
 from jaxdyn.lie import so3
 from jaxdyn.model import float64 as _f64
-from jaxdyn.model.arguments import Number, Numbers, Row
+from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 
 # Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
 _SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
 _TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
 
 
-def rotational_inertia(parameters: Float[Array, "10"]) -> Float[Array, "3 3"]:
+def _check_shapes(**given) -> None:
+    """Refuse arguments, by their names, of another shape than the one beside them."""
+    for name, (value, want) in given.items():
+        if np.shape(value) != want:
+            shapes = ", ".join(f"{other} {shape}" for other, (_, shape) in given.items())
+            raise ValueError(f"{name} has shape {np.shape(value)}, expected {shapes}")
+
+
+def rotational_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "3 3"]:
     """Rotational inertia (3, 3) about the frame's origin (kg m^2) from the ten numbers."""
+    _check_shapes(parameters=(parameters, (10,)))
     return parameters[4:][_SYMMETRIC]
 
 
-def spatial_inertia(parameters: Float[Array, "10"]) -> Float[Array, "6 6"]:
+def spatial_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "6 6"]:
     """Spatial inertia M = [[m 1, -hat(m c)], [hat(m c), I]] (6, 6), linear part first (EQUATIONS section 0)."""
+    _check_shapes(parameters=(parameters, (10,)))
     first = so3.hat(parameters[1:4])
     mass = parameters[0] * jnp.eye(3, dtype=parameters.dtype)
     return jnp.block([[mass, -first], [first, rotational_inertia(parameters)]])
 
 
-def parameters_from_spatial(matrix: Float[Array, "6 6"]) -> Float[Array, "10"]:
+def parameters_from_spatial(matrix: Checked[Float[Array, "6 6"]]) -> Float[Array, "10"]:
     """The ten numbers of a spatial inertia (6, 6); inverse of `spatial_inertia`."""
+    _check_shapes(matrix=(matrix, (6, 6)))
     return jnp.concatenate([matrix[:1, 0], so3.vee(matrix[3:, :3]), matrix[3:, 3:][_TRIANGLE]])
 
 
@@ -41,6 +54,7 @@ def inertial_parameters(mass: Number, com: Numbers, inertia_com: Numbers) -> Flo
 
     Steiner's theorem: I_origin = I_com - m hat(c)^2.
     """
+    _check_shapes(mass=(mass, ()), com=(com, (3,)), inertia_com=(inertia_com, (3, 3)))
     com, inertia_com = jnp.asarray(com), jnp.asarray(inertia_com)
     mass = jnp.asarray(mass, com.dtype)
     outer = com[:, None] * com[None, :]
@@ -48,8 +62,11 @@ def inertial_parameters(mass: Number, com: Numbers, inertia_com: Numbers) -> Flo
     return jnp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
 
 
-def mass_com_inertia(parameters: Float[Array, "10"]) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
+def mass_com_inertia(
+    parameters: Checked[Float[Array, "10"]],
+) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
     """Mass (), centre of mass (3,) and rotational inertia about it (3, 3). A massless body has its centre at the origin."""
+    _check_shapes(parameters=(parameters, (10,)))
     mass, first = parameters[0], parameters[1:4]
     massless = mass == 0
     com = jnp.where(massless, jnp.zeros_like(first), first / jnp.where(massless, jnp.ones_like(mass), mass))
@@ -58,11 +75,16 @@ def mass_com_inertia(parameters: Float[Array, "10"]) -> tuple[Float[Array, ""], 
     return mass, com, rotational_inertia(parameters) - shift
 
 
-def transform_inertia(pose: Float[Array, "4 4"], parameters: Float[Array, "10"]) -> Float[Array, "10"]:
+def transform_inertia(
+    pose: Checked[Float[Array, "4 4"]], parameters: Checked[Float[Array, "10"]]
+) -> Float[Array, "10"]:
     """The ten numbers (10,) in frame a of a body whose numbers in frame b are given; `pose` T_ab (4, 4) maps b coordinates to a.
 
     No mass is divided by, so massless bodies are allowed and gradients stay finite.
+
+    **Raises:** ValueError for other shapes, as of arguments that are swapped.
     """
+    _check_shapes(pose=(pose, (4, 4)), parameters=(parameters, (10,)))
     rotation, shift = pose[:3, :3], pose[:3, 3]
     mass = parameters[0]
     first = rotation @ parameters[1:4]
@@ -74,39 +96,42 @@ def transform_inertia(pose: Float[Array, "4 4"], parameters: Float[Array, "10"])
     return jnp.concatenate([mass[None], first + mass * shift, inertia[_TRIANGLE]])
 
 
-def pseudo_inertia(parameters: Float[Array, "10"]) -> Float[Array, "4 4"]:
+def pseudo_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "4 4"]:
     """Pseudo-inertia [[Sigma, m c], [m c^T, m]] (4, 4), Sigma = tr(I)/2 1 - I.
 
     The parameters belong to a physical body if and only if this matrix is positive definite (Wensing, Kim & Slotine 2018,
     eq. 7; a positive semidefinite one is the limit of point, line and plane bodies).
     """
+    _check_shapes(parameters=(parameters, (10,)))
     inertia = rotational_inertia(parameters)
     sigma = 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=parameters.dtype) - inertia
     first = parameters[1:4]
     return jnp.block([[sigma, first[:, None]], [first[None, :], parameters[:1, None]]])
 
 
-def parameters_from_pseudo(matrix: Float[Array, "4 4"]) -> Float[Array, "10"]:
+def parameters_from_pseudo(matrix: Checked[Float[Array, "4 4"]]) -> Float[Array, "10"]:
     """The ten numbers of a pseudo-inertia (4, 4); inverse of `pseudo_inertia`: I = tr(Sigma) 1 - Sigma."""
+    _check_shapes(matrix=(matrix, (4, 4)))
     sigma = matrix[:3, :3]
     inertia = jnp.trace(sigma) * jnp.eye(3, dtype=matrix.dtype) - sigma
     return jnp.concatenate([matrix[3:, 3], matrix[:3, 3], inertia[_TRIANGLE]])
 
 
-def log_cholesky_factor(theta: Float[Array, "10"]) -> Float[Array, "4 4"]:
+def log_cholesky_factor(theta: Checked[Float[Array, "10"]]) -> Float[Array, "4 4"]:
     """Upper-triangular factor U (4, 4) of the pseudo-inertia U U^T that ten unconstrained numbers stand for.
 
     theta = (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3) and U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2],
     [0, 0, exp d3, t3], [0, 0, 0, 1]] (Rucker & Wensing 2022, eq. 16): the affine map (stretch, shear, shift, and exp(2 alpha)
     the mass) that carries a reference body of unit pseudo-inertia to the body. It is the identity at theta = 0.
     """
+    _check_shapes(theta=(theta, (10,)))
     alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = theta
     zero, one = jnp.zeros_like(alpha), jnp.ones_like(alpha)
     rows = [jnp.exp(d1), s12, s13, t1, zero, jnp.exp(d2), s23, t2, zero, zero, jnp.exp(d3), t3, zero, zero, zero, one]
     return jnp.exp(alpha) * jnp.stack(rows).reshape(4, 4)
 
 
-def from_log_cholesky(theta: Float[Array, "10"]) -> Float[Array, "10"]:
+def from_log_cholesky(theta: Checked[Float[Array, "10"]]) -> Float[Array, "10"]:
     """Physically feasible parameters from ten unconstrained numbers (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3).
 
     Pseudo-inertia = U U^T with U = `log_cholesky_factor(theta)` (Rucker & Wensing 2022, eq. 16). Every theta gives a feasible
@@ -116,11 +141,12 @@ def from_log_cholesky(theta: Float[Array, "10"]) -> Float[Array, "10"]:
     return parameters_from_pseudo(upper @ upper.T)
 
 
-def to_log_cholesky(parameters: Float[Array, "10"]) -> Float[Array, "10"]:
+def to_log_cholesky(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "10"]:
     """Ten unconstrained numbers (10,) of ten inertial parameters (10,): the inverse of `from_log_cholesky`.
 
     NaN when the parameters are not strictly feasible (see `is_feasible`).
     """
+    _check_shapes(parameters=(parameters, (10,)))
     matrix = pseudo_inertia(parameters)
     # U U^T with U upper triangular is the Cholesky factorisation of the matrix with rows and columns reversed.
     upper = jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
@@ -192,7 +218,9 @@ def point_mass(mass: Number, position: Numbers = (0.0, 0.0, 0.0)) -> Array | np.
 
 def displaced(parameters: Numbers, position: Numbers, rotation: Numbers | None = None) -> Array | np.ndarray:
     """Parameters (10,) of the same body placed at `position` (3,), turned by `rotation` (3, 3), in a new frame."""
-    pose = _f64.pose_of(np.eye(3) if rotation is None else rotation, position)
+    rotation = np.eye(3) if rotation is None else rotation
+    _check_shapes(parameters=(parameters, (10,)), position=(position, (3,)), rotation=(rotation, (3, 3)))
+    pose = _f64.pose_of(rotation, position)
     return _f64.move_inertia(pose, _numpy_for(parameters).asarray(parameters, float))
 
 

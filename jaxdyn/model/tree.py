@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.compile import is_concrete, is_expanding, numpy_for
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes, warn_of_inertias
 from jaxdyn.model.inertia import inertial_parameters, transform_inertia
 from jaxdyn.model.joints import (
     KINDS,
@@ -104,6 +104,8 @@ class Model(eqx.Module):
         """A copy with some leaves replaced, e.g. `model.replace(gravity=None)`.
 
         **Raises:** ValueError for a name that is not a leaf or for a shape that differs from the present one.
+
+        **Warns:** UserWarning naming bodies whose new `inertias` no body has, as `ModelBuilder.build` does.
         """
         return _replace(self, leaves)
 
@@ -202,6 +204,8 @@ def _replace(model: Model, leaves: dict) -> Model:
         want = sizes.get(name) or getattr(model, name).shape
         if np.shape(value) != want:
             raise ValueError(f"replace: {name} has shape {np.shape(value)}, expected {want}")
+        if name == "inertias" and is_concrete(value):
+            warn_of_inertias(dict(zip(model.body_names, np.asarray(value), strict=True)))
         leaves[name] = jnp.asarray(value, model.home.dtype) if not isinstance(value, jax.Array) else value
     leaves = {name: leaves.get(name, getattr(model, name)) for name in names}
     return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints)

@@ -6,7 +6,7 @@ A file that is missing or cannot be read is named in a warning; the body then ge
 
 import os
 import pathlib
-import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from jaxdyn.io.mjcf_file import compiled, library, named, pose_of
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import as_path
+from jaxdyn.model.arguments import parse_number, warn
 from jaxdyn.pictures.meshes import MeshError, find_mesh, read_mesh
 from jaxdyn.pictures.solids import Shape, Shapes
 
@@ -25,14 +25,14 @@ _SHOWN_GROUPS = 3
 _DEFAULT_GREY = (0.5, 0.5, 0.5, 1.0)  # of a geom without a colour
 
 
-def shapes(path: str | os.PathLike) -> Shapes:
+def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = None) -> Shapes:
     """The solids that a URDF, MJCF or SDF file shows, for `jd.view`, `jd.save_html` and `jd.draw`.
 
     A model holds no geometry; what is drawn is read from the file again and kept beside it. Meshes are STL, DAE, OBJ, PLY or
     GLB files, looked for at the path that the file gives, `package://` and `model://` in the folders above the file and
     in those of ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and GZ_SIM_RESOURCE_PATH.
 
-    **Arguments:** `path`, the file; its root element tells the format.
+    **Arguments:** `path`, the file; its root element tells the format. `arguments`: of a xacro file, as for `jd.load`.
 
     **Returns:** `Shapes`, a tuple of `Shape`s, with `.missing`: in words, what could not be drawn.
 
@@ -46,21 +46,21 @@ def shapes(path: str | os.PathLike) -> Shapes:
     jd.save_html("robot.html", model, solution, shapes=solids)
     ```
     """
-    file = XmlFile(path, "robot")
+    file = XmlFile(path, "robot", arguments)
     readers = {"robot": _urdf, "mujoco": _mjcf, "sdf": _sdf}
     if file.root.tag not in readers:
         raise file.fault(file.root, f"the root element is <{file.root.tag}>; expected <robot>, <mujoco> or <sdf>")
     drawn = readers[file.root.tag](file)
     if drawn.missing:
-        warnings.warn(f"{path}: not drawn from the file: {'; '.join(drawn.missing)}", NotTakenWarning, stacklevel=2)
+        warn(f"{path}: not drawn from the file: {'; '.join(drawn.missing)}", NotTakenWarning)
     return drawn
 
 
 class _Meshes:
     """Meshes of one file, each read once; those that are missing are collected."""
 
-    def __init__(self, path: str):
-        self.folder = pathlib.Path(as_path(path)).resolve().parent
+    def __init__(self, path: pathlib.Path):
+        self.folder = path.resolve().parent
         self.missing: list[str] = []
         self._read: dict[str, list[tuple]] = {}
 
@@ -80,7 +80,7 @@ class _Meshes:
 
 
 def _urdf(file: XmlFile) -> Shapes:
-    meshes, shapes = _Meshes(file.path), []
+    meshes, shapes = _Meshes(file.source), []
     materials = {element.get("name"): rgba for element in file.root.iter("material") if (rgba := _rgba(file, element))}
     for link in file.root.findall("link"):
         frame = file.name(link, "the robot")
@@ -122,7 +122,7 @@ def _attribute(file: XmlFile, element, key: str, count: int, what: str, default:
     if not text and default is not None:
         return default
     try:
-        values = np.array([float(part) for part in text.split()])
+        values = np.array([parse_number(part) for part in text.split()])
     except ValueError:
         values = np.zeros(0)
     if len(values) != count or not np.isfinite(values).all():
@@ -131,8 +131,8 @@ def _attribute(file: XmlFile, element, key: str, count: int, what: str, default:
 
 
 def _sdf(file: XmlFile) -> Shapes:
-    scene, shapes = SdfFile(file.path), []
-    meshes = _Meshes(file.path)
+    scene, shapes = SdfFile(file.source), []
+    meshes = _Meshes(file.source)
     for frame, (link, _) in scene.links.items():
         for visual in link.findall("visual"):
             what = f"<visual> of link {frame!r}"

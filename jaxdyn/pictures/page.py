@@ -226,7 +226,7 @@ class _Content:
             if n and frame is None:
                 continue  # what stands in the world is there once
             if frame not in groups:
-                groups[frame] = f"/motion{n}/{frame or 'world'}"
+                groups[frame] = "/world" if frame is None else f"/motion{n}/{_escaped(frame)}"
                 self.bodies.append((n, frame, self.scene.add_frame(groups[frame], show_axes=False)))
             opacity = opacity * (_GHOST_OPACITY if n else 1.0)
             self.scene.add_mesh_simple(
@@ -269,6 +269,11 @@ class _Content:
             handle.wxyz, handle.position = quaternion(_attitude(cone, row) @ back), cone.apex[0, row]
         if self.arrows is not None:
             self.arrows.points = self._arrows(row)
+
+
+def _escaped(name: str) -> str:
+    """A name as one step of a path in viser's scene tree, where a slash begins a child that moves with its parent."""
+    return name.replace("%", "%25").replace("/", "%2F")
 
 
 def _attitude(cone: Cone, row: int) -> np.ndarray:

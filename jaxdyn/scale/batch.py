@@ -18,7 +18,7 @@ from jaxdyn.scale.processes import process_of
 from jaxdyn.scale.progress import Progress
 from jaxdyn.scale.reducer import Reducer
 from jaxdyn.scale.reductions import Arrays, checked_reductions, described
-from jaxdyn.scale.store import Store, full_disk, zarr_package
+from jaxdyn.scale.store import Store, check_place, full_disk, zarr_package
 
 LISTED = 1000  # failures that a result lists
 PROGRAM = "program of a rollout (scene, control, solver, functions)"  # how a store names its hash
@@ -114,8 +114,7 @@ def whole(
     """
     zarr_package()
     path = as_path(options.out, "out")
-    if not path.parent.is_dir():
-        raise ValueError(f"out is {str(path)!r}: there is no directory {path.parent}")
+    check_place(path)
     for name in ("lanes", "chunk", "memory"):
         value = getattr(options, name)
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):

@@ -60,6 +60,22 @@ def zarr_package() -> Any:
     return zarr
 
 
+def check_place(path: Path) -> None:
+    """Refuse a place where no store can be.
+
+    **Raises:** ValueError that names `out`, for a file, a folder that is not there, and one that cannot be written.
+    """
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"out is {str(path)!r}, which is a file; name a directory")
+    if not path.parent.is_dir():
+        raise ValueError(f"out is {str(path)!r}: there is no directory {path.parent}")
+    place = path if path.exists() else path.parent
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise ValueError(
+            f"out is {str(path)!r}: {place} cannot be written; change its permissions, or name another place"
+        )
+
+
 class Store:
     """A store on disk, open to be written.
 
@@ -76,18 +92,32 @@ class Store:
                 attributes = dict(self.group.attrs)
             except (FileNotFoundError, NotADirectoryError):  # it is there, and is no group of Zarr
                 attributes = {}
+            except PermissionError:
+                raise
+            except Exception as error:  # zarr reads the file with few checks: JSON, keys, types
+                raise self._damaged(error) from error
         if attributes.get("jaxdyn_store") != FORMAT:
             version = attributes.get("jaxdyn_store", "nothing")
             raise ValueError(
                 f"out is {str(path)!r}, whose format is {version} of jaxdyn and not {FORMAT}: it is of another version, or no "
                 "store of jd.scale; name another one"
             )
-        self.description = attributes["description"]
-        self.count, self.chunk = attributes["rollouts"], attributes["chunk"]
-        self.chunks = -(-self.count // self.chunk)
-        self.names = tuple(attributes["arrays"])
-        self._arrays = {name: self.group[name] for name in self.names}
-        self._record = self.group["record/checksum"]
+        try:
+            self.description = dict(attributes["description"])
+            self.count, self.chunk = int(attributes["rollouts"]), int(attributes["chunk"])
+            self.chunks = -(-self.count // self.chunk)
+            self.names = tuple(attributes["arrays"])
+            self._arrays: dict[str, Any] = {name: self.group[name] for name in self.names}
+            self._record: Any = self.group["record/checksum"]
+        except (KeyError, TypeError, ValueError, ArithmeticError, OSError) as error:
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception) -> ValueError:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        return ValueError(
+            f"out is {str(self.path)!r}, whose zarr.json is damaged ({type(error).__name__}: {reason}); put it back from a "
+            "copy, or name another store"
+        )
 
     @classmethod
     def create(

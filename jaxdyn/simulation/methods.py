@@ -80,7 +80,7 @@ class Method(eqx.Module):
     def evaluated(
         self, scene: Scene, y: State, t: Number, generalized_force: Callable[[Array, Array, Number], Array | None]
     ) -> tuple[State, Array | None, Array]:
-        """dy/dt with effort(q, v, t) for the force; the force (nv,) or None; and v (nv,)."""
+        """dy/dt with generalized_force(q, v, t) for the force; the force (nv,) or None; and v (nv,)."""
         q, v = self.to_qv(scene, y, t)
         force = generalized_force(q, v, t)
         return self.rates(scene, y, q, v, t, force), force, v

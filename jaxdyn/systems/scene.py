@@ -32,18 +32,22 @@ class _Static(eqx.Module):
         return self.function(*args)
 
 
-def as_pytree(function: Any, argument: str) -> Callable:
+def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
     """The callable itself if it is a pytree (an equinox Module, a `jax.tree_util.Partial`), else a static wrapper of
     it. A method of a pytree becomes a `Partial` that holds the pytree.
 
     A plain function is compared by identity: the same one gives the same compiled program, with the numbers it read when
     it was traced; a lambda written anew in every call gives a new one.
 
-    **Raises:** ValueError when `function` cannot be called, and for an object with attributes that is no pytree: the
-    compiled program would keep their first values; `argument` says where it came from.
+    `takes` names the arguments that it is called with, as "q, t".
+
+    **Raises:** ValueError when `function` cannot be called, or not with these arguments, and for an object with attributes that
+    is no pytree: the compiled program would keep their first values; `argument` says where it came from.
     """
     if not callable(function):
         raise ValueError(f"{argument} is {function!r}, which cannot be called; pass a function or a callable Module")
+    if takes:
+        _check_arguments(function, argument, takes)
     if not jax.tree_util.all_leaves([function]):
         return function
     owner = function.__self__ if isinstance(function, types.MethodType) else function
@@ -154,6 +158,17 @@ def checked_force(value, q: Float[Array, " nq"], nv: int, argument: str) -> Floa
         hint = batch_hint(value, (nv,))
         raise ValueError(f"{argument} returned shape {jnp.shape(value)}, expected {(nv,)} = (nv,){hint}")
     return as_array(value, argument, q.dtype)
+
+
+def _check_arguments(function: Any, argument: str, takes: str) -> None:
+    try:
+        signature = inspect.signature(function.function if isinstance(function, _Static) else function)
+    except (TypeError, ValueError):  # of what is not written in Python
+        return
+    try:
+        signature.bind(*takes.split(", "))
+    except TypeError as error:
+        raise ValueError(f"{argument} takes {signature}, but is called as ({takes}); {error}") from None
 
 
 def check_callback(function: Callable, name: str, signature: str, *args, first: tuple = ()) -> None:

@@ -121,8 +121,9 @@ class MetricSystem(System):
     def __init__(
         self, metric: Function, nq: Checked[int], *, potential: Function | None = None, parameters: PyTree = None
     ):
-        self.metric = as_pytree(metric, "metric")
-        self.potential = None if potential is None else as_pytree(potential, "potential")
+        more = "" if parameters is None else ", t, parameters"
+        self.metric = as_pytree(metric, "metric", "q" + more)
+        self.potential = None if potential is None else as_pytree(potential, "potential", "q" + more)
         self.nq = checked_size(nq)
         self.parameters = jax.tree.map(as_parameter, parameters)
 
@@ -186,9 +187,10 @@ class ExplicitSystem(System):
         parameters: PyTree = None,
         potential: Function | None = None,
     ):
-        self._mass_matrix = as_pytree(mass_matrix, "mass_matrix")
-        self._bias_force = as_pytree(bias_force, "bias_force")
-        self._potential = None if potential is None else as_pytree(potential, "potential")
+        more = "" if parameters is None else ", t, parameters"
+        self._mass_matrix = as_pytree(mass_matrix, "mass_matrix", "q" + more)
+        self._bias_force = as_pytree(bias_force, "bias_force", "q, v" + more)
+        self._potential = None if potential is None else as_pytree(potential, "potential", "q" + more)
         self.nq = checked_size(nq)
         self.parameters = jax.tree.map(as_parameter, parameters)
 
