@@ -150,10 +150,10 @@ def measured_columns(log: Log, columns: Callable[..., np.ndarray], *signals: np.
     """`columns(log, *signals)` (n, ...) as the log's filter would have left them, sampled finely enough to be filtered.
 
     A filtered log keeps some 15 samples of a period of its cut-off, between which the sign of a velocity changes at an unknown
-    time: a friction column sampled there is wrong by up to half a sample at every reversal, which other terms (pre-sliding, friction
-    quadratic in the velocity) then explain. The signals are smooth, so they are interpolated by cubic splines to eight times as many
-    samples; the columns are computed there, low-passed, and thinned out again. Logs without a filter, and those with other
-    coordinates than one for each joint, are taken as they are.
+    time: a friction column sampled there is wrong by up to half a sample at every reversal, which other terms (pre-
+    sliding, friction quadratic in the velocity) then explain. The signals are smooth, so they are interpolated by
+    cubic splines to eight times as many samples; the columns are computed there, low-passed, and thinned out again.
+    Logs without a filter, and those with other coordinates than one for each joint, are taken as they are.
     """
     rate = (len(log) - 1) / float(log.t[-1] - log.t[0]) if len(log) > 1 else 0.0
     fine = 1 if log.cutoff is None or not rate else int(np.ceil(_FINE * log.cutoff / rate))

@@ -102,7 +102,9 @@ class Fit(AbstractFit):
         torque = super().torques(log)
         if self.as_measured:
             column = coulomb_column(log, float(self.friction.v_s))
-            torque = torque + np.asarray(self.friction.coulomb) * (measured_coulomb(log, float(self.friction.v_s)) - column)
+            torque = torque + np.asarray(self.friction.coulomb) * (
+                measured_coulomb(log, float(self.friction.v_s)) - column
+            )
         if self.extra is None:
             return torque
         load = np.zeros_like(torque)

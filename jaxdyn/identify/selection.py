@@ -1,7 +1,7 @@
 """Smoothing velocity, loss, extra torque terms and prior weight by cross-validation over logs, or over blocks of them.
 
-Every setting is fitted with one part of the blocks left out in turn, and compared by its error there: the mean over the torques of
-the logarithm of their squared errors, which asks for the same share of improvement of a wrist as of a shoulder.
+Every setting is fitted with one part of the blocks left out in turn, and compared by its error there: the mean over the torques
+of the logarithm of their squared errors, which asks for the same share of improvement of a wrist as of a shoulder.
 
 Held-out errors are random, so the best of forty settings is better than the simplest one by chance. A simple setting is therefore
 left only for an improvement that groups of blocks agree upon:
@@ -81,7 +81,12 @@ class Search:
     """
 
     def __init__(
-        self, fit: Callable, parts: Sequence[np.ndarray], torque: float, samples: float, callback: Callable | None = None
+        self,
+        fit: Callable,
+        parts: Sequence[np.ndarray],
+        torque: float,
+        samples: float,
+        callback: Callable | None = None,
     ):
         self._fit, self._parts, self._torque, self._callback = fit, parts, torque, callback
         self._groups = block_groups(sum(map(len, parts)), samples)
