@@ -71,6 +71,8 @@ from jaxdyn.dynamics.quantities import rnea as rnea
 from jaxdyn.dynamics.quantities import torque_regressor as torque_regressor
 from jaxdyn.dynamics.workspace import WorkspaceDynamics as WorkspaceDynamics
 from jaxdyn.dynamics.workspace import workspace_dynamics as workspace_dynamics
+from jaxdyn.export import Exported as Exported
+from jaxdyn.export import export as export
 from jaxdyn.forces.dissipation import RayleighDissipation as RayleighDissipation
 from jaxdyn.forces.dissipation import SlidingFriction as SlidingFriction
 from jaxdyn.forces.elements import CoulombFriction as CoulombFriction
@@ -80,6 +82,7 @@ from jaxdyn.forces.elements import JointDamping as JointDamping
 from jaxdyn.forces.elements import JointSpring as JointSpring
 from jaxdyn.forces.limits import EffortLimits as EffortLimits
 from jaxdyn.forces.limits import JointStops as JointStops
+from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
 from jaxdyn.geometry.immersion import constrain_by_immersion as constrain_by_immersion
 from jaxdyn.geometry.immersion import reaction_force as reaction_force
 from jaxdyn.io import Actuators as Actuators

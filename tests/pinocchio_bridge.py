@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
+from xla_options import QUICK
 
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
 from jaxdyn.model.tree import Model, Topology
@@ -55,14 +56,8 @@ class Bridge:
 
 
 def quick(function):
-    """`jax.jit` that compiles fast and runs slowly, for tests that compare numbers of many models.
-
-    LLVM's optimiser and XLA's newer fusion emitters are most of a compile; neither changes what is computed.
-    """
-    return jax.jit(
-        function,
-        compiler_options={"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": False},
-    )
+    """`jax.jit` that compiles fast and runs slowly, for tests that compare numbers of many models."""
+    return jax.jit(function, compiler_options=QUICK)
 
 
 def to_pinocchio(model: Model) -> tuple[pin.Model, Bridge]:

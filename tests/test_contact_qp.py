@@ -325,3 +325,18 @@ def test_bad_input_is_refused(change, match):
     good = dict(Q=jnp.eye(2), q=jnp.ones(2), G=jnp.ones((1, 2)), h=jnp.ones(1))
     with pytest.raises(ValueError, match=match):
         solve_qp(**{**good, **change})
+
+
+def test_data_that_are_not_finite_have_a_code():
+    """In every argument, under jit, where nothing can be refused; an infinite h is no bound."""
+    program = [np.eye(2), [-2.0, 0.0], [[1.0, 0.0]], [1.0], [[0.0, 1.0]], [0.5]]
+    program = [np.asarray(x, float) for x in program]
+    rows = [program]
+    for i in range(6):
+        for bad in (np.nan, np.inf):
+            changed = [x.copy() for x in program]
+            changed[i].flat[0] = bad
+            rows.append(changed)
+    batch = [jnp.stack([row[i] for row in rows]) for i in range(6)]
+    results = jax.jit(jax.vmap(lambda *given: solve_qp(*given).result))(*batch)
+    np.testing.assert_array_equal(np.flatnonzero(results != RESULTS.nonfinite), [0, 8])

@@ -1,12 +1,14 @@
 """Reverse mode through adaptive steps takes the steps of the forward run, whatever controls them."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
 import pytest
 
+import jaxdyn as jd
 from jaxdyn.simulation.solvers import differentiable
 from jaxdyn.simulation.solvers.first_step import Adaptive
 
@@ -150,3 +152,26 @@ def test_runs_that_end_early(case):
     assert stats["num_accepted_steps"] == int(case == "one step")
     # At 1e-6 s, x_1 has changed by 1e-6 x_0 r.
     np.testing.assert_allclose(slope, 1e-6 if case == "one step" else 0.0, rtol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"rtol": 1e-10, "atol": 1e-10}, {"stepsize": 5e-3}])
+def test_hessian_of_a_motion_over_the_default_adjoint(options):
+    """Of q0 cos(w T) + v0 sin(w T)/w by q0, v0 and w, forward over reverse and reverse over reverse."""
+
+    class Oscillator(eqx.Module):
+        rate: jax.Array
+
+        def __call__(self, system, q, v, t):
+            return -(self.rate**2) * q
+
+    system = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v, 1)
+
+    def end(x):
+        scene = jd.Scene(system, forces=[Oscillator(x[2])])
+        return jd.simulate(scene, x[:1], x[1:2], jnp.asarray([0.0, 0.4, 1.0]), **options).q[-1, 0]
+
+    x = jnp.asarray([0.7, -0.4, 3.0])
+    exact = jax.hessian(lambda x: x[0] * jnp.cos(x[2]) + x[1] * jnp.sin(x[2]) / x[2])(x)
+    np.testing.assert_allclose(jax.hessian(end)(x), exact, atol=1e-8)
+    np.testing.assert_allclose(jax.jacrev(jax.jacrev(end))(x), exact, atol=1e-8)

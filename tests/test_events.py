@@ -390,7 +390,7 @@ def test_float32_finds_the_same_events():
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=-0.1), "stepsize"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=diffrax.PIDController(1e-6, 1e-6)), "stepsize"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, solver=jd.Rodas5P()), "solver"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, adjoint="forward"), "adjoint"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, adjoint="backsolve"), "adjoint"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, outputs=("work",)), "outputs"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, max_events=0), "max_events"),
         (lambda: jd.simulate(block(normal="rail"), [0.0], [1.0], TS), "rail"),

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from xla_options import flags
 
 from jaxdyn.compile.code import varying_first
 
@@ -88,7 +89,7 @@ def test_kernels_stay_within_their_buffers(request, derivatives):
     """Straight programs, those with subprograms, pseudo-inverses and loops; one lane and several, whole blocks and rests."""
     code = PROGRAM.format(tests=str(request.path.parent), derivatives=derivatives)
     # Kernels are not XLA's, so its optimiser may be left out.
-    options = {"XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"}
+    options = {"XLA_FLAGS": flags()}
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=os.environ | options, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -79,6 +79,7 @@ nu = jnp.zeros(motions.object.shape[1] + motions.internal.shape[1])
 NAMES = {
     "DryFriction": "system = jd.MetricSystem(lambda q: jnp.eye(1), 1)",
     "JointStops": "robot = model",
+    "PiecewiseForce": "system = model",
     "ModelBuilder": "from jaxdyn import ModelBuilder",
     "compilation": TWO,
     "control.GraspForce": """

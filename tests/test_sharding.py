@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from xla_options import flags
 
 pytestmark = pytest.mark.native
 
@@ -20,7 +21,7 @@ def _run(*what: str, **environment: str) -> list:
 
 
 # Devices exchange the same without LLVM's optimiser, which is most of these compiles.
-QUICK = {"XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"}
+QUICK = {"XLA_FLAGS": flags()}
 
 
 @pytest.fixture(scope="module")

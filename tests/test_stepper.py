@@ -145,3 +145,22 @@ def test_limits_cut_the_control_and_nothing_else():
 def test_what_does_not_fit_is_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+@pytest.mark.slow
+def test_second_derivatives_and_forward_mode_of_steps():
+    """A pendulum-like oscillator of rate w: one step of RK4 is the Taylor series of cos(w h) to (w h)^4."""
+    system = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v - 0.5 * 9.0 * q @ q, 1)
+
+    def after(adjoint, x):
+        return jd.stepper(system, 0.1, adjoint=adjoint)((x[:1], x[1:]), jnp.zeros(1))[0][0] ** 2
+
+    x, z = jnp.asarray([0.7, -0.4]), 0.3
+    row = np.array([1 - z**2 / 2 + z**4 / 24, (z - z**3 / 6) / 3])
+    for adjoint in ("reverse", "forward", "direct"):
+        hessian = jax.hessian(lambda x: after(adjoint, x))(x)  # noqa: B023
+        np.testing.assert_allclose(hessian, 2 * np.outer(row, row), rtol=1e-12)
+    slopes = jax.jacfwd(lambda x: after("forward", x))(x)
+    np.testing.assert_allclose(slopes, 2 * (row @ x) * row, rtol=1e-12)
+    with pytest.raises(ValueError, match="adjoint is 'back'"):
+        jd.stepper(system, 0.1, adjoint="back")

@@ -1,4 +1,5 @@
-"""The command line: `jaxdyn info`, `jaxdyn simulate`, `jaxdyn sweep`, `jaxdyn excite`, `jaxdyn identify` and `jaxdyn report`."""
+"""The command line: `jaxdyn info`, `jaxdyn simulate`, `jaxdyn sweep`, `jaxdyn excite`, `jaxdyn identify`, `jaxdyn report` and
+`jaxdyn export`."""
 
 import argparse
 import sys
@@ -7,9 +8,9 @@ from collections.abc import Sequence
 import jax
 
 from jaxdyn import __version__
-from jaxdyn.cli import excite, identify, info, report, simulate, sweep
+from jaxdyn.cli import excite, export, identify, info, report, simulate, sweep
 
-COMMANDS = (info, simulate, sweep, excite, identify, report)
+COMMANDS = (info, simulate, sweep, excite, identify, report, export)
 _EPILOG = """\
 examples:
   jaxdyn info panda.urdf
@@ -17,6 +18,7 @@ examples:
   jaxdyn sweep study.toml
   jaxdyn identify --urdf panda.urdf --log log.csv --out fitted.urdf
   jaxdyn report four_bar --out report
+  jaxdyn export panda.urdf --function forward_dynamics --jacobian --out panda_fd
 
 All numbers are in SI units and radians, in float64. `jaxdyn COMMAND --help` explains a command.
 Exit status: 0 done; 1 the computation failed; 2 wrong input or arguments.
@@ -28,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="jaxdyn",
         description="Rigid-body dynamics of robots: look at a file, simulate it, alone and in studies of many rollouts, identify "
-        "its inertias from a log; and report error against run time.",
+        "its inertias from a log; report error against run time, and export functions to C.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -13,6 +13,7 @@ from jaxdyn.compile.calls import compiled as compiled
 from jaxdyn.compile.calls import glue_options as glue_options
 from jaxdyn.compile.flags import unless as unless
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
+from jaxdyn.compile.jax_adapter import function_of as function_of
 from jaxdyn.compile.kernel import compute as compute
 from jaxdyn.compile.kernel import native as native
 from jaxdyn.compile.kernel import run as run
@@ -38,6 +39,4 @@ from jaxdyn.compile.repair import run_repaired as run_repaired
 from jaxdyn.compile.rows import map_rows as map_rows
 from jaxdyn.compile.rules import along as along
 from jaxdyn.compile.rules import implicit as implicit
-from jaxdyn.compile.versions import warn_of_version as _warn_of_version
-
-_warn_of_version()
+from jaxdyn.compile.trial import run_trial as _run_trial  # noqa: F401 (it registers itself)

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 
 from jaxdyn.compile import ahead, mode
+from jaxdyn.compile.jax_adapter import known_options
 from jaxdyn.compile.known import is_concrete, is_staged
 
 
@@ -44,16 +45,11 @@ _LEAST = _QUICK | {"xla_backend_optimization_level": 0}
 def quick_options() -> dict[str, Any] | None:
     """Options with which XLA compiles glue quickly.
 
-    None where the environment asks for the usual ones, or XLA does not know these.
+    None where the environment asks for the usual ones.
     """
     if mode.wants_usual_options():
         return None
-    options = _LEAST if mode.wants_least_optimisation() else _QUICK
-    try:
-        jax.jit(lambda: 0.0, compiler_options=options)()
-    except jax.errors.JaxRuntimeError:
-        return None
-    return options
+    return known_options(_LEAST if mode.wants_least_optimisation() else _QUICK)
 
 
 def glue_options(platform: str) -> dict[str, Any] | None:

@@ -198,10 +198,8 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
     return framed(e, f"{count} {sizes}", uniform, len(program.outputs), body.allocated())
 
 
-def framed(
-    e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocated: Sequence[str], last_block: str = "block"
-) -> str:
-    """The text of a whole kernel around the lines that `e` holds for the W samples from %base on; they end in `last_block`.
+def framed(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocated: Sequence[str]) -> str:
+    """The text of a whole kernel around the lines that `e` holds for the W samples from %base on, which may have labels.
 
     `uniform` says which arguments are the same for all samples; so many `outputs` follow them. `title` is a comment on top, and
     part of what is hashed.
@@ -220,8 +218,10 @@ def framed(
             "  %some = icmp ult i64 %begin, %end",
             "  br i1 %some, label %block, label %done",
             "block:",
-            f"  %base = phi i64 [ %begin, %entry ], [ %next, %{last_block} ]",
+            "  %base = phi i64 [ %begin, %entry ], [ %next, %following ]",
             *e.lines,
+            "  br label %following",
+            "following:",
             f"  %next = add i64 %base, {e.width}",
             "  %more = icmp ult i64 %next, %end",
             "  br i1 %more, label %block, label %done",

@@ -4,6 +4,7 @@ The change of every number is a sum of its partial derivatives times the changes
 Reverse mode is the transpose of that program in the changes, so that values which both need are there once.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,7 +19,8 @@ def tangent(program: Program, moving: Sequence[bool]) -> Program:
     moving = tuple(moving)
     if moving not in program.derived:
         rule = program.derivative
-        program.derived[moving] = _tangent(program, moving) if rule is None else rule(moving)
+        with np.errstate(all="ignore"):  # known numbers may overflow, as they do in XLA
+            program.derived[moving] = _tangent(program, moving) if rule is None else rule(moving)
     return program.derived[moving]
 
 
@@ -62,11 +64,25 @@ def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
         return g.mul(g.sub(d[0], g.mul(value, d[1])), inverse)
     if op == "select":
         return g.select(x[0], d[1], d[2], kind)
-    if op in ("max", "min"):  # where both are equal, half of each, as JAX does
-        first = g.compare("gt" if op == "max" else "lt", x[0], x[1])
-        equal = g.compare("eq", x[0], x[1])
-        chosen = g.select(first, d[1], d[0], kind)
-        return g.select(equal, chosen, g.mul(0.5, g.add(d[0], d[1])), kind)
+    # Ties are decided as JAX decides them: a maximum of two gives each half, one of several gives all that are largest the same
+    # share, and a number on a bound of its range does not move. Nothing moves a maximum that is not a number.
+    if op in ("max", "min"):
+        words = ("gt", "lt") if op == "max" else ("lt", "gt")
+        first, second = (g.compare(word, x[0], x[1]) for word in words)
+        chosen = g.select(first, g.select(second, 0.0, d[1], kind), d[0], kind)
+        return g.select(g.compare("eq", x[0], x[1]), chosen, g.mul(0.5, g.add(d[0], d[1])), kind)
+    if op in ("reduce_max", "reduce_min"):
+        hits = [g.compare("eq", entry, value) for entry in x]
+        total = functools.reduce(g.add, [g.select(hit, 0.0, step, kind) for hit, step in zip(hits, d, strict=True)])
+        return g.div(total, functools.reduce(g.add, [g.convert(hit, kind) for hit in hits]))
+    if op == "clamp":
+        low, inner, high = x
+        is_below = g.both(g.compare("gt", low, inner), g.compare("lt", low, high))
+        is_inside = g.both(g.compare("gt", inner, low), g.compare("lt", inner, high))
+        flags = is_below, is_inside, g.compare("lt", high, inner)
+        return functools.reduce(g.add, [g.select(flag, 0.0, step, kind) for flag, step in zip(flags, d, strict=True)])
+    if op == "abs":
+        return g.select(g.compare("ge", x[0], 0.0), g.neg(d[0]), d[0], kind)
     if op == "convert":
         return g.convert(d[0], kind)
     if op in _PARTIAL:
@@ -75,13 +91,16 @@ def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
         by_base = g.mul(x[1], g.function_of_two("pow", x[0], g.sub(x[1], 1.0)))
         total = g.mul(by_base, d[0])
         if is_number(d[1]) or d[1] != 0:
-            positive = g.compare("gt", x[0], 0.0)
-            logarithm = g.function("log", g.select(positive, 1.0, x[0], kind))
+            # At a base of zero the power is zero or one whatever the exponent is; below zero it is no function of the exponent.
+            is_zero = g.compare("eq", x[0], 0.0)
+            logarithm = g.function("log", g.select(is_zero, x[0], 1.0, kind))
             total = g.add(total, g.mul(g.mul(value, logarithm), d[1]))
         return total
     if op == "atan2":
-        inverse = g.div(1.0, g.add(g.mul(x[0], x[0]), g.mul(x[1], x[1])))
-        return g.mul(g.sub(g.mul(x[1], d[0]), g.mul(x[0], d[1])), inverse)
+        square = g.add(g.mul(x[0], x[0]), g.mul(x[1], x[1]))
+        by_first = g.mul(g.div(x[1], square), d[0]) if is_number(d[0]) or d[0] != 0 else 0.0
+        by_second = g.mul(g.div(x[0], square), d[1]) if is_number(d[1]) or d[1] != 0 else 0.0
+        return g.sub(by_first, by_second)
     if op == "rem":
         quotient = g.div(x[0], x[1])
         whole = g.select(
@@ -107,8 +126,7 @@ _PARTIAL: dict[str, Callable[..., Any]] = {
     "expm1": lambda g, y, x: g.add(y, 1.0),
     "log": lambda g, y, x: g.div(1.0, x),
     "log1p": lambda g, y, x: g.div(1.0, g.add(1.0, x)),
-    "abs": lambda g, y, x: g.function("sign", x),
-    "cbrt": lambda g, y, x: g.div(y, g.mul(3.0, x)),
+    "cbrt": lambda g, y, x: g.mul(1 / 3, g.power(y, -2)),  # not y / (3 x), which is not a number at zero
 }
 
 
@@ -119,7 +137,8 @@ def transposed(program: Program, linear: Sequence[bool], given: Sequence[bool]) 
     """
     key = ("transposed", tuple(linear), tuple(given))
     if key not in program.derived:
-        program.derived[key] = _transposed(program, tuple(linear), tuple(given))
+        with np.errstate(all="ignore"):
+            program.derived[key] = _transposed(program, tuple(linear), tuple(given))
     return program.derived[key]
 
 

@@ -12,14 +12,13 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Literal
 
 from jaxdyn.compile import matrices
 from jaxdyn.compile import program as numbers
-from jaxdyn.compile.constants import bound, computed, of_nothing
+from jaxdyn.compile.constants import bound, computed, converted, of_nothing
 from jaxdyn.compile.graph import Graph, Number, as_objects, objects
-from jaxdyn.compile.program import Array, NotNumbers, Program, kind_of
+from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts
+from jaxdyn.compile.program import Array, NotNumbers, Program, as_kind, kind_of
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS, written
 
 # A function of fewer operations is written where it is called.
@@ -70,17 +69,16 @@ class _Expansion:
         unary = {"neg": graph.neg, "not": graph.invert, "is_finite": graph.is_finite}
         unary |= {name: functools.partial(graph.function, name) for name in numbers.FUNCTIONS}
         unary |= {"square": lambda x: graph.mul(x, x), "rsqrt": lambda x: graph.div(1.0, graph.function("sqrt", x))}
+        unary |= {
+            "log2": lambda x: graph.div(graph.function("log", x), math.log(2.0)),
+            "one_minus_square": self._one_less,
+        }
         self.elementwise = {name: np.frompyfunc(f, 2, 1) for name, f in binary.items()}
         self.elementwise |= {name: np.frompyfunc(f, 1, 1) for name, f in unary.items()}
         self.divide = np.frompyfunc(graph.div, 2, 1)
-        self.reductions = {
-            "reduce_sum": graph.add,
-            "reduce_prod": graph.mul,
-            "reduce_max": functools.partial(graph.function_of_two, "max"),
-            "reduce_min": functools.partial(graph.function_of_two, "min"),
-            "reduce_and": graph.both,
-            "reduce_or": graph.either,
-        }
+        chains = {"sum": graph.add, "prod": graph.mul, "and": graph.both, "or": graph.either}
+        self.reductions = {f"reduce_{name}": functools.partial(functools.reduce, f) for name, f in chains.items()}
+        self.reductions |= {name: functools.partial(graph.extreme, name) for name in ("reduce_max", "reduce_min")}
 
     def evaluate(self, jaxpr, consts, args) -> list:
         values = dict(zip(jaxpr.constvars, (_constant(x) for x in consts), strict=True))
@@ -106,7 +104,7 @@ class _Expansion:
         if name in _INNER:
             inner = params[_INNER[name]]
             self.has_rules |= name.startswith("custom_")
-            if self.calls and name in ("jit", "pjit"):
+            if self.calls and name == "jit":
                 return self._called(inner, args)
             return self.closed(inner, args) if isinstance(inner, ClosedJaxpr) else self.evaluate(inner, (), args)
         rule = _OTHER.get(name)
@@ -126,11 +124,12 @@ class _Expansion:
         if name in self.elementwise:
             if name in _OF_FLOATS and any(x.aval.dtype.kind != "f" for x in eqn.invars):
                 raise NotNumbers(f"{name} of integers")
-            return [as_objects(self.elementwise[name](*args))]
+            # numpy would make Python's numbers of entries, which forget their type.
+            return [as_objects(self.elementwise[name](*(as_objects(x) for x in args)))]
         if name == "div":
             if out.dtype.kind != "f":
                 raise NotNumbers("division of integers")
-            return [as_objects(self.divide(*args))]
+            return [as_objects(self.divide(*(as_objects(x) for x in args)))]
         if name in self.reductions:
             return [self._reduced(name, args[0], params["axes"], out)]
         raise NotNumbers(name)
@@ -153,7 +152,7 @@ class _Expansion:
         if not count:
             return as_objects(np.full(out.shape, of_nothing(name, out.dtype), out.dtype))
         rows = np.moveaxis(as_objects(array), axes, range(len(axes))).reshape(count, math.prod(out.shape))
-        return objects([functools.reduce(fold, column) for column in rows.T.tolist()], out.shape)
+        return objects([fold(column) for column in rows.T.tolist()], out.shape)
 
     # --- rules that need more than the entries ---
 
@@ -169,6 +168,19 @@ class _Expansion:
 
         return objects([rounded(x) for x in array.ravel().tolist()], array.shape)
 
+    def _one_less(self, x):
+        """1 - x^2; the square where its rounding is small, else the product that is exact near one."""
+        g = self.graph
+        is_small = g.compare("lt", g.function("abs", x), 0.5)
+        return g.select(is_small, g.mul(g.add(1.0, x), g.sub(1.0, x)), g.sub(1.0, g.mul(x, x)), x.kind)
+
+    def _polynomial(self, params, args, eqn):
+        """Horner's rule; the coefficients follow x, that of the highest power last."""
+        shape = eqn.outvars[0].aval.shape
+        x, *coefficients = (np.broadcast_to(as_objects(y), shape) for y in args)
+        add, mul = self.elementwise["add"], self.elementwise["mul"]
+        return [as_objects(functools.reduce(lambda value, c: add(mul(value, x), c), reversed(coefficients)))]
+
     def _same(self, params, args, eqn):
         return args
 
@@ -181,17 +193,15 @@ class _Expansion:
         return [objects(chosen, args[1].shape)]
 
     def _convert(self, params, args, eqn):
-        if args[0].dtype.kind != "O":
-            return [args[0].astype(params["new_dtype"])]
-        kind = _kind(params["new_dtype"])
-        return [objects([self.graph.convert(x, kind) for x in args[0].ravel().tolist()], args[0].shape)]
+        return [self._as_dtype(args[0], params["new_dtype"])]
 
     def _integer_pow(self, params, args, eqn):
         if args[0].dtype.kind != "O":
             return [
                 np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)
             ]
-        return [objects([self.graph.power(x, params["y"]) for x in args[0].ravel().tolist()], args[0].shape)]
+        one = as_kind(1, _kind(eqn.outvars[0].aval.dtype))
+        return [objects([self.graph.power(x, params["y"], one) for x in args[0].ravel().tolist()], args[0].shape)]
 
     def _select(self, params, args, eqn):
         which, *cases = args
@@ -213,8 +223,7 @@ class _Expansion:
 
     def _clamp(self, params, args, eqn):
         low, x, high = (np.broadcast_to(as_objects(x), eqn.outvars[0].aval.shape).ravel().tolist() for x in args)
-        pick = self.graph.function_of_two
-        clamped = [pick("min", pick("max", b, a), c) for a, b, c in zip(low, x, high, strict=True)]
+        clamped = [self.graph.clamp(a, b, c) for a, b, c in zip(low, x, high, strict=True)]
         return [objects(clamped, eqn.outvars[0].aval.shape)]
 
     def _dot_general(self, params, args, eqn):
@@ -230,9 +239,21 @@ class _Expansion:
         b = np.moveaxis(b, (*batch_b, *sum_b), (*range(len(batch_b)), *range(-len(sum_b), 0))).reshape(
             count, columns, length
         )
+        # The result may be asked for in a wider type than that of the operands, and is summed in it.
+        a, b = (self._as_dtype(x, out.dtype) for x in (a, b))
+        if out.dtype == bool:
+            raise NotNumbers("a product of bools")
         if a.dtype.kind != "O" and b.dtype.kind != "O":
             return [np.asarray(a @ b.transpose(0, 2, 1), out.dtype).reshape(out.shape)]
-        return [objects(matrices.product(self.graph, a, b, 0.0 if out.dtype.kind == "f" else 0), out.shape)]
+        zero = as_kind(0, _kind(out.dtype))
+        return [objects(matrices.product(self.graph, as_objects(a), as_objects(b), zero), out.shape)]
+
+    def _as_dtype(self, x: np.ndarray, dtype) -> np.ndarray:
+        """An array, known or not, as one of a dtype."""
+        if x.dtype.kind != "O":
+            return converted(x, dtype)
+        kind = _kind(dtype)
+        return objects([self.graph.convert(y, kind) for y in x.ravel().tolist()], x.shape)
 
     def _scatter(self, params, args, eqn):
         operand, indices, updates = args
@@ -254,17 +275,17 @@ class _Expansion:
         return [np.moveaxis(sums, 0, params["axis"])]
 
     def _scan(self, params, args, eqn):
-        consts, carry = args[: params["num_consts"]], args[params["num_consts"] :][: params["num_carry"]]
-        rows = args[params["num_consts"] + params["num_carry"] :]
+        count, carried = scan_counts(params)
+        consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
         saved: list[list] = []
         length = params["length"]
         for i in reversed(range(length)) if params["reverse"] else range(length):
             results = self.closed(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
-            carry = results[: params["num_carry"]]
-            saved.append(results[params["num_carry"] :])
+            carry = results[:carried]
+            saved.append(results[carried:])
         if params["reverse"]:
             saved.reverse()
-        outs = [x.aval for x in eqn.outvars[params["num_carry"] :]]
+        outs = [x.aval for x in eqn.outvars[carried:]]
         if not length:
             return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
         return [*carry, *(_stacked(column) for column in zip(*saved, strict=True))]
@@ -345,13 +366,11 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
 
 
 _INNER = {
-    "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr",
-    "remat2": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
-    "custom_vjp_call_jaxpr": "fun_jaxpr",
+    "jit": "jaxpr", "closed_call": "call_jaxpr", "eval_jaxpr": "call_jaxpr", "remat2": "jaxpr",
+    "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
 }  # fmt: skip
 _OTHER: dict[str, Callable] = {
     "copy": _Expansion._same,
-    "copy_p": _Expansion._same,
     "optimization_barrier": _Expansion._same,
     "pvary": _Expansion._same,
     "convert_element_type": _Expansion._convert,
@@ -360,9 +379,9 @@ _OTHER: dict[str, Callable] = {
     "clamp": _Expansion._clamp,
     "dot_general": _Expansion._dot_general,
     "scatter-add": _Expansion._scatter,
-    "scatter_add": _Expansion._scatter,
     "scatter": _Expansion._scatter,
     "cumsum": _Expansion._cumsum,
+    "polynomial": _Expansion._polynomial,
     "scan": _Expansion._scan,
     "while": _Expansion._while,
     "cond": _Expansion._cond,
@@ -374,7 +393,11 @@ _OTHER: dict[str, Callable] = {
 }
 
 # Maxima and minima are of integers too.
-_OF_FLOATS = {*numbers.FUNCTIONS, *numbers.FUNCTIONS_OF_TWO} - {"max", "min", "stop_gradient"}
+_OF_FLOATS = {*numbers.FUNCTIONS, *numbers.FUNCTIONS_OF_TWO, "log2", "one_minus_square"} - {
+    "max",
+    "min",
+    "stop_gradient",
+}
 
 
 def _constant(x) -> np.ndarray:

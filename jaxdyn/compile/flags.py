@@ -6,12 +6,8 @@ was served (`run(..., served=True)`), and learns before anything is compiled whe
 
 import jax
 import jax.numpy as jnp
-from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching
 
-unless_p = Primitive("jaxdyn_unless")
-unless_p.def_abstract_eval(lambda flag, x: ShapedArray(x.shape, x.dtype))
+from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_zero
 
 
 def unless(flag: jax.Array, x: jax.Array) -> jax.Array:
@@ -20,9 +16,9 @@ def unless(flag: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def _batched(args, axes):
-    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not batching.not_mapped)
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
     moved = [
-        jnp.broadcast_to(x, (size, *x.shape)) if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0)
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(args, axes, strict=True)
     ]
     return unless_p.bind(*moved), 0
@@ -31,13 +27,17 @@ def _batched(args, axes):
 def _jvp(primals, tangents):
     flag, x = primals
     step = tangents[1]
-    return unless_p.bind(flag, x), step if type(step) is ad.Zero else unless_p.bind(flag, step)
+    return unless_p.bind(flag, x), step if is_zero(step) else unless_p.bind(flag, step)
 
 
 def _transpose(cotangent, flag, x):
-    return [None, cotangent if type(cotangent) is ad.Zero else unless_p.bind(flag, cotangent)]
+    return [None, cotangent if is_zero(cotangent) else unless_p.bind(flag, cotangent)]
 
 
-batching.primitive_batchers[unless_p] = _batched
-ad.primitive_transposes[unless_p] = _transpose
-ad.primitive_jvps[unless_p] = _jvp
+unless_p = define_primitive(
+    "jaxdyn_unless",
+    lambda flag, x: ShapedArray(x.shape, x.dtype),
+    batch=_batched,
+    jvp=_jvp,
+    transpose=_transpose,
+)

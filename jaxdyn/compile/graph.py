@@ -1,11 +1,15 @@
 """Programs of numbers while they are written: what is known is folded away, and equal numbers are made once.
 
-The `Number`s of a `Graph` and Python's floats, integers and booleans (known numbers) are the entries of numpy arrays of objects,
-so that numpy's own functions move, sum and multiply them. Sums and products with 0, 1 and -1 are not written, and signs are
-moved outwards, so that they meet and cancel. As everywhere in a compiler for real numbers, 0 x is 0 also where x is infinite
-or not a number. What no output needs is dropped when a graph is finished to a `Program`.
+The `Number`s of a `Graph` and known numbers are the entries of numpy arrays of objects, so that numpy's own functions move, sum
+and multiply them. Known numbers carry their type: a Python float is a float64 and a Python bool a bool, all others are scalars
+of numpy. So known integers wrap, and known float32 numbers round, as they would in XLA.
+
+Sums and products with 0, 1 and -1 are not written, and signs are moved outwards, so that they meet and cancel. Four of these
+rules change results: docs/algorithms.md lists them, and `python -m benchmarks.random_functions` compares all the rest with JAX.
+Each has its comment "Listed" here. What no output needs is dropped when a graph is finished to a `Program`.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,19 +18,21 @@ import numpy as np
 
 from jaxdyn.compile.program import (
     COMPARISONS,
-    FLOATS,
     FUNCTIONS,
     FUNCTIONS_OF_TWO,
     Array,
     Constant,
+    NotNumbers,
     Operation,
     Program,
     TooLong,
+    as_kind,
     dtype_of,
     kind_of,
 )
 
 _MADE_FOR_ONE_KEPT = 3  # numbers while a program is written, of which those that no output needs are dropped
+_LEAST_NORMAL = {"f8": 2.0**-1022, "f4": 2.0**-126}
 
 
 class Number:
@@ -84,8 +90,8 @@ class Graph:
     def make(self, op: str, kind: str, *args) -> Number:
         """The number op(*args), made once."""
         key = (op, kind, *args)
-        if 0.0 in args:  # zeros of both signs are equal, and not the same
-            key = (*key, tuple(type(x) is float and x == 0 and math.copysign(1.0, x) < 0 for x in args))
+        if 0.0 in args:  # zeros of both signs compare equal, and are different numbers: 1 / -0.0 is not 1 / 0.0
+            key = (*key, tuple(isinstance(x, (float, np.floating)) and x == 0 and _is_negative(x) for x in args))
         number = self.shared.get(key)
         if number is None:
             if len(self.numbers) >= self.most_made:
@@ -123,6 +129,7 @@ class Graph:
                 return a + b
             a, b = b, a
         if type(b) is not Number:
+            # Listed: -0.0 + 0.0 stays -0.0. Sums begin with a known zero everywhere.
             return a if b == 0 else self.make("add", a.kind, a, b)
         if b.op == "neg":
             return self.sub(a, b.args[0])
@@ -138,12 +145,16 @@ class Graph:
             if type(a) is not Number:
                 return a - b
             return a if b == 0 else self.make("add", a.kind, a, -b)
+        # Listed, here and below where a difference is turned round: the sign of a difference that is zero. Signs cost nothing
+        # where they meet others; kept in place they are 3 % of forward dynamics.
         if type(a) is not Number:
             return self.neg(b) if a == 0 else self.make("sub", b.kind, a, b)
         if b.op == "neg":
             return self.add(a, b.args[0])
         if a is b:
-            return 0.0 if a.kind in FLOATS else 0
+            # Listed: inf - inf and the difference of what is not a number are 0. The products of first moments cancel so when
+            # an inertia is turned, which is 4 % of forward dynamics.
+            return as_kind(0, a.kind)
         if a.op == "neg":
             return self.neg(self.add(a.args[0], b))
         if ("sub", a.kind, b, a) in self.shared:
@@ -164,15 +175,16 @@ class Graph:
             a, b = b, a
         if type(b) is not Number:
             if b == 0:
-                return 0.0 if a.kind in FLOATS else 0
+                return as_kind(
+                    0, a.kind
+                )  # Listed: 0 inf and 0 times what is not a number. The sparsity of mechanics is this.
             if b == 1:
                 return a
             if b == -1:
                 return self.neg(a)
             if a.op == "neg":
                 return self.mul(a.args[0], -b)
-            if a.op == "mul" and type(a.args[1]) is not Number and a.kind in FLOATS:
-                return self.mul(a.args[0], a.args[1] * b)
+            # (x c) d is not x (c d), whose product of known numbers may overflow where neither of the two products does.
             return self.make("mul", a.kind, a, b)
         if a.op == "neg":
             return self.neg(self.mul(a.args[0], b))
@@ -185,39 +197,37 @@ class Graph:
     def div(self, a, b):
         """a / b, of floats."""
         if type(b) is not Number:
-            with np.errstate(all="ignore"):
-                inverse = float(np.float64(1.0) / np.float64(b))
-                if type(a) is not Number:
-                    return float(np.float64(a) / np.float64(b))
-            if math.frexp(b)[0] in (0.5, -0.5):  # a power of two, whose inverse is exact
-                return self.mul(a, inverse)
+            if type(a) is not Number:
+                return _with_type(np.divide(a, b))  # of zero too, where Python's own division raises
+            least = _LEAST_NORMAL[a.kind]
+            if math.frexp(b)[0] in (0.5, -0.5) and least <= abs(b) <= 1 / least:
+                return self.mul(a, 1 / b)  # by a power of two, whose inverse is exact
             return self.make("div", a.kind, a, b)
-        if type(a) is not Number and a == 0:
-            return 0.0
+        # A known zero is divided: 0 / b is not a number where b is zero. Left out it saves no operation of any robot.
         if b.op == "neg":
             return self.neg(self.div(a, b.args[0]))
         if type(a) is Number and a.op == "neg":
             return self.neg(self.div(a.args[0], b))
         return self.make("div", b.kind, a, b)
 
-    def power(self, a, exponent: int):
-        """a to an integer power."""
+    def power(self, a, exponent: int, one=1.0):
+        """a to an integer power; `one` is the number one of the type of a."""
         if exponent < 0:
-            return self.div(1.0, self.power(a, -exponent))
-        result: Any = 1.0
+            # Powers of the inverse, not the inverse of a power: the derivative of the latter is inf 0 at infinity.
+            return self.power(self.div(one, a), -exponent, one)
+        result: Any = None
         while exponent:
             if exponent & 1:
-                result = self.mul(result, a)
+                result = a if result is None else self.mul(result, a)
             exponent >>= 1
             if exponent:
                 a = self.mul(a, a)
-        return result
+        return one if result is None else result
 
     def function(self, op: str, a):
         """One of `FUNCTIONS`."""
         if type(a) is not Number:
-            with np.errstate(all="ignore"):
-                return FUNCTIONS[op](a).item() if isinstance(a, int) else float(FUNCTIONS[op](a))
+            return _with_type(FUNCTIONS[op](a))
         if a.op == "neg":
             if op in ("sin", "tan", "atan", "asin", "sinh", "tanh", "cbrt", "sign"):
                 return self.neg(self.function(op, a.args[0]))
@@ -228,9 +238,29 @@ class Graph:
     def function_of_two(self, op: str, a, b):
         """One of `FUNCTIONS_OF_TWO`."""
         if type(a) is not Number and type(b) is not Number:
-            with np.errstate(all="ignore"):
-                return FUNCTIONS_OF_TWO[op](a, b).item()
-        return a if a is b and op in ("max", "min") else self.make(op, a.kind if type(a) is Number else b.kind, a, b)
+            return _with_type(FUNCTIONS_OF_TWO[op](a, b))
+        # The larger of x and x is written: where x is not a number JAX's derivative of it is zero, and that of x is not.
+        return self.make(op, a.kind if type(a) is Number else b.kind, a, b)
+
+    def extreme(self, op: str, entries: Sequence):
+        """The "reduce_max" or "reduce_min" of at least one entry.
+
+        One operation, not a chain of maxima: where several entries are the largest JAX gives each the same share of the
+        derivative, and a chain would give the last one half of it.
+        """
+        if len(entries) == 1:
+            return entries[0]
+        if not any(type(x) is Number for x in entries):
+            pick = FUNCTIONS_OF_TWO[op.removeprefix("reduce_")]
+            return _with_type(functools.reduce(pick, entries))
+        return self.make(op, next(x.kind for x in entries if type(x) is Number), *entries)
+
+    def clamp(self, low, x, high):
+        """x, or the bound that it is beyond; one operation, as JAX's derivative at a bound is not that of a maximum."""
+        of = next((y for y in (low, x, high) if type(y) is Number), None)
+        if of is None:
+            return _with_type(np.minimum(np.maximum(x, low), high))
+        return self.make("clamp", of.kind, low, x, high)
 
     def compare(self, op: str, a, b):
         """One of `COMPARISONS`."""
@@ -276,16 +306,14 @@ class Graph:
         """`if_true` where `which` is, else `if_false`."""
         if type(which) is not Number:
             return if_true if which else if_false
-        if if_false is if_true or (
-            type(if_false) is not Number and type(if_true) is not Number and if_false == if_true
-        ):
+        if if_false is if_true or _are_same(if_false, if_true):
             return if_true
         return self.make("select", kind, which, if_false, if_true)
 
     def convert(self, a, kind: str):
         """a as another kind of number."""
         if type(a) is not Number:
-            return np.asarray(a).astype(dtype_of(kind)).item()
+            return as_kind(a, kind)
         return a if a.kind == kind else self.make("convert", kind, a)
 
     # --- finishing ---
@@ -311,7 +339,7 @@ class Graph:
                 args = number.args
                 if number.op != "input":
                     args = tuple(index[x] if type(x) is Number else Constant(x) for x in args)
-                operations.append(Operation(number.op, number.kind, args))
+                operations.append(_checked(Operation(number.op, number.kind, args), operations))
             if len(operations) > self.most:
                 raise TooLong(f"more than {self.most} operations")
         results = [tuple(index[x] if type(x) is Number else Constant(x) for x in row) for row in flat]
@@ -357,13 +385,39 @@ class Graph:
             return self.function_of_two(op, *args)
         if op in COMPARISONS:
             return self.compare(op, *args)
+        if op in ("reduce_max", "reduce_min"):
+            return self.extreme(op, args)
         return self.select(args[0], args[1], args[2], kind) if op == "select" else self.convert(args[0], kind)
 
 
 _BY_NAME: dict[str, Callable] = {
     "add": Graph.add, "sub": Graph.sub, "neg": Graph.neg, "mul": Graph.mul, "div": Graph.div, "and": Graph.both,
-    "or": Graph.either, "not": Graph.invert, "is_finite": Graph.is_finite,
+    "or": Graph.either, "not": Graph.invert, "is_finite": Graph.is_finite, "clamp": Graph.clamp,
 }  # fmt: skip
+
+
+def _checked(operation: Operation, operations: Sequence[Operation]) -> Operation:
+    """The operation. **Raises:** `NotNumbers` where its operands differ in kind, which LLVM would refuse with less grace."""
+    op, kind, args = operation
+    if op not in ("input", "call", "part", "convert", "is_finite"):
+        kinds = {operations[x].kind for x in (args[1:] if op == "select" else args) if type(x) is not Constant}
+        if len(kinds) > 1 or (kinds and op not in COMPARISONS and kinds != {kind}):
+            raise NotNumbers(f"{op} of {' and '.join(dtype_of(x).name for x in sorted(kinds | {kind}))}")
+    return operation
+
+
+def _with_type(x):
+    """A known number that numpy has computed; float64 and bool are Python's own, which are twice as fast."""
+    return x.item() if isinstance(x, (np.float64, np.bool_)) else x
+
+
+def _is_negative(x) -> bool:
+    return math.copysign(1.0, x) < 0
+
+
+def _are_same(a, b) -> bool:
+    """Whether two known numbers are the same, and zeros of the same sign."""
+    return type(a) is not Number and type(b) is not Number and a == b and _is_negative(a) == _is_negative(b)
 
 
 def inlined(program: Program) -> Program:
@@ -371,7 +425,8 @@ def inlined(program: Program) -> Program:
     if not program.subprograms:
         return program
     graph = Graph()
-    _, outputs = graph.replay(program, [graph.inputs(i, array) for i, array in enumerate(program.inputs)])
+    with np.errstate(all="ignore"):  # known numbers may overflow, as they do in XLA
+        _, outputs = graph.replay(program, [graph.inputs(i, array) for i, array in enumerate(program.inputs)])
     return graph.finish(program.inputs, program.outputs, outputs, name=program.name)
 
 
@@ -389,4 +444,8 @@ def as_objects(x) -> np.ndarray:
     if isinstance(x, Number):
         return objects([x], ())
     x = np.asarray(x)
-    return objects(x.ravel().tolist(), x.shape)
+    # Scalars of numpy keep their type; those that Python has too are made Python's.
+    return objects(x.ravel().tolist() if x.dtype in _OF_PYTHON else list(x.ravel()), x.shape)
+
+
+_OF_PYTHON = (np.dtype(np.float64), np.dtype(bool))

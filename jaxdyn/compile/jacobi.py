@@ -32,7 +32,7 @@ MAX_SWEEPS = 60
 class PseudoInverse:
     """The kernel of A (rows, columns) -> its pseudo-inverse; stands in the place of a `Program`."""
 
-    derivative = None
+    derivative = fallback = None
     subprograms = ()
     turns = 1
 

@@ -16,13 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 
-from jaxdyn.compile import ahead, derive, mode, sharding
+from jaxdyn.compile import ahead, derive, jax_adapter, mode, sharding
 from jaxdyn.compile.expand import expand
 from jaxdyn.compile.graph import inlined
+from jaxdyn.compile.jax_adapter import define_primitive, is_linear, is_zero, lower_function, zero_tangent
 from jaxdyn.compile.known import Known, is_known, partition, partition_traced
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
 from jaxdyn.compile.shared import divided
@@ -76,21 +74,36 @@ def run(
         if target is None:
             mode.say_once("llvmlite is not installed, so functions run on JAX's own operations (pip install llvmlite)")
         return by_jax()
-    leaves, expanded = program_of(function, static, tree, args, tangent=tangent, most=most, calls=calls, served=served)
-    if isinstance(expanded, str):
+    try:
+        results = _by_kernel(function, static, tree, args, tangent=tangent, most=most, calls=calls, served=served)
+    except Exception as error:
+        if jax_adapter.is_tested():
+            raise
+        results = by_jax()  # an error of the function itself is raised here once more
+        jax_adapter.forgive(error)
+        return results
+    if isinstance(results, str):
         if otherwise is None:
-            mode.say_once(f"{_name_of(function)} runs on JAX's own operations: {expanded}")
+            mode.say_once(f"{_name_of(function)} runs on JAX's own operations: {results}")
         return by_jax()
+    return results
+
+
+def _by_kernel(function, static, tree, args, *, served: bool, **how):
+    """What `run` returns, or why there is no kernel."""
+    leaves, expanded = program_of(function, static, tree, args, served=served, **how)
+    if isinstance(expanded, str):
+        return expanded
     program, out_structure = expanded
     changes_shapes = any(x.ndim != 1 for x in leaves) or any(len(x.shape) != 1 for x in program.outputs)
-    shaped = _at_once(program, leaves) if changes_shapes and is_known(leaves) else _shaped(program, leaves)
+    shaped = _at_once(program, leaves) if changes_shapes and is_known(leaves) else shaped_results(program, leaves)
     if not served:
         return jax.tree.unflatten(out_structure, shaped)
     entry = program.results[-1][0]
     return jax.tree.unflatten(out_structure, shaped[:-1]), shaped[-1] if type(entry) is not Constant else entry.value
 
 
-def _shaped(program, leaves) -> list:
+def shaped_results(program, leaves) -> list:
     """Results of the program in their shapes, of inputs in any shape."""
     results = kernel_p.bind(*(x.reshape(-1) if x.ndim != 1 else x for x in leaves), program=program, rows=0)
     return [
@@ -100,14 +113,14 @@ def _shaped(program, leaves) -> list:
 
 
 def _at_once(program, leaves) -> list:
-    """`_shaped` of known numbers as one program: outside of a trace the kernel and each change of a shape would be one each."""
+    """The same of known numbers as one program: outside of a trace the kernel and each change of a shape would be one each."""
     with jax.disable_jit(False):
         return _jitted_shaped(program)(*leaves)
 
 
 @functools.lru_cache(maxsize=1024)
 def _jitted_shaped(program):
-    return jax.jit(lambda *leaves: _shaped(program, leaves))
+    return jax.jit(lambda *leaves: shaped_results(program, leaves))
 
 
 def compute(function: Callable, tree, *args, static: tuple = (), given: bool = False):
@@ -127,8 +140,9 @@ def compute(function: Callable, tree, *args, static: tuple = (), given: bool = F
         if not isinstance(expanded, str):
             try:
                 return jax.tree.unflatten(expanded[1], target.call(expanded[0], leaves))
-            except target.Unsupported:
-                pass
+            except Exception as error:
+                if not isinstance(error, target.Unsupported) and not jax_adapter.forgive(error):
+                    raise
     with jax.ensure_compile_time_eval():
         return jax.tree.map(np.asarray, function(*static, tree, *map(jnp.asarray, args)))
 
@@ -150,7 +164,7 @@ def program_of(
     """
     traced, known = partition_traced(tree)
     leaves, structure = jax.tree.flatten(args)
-    leaves = sharding.varying_alike([*map(jnp.asarray, (*traced, *leaves))])
+    leaves = jax_adapter.vary_alike([*map(jnp.asarray, (*traced, *leaves))])
     shapes = tuple((x.shape, x.dtype) for x in leaves)
     of = function, static, known, len(traced), structure, shapes, tangent, most, calls, served
     return leaves, _program(*of, mode.is_rank_safe(), jax.config.read("jax_enable_x64"))
@@ -185,12 +199,30 @@ def _program(function, static, known: Known, count, structure, shapes, tangent, 
         program, has_rules = expand(closed, most, _name_of(function), calls, served)
     except (NotNumbers, TooLong) as reason:
         return str(reason)
+    except Exception as error:
+        if not jax_adapter.forgive(error):
+            raise
+        return str(error)
     if tangent is not None:
         rule = functools.partial(tangent, *static)
         program.derivative = _by_rule(rule, known, count, structure, avals, served, is_safe)
     elif has_rules:
         program.derivative = _by_jax(flat, avals, served, is_safe)
+    program.fallback = _fallback(function, static, known, count, structure, avals, served)
     return program, jax.tree.structure(out)
+
+
+def _fallback(function, static, known: Known, count: int, structure, avals, served: bool) -> Callable:
+    """The function itself, from flat arrays to flat arrays, as `Program.fallback` wants it."""
+
+    def one(*flat):
+        leaves = [x.reshape(aval.shape) for x, aval in zip(flat, avals, strict=True)]
+        with mode.compilation("plain"):
+            results = function(*static, known(leaves[:count]), *jax.tree.unflatten(structure, leaves[count:]))
+        # It needs no other way for any sample.
+        return [*(jnp.reshape(x, -1) for x in jax.tree.leaves(results)), *([jnp.ones(1, bool)] if served else [])]
+
+    return one
 
 
 @functools.lru_cache(maxsize=1024)
@@ -229,7 +261,7 @@ def _by_rule(tangent: Callable, known: Known, count: int, structure, avals, serv
             args = jax.tree.unflatten(structure, primal[count:])
             return tangent(known(primal[:count]), *args, [*every, *given[count:]])
 
-        return _expanded_change(change, avals, moving, served, is_safe)
+        return _change_program(change, avals, moving, served, is_safe)
 
     return derivative
 
@@ -250,23 +282,27 @@ def _by_jax(flat: Callable, avals, served: bool, is_safe: bool):
 
             return jax.jvp(moved, [primal[i] for i in places], list(steps))[1]
 
-        return _expanded_change(change, avals, moving, served, is_safe)
+        return _change_program(change, avals, moving, served, is_safe)
 
     return derivative
 
 
-def _expanded_change(change: Callable, avals, moving, served: bool, is_safe: bool) -> Program:
-    """The change as a program; NaN at samples that are flagged, where whoever runs the function is told of them."""
-    steps = [aval for aval, varies in zip(avals, moving, strict=True) if varies]
+def _change_program(change: Callable, avals, moving, served: bool, is_safe: bool) -> Program:
+    """The change as a program; NaN at samples that are flagged, where whoever runs the function is told of them.
+
+    A rule may call functions with rules of their own, itself included, and then the change is differentiated by JAX again:
+    its numbers would give the derivative of how a value is computed, where the rule says another one.
+    """
+    avals = [*avals, *(aval for aval, varies in zip(avals, moving, strict=True) if varies)]
     with mode.expanding(), mode.rank_safe(is_safe):
-        closed = jax.make_jaxpr(change)(*avals, *steps)
-    return expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=served)[0]
+        closed = jax.make_jaxpr(change)(*avals)
+    program, has_rules = expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=served)
+    if has_rules:
+        program.derivative = _by_jax(change, avals, served, is_safe)
+    return program
 
 
 # --- the primitive ---
-
-kernel_p = Primitive("jaxdyn_kernel")
-kernel_p.multiple_results = True
 
 
 @functools.lru_cache(maxsize=1024)
@@ -274,15 +310,13 @@ def _jitted(program, rows: int):
     return jax.jit(lambda *args: kernel_p.bind(*args, program=program, rows=rows))
 
 
-@kernel_p.def_impl
-def _(*args, program, rows):
+def _implement(*args, program, rows):
     # A kernel is always compiled: under `jax.disable_jit()` it would be called by itself for ever.
     with jax.disable_jit(False):
         return _jitted(program, rows)(*args)
 
 
-@kernel_p.def_abstract_eval
-def _(*avals, program, rows):
+def _types(*avals, program, rows):
     is_one = not any(len(x.shape) > 1 for x in avals)
     if is_one and ahead.is_active() and not mode.is_expanding():
         assert target is not None
@@ -293,9 +327,9 @@ def _(*avals, program, rows):
 
 def _batched(args, axes, *, program, rows):
     """A new leading axis for what varies; what all samples share stays a row."""
-    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not batching.not_mapped)
-    moved = [x if axis is batching.not_mapped else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
-    varies = [axis is not batching.not_mapped for axis in axes]
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+    moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
+    varies = [axis is not None for axis in axes]
     inner = max((x.shape[v:-1] for x, v in zip(moved, varies, strict=True)), key=len)
     full = []
     for x, v in zip(moved, varies, strict=True):
@@ -310,29 +344,96 @@ def _batched(args, axes, *, program, rows):
     return results, [0] * len(results)
 
 
-batching.primitive_batchers[kernel_p] = _batched
-
-
 def _jvp(primals, tangents, *, program, rows):
     results = kernel_p.bind(*primals, program=program, rows=rows)
-    moving = tuple(type(step) is not ad.Zero for step in tangents)
-    change = derive.tangent(program, moving)
-    changes = iter(kernel_p.bind(*primals, *(x for x in tangents if type(x) is not ad.Zero), program=change, rows=rows))
+    moving, steps = tuple(not is_zero(x) for x in tangents), [x for x in tangents if not is_zero(x)]
+    change = _change_of(program, moving)
+    if change is None:
+        changes = iter(_changes_by_jax(program, moving, primals, steps))
+    else:
+        changes = iter(kernel_p.bind(*primals, *steps, program=change, rows=rows))
     out = []
     for x, array in zip(results, program.outputs, strict=True):
-        out.append(next(changes) if array.dtype.kind == "f" else ad.Zero(ShapedArray(x.shape, jax.dtypes.float0)))
+        out.append(next(changes) if array.dtype.kind == "f" else zero_tangent(x))
     return results, out
 
 
-ad.primitive_jvps[kernel_p] = _jvp
+def _change_of(program, moving: tuple[bool, ...]) -> Program | None:
+    """The program of the change; None where it cannot be one of numbers, and JAX differentiates the function itself."""
+    try:
+        return derive.tangent(program, moving)
+    except (NotNumbers, TooLong) as reason:
+        if program.fallback is None:
+            raise
+        mode.say_once(f"the derivative of {program.name} runs on JAX's own operations: {reason}")
+    except Exception as error:
+        if program.fallback is None or not jax_adapter.forgive(error):
+            raise
+    return None
+
+
+def _changes_by_jax(program, moving, primals, steps) -> list:
+    places = [i for i, varies in enumerate(moving) if varies]
+
+    def moved(*values):
+        here = list(primals)
+        for i, value in zip(places, values, strict=True):
+            here[i] = value
+        results = by_jax(*here, program=program)
+        return [x for x, array in zip(results, program.outputs, strict=True) if array.dtype.kind == "f"]
+
+    return jax.jvp(moved, [primals[i] for i in places], steps)[1]
+
+
+def _transposed(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
+    """The transpose of a program (see `derive`), which honours the rules of the program when it is differentiated."""
+    backwards = derive.transposed(program, linear, given)
+    if program.derivative is not None and backwards.derivative is None:
+        avals = [jax.ShapeDtypeStruct((array.size,), array.dtype) for array in backwards.inputs]
+        backwards.derivative = functools.partial(_change_of_transposed, program, linear, given, backwards, avals)
+    return backwards
+
+
+def _change_of_transposed(program, linear, given, backwards, avals, moving) -> Program:
+    """The change of x, c -> L(x)^T c for a program L(x) s, linear in s, whose change with x is known by a rule.
+
+    It is (dL/dx dx)^T c + L(x)^T dc: the transpose of the change of the program where x moves and s does not, and the
+    transpose of the program itself.
+    """
+    count = linear.count(False)  # inputs that are fixed, which come before the cotangents
+
+    def change(*leaves):
+        fixed, cotangents = list(leaves[:count]), list(leaves[count : len(avals)])
+        following = iter(leaves[len(avals) :])
+        steps = [next(following) if varies else None for varies in moving]
+        total = None
+        if any(moving[:count]):
+            each = iter(moving[:count])
+            first = derive.tangent(program, [False if is_linear else next(each) for is_linear in linear])
+            floats = [x.dtype.kind == "f" for x in program.outputs]
+            handed = [is_given for is_given, is_float in zip(given, floats, strict=True) if is_float]
+            of_change = [*linear, *[False] * sum(moving[:count])]
+            by_fixed = _transposed(first, tuple(of_change), tuple(handed))
+            total = kernel_p.bind(
+                *fixed, *(x for x in steps[:count] if x is not None), *cotangents, program=by_fixed, rows=0
+            )
+        if any(moving[count:]):
+            of_cotangents = [
+                jnp.zeros_like(c) if d is None else d for c, d in zip(cotangents, steps[count:], strict=True)
+            ]
+            by_cotangents = kernel_p.bind(*fixed, *of_cotangents, program=backwards, rows=0)
+            total = by_cotangents if total is None else [a + b for a, b in zip(total, by_cotangents, strict=True)]
+        return total
+
+    return _change_program(change, avals, moving, served=False, is_safe=False)
 
 
 def _transpose(cotangents, *operands, program, rows):
-    linear = [ad.is_undefined_primal(x) for x in operands]
-    given = [type(x) is not ad.Zero for x in cotangents]
-    backwards = derive.transposed(program, linear, given)
+    linear = [is_linear(x) for x in operands]
+    given = [not is_zero(x) for x in cotangents]
+    backwards = _transposed(program, tuple(linear), tuple(given))
     fixed = [x for x, varies in zip(operands, linear, strict=True) if not varies]
-    moved = [x for x in cotangents if type(x) is not ad.Zero]
+    moved = [x for x in cotangents if not is_zero(x)]
     results = iter(kernel_p.bind(*fixed, *moved, program=backwards, rows=rows))
     out = []
     for x, varies in zip(operands, linear, strict=True):
@@ -345,9 +446,6 @@ def _transpose(cotangents, *operands, program, rows):
     return out
 
 
-ad.primitive_transposes[kernel_p] = _transpose
-
-
 # --- lowering ---
 
 _OPERATIONS: dict[str, Callable] = {
@@ -357,7 +455,8 @@ _OPERATIONS: dict[str, Callable] = {
     "cos": cosine, "tan": lax.tan, "asin": lax.asin, "acos": lax.acos, "atan": lax.atan, "sinh": lax.sinh, "cosh": lax.cosh,
     "tanh": lax.tanh, "exp": lax.exp, "exp2": lax.exp2, "expm1": lax.expm1, "log": lax.log, "log1p": lax.log1p, "abs": lax.abs,
     "floor": lax.floor, "ceil": lax.ceil, "sign": lax.sign, "cbrt": lax.cbrt, "stop_gradient": lax.stop_gradient,
-    "round": lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN),
+    "round": lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), "reduce_max": lambda *x: functools.reduce(lax.max, x),
+    "reduce_min": lambda *x: functools.reduce(lax.min, x), "clamp": lambda low, x, high: lax.min(lax.max(x, low), high),
 } | {name: getattr(lax, name) for name in COMPARISONS}  # fmt: skip
 
 
@@ -394,30 +493,48 @@ def as_operations(*args, program: Program, rows: int = 0):
     return results
 
 
-_lower_elsewhere = mlir.lower_fun(as_operations, multiple_results=True)
+def by_jax(*args, program, rows: int = 0):
+    """The function of which the program was made, by operations of JAX on arrays over the batch."""
+    return as_operations(*args, program=program) if program.fallback is None else over_batch(program.fallback, args)
+
+
+def over_batch(one: Callable, arrays) -> Any:
+    """one(*arrays) of one sample, for arrays with the axes of a batch or without them."""
+    axes = [0 if x.ndim > 1 else None for x in arrays]
+    for _ in max((x.shape[:-1] for x in arrays), key=len, default=()):
+        one = jax.vmap(one, axes)
+    return one(*arrays)
 
 
 def _lower_on_cpu(ctx, *operands, program, rows):
+    try:
+        return _lower_to_call(ctx, *operands, program=program, rows=rows)
+    except Exception as error:
+        if not jax_adapter.forgive(error):
+            raise
+        return lower_function(by_jax, ctx, *operands, program=program, rows=rows)
+
+
+def _lower_to_call(ctx, *operands, program, rows):
     lead = ctx.avals_out[0].shape[:-1] if ctx.avals_out else ()
     uniform = [bool(lead) and len(x.shape) == 1 for x in ctx.avals_in]
     if any(uniform) and not all(uniform) and len(lead) == rows:  # the kernel of one sample shares nothing
-        return _lower_repeated(ctx, *operands, program=program, rows=rows)
+        return lower_function(_repeated, ctx, *operands, program=program, rows=rows)
     apart = lead[: len(lead) - rows]  # rows of one sample go through the kernel of one sample
     samples = math.prod(apart) if all(isinstance(n, int) for n in apart) else None
     if samples != 1 and target is not None and target.is_supported() and divided(program, uniform) is not None:
-        return _lower_divided(ctx, *operands, program=program, rows=rows)
+        return lower_function(_divided, ctx, *operands, program=program, rows=rows)
     try:
         assert target is not None
         number = target.kernel(program, target.width_of(program, samples), uniform)
     except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
         mode.say_once(f"functions run on JAX's own operations: {reason}")
-        return _lower_elsewhere(ctx, *operands, program=program, rows=rows)
+        return lower_function(as_operations, ctx, *operands, program=program, rows=rows)
     if sharding.may_be_divided(ctx.avals_in, lead):
-        return _lower_with_last_axis(ctx, *operands, program=program, rows=rows and rows + 1)
+        return lower_function(_with_last_axis, ctx, *operands, program=program, rows=rows and rows + 1)
     order = target.varying_first(uniform)
-    ctx = ctx.replace(avals_in=[ctx.avals_in[i] for i in order])
-    lower = jax.ffi.ffi_lowering(target.TARGET, extra_attributes=sharding.attributes(ctx.avals_in, ctx.avals_out))
-    return lower(ctx, *(operands[i] for i in order), program=np.int64(number))
+    attributes = functools.partial(sharding.attributes, [ctx.avals_in[i] for i in order], ctx.avals_out)
+    return jax_adapter.lower_call(target.TARGET, ctx, operands, order, attributes(), program=number)
 
 
 def _with_last_axis(*args, program, rows):
@@ -442,10 +559,14 @@ def _divided(*args, program, rows):
     return kernel_p.bind(*args, *shared, program=each, rows=rows)
 
 
-_lower_divided = mlir.lower_fun(_divided, multiple_results=True)
-_lower_repeated = mlir.lower_fun(_repeated, multiple_results=True)
-_lower_with_last_axis = mlir.lower_fun(_with_last_axis, multiple_results=True)
-
-
-mlir.register_lowering(kernel_p, _lower_elsewhere)
-mlir.register_lowering(kernel_p, _lower_on_cpu, platform="cpu")
+kernel_p = define_primitive(
+    "jaxdyn_kernel",
+    _types,
+    multiple_results=True,
+    implement=_implement,
+    lower=as_operations,
+    lower_on_cpu=_lower_on_cpu,
+    batch=_batched,
+    jvp=_jvp,
+    transpose=_transpose,
+)

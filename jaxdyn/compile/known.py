@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import ShapedArray, Tracer
-from jax.extend.core import Primitive
-from jax.interpreters import mlir
+
+from jaxdyn.compile.jax_adapter import ShapedArray, Tracer, define_primitive
 
 
 def is_concrete(*trees) -> bool:
@@ -23,15 +22,17 @@ def numpy_for(*trees) -> Any:
 
 
 # Nothing but False, without an operand. Every call outside of a trace asks, which must not cost an operation of XLA.
-_asked_p = Primitive("jaxdyn_asked")
-_asked_p.def_impl(lambda: np.False_)
-_asked_p.def_abstract_eval(lambda: ShapedArray((), np.dtype(bool)))
-mlir.register_lowering(_asked_p, mlir.lower_fun(lambda: jnp.zeros((), bool), multiple_results=False))
+_asked_p = define_primitive(
+    "jaxdyn_asked",
+    lambda: ShapedArray((), np.dtype(bool)),
+    implement=lambda: np.False_,
+    lower=lambda: jnp.zeros((), bool),
+)
 
 
 def is_staged() -> bool:
     """Whether a program is being traced, so that operations on known numbers are traced too."""
-    return isinstance(_asked_p.bind(), Tracer)
+    return isinstance(lax.neg(1) if _asked_p is None else _asked_p.bind(), Tracer)
 
 
 def is_known(*trees) -> bool:

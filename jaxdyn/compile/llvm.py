@@ -1,12 +1,13 @@
 """Operations on numbers as lines of LLVM's intermediate representation: every number is a vector over W samples of a batch."""
 
+import functools
 import struct
 from collections.abc import Sequence
 
 import numpy as np
 
 from jaxdyn.compile.program import COMPARISONS, FLOATS
-from jaxdyn.compile.trigonometry import COSINE, HALF_PI, SINE
+from jaxdyn.compile.trigonometry import COSINE, HALF_PI, MAX_ANGLE, SINE
 
 _TYPES = {"f8": "double", "f4": "float", "b1": "i1", "i1": "i8", "i4": "i32", "i8": "i64"}  # i1: a bool in memory
 _BYTES = {"f8": 8, "f4": 4, "b1": 1, "i1": 1, "i4": 4, "i8": 8}
@@ -112,6 +113,12 @@ class Emitter:
             return self.sine_and_cosine(args[0], kind)[op == "cos"]
         if op == "sign" and kind in FLOATS:
             return self.sign(args[0], kind)
+        if op in ("reduce_max", "reduce_min"):
+            pick = op.removeprefix("reduce_")
+            return functools.reduce(lambda a, b: self.operation(pick, kind, (a, b), kind), args)
+        if op == "clamp":
+            low, x, high = args
+            return self.operation("min", kind, (self.operation("max", kind, (x, low), kind), high), kind)
         if op in ("max", "min") and kind == "b1":
             return self.put(f"{'or' if op == 'max' else 'and'} {of} {args[0]}, {args[1]}")
         if op in ("max", "min") and kind not in FLOATS:
@@ -153,7 +160,7 @@ class Emitter:
         return self.put(f"select {flag} {up}, {of} {self.constant(1, kind)}, {of} {low}")
 
     def sine_and_cosine(self, x: str, kind: str) -> tuple[str, str]:
-        """(sin x, cos x) to about one unit in the last place, without branches: both share the reduction of x."""
+        """(sin x, cos x) to about one unit in the last place, of any angle: both share the reduction of x."""
         if x in self.sines:
             return self.sines[x]
 
@@ -196,8 +203,52 @@ class Emitter:
             value = self.put(f"select {flag} {odd}, {of} {second}, {of} {first}")
             minus = self.put(f"fneg {of} {value}")
             signed.append(self.put(f"select {flag} {negative}, {of} {minus}, {of} {value}"))
-        self.sines[x] = signed[0], signed[1]
+        self.sines[x] = self._or_far(x, kind, (signed[0], signed[1]))
         return self.sines[x]
+
+    def _or_far(self, x: str, kind: str, near: tuple[str, str]) -> tuple[str, str]:
+        """The pair, or that of the C library in lanes whose angle is beyond the reduction.
+
+        A branch that is never taken costs a comparison. It is taken where one lane is far, and the others keep their numbers,
+        so that no sample depends on those beside it.
+        """
+        of, flags = self.type(kind), self.type("b1")
+        self.count += 1
+        before, far, after = (f"{name}{self.count}" for name in ("near", "far", "after"))
+        # The label is for the two numbers that are merged below, which name the block that they come from.
+        self.lines += [f"  br label %{before}", f"{before}:"]
+        size = self.call("fabs", kind, x)
+        is_far = self.put(f"fcmp ogt {of} {size}, {self.constant(MAX_ANGLE[kind], kind)}")
+        self.declared["far"] = '!0 = !{!"branch_weights", i32 1, i32 1000000}'
+        self.lines += [f"  br i1 {self.any(is_far)}, label %{far}, label %{after}, !prof !0", f"{far}:"]
+        pair = f"{{{of}, {of}}}"
+        both = self.put(f"call {pair} @{self._far_pair(kind)}({of} {x})")
+        exact = [self.put(f"extractvalue {pair} {both}, {k}") for k in (0, 1)]
+        chosen = [self.put(f"select {flags} {is_far}, {of} {a}, {of} {b}") for a, b in zip(exact, near, strict=True)]
+        self.lines += [f"  br label %{after}", f"{after}:"]
+        sine, cosine = (
+            self.put(f"phi {of} [ {a}, %{before} ], [ {b}, %{far} ]") for a, b in zip(near, chosen, strict=True)
+        )
+        return sine, cosine
+
+    def _far_pair(self, kind: str) -> str:
+        """Name of a function of this module for the sine and cosine of any angle, by the C library."""
+        name, of, inner = f"far_pair_{kind}_{self.width}", self.type(kind), Emitter(self.width)
+        sine, cosine = (inner.library(function, kind, "%x") for function in ("sin", "cos"))
+        first = inner.put(f"insertvalue {{{of}, {of}}} poison, {of} {sine}, 0")
+        both = inner.put(f"insertvalue {{{of}, {of}}} {first}, {of} {cosine}, 1")
+        head = f"define internal {{{of}, {of}}} @{name}({of} %x) noinline cold nounwind {{"
+        self.declared |= inner.declared
+        self.declared[name] = "\n".join([head, *inner.lines, f"  ret {{{of}, {of}}} {both}", "}"])
+        return name
+
+    def any(self, flags: str) -> str:
+        """Whether a flag is set in any lane."""
+        if self.width == 1:
+            return flags
+        name, of = f"llvm.vector.reduce.or.v{self.width}i1", self.type("b1")
+        self.declared[name] = f"declare i1 @{name}({of})"
+        return self.put(f"call i1 @{name}({of} {flags})")
 
     # --- memory ---
 

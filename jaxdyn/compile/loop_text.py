@@ -55,7 +55,7 @@ class _LoopText:
         more = self._store_state(results)
         if loop.row is not None:
             self._rows(results)
-        e.lines.append(f"  br i1 {self._any(more)}, label %turn, label %out")
+        e.lines.append(f"  br i1 {e.any(more)}, label %turn, label %out")
         e.lines.append("out:")
         for k in range(loop.states):
             kind = kind_of(loop.outputs[k].dtype)
@@ -65,7 +65,7 @@ class _LoopText:
             e.store(self.lanes[self.saved_after], 0, "i4", e.load_at("%saved", 0, "i4"))
         title = f"{loop.digest} {self.uniform}"
         allocated = [*turn.allocated(), *self.allocated]
-        return framed(e, title, self.uniform[: self.results], len(loop.outputs), allocated, last_block="out")
+        return framed(e, title, self.uniform[: self.results], len(loop.outputs), allocated)
 
     # --- arguments ---
 
@@ -217,7 +217,7 @@ class _LoopText:
         is_passed = e.put(f"fcmp ole {e.type(kind)} {time}, {until}")
         kept = self._both(self.take, self._one(results, turn.kept))
         passed = self._both(kept, self._both(some_left, is_passed))
-        e.lines.append(f"  br i1 {self._any(passed)}, label %row, label %all.passed")
+        e.lines.append(f"  br i1 {e.any(passed)}, label %row, label %all.passed")
         e.lines.append("row:")
         dense = [[results[i] for i in self.entries[out]] for out in jax.tree.leaves(turn.dense)]
 
@@ -257,13 +257,6 @@ class _LoopText:
             scalar = Emitter(1).type(kind)
             total = self.e.put(f"insertelement {of} {total}, {scalar} {value}, i32 {lane}")
         return total
-
-    def _any(self, flags: str) -> str:
-        if self.width == 1:
-            return flags
-        name, of = f"llvm.vector.reduce.or.v{self.width}i1", self.e.type("b1")
-        self.e.declared[name] = f"declare i1 @{name}({of})"
-        return self.e.put(f"call i1 @{name}({of} {flags})")
 
 
 def _no_array(place: int) -> None:

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Array as Numbers
 
 from jaxdyn.compile import mode
-from jaxdyn.compile.kernel import kernel_p, program_of, target
+from jaxdyn.compile.jax_adapter import forgive, vary_alike
+from jaxdyn.compile.kernel import kernel_p, over_batch, program_of, target
 from jaxdyn.compile.known import Known, partition_traced
 from jaxdyn.compile.loop_text import loop_ir
 from jaxdyn.compile.program import Array, Constant, Program
-from jaxdyn.compile.sharding import varying_alike
 
 
 class Turn(NamedTuple):
@@ -88,6 +88,15 @@ def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[C
 
     **Returns:** the carry, and whether there are no such turns; None where there is no such loop.
     """
+    try:
+        return _run_loop(task, tree, constants, given, carry)
+    except Exception as error:
+        if not forgive(error):
+            raise
+        return None
+
+
+def _run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[Carry, bool] | None:
     if mode.current() == "plain" or target is None or mode.is_expanding() or not target.is_supported():
         return None
     given, carry = jax.tree.map(jnp.asarray, (given, carry))
@@ -109,7 +118,7 @@ def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[C
     loop = _loop(task, program, row, structure, known, len(traced), _Form.of((constants, given, carry)))
     leaves = leaves[: len(leaves) - len(read)]
     after = jax.tree.leaves(carry)[len(jax.tree.leaves(carry.state)) :]
-    flat = varying_alike([x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)])
+    flat = vary_alike([x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)])
     results = kernel_p.bind(*flat, program=loop, rows=0)
     return _Form.of(carry)(results), loop.always_ends
 
@@ -137,7 +146,7 @@ class Loop:
     state; its results are the carry.
     """
 
-    derivative = None
+    derivative = fallback = None
     turns = 100  # of a run, by which its cost is estimated
 
     def __init__(self, task: Task, turn: Program, row, structure, known: Known, count: int, form: _Form):
@@ -185,11 +194,7 @@ class Loop:
 
     def as_operations(self, *arrays):
         """The same by JAX."""
-        lead = max((x.shape[:-1] for x in arrays), key=len, default=())
-        one, axes = self._by_jax, [0 if len(x.shape) > 1 else None for x in arrays]
-        for _ in lead:
-            one = jax.vmap(one, axes)
-        return one(*arrays)
+        return over_batch(self._by_jax, arrays)
 
     def _by_jax(self, *flat):
         first, tables = self.end - self.states, len(jax.tree.leaves(self.given))

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 
 import jax
 
+from jaxdyn.compile import jax_adapter
+
 logger = logging.getLogger("jaxdyn")
 MODES = ("auto", "plain")
 OPTIONS = ("", "usual", "least")
@@ -26,7 +28,10 @@ _said: set[str] = set()
 
 def current() -> str:
     """The mode in force. **Raises:** ValueError where the environment asks for one that does not exist."""
-    return _mode.value or _checked(os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION")
+    asked = _mode.value or _checked(
+        os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION"
+    )
+    return asked if asked == "plain" or jax_adapter.reason_against_kernels() is None else "plain"
 
 
 def _checked(mode, what: str) -> str:

@@ -54,6 +54,7 @@ class Program:
     - `subprograms`: what is called, written once however often it is.
     - `derivative`: None, or a function (which inputs move) -> the `Program` of the change of all outputs, of the inputs and the
       changes of those that move.
+    - `fallback`: None, or the function of which this is the program, from flat arrays of one sample to flat arrays.
     """
 
     turns = 1  # how often the operations are carried out
@@ -68,6 +69,7 @@ class Program:
         self.subprograms: tuple[Program, ...] = tuple(subprograms)
         self.derivative = derivative
         self.name = name
+        self.fallback: Callable | None = None
         self.derived: dict = {}
 
     def __repr__(self):
@@ -76,7 +78,7 @@ class Program:
     @functools.cached_property
     def cost(self) -> int:
         """Number of operations that are carried out, without inputs and changes of sign."""
-        own = sum(x.op not in ("input", "neg", "call", "part") for x in self.operations)
+        own = sum(_weight(x) for x in self.operations if x.op not in ("input", "neg", "call", "part"))
         return own + sum(self.subprograms[x.args[0].value].cost for x in self.operations if x.op == "call")
 
     @functools.cached_property
@@ -90,8 +92,13 @@ class Program:
         """Number of operations of each kind."""
         counts_by_kind: dict[str, int] = {}
         for x in self.operations:
-            counts_by_kind[x.op] = counts_by_kind.get(x.op, 0) + 1
+            counts_by_kind[x.op] = counts_by_kind.get(x.op, 0) + _weight(x)
         return counts_by_kind
+
+
+def _weight(operation: Operation) -> int:
+    """Number of instructions of an operation: those of several operands are written as a chain."""
+    return len(operation.args) - 1 if operation.op in ("reduce_max", "reduce_min", "clamp") else 1
 
 
 COMPARISONS: dict[str, Callable] = {
@@ -132,3 +139,21 @@ def kind_of(dtype) -> str:
 def dtype_of(kind: str) -> np.dtype:
     """The dtype of a kind."""
     return _DTYPES[kind]
+
+
+def as_kind(value, kind: str):
+    """A known number as one of a kind, converted as XLA does.
+
+    Beyond the range of an integer a float becomes the nearest end of it, and what is not a number zero; a longer integer is cut.
+    """
+    if kind == "f8":
+        return float(value)
+    if kind == "b1":
+        return bool(value)
+    dtype = _DTYPES[kind]
+    if kind in FLOATS or not isinstance(value, (float, np.floating)):
+        return np.asarray(value).astype(dtype)[()]
+    ends = np.iinfo(dtype)
+    if math.isnan(value):
+        return dtype.type(0)
+    return dtype.type(ends.max if value >= ends.max else ends.min if value <= ends.min else int(value))

@@ -130,7 +130,6 @@ def dynamic_update_slice(params, args, eqn):
 REARRANGEMENTS: dict[str, Callable] = {
     "reshape": _reshape,
     "squeeze": lambda params, args, out: args[0].reshape(out.shape),
-    "expand_dims": lambda params, args, out: args[0].reshape(out.shape),
     "transpose": lambda params, args, out: args[0].transpose(params["permutation"]),
     "rev": lambda params, args, out: np.flip(args[0], params["dimensions"]),
     "concatenate": lambda params, args, out: np.concatenate(args, params["dimension"]),

@@ -9,38 +9,32 @@ import functools
 from collections.abc import Callable
 
 import jax
-import jax.core
 import jax.numpy as jnp
 from jax import lax
-from jax.core import ShapedArray
 from jax.custom_batching import custom_vmap
-from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
 
 from jaxdyn.compile import ahead, mode
 from jaxdyn.compile.flags import unless
+from jaxdyn.compile.jax_adapter import vary_alike
 from jaxdyn.compile.kernel import run
-from jaxdyn.compile.known import partition_traced
-from jaxdyn.compile.sharding import varying_alike
+from jaxdyn.compile.known import is_concrete, partition_traced
 
 SAMPLES_AT_ONCE = 32  # samples that are computed again together
 
-_any_in_batch_p = Primitive("any_in_batch")
-_any_in_batch_p.def_impl(lambda flag: flag)
-_any_in_batch_p.def_abstract_eval(lambda flag: ShapedArray((), flag.dtype))
-mlir.register_lowering(_any_in_batch_p, lambda ctx, flag: [flag])
+
+@custom_vmap
+def _any_of_batch(flag):
+    return flag
 
 
-def _over_samples(arrays, axes):
-    return _any_in_batch_p.bind(jnp.any(arrays[0], axis=axes[0])), batching.not_mapped
-
-
-batching.primitive_batchers[_any_in_batch_p] = _over_samples
+@_any_of_batch.def_vmap
+def _(size, batched, flag):
+    return _any_of_batch(jnp.any(flag)), False
 
 
 def any_in_batch(flag):
     """Whether a flag () is set for this sample or for any other one of the batch."""
-    return _any_in_batch_p.bind(flag) if isinstance(flag, jax.core.Tracer) else flag
+    return flag if is_concrete(flag) else _any_of_batch(flag)
 
 
 def rank_safe(function: Callable) -> Callable:
@@ -137,7 +131,7 @@ def _one(careful: Callable):
 
     def alike(*args):
         leaves, structure = jax.tree.flatten(args)
-        return one(*jax.tree.unflatten(structure, varying_alike(leaves)))
+        return one(*jax.tree.unflatten(structure, vary_alike(leaves)))
 
     return alike
 
@@ -186,7 +180,7 @@ def _many(careful: Callable, axes: list):
 
 def _like(new, values):
     """The same arrays with the dtypes of `values`, varying along the manual axes of meshes along which those do."""
-    return jax.tree.map(lambda x, y: varying_alike([jnp.asarray(x, y.dtype), y])[0], new, values)
+    return jax.tree.map(lambda x, y: vary_alike([jnp.asarray(x, y.dtype), y])[0], new, values)
 
 
 def _along_one_axis(args, axes, batched, shape):

@@ -14,38 +14,20 @@ Axes of meshes are of three kinds in JAX. Along automatic ones XLA divides, by t
 from collections.abc import Sequence
 
 import jax
-from jax import lax
-from jax.core import ShapedArray
-from jax.extend.mlir.dialects import sdy
-from jax.interpreters import mlir
-from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+from jaxdyn.compile import jax_adapter
+from jaxdyn.compile.jax_adapter import ShapedArray
 
 
 def results_of(avals: Sequence, arrays: Sequence) -> list:
     """Types of the results, one sample each of `arrays`, with the batch axes and the shardings of the arguments."""
     longest = max(avals, key=lambda x: x.ndim, default=None)
     lead = () if longest is None else longest.shape[:-1]
-    if longest is None or longest.sharding.mesh.empty:
+    if longest is None or jax_adapter.mesh_of(longest) is None:
         return [ShapedArray((*lead, array.size), array.dtype) for array in arrays]
-    specs = [x.sharding.spec for x in avals if x.ndim == longest.ndim]
+    specs = [jax_adapter.spec_of(x) for x in avals if x.ndim == longest.ndim]
     along = [next((spec[k] for spec in specs if spec[k] is not None), None) for k in range(len(lead))]
-    sharding = NamedSharding(longest.sharding.mesh, PartitionSpec(*along, None))
-    return [
-        longest.update(shape=(*lead, array.size), dtype=array.dtype, weak_type=False, sharding=sharding)
-        for array in arrays
-    ]
-
-
-def varying_alike(leaves: list) -> list:
-    """The same arrays, each varying along all manual axes of meshes along which one of them does."""
-    types = [getattr(jax.typeof(x), "manual_axis_type", None) for x in leaves]
-    axes = frozenset().union(*(x.varying for x in types if x is not None))
-    if not axes:
-        return leaves
-    return [
-        x if kind is None or axes <= kind.varying else lax.pcast(x, tuple(axes - kind.varying), to="varying")
-        for x, kind in zip(leaves, types, strict=True)
-    ]
+    return [jax_adapter.type_like(longest, (*lead, array.size), array.dtype, (*along, None)) for array in arrays]
 
 
 def may_be_divided(avals: Sequence, lead: Sequence) -> bool:
@@ -57,8 +39,8 @@ def may_be_divided(avals: Sequence, lead: Sequence) -> bool:
     """
     if not lead or lead[-1] == 1 or jax.device_count() == 1:
         return False
-    mesh = avals[0].sharding.mesh if avals else None
-    return mesh is None or not mesh.axis_types or any(kind != AxisType.Manual for kind in mesh.axis_types)
+    mesh = jax_adapter.mesh_of(avals[0]) if avals else None
+    return mesh is None or not jax_adapter.is_all_manual(mesh)
 
 
 def attributes(avals: Sequence, results: Sequence) -> dict | None:
@@ -66,19 +48,11 @@ def attributes(avals: Sequence, results: Sequence) -> dict | None:
     lead = results[0].shape[:-1] if results else ()
     if not lead or not all(isinstance(n, int) for n in lead):  # `jax.export` has sizes without a number
         return None
-    batch = [sdy.DimMappingAttr.get(factor_indices=[k]) for k in range(len(lead))]
     sizes = list(lead)
 
     def axes(x):
-        sizes.append(x.shape[-1])  # a factor of its own, which is in no other array
-        last = sdy.DimMappingAttr.get(factor_indices=[len(sizes) - 1])
-        return sdy.TensorMappingAttr.get(dim_mappings=[*batch, last] if x.ndim > 1 else [last])
+        sizes.append(x.shape[-1])  # an axis of its own, which is in no other array
+        return [*range(len(lead)), len(sizes) - 1] if x.ndim > 1 else [len(sizes) - 1]
 
-    given, results_axes = [axes(x) for x in avals], [axes(x) for x in results]
-    rule = sdy.OpShardingRuleAttr.get(
-        factor_sizes=sizes, operand_mappings=given, result_mappings=results_axes, is_custom=True
-    )
-    return {
-        "mhlo.frontend_attributes": mlir.ir_attribute({"num_batch_dims": str(len(lead))}),
-        "sdy.sharding_rule": rule,
-    }
+    operands, outputs = [axes(x) for x in avals], [axes(x) for x in results]
+    return jax_adapter.sharding_attributes(len(lead), sizes, operands, outputs)

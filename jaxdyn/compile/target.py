@@ -4,18 +4,17 @@ import ctypes
 import functools
 import hashlib
 import logging
-import re
 import threading
 from collections.abc import Sequence
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxdyn.compile import ahead
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
+from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
+from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.objects import Code, features
 from jaxdyn.compile.program import FLOATS, Program, kind_of
 
@@ -24,7 +23,6 @@ SLOTS = 1 << 16
 # A chunk of a batch takes some 20 microseconds: 40 000 vector operations at 2 a nanosecond, long beside the claim of a chunk
 # (0.1 us) and short beside the wait for the last one.
 OPERATIONS_PER_CHUNK = 40_000
-_VERSION = (0, 3)  # of XLA's FFI, whose structures `handler.ll` describes
 _MISSING = "jaxdyn: this program was compiled by another process, which had its kernel; trace it again here"
 _FAILED = "jaxdyn: a kernel could not be compiled; the error was logged"
 _MISFIT = "jaxdyn: a buffer of a kernel has another size than the kernel was written for"
@@ -33,10 +31,6 @@ _RELAX = {"x86_64": "void @llvm.x86.sse2.pause()", "aarch64": "void @llvm.aarch6
 
 
 logger = logging.getLogger("jaxdyn")
-
-
-class Unsupported(Exception):
-    """Why kernels cannot be called here."""
 
 
 class _Entry(ctypes.Structure):
@@ -64,20 +58,10 @@ def set_threads(count: int | None) -> None:
     _threads.value = 1 << 30 if count is None else count
 
 
-def interface_version() -> tuple[int, int]:
-    """Version of the FFI of the jaxlib that is installed."""
-    text = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
-    matches = [re.search(rf"define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
-    major, minor = (-1 if x is None else int(x.group(1)) for x in matches)
-    return major, minor
-
-
 @functools.cache
 def register() -> None:
     """Compile the handler and tell XLA of it, once in a process. **Raises:** `Unsupported`."""
-    version = interface_version()
-    if version != _VERSION:
-        raise Unsupported(f"jaxlib has version {version} of XLA's FFI, and kernels are written for {_VERSION}")
+    version = ffi_version()
     architecture = _architecture()
     if architecture not in _RELAX:
         raise Unsupported(f"the processor is {architecture}, and kernels are written for {', '.join(_RELAX)}")
@@ -93,10 +77,7 @@ def register() -> None:
         text = text.replace("{" + name + "}", str(value))
     # Its addresses are those of this process: it is not kept on disk.
     code = Code(text, stored=False)
-    new = ctypes.pythonapi.PyCapsule_New
-    new.restype, new.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
-    jax.ffi.register_ffi_target(TARGET, new(code.address("handler"), None, None), platform="cpu", api_version=1)
-    jax.ffi.register_ffi_target_as_batch_partitionable(TARGET)
+    register_handler(TARGET, code.address("handler"))
     _handler.append(code)
 
 

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.model.arguments import Checked, DType, Number, Numbers, pose_leaf
@@ -218,7 +218,7 @@ def distance(
     **Raises:** ValueError for bad points or a length that is not positive.
     """
     name = f"distance {body_a or 'world'}-{body_b or 'world'}" if name is None else name
-    if not isinstance(length, jax.core.Tracer) and not (np.isfinite(length) and length > 0):
+    if is_concrete(length) and not (np.isfinite(length) and length > 0):
         raise ValueError(f"{name!r}: length is {length}; give a positive number (m), or take loop(..., joint='point')")
     return Distance(
         name=name,
@@ -299,7 +299,7 @@ def lock_joint(joint: str, value: Numbers = 0.0, *, name: str | None = None) -> 
 
     **Raises:** ValueError for a value that is not finite; when used, for an unknown joint or a value of another size.
     """
-    if not isinstance(value, jax.core.Tracer) and not np.isfinite(np.asarray(value, float)).all():
+    if is_concrete(value) and not np.isfinite(np.asarray(value, float)).all():
         raise ValueError(f"lock_joint {joint!r}: value is {value}; give finite numbers")
     name = f"lock {joint}" if name is None else name
     return JointLock(name, joint, jnp.atleast_1d(jnp.asarray(value, float)))

@@ -4,12 +4,11 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.core
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import any_in_batch, is_expanding, pseudo_inverse_by_rotations, run, unless
+from jaxdyn.compile import any_in_batch, is_concrete, is_expanding, pseudo_inverse_by_rotations, run, unless
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_factored
 
@@ -21,7 +20,7 @@ def checked_tolerance(rank_tol: float | None) -> float | None:
     """The rank tolerance as a float, or None for the default. **Raises:** ValueError outside (0, 1)."""
     if rank_tol is None:
         return None
-    if isinstance(rank_tol, jax.core.Tracer) or not 0 < float(rank_tol) < 1:
+    if not is_concrete(rank_tol) or not 0 < float(rank_tol) < 1:
         raise ValueError(f"rank_tol is {rank_tol}; give a number between 0 and 1 that is not traced, or None")
     return float(rank_tol)
 

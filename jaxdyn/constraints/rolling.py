@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.lie.so3 import _product, cross
@@ -309,7 +309,7 @@ def rolling_sphere(
         )
     radius = _length(radius, f"{name!r}: radius")
     reach = None if surface_radius is None else _length(surface_radius, f"{name!r}: surface_radius")
-    concrete = reach is not None and not isinstance(radius - reach, jax.core.Tracer)
+    concrete = reach is not None and is_concrete(radius - reach)
     if inside and concrete and reach is not None and not radius < reach:
         raise ValueError(f"{name!r}: radius {radius} is not below surface_radius {reach}; it does not fit inside")
     return RollingSphere(
@@ -330,6 +330,6 @@ def rolling_sphere(
 
 def _length(value, what: str) -> Float[Array, ""]:
     value = jnp.asarray(value, float) if not isinstance(value, jax.Array) else value
-    if value.shape != () or (not isinstance(value, jax.core.Tracer) and not 0 < float(value) < float("inf")):
+    if value.shape != () or (is_concrete(value) and not 0 < float(value) < float("inf")):
         raise ValueError(f"{what} is {value}; give one positive number (m)")
     return value

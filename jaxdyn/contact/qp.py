@@ -31,6 +31,7 @@ class RESULTS(eqx.Enumeration):
     infeasible = "No x satisfies the rows and cones of the quadratic program."
     stalled = "The quadratic program was not solved to the tolerance in the steps that it was given."
     indefinite = "The matrix Q of the quadratic program is not positive definite."
+    nonfinite = "The data of the quadratic program, or its solution, are not finite."
 
 
 class QPSolution(eqx.Module):
@@ -165,6 +166,8 @@ def _unit(sizes):
 
 @compiled
 def _solved(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: float, max_steps: int) -> QPSolution:
+    data = [Q, q, G, A, b, *(x for pair in cones for x in pair)]
+    finite = jnp.stack([jnp.isfinite(x).all() for x in data]).all() & ~jnp.isnan(h).any()
     Q = (Q + Q.T) / 2
     bounded = jnp.isfinite(h)
     # A row without a bound becomes 0 <= 1; one that nothing satisfies, 0 <= -1.
@@ -217,6 +220,9 @@ def _solved(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: flo
     else:
         point = Point(-solve_factored(cholesky(program.Q), program.q), (), ())
     result = RESULTS.where(definite(Q, cholesky(Q)), result, RESULTS.indefinite)  # pyright: ignore[reportArgumentType]
+    # Comparisons with NaN are false, and zeros of rows without a bound hide what is not finite in them.
+    finite = finite & (jnp.isfinite(point.x).all() | (result != RESULTS.successful))
+    result = RESULTS.where(finite, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
 
     x = point.x if inverse is None else x0 + point.x - _product(inverse, _product(A, point.x))
     z = [jnp.zeros_like(y) for y in levels]

@@ -10,9 +10,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import Constraint, Pfaffian
 from jaxdyn.constraints.rolling import RollingSphere
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, as_array, pose_leaf
@@ -43,16 +43,16 @@ class DryFriction(WithModes):
     **Arguments:**
 
     - `coefficient`: mu of sliding. `static`: mu_s of rest; None for the same.
-    - `normal`: N, in N: a number, a function normal(system, q, v, t) -> (), or the name of a constraint with one row, or of a
-      contact (its normal force).
+    - `normal`: N, in N: a number, a function normal(system, q, v, t) -> (), which holds nothing where it is negative, or the
+      name of a constraint with one row, or of a contact (its normal force).
     - `along`: what slides: the index of a velocity, a function A(q, t) -> (nv,) or (2, nv) with w = A v, or a constraint with
       one or two rows on the velocity, as `jd.Pfaffian(A, b)` for a belt that moves.
     - `smoothing`: v_s, m/s: instead of modes, f = -mu N tanh(|w|/v_s) w/|w|. It never sticks, it creeps, at the velocity
       v_s artanh(load/(mu N)) under a load below mu N; while it slides the force is within 1 % above 2.65 v_s.
     - `name`: of its events.
 
-    **Raises:** ValueError for coefficients that are negative or a static one below the other, an index that is none, a
-    constraint that holds positions, and smoothing that is not positive.
+    **Raises:** ValueError for coefficients and normal forces that are negative, a static one below the other, an index that is
+    none, a constraint that holds positions, and smoothing that is not positive.
 
     Source: EQUATIONS section 11 and erratum E42.
 
@@ -88,6 +88,10 @@ class DryFriction(WithModes):
             self.normal = as_pytree(normal, f"DryFriction {name!r}: normal")
         else:
             self.normal = jnp.asarray(as_array(normal, f"DryFriction {name!r}: normal"), float)
+            if is_concrete(self.normal) and not (np.asarray(self.normal) >= 0).all():
+                raise ValueError(
+                    f"DryFriction {name!r}: normal is {normal}; give the size of the normal force (N), zero or more"
+                )
         if isinstance(along, bool) or not (callable(along) or isinstance(along, (int, Constraint))):
             raise ValueError(
                 f"DryFriction {name!r}: along is {along!r}; give an index of v, a function A(q, t) -> (nv,), or a constraint"
@@ -147,7 +151,7 @@ class UnilateralContact(WithModes):
         owner = f"UnilateralContact {self.name!r}"
         self.coefficient, self.static = _coefficients(friction, static, owner)
         self.restitution = jnp.asarray(as_array(restitution, f"{owner}: restitution"), float)
-        known = None if isinstance(self.restitution, Tracer) else np.asarray(self.restitution)
+        known = np.asarray(self.restitution) if is_concrete(self.restitution) else None
         if known is not None and not ((known >= 0) & (known <= 1)).all():
             raise ValueError(f"{owner}: restitution is {restitution}; give a number from 0 to 1")
 
@@ -181,7 +185,7 @@ def ground_contact(
     """
     name = f"{body} on the ground" if name is None else name
     size = jnp.asarray(as_array(radius, f"ground_contact {name!r}: radius"), float)
-    if size.shape != () or not (isinstance(size, Tracer) or 0 <= float(size) < np.inf):
+    if size.shape != () or (is_concrete(size) and not 0 <= float(size) < np.inf):
         raise ValueError(f"ground_contact {name!r}: radius is {radius}; give one number (m), 0 for a point")
     touching = RollingSphere(
         name=name,
@@ -278,7 +282,7 @@ def _coefficients(sliding: Any, static: Any, owner: str):
         jnp.asarray(as_array(x, f"{owner}: coefficient"), float)
         for x in (sliding, sliding if static is None else static)
     ]
-    if not any(isinstance(x, Tracer) for x in both):
+    if is_concrete(both):
         mu, mu_s = (np.asarray(x) for x in both)
         if not (np.isfinite(mu).all() and (mu >= 0).all() and np.isfinite(mu_s).all() and (mu_s >= mu).all()):
             raise ValueError(f"{owner}: coefficients are {mu} sliding and {mu_s} at rest; give 0 <= sliding <= static")
@@ -289,6 +293,6 @@ def _positive(value: Any, what: str):
     if value is None:
         return None
     number = jnp.asarray(as_array(value, what), float)
-    if not isinstance(number, Tracer) and not (np.asarray(number) > 0).all():
+    if is_concrete(number) and not (np.asarray(number) > 0).all():
         raise ValueError(f"{what} is {value}; give a positive velocity (m/s), or None for friction that sticks")
     return number

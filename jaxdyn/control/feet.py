@@ -6,7 +6,6 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.loops import Loop, loop, pose_leaf
@@ -15,7 +14,7 @@ from jaxdyn.contact.kinds import wrench_basis
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Checked, Numbers, as_array
+from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 
@@ -99,7 +98,7 @@ def foot(
     rotation = as_array(np.eye(3) if ground is None else ground, f"foot {frame!r}: ground")
     if rotation.shape != (3, 3):
         raise ValueError(f"foot {frame!r}: ground has shape {rotation.shape}; give a rotation (3, 3)")
-    if not isinstance(rotation, Tracer):
+    if is_concrete(rotation):
         known = np.asarray(rotation, float)
         # Numbers as people write them, with some six digits.
         if np.abs(known @ known.T - np.eye(3)).max() > 1e-5 or np.linalg.det(known) < 0:

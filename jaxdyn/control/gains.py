@@ -4,11 +4,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.arguments import as_array, batch_hint, is_concrete
 
 
 def gain(value: Any, name: str) -> Array:
@@ -22,7 +21,7 @@ def gain(value: Any, name: str) -> Array:
         raise ValueError(
             f"{name} has shape {array.shape}; give a number, (n,) for a diagonal matrix, or a matrix (n, n)"
         )
-    if not isinstance(array, Tracer):
+    if is_concrete(array):
         known = np.asarray(array, float)
         least = np.linalg.eigvalsh((known + known.T) / 2).min() if _is_matrix(known) else known.min(initial=np.inf)
         if not (np.isfinite(known).all() and least > 0):
@@ -38,7 +37,7 @@ def non_negative(value: Any, name: str) -> Array:
     number = as_array(value, name)
     if number.ndim:
         raise ValueError(f"{name} has shape {number.shape}; give one number{batch_hint(number, ())}")
-    if not isinstance(number, Tracer) and not 0 <= float(number) < np.inf:
+    if is_concrete(number) and not 0 <= float(number) < np.inf:
         raise ValueError(f"{name} is {float(number)}; give zero or a positive number")
     return jnp.asarray(number, number.dtype if jnp.issubdtype(number.dtype, jnp.floating) else float)
 

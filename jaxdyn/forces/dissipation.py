@@ -6,9 +6,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
-from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike
+from jaxdyn.forces.piecewise import PiecewiseForce
+from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, is_concrete
 from jaxdyn.systems.scene import as_pytree
 
 
@@ -45,22 +47,22 @@ class RayleighDissipation(eqx.Module):
 _ROUNDING = 100.0  # m/s (rad/s) times eps
 
 
-class SlidingFriction(eqx.Module):
+class SlidingFriction(PiecewiseForce):
     """Coulomb friction of a contact that slides: tau = -sign(A v) mu N A^T, for the sliding velocity A v.
 
     At A v = 0 the sign is that of `direction`, so that the force is smooth while it slides that way and where it comes to rest.
-    A contact that turns round is braked the other way. One that sticks is not held: the sign of the force changes from step to
-    step, velocities stay as small as a step's change, and adaptive steps become short until the run ends with a code.
+    A contact that turns round is braked the other way. One that sticks is not held: fixed steps change the sign of the force from
+    step to step, so that velocities stay as small as a step's change; adaptive ones end the run with the code `too_many_events`.
 
     **Arguments:**
 
     - `coefficient`: mu.
-    - `normal`: N, in N, a number or a function normal(system, q, v, t) -> ().
+    - `normal`: N, in N, a number or a function normal(system, q, v, t) -> (); where it is negative there is no friction.
     - `direction`: 1 or -1, the sign of A v where the motion starts and where it is zero.
     - `along`: index of the coordinate that slides, or a function A(q, t) -> (nv,).
 
-    **Raises:** ValueError for another direction, a negative coefficient, an index that is none; (when called) for one
-    beyond the system's velocities, and for shapes that do not fit.
+    **Raises:** ValueError for another direction, a negative coefficient or normal force, an index that is none; (when called)
+    for one beyond the system's velocities, and for shapes that do not fit.
 
     Source: EQUATIONS section 11 and erratum E42.
     """
@@ -81,8 +83,12 @@ class SlidingFriction(eqx.Module):
             raise ValueError(
                 f"SlidingFriction: direction is {direction!r}; give the sign of the sliding velocity, 1 or -1"
             )
-        if isinstance(coefficient, (int, float)) and coefficient < 0:
+        if is_concrete(coefficient) and not (np.asarray(coefficient) >= 0).all():
             raise ValueError(f"SlidingFriction: coefficient is {coefficient}; give mu >= 0 and turn direction round")
+        if not callable(normal) and is_concrete(normal) and not (np.asarray(normal) >= 0).all():
+            raise ValueError(
+                f"SlidingFriction: normal is {normal}; give the size of the normal force (N), zero or more"
+            )
         if not callable(along) and (isinstance(along, bool) or not isinstance(along, int) or along < 0):
             raise ValueError(f"SlidingFriction: along is {along!r}; give an index of v or a function A(q, t) -> (nv,)")
         self.coefficient = jnp.asarray(coefficient)
@@ -90,21 +96,35 @@ class SlidingFriction(eqx.Module):
         self.direction = direction
         self.along = as_pytree(along, "SlidingFriction: along") if callable(along) else _Coordinate(along)
 
-    def __call__(
+    def guards(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " 1"]:
+        """The sliding velocity along `direction`, (1,); rounding of one that ends at zero is no reversal."""
+        along = self.direction * jnp.sum(self._row(q, v, t) * v)
+        return (along + _ROUNDING * float(jnp.finfo(v.dtype).eps))[None]
+
+    def force(
+        self,
+        system: SystemLike,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        positive: Bool[Array, " 1"],
     ) -> Float[Array, " nv"]:
-        row: Any = self.along.row(v) if isinstance(self.along, _Coordinate) else self.along(q, t)
+        """Against `direction` where `positive` says that it slides that way, else along it, (nv,)."""
+        row = self._row(q, v, t)
         normal: Any = self.normal(system, q, v, t) if callable(self.normal) else self.normal
         if jnp.shape(row) != v.shape or jnp.shape(normal) != ():
             raise ValueError(
                 f"SlidingFriction: along gives shape {jnp.shape(row)}, normal {jnp.shape(normal)}; expected {v.shape} = "
                 "(nv,) and ()"
             )
-        limit = self.coefficient.astype(v.dtype) * jnp.asarray(normal, v.dtype)
-        row = jnp.asarray(row, v.dtype)
-        # Rounding of a velocity that ends at zero is no reversal.
-        turned = self.direction * jnp.sum(row * v) < -_ROUNDING * float(jnp.finfo(v.dtype).eps)
-        return jnp.where(turned, self.direction, -self.direction) * limit * row
+        limit = self.coefficient.astype(v.dtype) * jnp.maximum(jnp.asarray(normal, v.dtype), 0.0)
+        return jnp.where(positive[0], -self.direction, self.direction) * limit * row
+
+    def _row(self, q, v, t):
+        row: Any = self.along.row(v) if isinstance(self.along, _Coordinate) else self.along(q, t)
+        return jnp.asarray(row, v.dtype)
 
 
 class _Coordinate(eqx.Module):

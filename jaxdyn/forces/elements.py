@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, take
-from jaxdyn.model.arguments import Number, SystemLike, batch_hint
+from jaxdyn.model.arguments import Number, SystemLike, batch_hint, is_concrete
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model, difference, neutral
 
@@ -260,4 +259,4 @@ class ExternalWrench(eqx.Module):
 def _all_positive(value) -> bool:
     """False when a value is known and not positive; a traced one is taken on trust."""
 
-    return isinstance(value, Tracer) or bool((np.asarray(value) > 0).all())
+    return not is_concrete(value) or bool((np.asarray(value) > 0).all())

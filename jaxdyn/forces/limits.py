@@ -6,17 +6,18 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array
+from jaxdyn.forces.piecewise import PiecewiseForce
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete
 from jaxdyn.model.tree import Model
 
 
-class JointStops(eqx.Module):
+class JointStops(PiecewiseForce):
     """Stops at the position limits of the model's joints, as springs with dampers that push and never pull.
 
-    Beyond a limit by x, with the velocity x' outwards, tau = -max(k x + d x', 0); else none. A joint that is driven against its
+    Beyond a limit by x, with the velocity x' outwards, tau = -max(k x + d x', 0); else none. `jd.simulate` ends a step where a
+    joint meets a stop or leaves it (see `PiecewiseForce`). A joint that is driven against its
     stop with tau comes to rest tau/k beyond it. The rate sqrt(k/M) has to be followed by the steps; with d = 2 sqrt(k M) the
     stop does not throw the joint back.
 
@@ -42,21 +43,44 @@ class JointStops(eqx.Module):
         self.damping = _number(damping, "JointStops: damping", least=0.0, strict=False)
         self.joints = (joints,) if isinstance(joints, str) else joints if joints is None else tuple(joints)
 
-    def __call__(
+    def guards(
         self, system: Checked[Model], q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " n"]:
+        """k x + min(d x', 0) of the lower limits, then of the upper ones: x where a stop is met, its force where it is left."""
+        return jnp.concatenate([jnp.where(bounded, k * x + jnp.minimum(d * rate, 0.0), -1.0)
+                                for bounded, k, x, d, rate in self._beyond(system, q, v)])  # fmt: skip
+
+    def force(
+        self,
+        system: Checked[Model],
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        positive: Bool[Array, " n"],
     ) -> Float[Array, " nv"]:
+        """The force of the stops that are met, (nv,)."""
+        total, at_v = jnp.zeros_like(v), self._indices(system)[1]
+        met = positive.reshape(2, -1)
+        for side, (bounded, k, x, d, rate) in enumerate(self._beyond(system, q, v)):
+            push = jnp.where(met[side] & bounded, k * x + d * rate, 0.0)
+            total = total.at[at_v].add(push if side == 0 else -push)
+        return total
+
+    def _indices(self, system):
         places = self._places(system)
-        at_q, at_v = (np.array(x, int) for x in zip(*places, strict=True)) if places else (np.zeros(0, int),) * 2
-        place, rate = q[at_q], v[at_v]
+        return tuple(np.array(x, int) for x in zip(*places, strict=True)) if places else (np.zeros(0, int),) * 2
+
+    def _beyond(self, system, q, v):
+        """Of the lower limits and of the upper ones: which there are, and k, x, d and x' outwards."""
+        at_q, at_v = self._indices(system)
         k, d = self.stiffness.astype(q.dtype), self.damping.astype(q.dtype)
-        total = jnp.zeros_like(v)
+        sides = []
         for limit, sign in ((system.lower, -1.0), (system.upper, 1.0)):
             edge = jnp.asarray(limit, q.dtype)[at_q]
             bounded = jnp.isfinite(edge)
-            beyond = sign * (place - jnp.where(bounded, edge, jnp.zeros_like(edge)))  # keeps inf out of the gradient
-            push = jnp.where(bounded & (beyond > 0), jnp.maximum(k * beyond + d * sign * rate, 0.0), 0.0)
-            total = total.at[at_v].add(-sign * push)
-        return total
+            # The zero keeps inf out of the gradient.
+            sides.append((bounded, k, sign * (q[at_q] - jnp.where(bounded, edge, 0.0)), d, sign * v[at_v]))
+        return sides
 
     def _places(self, system) -> list[tuple[int, int]]:
         """Where the joints stand in q and v."""
@@ -97,7 +121,7 @@ class EffortLimits(eqx.Module):
 
     def __init__(self, limit: Numbers | None = None):
         self.limit = None if limit is None else jnp.asarray(as_array(limit, "EffortLimits: limit"), float)
-        if self.limit is not None and not isinstance(self.limit, Tracer) and not (np.asarray(self.limit) >= 0).all():
+        if self.limit is not None and is_concrete(self.limit) and not (np.asarray(self.limit) >= 0).all():
             raise ValueError(
                 f"EffortLimits: limit is {limit}; give limits that are not negative, or None for the model's"
             )
@@ -107,8 +131,24 @@ class EffortLimits(eqx.Module):
     ) -> Float[Array, " nv"]:
         return jnp.zeros_like(v)
 
-    def limited(self, system: SystemLike, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
-        """tau cut off."""
+    def effort_guards(self, system: SystemLike, tau: Float[Array, " nv"]) -> Float[Array, " n"]:
+        """tau - limit, then -limit - tau, (2 nv,): negative where nothing is cut off."""
+        limit = self._limit(system, tau)
+        bounded = jnp.isfinite(limit)
+        limit = jnp.where(bounded, limit, 0.0)
+        return jnp.concatenate([jnp.where(bounded, side * tau - limit, -1.0) for side in (1.0, -1.0)])
+
+    def limited(
+        self, system: SystemLike, tau: Float[Array, " nv"], positive: Bool[Array, " n"] | None = None
+    ) -> Float[Array, " nv"]:
+        """tau cut off; `positive` (2 nv,): where, if that is known from the signs of `effort_guards`."""
+        limit = self._limit(system, tau)
+        if positive is None:
+            return jnp.clip(tau, -limit, limit)
+        above, below = positive.reshape(2, -1)
+        return jnp.where(above, limit, jnp.where(below, -limit, tau))
+
+    def _limit(self, system, tau):
         limit: Any = getattr(system, "effort_limit", None) if self.limit is None else self.limit
         if limit is None:
             raise ValueError(f"EffortLimits: a {type(system).__name__} has no effort_limit; give the limit")
@@ -116,13 +156,12 @@ class EffortLimits(eqx.Module):
             raise ValueError(
                 f"EffortLimits: limit has shape {jnp.shape(limit)}, expected a number or {tau.shape} = (nv,)"
             )
-        limit = jnp.broadcast_to(jnp.asarray(limit, tau.dtype), tau.shape)
-        return jnp.clip(tau, -limit, limit)
+        return jnp.broadcast_to(jnp.asarray(limit, tau.dtype), tau.shape)
 
 
 def _number(value: Any, what: str, least: float, strict: bool):
     number = jnp.asarray(as_array(value, what), float)
-    fine = isinstance(number, Tracer) or (
+    fine = not is_concrete(number) or (
         number.shape == () and np.isfinite(number) and (number > least if strict else number >= least)
     )
     if not fine:

@@ -5,11 +5,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.model.arguments import Checked, Numbers
+from jaxdyn.model.arguments import Checked, Numbers, is_concrete
 from jaxdyn.model.tree import Model
 
 
@@ -162,7 +161,7 @@ def _check_signals(signals: dict) -> None:
     for name in ("v", "a"):
         if name in signals and signals[name].shape[1] != signals["tau"].shape[1]:
             raise ValueError(f"{name} has {signals[name].shape[1]} columns, tau has {signals['tau'].shape[1]}")
-    if any(isinstance(value, jax.core.Tracer) for value in signals.values()):
+    if not is_concrete(signals):
         return
     for name, value in signals.items():
         bad = np.argwhere(~np.isfinite(np.asarray(value)))

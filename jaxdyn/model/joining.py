@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import numpy_for
+from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Checked, Numbers, pose_leaf, stored
 from jaxdyn.model.joints import KINDS
@@ -194,7 +193,7 @@ def _concatenated(values: list, dtype, rows: Any = slice(None)) -> jax.Array:
 
 def _common_gravity(models):
     gravities = [model.gravity for model in models]
-    known = [g for g in gravities if not isinstance(g, jax.core.Tracer)]
+    known = [g for g in gravities if is_concrete(g)]
     if any((g is None) != (gravities[0] is None) for g in gravities) or any(
         g is not None and not np.array_equal(g, known[0]) for g in known
     ):

@@ -12,9 +12,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import jaxpr_as_fun
 
-from jaxdyn.compile import compilation, glue_options
+from jaxdyn.compile import compilation, function_of, glue_options
 from jaxdyn.scale.members import Members
 
 logger = logging.getLogger("jaxdyn")
@@ -113,7 +112,7 @@ class Traced:
     def __init__(self, one: Callable, members: Members):
         trace = jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True)
         operations, self.shapes = trace(given_to_one(members))
-        self._call = jaxpr_as_fun(operations)
+        self._call = function_of(operations)
         self._structure = jax.tree.structure(self.shapes)
 
     def __call__(self, given: Any) -> dict[str, Any]:

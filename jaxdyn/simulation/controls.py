@@ -19,7 +19,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
@@ -123,7 +122,7 @@ class Sampled(eqx.Module):
         self.law = as_pytree(law, "Sampled: law")
         self.state = jax.tree.map(lambda x: jnp.asarray(as_array(x, "Sampled: state")), state)
         seconds = as_array(period, "Sampled: period")
-        if seconds.shape != () or not (isinstance(seconds, Tracer) or 0 < float(seconds) < np.inf):
+        if seconds.shape != () or (is_concrete(seconds) and not 0 < float(seconds) < np.inf):
             raise ValueError(f"Sampled: period is {period!r}; give one positive number (s)")
         self.period = jnp.asarray(seconds, float)
 

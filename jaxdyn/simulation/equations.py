@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import partition_traced
+from jaxdyn.forces.piecewise import Pieces, guards, in_pieces, pieces_of, values_and_levels
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
@@ -26,6 +27,8 @@ class Equations(NamedTuple):
     - `args`: what is traced. `derivative(t, y, args)`, and its two parts for solvers that split it.
     - `torque(args, y, q, v, t)` of the control and `generalized_force`, which is that plus the scene's forces, (nv,) or None.
     - `project(t, y, error, args)` after a step; `quality` of the method's basis; `begin`, `advance` for steps of its own.
+    - `pieces`: the switching functions of the scene's forces, and switching(t, y, args) -> their values and rounding levels.
+      With which of them are positive behind the other `args`, forces keep to these pieces (`with_pieces`).
     - `allowances(args, y, q, v, t)` of contacts, joints and the control, which can end the run;
       `least_allowance(t, y, args)`, or None where nothing can.
     """
@@ -40,8 +43,15 @@ class Equations(NamedTuple):
     quality: Callable
     begin: Callable
     advance: Callable
+    pieces: Pieces
+    switching: Callable
     allowances: Callable
     least_allowance: Callable | None
+
+
+def with_pieces(unknown, positive) -> tuple:
+    """The arguments of equations whose forces keep to pieces."""
+    return (*(unknown or ()), positive)
 
 
 def power(force, v):
@@ -49,28 +59,41 @@ def power(force, v):
     return jnp.zeros((), v.dtype) if force is None else jnp.sum(v * force)
 
 
-def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...], options: dict) -> Equations:
-    """The equations of a run; `added`: names of what the control adds to the state."""
-    system = scene.system
+def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t0, options: dict) -> Equations:
+    """The equations of a run; `start`: what the control adds to the state, at its start (q0, v0, t0)."""
+    system, added = scene.system, tuple(start)  # names alone, as functions of a run hold no arrays
     # diffrax compiles its arguments, which hides their values. What is known stays in closures, the rest is `args`:
     # flat, because its continuous adjoint takes no empty tuples.
     unknown, known = partition_traced((scene, control, method))
-    args = tuple(unknown) or None
+    args, count = tuple(unknown) or None, len(unknown)
 
     def given(args):
         """The scene, the control and the method."""
-        return known(args or ())
+        args = args or ()
+        scene, control, method = known(args[:count])
+        return in_pieces(scene, pieces, args[count]) if len(args) > count else scene, control, method
 
-    def torque(args, y, q, v, t):
-        """Of the control, or None when there is none."""
+    def effort(args, y, q, v, t):
+        """Of the control before limits, or None when there is none."""
         scene, control, method = given(args)
 
         def multipliers(tau):
             force = scene.applied_force(q, v, t)
             return method.multipliers(scene, q, v, t, tau if force is None else tau + force)
 
-        tau = controls.torque(control, scene, y, q, v, t, multipliers)
-        return None if tau is None else scene.limited(tau)
+        return controls.torque(control, scene, y, q, v, t, multipliers)
+
+    def torque(args, y, q, v, t):
+        """Of the control, or None when there is none."""
+        tau = effort(args, y, q, v, t)
+        return None if tau is None else given(args)[0].limited(tau)
+
+    pieces = pieces_of(scene, start, q0, v0, t0, functools.partial(effort, args))
+
+    def switching(t, y, args):
+        scene, _, method = given(args)
+        q, v = method.to_qv(scene, y, t)
+        return values_and_levels(lambda q, v: guards(scene, q, v, t, effort(args, y, q, v, t)), q, v)
 
     def generalized_force(args, y, q, v, t):
         """Tau plus the scene's forces, or None when there are none."""
@@ -160,6 +183,6 @@ def equations(scene: Scene, control: Any, method: Method, added: tuple[str, ...]
 
     has_margins = by_contacts or by_control or options["limits"] == "stop"
     return Equations(
-        args, torque, generalized_force, derivative, explicit_part, implicit_part, project, quality, begin, advance, allowances,
-        least_allowance if has_margins else None,
+        args, torque, generalized_force, derivative, explicit_part, implicit_part, project, quality, begin, advance, pieces,
+        switching, allowances, least_allowance if has_margins else None,
     )  # fmt: skip

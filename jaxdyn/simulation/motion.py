@@ -70,7 +70,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     states = controls.started(control, q0, v0, ts[0])
     added = tuple(states)  # names alone, as functions of a run hold no arrays
     options = options | {"control_ends": controls.can_end(control, q0, v0, ts[0])}
-    eqs = equations(scene, control, method, added, options)
+    eqs = equations(scene, control, method, states, q0, v0, ts[0], options)
     eqx.filter_eval_shape(eqs.generalized_force, eqs.args, states, q0, v0, ts[0])
     y0 = method.start(scene, q0, v0, ts[0]) | states
     first = method.quality(scene, y0, ts[0])
@@ -90,9 +90,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         term = diffrax.MultiTerm(diffrax.ODETerm(eqs.explicit_part), diffrax.ODETerm(eqs.implicit_part))
     options = options | {"solver": solver}
     corrector = eqs.project if corrects else None
-    rows, result, counts, time_reached, last = integrate(
-        term, corrector, eqs.quality, eqs.least_allowance, method, y0, ts, eqs.args, steps, options
-    )
+    rows, result, counts, time_reached, last = integrate(term, corrector, eqs, method, y0, ts, steps, options)
 
     y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, rows)
     finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]

@@ -21,6 +21,7 @@ from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
 from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.hybrid import motion as hybrid
+from jaxdyn.simulation.hybrid.machine import SEARCHED
 from jaxdyn.simulation.methods import Method
 from jaxdyn.simulation.motion import motion
 from jaxdyn.simulation.outputs import checked_outputs
@@ -98,8 +99,8 @@ def simulate(
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to and besides the size of each entry of (q, v). Values below ten
       times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
-    - `adjoint`: "reverse" (default) for reverse mode with checkpoints; "forward" for jvp, jacfwd and Hessians by
-      forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
+    - `adjoint`: "reverse" (default) for reverse mode with checkpoints, and Hessians over it; "forward" for jvp, jacfwd and
+      Hessians by forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration"
       (the rate of v: of a free joint that of its body twist; `jd.frame_acceleration` gives those of frames in world axes),
@@ -113,8 +114,7 @@ def simulate(
       "report": the run goes on; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point, or
       -1, and a concrete run warns (`JointLimitWarning`).
     - `max_events`: of a scene with forces that have modes (`jd.DryFriction`, `jd.UnilateralContact`), after which the run ends
-      with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps, which end at events,
-      and are differentiated in reverse mode.
+      with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps, which end at events.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
       4096 with "direct", and where reverse mode goes through adaptive steps: it remembers where each one ends, at 8 bytes a
@@ -195,7 +195,7 @@ def simulate(
         "max_events": max_events,
     }
     if modal and is_fixed(stepsize) and max_steps is None:
-        options["max_steps"] += hybrid.SEARCHED * max_events
+        options["max_steps"] += SEARCHED * max_events
     dtype = state_dtype(scene.system)
     numbers: list[Any] = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
     numbers.append(jnp.asarray(stepsize, dtype) if is_fixed(stepsize) else stepsize)

@@ -189,6 +189,7 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
                 f"{float(rates.explicit_step):.3g} s; pass solver=jd.Rodas5P(), or raise max_steps (now {options['max_steps']})"
             )
+    if name in ("max_steps_reached", "too_many_events"):
         if any(isinstance(force, SlidingFriction) for force in scene.forces):
             advice = f"where a contact with jd.SlidingFriction comes to rest, take jd.DryFriction, which sticks; else {advice}"
     if name == "contact_lost":

@@ -7,11 +7,13 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
-from jaxdyn.compile import partition_traced
+from jaxdyn.compile import is_concrete, partition_traced
 from jaxdyn.contact.unilateral import has_modes
+from jaxdyn.forces.piecewise import guards, in_pieces, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
+from jaxdyn.simulation.hybrid.laws import laws_of_pieces
+from jaxdyn.simulation.hybrid.pieces import motion_in_pieces
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
 from jaxdyn.simulation.solvers.driver import Drive
 from jaxdyn.simulation.solvers.rk4 import RK4
@@ -19,14 +21,18 @@ from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import as_scene, checked_force
 from jaxdyn.systems.system import SceneLike
 
+EVENTS = 8  # of a step, at most: a force that changes its piece more often leaves it without derivatives
+ADJOINTS = ("reverse", "forward", "direct")
 
-def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True) -> Callable:
+
+def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True, adjoint: str = "reverse") -> Callable:
     """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a constant tau, or under a law.
 
     The state is a pair (q (nq,), v (nv,)); batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
     torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
     steps are those of `jd.simulate` with `stepsize=dt/substeps`: RK4, constraints closed at the end of each, the scene's
-    forces applied (friction, stops, drives), and tau cut off by its `jd.EffortLimits`.
+    forces applied (friction, stops, drives), and tau cut off by its `jd.EffortLimits`. Where a joint meets a stop
+    (`jd.JointStops`, any `jd.PiecewiseForce`) a step ends and the next one goes on to where it would have ended.
 
     **Arguments:**
 
@@ -36,9 +42,11 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     - `remat`: whether reverse mode keeps no more of a step than its state and tau, and computes the rest again. That costs a
       step, and a run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau, which is computed
       again too, 8 (nq + nv) n bytes and nothing of what happens inside the law.
+    - `adjoint`: "reverse" (default), for `jax.grad`, `jax.jacrev` and, over them, `jax.hessian`; "forward" or "direct", for
+      forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer.
 
-    **Raises:** ValueError for a dt that is not positive, substeps that are no count, forces with modes; (when called) for shapes
-    that do not fit.
+    **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, forces with modes; (when
+    called) for shapes that do not fit.
 
     ```python
     step = jd.stepper(robot, dt=0.01, substeps=2)
@@ -53,18 +61,26 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
             "jd.simulate, or jd.CoulombFriction in their place"
         )
     seconds = as_array(dt, "stepper: dt")
-    if seconds.shape != () or not (isinstance(seconds, Tracer) or 0 < float(seconds) < np.inf):
+    if seconds.shape != () or (is_concrete(seconds) and not 0 < float(seconds) < np.inf):
         raise ValueError(f"stepper: dt is {dt!r}; give one positive number (s)")
     if isinstance(substeps, bool) or not isinstance(substeps, (int, np.integer)) or substeps < 1:
         raise ValueError(f"stepper: substeps is {substeps!r}; give a positive integer")
+    if adjoint not in ADJOINTS:
+        raise ValueError(f"stepper: adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}")
+    is_direct = adjoint != "reverse"
     method, system, dtype = chosen_method(scene, "auto"), scene.system, state_dtype(scene.system)
     unknown, known = partition_traced(scene)
-    length = jnp.asarray(seconds, dtype) if isinstance(seconds, Tracer) else np.asarray(seconds, dtype)
+    length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
+
+    def given(args):
+        """The scene, in the pieces that come behind tau if any do, and tau."""
+        unknown, tau, *positive = args
+        scene = known(unknown)
+        return in_pieces(scene, pieces, *positive) if positive else scene, tau
 
     @jax.jit
     def field(t, y, args):
-        unknown, tau = args
-        scene = known(unknown)
+        scene, tau = given(args)
 
         def generalized_force(q, v, t):
             force, given = scene.applied_force(q, v, t), scene.limited(tau)
@@ -73,19 +89,30 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
         return method.evaluated(scene, y, t, generalized_force)[0]
 
     def project(t, y, error, args):
-        scene = known(args[0])
+        scene, _ = given(args)
         y, error = method.stepped(scene, y, t, error)
         return y, error, diffrax.RESULTS.successful
 
     corrector = project if method.corrects(scene) else None
     solver = ExplicitSteps(RK4(), corrector, method.step_constants, method.projects, field=field)
 
+    def switching(t, y, args):
+        scene, _ = given(args)
+        return values_and_levels(lambda q, v: guards(scene, q, v, t, None), *method.to_qv(scene, y, t))
+
+    # tau is constant in a step, and so is where it is cut off.
+    q, v = (jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv))
+    pieces = pieces_of(scene, (), q, v, jnp.zeros((), dtype), None)
+
     def advance(q, v, tau, t):
         y = method.start(scene, q, v, t)
-        drive = Drive(
-            solver.plan(y), driver.Fixed(4, 3), None, None, length / substeps, substeps, substeps
-        )  # fmt: skip
-        rows, _, _ = drive(y, (unknown, tau), jnp.stack([t, t + length]))
+        plan, args, ts, size = solver.plan(y), (unknown, tau), jnp.stack([t, t + length]), length / substeps
+        if pieces.names:
+            laws = laws_of_pieces(plan, pieces, switching, 4, 3)
+            rows = motion_in_pieces(laws, y, args, ts, (0.0, 0.0), size, substeps, substeps + 1, EVENTS, is_direct)[0]
+        else:
+            drive = Drive(plan, driver.Fixed(4, 3), None, None, size, substeps, substeps)
+            rows = (drive.direct if is_direct else drive)(y, args, ts)[0]
         return method.to_qv(scene, jax.tree.map(lambda x: x[0], rows), t + length)
 
     taken = jax.checkpoint(advance) if remat else advance

@@ -2,15 +2,15 @@
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jax import lax
-from jax.core import Tracer
+
+from jaxdyn.compile import is_concrete
 
 
 def is_known(*arrays) -> bool:
     """Whether the values of all arrays can be read while tracing."""
-    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays))
+    return is_concrete(*arrays)
 
 
 def known_as_numpy(array):

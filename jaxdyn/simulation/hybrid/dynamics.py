@@ -64,12 +64,12 @@ def by_element(elements: Elements, rowwise) -> Array:
 
 
 def normal_given(scene: Scene, element, q, v, t):
-    """N of a friction whose normal force is given."""
+    """N of a friction whose normal force is given, zero where that is negative: such friction would drive the motion."""
     normal: Any = force_at(scene, element).normal
     value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
     if jnp.shape(value) != ():
         raise ValueError(f"friction {element.name!r}: normal gives shape {jnp.shape(value)}; expected one number, ()")
-    return jnp.asarray(value, q.dtype)
+    return jnp.maximum(jnp.asarray(value, q.dtype), 0.0)
 
 
 def directions(scene: Scene, elements: Elements, slip, reference) -> Array:

@@ -3,8 +3,9 @@
 import equinox as eqx
 import jax
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
+
+from jaxdyn.compile import is_concrete
 
 
 class Events(eqx.Module):
@@ -29,7 +30,7 @@ class Events(eqx.Module):
     @property
     def name(self) -> np.ndarray:
         """Names (ne,) of the events, "" behind the last. **Raises:** ValueError inside of `jax.jit`, where there are no texts."""
-        if isinstance(self.index, Tracer):
+        if not is_concrete(self.index):
             raise ValueError(
                 "events.name are texts, which a traced program does not have; take events.index and events.names"
             )

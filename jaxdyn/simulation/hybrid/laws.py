@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxdyn.compile import run
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.forces.piecewise import Pieces, values_and_levels
 from jaxdyn.lie.so3 import _product
 from jaxdyn.simulation.hybrid.dynamics import (
     StateTerms,
@@ -30,7 +31,7 @@ from jaxdyn.simulation.hybrid.dynamics import (
 )
 from jaxdyn.simulation.hybrid.machine import Laws
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extended, force_at
-from jaxdyn.simulation.hybrid.transitions import Judged, Jumped, aligned, at_once, changed_mode
+from jaxdyn.simulation.hybrid.transitions import Change, Judged, Jumped, aligned, at_once, changed_mode
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_to_rate
@@ -39,11 +40,15 @@ _ROUNDS = 2
 
 
 def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
-    """`given(unknown)` -> (scene, effort(q, v, t)), of the numbers that are arguments; `y0`, a state."""
+    """Functions of a motion with modes.
+
+    `given(unknown, positive=None)` -> (scene, generalized_force(q, v, t), switching(q, v, t)), of the numbers that are arguments,
+    with forces in the pieces where the switching functions are `positive`; `y0`, a state.
+    """
 
     def at(args, t, y):
         unknown, mode = args
-        scene, generalized_force = given(unknown)
+        scene, generalized_force, _ = given(unknown, mode.positive)
         q, v = retract(scene.system, y["q"]), y["v"]
         terms = terms_at(scene, elements, q, v, t)
         return (
@@ -70,7 +75,9 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
         y = plan.structure(y)
         scene, mode, q, v, terms, motion = at(args, t, y)
         judged = _judged(scene, elements, mode, terms, motion, y["slip"], q, v, t)
-        return judged.conditions, judged.levels
+        values, levels = _switches(given(args[0])[2], mode.positive, q, v, t)
+        return tuple(jnp.concatenate([own.reshape(-1), more]) for own, more in
+                     ((judged.conditions, values), (judged.levels, levels)))  # fmt: skip
 
     def judge_all(unknown, mode, slip, t, q, v):
         scene, _, q, v, terms, motion = at((unknown, mode), t, {"q": q, "v": v, "slip": slip})
@@ -82,7 +89,9 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
     def transit(unknown, t, y, mode, slip, hit):
         y = plan.structure(y)
         q, v = y["q"], y["v"]
-        scene = given(unknown)[0]
+        scene, _, switching = given(unknown)
+        hit, switched = elements.split(hit)
+        mode = mode._replace(positive=mode.positive ^ switched)
 
         def judge_in(mode, slip, v):
             return run(judge_all, unknown, mode, slip, t, q, v)
@@ -92,7 +101,11 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
 
         mode, slip, begins = at_once(elements, mode, slip, judge_in(mode, slip, v), hit)
         cones = jnp.stack([force_at(scene, one).static.astype(v.dtype) for one in elements.each])
-        return changed_mode(elements, cones, mode, slip, begins, v, jump_in, judge_in)
+        change = changed_mode(elements, cones, mode, slip, begins, v, jump_in, judge_in)
+        # What an impact has carried across its zero.
+        values, levels = _switches(switching, change.mode.positive, q, change.v, t)
+        crossed = (values < -levels) & ~switched
+        return change._replace(mode=change.mode._replace(positive=change.mode.positive ^ crossed))
 
     def land(unknown, mode, slip, t, y):
         y = plan.structure(y)
@@ -106,6 +119,53 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
         return ravel_pytree(plan.structure(y) | {"v": v, "slip": slip})[0]
 
     return Laws(plan, elements, judge, transit, land, solver.order(None), solver.error_order(None), slip_of, placed)
+
+
+def _switches(switching: Callable, positive, q, v, t):
+    """Switching functions with signs such that they are positive until one changes its sign, and their rounding levels, (k,)."""
+    values, levels = values_and_levels(lambda q, v: switching(q, v, t), q, v)
+    return jnp.where(positive, values, -values), levels
+
+
+def laws_of_pieces(plan: Plan, pieces: Pieces, switching: Callable, order, error_order) -> Laws:
+    """Of a motion whose only modes are the pieces of its forces.
+
+    `plan` of steps; switching(t, y, args) -> values and rounding levels (k,). The arguments of both are followed by which of
+    these are positive.
+    """
+    elements = Elements((), 0, 0, pieces)
+
+    def inner(args):
+        unknown, mode = args
+        return (*unknown, mode.positive)
+
+    def field(t, y, args):
+        return plan.field(t, y, inner(args))
+
+    def project(t, y, error, args):
+        return plan.project(t, y, error, inner(args))  # pyright: ignore[reportOptionalCall]
+
+    whole = plan._replace(field=field, project=None if plan.project is None else project)
+
+    def judge(args, t, y):
+        values, levels = switching(t, whole.structure(y), inner(args))
+        return jnp.where(args[1].positive, values, -values), levels
+
+    def transit(unknown, t, y, mode, slip, hit):
+        changed = mode._replace(positive=mode.positive ^ hit)
+        yes = jnp.ones((), bool)
+        return Change(changed, slip, changed, slip, jnp.zeros((0,), y.dtype), yes, ~yes)
+
+    def land(unknown, mode, slip, t, y):
+        return y
+
+    def slip_of(y):
+        return jnp.zeros((0, 2), y.dtype)
+
+    def placed(y, v, slip):
+        return y
+
+    return Laws(whole, elements, judge, transit, land, order, error_order, slip_of, placed)
 
 
 def _shape_of(y0):

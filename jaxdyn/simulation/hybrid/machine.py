@@ -23,7 +23,8 @@ from jaxdyn.simulation.solvers.explicit import Plan, projected_output, step_in_t
 from jaxdyn.simulation.solvers.fixed_steps import accumulated, no_sums
 
 _SAFETY, _LEAST, _MOST, _AFTER_EVENT = 0.9, 0.2, 10.0, 0.3
-_SIMULTANEOUS, _REAL = 1e-9, 1e-6  # of the size of a condition in the step
+_SIMULTANEOUS, _REAL = 0.575, 0.383  # powers of eps, of the size of a condition in the step: 1e-9 and 1e-6 in float64
+SEARCHED = 40  # attempts at most to end a step at an event
 FINE, SHORT, PARADOX, NO_MODE, CROWDED = range(5)
 
 
@@ -63,6 +64,7 @@ class Lane(NamedTuple):
     code: Array
     count: Array
     sums: tuple[Array, Array]  # about steps of fixed length (`accumulated`)
+    loose: Array  # whether steps go across the zeros of switching functions, and pieces change where they end
 
 
 class Steps(NamedTuple):
@@ -78,10 +80,13 @@ class Steps(NamedTuple):
 
 
 class Laws(NamedTuple):
-    """The functions of a motion: `plan` of its steps, `judge(args, t, y)` -> conditions and their levels (n, CHANNELS), of flat
-    states; `transit(unknown, t, y, mode, slip, hit)` -> `Change`; `land(unknown, mode, slip, t, y)`, the state after
-    an impact; `order` of the method and `error_order` of its estimate; `slip(y)` (n, 2) of a flat
-    state, and `placed(y, v, slip)`, the flat state with these."""
+    """The functions of a motion.
+
+    `plan` of its steps; `judge(args, t, y)` -> conditions and their levels, of flat states: those of the elements by CHANNELS,
+    then those of the switching functions (see `Elements.split`); `transit(unknown, t, y, mode, slip, hit)` -> `Change`;
+    `land(unknown, mode, slip, t, y)`, the state after an impact; `order` of the method and `error_order` of its estimate;
+    `slip(y)` (n, 2) of a flat state, and `placed(y, v, slip)`, the flat state with these.
+    """
 
     plan: Plan
     elements: Elements
@@ -125,7 +130,7 @@ def blank(elements: Elements, dtype, most: int) -> Records:
     """Before anything happened."""
     n, none = len(elements.each), jnp.zeros((most + 1,), jnp.int32)
     flags = jnp.zeros((most + 1, n), bool)
-    mode = Mode(flags, flags, flags)
+    mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool))
     slip = jnp.zeros((most + 1, n, 2), dtype)
     return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, mode, slip, mode, slip)
 
@@ -138,7 +143,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
     start, end, count = ts[0], ts[-1], ts.shape[0] - 1
     eps, dtype, n = float(jnp.finfo(ts.dtype).eps), y0.dtype, len(laws.elements.each)
     none, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    hit = jnp.zeros((n, CHANNELS), bool)
+    hit = jnp.zeros((n * CHANNELS + laws.elements.switches,), bool)
     begun: Change = laws.transit(unknown, start, y0, mode, slip, hit)
     y = laws.placed(y0, begun.v, begun.slip)
     conditions, _ = run(judged, (unknown, begun.mode), start, y, static=(laws,))
@@ -150,7 +155,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
         steps = Steps(start, first)
     lane = Lane(
         start, y, first, first, begun.mode, conditions, no, zero, zero, zero, zero, none, none,
-        jnp.ones_like(conditions), none, none, code, none, no_sums(_moving(laws, y)),
+        jnp.ones_like(conditions), none, none, code, none, no_sums(_moving(laws, y)), no,
     )  # fmt: skip
     origin = y
     rows = jnp.broadcast_to(jnp.full_like(y, jnp.inf), (count, y.size))
@@ -167,13 +172,15 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
         after, kept, hit = _decided(laws, lane, t1, end, attempt, eps, steps)
         if steps is not None:
             after = _monitored(laws, origin, lane, after, kept, attempt[0])
+        if laws.elements.switches:
+            after = _across(laws.elements, after)
         after = jax.tree.map(lambda a, b: jnp.where(active, a, b), after, lane)
         kept, hit = kept & active, hit & active & kept
         saved, rows = save(laws.plan, ts, lane, after, kept, attempt[0], saved, rows)
         happens = hit.any()
         after, records = lax.cond(
             any_in_batch(happens),
-            lambda after, records: _crossed(laws, unknown, after, records, hit, happens, most),
+            lambda after, records: _crossed(laws, unknown, after, records, hit, happens, most, steps),
             lambda after, records: (after, records),
             after,
             records,
@@ -187,8 +194,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
 
 def _moving(laws: Laws, y) -> dict[str, Array]:
     """What moves of a flat state: not the directions of sliding."""
-    parts = laws.plan.structure(y)
-    return {"q": parts["q"], "v": parts["v"]}
+    return {name: part for name, part in laws.plan.structure(y).items() if name != "slip"}
 
 
 def _monitored(laws: Laws, origin, lane: Lane, after: Lane, kept, step) -> Lane:
@@ -196,6 +202,19 @@ def _monitored(laws: Laws, origin, lane: Lane, after: Lane, kept, step) -> Lane:
     start, before, y, error = (_moving(laws, x) for x in (origin, lane.y, step.projected, step.error))
     sums = accumulated(laws.order, laws.error_order, start, before, y, error, *lane.sums)
     return after._replace(sums=jax.tree.map(lambda new, old: jnp.where(kept, new, old), sums, lane.sums))
+
+
+def _across(elements: Elements, lane: Lane) -> Lane:
+    """The lane in the pieces where its last step has ended, where steps go across the zeros of switching functions."""
+    first, switching = elements.split(lane.conditions)
+    crossed = lane.loose & (switching < 0)
+    conditions = jnp.concatenate([first.reshape(-1), jnp.where(crossed, -switching, switching)])
+    return lane._replace(mode=lane.mode._replace(positive=lane.mode.positive ^ crossed), conditions=conditions)
+
+
+def _put_back(laws: Laws, args, t, y):
+    """A state on the rows that act."""
+    return laws.plan.ended(args, t, y, jnp.zeros_like(y))[0]
 
 
 def judged(laws: Laws, args, t, y):
@@ -212,9 +231,9 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float, steps: Steps 
     factor = jnp.where(jnp.isnan(factor), _LEAST, factor)
     factor = jnp.clip(factor, jnp.where(good, 1.0, _LEAST), jnp.where(good, _MOST, _SAFETY)).astype(length.dtype)
 
-    violated = (values < -levels).any()
+    violated = (values < -levels).any() & ~lane.loose
     # In the middle alone: the step is halved first.
-    inside = good & ~lane.locating & (between < -levels_between).any()
+    inside = good & ~lane.locating & ~lane.loose & (between < -levels_between).any()
     violated = violated | inside
     at = jnp.where(inside, between, values)
     high = jnp.where(inside, length / 2, length)
@@ -243,8 +262,8 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float, steps: Steps 
     located = locating & (near | narrow) & ~inside
     kept = good & ((~violated & ~lane.locating) | located)
     # What the middle of a step showed may have been an error of the dense output.
-    real = located & (value <= _REAL)
-    hit = real & ((values <= _SIMULTANEOUS * scale) & (scale > 4 * level) | (values / scale <= value))
+    real = located & (value <= eps**_REAL)
+    hit = real & ((values <= eps**_SIMULTANEOUS * scale) & (scale > 4 * level) | (values / scale <= value))
 
     guided = (value_low > 64 * eps) & (value_high < 0) & (lane.tries < 30)
     slope = jnp.where(guided, value_high - value_low, 1.0)
@@ -260,7 +279,8 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float, steps: Steps 
         short, usual = ~good, lane.usual
         to_next = steps.to_next(jnp.where(kept, t1, lane.t))
         next_length = jnp.where(locating & ~located, secant, to_next)
-    pivot = jnp.min(lane.conditions[:, 2]) < 0.05  # friction that leaves no forces grows without bound before
+    pivots = laws.elements.split(lane.conditions)[0][:, 2]
+    pivot = jnp.min(pivots, initial=1.0) < 0.05  # friction that leaves no forces grows without bound before
     code = jnp.where(short, jnp.where(pivot, PARADOX, SHORT), lane.code).astype(jnp.int32)
     # Steps end on the run's end, or well before it.
     t = jnp.where(kept, t1, lane.t)
@@ -272,20 +292,24 @@ def _decided(laws: Laws, lane: Lane, t1, end, attempt, eps: float, steps: Steps 
             t, jnp.where(kept, step.projected, lane.y), next_length, usual, lane.mode,
             jnp.where(kept, values, lane.conditions), locating & ~located, low, high_, value_low, value_high, side,
             jnp.where(locating & ~located, lane.tries + one, 0), scale, lane.taken + one, lane.kept + kept.astype(jnp.int32),
-            code, lane.count, lane.sums,
+            code, lane.count, lane.sums, lane.loose,
         ),
         kept,
         hit,
     )  # fmt: skip
 
 
-def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, most: int):
+def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, most: int, steps: Steps | None):
     """The lane in the mode behind an event, and the records with it."""
     elements = laws.elements
     change: Change = laws.transit(unknown, lane.t, lane.y, lane.mode, laws.slip(lane.y), hit)
     before, mode = lane.mode, change.mode
     y = laws.placed(lane.y, change.v, change.slip)
+    if elements.each:
+        # A gap is closed where it has fallen below zero by its level, which the first step behind would count as its error.
+        y = run(_put_back, (unknown, mode), lane.t, y, static=(laws,))
     conditions, _ = run(judged, (unknown, mode), lane.t, y, static=(laws,))
+    hit, switched = elements.split(hit)
     opened = hit.any(1)
     kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, 4))
     # A contact that is hit may let go at once.
@@ -294,12 +318,14 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
     differs = (mode.closed != before.closed) | (mode.stick != before.stick) | (mode.negative != before.negative)
     told = happens & (opened | differs)
     lost = hit[:, 2].any()  # of pivots: no mode follows
-    leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32)
+    leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32) if elements.each else jnp.zeros((), jnp.int32)
     rows, count = records, lane.count
+    if elements.switches:
+        rows, count = _switched(elements, lane, records, switched & happens, change.slip, most)
     order = [(i, True) for i in range(len(elements.each))] + [(i, False) for i in range(len(elements.each))]
     for i, by_trigger in order:
         # First the one whose condition it was, which carries the impact; then what came with it.
-        mine = told[i] & ((leading // CHANNELS == i) == by_trigger)
+        mine = told[i] & ((hit.any() & (leading // CHANNELS == i)) == by_trigger)
         place = jnp.where(mine & (count < most), count, most)
         row = Records(
             lane.t,
@@ -314,9 +340,41 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
         count = count + mine.astype(jnp.int32)
     crowded = count > most
     code = jnp.where(change.settled, FINE, NO_MODE)
-    code = jnp.where(crowded, CROWDED, code)
+    # Of switching functions alone, a motion without room for its events goes on: it loses its derivatives.
+    code = jnp.where(crowded & bool(elements.each), CROWDED, code)
     code = jnp.where(change.paradox | lost, PARADOX, code)
-    after = lane._replace(
-        y=y, mode=mode, conditions=conditions, count=jnp.minimum(count, most), code=code.astype(jnp.int32)
-    )
+    loose = jnp.zeros((), bool)
+    if elements.switches:
+        is_held = _changes_back(elements, lane, records, switched, most)
+        # Steps of fixed length go on about it.
+        loose = is_held & bool(steps is not None and not elements.each)
+        code = jnp.where(is_held & ~loose, CROWDED, code)
+        count = jnp.where(loose, most + 1, count)
+    code = code.astype(jnp.int32)
+    after = lane._replace(y=y, mode=mode, conditions=conditions, count=count, code=code, loose=lane.loose | loose)
     return jax.tree.map(lambda a, b: jnp.where(happens, a, b), (after, rows), (lane, records))
+
+
+def _switched(elements: Elements, lane: Lane, records: Records, switched, slip, most: int):
+    """The records with a row for each switching function that changed its sign, one after the other, and their number."""
+    index = jnp.cumsum(switched, dtype=jnp.int32) - 1
+    places = jnp.where(switched, jnp.minimum(lane.count + index, most), most)
+    # Each row has changed what stands in the rows before it and its own.
+    earlier = switched[None] & (index[None] <= index[:, None])
+    k, first = elements.switches, len(elements.each)
+    number = jnp.arange(k, dtype=jnp.int32)
+    modes, slip = jax.tree.map(lambda x: jnp.broadcast_to(x, (k, *x.shape)), (lane.mode, slip))
+    modes = modes._replace(positive=modes.positive ^ earlier)
+    rows = Records(
+        jnp.broadcast_to(lane.t, (k,)), first * len(KINDS) + number, first * CHANNELS + number, modes, slip, modes, slip
+    )  # fmt: skip
+    rows = jax.tree.map(lambda all_, new: all_.at[places].set(new.astype(all_.dtype)), records, rows)
+    return rows, lane.count + jnp.sum(switched, dtype=jnp.int32)
+
+
+def _changes_back(elements: Elements, lane: Lane, records: Records, switched, most: int):
+    """Whether a switching function changes back at once: on both sides of its zero the force drives the motion onto it."""
+    last = jnp.maximum(jnp.minimum(lane.count, most) - 1, 0)
+    names = jnp.arange(elements.switches, dtype=jnp.int32) + len(elements.each) * len(KINDS)
+    least = 64 * float(jnp.finfo(lane.t.dtype).eps) * jnp.maximum(jnp.abs(lane.t), lane.usual)
+    return ((names == records.name[last]) & switched).any() & (lane.t - records.time[last] <= least)

@@ -8,6 +8,7 @@ from jaxtyping import Array
 
 from jaxdyn.constraints.base import layout
 from jaxdyn.contact.unilateral import UnilateralContact, WithModes
+from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.systems.scene import Scene
 
 KINDS = ("touch", "release", "stick", "slip", "turn")
@@ -31,11 +32,13 @@ class Element(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """Of each element (n,): whether it is closed, whether it sticks, and whether its normal multiplier is negative."""
+    """Of each element (n,): whether it is closed, whether it sticks, and whether its normal multiplier is negative. Of the forces
+    that are smooth in pieces: which of their switching functions are positive, (k,)."""
 
     closed: Array
     stick: Array
     negative: Array
+    positive: Array
 
     def signs(self, dtype) -> Array:
         """Of the normal multipliers, (n,)."""
@@ -43,16 +46,27 @@ class Mode(NamedTuple):
 
 
 class Elements(NamedTuple):
-    """The elements of a scene, and the number of rows of the scene's own constraints and of all."""
+    """The elements of a scene, the number of rows of the scene's own constraints and of all, and its switching functions."""
 
     each: tuple[Element, ...]
     own: int
     count: int
+    pieces: Pieces
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the events: every element with every kind."""
-        return tuple(f"{one.name}: {kind}" for one in self.each for kind in KINDS)
+        """Of the events: every element with every kind, then every switching function."""
+        return (*(f"{one.name}: {kind}" for one in self.each for kind in KINDS), *self.pieces.names)
+
+    @property
+    def switches(self) -> int:
+        """Number of switching functions."""
+        return len(self.pieces.names)
+
+    def split(self, flat) -> tuple[Array, Array]:
+        """Conditions as (n, CHANNELS) of the elements and (k,) of the switching functions."""
+        count = CHANNELS * len(self.each)
+        return flat[:count].reshape(-1, CHANNELS), flat[count:]
 
     @property
     def coupled(self) -> tuple[int, ...]:
@@ -93,8 +107,8 @@ def _constraint(force: Any):
     return force.contact if isinstance(force, UnilateralContact) else force.along
 
 
-def elements_of(scene: Scene) -> Elements:
-    """The elements of a scene.
+def elements_of(scene: Scene, pieces: Pieces) -> Elements:
+    """The elements of a scene; `pieces`: its switching functions.
 
     **Raises:** ValueError for rows that do not fit, and constraints that are not there.
     """
@@ -134,4 +148,4 @@ def elements_of(scene: Scene) -> Elements:
                     "normal force; name one with one row"
                 )
         elements.append(Element(name, i, normal, tangent, False, force.smoothing is not None))
-    return Elements(tuple(elements), places[own].start, places[-1].end)
+    return Elements(tuple(elements), places[own].start, places[-1].end, pieces)

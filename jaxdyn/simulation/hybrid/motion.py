@@ -14,25 +14,26 @@ from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.forces.piecewise import guards, in_pieces, pieces_of
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.hybrid import machine
 from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, slides, terms_at
 from jaxdyn.simulation.hybrid.events import Events
 from jaxdyn.simulation.hybrid.laws import laws_of, put_back
-from jaxdyn.simulation.hybrid.modes import Mode, elements_of, extended, force_at
+from jaxdyn.simulation.hybrid.modes import KINDS, Mode, elements_of, extended, force_at
 from jaxdyn.simulation.hybrid.replay import Hybrid
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
 from jaxdyn.simulation.solution import Solution, faults_of_inputs, first_of, rows_where
 from jaxdyn.simulation.solvers.choice import is_fixed, label, unwrapped
+from jaxdyn.simulation.solvers.differentiable import ROOM
 from jaxdyn.simulation.solvers.fixed_steps import too_coarse
 from jaxdyn.simulation.solvers.inputs import has_unit_quaternions
 from jaxdyn.systems.scene import Scene, check_callback, checked_force
 from jaxdyn.systems.system import retract
 
 OUTPUTS = ("energy", "acceleration", "multipliers", "contact_forces", "torque")
-SEARCHED = 40  # attempts at most to end a step at an event
 _CODES = {
     machine.SHORT: "dt_min_reached",
     machine.PARADOX: "painleve_paradox",
@@ -58,11 +59,8 @@ def check_options(control, stepsize, solver, adjoint, outputs) -> None:
             f"solver is {label(solver)}, and {what}, looked for within explicit steps; take diffrax.Dopri8() or Tsit5(), "
             "or, where forces are stiff, friction without modes (jd.CoulombFriction)"
         )
-    if not isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        raise ValueError(
-            f"adjoint is {type(adjoint).__name__}, and {what}, whose motions are taken again from event to event for "
-            "reverse mode alone; leave it out, and take jax.grad or jax.jacrev"
-        )
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(f"adjoint is 'backsolve', which does not go back through events, and {what}; take 'reverse'")
     for name in outputs:
         if name not in OUTPUTS and not name.startswith("pose:"):
             raise ValueError(f"outputs has {name!r}, and {what}; choose from {', '.join(OUTPUTS)} and 'pose:<frame>'")
@@ -77,24 +75,34 @@ def check_count(most: Any) -> None:
 def motion(scene: Scene, control, numbers, options) -> Solution:
     """The solution; `numbers` are q0, v0, ts, rtol, atol, and the length of fixed steps or None."""
     q0, v0, ts, rtol, atol, stepsize = numbers
-    system, elements, outputs = scene.system, elements_of(scene), options["outputs"]
+    system, outputs = scene.system, options["outputs"]
+    control_of: Any = (
+        None if control is None else lambda _, q, v, t: checked_force(control(q, v, t), q, scene.nv, "control")
+    )
+    pieces = pieces_of(scene, (), q0, v0, ts[0], control_of)
+    elements = elements_of(scene, pieces)
     eps, dtype = float(jnp.finfo(q0.dtype).eps), q0.dtype
     unknown, known = partition_traced((scene, control))
     unknown = tuple(unknown)
     bare = extended(scene).forces
 
-    def given(unknown):
+    def given(unknown, positive=None):
         scene, control = known(unknown)
-        whole = extended(scene)
+        in_piece = scene if positive is None or not pieces.names else in_pieces(scene, pieces, positive)
+        whole = extended(in_piece)
+
+        def effort(q, v, t):
+            """Of the control, before limits."""
+            return None if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
 
         def generalized_force(q, v, t):
-            force = whole.applied_force(q, v, t)
-            if control is None:
+            force, tau = whole.applied_force(q, v, t), effort(q, v, t)
+            if tau is None:
                 return force
-            tau = whole.limited(checked_force(control(q, v, t), q, scene.nv, "control"))
+            tau = in_piece.limited(tau)
             return tau if force is None else tau + force
 
-        return scene, generalized_force
+        return in_piece, generalized_force, lambda q, v, t: guards(scene, q, v, t, effort(q, v, t))
 
     for i, force in enumerate(bare):
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", q0, v0, ts[0], first=(system,))
@@ -114,14 +122,17 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
 
     mode, slip, start_ok = _guess(scene, elements, q0, v0, ts[0])
+    mode = mode._replace(positive=given(unknown)[2](q0, v0, ts[0]) > 0)
     own = Scene(system, scene.constraints)
     if scene.constraints:
         start_ok = start_ok & consistent(own, q0, v0, ts[0])
     y0 = {"q": q0, "v": v0, "slip": slip}
     laws = laws_of(given, elements, options["solver"], y0)
     most = options["max_events"]
-    hybrid = Hybrid(laws, mode, rtol, atol, stepsize, options["max_steps"], most)
-    rows, times, facts = hybrid(y0, unknown, ts)
+    room = options["max_steps"] if stepsize is not None else min(options["max_steps"], ROOM)
+    hybrid = Hybrid(laws, mode, rtol, atol, stepsize, options["max_steps"], most, room)
+    is_direct = isinstance(options["adjoint"], (diffrax.ForwardMode, diffrax.DirectAdjoint))
+    rows, times, facts = (hybrid.direct if is_direct else hybrid)(y0, unknown, ts)
     lane, records, begun = facts
     # A save point at an event shows what was before.
     passed = jnp.sum(records.time[None, :most] < ts[:, None], 1)
@@ -133,7 +144,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
 
     def report(unknown, row):
         y, mode, t = row
-        scene_, generalized_force = given(unknown)
+        scene_, generalized_force, _ = given(unknown)
         system, control = scene_.system, known(unknown)[1]
         q, v, values = y["q"], y["v"], {}
         if "energy" in outputs:
@@ -180,7 +191,8 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
         "num_rejected_steps": lane.taken - lane.kept,
         "time_reached": jnp.where(good, lane.t, ts[0]),
     }
-    happened = Events(times, records.name[:most], elements.names)
+    struck = _struck(scene, elements, q0, v0, ts[0], mode)
+    happened = _events(elements, struck, ts[0], times, records.name[:most], good & start_ok)
     solver = label(options["solver"])
     shown = {"q": y["q"], "v": y["v"], **values}
     shown = jax.tree.map(lambda rows: rows_where(reached, rows, jnp.nan), shown)
@@ -194,11 +206,35 @@ def _guess(scene: Scene, elements, q, v, t):
     slip = by_element(elements, velocity_residual(extended(scene), q, v, t))
     speed, unit = length(slip)
     opens = jnp.asarray(elements.opening)
-    mode = Mode(~opens | (gap <= small * reach), speed <= small * (1 + jnp.max(jnp.abs(v))), jnp.zeros(gap.shape, bool))
+    mode = Mode(
+        ~opens | (gap <= small * reach),
+        speed <= small * (1 + jnp.max(jnp.abs(v))),
+        jnp.zeros(gap.shape, bool),
+        jnp.zeros((0,), bool),
+    )
     smooth = jnp.asarray(np.array([one.smooth for one in elements.each]))
     limit = float(jnp.finfo(q.dtype).eps) ** 0.4
     start_ok = (~opens | (gap >= -limit * reach)).all()
     return mode._replace(stick=mode.stick & ~smooth), lax.stop_gradient(unit), start_ok
+
+
+def _struck(scene: Scene, elements, q, v, t, mode: Mode):
+    """Which contacts are closed at the start by an impact, (n,)."""
+    rates = velocity_residual(extended(scene), q, v, t)
+    small = float(jnp.finfo(q.dtype).eps) ** 0.6 * (1 + jnp.max(jnp.abs(v)))
+    into = [rates[one.normal] < -small if one.opens else jnp.zeros((), bool) for one in elements.each]
+    return mode.closed & jnp.stack(into)
+
+
+def _events(elements, struck, start, times, index, good) -> Events:
+    """The events of a run, with the impacts at its start in front; none of a start that is refused."""
+    most = index.shape[0]
+    first = jnp.where(struck, jnp.arange(struck.shape[0], dtype=index.dtype) * len(KINDS), -1)
+    index = jnp.concatenate([first, index])
+    times = jnp.concatenate([jnp.where(struck, start, jnp.nan), times])
+    order = jnp.argsort(index < 0, stable=True)[:most]
+    index, times = index[order], times[order]
+    return Events(jnp.where(good, times, jnp.nan), jnp.where(good, index, -1), elements.names)
 
 
 def _forces(scene: Scene, elements, mode: Mode, terms, at_time, slip) -> dict:

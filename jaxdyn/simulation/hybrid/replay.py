@@ -20,19 +20,18 @@ import optimistix
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from jaxdyn.compile import run
+from jaxdyn.compile import any_in_batch, run
 from jaxdyn.simulation.hybrid import machine
 from jaxdyn.simulation.hybrid.machine import Laws, Records
 from jaxdyn.simulation.hybrid.modes import Mode
 from jaxdyn.simulation.solvers import driver
-from jaxdyn.simulation.solvers.differentiable import ROOM
 from jaxdyn.simulation.solvers.driver import Drive
 
 
 class Hybrid(eqx.Module):
     """How a motion is made: hybrid(y0, unknown, ts) -> rows of the state at ts[1:]; times of events; lane, records and start.
 
-    Reverse mode reaches y0, `unknown` and ts, through rows and times of events.
+    Derivatives reach y0, `unknown` and ts through rows and times of events: of a call in reverse mode, of `direct` in both.
     """
 
     laws: Laws = eqx.field(static=True)
@@ -42,9 +41,14 @@ class Hybrid(eqx.Module):
     stepsize: Any  # None for adaptive steps
     max_steps: int = eqx.field(static=True)
     most: int = eqx.field(static=True)
+    room: int = eqx.field(static=True)  # steps from one event or save point to the next, at most
 
     def __call__(self, y0, unknown, ts):
         return _driven((y0, unknown, ts), lax.stop_gradient(self))
+
+    def direct(self, y0, unknown, ts):
+        """The same for forward mode too."""
+        return _value((y0, unknown, ts), lax.stop_gradient(self))
 
     def driven(self, moving):
         """What a call returns."""
@@ -56,7 +60,7 @@ class Hybrid(eqx.Module):
             ts,
             flat,
             self.mode,
-            y0["slip"],
+            self.laws.slip(flat),
             self.rtol,
             self.atol,
             self.stepsize,
@@ -68,12 +72,12 @@ class Hybrid(eqx.Module):
 
 @eqx.filter_custom_vjp
 def _driven(moving, how: Hybrid):
-    return how.driven(moving)
+    return _value(moving, how)
 
 
 @_driven.def_fwd
 def _(perturbed, moving, how: Hybrid):
-    driven = how.driven(moving)
+    driven = _value(moving, how)
     return driven, driven[2]
 
 
@@ -85,24 +89,59 @@ def _(facts, gradients, perturbed, moving, how: Hybrid):
     rows = jax.tree.map(lambda y, g: jnp.zeros((count, *y.shape), y.dtype) if g is None else g, y0, rows)
     times = jnp.zeros((how.most,), ts.dtype) if times is None else times
     times = jnp.where(facts[1].name[: how.most] < 0, jnp.zeros_like(times), times)  # of events that there were not
+    return _pulled((moving, (rows, times)), lax.stop_gradient(facts), how, perturbed)
+
+
+@eqx.filter_custom_jvp
+def _value(moving, how: Hybrid):
+    return how.driven(moving)
+
+
+@_value.def_jvp
+def _(primals, tangents):
+    moving, how = primals
+    rows, times, facts = _value(moving, how)
+    known = lax.stop_gradient(facts)
+    _, changes = eqx.filter_jvp(lambda moving: _replayed(how, moving, *known, direct=True), (moving,), (tangents[0],))
+    return (rows, times, facts), (*changes, jax.tree.map(lambda _: None, facts))
+
+
+def _pull(given, facts, how: Hybrid, perturbed, direct: bool):
+    moving, weights = given
     free, fixed = eqx.partition(moving, perturbed)
-    _, pull = jax.vjp(lambda free: _replayed(how, eqx.combine(free, fixed), *facts), free)
-    return pull((rows, times))[0]
+    _, pull = jax.vjp(lambda free: _replayed(how, eqx.combine(free, fixed), *facts, direct=direct), free)
+    return pull(weights)[0]
 
 
-def _replayed(how: Hybrid, moving, lane, records, begun):
-    """Rows at ts[1:] and times of events, taken again in the modes that are known."""
+@eqx.filter_custom_jvp
+def _pulled(given, facts, how: Hybrid, perturbed):
+    return _pull(given, facts, how, perturbed, False)
+
+
+@_pulled.def_jvp
+def _(primals, tangents):
+    given, facts, how, perturbed = primals
+    _, change = eqx.filter_jvp(lambda given: _pull(given, facts, how, perturbed, True), (given,), (tangents[0],))
+    return _pulled(*primals), change
+
+
+def _replayed(how: Hybrid, moving, lane, records, begun, direct: bool):
+    """Rows at ts[1:] and times of events, taken again in the modes that are known; `direct`: differentiable in both modes."""
     laws, (y0, unknown, ts) = how.laws, moving
     saves, most = ts.shape[0] - 1, how.most
     happened = records.name[:most] >= 0
     known_times = jnp.concatenate([ts[1:], jnp.where(happened, records.time[:most], jnp.inf)])
     is_event = jnp.arange(saves + most) >= saves
     order = jnp.lexsort((is_event, lax.stop_gradient(known_times)))  # a save point at an event is before it
-    room = min(how.max_steps, ROOM)
     control: Any = driver.Adaptive(laws.error_order, optimistix.rms_norm)
     if how.stepsize is not None:
-        control, room = driver.Fixed(laws.order, laws.error_order), how.max_steps
+        control = driver.Fixed(laws.order, laws.error_order)
     end = lax.stop_gradient(lane.t)
+
+    def taken(carry, at):
+        # Most of the events that there is room for did not happen.
+        happens = ~is_event[at] | happened[jnp.clip(at - saves, 0, most - 1)]
+        return lax.cond(any_in_batch(happens), piece, lambda carry, at: (carry, carry[:2]), carry, at)
 
     def piece(carry, at):
         t, y, mode = carry
@@ -112,8 +151,10 @@ def _replayed(how: Hybrid, moving, lane, records, begun):
         known = ~event | (record.name >= 0)
         advances = known & (until > t) & (until <= end)
         until = jnp.where(advances, until, t)
-        drive = Drive(laws.plan, control, how.rtol, how.atol, how.stepsize, how.max_steps, room)
-        driven, _, _ = drive(laws.plan.structure(y), (unknown, mode), jnp.stack([t, until]))
+        drive = Drive(laws.plan, control, how.rtol, how.atol, how.stepsize, how.max_steps, how.room)
+        driven, _, _ = (drive.direct if direct else drive)(
+            laws.plan.structure(y), (unknown, mode), jnp.stack([t, until])
+        )
         here = jnp.where(advances, ravel_pytree(jax.tree.map(lambda x: x[0], driven))[0], y)
         landed = _crossed(laws, unknown, mode, record, t, until, here)
         crosses = event & known
@@ -122,8 +163,10 @@ def _replayed(how: Hybrid, moving, lane, records, begun):
         return (t, y, mode), (t, here)
 
     y = _with_slip(laws, laws.land(unknown, begun.impact, begun.impact_slip, ts[0], ravel_pytree(y0)[0]), begun.slip)
-    _, (times, rows) = lax.scan(jax.checkpoint(piece), (ts[0], y, begun.mode), order)
+    _, (times, rows) = lax.scan(jax.checkpoint(taken), (ts[0], y, begun.mode), order)
     back = jnp.argsort(order)
+    # A motion that went on beyond the events that there was room for has no derivative here.
+    rows = rows * jnp.where((lane.count > most) & (lane.code == machine.FINE), jnp.nan, 1.0).astype(rows.dtype)
     return jax.vmap(laws.plan.structure)(rows[back[:saves]]), times[back[saves:]]
 
 

@@ -103,10 +103,10 @@ def at_once(elements: Elements, mode: Mode, slip, judged: Judged, hit) -> tuple[
     begins, ends = second & mode.stick & mode.closed, second & ~mode.stick & mode.closed
     _, against = length(-judged.holding)
     slip = jnp.where(begins[:, None], against, slip)
-    changed = Mode(
-        (mode.closed | closes) & ~releases,
-        ((mode.stick | closes | ends) & ~begins) & ~releases,
-        mode.negative ^ (first & ~opens),
+    changed = mode._replace(
+        closed=(mode.closed | closes) & ~releases,
+        stick=((mode.stick | closes | ends) & ~begins) & ~releases,
+        negative=mode.negative ^ (first & ~opens),
     )
     return changed, slip, begins
 
@@ -130,10 +130,10 @@ def changed_mode(elements: Elements, cones, mode: Mode, slip, begins, v, jump: C
         one = jnp.zeros(wrong.size, bool).at[first].set(True).reshape(wrong.shape) & wrong
         pulls, pressed, leaves, turns, reverses = (one[:, k] for k in range(5))
         slip = jnp.where(leaves[:, None], against, slip)
-        changed = Mode(
-            (mode.closed | pressed) & ~pulls,
-            (mode.stick | (pressed & stick_when_closing) | turns) & ~pulls & ~leaves & rough,
-            mode.negative ^ reverses,
+        changed = mode._replace(
+            closed=(mode.closed | pressed) & ~pulls,
+            stick=(mode.stick | (pressed & stick_when_closing) | turns) & ~pulls & ~leaves & rough,
+            negative=mode.negative ^ reverses,
         )
         return changed, slip
 

@@ -23,6 +23,7 @@ from jaxdyn.simulation.solvers import reverse
 from jaxdyn.simulation.solvers.explicit import Plan, Step, projected_output, step_in_turn, whole_step
 from jaxdyn.simulation.solvers.first_step import first_step
 from jaxdyn.simulation.solvers.fixed_steps import accumulated, no_sums
+from jaxdyn.simulation.solvers.repeated import repeated_rows
 
 _SAFETY, _LEAST_FACTOR, _MOST_FACTOR = 0.9, 0.2, 10.0  # of diffrax's PIDController
 _ROUNDED = 100  # numbers before the end from which on a step goes to the end
@@ -75,14 +76,49 @@ class Drive(eqx.Module):
     def __call__(self, y0, args, ts):
         return _driven((y0, args, ts), jax.lax.stop_gradient(self))
 
+    def direct(self, y0, args, ts):
+        """The same, with derivatives of any order in both modes, which go through the steps taken again (see `repeated`)."""
+        return self.with_history((y0, args, ts), self.room)[0]
+
     def with_history(self, moving, room: int | None):
         """What a call returns, and the `History` of at most `room` steps, or None."""
+        return _with_history(moving, jax.lax.stop_gradient(self), room)
+
+    def driven(self, moving, room: int | None):
+        """The same without derivatives."""
         y0, args, ts = moving
         most = self.max_steps if room is None else room
         steps = self.rtol, self.atol, self.stepsize
         driven = drive(self.plan, self.how, ravel_pytree(y0)[0], args, ts, *steps, most, room is not None)
         rows = jax.vmap(self.plan.structure)(driven.rows)
         return (rows, (driven.result, driven.counts, driven.reached), driven.sums), driven.history
+
+    def number_of_steps(self, ts):
+        """Of fixed ones, or None."""
+        return None if isinstance(self.how, Adaptive) else number_of_steps(ts[0], ts[-1], self.stepsize)
+
+    def pulled(self, moving, rows, history, perturbed):
+        """Cotangents of what moves from those of the rows, by kernels."""
+        y0, args, ts = moving
+        flat = jax.vmap(lambda y: ravel_pytree(y)[0])(rows)
+        start, structure = ravel_pytree(y0)
+        of_y, of_args, of_ts = reverse.pulled(
+            self.plan, history, start, args, ts, self.number_of_steps(ts), flat, perturbed[1:]
+        )
+
+        def or_none(x, varies):
+            return x if varies else None
+
+        return jax.tree.map(or_none, structure(of_y), perturbed[0]), of_args, or_none(of_ts, perturbed[2])
+
+    def repeated(self, history, moving):
+        """Rows of the state at ts[1:] by the steps of a history, differentiable to any order."""
+        y0, args, ts = moving
+        steps = self.number_of_steps(ts)
+        rows = repeated_rows(
+            self.plan, history.times, history.kept, history.count, ravel_pytree(y0)[0], args, ts, steps
+        )
+        return jax.vmap(self.plan.structure)(rows)
 
 
 @eqx.filter_custom_vjp
@@ -97,18 +133,44 @@ def _(perturbed, moving, how: Drive):
 
 @_driven.def_bwd
 def _(history, gradients, perturbed, moving, how: Drive):
-    y0, args, ts = moving
-    count = ts.shape[0] - 1
-    given = jax.tree.map(lambda y, g: jnp.zeros((count, *y.shape), y.dtype) if g is None else g, y0, gradients[0])
-    rows = jax.vmap(lambda y: ravel_pytree(y)[0])(given)
-    start, structure = ravel_pytree(y0)
-    steps = None if isinstance(how.how, Adaptive) else number_of_steps(ts[0], ts[-1], how.stepsize)
-    of_y, of_args, of_ts = reverse.pulled(how.plan, history, start, args, ts, steps, rows, perturbed[1:])
+    count = moving[2].shape[0] - 1
+    rows = jax.tree.map(lambda y, g: jnp.zeros((count, *y.shape), y.dtype) if g is None else g, moving[0], gradients[0])
+    return _pulled((moving, rows), jax.lax.stop_gradient(history), how, perturbed)
 
-    def or_none(x, varies):
-        return x if varies else None
 
-    return jax.tree.map(or_none, structure(of_y), perturbed[0]), of_args, or_none(of_ts, perturbed[2])
+@eqx.filter_custom_jvp
+def _with_history(moving, how: Drive, room: int | None):
+    return how.driven(moving, room)
+
+
+@_with_history.def_jvp
+def _(primals, tangents):
+    moving, how, room = primals
+    driven, history = _with_history(moving, how, how.room if room is None else room)
+    _, rows = eqx.filter_jvp(partial(how.repeated, jax.lax.stop_gradient(history)), (moving,), (tangents[0],))
+    values = driven, None if room is None else history
+    still = jax.tree.map(lambda _: None, values)
+    return values, ((rows, *still[0][1:]), still[1])
+
+
+@eqx.filter_custom_jvp
+def _pulled(given, history, how: Drive, perturbed):
+    moving, rows = given
+    return how.pulled(moving, rows, history, perturbed)
+
+
+@_pulled.def_jvp
+def _(primals, tangents):
+    given, history, how, perturbed = primals
+
+    def pulled(given):
+        moving, rows = given
+        free, fixed = eqx.partition(moving, perturbed)
+        _, pull = jax.vjp(lambda free: how.repeated(history, eqx.combine(free, fixed)), free)
+        return pull(rows)[0]
+
+    _, change = eqx.filter_jvp(pulled, (given,), (tangents[0],))
+    return _pulled(*primals), change
 
 
 class _Limits(NamedTuple):

@@ -220,7 +220,7 @@ def _back_through_step(pull, times_move: bool, ends: _Ends, cotangents: _Cotange
     asked = kept & ((after != 0).any() | (row != 0).any())
     back = jax.tree.map(lambda x: when(asked, x), pull(t0, t1, y, at, after, row))
     of_args, of_y, of_t0, of_t1, of_at = back
-    from_start, to_end = _shares(step, t0, ends), _shares(step + 1, t1, ends)
+    from_start, to_end = (step_share(i, t, ends.end, ends.steps) for i, t in ((step, t0), (step + 1, t1)))
     saved = cotangents.saved - here.astype(jnp.int32)
     again = here & (saved > 0) & (at_next > t0)
     before = cotangents.before + of_y
@@ -264,12 +264,11 @@ def _replay_by_turns(plan: Plan, args, ends, given: Given, carry: Carry) -> Carr
     return lax.fori_loop(carry.state.places[0], ends[1], turn, carry)
 
 
-def _shares(i, t, ends: _Ends):
-    """How much of a change of the run's end the end of step i, counted from one, follows; it follows the start by the rest."""
+def step_share(i, t, end, steps):
+    """How much of a change of the run's end the end t of step i, counted from one, follows; it follows the start by the rest."""
     one = jnp.ones_like(t)
-    steps = ends.steps
     share = jnp.zeros_like(t) if steps is None else jnp.where(i < 2, 0.0, i.astype(t.dtype) / steps.astype(t.dtype))
-    return jnp.where(t >= ends.end, one, share)
+    return jnp.where(t >= end, one, share)
 
 
 def _pull(plan: Plan, times_move: bool, structure, fixed, free, t0, t1, y, at, after, row):

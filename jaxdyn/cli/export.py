@@ -1,0 +1,88 @@
+"""`jaxdyn export`: a function of a robot's dynamics as an object file for C or CasADi."""
+
+import argparse
+from collections.abc import Callable
+
+import numpy as np
+
+import jaxdyn as jd
+from jaxdyn.cli.common import FILE, add_model_options, load_scene
+from jaxdyn.export.exported import ABIS, HOST, TARGETS
+
+HELP = "write a function of a robot as an object file for C or CasADi"
+DESCRIPTION = """\
+Compile a function of a robot's dynamics to an object file that needs no Python, with a C header, a test program and a build file,
+or with CasADi's interface. The robot is compiled in.
+"""
+EPILOG = """\
+examples:
+  jaxdyn export panda.urdf --function forward_dynamics --jacobian --out panda_fd
+  jaxdyn export panda.urdf --function inverse_dynamics --target aarch64 --out panda_id
+  jaxdyn export robot.xml --function constrained_dynamics --jacobian --abi casadi --out robot_cd
+
+FOLDER/NAME.h documents the C function; `cc NAME_test.c NAME.o -lm && ./a.out` compares it with reference results.
+"""
+
+# For each function what it takes: q, v and a third vector.
+_ARGUMENTS = {
+    "forward_dynamics": ("q", "v", "tau"),
+    "constrained_dynamics": ("q", "v", "tau"),
+    "inverse_dynamics": ("q", "v", "a"),
+    "bias_force": ("q", "v"),
+    "gravity_force": ("q",),
+    "mass_matrix": ("q",),
+    "forward_kinematics": ("q",),
+    "center_of_mass": ("q",),
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("file", help=FILE)
+    add_model_options(parser)
+    parser.add_argument(
+        "--function", choices=tuple(_ARGUMENTS), default="forward_dynamics", help="(default: forward_dynamics)"
+    )
+    parser.add_argument("--name", help="of the C function (default: that of --function)")
+    parser.add_argument("--jacobian", action="store_true", help="add the derivatives of the result by each argument")
+    parser.add_argument("--batch", action="store_true", help="add a function of many samples, in vector registers")
+    parser.add_argument("--out", metavar="FOLDER", required=True, help="made where it does not exist")
+    parser.add_argument(
+        "--target", default=HOST, help=f"{HOST}, {', '.join(TARGETS)}, or an LLVM triple (default: {HOST})"
+    )
+    parser.add_argument("--cpu", help="the processor, as LLVM writes it, as cortex-a72")
+    parser.add_argument("--features", help="of the processor, as LLVM writes them, as +neon")
+    parser.add_argument("--abi", choices=ABIS, default="c", help="(default: c)")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Export the function, and say where the files are."""
+    scene, _ = load_scene(args.file, args)
+    names, example = _ARGUMENTS[args.function], np.asarray(jd.neutral(scene.system), float)
+    rest = np.zeros(scene.system.nv)
+    name = args.function if args.name is None else args.name
+    exported = jd.export(
+        _function_of(scene, args.function),
+        *(example if x == "q" else rest for x in names),
+        name=name,
+        derivatives=("jacobian",) if args.jacobian else (),
+        batch=args.batch,
+    )
+    folder = exported.save(args.out, args.target, args.abi, cpu=args.cpu, features=args.features)
+    files = ", ".join(sorted(x.name for x in folder.iterdir() if x.name.startswith(name)))
+    print(f"{exported} for {args.target}, in {folder}: {files}")
+
+
+def _function_of(scene, name: str) -> Callable:
+    """The function of arrays alone, whose parameters have the names that the header shows."""
+    system = scene.system
+    if name == "constrained_dynamics":
+        return lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration
+    function = getattr(jd, name)
+    wrappers: dict[tuple[str, ...], Callable] = {
+        ("q", "v", "tau"): lambda q, v, tau: function(system, q, v, tau),
+        ("q", "v", "a"): lambda q, v, a: function(system, q, v, a),
+        ("q", "v"): lambda q, v: function(system, q, v),
+        ("q",): lambda q: function(system, q),
+    }
+    return wrappers[_ARGUMENTS[name]]

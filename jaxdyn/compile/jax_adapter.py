@@ -1,0 +1,364 @@
+"""The only module of jaxdyn that depends on the version of JAX: its extension points, jaxprs, XLA's FFI and compiler options.
+
+Names of JAX that are documented little, or that have changed, are used here alone; `tests/test_jax_adapter.py` lists them, with
+the page that documents each. The versions of `TESTED` are those that the tests run with. On any other version an error while a
+function is compiled to a kernel means that JAX has changed, not that jaxdyn is wrong: the function then runs on JAX's own
+operations, and one warning names the version and the reason (`forgive`, `reason_against_kernels`).
+"""
+
+import contextlib
+import ctypes
+import functools
+import logging
+import re
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax import lax
+from jax.core import ShapedArray as ShapedArray
+from jax.core import Tracer as Tracer
+from jax.core import eval_jaxpr
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+logger = logging.getLogger("jaxdyn")
+
+# --- versions ---
+
+TESTED = ((0, 10), (0, 12))  # the first and the last minor version
+
+_against_kernels: str | None = None  # why there are none in this process
+_trial: Callable | None = None
+_is_warned = False
+
+
+def is_tested() -> bool:
+    """Whether the tests run with this version of JAX."""
+    return TESTED[0] <= tuple(jax.__version_info__[:2]) <= TESTED[1]
+
+
+def forgive(error: BaseException) -> bool:
+    """Whether to go on without a kernel after this error: never on a tested version, else after one warning."""
+    global _is_warned
+    if is_tested() or not isinstance(error, Exception):
+        return False
+    if not _is_warned:
+        _is_warned = True
+        first, last = (".".join(map(str, version)) for version in TESTED)
+        reason = f"{type(error).__name__}: {error}".strip()
+        warnings.warn(
+            f"jaxdyn is tested with jax {first} to {last}, and this is jax {jax.__version__}: functions run on JAX's own "
+            f"operations, right but slower, where native kernels fail ({reason}). For kernels, "
+            f"pip install 'jax<{TESTED[1][0]}.{TESTED[1][1] + 1}'",
+            UserWarning,
+            stacklevel=2,
+        )
+    return True
+
+
+@contextlib.contextmanager
+def _kernels_or_none() -> Iterator[None]:
+    """Where an error is forgiven, there are no kernels in this process."""
+    global _against_kernels
+    try:
+        yield
+    except Exception as error:
+        if not forgive(error):
+            raise
+        _against_kernels = _against_kernels or f"{type(error).__name__}: {error}"
+
+
+def try_first(trial: Callable) -> None:
+    """Call `trial()` before the first kernel, on an unknown version alone: where it raises, there are no kernels.
+
+    Rules of primitives are called by JAX in the midst of its transformations, where nothing can be forgiven any more.
+    """
+    global _trial
+    _trial = trial
+
+
+def reason_against_kernels() -> str | None:
+    """Why no function can be a kernel with this JAX, or None."""
+    global _trial
+    if _trial is not None and _against_kernels is None and not is_tested():
+        trial, _trial = _trial, None  # the trial asks too
+        with _kernels_or_none(), ThreadPoolExecutor(1) as other:  # a thread that is in the midst of no trace
+            other.submit(trial).result()
+    return _against_kernels
+
+
+# --- extension points ---
+
+try:
+    from jax.extend.core import ClosedJaxpr as ClosedJaxpr
+    from jax.extend.core import Literal as Literal
+    from jax.extend.core import Primitive
+    from jax.extend.mlir.dialects import sdy
+    from jax.interpreters import ad, batching, mlir
+except ImportError as _error:
+    if not forgive(_error):
+        raise
+    _against_kernels = f"{type(_error).__name__}: {_error}"
+    ClosedJaxpr = Literal = object  # which nothing asks for then
+
+
+def define_primitive(
+    name: str,
+    types: Callable,
+    *,
+    multiple_results: bool = False,
+    implement: Callable | None = None,
+    lower: Callable | None = None,
+    lower_on_cpu: Callable | None = None,
+    batch: Callable | None = None,
+    jvp: Callable | None = None,
+    transpose: Callable | None = None,
+) -> Any:
+    """A primitive of JAX with its rules; None on an unknown JAX whose extension points are others.
+
+    **Arguments:**
+
+    - `types(*types, **params)`: types of the results. `implement(*arrays, **params)`: the call outside of a trace.
+    - `lower(*arrays, **params)`: the same by operations of JAX. `lower_on_cpu(context, *operands, **params)`: a rule of its own.
+    - `batch(arrays, axes, **params)` -> results and their axes, None for what has no axis; `jvp(primals, tangents, **params)`;
+      `transpose(cotangents, *operands, **params)`. Tangents and cotangents may be zero (`is_zero`).
+    """
+    with _kernels_or_none():
+        primitive = Primitive(name)
+        primitive.multiple_results = multiple_results
+        primitive.def_abstract_eval(types)
+        if implement is not None:
+            primitive.def_impl(implement)
+        if lower is not None:
+            mlir.register_lowering(primitive, mlir.lower_fun(lower, multiple_results=multiple_results))
+        if lower_on_cpu is not None:
+            mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
+        if batch is not None:
+            batching.primitive_batchers[primitive] = batch
+        if jvp is not None:
+            ad.primitive_jvps[primitive] = jvp
+        if transpose is not None:
+            ad.primitive_transposes[primitive] = transpose
+        return primitive
+    return None
+
+
+def is_zero(tangent) -> bool:
+    """Whether a tangent or a cotangent is a zero that JAX has not made an array of."""
+    return type(tangent) is ad.Zero
+
+
+def zero_tangent(x) -> Any:
+    """The tangent of an array that cannot move, such as one of integers."""
+    return ad.Zero(ShapedArray(x.shape, jax.dtypes.float0))
+
+
+def is_linear(operand) -> bool:
+    """Whether an operand of a transpose rule is one to whose values the result is linear."""
+    return ad.is_undefined_primal(operand)
+
+
+def lower_function(function: Callable, context, *operands, **params) -> Any:
+    """Lower a call of a function of arrays, within a lowering rule."""
+    return mlir.lower_fun(function, multiple_results=True)(context, *operands, **params)
+
+
+def function_of(closed) -> Callable:
+    """The function of a closed jaxpr, from a flat list of arrays to one."""
+    return functools.partial(eval_jaxpr, closed.jaxpr, closed.consts)
+
+
+# --- parameters of primitives in jaxprs ---
+
+
+def scan_counts(params: dict) -> tuple[int, int]:
+    """Number of constants and of carried values among the operands of a `scan`."""
+    if "ft_in" in params:  # since 0.11: trees of the constants, the carry and the rows
+        constants, carry, _ = params["ft_in"].unpack()
+        return len(constants), len(carry)
+    return params["num_consts"], params["num_carry"]
+
+
+# --- types of arrays on meshes of devices ---
+
+
+def mesh_of(array_type) -> Any:
+    """The mesh in the type of an array; None where the type has none."""
+    mesh = array_type.sharding.mesh
+    return None if mesh.empty else mesh
+
+
+def spec_of(array_type) -> tuple:
+    """For each axis of an array the axes of the mesh along which its type divides it, or None."""
+    return tuple(array_type.sharding.spec)
+
+
+def type_like(array_type, shape: tuple, dtype, spec: Sequence) -> Any:
+    """The type of an array on the same mesh, varying along the same manual axes."""
+    sharding = NamedSharding(array_type.sharding.mesh, PartitionSpec(*spec))
+    return array_type.update(shape=shape, dtype=dtype, weak_type=False, sharding=sharding)
+
+
+def is_all_manual(mesh) -> bool:
+    """Whether all axes of a mesh are manual, so that XLA divides nothing along them."""
+    return bool(mesh.axis_types) and all(kind == AxisType.Manual for kind in mesh.axis_types)
+
+
+def vary_alike(leaves: list) -> list:
+    """The same arrays, each varying along all manual axes of meshes along which one of them does."""
+    try:
+        types = [getattr(jax.typeof(x), "manual_axis_type", None) for x in leaves]
+        axes = frozenset().union(*(x.varying for x in types if x is not None))
+        return [
+            x if kind is None or axes <= kind.varying else lax.pcast(x, tuple(axes - kind.varying), to="varying")
+            for x, kind in zip(leaves, types, strict=True)
+        ]
+    except Exception as error:
+        if not forgive(error):
+            raise
+        return leaves
+
+
+def sharding_attributes(batch_dims: int, sizes: Sequence[int], operands: Sequence, results: Sequence) -> dict:
+    """Attributes that tell XLA's partitioners along which axes a call can be divided.
+
+    `sizes` are those of the independent axes; `operands` and `results` list for each array which of them its axes are.
+    """
+
+    def mapped(axes):
+        return sdy.TensorMappingAttr.get(dim_mappings=[sdy.DimMappingAttr.get(factor_indices=[k]) for k in axes])
+
+    rule = sdy.OpShardingRuleAttr.get(
+        factor_sizes=list(sizes),
+        operand_mappings=[mapped(axes) for axes in operands],
+        result_mappings=[mapped(axes) for axes in results],
+        is_custom=True,
+    )
+    return {
+        "mhlo.frontend_attributes": mlir.ir_attribute({"num_batch_dims": str(batch_dims)}),
+        "sdy.sharding_rule": rule,
+    }
+
+
+# --- XLA's foreign function interface ---
+
+# Offsets of the fields that `handler.ll` reads, in bytes.
+_READ = {
+    "XLA_FFI_CallFrame": {"extension_start": 8, "api": 16, "ctx": 24, "args": 40, "rets": 80, "attrs": 120},
+    "XLA_FFI_Args": {"size": 16, "args": 32},
+    "XLA_FFI_Rets": {"size": 16, "rets": 32},
+    "XLA_FFI_Attrs": {"attrs": 40},
+    "XLA_FFI_Scalar": {"value": 8},
+    "XLA_FFI_Buffer": {"data": 24, "rank": 32, "dims": 40},
+    "XLA_FFI_Metadata_Extension": {"extension_base": 0, "metadata": 24},
+    "XLA_FFI_Metadata": {"api_version": 8, "traits": 32},
+    "XLA_FFI_Api_Version": {"major_version": 16, "minor_version": 20},
+    "XLA_FFI_Api": {
+        "XLA_FFI_Error_Create": 48, "XLA_FFI_Error_Destroy": 64, "XLA_FFI_ThreadPool_Schedule": 136,
+        "XLA_FFI_ThreadPool_NumThreads": 144,
+    },
+}  # fmt: skip
+# Those that it fills in, of the size that it says: a field more would not be filled in.
+_PASSED = {
+    "XLA_FFI_Error_Create_Args": {"message": 16, "errc": 24},
+    "XLA_FFI_Error_Destroy_Args": {"error": 16},
+    "XLA_FFI_ThreadPool_Schedule_Args": {"ctx": 16, "task": 24, "data": 32},
+    "XLA_FFI_ThreadPool_NumThreads_Args": {"ctx": 16, "num_threads": 24},
+}
+_MAJOR = 0
+
+
+class Unsupported(Exception):
+    """Why kernels cannot be called here."""
+
+
+def ffi_version(header: str | None = None) -> tuple[int, int]:
+    """Version of the FFI of the jaxlib that is installed, or of that header. **Raises:** `Unsupported`.
+
+    Minor versions add fields at the ends of structures and functions at the end of the table, and may rename. So no version is
+    refused for its number, but for another major one and where a field that kernels use is at another place.
+    """
+    if header is None:
+        try:
+            header = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
+        except OSError as error:
+            raise Unsupported(f"jaxlib comes without the header of XLA's FFI ({error})") from None
+    found = [re.search(rf"define XLA_FFI_API_{part} (\d+)", header) for part in ("MAJOR", "MINOR")]
+    major, minor = (-1 if x is None else int(x.group(1)) for x in found)
+    if major != _MAJOR:
+        raise Unsupported(f"jaxlib has version {major}.{minor} of XLA's FFI, and kernels are written for {_MAJOR}.x")
+    structures = _structures(header)
+    for name, expected in (_READ | _PASSED).items():
+        fields = structures.get(name, {})
+        have = {field: fields.get(field) for field in expected}
+        if have != expected or (name in _PASSED and list(fields)[-1] != list(expected)[-1]):
+            raise Unsupported(
+                f"version {major}.{minor} of XLA's FFI has another {name}: {fields or 'none'}, and kernels need {expected}"
+            )
+    return major, minor
+
+
+def _structures(header: str) -> dict[str, dict[str, int]]:
+    """Offsets of the fields of each structure of a C header, as compilers for 64 bits lay them out.
+
+    Fields whose type the header does not define end a structure: what comes after them has no known offset.
+    """
+    text = re.sub(r"//[^\n]*|/\*.*?\*/", "", header, flags=re.DOTALL)
+    text = re.sub(r"_XLA_FFI_API_STRUCT_FIELD\((\w+)\)", r"void* \1", text)
+    sizes = {name: (4, 4) for name in re.findall(r"typedef enum[^;{]*\{[^}]*\}\s*(\w+)\s*;", text)}
+    sizes |= {f"{sign}int{bits}_t": (bits // 8, bits // 8) for sign in ("", "u") for bits in (8, 16, 32, 64)}
+    sizes |= {"size_t": (8, 8), "bool": (1, 1), "double": (8, 8), "float": (4, 4), "int": (4, 4)}
+    for name, known in re.findall(r"typedef\s+(?=\w+\s+(\w+)\s*;)(\w+)", text):
+        if known in sizes:
+            sizes[name] = sizes[known]
+    structures = {}
+    for name, body in re.findall(r"struct\s+(\w+)\s*\{([^}]*)\}", text):
+        fields: dict[str, int] = {}
+        at, widest = 0, 1
+        for declaration in filter(None, map(str.strip, body.split(";"))):
+            field = re.fullmatch(r"(?:const\s+)?(?:struct\s+)?(\w+)(.*?)(\w+)", declaration, re.DOTALL)
+            kind = None if field is None else (8, 8) if "*" in declaration else sizes.get(field.group(1))
+            if field is None or kind is None:
+                break
+            size, alignment = kind
+            at = -(-at // alignment) * alignment
+            fields[field.group(3)], at, widest = at, at + size, max(widest, alignment)
+        else:
+            sizes[name] = -(-at // widest) * widest, widest
+        structures[name] = fields
+    return structures
+
+
+def register_handler(name: str, address: int) -> None:
+    """Tell XLA of a function that serves typed calls of this name on CPUs, and that their batches can be divided."""
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.c_void_p(address)), platform="cpu", api_version=1)
+    jax.ffi.register_ffi_target_as_batch_partitionable(name)
+
+
+def lower_call(name: str, context, operands: Sequence, order: Sequence[int], attributes: dict | None, **static) -> Any:
+    """Lower a call of a registered function with its operands in that order, within a lowering rule."""
+    context = context.replace(avals_in=[context.avals_in[i] for i in order])
+    lower = jax.ffi.ffi_lowering(name, extra_attributes=attributes)
+    return lower(context, *(operands[i] for i in order), **{key: np.int64(value) for key, value in static.items()})
+
+
+# --- compiler options ---
+
+
+def known_options(options: dict[str, Any]) -> dict[str, Any]:
+    """Those of the compiler options that the installed XLA has; each other one is logged at level debug, once."""
+    return {name: value for name, value in options.items() if _is_option(name, value)}
+
+
+@functools.cache
+def _is_option(name: str, value) -> bool:
+    try:
+        jax.jit(lambda: 0.0, compiler_options={name: value})()
+    except jax.errors.JaxRuntimeError:
+        logger.debug("jaxdyn: XLA has no compiler option %s, which is left out", name)
+        return False
+    return True

@@ -1,0 +1,135 @@
+"""Arguments and results of an exported function: names in C, places in memory, and comments about their entries."""
+
+import inspect
+import keyword
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxdyn.compile.standalone import Field
+from jaxdyn.model.columns import columns_of
+from jaxdyn.model.tree import Model
+
+C_TYPES = {"float64": "double", "float32": "float"}
+C_KEYWORDS = frozenset(
+    "alignas alignof and asm auto bool break case catch char class const constexpr continue decltype default delete do double "
+    "else enum "
+    "explicit export extern false float for friend goto if inline int long mutable namespace new not nullptr operator or private "
+    "protected public register restrict return short signed sizeof static struct switch template this throw true try typedef "
+    "typeid typename union unsigned using virtual void volatile wchar_t while xor".split()
+)
+
+
+class Leaf(NamedTuple):
+    """An array of an argument: its name, its shape and dtype, and its offset in bytes within a structure."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    offset: int
+
+
+class Argument(NamedTuple):
+    """An argument of the C function: an array, or a structure of arrays."""
+
+    name: str
+    leaves: tuple[Leaf, ...]
+    is_structure: bool
+    bytes: int
+
+
+def check_identifier(name: str, what: str) -> str:
+    """The name. **Raises:** ValueError unless it is an identifier of C and C++ and no keyword of theirs."""
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) or name in C_KEYWORDS:
+        raise ValueError(
+            f"{what} is {name!r}, which is no identifier of C and C++; use letters, digits and underscores, and no keyword, "
+            "as in 'arm_fd'"
+        )
+    return name
+
+
+def _identifier(text: str) -> str:
+    name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_") or "value"
+    name = f"x{name}" if name[0].isdigit() else name
+    return f"{name}_" if name in C_KEYWORDS or keyword.iskeyword(name) else name
+
+
+def arguments_of(function: Callable, examples: Sequence[Any]) -> tuple[Argument, ...]:
+    """The arguments of the C function, named as those of the Python function.
+
+    **Raises:** ValueError for examples that are no arrays of float64 or float32.
+    """
+    names = _parameter_names(function, len(examples))
+    return tuple(_argument(name, example) for name, example in zip(names, examples, strict=True))
+
+
+def _parameter_names(function: Callable, count: int) -> list[str]:
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        parameters = []
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    names = [_identifier(x.name) for x in parameters if x.kind in kinds][:count]
+    names += [f"x{i}" for i in range(len(names), count)]
+    return names if len(set(names)) == count else [f"x{i}" for i in range(count)]
+
+
+def _argument(name: str, example: Any) -> Argument:
+    paths = jax.tree_util.tree_flatten_with_path(example)[0]
+    is_structure = not (len(paths) == 1 and not paths[0][0])
+    leaves, used, offset, widest = [], set(), 0, 1
+    for path, value in paths:
+        dtype = np.dtype(getattr(value, "dtype", type(value)))
+        if dtype.name not in C_TYPES:
+            raise ValueError(
+                f"examples: {name}{jax.tree_util.keystr(path)} has dtype {dtype}; exported functions take float64 and float32, "
+                "so close over integers, or make them floats"
+            )
+        shape = np.shape(value)
+        field = _identifier(jax.tree_util.keystr(path)) if is_structure else name
+        while field in used:
+            field += "_"
+        used.add(field)
+        size = dtype.itemsize
+        offset, widest = -(-offset // size) * size, max(widest, size)
+        leaves.append(Leaf(field, shape, dtype, offset))
+        offset += size * int(np.prod(shape, dtype=int))
+    return Argument(name, tuple(leaves), is_structure, -(-offset // widest) * widest)
+
+
+def fields_of(arguments: Sequence[Argument]) -> list[Field]:
+    """For each array, in order, the argument that holds it and its offset."""
+    return [Field(i, leaf.offset) for i, argument in enumerate(arguments) for leaf in argument.leaves]
+
+
+def system_of(function: Callable, examples: Sequence[Any]) -> Model | None:
+    """A model that the function is given or closes over, for the names of joints in comments."""
+    candidates = list(examples)
+    try:
+        closure = inspect.getclosurevars(inspect.unwrap(getattr(function, "func", function)))
+        candidates += [*closure.nonlocals.values(), *closure.globals.values()]
+    except TypeError:
+        pass
+    candidates += list(getattr(function, "args", ()))
+    for value in candidates:
+        system = getattr(value, "system", value)
+        if isinstance(system, Model):
+            return system
+    return None
+
+
+_QUANTITIES = {"q": ("q", "q_units"), "v": ("v", "v_units"), "tau": ("v", "force_units"), "a": ("v", "a_units")}
+
+
+def comment_on(name: str, size: int, system: Model | None) -> str:
+    """Order and units of the entries of an argument that is called q, v, a or tau; "" for others."""
+    if system is None or name not in _QUANTITIES:
+        return ""
+    columns = columns_of(system)
+    entries, units = (getattr(columns, key) for key in _QUANTITIES[name])
+    if len(entries) != size:
+        return ""
+    return ", ".join(f"{entry} [{unit}]" for entry, unit in zip(entries, units, strict=True))

@@ -1,0 +1,126 @@
+"""Functions behind CasADi's interface for external functions, so that `casadi.external` has exact first derivatives.
+
+CasADi stores matrices by columns, and sparse ones as the entries of a pattern. The pattern of a Jacobian leaves out
+structural zeros, which no input can make other than zero. A null pointer stands for an argument that is zero, or for a result
+that is not asked for.
+
+Source: CasADi's user guide, "Using the generated code", and the signatures that its code generator writes.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdyn.compile import standalone
+from jaxdyn.compile.program import Array, Constant, Program
+from jaxdyn.compile.standalone import Text
+from jaxdyn.export.arguments import fields_of
+
+
+class Pattern(NamedTuple):
+    """A sparse matrix of CasADi's: its stored places, and for each entry of the program's array the place where it is stored."""
+
+    stored: np.ndarray  # (rows, columns) of bools
+    places: np.ndarray  # for each entry, by rows, its place among the stored ones by columns; -1 where it is not stored
+
+    @property
+    def count(self) -> int:
+        """Number of stored entries."""
+        return int(self.stored.sum())
+
+    def description(self) -> list[int]:
+        """Rows, columns, where each column begins, and the rows of the stored entries."""
+        starts = np.concatenate([[0], np.cumsum(self.stored.sum(axis=0))])
+        return [*self.stored.shape, *starts.tolist(), *np.nonzero(self.stored.T)[1].tolist()]
+
+
+def _by_columns(stored: np.ndarray) -> np.ndarray:
+    """For each place of a matrix, the number of stored places before it, by columns; -1 where it is not stored."""
+    places = np.full(stored.T.shape, -1)
+    places[stored.T] = np.arange(stored.sum())
+    return places.T
+
+
+def _dense(array: Array) -> Pattern:
+    """Of a vector a column; leading axes of an array of more than two become rows."""
+    columns = array.shape[-1] if len(array.shape) > 1 else 1
+    stored = np.ones((array.size // max(columns, 1), columns), bool)
+    return Pattern(stored, _by_columns(stored).ravel())
+
+
+def _block(is_stored: np.ndarray, of: Pattern, by: Pattern) -> Pattern:
+    """Of a Jacobian, whose rows and columns are the entries of two dense matrices by columns."""
+    where = np.ix_(of.places, by.places)
+    stored = np.zeros(is_stored.shape, bool)
+    stored[where] = is_stored
+    return Pattern(stored, _by_columns(stored)[where].ravel())
+
+
+def casadi_ir(exported: Any) -> str:
+    """The text of `name`, and of `jac_name` where the Jacobian was exported, with all that CasADi asks of them."""
+    program = exported.program
+    inputs, outputs = list(map(_dense, program.inputs)), list(map(_dense, program.outputs[:-1]))
+    functions = [_functions(exported.name, program, exported, inputs, outputs, [])]
+    jacobian = exported.jacobian_program
+    if jacobian is not None:
+        patterns, count = [], len(inputs)
+        for i, (row, array) in enumerate(zip(jacobian.results, jacobian.outputs[:-1], strict=False)):
+            is_zero = [type(x) is Constant and x.value == 0 for x in row]
+            patterns.append(_block(~np.reshape(is_zero, array.shape), outputs[i // count], inputs[i % count]))
+        functions.append(_functions(f"jac_{exported.name}", jacobian, exported, inputs, patterns, outputs))
+    return standalone.module_ir(*functions)
+
+
+def _functions(
+    name: str,
+    program: Program,
+    exported: Any,
+    inputs: Sequence[Pattern],
+    outputs: Sequence[Pattern],
+    nominal: Sequence[Pattern],
+) -> Text:
+    """The text of one function of CasADi's interface; `nominal` are the results that a Jacobian is given as further arguments."""
+    core, given = f"{name}_core", [*inputs, *nominal]
+    places = {i: pattern.places for i, pattern in enumerate(inputs)}
+    results = [pattern.places for pattern in outputs]
+    text, declared = standalone.function_ir(
+        core, program, fields_of(exported.arguments), places=places, results=results, internal=True
+    )
+    lines = [text]
+    lines += [f"@{name}_zero = internal constant [{max([1, *(x.count for x in inputs)])} x double] zeroinitializer"]
+    for kind, patterns in (("in", given), ("out", outputs)):
+        for i, pattern in enumerate(patterns):
+            numbers = pattern.description()
+            entries = ", ".join(f"i64 {x}" for x in numbers)
+            lines.append(f"@{name}_{kind}{i} = internal constant [{len(numbers)} x i64] [{entries}]")
+        lines += [f"define i64 @{name}_n_{kind}() #0 {{", f"  ret i64 {len(patterns)}", "}"]
+        cases = " ".join(f"i64 {i}, label %case{i}" for i in range(len(patterns)))
+        lines += [f"define ptr @{name}_sparsity_{kind}(i64 %i) #0 {{", f"  switch i64 %i, label %other [ {cases} ]"]
+        for i in range(len(patterns)):
+            lines += [f"case{i}:", f"  ret ptr @{name}_{kind}{i}"]
+        lines += ["other:", "  ret ptr null", "}"]
+    # Results that are not asked for are written to the end of the work vector.
+    work = max([0, *(x.count for x in outputs)])
+    lines += [f"define i32 @{name}_work(ptr %args, ptr %results, ptr %iw, ptr %w) #0 {{"]
+    for pointer, size in (("%args", len(given)), ("%results", len(outputs)), ("%iw", 0), ("%w", work)):
+        lines.append(f"  store i64 {size}, ptr {pointer}")
+    lines += ["  ret i32 0", "}"]
+    lines += [f"define i32 @{name}(ptr %args, ptr %results, ptr %iw, ptr %w, i32 %mem) #0 {{"]
+    for i in range(len(inputs)):
+        lines += [
+            f"  %pa{i} = getelementptr ptr, ptr %args, i64 {i}",
+            f"  %la{i} = load ptr, ptr %pa{i}",
+            f"  %na{i} = icmp eq ptr %la{i}, null",
+            f"  %a{i} = select i1 %na{i}, ptr @{name}_zero, ptr %la{i}",
+        ]
+    for i in range(len(outputs)):
+        lines += [
+            f"  %pr{i} = getelementptr ptr, ptr %results, i64 {i}",
+            f"  %lr{i} = load ptr, ptr %pr{i}",
+            f"  %nr{i} = icmp eq ptr %lr{i}, null",
+            f"  %r{i} = select i1 %nr{i}, ptr %w, ptr %lr{i}",
+        ]
+    pointers = [f"ptr %a{i}" for i in range(len(inputs))] + [f"ptr %r{i}" for i in range(len(outputs))]
+    lines += [f"  %status = call i32 @{core}({', '.join(pointers)})", "  ret i32 %status", "}"]
+    return Text("\n".join(lines), declared)

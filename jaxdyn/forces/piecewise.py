@@ -1,0 +1,155 @@
+"""Forces that are smooth in pieces: what tells their pieces apart, said once, and a scene whose forces keep to given pieces.
+
+A force with a kink or a jump declares switching functions. `jd.simulate` ends a step where one of them changes its sign, so that
+no step goes across a kink, and the derivatives of the motion are those of the pieces, put together by what the time of the change
+depends on.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxdyn.model.arguments import Number, SystemLike
+from jaxdyn.systems.scene import Scene
+
+
+class PiecewiseForce(eqx.Module):
+    """A force that is smooth but where one of its switching functions changes its sign.
+
+    Derive a class with two methods. As a force it takes the piece in which the state is.
+
+    - `guards(system, q, v, t) -> (n,)`: the switching functions, each smooth near its own zeros, in any unit.
+    - `force(system, q, v, t, positive) -> (nv,)`: the force in the piece in which those guards are positive that `positive` (n,)
+      marks. For a given `positive` it is smooth, across the zeros of the guards too.
+
+    ```python
+    class Backlash(jd.PiecewiseForce):
+        stiffness: jax.Array
+        play: jax.Array
+
+        def guards(self, system, q, v, t):
+            return jnp.stack([q[0] - self.play, -q[0] - self.play])
+
+        def force(self, system, q, v, t, positive):
+            beyond = jnp.where(positive[0], q[0] - self.play, jnp.where(positive[1], q[0] + self.play, 0.0))
+            return jnp.zeros_like(v).at[0].set(-self.stiffness * beyond)
+
+    scene = jd.Scene(system, forces=[Backlash(jnp.asarray(300.0), jnp.asarray(0.02))])
+    ```
+    """
+
+    @abc.abstractmethod
+    def guards(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " n"]:
+        """Switching functions (n,)."""
+
+    @abc.abstractmethod
+    def force(
+        self,
+        system: SystemLike,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        positive: Bool[Array, " n"],
+    ) -> Float[Array, " nv"]:
+        """The force (nv,) in the piece that `positive` marks."""
+
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
+        return self.force(system, q, v, t, self.guards(system, q, v, t) > 0)
+
+
+class _OnePiece(eqx.Module):
+    """A force of a scene that keeps to the piece it is told."""
+
+    inner: Any
+    positive: Any
+    of_efforts: Any
+
+    def __call__(self, system, q, v, t):
+        if isinstance(self.inner, PiecewiseForce):
+            return self.inner.force(system, q, v, t, self.positive)
+        return self.inner(system, q, v, t)
+
+    def limited(self, system, tau):
+        cut = getattr(self.inner, "limited", None)
+        if cut is None:
+            return tau
+        return cut(system, tau) if self.of_efforts is None else cut(system, tau, self.of_efforts)
+
+
+def guards_by_force(scene: Scene, q, v, t, tau) -> list[tuple[Any, Any]]:
+    """Of each force its switching functions, and those of how it cuts off `tau` (nv,); None where it has none.
+
+    `tau`: of the control before limits; None where there is none, or where it does not depend on the state.
+    """
+    rows = []
+    for force in scene.forces:
+        force = force.inner if isinstance(force, _OnePiece) else force
+        own = efforts = None
+        if isinstance(force, PiecewiseForce):
+            own = jnp.asarray(force.guards(scene.system, q, v, t), q.dtype)
+            if own.ndim != 1:
+                raise ValueError(f"{type(force).__name__}: guards gives shape {own.shape}; expected (n,)")
+        if tau is not None and hasattr(force, "effort_guards"):
+            efforts = force.effort_guards(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
+        if tau is not None and hasattr(force, "limited"):
+            tau = force.limited(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
+        rows.append((own, efforts))
+    return rows
+
+
+class Pieces(NamedTuple):
+    """The switching functions of a scene: of each force how many of its own there are and how many of how it cuts off efforts."""
+
+    counts: tuple[tuple[int, int], ...]
+    names: tuple[str, ...]
+
+
+def pieces_of(scene: Scene, y, q, v, t, tau_of: Callable | None) -> Pieces:
+    """The switching functions of a scene under a control, tau_of(y, q, v, t), at one state; None without a control."""
+
+    if not any(isinstance(force, PiecewiseForce) or hasattr(force, "effort_guards") for force in scene.forces):
+        return Pieces(((0, 0),) * len(scene.forces), ())
+
+    def shapes(y, q, v, t):
+        return guards_by_force(scene, q, v, t, None if tau_of is None else tau_of(y, q, v, t))
+
+    counts, names = [], []
+    for i, (force, parts) in enumerate(zip(scene.forces, jax.eval_shape(shapes, y, q, v, t), strict=True)):
+        counts.append(tuple(0 if part is None else part.shape[0] for part in parts))
+        names += [f"{type(force).__name__} ({i}): switch {k}" for k in range(sum(counts[-1]))]
+    return Pieces(tuple(counts), tuple(names))
+
+
+def guards(scene: Scene, q, v, t, tau) -> Float[Array, " n"]:
+    """All switching functions of a scene's forces, (n,)."""
+    parts = [part for pair in guards_by_force(scene, q, v, t, tau) for part in pair if part is not None]
+    return jnp.concatenate(parts) if parts else jnp.zeros((0,), q.dtype)
+
+
+def in_pieces(scene: Scene, pieces: Pieces, positive: Bool[Array, " n"]) -> Scene:
+    """The scene with forces that keep to the pieces that `positive` marks."""
+    forces, place = [], 0
+    for force, (own, efforts) in zip(scene.forces, pieces.counts, strict=True):
+        middle, end = place + own, place + own + efforts
+        marks = positive[place:middle], positive[middle:end] if efforts else None
+        forces.append(_OnePiece(force, *marks) if own + efforts else force)
+        place = end
+    return eqx.tree_at(lambda scene: scene.forces, scene, tuple(forces))
+
+
+def values_and_levels(switching: Callable, q, v):
+    """switching(q, v) (k,), and the size of its rounding.
+
+    That follows from what cancels in a function g: dg along (q, v) is the size of its terms.
+    """
+    values, sizes = jax.jvp(switching, (q, v), (q, v))
+    return values, jax.lax.stop_gradient(100 * float(jnp.finfo(q.dtype).eps) * (jnp.abs(sizes) + jnp.abs(values)))

@@ -1,0 +1,359 @@
+"""Exported functions: C programs, CasADi's interface, other processors and calls from NumPy, against JAX's own evaluation."""
+
+import ctypes
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+from jaxdyn.compile import standalone
+from jaxdyn.compile.objects import Code
+
+X = np.linspace(0.1, 0.7, 7)
+V, TAU = 0.3 * np.cos(X), np.sin(3 * X)
+STATE = tuple(map(jnp.asarray, (X, V, TAU)))
+LIBM = {
+    "acos", "asin", "atan", "atan2", "cbrt", "ceil", "cos", "cosh", "exp", "exp2", "expm1", "floor", "fmod", "log", "log1p",
+    "pow", "rint", "roundeven", "sin", "sincos", "sinh", "tan", "tanh",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return jd.robots.iiwa()
+
+
+@pytest.fixture(scope="module")
+def exported(arm):
+    def function(q, v, tau):
+        return jd.forward_dynamics(arm, q, v, tau)
+
+    return jd.export(function, X, V, TAU, name="arm_fd", derivatives=("jacobian",), batch=True)
+
+
+def compiler() -> str:
+    found = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if found is None:
+        pytest.skip("no C compiler on this machine")
+    return found
+
+
+def run_c(folder, name: str, compile_command: list[str] | None = None, runner: tuple[str, ...] = ()) -> str:
+    """Build the test program that `save` wrote, run it, and return what it prints."""
+    command = compile_command or [compiler(), "-Wall", "-Werror", "-O1"]
+    files = [f"{name}_test.c", f"{name}.o"]
+    done = subprocess.run([*command, *files, "-lm", "-o", "program"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    ran = subprocess.run([*runner, "./program"], cwd=folder, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    return ran.stdout
+
+
+def test_calls_from_numpy_equal_the_library(arm, exported):
+    np.testing.assert_allclose(exported(X, V, TAU), jd.forward_dynamics(arm, *STATE), rtol=1e-12)
+    # The independent answer: inverse dynamics by another recursion gives the torques back.
+    np.testing.assert_allclose(jd.inverse_dynamics(arm, *STATE[:2], jnp.asarray(exported(X, V, TAU))), TAU, atol=1e-12)
+    assert isinstance(exported(X, V, TAU), np.ndarray)
+
+
+def test_jacobian_equals_that_of_plain_jax(arm, exported):
+    with jd.compilation("plain"):
+        expected = jax.jacrev(lambda q, v, tau: jd.forward_dynamics(arm, q, v, tau), (0, 1, 2))(
+            *map(jnp.asarray, (X, V, TAU))
+        )
+    for got, reference in zip(exported.jacobian(X, V, TAU), expected, strict=True):
+        np.testing.assert_allclose(got, reference, rtol=1e-10, atol=1e-11 * np.abs(reference).max())
+
+
+def test_test_program_in_c_passes_and_fails_when_it_should(exported, tmp_path):
+    exported.save(tmp_path)
+    assert "largest relative difference" in run_c(tmp_path, "arm_fd")
+    text = (tmp_path / "arm_fd_test.c").read_text()
+    first = float(exported(X, V, TAU)[0]).hex()
+    assert first in text
+    (tmp_path / "arm_fd_test.c").write_text(text.replace(first, float(exported(X, V, TAU)[0] * (1 + 1e-9)).hex()))
+    with pytest.raises(AssertionError, match="largest relative difference"):
+        run_c(tmp_path, "arm_fd")
+
+
+def test_header_compiles_as_cplusplus_and_build_file_builds(exported, tmp_path):
+    exported.save(tmp_path)
+    if shutil.which("c++") is not None:
+        (tmp_path / "use.cpp").write_text(
+            '#include "arm_fd.h"\nint main() { double x[ARM_FD_SIZE_Q] = {}, a[ARM_FD_SIZE_OUT]; return arm_fd(x, x, x, a); }\n'
+        )
+        done = subprocess.run(
+            ["c++", "use.cpp", "arm_fd.o", "-lm", "-o", "use"], cwd=tmp_path, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        assert subprocess.run(["./use"], cwd=tmp_path).returncode == 0
+    if shutil.which("cmake") is None:
+        pytest.skip("no cmake on this machine")
+    for command in (["cmake", "-S", ".", "-B", "build"], ["cmake", "--build", "build"], ["./build/arm_fd_test"]):
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def undefined_symbols(path) -> set[str]:
+    if shutil.which("nm") is None:
+        pytest.skip("no nm on this machine")
+    printed = subprocess.run(["nm", "-u", path], capture_output=True, text=True, check=True).stdout
+    return {line.split()[-1] for line in printed.splitlines()}
+
+
+def test_object_file_needs_nothing_but_libm(exported, tmp_path):
+    exported.save(tmp_path)
+    assert undefined_symbols(tmp_path / "arm_fd.o") <= LIBM
+
+    def function(x):
+        return jnp.arctan2(x, 2.0) + jnp.exp(x)
+
+    jd.export(function, np.ones(2), name="other").save(tmp_path)
+    assert undefined_symbols(tmp_path / "other.o") == {"atan2", "exp"}
+    assert "atan2, exp" in (tmp_path / "other.h").read_text()
+
+
+def test_header_names_joints_units_sizes_and_stack(exported, tmp_path):
+    text = (exported.save(tmp_path) / "arm_fd.h").read_text()
+    assert "q (7,): iiwa_joint_1 [rad]" in text and "iiwa_joint_7 [N m]" in text
+    assert "#define ARM_FD_SIZE_TAU 7" in text
+    stack = int(text.partition("ARM_FD_STACK_BYTES ")[2].split()[0])
+    assert 100 < stack < 10_000
+
+
+def test_batch_over_vector_lanes_equals_single_samples(exported):
+    lanes = standalone.resolve_target("host").lanes
+    code = Code(exported.module("c", lanes))
+    for n in (0, 1, 3, 13):
+        rng = np.random.default_rng(n)
+        q, v, tau = (np.ascontiguousarray(rng.normal(size=(n, 7))) for _ in range(3))
+        out = np.full((n, 7), np.nan)
+        function = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, *[ctypes.c_void_p] * 4)(code.address("arm_fd_batch"))
+        assert function(n, *(x.ctypes.data for x in (q, v, tau, out))) == 0
+        expected = np.array([exported(*row) for row in zip(q, v, tau, strict=True)]).reshape(n, 7)
+        np.testing.assert_allclose(out, expected, rtol=1e-11, atol=1e-11)
+
+
+def test_a_model_as_argument_is_a_structure_with_named_fields(arm, tmp_path):
+    exported = jd.export(lambda model, q: jd.gravity_force(model, q), arm, X, name="weight")
+    np.testing.assert_allclose(exported(arm, X), jd.gravity_force(arm, STATE[0]), rtol=1e-12, atol=1e-12)
+    heavier = arm.replace(inertias=2 * arm.inertias)
+    np.testing.assert_allclose(exported(heavier, X), 2 * exported(arm, X), rtol=1e-12)
+    text = (exported.save(tmp_path) / "weight.h").read_text()
+    assert "} weight_model_t;" in text and "double inertias[" in text
+    run_c(tmp_path, "weight")
+
+
+def test_single_precision(tmp_path):
+    x = np.array([0.3, 0.4], np.float32)
+    exported = jd.export(lambda x: jnp.sin(x) * x[::-1], x, name="single", derivatives="jacobian")
+    got = exported(x)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, np.sin(x.astype(float)) * x[::-1], rtol=1e-6)
+    assert "const float x[2]" in (exported.save(tmp_path) / "single.h").read_text()
+    run_c(tmp_path, "single")
+
+
+def test_constrained_dynamics_and_projections(tmp_path):
+    scene = jd.scenes.four_bar()
+    q, v = map(np.asarray, jd.scenes.four_bar.start())
+
+    def function(q, v, tau):
+        dynamics = jd.constrained_dynamics(scene, q, v, tau)
+        return dynamics.acceleration, dynamics.multipliers
+
+    tau = np.array([1.0, 0.0, 0.5])
+    exported = jd.export(function, q, v, tau, name="four_bar", derivatives=("jacobian",))
+    a, lam = exported(q, v, tau)
+    here, moving = jnp.asarray(q), jnp.asarray(v)
+    M, h = jd.mass_matrix(scene.system, here), jd.bias_force(scene.system, here, moving)
+    A = jd.constraint_jacobian(scene, here)
+    np.testing.assert_allclose(M @ a + h, tau + A.T @ lam, atol=1e-11)  # the equations themselves
+    exported.save(tmp_path)
+    run_c(tmp_path, "four_bar")
+
+    projection = jd.export(lambda q: jd.projections(scene, q).P_T, q, name="projection")(q)
+    np.testing.assert_allclose(projection @ projection, projection, atol=1e-12)
+
+
+def test_a_degenerate_sample_gives_a_status():
+    def function(q, v, tau):
+        return jd.constrained_dynamics(scene, q, v, tau).acceleration
+
+    scene = jd.Scene(jd.scenes.planar_arm().system, [jd.Holonomic(lambda q, t: jnp.stack([q[0] ** 2 - q[1] ** 2]))])
+    q = np.array([0.5, 0.5])
+    exported = jd.export(function, q, q * 0, q, name="crossing")
+    assert np.isfinite(exported(q, q * 0, q)).all()
+    with pytest.raises(FloatingPointError, match="crossing: the constraints lose rank"):
+        exported(q * 0, q * 0, q)
+
+
+def test_a_lagrangian_and_a_control_law():
+    system = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v - jnp.cos(q[0]) * q[1], 2)
+    x = np.array([0.3, -0.2])
+    exported = jd.export(lambda q, v, tau: jd.forward_dynamics(system, q, v, tau), x, x, x, name="lagrangian")
+    # Euler-Lagrange by hand: qdd = tau - dV/dq with V = cos(q0) q1.
+    np.testing.assert_allclose(exported(x, x, x), x - [-np.sin(x[0]) * x[1], np.cos(x[0])], rtol=1e-12)
+
+
+# --- CasADi ---
+
+
+def test_casadi_has_exact_sparse_derivatives(tmp_path):
+    casadi = pytest.importorskip("casadi")
+
+    def function(x, y):  # x acts on the first entries alone, so that half of the pattern is empty
+        return jnp.stack([x[0] * x[1], jnp.sin(x[1]), y[0, 1] ** 2 + y[1, 0]]), y * 2.0
+
+    x, y = np.array([0.3, 0.7]), np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    exported = jd.export(function, x, y, name="fn", derivatives=("jacobian",))
+    exported.save(tmp_path, abi="casadi")
+    subprocess.run([compiler(), "-shared", "-o", "fn.so", "fn.o", "-lm"], cwd=tmp_path, check=True)
+    external = casadi.external("fn", str(tmp_path / "fn.so"))
+    first, second = external(x, y)
+    np.testing.assert_allclose(first.full().ravel(), function(x, y)[0], rtol=1e-14)
+    np.testing.assert_allclose(second.full(), 2 * y)
+    a, b = casadi.MX.sym("a", 2), casadi.MX.sym("b", 2, 3)
+    out = external(a, b)
+    slopes = casadi.Function(
+        "J", [a, b], [casadi.jacobian(out[0], a), casadi.jacobian(out[0], b), casadi.jacobian(out[1], b)]
+    )
+    by_a, by_b, scaling = slopes(x, y)
+    assert by_a.sparsity().nnz() == 3 and by_b.sparsity().nnz() == 2 and scaling.sparsity().nnz() == 6
+    by_x, by_y = (np.asarray(J) for J in jax.jacobian(lambda x, y: function(x, y)[0], (0, 1))(x, y))
+    np.testing.assert_allclose(by_a.full(), by_x, rtol=1e-13, atol=1e-15)
+    by_columns = by_y.transpose(0, 2, 1).reshape(3, 6)  # CasADi stacks the columns of a matrix
+    np.testing.assert_allclose(by_b.full(), by_columns, rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(scaling.full(), 2 * np.eye(6))
+    done = subprocess.run([sys.executable, "fn_test.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_ipopt_holds_an_arm_with_exact_derivatives(arm, tmp_path):
+    casadi = pytest.importorskip("casadi")
+    exported = jd.export(
+        lambda q, v, tau: jd.forward_dynamics(arm, q, v, tau), X, V, TAU, name="fd", derivatives=("jacobian",)
+    )
+    exported.save(tmp_path, abi="casadi")
+    subprocess.run([compiler(), "-shared", "-o", "fd.so", "fd.o", "-lm"], cwd=tmp_path, check=True)
+    external, tau = casadi.external("fd", str(tmp_path / "fd.so")), casadi.MX.sym("tau", 7)
+    problem = {"x": tau, "f": casadi.sumsqr(tau), "g": external(X, V, tau)}
+    options = {"ipopt.print_level": 0, "print_time": 0, "ipopt.hessian_approximation": "limited-memory"}
+    found = casadi.nlpsol("s", "ipopt", problem, options)(x0=np.zeros(7), lbg=0, ubg=0)
+    # No acceleration: the torques of gravity and velocities.
+    np.testing.assert_allclose(found["x"].full().ravel(), jd.bias_force(arm, *STATE[:2]), rtol=1e-7)
+
+
+# --- other processors ---
+
+
+@pytest.mark.parametrize("target", ["x86_64", "x86_64-v3", "x86_64-v4", "aarch64", "cortex-m7", "riscv64", "wasm32"])
+def test_every_target_compiles(exported, tmp_path, target):
+    exported.save(tmp_path, target=target)
+    binary = (tmp_path / "arm_fd.o").read_bytes()
+    machines = {"aarch64": 183, "cortex-m7": 40, "riscv64": 243}  # numbers of the ELF specification
+    if target == "wasm32":
+        assert binary[:4] == b"\0asm"
+    else:
+        assert binary[:4] == b"\x7fELF" and int.from_bytes(binary[18:20], "little") == machines.get(target, 62)
+
+
+def test_baseline_of_x86_64_runs_here(exported, tmp_path):
+    if not standalone.resolve_target("host").triple.startswith("x86_64"):
+        pytest.skip("another processor")
+    exported.save(tmp_path, target="x86_64")
+    run_c(tmp_path, "arm_fd")
+
+
+def test_aarch64_runs_under_qemu(exported, tmp_path):
+    gcc, qemu = shutil.which("aarch64-linux-gnu-gcc"), shutil.which("qemu-aarch64")
+    if gcc is None or qemu is None:
+        pytest.skip("needs Debian's qemu-user and gcc-aarch64-linux-gnu")
+    exported.save(tmp_path, target="aarch64")
+    run_c(tmp_path, "arm_fd", [gcc, "-O1", "-static"], (qemu,))
+
+
+def test_wasm_runs_in_node(exported, tmp_path):
+    linker, node = shutil.which("wasm-ld") or shutil.which("wasm-ld-14"), shutil.which("node")
+    if linker is None or node is None:
+        pytest.skip("needs node and Debian's lld")
+    exported.save(tmp_path, target="wasm32")
+    command = [linker, "--no-entry", "--export=arm_fd", "--allow-undefined", "arm_fd.o", "-o", "arm_fd.wasm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    (tmp_path / "run.js").write_text(
+        """
+        const bytes = require("fs").readFileSync("arm_fd.wasm");
+        WebAssembly.instantiate(bytes, {env: {sin: Math.sin, cos: Math.cos}}).then(({instance}) => {
+          const at = 65536 + 1024, numbers = new Float64Array(instance.exports.memory.buffer, at, 28);
+          JSON.parse(process.argv[2]).forEach((x, i) => numbers[i] = x);
+          const status = instance.exports.arm_fd(at, at + 56, at + 112, at + 168);
+          console.log(JSON.stringify([status, ...numbers.slice(21)]));
+        });
+        """
+    )
+    import json
+
+    given = json.dumps([*X, *V, *TAU])
+    printed = subprocess.run([node, "run.js", given], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    status, *values = json.loads(printed)
+    assert status == 0
+    np.testing.assert_allclose(values, exported(X, V, TAU), rtol=1e-12, atol=1e-12)
+
+
+def test_cortex_m_calls_only_what_the_runtime_has(exported, tmp_path):
+    exported.save(tmp_path, target="cortex-m7")
+    names = undefined_symbols(tmp_path / "arm_fd.o")
+    assert all(name in LIBM or name.startswith("__aeabi") for name in names), names
+
+
+# --- refusals ---
+
+
+@pytest.mark.parametrize(
+    ("function", "examples", "options", "message"),
+    [
+        (lambda x: x, (X,), {"name": "for"}, "name is 'for', which is no identifier"),
+        (lambda x: x, (X,), {"name": "a b"}, "name is 'a b'"),
+        (lambda x: x, (np.arange(3),), {"name": "f"}, "examples: x has dtype int64"),
+        (lambda x: x, (X + 1j,), {"name": "f"}, "examples: x has dtype complex128"),
+        (lambda x: x > 0, (X,), {"name": "f"}, "function returns arrays of bool"),
+        (lambda x: x, (X,), {"name": "f", "derivatives": ("hessian",)}, "derivatives has 'hessian'"),
+        (
+            lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((7,), float), x),
+            (X,),
+            {"name": "f"},
+            "function cannot be exported: it has pure_callback",
+        ),
+        (
+            lambda x: jax.lax.while_loop(lambda x: x.sum() < 9, lambda x: 2 * x, x),
+            (X,),
+            {"name": "f"},
+            "cannot be exported: it has a while_loop whose end is not known",
+        ),
+    ],
+)
+def test_refusals(function, examples, options, message):
+    with pytest.raises(ValueError, match=message):
+        jd.export(function, *examples, **options)
+
+
+def test_refusals_of_saving_and_calling(exported, tmp_path):
+    with pytest.raises(ValueError, match="target is 'pdp11'"):
+        exported.save(tmp_path / "a", target="pdp11")
+    with pytest.raises(ValueError, match="abi is 'fortran'"):
+        exported.save(tmp_path / "a", abi="fortran")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="cannot be written"):
+        exported.save(tmp_path / "file" / "folder")
+    assert not (tmp_path / "a").exists()
+    with pytest.raises(ValueError, match=r"an argument has shape \(3,\), the example had \(7,\)"):
+        exported(X[:3], V, TAU)
+    with pytest.raises(ValueError, match="takes 3 arguments, and was given 2"):
+        exported(X, V)
+    with pytest.raises(ValueError, match="was exported without its Jacobian"):
+        jd.export(lambda x: x, X, name="f").jacobian(X)

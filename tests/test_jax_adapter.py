@@ -1,0 +1,420 @@
+"""JAX of several versions, those of the future included: what jaxdyn uses of it, and what it does where that has changed."""
+
+import ast
+import functools
+import importlib.util
+import logging
+import pkgutil
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.extend.core import Primitive
+
+import jaxdyn as jd
+from jaxdyn import compile as backend
+from jaxdyn.compile import expand, jax_adapter, kernel, mode, target
+from jaxdyn.compile.trial import run_trial
+
+ADAPTER = Path(jax_adapter.__file__)
+DOCS = "https://docs.jax.dev/en/latest/"
+
+# --- names ---
+
+# Each name of JAX that the adapter uses, and the page below DOCS that documents it; "" where none does, with the reason.
+NAMES = {
+    "jax.__version__": ("changelog.html", ""),
+    "jax.__version_info__": ("", "numbers of __version__; equinox and flax read it too"),
+    "jax.core.ShapedArray": ("jax-primitives.html", ""),
+    "jax.core.Tracer": ("key-concepts.html", ""),
+    "jax.core.eval_jaxpr": ("jaxpr.html", ""),
+    "jax.dtypes.float0": ("_autosummary/jax.dtypes.float0.html", ""),
+    "jax.errors.JaxRuntimeError": ("errors.html", ""),
+    "jax.extend.core.ClosedJaxpr": ("jax.extend.core.html", ""),
+    "jax.extend.core.Literal": ("jax.extend.core.html", ""),
+    "jax.extend.core.Primitive": ("jax.extend.core.html", ""),
+    "jax.extend.mlir.dialects.sdy": ("jax.extend.mlir.html", ""),
+    "jax.extend.mlir.dialects.sdy.DimMappingAttr.get": ("", "Shardy's own Python bindings: openxla.org/shardy"),
+    "jax.extend.mlir.dialects.sdy.OpShardingRuleAttr.get": ("", "Shardy's own Python bindings: openxla.org/shardy"),
+    "jax.extend.mlir.dialects.sdy.TensorMappingAttr.get": ("", "Shardy's own Python bindings: openxla.org/shardy"),
+    "jax.ffi.ffi_lowering": ("jax.ffi.html", ""),
+    "jax.ffi.include_dir": ("ffi.html", ""),
+    "jax.ffi.pycapsule": ("jax.ffi.html", ""),
+    "jax.ffi.register_ffi_target": ("jax.ffi.html", ""),
+    "jax.ffi.register_ffi_target_as_batch_partitionable": (
+        "",
+        "its docstring: without it XLA gathers the batch around a call",
+    ),
+    "jax.interpreters.ad": ("jax-primitives.html", ""),
+    "jax.interpreters.ad.Zero": ("jax-primitives.html", ""),
+    "jax.interpreters.ad.is_undefined_primal": ("jax-primitives.html", ""),
+    "jax.interpreters.ad.primitive_jvps": ("jax-primitives.html", ""),
+    "jax.interpreters.ad.primitive_transposes": ("jax-primitives.html", ""),
+    "jax.interpreters.batching": ("jax-primitives.html", ""),
+    "jax.interpreters.batching.primitive_batchers": ("jax-primitives.html", ""),
+    "jax.interpreters.mlir": ("jax-primitives.html", ""),
+    "jax.interpreters.mlir.ir_attribute": (
+        "",
+        "attributes of a call; jax.ffi has no other way to hand over one of ours",
+    ),
+    "jax.interpreters.mlir.lower_fun": ("", "lowers by operations of JAX; in all extension libraries"),
+    "jax.interpreters.mlir.register_lowering": ("jax-primitives.html", ""),
+    "jax.jit": ("_autosummary/jax.jit.html", ""),
+    "jax.lax": ("jax.lax.html", ""),
+    "jax.lax.pcast": ("_autosummary/jax.lax.pcast.html", ""),
+    "jax.sharding.AxisType": ("jax.sharding.html", ""),
+    "jax.sharding.AxisType.Manual": ("jax.sharding.html", ""),
+    "jax.sharding.NamedSharding": ("jax.sharding.html", ""),
+    "jax.sharding.PartitionSpec": ("jax.sharding.html", ""),
+    "jax.typeof": ("_autosummary/jax.typeof.html", ""),
+}
+# Private to JAX, or so little documented that a new version may move them.
+PRIVATE = ("jax._src", "jax.core", "jax.extend", "jax.interpreters", "jax.lib", "jaxlib")
+
+
+def names_of_jax(tree: ast.Module) -> set[str]:
+    """Dotted names of JAX in a module: what it imports and the attributes of that."""
+    local, names = {}, set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                if alias.name.partition(".")[0] in ("jax", "jaxlib"):
+                    local[(alias.asname or alias.name).partition(".")[0]] = alias.name if alias.asname else "jax"
+                    names.add(alias.name)
+        elif isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in ("jax", "jaxlib"):
+            for alias in node.names:
+                local[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+                names.add(f"{node.module}.{alias.name}")
+
+    def dotted(node) -> str | None:
+        if isinstance(node, ast.Name):
+            return local.get(node.id)
+        if isinstance(node, ast.Attribute):
+            owner = dotted(node.value)
+            return None if owner is None else f"{owner}.{node.attr}"
+        return None
+
+    inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and node not in inner and (name := dotted(node)) is not None:
+            names.add(name)
+    return names - {"jax"}
+
+
+def test_each_name_that_the_adapter_uses_is_listed_with_its_documentation():
+    used = names_of_jax(ast.parse(ADAPTER.read_text(encoding="utf-8")))
+    assert used == NAMES.keys(), f"not listed: {used - NAMES.keys()}; not used: {NAMES.keys() - used}"
+    assert all(bool(page) != bool(reason) for page, reason in NAMES.values())
+    for name in NAMES:
+        pkgutil.resolve_name(name)
+
+
+def test_no_other_module_depends_on_the_version_of_jax():
+    package = Path(jd.__file__).parent
+    wrong = [
+        f"{path.relative_to(package)}: {name}"
+        for path in sorted(package.rglob("*.py"))
+        if path != ADAPTER
+        for name in names_of_jax(ast.parse(path.read_text(encoding="utf-8")))
+        if any(name == private or name.startswith(f"{private}.") for private in PRIVATE)
+    ]
+    assert not wrong, "take these from jaxdyn/compile/jax_adapter.py:\n" + "\n".join(wrong)
+
+
+# --- XLA's foreign function interface ---
+
+HEADER = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
+
+
+def changed(*pairs) -> str:
+    text = HEADER
+    for pattern, replacement in pairs:
+        text, count = re.subn(pattern, replacement, text)
+        assert count, pattern
+    return text
+
+
+@pytest.mark.parametrize("minor", [0, 3, 4, 5, 17])
+def test_every_minor_version_serves_while_fields_keep_their_places(minor):
+    version = r"API_MINOR \d+", f"API_MINOR {minor}"
+    assert jax_adapter.ffi_version(changed(version)) == (0, minor)
+    # What minor versions may do: new fields and functions at the end, other names of types.
+    grown = changed(
+        version,
+        (r"(struct XLA_FFI_CallFrame \{[^}]*)\}", r"\1  struct XLA_FFI_New* more; }"),
+        (r"(struct XLA_FFI_Api \{[^}]*)\}", r"\1  _XLA_FFI_API_STRUCT_FIELD(XLA_FFI_New_Get); }"),
+        (r"XLA_FFI_\w*Extension\w*\* extension_start", "XLA_FFI_OtherName* extension_start"),
+    )
+    assert jax_adapter.ffi_version(grown) == (0, minor)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ((r"API_MAJOR \d+", "API_MAJOR 1"), r"version 1\.\d+ .* kernels are written for 0\.x"),
+        ((r"(struct XLA_FFI_CallFrame \{)", r"\1 void* first;"), "another XLA_FFI_CallFrame: {'first': 0"),
+        ((r"(struct XLA_FFI_Buffer \{[^}]*)(int64_t rank;)", r"\1 int64_t layout; \2"), "another XLA_FFI_Buffer"),
+        ((r"(struct XLA_FFI_Attrs \{)", r"\1 Unknown first;"), "another XLA_FFI_CallFrame"),
+        (
+            (r"(struct XLA_FFI_Error_Create_Args \{[^}]*)\}", r"\1 int64_t place; }"),
+            "another XLA_FFI_Error_Create_Args",
+        ),
+        ((r"(_XLA_FFI_API_STRUCT_FIELD\(XLA_FFI_Stream_Get\);)", r"\1 void* more;"), "another XLA_FFI_Api"),
+        ((r"struct XLA_FFI_Args \{", "struct XLA_FFI_Operands {"), "another XLA_FFI_CallFrame"),
+        ((r"XLA_FFI_API_MAJOR", "XLA_FFI_OTHER"), r"version -1\."),
+    ],
+    ids=["major", "first field", "moved", "unknown type", "passed", "function", "gone", "no version"],
+)
+def test_what_is_incompatible_is_refused(change, reason):
+    with pytest.raises(jax_adapter.Unsupported, match=reason):
+        jax_adapter.ffi_version(changed(change))
+
+
+def test_a_jaxlib_without_the_header_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setattr(jax.ffi, "include_dir", lambda: str(tmp_path))
+    with pytest.raises(jax_adapter.Unsupported, match="without the header"):
+        jax_adapter.ffi_version()
+
+
+# --- compiler options ---
+
+
+def test_options_that_xla_does_not_have_are_left_out_and_said_once(caplog):
+    options = {"xla_backend_optimization_level": 1, "xla_cpu_no_such_option": True}
+    with caplog.at_level(logging.DEBUG, "jaxdyn"):
+        for _ in range(2):
+            assert jax_adapter.known_options(options) == {"xla_backend_optimization_level": 1}
+    assert [(x.levelno, x.getMessage()) for x in caplog.records if x.name == "jaxdyn"] == [
+        (logging.DEBUG, "jaxdyn: XLA has no compiler option xla_cpu_no_such_option, which is left out")
+    ]
+
+
+# --- versions of the future ---
+
+
+def test_the_installed_version_is_tested():
+    assert jax_adapter.is_tested() and jax_adapter.reason_against_kernels() is None
+
+
+@pytest.fixture
+def future(monkeypatch) -> None:
+    """JAX calls itself 0.99, and nothing has been tried with it. Warnings are errors, so one that is not expected is seen."""
+    monkeypatch.setattr(jax, "__version_info__", (0, 99, 0))
+    monkeypatch.setattr(jax, "__version__", "0.99.0")
+    for name, value in {"_is_warned": False, "_against_kernels": None, "_trial": run_trial}.items():
+        monkeypatch.setattr(jax_adapter, name, value)
+
+
+def one_warning(reason: str):
+    return pytest.warns(
+        UserWarning, match=rf"tested with jax 0\.10 to 0\.12, and this is jax 0\.99\.0.*{reason}.*'jax<0\.13'"
+    )
+
+
+def sums(known, x):
+    del known
+    return lax.scan(lambda total, y: (total + jnp.sin(y), total * y), 0.0, x)
+
+
+def results(function, x):
+    """Values and derivatives, of one sample and of a batch."""
+    value, slope = functools.partial(backend.run, function, ()), lambda x: jax.grad(lambda x: value(x)[0])(x)
+    return [value(x), slope(x), jax.jit(jax.vmap(value))(jnp.stack([x, 2 * x])), jax.jit(jax.vmap(slope))(x[None])]
+
+
+def assert_right(function, x, computed):
+    with jd.compilation("plain"):
+        wanted = results(function, x)
+    for mine, theirs in zip(jax.tree.leaves(computed), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12)
+
+
+def fresh(function):
+    """The same as a function that no cache knows."""
+    return lambda known, x: function(known, x)
+
+
+X = jnp.asarray([0.3, -0.4, 0.9])
+
+
+def uses_kernels(function) -> bool:
+    return "jaxdyn_kernel" in str(jax.make_jaxpr(functools.partial(backend.run, function, ()))(X))
+
+
+def test_a_new_version_in_which_nothing_has_changed_has_kernels(future):
+    function = fresh(sums)
+    assert_right(function, X, results(function, X))
+    assert uses_kernels(function) and mode.current() == "auto"
+
+
+@pytest.fixture
+def renamed(monkeypatch) -> None:
+    """`scan` has its parameters under other names."""
+    one = expand._Expansion.one
+
+    def with_other_names(self, eqn, args):
+        if eqn.primitive.name == "scan":
+            params = {f"new_{name}": value for name, value in eqn.params.items()}
+            eqn = SimpleNamespace(primitive=eqn.primitive, params=params, invars=eqn.invars, outvars=eqn.outvars)
+        return one(self, eqn, args)
+
+    monkeypatch.setattr(expand._Expansion, "one", with_other_names)
+
+
+def test_a_renamed_parameter_leaves_a_function_to_jax(future, renamed):
+    function = fresh(sums)
+    with one_warning("KeyError: 'num_consts'"):
+        computed = results(function, X)
+    assert_right(function, X, computed)
+    assert not uses_kernels(function)
+    other = fresh(sums)  # there is no second warning
+    assert_right(other, X, results(other, X))
+    assert uses_kernels(lambda known, x: jnp.sin(x))  # what has no scan has kernels
+
+
+def test_a_renamed_parameter_is_an_error_on_a_tested_version(renamed):
+    with pytest.raises(KeyError, match="num_consts"):
+        backend.run(fresh(sums), (), X)
+
+
+def test_an_error_of_the_users_function_stays_what_it_is(future):
+    def wrong(known, x):
+        raise ZeroDivisionError("of the user")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(ZeroDivisionError, match="of the user"):
+            backend.run(wrong, (), X)
+
+
+NEW = Primitive("quite_new")
+NEW.def_impl(lambda x: x + 1)
+NEW.def_abstract_eval(lambda x: x)
+jax.interpreters.mlir.register_lowering(NEW, jax.interpreters.mlir.lower_fun(lambda x: x + 1, multiple_results=False))
+
+
+def test_a_new_primitive_leaves_a_function_to_jax(future):
+    def function(known, x):
+        return NEW.bind(jnp.sin(x))
+
+    np.testing.assert_allclose(backend.run(function, (), X), jnp.sin(X) + 1, rtol=1e-15)
+    assert not uses_kernels(function)
+
+
+@jax.custom_jvp
+def _sorted_slope(x):
+    return jnp.sin(x)
+
+
+_sorted_slope.defjvp(lambda primals, steps: (jnp.sin(primals[0]), jnp.sort(jnp.cos(primals[0])) * steps[0]))
+
+
+def test_a_derivative_that_cannot_be_numbers_is_left_to_jax():
+    """On every version: the value has a kernel, its derivative, whose rule sorts, has none."""
+
+    def function(known, x):
+        return jnp.sum(_sorted_slope(x)), x
+
+    assert_right(function, X, results(function, X))
+    assert uses_kernels(function)
+
+
+def test_another_interface_of_xla_leaves_everything_to_jax(future, monkeypatch, tmp_path):
+    folder = tmp_path / "xla/ffi/api"
+    folder.mkdir(parents=True)
+    (folder / "c_api.h").write_text(changed((r"API_MAJOR \d+", "API_MAJOR 1")))
+    monkeypatch.setattr(jax.ffi, "include_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(target, "register", target.register.__wrapped__)
+    function = fresh(sums)
+    with one_warning(r"Unsupported: jaxlib has version 1\.\d+ of XLA's FFI"):
+        computed = results(function, X)
+    assert mode.current() == "plain" and not uses_kernels(function)
+    assert_right(function, X, computed)
+
+
+@pytest.mark.parametrize(("module", "name"), [("ad", "Zero"), ("ad", "is_undefined_primal"), ("mlir", "ir_attribute")])
+def test_a_missing_name_leaves_everything_or_nothing_to_jax(future, monkeypatch, module, name):
+    """Rules and lowerings that JAX calls meet it."""
+    names = {key: value for key, value in vars(getattr(jax_adapter, module)).items() if key != name}
+    monkeypatch.setattr(jax_adapter, module, SimpleNamespace(**names))
+    function = fresh(sums)
+    with one_warning(f"AttributeError: .*{name}"):
+        computed = results(function, X)
+    assert_right(function, X, computed)
+
+
+def test_a_call_that_cannot_be_lowered_is_left_to_jax(future, monkeypatch):
+    monkeypatch.setattr(jax_adapter, "_trial", None)
+
+    def broken(*args, **static):
+        raise TypeError("ffi_lowering got an unexpected argument")
+
+    monkeypatch.setattr(jax_adapter, "lower_call", broken)
+    function = fresh(sums)
+    with one_warning("TypeError: ffi_lowering got an unexpected argument"):
+        computed = results(function, X)
+    assert_right(function, X, computed)
+    monkeypatch.setattr(jax, "__version_info__", (0, 12, 0))
+    with pytest.raises(TypeError, match="unexpected argument"):
+        jax.jit(functools.partial(backend.run, lambda known, x: jnp.cos(x), ()))(X)
+
+
+def test_wrong_numbers_leave_everything_to_jax(future, monkeypatch):
+    """As those of jax 0.10.2 were."""
+    rule = kernel.shaped_results
+    monkeypatch.setattr("jaxdyn.compile.trial.shaped_results", lambda *args: [2 * x for x in rule(*args)])
+    with one_warning("a kernel gives other numbers than JAX"):
+        assert mode.current() == "plain"
+
+
+@pytest.mark.parametrize("name", ["Literal", "Primitive"])
+def test_the_adapter_can_be_imported_where_a_name_is_missing(future, monkeypatch, name):
+    monkeypatch.delattr(jax.extend.core, name)
+    spec = importlib.util.spec_from_file_location("another_adapter", ADAPTER)
+    with one_warning(f"ImportError: .*{name}"):
+        adapter = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(adapter)
+    assert name in adapter.reason_against_kernels()
+    assert adapter.define_primitive("one", lambda x: x) is None
+    monkeypatch.setattr(jax, "__version_info__", (0, 12, 0))
+    with pytest.raises(ImportError, match=name):
+        spec.loader.exec_module(importlib.util.module_from_spec(spec))
+
+
+@pytest.mark.slow
+def test_the_package_works_where_a_name_is_missing():
+    code = """
+import warnings, jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+import diffrax, equinox, lineax, optimistix, jax.interpreters.batching
+jax.__version__, jax.__version_info__ = "0.99.0", (0, 99, 0)
+del jax.interpreters.batching.primitive_batchers
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    import jaxdyn as jd
+    model = jd.robots.iiwa()
+    q = np.full((3, 7), 0.3)
+    a = jax.vmap(lambda q: jd.forward_dynamics(model, q, q, q))(q)
+    slope = jax.grad(lambda q: jd.forward_dynamics(model, q, q, q).sum())(q[0])
+    motion = jd.simulate(jd.scenes.four_bar(), *jd.scenes.four_bar.start(), np.linspace(0.0, 0.2, 3))
+print(len([x for x in caught if "0.99.0" in str(x.message)]), a[0, 0], slope[0], motion.q[-1, 0])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr[-2000:]
+    count, *numbers = map(float, done.stdout.split())
+    model, q = jd.robots.iiwa(), jnp.full(7, 0.3)
+    dynamics = lambda q: jd.forward_dynamics(model, q, q, q)  # noqa: E731
+    motion = jd.simulate(jd.scenes.four_bar(), *jd.scenes.four_bar.start(), jnp.linspace(0.0, 0.2, 3))
+    wanted = dynamics(q)[0], jax.grad(lambda q: dynamics(q).sum())(q)[0], motion.q[-1, 0]
+    assert count == 1
+    np.testing.assert_allclose(
+        numbers, np.asarray(wanted), rtol=1e-6
+    )  # of the motion; the printed digits of float64 else

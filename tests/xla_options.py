@@ -1,0 +1,20 @@
+"""Options with which XLA compiles fast code that runs slowly, for tests that compile much and run little.
+
+LLVM's optimiser and XLA's newer fusion emitters are most of a compile; neither changes what is computed. Options that the
+installed XLA does not have are left out: a compiler option would be refused, and an unknown flag ends the process.
+
+`python tests/xla_options.py` prints the flags of whole test runs.
+"""
+
+from jaxdyn.compile.jax_adapter import known_options
+
+QUICK = known_options({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
+
+
+def flags(**more) -> str:
+    """The same as XLA_FLAGS, for processes that a test starts."""
+    return " ".join(f"--{name}={str(value).lower()}" for name, value in (QUICK | known_options(more)).items())
+
+
+if __name__ == "__main__":
+    print(flags(xla_cpu_parallel_codegen_split_count=1))
