@@ -3,9 +3,9 @@
     python -m benchmarks.random_functions [--count 10000] [--seed 0] [--through-xla 50]
 
 A function is a short random program of what users write: elementary functions, functions with rules of their own, choices,
-reductions, products, loops, integers. It is compared at random points and at points with zeros, ties, infinities and what is not
-a number. What docs/algorithms.md lists as different is counted apart; everything else that differs is printed with the seed that makes
-it again, and the exit code is 1.
+reductions, products, loops, integers. It is compared at random points and at points with zeros, ties, infinities and what
+is not a number. What docs/algorithms.md lists as different is counted apart; everything else that differs is printed with
+the seed that makes it again, and the exit code is 1.
 """
 
 import argparse
