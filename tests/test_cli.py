@@ -714,7 +714,7 @@ def test_simulate_a_file_with_a_loop(four_bar, tmp_path, capsys):
 )
 def test_numbers_of_options_end_in_a_line(arguments, words, arm, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("x.toml").write_text('scene = "pendulum"\nout = "o.zarr"\nsamples = 2\nduration = 0.1\n')
+    (tmp_path / "x.toml").write_text('scene = "pendulum"\nout = "o.zarr"\nsamples = 2\nduration = 0.1\n')
     try:
         status = main([str(arm) if part == "ARM" else part for part in arguments.split()])
     except SystemExit as error:  # of argparse, which prints the usage first
