@@ -15,6 +15,7 @@ from pages import ROOT
 import jaxdyn as jd
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.simulation.controls import Controller
+from jaxdyn.systems.system import System
 
 REFERENCE = ROOT / "docs" / "reference"
 PAGES = sorted(path.stem for path in REFERENCE.glob("*.md") if path.stem != "index")
@@ -185,7 +186,7 @@ def use(value, systems: list) -> None:
 def use_what_was_made(before: dict, names: dict) -> int:
     """Use each constraint, force, control law and scene that a block has bound to a name; how many these are."""
     scenes = [x for x in names.values() if isinstance(x, jd.Scene)]
-    systems = [x for x in names.values() if isinstance(x, jd.System | jd.Model)] + [scene.system for scene in scenes]
+    systems = [x for x in names.values() if isinstance(x, System | jd.Model)] + [scene.system for scene in scenes]
     made = [x for name, x in names.items() if before.get(name) is not x]
     wanted = [x for x in made if isinstance(x, Constraint | Controller | jd.Scene) or is_force(x)]
     for value in wanted:
