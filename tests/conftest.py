@@ -93,7 +93,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 @pytest.fixture(params=["auto", "plain"])
 def mode(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Both modes of `jaxdyn.compilation`, in force where the test traces; functions that are compiled once keep theirs."""
+    """Both modes of `jaxdyn.compilation`."""
     import jaxdyn
 
     with jaxdyn.compilation(request.param):

@@ -211,7 +211,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     files.add_argument("--progress", action="store_true", help="print what is tried, and the loss, while fitting")
 
 
-@on_one_thread()
+@on_one_thread
 def run(args: argparse.Namespace) -> None:
     """Fit, print the errors and the parameters, write the files."""
     args = with_file(args, add_arguments)

@@ -10,11 +10,8 @@ Imports nothing of jaxdyn. Others import the names below, and no module of this 
 """
 
 from jaxdyn.compile.calls import compiled as compiled
-from jaxdyn.compile.calls import first_numbers as first_numbers
 from jaxdyn.compile.calls import glue_options as glue_options
-from jaxdyn.compile.calls import specialized as specialized
 from jaxdyn.compile.flags import unless as unless
-from jaxdyn.compile.garbage import uncollected as uncollected
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
 from jaxdyn.compile.jax_adapter import function_of as function_of
 from jaxdyn.compile.kernel import compute as compute
@@ -34,8 +31,8 @@ from jaxdyn.compile.loops import Turn as Turn
 from jaxdyn.compile.loops import run_loop as run_loop
 from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import is_expanding as is_expanding
+from jaxdyn.compile.mode import is_rank_safe as is_rank_safe
 from jaxdyn.compile.repair import any_in_batch as any_in_batch
-from jaxdyn.compile.repair import is_rank_safe as is_rank_safe
 from jaxdyn.compile.repair import recompute_unless as recompute_unless
 from jaxdyn.compile.repair import repair_flagged as repair_flagged
 from jaxdyn.compile.repair import run_repaired as run_repaired

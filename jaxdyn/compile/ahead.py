@@ -1,61 +1,55 @@
-"""Machine code that is made before it is called: by a thread of its own, while Python traces on and XLA compiles.
+"""Machine code that is made before it is called: by a thread, while Python traces on and XLA compiles.
 
-LLVM lets other threads of Python run, and takes one program at a time. Whoever calls a kernel that has no code yet goes before
-all that is made ahead.
+LLVM lets other threads of Python run. The thread belongs to one call from outside, which waits for it before it returns.
 """
 
 import contextlib
-import threading
-from collections import deque
+import contextvars
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
-_state = threading.Condition()
-_waiting: deque[Callable] = deque()  # what is to be made ahead
-_urgent = 0  # threads that wait for code that they call
-_busy = False
-_worker: threading.Thread | None = None
+_worker: contextvars.ContextVar["_Worker | None"] = contextvars.ContextVar("jaxdyn_worker", default=None)
+
+
+class _Worker:
+    """A thread that starts when there is something to do."""
+
+    def __init__(self):
+        self.executor: ThreadPoolExecutor | None = None
+
+    def submit(self, make: Callable) -> None:
+        if self.executor is None:
+            self.executor = ThreadPoolExecutor(1, thread_name_prefix="jaxdyn compiler")
+        self.executor.submit(make)
+
+    def end(self) -> None:
+        if self.executor is not None:  # whoever calls a kernel that has no code yet makes it
+            self.executor.shutdown(wait=True, cancel_futures=True)
 
 
 @contextlib.contextmanager
-def turn() -> Iterator[None]:
-    """While code is made, by one thread at a time."""
-    global _urgent, _busy
-    is_urgent, is_mine = threading.current_thread() is not _worker, False
+def worker(is_wanted: bool = True) -> Iterator[None]:
+    """Context in which kernels are called as soon as they are compiled: a thread makes their code, and ends with the context.
+
+    Not `is_wanted`: what is traced is hardly ever called, as what singular samples need.
+    """
+    mine = _Worker() if is_wanted else None
+    token = _worker.set(mine)
     try:
-        with _state:
-            _urgent += is_urgent
-            try:
-                _state.wait_for(lambda: not _busy and (is_urgent or not _urgent))
-                is_mine = _busy = True
-            finally:
-                _urgent -= is_urgent
         yield
     finally:
-        if is_mine:
-            with _state:
-                _busy = False
-                _state.notify_all()
+        _worker.reset(token)
+        if mine is not None:
+            mine.end()
+
+
+def is_active() -> bool:
+    """Whether what is traced is called as soon as it is compiled."""
+    return _worker.get() is not None
 
 
 def make_later(make: Callable) -> None:
-    """Call `make()` in another thread, soon."""
-    global _worker
-    with _state:
-        _waiting.append(make)
-        if _worker is None:
-            # Not a daemon: Python ends when LLVM has, and starts nothing more then.
-            _worker = threading.Thread(target=_work, name="jaxdyn-compiler", daemon=False)
-            _worker.start()
-
-
-def _work() -> None:
-    global _worker
-    while True:
-        with _state:
-            if not _waiting or not threading.main_thread().is_alive():
-                _waiting.clear()
-                _worker = None
-                return
-            make = _waiting.popleft()
-        with contextlib.suppress(Exception):  # whoever calls the kernel makes its code again, and is told
-            make()
+    """Call `make()` in the thread of the context. An error is met again, and raised, by whoever calls the kernel."""
+    current = _worker.get()
+    assert current is not None
+    current.submit(make)

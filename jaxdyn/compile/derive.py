@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.compile.garbage import uncollected
 from jaxdyn.compile.graph import Graph, inlined, is_number, objects
 from jaxdyn.compile.program import FLOATS, Constant, Program
 
 
-@uncollected
 def tangent(program: Program, moving: Sequence[bool]) -> Program:
     """The change of the outputs that are floats, a program of all inputs and of the changes of those that move."""
     moving = tuple(moving)
@@ -132,7 +130,6 @@ _PARTIAL: dict[str, Callable[..., Any]] = {
 }
 
 
-@uncollected
 def transposed(program: Program, linear: Sequence[bool], given: Sequence[bool]) -> Program:
     """The transpose of a program that is linear in some of its inputs together.
 

@@ -17,14 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdyn.compile import derive, jax_adapter, mode, sharding
+from jaxdyn.compile import ahead, derive, jax_adapter, mode, sharding
 from jaxdyn.compile.expand import expand
-from jaxdyn.compile.garbage import uncollected
 from jaxdyn.compile.graph import inlined
 from jaxdyn.compile.jax_adapter import define_primitive, is_linear, is_zero, lower_function, zero_tangent
 from jaxdyn.compile.known import Known, is_known, partition, partition_traced
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
-from jaxdyn.compile.rows import is_row
 from jaxdyn.compile.shared import divided
 from jaxdyn.compile.trigonometry import cosine, sine
 
@@ -137,9 +135,8 @@ def compute(function: Callable, tree, *args, static: tuple = (), given: bool = F
     leaves = [x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) for x in leaves]
     if mode.current() != "plain" and target is not None:
         shapes = tuple((x.shape, x.dtype) for x in leaves)
-        expanded = _program(
-            function, static, known, len(inputs), structure, shapes, None, mode.MAX_OPERATIONS, False, False
-        )
+        of = function, static, known, len(inputs), structure, shapes, None, mode.MAX_OPERATIONS, False, False
+        expanded = _program(*of, mode.is_rank_safe(), jax.config.read("jax_enable_x64"))
         if not isinstance(expanded, str):
             try:
                 return jax.tree.unflatten(expanded[1], target.call(expanded[0], leaves))
@@ -169,7 +166,8 @@ def program_of(
     leaves, structure = jax.tree.flatten(args)
     leaves = jax_adapter.vary_alike([*map(jnp.asarray, (*traced, *leaves))])
     shapes = tuple((x.shape, x.dtype) for x in leaves)
-    return leaves, _program(function, static, known, len(traced), structure, shapes, tangent, most, calls, served)
+    of = function, static, known, len(traced), structure, shapes, tangent, most, calls, served
+    return leaves, _program(*of, mode.is_rank_safe(), jax.config.read("jax_enable_x64"))
 
 
 def native(function: Callable) -> Callable:
@@ -187,9 +185,12 @@ def _name_of(function) -> str:
 
 
 @functools.lru_cache(maxsize=1024)
-@uncollected
-def _program(function, static, known: Known, count: int, structure, shapes, tangent, most, calls, served):
-    """The program of a function and the structure of its results, or why there is none."""
+def _program(function, static, known: Known, count, structure, shapes, tangent, most, calls, served, is_safe, has_x64):
+    """The program of a function and the structure of its results, or why there is none.
+
+    `is_safe`, `has_x64`: what else its trace depends on, its derivatives too, which are traced when they are asked for.
+    """
+    del has_x64
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
     flat = _traced_once(function, static, known, count, structure)
     try:
@@ -203,9 +204,10 @@ def _program(function, static, known: Known, count: int, structure, shapes, tang
             raise
         return str(error)
     if tangent is not None:
-        program.derivative = _by_rule(functools.partial(tangent, *static), known, count, structure, avals, served)
+        rule = functools.partial(tangent, *static)
+        program.derivative = _by_rule(rule, known, count, structure, avals, served, is_safe)
     elif has_rules:
-        program.derivative = _by_jax(flat, avals, served)
+        program.derivative = _by_jax(flat, avals, served, is_safe)
     program.fallback = _fallback(function, static, known, count, structure, avals, served)
     return program, jax.tree.structure(out)
 
@@ -246,7 +248,7 @@ def _inside(function, static, tree, args):
     return _traced_once(function, static, known, len(traced), structure)(*traced, *leaves)
 
 
-def _by_rule(tangent: Callable, known: Known, count: int, structure, avals, served: bool):
+def _by_rule(tangent: Callable, known: Known, count: int, structure, avals, served: bool, is_safe: bool):
     """The program of the change that a rule gives."""
 
     def derivative(moving):
@@ -259,12 +261,12 @@ def _by_rule(tangent: Callable, known: Known, count: int, structure, avals, serv
             args = jax.tree.unflatten(structure, primal[count:])
             return tangent(known(primal[:count]), *args, [*every, *given[count:]])
 
-        return _change_program(change, avals, moving, served)
+        return _change_program(change, avals, moving, served, is_safe)
 
     return derivative
 
 
-def _by_jax(flat: Callable, avals, served: bool):
+def _by_jax(flat: Callable, avals, served: bool, is_safe: bool):
     """The program of the change that JAX finds, which asks functions for their own rules."""
 
     def derivative(moving):
@@ -280,23 +282,23 @@ def _by_jax(flat: Callable, avals, served: bool):
 
             return jax.jvp(moved, [primal[i] for i in places], list(steps))[1]
 
-        return _change_program(change, avals, moving, served)
+        return _change_program(change, avals, moving, served, is_safe)
 
     return derivative
 
 
-def _change_program(change: Callable, avals, moving, served: bool) -> Program:
+def _change_program(change: Callable, avals, moving, served: bool, is_safe: bool) -> Program:
     """The change as a program; NaN at samples that are flagged, where whoever runs the function is told of them.
 
     A rule may call functions with rules of their own, itself included, and then the change is differentiated by JAX again:
     its numbers would give the derivative of how a value is computed, where the rule says another one.
     """
     avals = [*avals, *(aval for aval, varies in zip(avals, moving, strict=True) if varies)]
-    with mode.expanding():
+    with mode.expanding(), mode.rank_safe(is_safe):
         closed = jax.make_jaxpr(change)(*avals)
     program, has_rules = expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=served)
     if has_rules:
-        program.derivative = _by_jax(change, avals, served)
+        program.derivative = _by_jax(change, avals, served, is_safe)
     return program
 
 
@@ -316,7 +318,7 @@ def _implement(*args, program, rows):
 
 def _types(*avals, program, rows):
     is_one = not any(len(x.shape) > 1 for x in avals)
-    if is_one and mode.is_called_at_once() and not mode.is_expanding():
+    if is_one and ahead.is_active() and not mode.is_expanding():
         assert target is not None
         with contextlib.suppress(target.Unsupported):  # which is said where the kernel is lowered
             target.make_ahead(target.kernel(program, target.width_of(program, 1), [False] * len(avals)))
@@ -337,7 +339,7 @@ def _batched(args, axes, *, program, rows):
         elif v and lead != inner:
             x = jnp.broadcast_to(x.reshape(size, *[1] * len(inner), x.shape[-1]), (size, *inner, x.shape[-1]))
         full.append(x)
-    rows += is_row() and not mode.is_expanding()
+    rows += mode.is_row() and not mode.is_expanding()
     results = kernel_p.bind(*full, program=program, rows=rows)
     return results, [0] * len(results)
 

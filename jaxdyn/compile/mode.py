@@ -1,28 +1,34 @@
-"""How functions are compiled: by native kernels where they serve, or, under `compilation("plain")`, by JAX alone."""
+"""How functions are compiled: by native kernels where they serve, or, under `compilation("plain")`, by JAX alone.
+
+What tracing depends on are user contexts of JAX. They are part of the keys of its caches, so that a function under `jax.jit`
+is traced once in each of them: what a call gives does not depend on how the function was traced before.
+"""
 
 import contextlib
-import contextvars
 import logging
 import os
 from collections.abc import Iterator
 
+import jax
+
 from jaxdyn.compile import jax_adapter
 
 logger = logging.getLogger("jaxdyn")
-MODES = ("auto", "general", "plain")
+MODES = ("auto", "plain")
 OPTIONS = ("", "usual", "least")
 # LLVM takes some 50 microseconds an operation: three seconds.
 MAX_OPERATIONS = 60_000
 
-_mode: contextvars.ContextVar[str | None] = contextvars.ContextVar("jaxdyn_compilation", default=None)
-_expanding: contextvars.ContextVar[bool] = contextvars.ContextVar("jaxdyn_expanding", default=False)
-_called_at_once: contextvars.ContextVar[bool] = contextvars.ContextVar("jaxdyn_called_at_once", default=False)
+_mode = jax.make_user_context(None)
+_expanding = jax.make_user_context(False)
+_rank_safe = jax.make_user_context(False)
+_in_rows = jax.make_user_context(False)
 _said: set[str] = set()
 
 
 def current() -> str:
     """The mode in force. **Raises:** ValueError where the environment asks for one that does not exist."""
-    mode = _mode.get() or _checked(os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION")
+    mode = _mode.value or _checked(os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION")
     return mode if mode == "plain" or jax_adapter.reason_against_kernels() is None else "plain"
 
 
@@ -38,14 +44,11 @@ def compilation(mode: str) -> Iterator[None]:
 
     **Arguments:** `mode`:
 
-    - "auto": native kernels on a CPU where a function is a program of single numbers, operations of JAX elsewhere. `simulate` and
-      `assemble`, called outside of `jax.jit`, compile the numbers of the first scene of its shape in, whose zeros and ones
-      then cost nothing; all other scenes of that shape share a second program that takes their numbers as inputs.
-    - "general": the same with that second program for all of them.
+    - "auto": native kernels on a CPU where a function is a program of single numbers, operations of JAX elsewhere.
     - "plain": operations of JAX everywhere, which compile and run slower and serve as a witness.
 
-    The mode counts when a function is traced: what `jax.jit` has compiled stays as it is. Without this context the environment
-    variable JAXDYN_COMPILATION decides, and without that, "auto".
+    The mode counts when a function is traced, and `jax.jit` traces a function once in each mode. Without this context the
+    environment variable JAXDYN_COMPILATION decides, and without that, "auto".
 
     **Raises:** ValueError for another mode.
 
@@ -54,41 +57,38 @@ def compilation(mode: str) -> Iterator[None]:
         a = jd.forward_dynamics(model, q, v, tau)
     ```
     """
-    token = _mode.set(_checked(mode, "compilation: mode"))
-    try:
+    with _mode(_checked(mode, "compilation: mode")):
         yield
-    finally:
-        _mode.reset(token)
 
 
 def is_expanding() -> bool:
     """Whether a function is traced to become a program of numbers: what it calls is traced with it."""
-    return _expanding.get()
+    return _expanding.value
 
 
-@contextlib.contextmanager
 def expanding():
-    """While a function is traced to become a program of numbers."""
-    token = _expanding.set(True)
-    try:
-        yield
-    finally:
-        _expanding.reset(token)
+    """Context in which a function is traced to become a program of numbers."""
+    return _expanding(True)
 
 
-def is_called_at_once() -> bool:
-    """Whether what is traced is called as soon as it is compiled."""
-    return _called_at_once.get()
+def is_rank_safe() -> bool:
+    """Whether what is traced is computed again for samples that need care: the fast way has failed them already."""
+    return _rank_safe.value
 
 
-@contextlib.contextmanager
-def called_at_once(whether: bool):
-    """While something is traced that is called as soon as it is compiled; or hardly ever, as what singular samples need."""
-    token = _called_at_once.set(whether)
-    try:
-        yield
-    finally:
-        _called_at_once.reset(token)
+def rank_safe(is_safe: bool = True):
+    """Context in which a function is traced for samples that need care."""
+    return _rank_safe(is_safe)
+
+
+def is_row() -> bool:
+    """Whether an axis that is added to a kernel now is one of rows (see `rows`)."""
+    return _in_rows.value
+
+
+def in_rows():
+    """Context in which an axis that is added to a kernel is one of rows."""
+    return _in_rows(True)
 
 
 def wants_usual_options() -> bool:

@@ -21,6 +21,7 @@ from jaxdyn.compile.mode import wants_least_optimisation
 
 logger = logging.getLogger("jaxdyn")
 MAX_CACHE_BYTES = 512 * 2**20
+ANNOUNCED_LINES = 100_000  # of LLVM's text, which compile in some five seconds
 _CHECKSUM_BYTES = 32
 
 
@@ -66,11 +67,14 @@ def key_of(text: str) -> bytes:
 class Code:
     """Machine code in memory, as long as it is held."""
 
-    def __init__(self, text: str, stored: bool = True):
+    def __init__(self, text: str, stored: bool = True, name: str = ""):
         initialize()
         self.key = key_of(text)
         binary = _read(self.key) if stored else None
         if binary is None:
+            if (lines := text.count("\n")) > ANNOUNCED_LINES:
+                message = "jaxdyn: compiling %s, %d lines; the next start of this script reads it from the cache"
+                logger.warning(message, name or "a function", lines)
             binary = _compiled(text)
             if stored:
                 _write(self.key, binary)

@@ -5,7 +5,6 @@ through `any_in_batch` is one for all samples, however many `vmap`s enclose it, 
 computes samples that need it again and leaves the others alone.
 """
 
-import contextvars
 import functools
 from collections.abc import Callable
 
@@ -14,15 +13,13 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
+from jaxdyn.compile import ahead, mode
 from jaxdyn.compile.flags import unless
 from jaxdyn.compile.jax_adapter import vary_alike
 from jaxdyn.compile.kernel import run
 from jaxdyn.compile.known import is_concrete, partition_traced
-from jaxdyn.compile.mode import called_at_once, is_expanding
 
 SAMPLES_AT_ONCE = 32  # samples that are computed again together
-
-_rank_safe: contextvars.ContextVar[bool] = contextvars.ContextVar("jaxdyn_rank_safe", default=False)
 
 
 @custom_vmap
@@ -40,21 +37,13 @@ def any_in_batch(flag):
     return flag if is_concrete(flag) else _any_of_batch(flag)
 
 
-def is_rank_safe() -> bool:
-    """Whether what is traced is computed again for samples that need care: the fast way has failed them already."""
-    return _rank_safe.get()
-
-
 def rank_safe(function: Callable) -> Callable:
     """The function, traced for samples that need care."""
 
     @functools.wraps(function)
     def call(*args):
-        token = _rank_safe.set(True)
-        try:
+        with mode.rank_safe():
             return function(*args)
-        finally:
-            _rank_safe.reset(token)
 
     return call
 
@@ -83,7 +72,7 @@ def repair_flagged(flag, careful: Callable, fast: Callable, values: tuple, args:
     While a function is traced to become a program of single numbers, which has no branches, floats of flagged samples are NaN,
     and the program knows it (`jaxdyn.compile.run(..., served=True)`).
     """
-    if is_expanding():
+    if mode.is_expanding():
         return jax.tree.map(lambda x: unless(flag, x) if jnp.issubdtype(x.dtype, jnp.floating) else x, values)
 
     @jax.custom_jvp
@@ -149,7 +138,7 @@ def _one(careful: Callable):
 
 def _hardly_called(careful: Callable) -> Callable:
     def call(*args):
-        with called_at_once(False):
+        with ahead.worker(False):
             return careful(*args)
 
     return call

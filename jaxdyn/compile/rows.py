@@ -4,21 +4,15 @@
 `jax.vmap` alone would ask for a second kernel, over the lanes of a batch, which would have to be compiled.
 """
 
-import contextvars
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxdyn.compile.mode import in_rows
+
 AT_ONCE = 16  # rows, which bounds the memory for what kernels are given and give
-
-_in_rows: contextvars.ContextVar[bool] = contextvars.ContextVar("jaxdyn_in_rows", default=False)
-
-
-def is_row() -> bool:
-    """Whether an axis that is added to a kernel now is one of rows."""
-    return _in_rows.get()
 
 
 def map_rows(function: Callable, rows):
@@ -26,11 +20,8 @@ def map_rows(function: Callable, rows):
 
     @jax.jit  # which traces it before any transformation around this call adds an axis
     def at_once(rows):
-        token = _in_rows.set(True)
-        try:
+        with in_rows():
             return jax.vmap(function)(rows)
-        finally:
-            _in_rows.reset(token)
 
     count = jax.tree.leaves(rows)[0].shape[0]
     if not isinstance(count, int):  # `jax.export` has sizes without a number

@@ -1,6 +1,5 @@
 """The one FFI target of the process: a table of kernels, and the handler through which XLA calls them (`handler.ll`)."""
 
-import contextlib
 import ctypes
 import functools
 import hashlib
@@ -14,7 +13,6 @@ import numpy as np
 
 from jaxdyn.compile import ahead
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
-from jaxdyn.compile.garbage import uncollected
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.objects import Code, features
@@ -25,7 +23,6 @@ SLOTS = 1 << 16
 # A chunk of a batch takes some 20 microseconds: 40 000 vector operations at 2 a nanosecond, long beside the claim of a chunk
 # (0.1 us) and short beside the wait for the last one.
 OPERATIONS_PER_CHUNK = 40_000
-ANNOUNCED_AFTER = 5.0  # seconds of compilation
 _MISSING = "jaxdyn: this program was compiled by another process, which had its kernel; trace it again here"
 _FAILED = "jaxdyn: a kernel could not be compiled; the error was logged"
 _MISFIT = "jaxdyn: a buffer of a kernel has another size than the kernel was written for"
@@ -50,6 +47,7 @@ class _Entry(ctypes.Structure):
 _table = (_Entry * SLOTS)()
 _threads = ctypes.c_int64(1 << 30)
 _lock = threading.RLock()
+_making = threading.Lock()  # LLVM takes one program at a time
 _called: dict[str, Code] = {}  # subprograms, which other kernels call too
 _kernels: dict[int, "_Kernel"] = {}  # by number, for as long as the process may call them
 _handler: list[Code] = []
@@ -155,20 +153,18 @@ class _Kernel:
     def address(self) -> int:
         """Of its code, which is made where there is none."""
         if self.code is None:
-            with ahead.turn():
+            with _making:
                 if self.code is None:
                     self._make()
         return self.entry.kernel
 
-    @uncollected
     def _make(self) -> None:
         program, width = self.program, self.width
-        with _announced(program):
-            is_program = isinstance(program, Program)
-            for called in (program,) if is_program and calls_itself(program, width) else program.subprograms:
-                _publish(called, width)
-            text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
-            code = Code(text)
+        is_program = isinstance(program, Program)
+        for called in (program,) if is_program and calls_itself(program, width) else program.subprograms:
+            _publish(called, width)
+        text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
+        code = Code(text, name=program.name)
         self.entry.kernel = code.address("kernel")
         self.code, self.program = code, None
 
@@ -185,7 +181,7 @@ def _publish(called: Program, width: int) -> None:
     """Compile a subprogram where that has not been done."""
     symbol = symbol_of(called, width)
     if symbol not in _called:
-        _called[symbol] = Code(subprogram_ir(called, width))
+        _called[symbol] = Code(subprogram_ir(called, width), name=called.name)
         _called[symbol].publish("called", symbol)
 
 
@@ -199,19 +195,6 @@ def _prepare(number: int) -> int:
 
 
 _PREPARE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint64)(_prepare)
-
-
-@contextlib.contextmanager
-def _announced(program):
-    """Say what is being compiled where that takes long."""
-    message = "jaxdyn: compiling %s, %d operations; the next start of this script reads it from the cache"
-    timer = threading.Timer(ANNOUNCED_AFTER, logger.warning, (message, program.name or "a function", program.cost))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:

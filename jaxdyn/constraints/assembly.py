@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import along, compute, constant, first_numbers, implicit, is_concrete, is_staged, run, specialized
+from jaxdyn.compile import along, compiled, compute, constant, implicit, is_concrete, is_staged, run
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import correction, right_inverse, whitened_rows
@@ -119,7 +119,7 @@ def _from_elsewhere(assembly: Assembly, guesses: int, assembled: Callable, scene
     return assembly
 
 
-@specialized
+@compiled
 def _assemble(locked, q, v, t, rank_tol, scene):
     """The scene `locked` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
     if holonomic_rows(layout(locked)).size:
@@ -296,8 +296,7 @@ def _residuals_and_limits(scene, q, v, t, relative):
 def start_evidence(scene: Scene, q, v, t, relative: float) -> tuple[np.ndarray, float, int]:
     """Largest residuals (2,), `openness`, and the rank of the rows at a concrete state."""
     bare = Scene(scene.system, scene.constraints)
-    first = None if is_staged() else first_numbers(bare)
-    bare, given = (bare, not is_staged()) if first is None else (first(()), False)
+    given = not is_staged()  # as in the program of a run that begins here
     _, Y = compute(whitened_rows, bare, q, t, given=given)
     sizes = np.linalg.svd(Y, compute_uv=False)
     rank = int(np.sum(sizes > tolerance(None, Y) * sizes[0])) if sizes.size else 0

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import is_concrete, specialized
+from jaxdyn.compile import compiled, is_concrete
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import checked_tolerance, pseudo_inverse, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes
@@ -46,13 +46,13 @@ def degrees_of_freedom(
     return scene.nv - int(rank) if is_concrete(rank) else scene.nv - rank
 
 
-@specialized
+@compiled
 def _rank(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
     A = _scaled_rows(scene, q, t)
     return jnp.round(jnp.trace(_product(A, pseudo_inverse(A, tolerance(rank_tol, A), True)))).astype(jnp.int32)
 
 
-@specialized
+@compiled
 def _scaled_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     """Rows with distances in units of the mechanism's length, each scaled down to length 1."""
     sizes, length = coordinate_sizes(scene.system, q.dtype)

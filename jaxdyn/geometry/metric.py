@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import specialized
+from jaxdyn.compile import compiled
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint, check_state, check_system, state_dtype
@@ -37,7 +37,7 @@ else:
 
 def _whole(function: Callable) -> Callable:
     """`function(metric, *args)`, one program for a system. What a plain function captures may change: it is called each time."""
-    program = specialized(function)
+    program = compiled(function)
 
     @functools.wraps(function)
     def call(metric, *args):

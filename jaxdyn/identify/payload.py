@@ -67,7 +67,7 @@ class Payload(eqx.Module):
         return _f64.about_com(self.inertia)[2]
 
 
-@on_one_thread()
+@on_one_thread
 def fit_payload(
     model: Model,
     unloaded: Log | Sequence[Log],

@@ -294,7 +294,7 @@ class LeastSquares(eqx.Module):
         return "\n".join(lines)
 
 
-@on_one_thread()
+@on_one_thread
 def least_squares(
     model: Model,
     log: Log | Sequence[Log],

@@ -51,7 +51,7 @@ class RobotFit(eqx.Module):
         return log if self.delays is None else shift_torques(log, self.delays.seconds)
 
 
-@on_one_thread()
+@on_one_thread
 def fit_robot(
     model: Model,
     log: Log | Sequence[Log],
@@ -133,11 +133,12 @@ def fit_robot(
     if delays is not None:
         logs = tuple(shift_torques(log, delays.seconds) for log in given)
     problem = RobotProblem(model, logs, basic, extra, inertia, blocks)
-    problem.refine(setting, fixed, rounds=2)
+    first = problem.refine(setting, fixed, rounds=2)
     trials, by = (), "given"
     if is_auto or any(isinstance(value, str) for value in (v_s, prior, robust)):
         parts, by = folds(problem.data(setting).blocks)
-        trying = Search(problem.left_out, parts, problem.torque, callback)
+        samples = problem.effective_samples(problem.result(setting, first, problem.data(setting)))
+        trying = Search(problem.left_out, parts, problem.torque, samples, callback)
         velocities = VELOCITIES if isinstance(v_s, str) else (setting.v_s,)
         priors = PRIORS if isinstance(prior, str) else (setting.prior,)
         names = [term.name for term in extra] if is_auto else []

@@ -334,8 +334,8 @@ def _server(port: int) -> Any:
         import viser
     except ImportError as error:
         raise ImportError("the viewer needs viser: pip install jaxdyn[view]") from error
-    # Of probes that connect and leave without a word (a browser's, a test's) nobody wants to know.
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    _unlogged.ports.add(port)
+    logging.getLogger("websockets.server").addFilter(_unlogged)
     with contextlib.redirect_stdout(io.StringIO()):  # a banner
         return viser.ViserServer(host=_HOST, port=port, label="jaxdyn", verbose=False)
 
@@ -343,6 +343,27 @@ def _server(port: int) -> Any:
 def _stop(server) -> None:
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
+    _unlogged.ports.discard(server.get_port())
+    if not _unlogged.ports:
+        logging.getLogger("websockets.server").removeFilter(_unlogged)
+
+
+class _Unlogged(logging.Filter):
+    """Leaves out what is logged of our own ports: probes connect and leave without a word (a browser's, a test's).
+
+    Other servers of the process are logged as their owner wants it.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.ports: set[int] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        address = getattr(getattr(record, "websocket", None), "local_address", None)
+        return not (isinstance(address, tuple) and len(address) > 1 and address[1] in self.ports)
+
+
+_unlogged = _Unlogged()
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile import compilation, function_of, glue_options, uncollected
+from jaxdyn.compile import compilation, function_of, glue_options
 from jaxdyn.scale.members import Members
 
 logger = logging.getLogger("jaxdyn")
@@ -60,7 +60,7 @@ class Program:
         self.lanes = max(least, -(-lanes // least) * least)
         budget = available_memory(self.devices) * SHARE if memory is None else memory
         while True:
-            lowered = uncollected(self._batch.lower)(self._inputs_of(self.lanes))
+            lowered = self._batch.lower(self._inputs_of(self.lanes))
             self.lowered = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
             self.compiled = lowered.compile(compiler_options=self._options)
             self.bytes = self._needed()
@@ -110,7 +110,7 @@ class Traced:
     """
 
     def __init__(self, one: Callable, members: Members):
-        trace = uncollected(jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True))
+        trace = jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True)
         operations, self.shapes = trace(given_to_one(members))
         self._call = function_of(operations)
         self._structure = jax.tree.structure(self.shapes)
@@ -127,7 +127,6 @@ def given_to_one(members: Members) -> Any:
     )
 
 
-@uncollected
 def fingerprint(one: Callable, members: Members) -> str:
     """A hash of what is computed for one member, by operations of JAX alone: the same on every machine with these versions."""
     with compilation("plain"):

@@ -11,7 +11,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.compile import is_expanding, is_rank_safe, partition_traced
+from jaxdyn.compile import partition_traced
 from jaxdyn.forces.piecewise import Pieces, guards, in_pieces, pieces_of, values_and_levels
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
@@ -105,17 +105,14 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
         scene, control, method = given(args)
         return controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
 
-    # diffrax and differentiation call it in many places: it is traced once for each mode of `jd.compilation`.
-    @functools.partial(jax.jit, static_argnums=0)
-    def traced(mode, t, y, args):
+    # diffrax and differentiation call it in many places: it is traced once for all of them.
+    @jax.jit
+    def derivative(t, y, args):
         scene, _, method = given(args)
         rates, force, v = method.evaluated(scene, y, t, functools.partial(generalized_force, args, y))
         if added:
             rates = rates | of_control(args, y, retract(system, y["q"]), v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
-
-    def derivative(t, y, args):
-        return traced((is_expanding(), is_rank_safe()), t, y, args)
 
     @jax.jit
     def explicit_part(t, y, args):

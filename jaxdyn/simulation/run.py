@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import is_concrete, is_known, specialized
+from jaxdyn.compile import compiled, is_concrete, is_known
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.simulation import contacts as unilateral
@@ -71,9 +71,8 @@ def simulate(
     """Integrate M a + C v + N = tau + forces + A^T lam, dq/dt = H(q) v, from (q0, v0) and save it at the times `ts`.
 
     One sample; batch states, controls and the scene's leaves with `jax.vmap`. Computed in the dtype of the model.
-    Called outside of `jax.jit` it compiles twice per shape at most: with the numbers of the first scene compiled in, which runs
-    fastest, and once for all other scenes (`jd.compilation`). Inside your own `jax.jit`, a model that is closed over is known to
-    the compiler; one that is an argument serves for other numbers too.
+    Called outside of `jax.jit` it compiles once for all scenes of a shape, whose numbers are inputs of the program. Inside your
+    own `jax.jit`, a model that is closed over is known to the compiler; one that is an argument serves for other numbers too.
 
     **Arguments:**
 
@@ -213,12 +212,12 @@ def simulate(
     return solution
 
 
-@specialized
+@compiled
 def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     return motion(scene, control, method, numbers, options)
 
 
-@specialized
+@compiled
 def _run_with_events(scene: Scene, control, method: Method, numbers, options) -> Solution:
     return hybrid.motion(scene, control, numbers, options)
 

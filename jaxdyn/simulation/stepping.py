@@ -1,6 +1,5 @@
 """A motion one step at a time, for learning: the steps of `simulate` with a fixed length, as a function of state and torque."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import is_concrete, is_expanding, is_rank_safe, partition_traced
+from jaxdyn.compile import is_concrete, partition_traced
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import guards, in_pieces, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
@@ -79,9 +78,8 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
         scene = known(unknown)
         return in_pieces(scene, pieces, *positive) if positive else scene, tau
 
-    # Traced once for each mode of `jd.compilation`.
-    @functools.partial(jax.jit, static_argnums=0)
-    def traced(mode, t, y, args):
+    @jax.jit
+    def field(t, y, args):
         scene, tau = given(args)
 
         def generalized_force(q, v, t):
@@ -89,9 +87,6 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
             return given if force is None else given + force
 
         return method.evaluated(scene, y, t, generalized_force)[0]
-
-    def field(t, y, args):
-        return traced((is_expanding(), is_rank_safe()), t, y, args)
 
     def project(t, y, error, args):
         scene, _ = given(args)
