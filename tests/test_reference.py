@@ -169,12 +169,14 @@ def use(value, systems: list) -> None:
         q, v = jd.neutral(system) if isinstance(system, jd.Model) else jnp.zeros(system.nq), jnp.zeros(system.nv)
         try:
             if isinstance(value, jd.Scene):
-                jd.constraint_jacobian(value, q)
+                if value.constraints:
+                    jd.constraint_jacobian(value, q)
                 value.applied_force(q, v)
             elif isinstance(value, Constraint):
                 jd.constraint_jacobian(jd.Scene(system, [value]), q)
             elif isinstance(value, Controller):
-                value(q, v, jnp.zeros(()))
+                start = value.start(q, v, jnp.zeros(()))
+                value(q, v, jnp.zeros(()), start)
             else:
                 jd.Scene(system, forces=[value]).applied_force(q, v)
             return
