@@ -3,9 +3,9 @@
     python -m benchmarks.random_functions [--count 10000] [--seed 0] [--through-xla 50]
 
 A function is a short random program of what users write: elementary functions, functions with rules of their own, choices,
-reductions, products, loops, integers. It is compared at random points and at points with zeros, ties, infinities and what is not
-a number. What docs/algorithms.md lists as different is counted apart; everything else that differs is printed with the seed that makes
-it again, and the exit code is 1.
+reductions, products, loops, integers. It is compared at random points and at points with zeros, ties, infinities and what
+is not a number. What docs/algorithms.md lists as different is counted apart; everything else that differs is printed with
+the seed that makes it again, and the exit code is 1.
 """
 
 import argparse
@@ -58,9 +58,10 @@ UNARY: dict[str, Callable] = {
     "exp": lambda x: jnp.exp(jnp.minimum(x, 5.0)), "sqrt": lambda x: jnp.sqrt(jnp.abs(x)), "atan": jnp.arctan,
     "log": lambda x: jnp.log(1 + x * x), "rsqrt": lambda x: lax.rsqrt(1 + x * x), "cbrt": jnp.cbrt, "root": jnp.sqrt,
     "sinc": jnp.sinc, "relu": jax.nn.relu, "own rule": _own_rule, "clip": lambda x: jnp.clip(x, -0.5, 1.0),
-    "clamp": lambda x: lax.clamp(jnp.asarray(-1.0, x.dtype), x, jnp.asarray(1.0, x.dtype)), "scaled": lambda x: 2.5 * x, "shifted": lambda x: x + 0.75,
-    "sum": lambda x: _all(x.sum()), "prod": lambda x: _all(x.prod()), "max": lambda x: _all(x.max()), "min": lambda x: _all(x.min()),
-    "cumsum": jnp.cumsum, "reversed": lambda x: x[::-1], "matrix": lambda x: jnp.asarray(MATRIX, x.dtype) @ x, "norm": lambda x: _all(jnp.sqrt(x @ x)),
+    "clamp": lambda x: lax.clamp(jnp.asarray(-1.0, x.dtype), x, jnp.asarray(1.0, x.dtype)), "scaled": lambda x: 2.5 * x,
+    "shifted": lambda x: x + 0.75, "sum": lambda x: _all(x.sum()), "prod": lambda x: _all(x.prod()),
+    "max": lambda x: _all(x.max()), "min": lambda x: _all(x.min()), "cumsum": jnp.cumsum, "reversed": lambda x: x[::-1],
+    "matrix": lambda x: jnp.asarray(MATRIX, x.dtype) @ x, "norm": lambda x: _all(jnp.sqrt(x @ x)),
     "taken": lambda x: x[np.array([2, 0, 0])], "added": lambda x: x.at[np.array([0, 0, 2])].add(x),
     "loop": lambda x: lax.fori_loop(0, 3, _halve_and_add, (x, x))[0],
     "scan": lambda x: lax.scan(_running, x[0], x)[1],
@@ -70,7 +71,8 @@ UNARY: dict[str, Callable] = {
 }  # fmt: skip
 BINARY: dict[str, Callable] = {
     "add": jnp.add, "sub": jnp.subtract, "mul": jnp.multiply, "div": jnp.divide, "maximum": jnp.maximum, "minimum": jnp.minimum,
-    "atan2": jnp.arctan2, "where": lambda x, y: jnp.where(x > y, x, y * y), "pow": lambda x, y: jnp.abs(x) ** jnp.clip(y, -2.0, 2.0),
+    "atan2": jnp.arctan2, "where": lambda x, y: jnp.where(x > y, x, y * y),
+    "pow": lambda x, y: jnp.abs(x) ** jnp.clip(y, -2.0, 2.0),
     "rem": lambda x, y: lax.rem(x, 1 + y * y), "dot": lambda x, y: _all(jnp.dot(x, y)), "cross": jnp.cross,
     "logaddexp": jnp.logaddexp, "hypot": lambda x, y: jnp.sqrt(x * x + y * y), "chosen": lambda x, y: jnp.where(x == y, x, -y),
 }  # fmt: skip
@@ -103,7 +105,7 @@ def random_function(rng: np.random.Generator) -> Function:
 
 
 def differentiated(function: Callable) -> Callable:
-    """x, step, cotangent -> the value, J step, J^T cotangent, and the Hessian of cotangent . f times step, by three orders of modes."""
+    """x, step, cotangent -> the value, J step, J^T cotangent, and the Hessian of cotangent . f times step in three orders."""
 
     def all_of(x, step, cotangent):
         def weighed(y):

@@ -331,7 +331,7 @@ def test_other_faults_of_a_urdf(tmp_path):
             loaded(path, ROBOT.replace(f'{key}="', f'{key}="-'))
     with pytest.raises(ValueError, match=r"a.urdf:2: the file declares the entity 'x', which is refused"):
         loaded(path, '<!DOCTYPE robot [\n<!ENTITY x "b">]>' + ROBOT.replace('link="b"', 'link="&x;"'))
-    with pytest.warns(UserWarning, match=r"a.urdf:1: link 'b': a principal moment of inertia is negative \(-0.1 kg"):
+    with pytest.warns(UserWarning, match=r"a.urdf:1: body 'b': a principal moment of inertia is negative \(-0.1 kg"):
         loaded(path, ROBOT.replace('ixx="1"', 'ixx="-0.1"'))
 
 

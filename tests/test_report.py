@@ -509,9 +509,9 @@ def test_command(small, rungs, capsys):
     for wrong, word in (
         (["report"], "free_body"),
         (["report", "pendulums"], "pendulums"),
-        (["report", "free_body", "--batch", "0"], "batches"),
+        (["report", "free_body", "--batch", "0"], "--batch is 0"),
         (["report", "free_body", "--dtype", "float16"], "float16"),
-        (["report", "free_body", "--rounds", "0"], "rounds"),
+        (["report", "free_body", "--rounds", "0"], "--rounds is 0"),
         (["report", "free_body", "--integrator", "Dopri8"], "integrators"),
         (["report", "free_body", "--integrator", "free:Euler"], "Euler"),
         (["report", "four_bar", "free_body", "--way", "projected:Dopri8"], "free_body cannot take"),

@@ -824,7 +824,7 @@ def test_sweep_runs_a_study_and_goes_on_with_it(tmp_path, capsys):
         ("samples = 12", "", "has no samples"),
         ("samples = 12", "sample = 12", "has sample; a study has"),
         ("log_uniform = [0.1, 1.0]", "log_uniform = [-0.1, 1.0]", "give positive numbers"),
-        ("normal = [0.5, 0.1]", "normal = [0.5]", "parameter angle is .*give a number, or one of uniform"),
+        ("normal = [0.5, 0.1]", "normal = [0.5]", "parameter angle is .*give a finite number, or one of uniform"),
         ('mean = "energy"', 'median = "energy"', "give one of mean"),
         ('cost = "damping"', 'cost = "mass"', "name one of the parameters"),
         ("duration = 0.1", "duration = ", "is no TOML"),

@@ -223,7 +223,7 @@ def test_load_takes_every_format(urdf, tmp_path, monkeypatch):
         jd.load(tmp_path / "c.mjcf", floating_base=True)
     with pytest.raises(ValueError, match=r"x\.step: not a file of a known format"):
         jd.load("x.step")
-    with pytest.raises(ValueError, match=r"gone\.xml cannot be read \(No such file"):
+    with pytest.raises(ValueError, match=r"gone\.xml' cannot be read \(No such file"):
         jd.load(tmp_path / "gone.xml")
     # A name of robot_descriptions, whose module says where the file is; nothing is fetched here.
     fake = types.ModuleType("robot_descriptions.go2_description")

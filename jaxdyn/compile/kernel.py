@@ -425,7 +425,7 @@ def _change_of_transposed(program, linear, given, backwards, avals, moving) -> P
             total = by_cotangents if total is None else [a + b for a, b in zip(total, by_cotangents, strict=True)]
         return total
 
-    return _change_program(change, avals, moving, served=False)
+    return _change_program(change, avals, moving, served=False, is_safe=False)
 
 
 def _transpose(cotangents, *operands, program, rows):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxdyn.compile.mode import wants_least_optimisation
 from jaxdyn.compile.program import COMPARISONS, FLOATS
 from jaxdyn.compile.trigonometry import COSINE, HALF_PI, MAX_ANGLE, SINE
 
@@ -285,6 +286,9 @@ class Emitter:
         if self.width == 1:
             return value
         of = self.type(kind)
+        if wants_least_optimisation():
+            # LLVM 22 at level 0 aborts where it joins these loads to their copies in all lanes ("Node is not in map!").
+            value = self.put(f"freeze {_TYPES[kind]} {value}")
         first = self.put(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
         return self.put(f"shufflevector {of} {first}, {of} poison, <{self.width} x i32> zeroinitializer")
 

@@ -28,8 +28,10 @@ _said: set[str] = set()
 
 def current() -> str:
     """The mode in force. **Raises:** ValueError where the environment asks for one that does not exist."""
-    mode = _mode.value or _checked(os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION")
-    return mode if mode == "plain" or jax_adapter.reason_against_kernels() is None else "plain"
+    asked = _mode.value or _checked(
+        os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION"
+    )
+    return asked if asked == "plain" or jax_adapter.reason_against_kernels() is None else "plain"
 
 
 def _checked(mode, what: str) -> str:

@@ -54,7 +54,7 @@ def recompute_unless(served, again: Callable, values, args: tuple):
     `served` is True where every sample is, and `again` is not in the program then; else an array (). `again` depends on nothing
     traced but `args`. Without derivatives.
     """
-    return values if served is True else _one(rank_safe(again))(~served, values, args)
+    return values if served is True else _one(rank_safe(again))(jnp.logical_not(served), values, args)
 
 
 def repair_flagged(flag, careful: Callable, fast: Callable, values: tuple, args: tuple):
@@ -111,7 +111,7 @@ def run_repaired(function: Callable, tree, *args, static: tuple = ()):
 
     # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
     careful = jax.checkpoint(careful, prevent_cse=False)
-    return repair_flagged(~served, careful, fast, (values, ()), (traced, args))[0]
+    return repair_flagged(jnp.logical_not(served), careful, fast, (values, ()), (traced, args))[0]
 
 
 def _one(careful: Callable):

@@ -29,8 +29,7 @@ _SETTLED = 0.1
 class Delays(NamedTuple):
     """How late the torques of a robot's logs are, against its positions.
 
-    - `seconds` (nv,): delays, negative where torques come early; zero where a delay lowers no error on parts left out, or its
-      95 % interval holds zero.
+    - `seconds` (nv,): delays, negative where torques come early; zero where a delay helped nothing.
     - `std` (nv,): standard deviations by blocks of samples, as in `Intervals`; `factor`: a 95 % interval is plus and minus this
       many of them. Infinite std of a delay that was given.
     - `squares`: squared errors (folds, nv) on parts left out in turn, without the delays and with them; None for given ones.
@@ -113,8 +112,8 @@ def find_delays(
         problem = RobotProblem(model, _shifted(logs, shift), basic, used, inertia, blocks)
         problem.refine(setting, fixed, rounds=2)
         parts, _ = folds(problem.data(setting).blocks)
-        squares.append(np.array([problem.left_out(setting, part).sum(axis=0) for part in parts]))
-    kept = np.isin(every, helped(*squares, worth=0.0)) & (np.abs(delay) > spread.factor * std)
+        squares.append(np.array([problem.left_out(setting, part) for part in parts]))
+    kept = np.isin(every, helped(*squares, worth=0.0))
     return Delays(np.where(kept, delay, 0.0), std, spread.factor, (squares[0], squares[1]))
 
 

@@ -13,13 +13,13 @@ from jaxdyn.identify import interior
 from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart
 from jaxdyn.identify.condensed import Condensed, condensed_rows
 from jaxdyn.identify.friction import TERMS, Terms, check_terms
-from jaxdyn.identify.logs import Log, as_logs, root_mean_square
+from jaxdyn.identify.logs import Log, as_logs, as_measured, root_mean_square
 from jaxdyn.identify.minimise import METHODS, Optimizer, minimise
 from jaxdyn.identify.progress import Watch
 from jaxdyn.identify.regression import check_weights, condense_model, noise_level
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.threads import on_one_thread
-from jaxdyn.identify.torque_terms import measured_coulomb
+from jaxdyn.identify.torque_terms import coulomb_column
 from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
 
@@ -97,7 +97,7 @@ def fit_torques(
     logs = as_logs(log, model)
     terms = check_terms(terms, v_s)
     check_prior(prior)
-    coulomb = [measured_coulomb(one, v_s) for one in logs]
+    coulomb = [as_measured(one, coulomb_column(one, v_s)) for one in logs]
     blocks = condense_model(model, logs, v_s=v_s, coulomb=coulomb)
     condensed = condensed_rows(blocks.rows(check_weights(weights, model.nv)), blocks.count())
     problem, point, sigma = make_problem(model, condensed, signal_sizes(logs), terms, v_s, inertia, prior, sigma)

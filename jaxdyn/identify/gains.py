@@ -18,7 +18,7 @@ import numpy as np
 from jaxdyn.identify.condensed import Blocks
 from jaxdyn.identify.friction import TERMS, Terms, check_terms
 from jaxdyn.identify.jackknife import block_groups, jackknife, student
-from jaxdyn.identify.logs import Log, as_logs
+from jaxdyn.identify.logs import Log, as_logs, as_measured
 from jaxdyn.identify.regression import (
     base_parameters,
     condense_model,
@@ -28,7 +28,7 @@ from jaxdyn.identify.regression import (
 )
 from jaxdyn.identify.selection import VELOCITIES
 from jaxdyn.identify.threads import on_one_thread
-from jaxdyn.identify.torque_terms import measured_coulomb
+from jaxdyn.identify.torque_terms import coulomb_column
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model
@@ -122,7 +122,7 @@ def fit_gains(
         carried.append(np.concatenate([(columns @ known)[:, :, None], free], axis=2))
     best = None
     for velocity in VELOCITIES if isinstance(v_s, str) else (float(v_s),):
-        coulomb = [measured_coulomb(log, velocity) for log in logs]
+        coulomb = [as_measured(log, coulomb_column(log, velocity)) for log in logs]
         data = condense_model(model, logs, v_s=velocity, coulomb=coulomb, extra=carried, blocks=blocks)
         trial = _fit(_Problem(model, data, terms), velocity)
         if best is None or trial[0] < best[0]:

@@ -1,6 +1,6 @@
 """Logs: measured motion and torque, checked, and what their low-pass does to other signals."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,9 +10,6 @@ from jaxtyping import Array, Float
 
 from jaxdyn.model.arguments import Checked, Numbers, is_concrete
 from jaxdyn.model.tree import Model
-
-# Samples of a period of the cut-off at which friction that jumps is computed before it is filtered.
-_FINE = 120
 
 
 class Log(eqx.Module):
@@ -131,44 +128,16 @@ def as_measured(log: Log, columns: np.ndarray, order: int = 4) -> np.ndarray:
     """Columns (n, ...) as the log's filter would have left them; as they are where the log came through none.
 
     Friction that jumps where a joint turns round is a torque like any other when it is measured: what predicts it must go through
-    the same low-pass as the torque, or the jump counts as an error. Columns that are no smooth functions of the signals are
-    sampled too coarsely here, see `measured_columns`.
+    the same low-pass as the torque, or the jump counts as an error.
     """
     rate = (len(log) - 1) / float(log.t[-1] - log.t[0]) if len(log) > 1 else 0.0
     shortest = 3 * (order + 1) + 1
     if log.cutoff is None or not log.cutoff < 0.45 * rate or len(log) < shortest or not columns.size:
         return columns
-    from scipy.signal import butter, sosfiltfilt
+    from scipy.signal import butter, filtfilt
 
-    sections = butter(order, 2 * log.cutoff / rate, output="sos")
-    # Two periods of the cut-off beyond each end: with less the filter starts in the middle of its own transient.
-    pad = min(len(log) - 1, max(shortest - 1, round(2 * rate / log.cutoff)))
-    return sosfiltfilt(sections, columns, axis=0, padlen=pad)
-
-
-def measured_columns(log: Log, columns: Callable[..., np.ndarray], *signals: np.ndarray) -> np.ndarray:
-    """`columns(log, *signals)` (n, ...) as the log's filter would have left them, sampled finely enough to be filtered.
-
-    A filtered log keeps some 15 samples of a period of its cut-off, between which the sign of a velocity changes at an unknown
-    time: a friction column sampled there is wrong by up to half a sample at every reversal, which other terms (pre-sliding, friction
-    quadratic in the velocity) then explain. The signals are smooth, so they are interpolated by cubic splines to eight times as many
-    samples; the columns are computed there, low-passed, and thinned out again. Logs without a filter, and those with other
-    coordinates than one for each joint, are taken as they are.
-    """
-    rate = (len(log) - 1) / float(log.t[-1] - log.t[0]) if len(log) > 1 else 0.0
-    fine = 1 if log.cutoff is None or not rate else int(np.ceil(_FINE * log.cutoff / rate))
-    if fine < 2 or len(log) < 4 or log.q.shape[1] != log.nv or not log.cutoff < 0.45 * rate:
-        return as_measured(log, columns(log, *signals))
-    from scipy.interpolate import CubicSpline
-
-    t = np.asarray(log.t, np.float64)
-    times = np.interp(np.arange(fine * (len(t) - 1) + 1) / fine, np.arange(len(t)), t)
-
-    def denser(x):
-        return None if x is None else CubicSpline(t, np.asarray(x, np.float64))(times)
-
-    dense = Log(times, *(denser(x) for x in (log.q, log.v, log.a, log.tau)), cutoff=log.cutoff)
-    return as_measured(dense, columns(dense, *(denser(x) for x in signals)))[::fine]
+    numerator, denominator = butter(order, 2 * log.cutoff / rate, output="ba")  # pyright: ignore
+    return filtfilt(numerator, denominator, columns, axis=0)
 
 
 def _as_array(value, name: str):

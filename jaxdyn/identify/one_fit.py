@@ -13,9 +13,9 @@ from jaxdyn.identify.chart import Chart
 from jaxdyn.identify.condensed import Blocks, condensed_rows, condensed_triangle
 from jaxdyn.identify.feasible import torque_noise
 from jaxdyn.identify.interior import Linear, Minimum, TorqueProblem, newton
-from jaxdyn.identify.logs import Log, root_mean_square
+from jaxdyn.identify.logs import Log, as_measured, root_mean_square
 from jaxdyn.identify.regression import condense_model, noise_level
-from jaxdyn.identify.torque_terms import TorqueTerm, measured_coulomb, measured_term
+from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_column
 from jaxdyn.model.tree import Model
 
 # A coefficient's unit is what makes this share of the joint's torque.
@@ -82,8 +82,8 @@ def gather(
 
     `weights` (n, nv) of each log: of single torques, ones by default.
     """
-    parts = [[measured_term(term, log, load, v_s) for term in extra] for log, load in zip(logs, loads, strict=True)]
-    coulomb = [measured_coulomb(log, v_s) for log in logs]
+    parts = [[as_measured(log, term(log, load, v_s)) for term in extra] for log, load in zip(logs, loads, strict=True)]
+    coulomb = [as_measured(log, coulomb_column(log, v_s)) for log in logs]
     counts = {term.name: part.shape[2] for term, part in zip(extra, parts[0], strict=True)}
     columns = [
         np.concatenate([np.zeros((len(log), log.nv, 0)), *part], axis=2) for log, part in zip(logs, parts, strict=True)

@@ -15,9 +15,9 @@ def from_raw(
     tau: Numbers,
     *,
     cutoff: float | str = 8.0,
-    order: int = 4,
-    trim: int = 200,
-    every: int = 8,
+    order: Checked[int] = 4,
+    trim: Checked[int] = 200,
+    every: Checked[int] = 8,
     joint_names: Checked[Sequence[str] | None] = None,
 ) -> Log:
     """A log for torque fits from raw positions and torques: uniform time, low-pass without delay, numerical rates.

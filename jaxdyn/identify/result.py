@@ -10,10 +10,10 @@ import numpy as np
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.friction import Friction
-from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.identify.logs import Log, as_measured, check_log
 from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
 from jaxdyn.identify.sensors import Measured, with_sensors
-from jaxdyn.identify.torque_terms import ExtraTorque, coulomb_column, measured_coulomb
+from jaxdyn.identify.torque_terms import ExtraTorque, coulomb_column
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
@@ -102,7 +102,7 @@ class Fit(AbstractFit):
         torque = super().torques(log)
         if self.as_measured:
             column = coulomb_column(log, float(self.friction.v_s))
-            torque = torque + np.asarray(self.friction.coulomb) * (measured_coulomb(log, float(self.friction.v_s)) - column)
+            torque = torque + np.asarray(self.friction.coulomb) * (as_measured(log, column) - column)
         if self.extra is None:
             return torque
         load = np.zeros_like(torque)

@@ -133,12 +133,11 @@ def fit_robot(
     if delays is not None:
         logs = tuple(shift_torques(log, delays.seconds) for log in given)
     problem = RobotProblem(model, logs, basic, extra, inertia, blocks)
-    first = problem.refine(setting, fixed, rounds=2)
+    problem.refine(setting, fixed, rounds=2)
     trials, by = (), "given"
     if is_auto or any(isinstance(value, str) for value in (v_s, prior, robust)):
         parts, by = folds(problem.data(setting).blocks)
-        samples = problem.effective_samples(problem.result(setting, first, problem.data(setting)))
-        trying = Search(problem.left_out, parts, problem.torque, samples, callback)
+        trying = Search(problem.left_out, parts, problem.torque, callback)
         velocities = VELOCITIES if isinstance(v_s, str) else (setting.v_s,)
         priors = PRIORS if isinstance(prior, str) else (setting.prior,)
         names = [term.name for term in extra] if is_auto else []

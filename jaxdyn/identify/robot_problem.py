@@ -48,7 +48,7 @@ class RobotProblem:
         return fit_condensed(chart, start, data, setting, self.sizes, self.weights, **options)
 
     def left_out(self, setting: Setting, part: np.ndarray) -> np.ndarray:
-        """Squared errors (blocks, nv) on some blocks, of a fit to the others. No more digits than the choice needs.
+        """Squared errors (nv,) on some blocks, of a fit to the others. No more digits than the choice needs.
 
         A robust loss takes the weights of single torques from the first setting that asks for it.
         """
@@ -59,7 +59,7 @@ class RobotProblem:
         if key not in self._rows:
             self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
         estimate = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
-        return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part)
+        return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part).sum(axis=0)
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
         """Fit some times over; after each but the last, update weights and loads."""
@@ -96,12 +96,8 @@ class RobotProblem:
     def intervals(self, setting: Setting, estimate: Estimate, fit: Fit) -> Intervals:
         """Standard deviations of an estimate, which is this fit."""
         data, curved = self.data(setting), self.curved(setting)
-        worth = self.effective_samples(fit)
+        worth = stretches([fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs])
         return intervals(self.model, data, setting, estimate, self.weights, self.basic, worth, curved)
-
-    def effective_samples(self, fit: Fit) -> float:
-        """How many independent errors a fit leaves in the logs."""
-        return stretches([fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs])
 
     def with_term(self, term: TorqueTerm) -> "RobotProblem":
         """The same logs and weights with the columns of one more term, behind all others."""

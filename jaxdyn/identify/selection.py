@@ -1,17 +1,7 @@
 """Smoothing velocity, loss, extra torque terms and prior weight by cross-validation over logs, or over blocks of them.
 
-Every setting is fitted with one part of the blocks left out in turn, and compared by its error there: the mean over the torques of
+Every setting is fitted with one part of the blocks left out in turn, and judged by its error there: the mean over the torques of
 the logarithm of their squared errors, which asks for the same share of improvement of a wrist as of a shoulder.
-
-Held-out errors are random, so the best of forty settings is better than the simplest one by chance. A simple setting is therefore
-left only for an improvement that groups of blocks agree upon:
-
-- v_s and the weight of the prior: by more than one standard error of the difference (Breiman et al. 1984).
-- a term at a joint, and Huber's loss: by more than Student's t at 5 % shared among all terms, joints and losses that are tried
-  (Bonferroni), and by more than 1 % of the squared error. One standard error would accept one useless term in six.
-
-Source: Breiman, Friedman, Olshen & Stone (1984), "Classification and regression trees", section 3.4.3; Hastie, Tibshirani &
-Friedman (2009), "The elements of statistical learning", section 7.10.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdyn.identify.condensed import Blocks
-from jaxdyn.identify.jackknife import block_groups
 from jaxdyn.identify.one_fit import Setting
 
 VELOCITIES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
@@ -30,20 +19,14 @@ ROBUST = (None, 3.0, 1.345)
 _FOLDS = 5
 # A term stays at a joint where it lowers the squared error on what was left out by this share, and in most of the parts.
 _WORTH, _MOST = 0.01, 0.6
-# Probability that any useless term or loss is accepted.
-_LEVEL = 0.05
 
 
 class Trial(NamedTuple):
-    """One setting that was tried: squared errors (folds, nv) on the parts left out, and the error over all in per cent.
-
-    `groups` (groups, nv): the same squared errors by groups of consecutive blocks, from whose scatter standard errors come.
-    """
+    """One setting that was tried: squared errors (folds, nv) on the parts left out, and the error over all in per cent."""
 
     setting: Setting
     squares: np.ndarray
     percent: float
-    groups: np.ndarray
 
     @property
     def score(self) -> float:
@@ -74,27 +57,17 @@ def folds(blocks: Blocks) -> tuple[list[np.ndarray], str]:
 
 
 class Search:
-    """Trials of settings, none of them twice.
+    """Trials of settings, none of them twice. `fit(setting, left out)` gives squared errors (nv,) on the blocks left out."""
 
-    `fit(setting, left out)` gives squared errors (blocks, nv) on the blocks left out; `samples`: how many independent errors the
-    logs hold (`effective_samples`), which says how many blocks make a group.
-    """
-
-    def __init__(
-        self, fit: Callable, parts: Sequence[np.ndarray], torque: float, samples: float, callback: Callable | None = None
-    ):
+    def __init__(self, fit: Callable, parts: Sequence[np.ndarray], torque: float, callback: Callable | None = None):
         self._fit, self._parts, self._torque, self._callback = fit, parts, torque, callback
-        self._groups = block_groups(sum(map(len, parts)), samples)
         self.trials: dict[Setting, Trial] = {}
 
     def __call__(self, setting: Setting) -> Trial:
         """The trial of a setting."""
         if setting not in self.trials:
-            errors = [np.asarray(self._fit(setting, part)) for part in self._parts]
-            blocks = np.concatenate(errors)
-            squares = np.array([part.sum(axis=0) for part in errors])
-            groups = np.array([blocks[group].sum(axis=0) for group in self._groups])
-            trial = Trial(setting, squares, 100 * float(np.sqrt(squares.sum() / self._torque)), groups)
+            squares = np.array([self._fit(setting, part) for part in self._parts])
+            trial = Trial(setting, squares, 100 * float(np.sqrt(squares.sum() / self._torque)))
             self.trials[setting] = trial
             if self._callback is not None:
                 self._callback(trial)
@@ -103,30 +76,6 @@ class Search:
     def best(self, settings: Sequence[Setting]) -> Setting:
         """The best of some settings."""
         return min(settings, key=lambda setting: self(setting).score)
-
-    def better(self, simple: Setting, settings: Sequence[Setting], errors: float, worth: float = 0.0) -> Setting:
-        """The best of some settings if it is better than the simple one by so many standard errors, else the simple one."""
-        best = self.best([simple, *settings])
-        before, after = self(simple), self(best)
-        gain, error = score_gain(before.groups, after.groups)
-        return best if gain > max(errors * error, worth) and after.score < before.score else simple
-
-
-def score_gain(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
-    """Mean relative reduction of squared errors (groups, nv) over the torques, and its standard error.
-
-    To first order the reduction of the score, of which every group of blocks holds a part.
-    """
-    total = np.maximum(before.sum(axis=0), 1e-300)
-    parts = np.mean((before - after) / total, axis=1)
-    return float(parts.sum()), float(np.sqrt(len(parts)) * np.std(parts, ddof=1))
-
-
-def acceptance(candidates: int, groups: int) -> float:
-    """Standard errors of an improvement from which on it is accepted, one of so many candidates (Bonferroni, Student's t)."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(max(groups - 1, 1), 1 - _LEVEL / max(candidates, 1)))
 
 
 def search(
@@ -140,17 +89,8 @@ def search(
     losses=ROBUST,
 ) -> Setting:
     """Coordinate descent: v_s, the loss, terms joint by joint in order of what they gain, the prior, v_s and the loss again."""
-    candidates = len(extra) * nv + len(losses) - 1
-    strict = acceptance(candidates, len(search(start).groups))
-
-    def velocity(setting):
-        return search.better(setting, [setting._replace(v_s=v_s) for v_s in velocities], 1.0)
-
-    def loss(setting):
-        plain = setting._replace(robust=losses[0])
-        return search.better(plain, [setting._replace(robust=threshold) for threshold in losses], strict, _WORTH)
-
-    setting = loss(velocity(start))
+    setting = search.best([start._replace(v_s=v_s) for v_s in velocities])
+    setting = search.best([setting._replace(robust=threshold) for threshold in losses])
     remaining = list(extra)
     while remaining:
         before = search(setting)
@@ -158,7 +98,6 @@ def search(
         for name in remaining:
             tried = search(setting._replace(extra=(*setting.extra, (name, tuple(range(nv))))))
             joints = helped(before.squares, tried.squares)
-            joints = tuple(j for j in joints if is_significant(before.groups[:, j], tried.groups[:, j], strict))
             if joints:
                 trials.append(setting._replace(extra=(*setting.extra, (name, joints))))
         if not trials:
@@ -168,14 +107,9 @@ def search(
             break
         setting = following
         remaining.remove(setting.extra[-1][0])
-    setting = search.better(setting, [setting._replace(prior=prior) for prior in priors], 1.0)
-    return loss(velocity(setting))
-
-
-def is_significant(before: np.ndarray, after: np.ndarray, errors: float) -> bool:
-    """Whether squared errors (groups,) fell by more than so many standard errors of their difference."""
-    gain, error = score_gain(before[:, None], after[:, None])
-    return gain > errors * error
+    setting = search.best([setting._replace(prior=prior) for prior in priors])
+    setting = search.best([setting._replace(v_s=v_s) for v_s in velocities])
+    return search.best([setting._replace(robust=threshold) for threshold in losses])
 
 
 def helped(before: np.ndarray, after: np.ndarray, worth: float = _WORTH) -> tuple[int, ...]:

@@ -17,7 +17,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.identify.friction import TERMS, check_terms
-from jaxdyn.identify.logs import Log, as_measured, measured_columns
+from jaxdyn.identify.logs import Log, as_measured
 
 # The way in which pre-sliding friction turns round (rad, m).
 PRESLIDING = 0.003
@@ -30,14 +30,11 @@ class TorqueTerm(eqx.Module):
     - `columns(log, load, v_s)`: (n, nv, k) or (n, nv), from a log, the torque (n, nv) that the rigid bodies need along it
       (N m, N) and the smoothing velocity. It may look at samples before, but belongs to one log.
     - `needs_load`: whether it uses `load`, which is a zero array otherwise.
-    - `is_smooth`: False for columns that change fast where a joint turns round. They are computed from an interpolated log with
-      more samples before they go through the log's low-pass, so they must be functions of the log that they are given.
     """
 
     name: str = eqx.field(static=True)
     columns: Callable[[Log, np.ndarray, float], np.ndarray] = eqx.field(static=True)
     needs_load: bool = eqx.field(static=True, default=False)
-    is_smooth: bool = eqx.field(static=True, default=True)
 
     def __call__(self, log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
         """The columns (n, nv, k). **Raises:** ValueError for columns of another shape, or not finite."""
@@ -54,20 +51,6 @@ class TorqueTerm(eqx.Module):
 def coulomb_column(log: Log, v_s: float) -> np.ndarray:
     """tanh(v / v_s), (n, nv)."""
     return np.tanh(np.asarray(log.v, np.float64) / v_s)
-
-
-def measured_coulomb(log: Log, v_s: float) -> np.ndarray:
-    """`coulomb_column` as the log's filter leaves it, (n, nv)."""
-    return measured_columns(log, lambda fine: coulomb_column(fine, v_s))
-
-
-def measured_term(term: TorqueTerm, log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
-    """Columns of a term (n, nv, k) as the log's filter leaves them."""
-    if term.is_smooth:
-        return as_measured(log, term(log, load, v_s))
-    if not term.needs_load:
-        return measured_columns(log, lambda fine: term(fine, np.zeros((len(fine), fine.nv)), v_s))
-    return measured_columns(log, lambda fine, load: term(fine, load, v_s), load)
 
 
 def _load(log, load, v_s):
@@ -109,10 +92,10 @@ def _angles(log: Log, name: str) -> np.ndarray:
 
 
 EXTRA = {
-    "load": TorqueTerm("load", _load, needs_load=True, is_smooth=False),
-    "dahl": TorqueTerm("dahl", _dahl, is_smooth=False),
-    "asymmetric": TorqueTerm("asymmetric", _asymmetric, is_smooth=False),
-    "quadratic": TorqueTerm("quadratic", _quadratic, is_smooth=False),
+    "load": TorqueTerm("load", _load, needs_load=True),
+    "dahl": TorqueTerm("dahl", _dahl),
+    "asymmetric": TorqueTerm("asymmetric", _asymmetric),
+    "quadratic": TorqueTerm("quadratic", _quadratic),
     "spring": TorqueTerm("spring", _spring),
 }
 
@@ -157,6 +140,12 @@ def split_terms(
     return check_terms(basic, 1.0), tuple(extra), tuple(where)
 
 
+def term_columns(terms: Sequence[TorqueTerm], log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
+    """Columns of all terms (n, nv, k) side by side."""
+    parts = [term(log, load, v_s) for term in terms]
+    return np.concatenate([np.zeros((len(log), log.nv, 0)), *parts], axis=2)
+
+
 class ExtraTorque(eqx.Module):
     """Fitted `TorqueTerm`s: `coefficients` (k, nv), rows in the order of the terms' columns, `counts` of each term."""
 
@@ -172,8 +161,7 @@ class ExtraTorque(eqx.Module):
 
     def torque(self, log: Log, load: np.ndarray) -> np.ndarray:
         """Torque (n, nv) of all terms along a log, with the rigid bodies' torque `load` (n, nv) (N m, N)."""
-        parts = [measured_term(term, log, load, self.v_s) for term in self.terms]
-        columns = np.concatenate([np.zeros((len(log), log.nv, 0)), *parts], axis=2)
+        columns = as_measured(log, term_columns(self.terms, log, load, self.v_s))
         return np.einsum("ijk,kj->ij", columns, self.coefficients)
 
     @property

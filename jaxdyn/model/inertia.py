@@ -24,9 +24,11 @@ _TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
 def _check_shapes(**given) -> None:
     """Refuse arguments, by their names, of another shape than the one beside them."""
     for name, (value, want) in given.items():
-        if np.shape(value) != want:
-            shapes = ", ".join(f"{other} {shape}" for other, (_, shape) in given.items())
-            raise ValueError(f"{name} has shape {np.shape(value)}, expected {shapes}")
+        # Rows may be tuples of traced numbers, whose shape numpy cannot ask for.
+        shape = np.shape(_numpy_for(value).asarray(value))
+        if shape != want:
+            shapes = ", ".join(f"{other} {size}" for other, (_, size) in given.items())
+            raise ValueError(f"{name} has shape {shape}, expected {shapes}")
 
 
 def rotational_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "3 3"]:

@@ -53,10 +53,10 @@ class LagrangianSystem(System):
     def __init__(
         self, lagrangian: Function, nq: Checked[int], *, parameters: PyTree = None, potential: Function | None = None
     ):
+        self.nq = checked_size(nq)
         more = "" if parameters is None else ", t, parameters"
         self.lagrangian = as_pytree(lagrangian, "lagrangian", "q, v" + more)
         self.potential = None if potential is None else as_pytree(potential, "potential", "q" + more)
-        self.nq = checked_size(nq)
         self.parameters = jax.tree.map(as_parameter, parameters)
 
     def value(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:

@@ -346,7 +346,7 @@ class OwnProgram(NamedTuple):
         arrays, rest = eqx.partition(args[-1], eqx.is_array)
         del rest
         results, served = run(_applied, arrays, args[:-1], static=(self.function,), served=True, own_program=True)
-        return results if served is True else jax.tree.map(lambda x: unless(~served, x), results)
+        return results if served is True else jax.tree.map(lambda x: unless(jnp.logical_not(served), x), results)
 
 
 def _applied(function, args, given):
