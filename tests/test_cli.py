@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from pathlib import Path
 
 import jax.numpy as jnp
 import mujoco
@@ -702,6 +703,8 @@ def test_simulate_a_file_with_a_loop(four_bar, tmp_path, capsys):
         ("simulate ARM --arguments a=1", "arguments is .* no .xacro file"),
         ("simulate ARM --arguments a", "--arguments a: give NAME=VALUE"),
         ("excite ARM --rate 1e300", "--rate 1e.300 .*GB of results"),
+        ("excite ARM --period 1e-300", "rows a period do not hold 5 harmonics; give more than 10"),
+        ("report four_bar --batch 999999999999999999", "--batch 999999999999999999: .* GB of results"),
         ("excite ARM --harmonics 0", "--harmonics is 0; give at least 1"),
         ("excite ARM --period -1", "--period is -1.0 s; give a positive time"),
         ("identify --urdf ARM --log x.csv --every 0", "--every is 0; give at least 1"),

@@ -228,7 +228,6 @@ def test_from_raw_is_the_protocol_of_the_recorded_data(data_dir):
     ("options", "words"),
     [
         ({"every": 0}, "every is 0; give a whole number of at least 1"),
-        ({"every": 1.5}, "every is 1.5; give a whole number"),
         ({"trim": -1}, "trim is -1; give a whole number of at least 0"),
         ({"order": 0}, "order is 0; give a whole number of at least 1"),
     ],

@@ -175,7 +175,8 @@ def use(value, systems: list) -> None:
             elif isinstance(value, Constraint):
                 jd.constraint_jacobian(jd.Scene(system, [value]), q)
             elif isinstance(value, Controller):
-                value(q, v, jnp.zeros(()))
+                start = value.start(q, v, jnp.zeros(()))
+                value(q, v, jnp.zeros(()), start)
             else:
                 jd.Scene(system, forces=[value]).applied_force(q, v)
             return

@@ -71,6 +71,11 @@ def run(args: argparse.Namespace) -> None:
     if not args.period > 0:
         raise ValueError(f"--period is {args.period} s; give a positive time")
     check_least(args, harmonics=1, steps=0, seed=0)
+    if args.rate * args.period <= 2 * args.harmonics:
+        raise ValueError(
+            f"--rate {args.rate:g} --period {args.period:g}: {args.rate * args.period:.3g} rows a period do not hold "
+            f"{args.harmonics} harmonics; give more than {2 * args.harmonics}"
+        )
     model = load_model(args.urdf, args)
     rows = args.rate * args.period * args.periods
     check_memory(

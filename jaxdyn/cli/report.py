@@ -2,7 +2,7 @@
 
 import argparse
 
-from jaxdyn.cli.common import Stopwatch, check_least, whole
+from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
 from jaxdyn.reports import cases, report
 
 HELP = "error against run time of scenes whose motion is known"
@@ -59,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
     if not (args.scenes or args.full):
         raise ValueError(f"no scene is named; name one of {', '.join(known)}, or give --full for all")
     check_least(args, batch=1, rounds=1)
+    check_memory(1000.0 * max(args.batch or [1]), f"--batch {max(args.batch or [1])}")
     watch = Stopwatch()
     integrators = None if args.integrator is None else [tuple(pair.split(":")) for pair in args.integrator]
     options = {

@@ -101,15 +101,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and print what became of it; 1 if a rollout failed."""
+    check_least(args, chunk=1, samples=1)
+    if args.process is not None and not 0 <= args.process[0] < args.process[1]:
+        raise ValueError(f"--process is {args.process[0]} {args.process[1]}; give I N with 0 <= I < N")
     path = as_path(args.study, "study")
     study = _read(path)
     if args.devices is not None:
         if not 1 <= args.devices <= 4096:
             raise ValueError(f"--devices is {args.devices}; give 1 to 4096")
         jax.config.update("jax_num_cpu_devices", args.devices)
-    check_least(args, chunk=1, samples=1)
-    if args.process is not None and not 0 <= args.process[0] < args.process[1]:
-        raise ValueError(f"--process is {args.process[0]} {args.process[1]}; give I N with 0 <= I < N")
     given = _required(study, path, "samples") if args.samples is None else args.samples
     duration, points = float(_required(study, path, "duration")), study.get("points", 2)
     if not 0 < duration < np.inf or points < 2 or given < 1:
