@@ -24,7 +24,7 @@ def load_for_repair(path: str, args: argparse.Namespace) -> tuple[Model, list[st
     except ValueError:
         try:
             tree = ET.ElementTree(XmlFile(path, "URDF").root)
-            names = _give_balls(tree.getroot())
+            names = _give_balls(tree.getroot())  # pyright: ignore[reportArgumentType]
         except ValueError:
             tree, names = None, []
         if tree is None or not names:

@@ -172,9 +172,9 @@ def drawing(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
         size = given.get("size", 1)
         if type(size) is not int or not 1 <= size < 2**31:
             raise ValueError(f"parameter {name}: size is {size!r}; give a whole number of at least 1")
-        if kinds[0] == "log_uniform" and not min(ends) > 0:
+        if kinds[0] == "log_uniform" and not min(ends) > 0:  # pyright: ignore[reportArgumentType]
             raise ValueError(f"parameter {name}: log_uniform = {ends}; give positive numbers")
-        drawn[name] = (kinds[0], float(ends[0]), float(ends[1]), (int(given["size"]),) if "size" in given else ())
+        drawn[name] = (kinds[0], float(ends[0]), float(ends[1]), (int(given["size"]),) if "size" in given else ())  # pyright: ignore[reportOptionalSubscript]
 
     def draw(key: Any) -> dict[str, Any]:
         keys = jax.random.split(key, max(1, len(drawn)))

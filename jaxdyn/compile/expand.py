@@ -17,7 +17,7 @@ from jaxdyn.compile import matrices
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bound, computed, converted, of_nothing
 from jaxdyn.compile.graph import Graph, Number, as_objects, objects
-from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts
+from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import Array, NotNumbers, Program, as_kind, kind_of
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS, written
 
@@ -36,8 +36,8 @@ def expand(
     **Raises:** `NotNumbers`, `TooLong`.
     """
     graph = Graph(most)
-    inputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in closed.jaxpr.invars]
-    outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in closed.jaxpr.outvars]
+    inputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in closed.jaxpr.invars]  # pyright: ignore[reportAttributeAccessIssue]
+    outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in closed.jaxpr.outvars]  # pyright: ignore[reportAttributeAccessIssue]
     for array in (*inputs, *outputs):
         if array.dtype.name not in ("float64", "float32", "bool", "int32", "int64"):
             raise NotNumbers(f"an array of {array.dtype}")
@@ -201,7 +201,7 @@ class _Expansion:
                 np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)
             ]
         one = as_kind(1, _kind(eqn.outvars[0].aval.dtype))
-        return [objects([self.graph.power(x, params["y"], one) for x in args[0].ravel().tolist()], args[0].shape)]
+        return [objects([self.graph.power(x, params["y"], one) for x in args[0].ravel().tolist()], args[0].shape)]  # pyright: ignore[reportArgumentType]
 
     def _select(self, params, args, eqn):
         which, *cases = args
@@ -352,13 +352,13 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
     flagged, there is one more output, which says whether one is.
     """
     graph = Graph(most)
-    arrays = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]
+    arrays = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]  # pyright: ignore[reportAttributeAccessIssue]
     inputs = [array for array, x in zip(arrays, known, strict=True) if x is None]
     entries = iter([graph.inputs(place, array) for place, array in enumerate(inputs)])
     expansion = _Expansion(graph, False)
     args = [next(entries) if x is None else np.frombuffer(x[2], x[1]).reshape(x[0]) for x in known]
     results = [as_objects(x) for x in expansion.closed(inner, args)]
-    outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]
+    outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]  # pyright: ignore[reportAttributeAccessIssue]
     if expansion.flagged is not False:
         outputs.append(_FLAG)
         results.append(objects([expansion.flagged], ()))

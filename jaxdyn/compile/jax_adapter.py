@@ -94,7 +94,7 @@ def reason_against_kernels() -> str | None:
 # --- extension points ---
 
 try:
-    from jax.extend.core import ClosedJaxpr as ClosedJaxpr
+    from jax.extend.core import ClosedJaxpr as ClosedJaxpr  # pyright: ignore[reportPrivateImportUsage]
     from jax.extend.core import Literal as Literal
     from jax.extend.core import Primitive
     from jax.extend.mlir.dialects import sdy

@@ -155,10 +155,10 @@ def _stacked(cones: list[FrictionCone], faces: int | None, side: str) -> _Rows:
             )
             rows = rows[[np.abs(row[~used]).sum() == 0 for row in rows]]
             cones_of = cones_of if float(cone.mu) > 0 else cones_of[:0]  # pyright: ignore[reportArgumentType]
-        linear.append(np.zeros((len(rows), total)))
+        linear.append(np.zeros((len(rows), total)))  # pyright: ignore[reportArgumentType]
         linear[-1][:, columns] = rows
         if faces is None and len(cones_of):
-            second.append(np.zeros((len(cones_of), 3, total)))
+            second.append(np.zeros((len(cones_of), 3, total)))  # pyright: ignore[reportArgumentType]
             second[-1][:, :, columns] = cones_of
         if cone.rows is not None:
             normal[columns] = -rows.mean(0)

@@ -249,7 +249,7 @@ def plugin_followers(file: XmlFile) -> dict[str, tuple[Mimic, str]]:
             raise file.fault(plugin, "a mimicking plugin has no <joint> or no name in <mimicJoint>; give both")
         ratio = file.number(plugin, "multiplier", 1.0, "a mimicking plugin")
         coupling = Mimic(leader, ratio, file.number(plugin, "offset", 0.0, "a mimicking plugin"))
-        if followers.setdefault(follower, (coupling, f"{file.path}:{plugin.line}"))[0] != coupling:
+        if followers.setdefault(follower, (coupling, f"{file.path}:{plugin.line}"))[0] != coupling:  # pyright: ignore[reportAttributeAccessIssue]
             raise file.fault(plugin, f"joint {follower!r} follows {followers[follower][0].joint!r} already; keep one")
     return followers
 

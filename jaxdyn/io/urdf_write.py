@@ -209,9 +209,9 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
                 raise ValueError(
                     f"{what}: {key} {own.tolist()} differs between directions; URDF holds one number per joint"
                 )
-            dynamics[key] = _text(own[:1])
+            dynamics[key] = _text(own[:1])  # pyright: ignore[reportArgumentType]
     if dynamics:
-        ET.SubElement(joint, "dynamics", dynamics)
+        ET.SubElement(joint, "dynamics", dynamics)  # pyright: ignore[reportArgumentType]
     for n, (i, source) in enumerate(model.topology.couplings):
         if i == edge.body and model.coupling_values is not None:
             multiplier, offset = np.asarray(model.coupling_values, np.float64)[n]

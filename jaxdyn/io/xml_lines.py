@@ -179,7 +179,7 @@ def _expand(path: str, arguments: Mapping[str, Any]) -> str:
         raise ImportError(f"{path}: reading xacro files needs the package xacro: pip install jaxdyn[xacro]") from error
     words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
     try:
-        return xacro.process_file(path, mappings=words).toprettyxml(indent="  ")
+        return xacro.process_file(path, mappings=words).toprettyxml(indent="  ")  # pyright: ignore[reportAttributeAccessIssue]
     except Exception as error:  # expressions of a file raise anything
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"{path}: xacro: {reason}; mend the file, or give its arguments={{NAME: VALUE}}") from error
