@@ -224,7 +224,7 @@ def _mjcf(model) -> str:
             "free": lambda: 'type="free"',
         }[kind]()
         children = "".join(body(j) for j in range(topology.nb) if topology.parents[j] == i)
-        quat = np.roll(Rotation.from_matrix(home[:3, :3]).as_quat(), 1)
+        quat = np.roll(Rotation.from_matrix(np.array(home[:3, :3])).as_quat(), 1)
         return (
             f'<body pos="{numbers(home[:3, 3])}" quat="{numbers(quat)}">'
             f'<inertial pos="{numbers(com)}" mass="{mass!r}" fullinertia="{numbers(full)}"/>'

@@ -458,7 +458,7 @@ def test_a_store_of_something_else_is_refused_with_what_differs(tmp_path, monkey
     old = json.loads((out / "zarr.json").read_text())
     old["attributes"]["description"]["version of jaxdyn"] = "0.0.9"
     (out / "zarr.json").write_text(json.dumps(old))
-    refused("of another version of jaxdyn: there it is 0.0.9, here 0.1.0")
+    refused("of another version of jaxdyn: there it is 0.0.9, here " + jd.__version__)
     old["attributes"]["jaxdyn_store"] = 0
     (out / "zarr.json").write_text(json.dumps(old))
     refused("whose format is 0 of jaxdyn and not 1")
