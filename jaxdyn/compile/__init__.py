@@ -6,8 +6,8 @@ machine code through XLA's foreign function interface (`target`, `objects`); `ke
 for it, with its batches, derivatives (`derive`) and the way without machine code. `compilation` (`mode`) turns all of it
 off.
 
-Imports nothing of jaxdyn. Others import the names below, and no module of this package; `jaxdyn.export`, which writes code of its own,
-imports its modules.
+Imports nothing of jaxdyn. Others import the names below, and no module of this package. Only
+`jaxdyn.export`, which writes code of its own, imports its modules.
 """
 
 from jaxdyn.compile.calls import compiled as compiled
