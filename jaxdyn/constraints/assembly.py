@@ -15,7 +15,6 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import correction, right_inverse, whitened_rows
 from jaxdyn.constraints.loops import lock_joint
-from jaxdyn.constraints.rank import tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, openness, row_limits
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
@@ -293,12 +292,9 @@ def _residuals_and_limits(scene, q, v, t, relative):
     return position_residual(scene, q, t), velocity_residual(scene, q, v, t), *limits
 
 
-def start_evidence(scene: Scene, q, v, t, relative: float) -> tuple[np.ndarray, float, int]:
-    """Largest residuals (2,), `openness`, and the rank of the rows at a concrete state."""
+def start_evidence(scene: Scene, q, v, t, relative: float) -> tuple[np.ndarray, float]:
+    """Largest residuals (2,), and `openness`, at a concrete state."""
     bare = Scene(scene.system, scene.constraints)
     given = not is_staged()  # as in the program of a run that begins here
-    _, Y = compute(whitened_rows, bare, q, t, given=given)
-    sizes = np.linalg.svd(Y, compute_uv=False)
-    rank = int(np.sum(sizes > tolerance(None, Y) * sizes[0])) if sizes.size else 0
     ratio = compute(largest_ratio, bare, q, v, t, static=(relative,), given=given)
-    return compute(_largest_residuals, bare, q, v, t, given=given), float(ratio), rank
+    return compute(_largest_residuals, bare, q, v, t, given=given), float(ratio)

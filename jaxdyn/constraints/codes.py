@@ -46,6 +46,7 @@ class RESULTS(eqx.Enumeration):
     )
     coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
     inconsistent_start = "The initial state is not on the constraints."
+    no_freedom = "The constraints remove all freedom: there is no motion."
     open_constraints = "The constraints opened, and the projection could not close them."
     contact_lost = "A contact pulled or left its friction cone."
     joint_limit_passed = "A joint passed one of its position limits."

@@ -17,7 +17,16 @@ from jaxtyping import Array, Float, Int
 from jaxdyn.compile import is_rank_safe, partition_traced, repair_flagged, run
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome
-from jaxdyn.constraints.rank import checked_tolerance, eps_of, least_pivot, pseudo_inverse, quality_of, tolerance
+from jaxdyn.constraints.rank import (
+    checked_tolerance,
+    eps_of,
+    least_pivot,
+    pseudo_inverse,
+    quality_of,
+    regular_gram,
+    tolerance,
+)
+from jaxdyn.constraints.selection import is_selected
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
 from jaxdyn.lie.so3 import _product
@@ -104,7 +113,7 @@ def constrained_dynamics(
     state = q, v, tau, t
     if method != "rank_aware":
         return _by_schur(scene, *state, method=method)
-    if places[-1].end > scene.nv or is_rank_safe():
+    if (places[-1].end > scene.nv and not is_selected(scene)) or is_rank_safe():
         return _by_rank(scene, *state, rank_tol)
     solution = run(_by_pivots, scene, *state, otherwise=_nothing)
     if solution is None and scene.forces:
@@ -122,7 +131,7 @@ def _nothing(*_):
 def _by_pivots(scene: Scene, q, v, tau, t):
     """(a, lam, least over largest pivot of A M^-1 A^T) without branches; NaN where M is not positive definite."""
     metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
-    normal = cholesky(_product(Y.T, Y))
+    normal = cholesky(regular_gram(Y) if is_selected(scene) else _product(Y.T, Y))
     lam = _refined(normal, Y, wanted)
     quality = jnp.where(metric.definite(), quality_of(normal), jnp.nan)
     return metric.unwhiten(free + _product(Y, lam)), lam, quality

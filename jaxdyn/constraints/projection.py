@@ -21,7 +21,8 @@ from jaxdyn.compile import (
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whitened_rows
 from jaxdyn.constraints.projection_derivative import LOST, Corrections, projected
-from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, tolerance
+from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, regular_gram, tolerance
+from jaxdyn.constraints.selection import is_selected
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_factored
 from jaxdyn.systems.scene import Scene
@@ -68,7 +69,7 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 def _projected(scene: Scene, rank_tol, q, v, t, errors):
     """A few steps from one factorisation of the rows; where these were not enough, the next round factors them anew."""
     q = retract(scene.system, q)
-    if layout(scene)[-1].end > scene.nv or is_rank_safe():
+    if (layout(scene)[-1].end > scene.nv and not is_selected(scene)) or is_rank_safe():
         return _by_rank(scene, rank_tol, q, v, t, errors)
     projected = run(_by_pivots, scene, q, v, t, *errors, otherwise=lambda *_: None)
     if projected is None:
@@ -138,7 +139,7 @@ def _by_pivots(scene: Scene, q, v, t, *errors):
     metric, Y = whitened_rows(scene, q, t)
 
     def steps(Y):
-        factor = cholesky(_product(Y.T, Y))
+        factor = cholesky(regular_gram(Y) if is_selected(scene) else _product(Y.T, Y))
         return (lambda residual: metric.unwhiten(_product(Y, solve_factored(factor, residual)))), quality_of(factor)
 
     every, quality = steps(Y)

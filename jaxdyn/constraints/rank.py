@@ -40,6 +40,18 @@ def least_pivot(like, rank_tol: float | None) -> float:
     return max(eps_of(like) ** 0.4, (100 * tolerance(rank_tol, like)) ** 2)
 
 
+def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
+    """Y^T Y, with the largest entry of its diagonal where a column is zero: a row that was dropped.
+
+    Solutions with right-hand sides that are zero there, such as (Y^T Y)^-1 Y^T, are those of the other columns.
+    """
+    gram = _product(Y.T, Y)
+    squares = jnp.diagonal(gram)
+    largest = jnp.max(squares)
+    fill = jnp.where(largest > 0, largest, jnp.ones_like(largest))
+    return gram + jnp.diag(jnp.where(squares == 0, fill, jnp.zeros_like(squares)))
+
+
 def quality_of(factor):
     """Least over largest pivot, from a Cholesky factor."""
     pivots = jnp.diagonal(factor) ** 2
@@ -95,13 +107,13 @@ def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
     pseudo-inverse."""
     if not is_expanding():
         return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
-    factor = cholesky(_product(Y.T, Y))
+    factor = cholesky(regular_gram(Y))
     return LeastSquares(Y, unless(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
 
 
 def _by_normal_equations(_, Y):
     """(Y^T Y)^-1 Y^T, and the least over the largest pivot of Y^T Y."""
-    factor = cholesky(_product(Y.T, Y))
+    factor = cholesky(regular_gram(Y))
     inverse = solve_factored(factor, Y.T)
     # One step of Newton and Schulz takes the squared condition number out of the error.
     return 2 * inverse - _product(_product(inverse, Y), inverse), quality_of(factor)

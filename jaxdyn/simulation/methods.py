@@ -22,6 +22,7 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
 from jaxdyn.constraints.rank import checked_tolerance
+from jaxdyn.constraints.selection import is_selected, most_opening, opening_of_dropped, spread_multipliers
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import _product
@@ -52,6 +53,7 @@ class Method(eqx.Module):
 
     name: ClassVar[str] = "free"
     projects: ClassVar[bool] = False
+    rank_tol: ClassVar[float | None] = None
 
     def stepper(self, solver: Solver, stepsize: Stepsize) -> Solver:
         """The solver to take: the one given, or the method's own."""
@@ -417,7 +419,11 @@ def _error_of_place(scene: Scene, q, error) -> Array:
 
 def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
     """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
-    return constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
+    found = constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
+    if not is_selected(scene):
+        return found
+    shared = spread_multipliers(scene, q, t, found.multipliers)
+    return eqx.tree_at(lambda found: found.multipliers, found, shared)
 
 
 def is_regular(quality) -> Array:
@@ -431,5 +437,10 @@ def start_limit(dtype) -> float:
 
 
 def consistent(scene: Scene, q, v, t):
-    """Whether a state is on the constraints but for rounding."""
+    """Whether a state is on the constraints but for rounding; rows that `keep_rows` has dropped are not looked at."""
     return openness(scene, q, v, t, start_limit(q.dtype)) <= 1.0
+
+
+def repeats(scene: Scene, opening, q, v, t):
+    """Whether dropped rows are still met, along a motion that starts with them open by `opening`."""
+    return opening_of_dropped(scene, q, v, t) <= most_opening(opening, q.dtype)

@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import map_rows
+from jaxdyn.constraints.selection import is_selected, keep_rows, most_rounding, opening_of_dropped, select_rows
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.equations import equations
 from jaxdyn.simulation.integration import integrate
-from jaxdyn.simulation.methods import Method, consistent, is_regular, start_limit
+from jaxdyn.simulation.methods import Method, consistent, is_regular, repeats, start_limit
 from jaxdyn.simulation.outputs import at_save_point
 from jaxdyn.simulation.solution import RESULTS, Solution, faults_of_inputs, first_of, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
@@ -52,9 +53,15 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
             harmless.at[system.topology.nq :].set(1.0).at[: system.topology.nq].set(neutral(system).astype(q0.dtype))
         )
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
-    start_ok = jnp.asarray(True)
+    start_ok, opening, is_free = jnp.asarray(True), None, None
+    if options["selects_rows"]:
+        selection = select_rows(scene, q0, ts[0], method.rank_tol)
+        scene, opening = keep_rows(scene, selection.kept), selection.opening
+        start_ok, is_free = opening <= most_rounding(q0.dtype), jnp.sum(selection.kept) < scene.nv
+    elif is_selected(scene):
+        opening = opening_of_dropped(scene, q0, jnp.zeros_like(v0), ts[0])
     if scene.constraints:
-        start_ok = consistent(scene, q0, v0, ts[0])
+        start_ok = start_ok & consistent(scene, q0, v0, ts[0])
         if method.projects:
             given_start = q0, v0
             q0, v0 = method.onto_constraints(scene, q0, v0, ts[0])
@@ -147,11 +154,18 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         coarse = jnp.max(jnp.abs(q0[angles])) > most_turned(q0.dtype)
         failures.append((coarse, RESULTS.coarse_start))
     failures.append((~start_ok, RESULTS.inconsistent_start))
+    if is_free is not None:
+        failures.append((~is_free, RESULTS.no_freedom))
     if first is not None:
         failures.append((~is_regular(first), RESULTS.singular_basis))
     failures.append((nonfinite, RESULTS.nonfinite_state))
     if method.projects and scene.constraints:
-        closed = map_rows(lambda row: consistent(scene, *row), (q, v, ts))
+
+        def is_closed(row):
+            met = consistent(scene, *row)
+            return met if opening is None else met & repeats(scene, opening, *row)
+
+        closed = map_rows(is_closed, (q, v, ts))
         failures.append(((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints))
     elif scene.constraints:
 

@@ -148,7 +148,8 @@ def simulate(
         _check_system(scene.system, q0, v0, ts[0])
     if scene.constraints and is_concrete((scene, method, q0, v0, ts)):
         state = [np.asarray(x, state_dtype(scene.system)) for x in (q0, v0, np.asarray(ts)[0])]
-        method = checked_start(scene, method, *state)
+        selected, method = checked_start(scene, method, *state)
+        scene = scene if modal else selected
     if isinstance(scene.system, System) and is_concrete((scene, q0, v0, ts)):
         _check_system(scene.system, q0, v0, ts[0])
     if not is_fixed(stepsize) and is_concrete(q0):
@@ -193,6 +194,7 @@ def simulate(
         "max_steps": checked_step_limit(max_steps, ts, stepsize, adjoint),
         "limit_is_given": max_steps is not None,
         "max_events": max_events,
+        "selects_rows": bool(scene.constraints) and not is_concrete((scene, method, q0, v0, ts)),
     }
     if modal and is_fixed(stepsize) and max_steps is None:
         options["max_steps"] += SEARCHED * max_events

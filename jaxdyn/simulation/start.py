@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxdyn.constraints.assembly import open_constraints, start_evidence
 from jaxdyn.constraints.base import layout
+from jaxdyn.constraints.selection import keep_rows, known_selection, most_rounding
 from jaxdyn.simulation.methods import (
     Baumgarte,
     Free,
@@ -53,17 +54,25 @@ def chosen_method(scene: Scene, method: str | Method) -> Method:
     return chosen.fitted(scene, None) if isinstance(chosen, Reduced) else chosen
 
 
-def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
-    """The method for a start with concrete numbers, which must be on the constraints and have some freedom.
+def checked_start(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Method]:
+    """The scene with its independent rows and the method, for a start with concrete numbers on the constraints.
 
     **Raises:** ValueError that names the constraints and by how much they are violated, and the fix; for a basis that
     does not serve at the start.
     """
-    limit = start_limit(q.dtype)
-    residuals, ratio, rank = start_evidence(scene, q, v, np.asarray(t, q.dtype), limit)
+    limit, t = start_limit(q.dtype), np.asarray(t, q.dtype)
+    selection, here = known_selection(scene, q, t, method.rank_tol)
+    rank = int(np.sum(selection.kept))
+    selected = scene if rank == len(selection.kept) else keep_rows(scene, selection.kept)
+    residuals, ratio = start_evidence(selected, q, v, t, limit)
+    if ratio <= 1 and selection.opening > most_rounding(q.dtype):
+        raise ValueError(
+            f"rows of the constraints contradict each other: they depend on others, but are open by "
+            f"{float(selection.opening):.2g} of their size ({open_constraints(scene, q, v, t, limit)}); leave them out"
+        )
     if not ratio <= 1:
         raise ValueError(
-            f"q0, v0 are not on the constraints: {open_constraints(scene, q, v, t, limit)} (position residual "
+            f"q0, v0 are not on the constraints: {open_constraints(selected, q, v, t, limit)} (position residual "
             f"{float(residuals[0]):.3g}, velocity residual {float(residuals[1]):.3g}); start from "
             "state = jd.assemble(scene, q0, v0), with state.q and state.v"
         )
@@ -74,14 +83,14 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> Method:
             "leave one out, or free a joint"
         )
     if not isinstance(method, Reduced):
-        return method
+        return selected, method
     # Inside a jit, jax would trace operations on known numbers too.
     with jax.ensure_compile_time_eval():
         q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
-        method = method.fitted(scene, scene.nv - rank)
-        if method.basis is not None and not bool(_is_regular_at(scene, method.basis, q, t)):
-            raise ValueError(f"the basis does not serve at q0: {method.basis.advice(scene, q, t)}")
-    return method
+        method = method.fitted(scene, scene.nv - (here if selected is scene else rank))
+        if method.basis is not None and not bool(_is_regular_at(selected, method.basis, q, t)):
+            raise ValueError(f"the basis does not serve at q0: {method.basis.advice(selected, q, t)}")
+    return selected, method
 
 
 @eqx.filter_jit

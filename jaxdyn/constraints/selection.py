@@ -1,0 +1,303 @@
+"""Which rows of a mechanism are independent: decided once, at the start of a motion, and kept for all of it.
+
+In an overconstrained mechanism some rows depend on others, but only on the constraints. The stages of a step lie off them by
+O(h^p), where the same rows are independent: a rank that is counted there removes all freedom. Rows that a file rounds to a few
+digits are never dependent to rounding of the dtype. So rank is a property of the mechanism and not of a point:
+
+- rows that are well apart from the others are independent;
+- the others are looked at a finite distance away, on the constraints of the independent rows. Near a singular position they
+  become independent there, and are kept. Rows that stay dependent repeat what others say, and are dropped.
+
+A dropped row stays in its place as a row of zeros (`KeptRows`), so that shapes, names and multipliers are those of the scene.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import any_in_batch, compiled, compute, constant, is_staged, pseudo_inverse_by_rotations, run
+from jaxdyn.constraints.base import (
+    Constraint,
+    constraint_jacobian,
+    holonomic_rows,
+    layout,
+    position_residual,
+    velocity_residual,
+)
+from jaxdyn.constraints.rank import eps_of, tolerance
+from jaxdyn.constraints.tolerances import coordinate_sizes, row_limits
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Number, SystemLike
+from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displace, retract
+
+# Rows whose distance from the span of the others is below this part of their length may repeat what others say. Numbers written
+# with four digits leave 1e-4.
+_DOUBTFUL = 1e-3
+# How far away doubtful rows are looked at, rad or lengths of the mechanism, and steps of Newton's method that go there.
+_FAR, _NEWTON_STEPS = 0.2, 12
+# A row below this part of the largest one of its constraint has no direction of its own: it is what rounding has left.
+_TINY_ROW = 1e-3
+
+
+class KeptRows(Constraint):
+    """A constraint whose dropped rows are zero. `kept` (n,) is 1 for rows that stay, 0 for dropped ones."""
+
+    inner: Constraint
+    kept: Float[Array, " n"]
+    name: str = eqx.field(static=True)
+
+    def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
+        """Of the inner constraint."""
+        return self._of_position(self.inner.position(system, q, t))
+
+    def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
+        """Of the inner constraint."""
+        residual = self.inner.velocity(system, q, v, t)
+        return None if residual is None else residual * self.kept[-residual.shape[0] :].astype(q.dtype)
+
+    def sizes(self, system, dtype) -> tuple[int, int]:
+        """Of the inner constraint."""
+        return self.inner.sizes(system, dtype)
+
+    def wrench_components(self) -> tuple[int, ...] | None:
+        """Of the inner constraint."""
+        return self.inner.wrench_components()
+
+    def group(self):
+        """That of the inner constraint, apart from constraints with all rows."""
+        group = self.inner.group()
+        return None if group is None else ("kept rows", group)
+
+    def _of_position(self, residual):
+        return None if residual is None else residual * self.kept[: residual.shape[0]].astype(residual.dtype)
+
+    @classmethod
+    def grouped_position(cls, members: Sequence[Any], system, q, t) -> list:
+        """By the inner constraints, together."""
+        inner = [member.inner for member in members]
+        residuals = inner[0].grouped_position(inner, system, q, t)
+        return [member._of_position(residual) for member, residual in zip(members, residuals, strict=True)]
+
+    @classmethod
+    def grouped_motion(cls, members: Sequence[Any], system, q, v, t) -> list:
+        """By the inner constraints, together."""
+        inner = [member.inner for member in members]
+        motions = []
+        for member, (A, gamma, velocity) in zip(members, inner[0].grouped_motion(inner, system, q, v, t), strict=True):
+            kept = member.kept.astype(q.dtype)
+            motions.append((kept[:, None] * A, kept * gamma, kept * velocity))
+        return motions
+
+
+class Selection(NamedTuple):
+    """The rows of a mechanism that count: `kept` (nc,), 1 or 0, and `opening` (), by which the dropped ones are open.
+
+    `opening` is relative to the sizes of the rows, as in `row_limits`: rounding of the geometry.
+    """
+
+    kept: Float[Array, " nc"]
+    opening: Float[Array, ""]
+
+
+def keep_rows(scene: Scene, kept: Float[Array, " nc"]) -> Scene:
+    """The scene with the rows that are not kept set to zero."""
+    constraints = tuple(
+        KeptRows(constraint, kept[place.start : place.end], constraint.name)
+        for constraint, place in zip(scene.constraints, layout(scene), strict=True)
+    )
+    return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
+
+
+def is_selected(scene: Scene) -> bool:
+    """Whether rows of the scene were chosen by `keep_rows`."""
+    return any(isinstance(constraint, KeptRows) for constraint in scene.constraints)
+
+
+def all_rows(scene: Scene) -> Scene:
+    """The scene with the rows that `keep_rows` has dropped."""
+    if not is_selected(scene):
+        return scene
+    constraints = tuple(c.inner if isinstance(c, KeptRows) else c for c in scene.constraints)
+    return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
+
+
+def kept_of(scene: Scene) -> Array | None:
+    """1 for rows that stay and 0 for dropped ones, (nc,), or None where none was looked at."""
+    return jnp.concatenate([c.kept for c in scene.constraints]) if is_selected(scene) else None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def scaled_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
+    """A for distances in units of the mechanism's length, each row scaled to length 1; rows of rounding alone stay small."""
+    sizes, _ = coordinate_sizes(scene.system, q.dtype)
+    A = constraint_jacobian(scene, q, t) * sizes[None]
+    squares = jnp.sum(A * A, 1)
+    largest = []
+    for place in layout(scene):
+        for start, end in ((place.start, place.nonholonomic), (place.nonholonomic, place.end)):
+            if end > start:
+                largest.append(jnp.broadcast_to(jnp.max(squares[start:end])[None], (end - start,)))
+    largest = jnp.concatenate(largest)
+    squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
+    some = squares > 0
+    return A * jnp.where(some, 1 / jnp.sqrt(jnp.where(some, squares, jnp.ones_like(squares))), squares)[:, None]
+
+
+def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]) -> tuple[Array, Array]:
+    """Independent rows of B by elimination with pivots: which are kept, (nc,) of 1 and 0, and their pivots (nc,).
+
+    The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
+    others; a row is kept where its pivot is above `least`.
+    """
+    none = jnp.zeros_like(B[:, 0])
+
+    def keep_next(_, state):
+        rest, kept, pivots = state
+        lengths = jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)
+        row = jnp.argmax(jnp.where((first > 0) & (lengths > least), lengths + jnp.max(lengths), lengths))
+        pivot = lengths[row]
+        along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
+        taken = pivot > least
+        rest = jnp.where(taken, rest - _product(rest, along)[:, None] * along[None], rest)
+        return rest, kept.at[row].add(taken.astype(B.dtype)), pivots.at[row].set(jnp.where(taken, pivot, pivots[row]))
+
+    return lax.fori_loop(0, min(B.shape), keep_next, (B, none, none))[1:]
+
+
+def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float | None) -> Selection:
+    """The independent rows of a mechanism at a configuration on its constraints; a constant.
+
+    With `rank_tol` rows count whose pivots are above it, at this configuration. Without, see above.
+    """
+    bare = constant(Scene(scene.system, scene.constraints))
+    q, t = constant((q, jnp.asarray(t, q.dtype)))
+    B = run(scaled_rows, bare, q, t)
+    apart = rank_tol if rank_tol is not None else _apart(B)
+    kept, pivots = eliminate(B, apart, jnp.zeros_like(B[:, 0]))
+    if rank_tol is None:
+        doubtful = any_in_batch(jnp.sum(kept) < B.shape[0])
+        kept = lax.cond(doubtful, lambda: _kept_far_away(bare, q, t, kept, apart), lambda: kept)
+    none = jnp.zeros((scene.nv,), q.dtype)
+    return Selection(kept, run(_opening, bare, q, none, t, kept))
+
+
+def _apart(like) -> float:
+    """Pivot above which rows are independent without a doubt."""
+    return max(_DOUBTFUL, 10 * tolerance(None, like))
+
+
+def _kept_far_away(scene: Scene, q, t, sure, apart: float):
+    """Which rows are independent a finite distance away, where those in `sure` are among them."""
+    sizes, _ = coordinate_sizes(scene.system, q.dtype)
+    least = tolerance(None, q)
+    held = holonomic_rows(layout(scene))
+
+    def inverse_of(rows):
+        return pseudo_inverse_by_rotations(rows * sizes[None], least)  # of coordinates in units of their sizes
+
+    # Any direction that the sure rows leave serves, as long as it moves all of the mechanism.
+    A = sure[:, None] * constraint_jacobian(scene, q, t)
+    direction = jnp.asarray(1 + np.modf(np.arange(scene.nv) * 0.618)[0], q.dtype)
+    direction = direction - _product(inverse_of(A), _product(A * sizes[None], direction))
+    length = jnp.max(jnp.abs(direction))
+    moves = length > 1e-6
+    direction = jnp.where(moves, direction / jnp.where(moves, length, jnp.ones_like(length)), direction)
+    place = displace(scene.system, q, _FAR * direction * sizes)
+
+    def close(_, place):
+        place = retract(scene.system, place)
+        A = (sure[:, None] * constraint_jacobian(scene, place, t))[held]
+        step = _product(inverse_of(A), sure[held] * position_residual(scene, place, t)) * sizes
+        # A step that is longer than the way itself leaves the branch.
+        size = jnp.max(jnp.abs(step / sizes))
+        return displace(scene.system, place, -step * jnp.minimum(1.0, _FAR / jnp.where(size > 0, size, 1.0)))
+
+    if held.size:
+        place = retract(scene.system, lax.fori_loop(0, _NEWTON_STEPS, close, place))
+    B = run(scaled_rows, scene, place, t)
+    # Sure rows may be less so there; they stay.
+    return jnp.maximum(sure, eliminate(B, 2 * apart, sure)[0])
+
+
+def _opening(scene: Scene, q, v, t, kept):
+    """Largest residual of the dropped rows over their sizes."""
+    phi, psi = position_residual(scene, q, t), velocity_residual(scene, q, v, t)
+    of_position, of_velocity = row_limits(scene, q, v, t, 1.0)
+    dropped = 1 - kept
+    ratios = jnp.abs(phi) / of_position * dropped[holonomic_rows(layout(scene))], jnp.abs(psi) / of_velocity * dropped
+    return jnp.max(jnp.concatenate(ratios), initial=0.0)
+
+
+def opening_of_dropped(scene: Scene, q, v, t) -> Float[Array, ""]:
+    """By which part of their size the dropped rows of a scene are open in positions and velocities; a constant."""
+    bare, kept = constant((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
+    q, v, t = constant((q, v, jnp.asarray(t, q.dtype)))
+    return run(_opening, bare, q, v, t, kept.astype(q.dtype))
+
+
+def most_opening(opening, dtype):
+    """How far dropped rows may be open along a motion that starts with an `opening`: ten times that, and rounding."""
+    return 10 * opening + eps_of(jnp.zeros((), dtype)) ** 0.4
+
+
+def most_rounding(dtype) -> float:
+    """Opening above which rows do not repeat what others say but contradict them."""
+    return 10 * _apart(jnp.zeros((), dtype))
+
+
+def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selection, int]:
+    """`select_rows` for concrete numbers, and the number of rows that are independent there."""
+    bare = Scene(scene.system, scene.constraints)
+    B = compute(scaled_rows, bare, q, t, given=not is_staged())
+    # Pivots of a QR factorisation with column exchanges are those of `eliminate`.
+    pivots = _pivots(B)
+    apart = _apart(B) if rank_tol is None else rank_tol
+    if np.sum(pivots > apart) == B.shape[0]:
+        return Selection(np.ones(B.shape[0], B.dtype), np.zeros((), B.dtype)), B.shape[0]  # pyright: ignore[reportArgumentType]
+    with jax.ensure_compile_time_eval():
+        kept, opening = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol)
+    return Selection(np.asarray(kept), np.asarray(opening)), int(np.sum(pivots > tolerance(rank_tol, B)))  # pyright: ignore[reportArgumentType]
+
+
+@compiled
+def _select_compiled(scene: Scene, q, t, rank_tol):
+    return select_rows(scene, q, t, rank_tol)
+
+
+def _pivots(B: np.ndarray) -> np.ndarray:
+    rest, pivots = np.array(B), []
+    for _ in range(min(B.shape)):
+        lengths = np.linalg.norm(rest, axis=1)
+        row = int(np.argmax(lengths))
+        pivots.append(lengths[row])
+        if lengths[row] == 0:
+            break
+        along = rest[row] / lengths[row]
+        rest = rest - np.outer(rest @ along, along)
+    return np.asarray(pivots)
+
+
+def spread_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Float[Array, " nc"]:
+    """The multipliers of least norm of all rows that give the same force as `lam` of the kept ones.
+
+    With the dropped rows as combinations A_d = C A_k of the kept ones, lam_k + C^T lam_d = lam, whose shortest solution is
+    [1; C] (1 + C^T C)^-1 lam.
+    """
+    kept, whole = kept_of(scene), all_rows(scene)
+    return run(_spread, Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype), lam, kept)
+
+
+def _spread(scene: Scene, q, t, lam, kept):
+    A, kept = constraint_jacobian(scene, q, t), kept.astype(q.dtype)
+    own = kept[:, None] * A
+    gram = _product(own, own.T) + jnp.diag(1 - kept)
+    C = solve_factored(cholesky(gram), _product(own, ((1 - kept)[:, None] * A).T)).T
+    shared = solve_factored(cholesky(jnp.eye(A.shape[0], dtype=A.dtype) + _product(C.T, C)), kept * lam)
+    return kept * shared + _product(C, shared)
