@@ -178,14 +178,26 @@ def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float
     """
     bare = constant(Scene(scene.system, scene.constraints))
     q, t = constant((q, jnp.asarray(t, q.dtype)))
-    B = run(scaled_rows, bare, q, t)
-    apart = rank_tol if rank_tol is not None else _apart(B)
-    kept, pivots = eliminate(B, apart, jnp.zeros_like(B[:, 0]))
-    if rank_tol is None:
-        doubtful = any_in_batch(jnp.sum(kept) < B.shape[0])
-        kept = lax.cond(doubtful, lambda: _kept_far_away(bare, q, t, kept, apart), lambda: kept)
-    none = jnp.zeros((scene.nv,), q.dtype)
-    return Selection(kept, run(_opening, bare, q, none, t, kept))
+    count = layout(bare)[-1].end
+    every = jnp.ones((count,), q.dtype), jnp.zeros((), q.dtype)
+    apart = rank_tol if rank_tol is not None else _apart(q)
+
+    def select():
+        kept = eliminate(run(scaled_rows, bare, q, t), apart, jnp.zeros_like(every[0]))[0]
+        if rank_tol is None:
+            kept = _kept_far_away(bare, q, t, kept, apart)
+        return kept, run(_opening, bare, q, jnp.zeros((scene.nv,), q.dtype), t, kept)
+
+    if count > scene.nv:
+        return Selection(*select())
+    doubtful = any_in_batch(~(run(_least_distance, bare, q, t) > apart))
+    return Selection(*lax.cond(doubtful, select, lambda: every))
+
+
+def _least_distance(scene: Scene, q, t):
+    """Least distance of a row from the span of those before it; NaN where there is none."""
+    B = scaled_rows(scene, q, t)
+    return jnp.min(jnp.diagonal(cholesky(_product(B, B.T))))
 
 
 def _apart(like) -> float:

@@ -8,7 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import map_rows
-from jaxdyn.constraints.selection import is_selected, keep_rows, most_rounding, opening_of_dropped, select_rows
+from jaxdyn.constraints.selection import (
+    all_rows,
+    is_selected,
+    keep_rows,
+    most_rounding,
+    opening_of_dropped,
+    select_rows,
+)
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation import contacts as unilateral
@@ -171,7 +178,8 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
 
         def is_met(row):
             force = eqs.generalized_force(eqs.args, *row)
-            return method.satisfies(scene, *row[1:], force)  # pyright: ignore[reportCallIssue]
+            # Rows that repeat others at the start may ask for something else later.
+            return method.satisfies(all_rows(scene), *row[1:], force)  # pyright: ignore[reportCallIssue]
 
         met = map_rows(is_met, (y, q, v, ts))
         failures.append(((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows))
