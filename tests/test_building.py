@@ -543,3 +543,26 @@ def test_swapped_arguments_of_inertias_are_named():
     for function in (jd.inertia.spatial_inertia, jd.inertia.pseudo_inertia, jd.inertia.to_log_cholesky):
         with pytest.raises(ValueError, match=r"parameters has shape \(4, 4\), expected parameters \(10,\)"):
             function(jnp.eye(4))
+
+
+def test_a_motion_that_starts_where_a_gimbal_locks_says_so():
+    """Three hinges with massless links: where the first and the last are parallel, no inertia answers to their difference."""
+    builder = ModelBuilder("gimbal", gravity=None)
+    for name, parent, axis in (("x", None, (1, 0, 0)), ("y", "x", (0, 1, 0)), ("z", "y", (0, 0, 1))):
+        builder.add_body(name, parent, axis=axis, inertia=BALL if name == "z" else None)
+    model, v = builder.build(), jnp.asarray([0.1, 0.2, 0.3])
+
+    def result(angle):
+        q = jnp.stack([jnp.asarray(0.1), angle, jnp.asarray(0.2)])
+        return jd.simulate(model, q, v, [0.0, 0.1], outputs=("energy",), throw=False)
+
+    for angle in (np.pi / 2, -np.pi / 2):
+        assert result(jnp.asarray(angle)).result == jd.RESULTS.singular_mass_matrix
+    with pytest.raises(RuntimeError, match=r"not positive definite.* Fix: give massless bodies an inertia"):
+        jd.simulate(model, [0.1, np.pi / 2, 0.2], v, [0.0, 0.1])
+    codes = jax.jit(jax.vmap(lambda angle: result(angle).success))(jnp.asarray([np.pi / 2, 0.3]))
+    assert codes.tolist() == [False, True]
+    # Next to it the motion is that of a free body, whose energy is constant.
+    near = result(jnp.asarray(1.57))
+    assert bool(near.success)
+    np.testing.assert_allclose(near.energy, near.energy[0], rtol=1e-7)  # rates of 1e3 amplify the tolerance

@@ -28,6 +28,7 @@ from jaxdyn.constraints.base import (
     holonomic_rows,
     layout,
     position_residual,
+    rows,
     velocity_residual,
 )
 from jaxdyn.constraints.rank import eps_of, tolerance
@@ -226,8 +227,8 @@ def _kept_far_away(scene: Scene, q, t, sure, apart: float):
     least = tolerance(None, q)
     held = holonomic_rows(layout(scene))
 
-    def inverse_of(rows):
-        return pseudo_inverse_by_rotations(rows * sizes[None], least)  # of coordinates in units of their sizes
+    def inverse_of(A):
+        return pseudo_inverse_by_rotations(A * sizes[None], least)  # of coordinates in units of their sizes
 
     # Any direction that the sure rows leave serves, as long as it moves all of the mechanism.
     A = sure[:, None] * constraint_jacobian(scene, q, t)
@@ -273,6 +274,20 @@ def opening_of_dropped(scene: Scene, q, t, v=None) -> Float[Array, ""]:
     kept, q, t = constant((kept.astype(q.dtype), q, jnp.asarray(t, q.dtype)))
     opening = run(_opening, bare, q, t, kept)
     return opening if v is None else jnp.maximum(opening, run(_opening_rate, bare, q, constant(v), t, kept))
+
+
+def missed_by_dropped(scene: Scene, q, v, t, a) -> Float[Array, ""]:
+    """Largest |A a - gamma| of the dropped rows of a scene, if any, over the sizes of what cancels in it; a constant."""
+    if not is_selected(scene):
+        return jnp.zeros((), q.dtype)
+    whole, kept = constant((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
+    q, v, t, a = constant((q, v, jnp.asarray(t, q.dtype), a))
+    A, gamma, _ = rows(whole, q, v, t)
+    sizes = jnp.abs(gamma) + _product(jnp.abs(A), jnp.abs(a))
+    sizes = sizes + jnp.max(sizes)
+    some = sizes > 0
+    ratio = jnp.abs(_product(A, a) - gamma) / jnp.where(some, sizes, jnp.ones_like(sizes))
+    return jnp.max(jnp.where(some, ratio, jnp.zeros_like(ratio)) * (1 - kept.astype(q.dtype)))
 
 
 def gap_of_dropped(scene: Scene, q, t) -> Float[Array, ""]:

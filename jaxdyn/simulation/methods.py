@@ -22,7 +22,14 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
 from jaxdyn.constraints.rank import checked_tolerance
-from jaxdyn.constraints.selection import is_selected, most_opening, opening_of_dropped, spread_multipliers
+from jaxdyn.constraints.selection import (
+    is_selected,
+    missed_by_dropped,
+    most_opening,
+    most_rounding,
+    opening_of_dropped,
+    spread_multipliers,
+)
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import _product
@@ -169,8 +176,10 @@ class Multipliers(Method):
     def satisfies(
         self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
     ) -> Array:
-        """From `constrained_dynamics`."""
-        return dynamics(scene, q, v, t, force, self.rank_tol).result != RESULTS.contradictory_rows
+        """From `constrained_dynamics`; rows that were dropped at the start may ask for something else now."""
+        found = dynamics(scene, q, v, t, force, self.rank_tol)
+        met = found.result != RESULTS.contradictory_rows
+        return met & (missed_by_dropped(scene, q, v, t, found.acceleration) <= most_rounding(q.dtype))
 
 
 class Projected(Multipliers):

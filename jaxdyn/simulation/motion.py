@@ -7,9 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.compile import map_rows
+from jaxdyn.compile import map_rows, run
 from jaxdyn.constraints.selection import (
-    all_rows,
     gap_of_dropped,
     is_selected,
     keep_rows,
@@ -39,6 +38,7 @@ from jaxdyn.simulation.solvers.inputs import (
     turning,
     usable_steps,
 )
+from jaxdyn.simulation.start import has_definite_mass
 from jaxdyn.systems.scene import Scene, check_callback
 from jaxdyn.systems.system import displace, has_followers, retract
 
@@ -163,6 +163,8 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     failures.append((~start_ok, RESULTS.inconsistent_start))
     if is_free is not None:
         failures.append((~is_free, RESULTS.no_freedom))
+    if options["checks_mass"]:
+        failures.append((~run(has_definite_mass, system, q0, ts[0]), RESULTS.singular_mass_matrix))
     if first is not None:
         failures.append((~is_regular(first), RESULTS.singular_basis))
     failures.append((nonfinite, RESULTS.nonfinite_state))
@@ -178,8 +180,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
 
         def is_met(row):
             force = eqs.generalized_force(eqs.args, *row)
-            # Rows that repeat others at the start may ask for something else later.
-            return method.satisfies(all_rows(scene), *row[1:], force)  # pyright: ignore[reportCallIssue]
+            return method.satisfies(scene, *row[1:], force)  # pyright: ignore[reportCallIssue]
 
         met = map_rows(is_met, (y, q, v, ts))
         failures.append(((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows))

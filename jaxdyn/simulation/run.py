@@ -42,7 +42,7 @@ from jaxdyn.simulation.solvers.inputs import (
     check_tolerance,
     check_turns,
 )
-from jaxdyn.simulation.start import checked_start, chosen_method
+from jaxdyn.simulation.start import checked_start, chosen_method, may_have_singular_mass
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, System, has_followers
 
@@ -194,6 +194,7 @@ def simulate(
         "max_steps": checked_step_limit(max_steps, ts, stepsize, adjoint),
         "limit_is_given": max_steps is not None,
         "max_events": max_events,
+        "checks_mass": may_have_singular_mass(scene.system),
         "selects_rows": bool(scene.constraints) and not is_concrete((scene, method, q0, v0, ts)),
     }
     if modal and is_fixed(stepsize) and max_steps is None:

@@ -5,9 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.assembly import open_constraints, start_evidence
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.selection import keep_rows, known_selection, most_rounding
+from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.tree import Model
 from jaxdyn.simulation.methods import (
     Baumgarte,
     Free,
@@ -19,6 +23,7 @@ from jaxdyn.simulation.methods import (
     is_regular,
     start_limit,
 )
+from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene
 
 METHODS: dict[str, type[Method]] = {
@@ -91,6 +96,21 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Method]
         if method.basis is not None and not bool(_is_regular_at(selected, method.basis, q, t)):
             raise ValueError(f"the basis does not serve at q0: {method.basis.advice(selected, q, t)}")
     return selected, method
+
+
+def may_have_singular_mass(system) -> bool:
+    """Whether the mass matrix of a tree can be singular: where a body's inertia is not known to be positive definite."""
+    if not isinstance(system, Model):
+        return False  # other systems are checked by their own rules
+    if not is_concrete(system.inertias):
+        return True
+    sizes = [np.linalg.eigvalsh(f64.pseudo_inertia(x)) for x in np.asarray(system.inertias, float)]
+    return not all(least > 1e-12 * largest for least, *_, largest in sizes)
+
+
+def has_definite_mass(system, q, t):
+    """Whether the mass matrix is positive definite to rounding, ()."""
+    return mass_factor(mass_matrix(system, q, t)).definite()
 
 
 @eqx.filter_jit
