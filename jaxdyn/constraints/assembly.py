@@ -1,45 +1,76 @@
 """Putting a scene on its constraints: `assemble` from a rough guess."""
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import along, compiled, compute, constant, implicit, is_concrete, is_staged, run
-from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
-from jaxdyn.constraints.codes import RESULTS, Outcome
-from jaxdyn.constraints.dynamics import correction, right_inverse, whitened_rows
+from jaxdyn.compile import compiled, compute, constant, is_concrete, is_staged, run
+from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
+from jaxdyn.constraints.closing import displacement_from, follow_path, nearest_configuration
+from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
+from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
-from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, openness, row_limits
-from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.constraints.rank import checked_tolerance, tolerance
+from jaxdyn.constraints.selection import keep_rows, most_rounding, opening_of_dropped, select_rows, surely_apart
+from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, check_state, or_zeros
-from jaxdyn.model.tree import Model, difference
-from jaxdyn.systems.mass_factor import mass_factor
+from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import displace, retract
-
-_NEAREST_STEPS = 30
-_NEWTON_STEPS = 40
-_STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
+from jaxdyn.systems.system import displace
 
 
 class Assembly(Outcome):
-    """State on the constraints: `q` (nq,), `v` (nv,), largest `residual` (2,) left in |phi| and |A v - b|, `result`.
+    """State on the constraints.
 
-    `guesses`: how many starts were tried; 1 says that the given one led there.
+    - `q` (nq,), `v` (nv,); largest `residual` (2,) left in |phi| (m or rad) of all rows and |A v - b| of those kept; `result`.
+    - `distance` (): largest change of a coordinate from the guess, rad or lengths of the mechanism.
+    - `passed_singular` (): whether the path from the guess came through a singular position, so that the branch may be another.
+    - `dropped` (nc,): 1 for rows that repeat what others say but for rounding, and `gaps` (nc,): by how much these are open, m or
+      rad; `layout`: name and place of each constraint's rows.
+    - `guesses`: how many starts were tried; 1 says that the given one led there.
     """
 
     q: Float[Array, " nq"]
     v: Float[Array, " nv"]
     residual: Float[Array, "2"]
     result: Any
+    distance: Float[Array, ""]
+    passed_singular: Bool[Array, ""]
+    dropped: Float[Array, " nc"]
+    gaps: Float[Array, " nc"]
+    layout: tuple[Layout, ...] = eqx.field(static=True)
     guesses: int = eqx.field(static=True, default=1)
+
+    def redundancies(self) -> list[str]:
+        """In words, which constraints have rows that repeat others, and by how much these stay open; of a known assembly."""
+        dropped, gaps = np.asarray(self.dropped), np.asarray(self.gaps)
+        lines = []
+        for place in self.layout:
+            rows = slice(place.start, place.end)
+            if count := int(dropped[rows].sum()):
+                lines.append(
+                    f"dropped {count} redundant row{'s' * (count > 1)} of {place.name!r}, open by up to "
+                    f"{float(gaps[rows].max()):.2g} (m or rad)"
+                )
+        return lines
+
+    def __str__(self) -> str:
+        if not is_concrete(self.q) or np.ndim(self.q) > 1:
+            return f"Assembly: q {self.q.shape}, v {self.v.shape}"
+        words = [
+            f"Assembly: {name_of(self.result)}, residual {float(self.residual[0]):.2g} (m or rad) and "
+            f"{float(self.residual[1]):.2g} (1/s), {float(self.distance):.3g} from the guess"
+        ]
+        if bool(self.passed_singular):
+            words.append("the path came through a singular position: the branch may be another than that of the guess")
+        return "\n  ".join([*words, *self.redundancies()])
 
 
 def assemble(
@@ -50,13 +81,17 @@ def assemble(
     *,
     hold: Mapping[str, Any] | None = None,
     guesses: int = 16,
+    steps: int = 100,
+    atol: float | None = None,
     rank_tol: float | None = None,
     throw: bool | None = None,
 ) -> Assembly:
     """Find q with phi(q, t) = 0 and v with A v = b from a rough guess, with the least change in the mass metric.
 
-    q minimises |q - guess| in the metric M(guess) among the configurations on the constraints (a local minimum, by
-    repeated linearisation, then Newton steps to rounding); v is the guess plus the least change in the metric M(q).
+    q minimises |q - guess| in the metric M(guess) among the configurations on the constraints: a local minimum on the branch
+    to which short steps lead that reduce all residuals together. Hinges stay within half a turn of the guess. v is the guess plus
+    the least change in the metric M(q). Rows that repeat others but for the digits of a file are left open by these digits, and the
+    others are closed to rounding (see `Assembly.dropped`).
 
     **Arguments:**
 
@@ -65,7 +100,11 @@ def assemble(
     - `guesses`: how many configurations to start from, where all inputs are concrete. The first is the given one; the others,
       tried only where it fails, lie around it at random (the same ones in every call), farther and farther away, by up to pi
       (rad, or lengths of the mechanism).
-    - `rank_tol` as in `constrained_dynamics`.
+    - `steps`: most steps of the path from the guess, each of at most 0.3 rad or lengths of the mechanism.
+    - `atol`: m or rad; residuals of positions up to it count as closed. Where the rows cannot all be met q is then the point of
+      least squares. By default rows that are independent must close to rounding.
+    - `rank_tol`: rows count whose distance from the span of the others is above this part of their length. By default those that
+      are independent, here or a finite distance away.
     - `throw`: raise when it fails, by default if all inputs are concrete.
 
     **Returns:** `Assembly`. Derivatives, of any order, with respect to the guess and the scene's numbers are those of the
@@ -78,21 +117,28 @@ def assemble(
     state = jd.assemble(jd.scenes.four_bar(), jnp.zeros(3), hold={"1": 0.5})
     ```
     """
-    scene = as_scene(scene)
-    if isinstance(guesses, bool) or not isinstance(guesses, int) or guesses < 1:
-        raise ValueError(f"guesses is {guesses!r}; give how many configurations to start from, at least 1")
+    scene, rank_tol = as_scene(scene), checked_tolerance(rank_tol)
+    for name, count in (("guesses", guesses), ("steps", steps)):
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            what = "how many configurations to start from" if name == "guesses" else "how many steps to take at most"
+            raise ValueError(f"{name} is {count!r}; give {what}, at least 1")
+    if atol is not None and (not is_concrete(atol) or not 0 <= float(atol) < np.inf):
+        raise ValueError(f"atol is {atol!r}; give a length (m) or an angle (rad) that is not negative, or None")
     v = or_zeros(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
     layout(locked)  # refuses joints that do not exist
     concrete = is_concrete(locked, q, v, t)
-    assembly = _assemble(locked, q, v, t, rank_tol, scene if hold else None)
+    atol = None if atol is None else float(atol)
+
+    def from_guess(q):
+        return _assemble(locked, q, v, t, rank_tol, atol, steps, scene if hold else None)
+
+    assembly = from_guess(q)
     if concrete and not bool(assembly.success):
-        assembly = _from_elsewhere(
-            assembly, guesses, lambda q: _assemble(locked, q, v, t, rank_tol, scene if hold else None), locked, q
-        )
+        assembly = _from_elsewhere(assembly, guesses, from_guess, locked, q)
     if concrete and (throw is None or throw) and not bool(assembly.success):
-        left = open_constraints(locked, assembly.q, assembly.v, t, _closed_to(q.dtype))
+        left = open_constraints(locked, assembly.q, assembly.v, t, closed_to(q.dtype))
         tried = f" (nor are they from {guesses - 1} configurations around it)" if guesses > 1 else ""
         raise ValueError(f"not assembled: {left}{tried}; give a better guess")
     if throw and not concrete:
@@ -100,7 +146,7 @@ def assemble(
     return assembly
 
 
-def _closed_to(dtype) -> float:
+def closed_to(dtype) -> float:
     """Part of the mechanism's length that counts as rounding of what has converged."""
     return float(jnp.finfo(dtype).eps) ** 0.7
 
@@ -114,23 +160,75 @@ def _from_elsewhere(assembly: Assembly, guesses: int, assembled: Callable, scene
         step = jnp.asarray(chance.uniform(-far, far, scene.nv), q.dtype) * sizes
         other = assembled(displace(scene.system, q, step))
         if bool(other.success):
-            return Assembly(other.q, other.v, other.residual, other.result, tried + 1)
+            return eqx.tree_at(
+                lambda found: found.distance,
+                dataclasses.replace(other, guesses=tried + 1),
+                jnp.max(jnp.abs(displacement_from(scene, q, other.q)) / sizes),
+            )
     return assembly
 
 
 @compiled
-def _assemble(locked, q, v, t, rank_tol, scene):
+def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
     """The scene `locked` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
-    if holonomic_rows(layout(locked)).size:
-        q = _closed(Scene(locked.system, locked.constraints), q, t, rank_tol)
-    limit, good = _closed_to(q.dtype), jnp.asarray(True)
-    if scene is not None:
-        good = openness(locked, q, _with_velocity(locked, q, v, t, rank_tol), t, limit) <= 1.0
-    scene = locked if scene is None else scene
+    guess, whole = q, locked
+    passed = jnp.asarray(False)
+    has_positions = bool(holonomic_rows(layout(locked)).size)
+    bare = Scene(locked.system, locked.constraints)
+    if has_positions:
+        fixed, start, time = constant((bare, q, t))
+        loose = tolerance(rank_tol, q) if rank_tol is not None else surely_apart(q)
+        q, passed = follow_path(fixed, start, time, loose, steps)
+    selection = select_rows(bare, q, t, rank_tol)
+    locked = keep_rows(bare, selection.kept)
+    if has_positions:
+        q = _turned_back(locked, guess, nearest_configuration(locked, guess, q, t, rank_tol), t)
+    if scene is None:
+        scene = locked
+    else:
+        free = Scene(scene.system, scene.constraints)
+        scene = keep_rows(free, select_rows(free, q, t, rank_tol).kept)
     v = _with_velocity(scene, q, v, t, rank_tol)
-    residual = _sizes(position_residual(scene, q, t), velocity_residual(scene, q, v, t))
-    good = good & (openness(scene, q, v, t, limit) <= 1.0)
-    return Assembly(q, v, residual, RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled))  # pyright: ignore[reportArgumentType]
+    limits = row_limits(locked, q, jnp.zeros_like(v), t, closed_to(q.dtype))[0]
+    phi = position_residual(locked, q, t)
+    is_closed = jnp.all(jnp.abs(phi) <= limits) & (opening_of_dropped(locked, q, t) <= most_rounding(q.dtype))
+    is_admissible = jnp.all(
+        jnp.abs(velocity_residual(scene, q, v, t)) <= row_limits(scene, q, v, t, closed_to(q.dtype))[1]
+    )
+    residual = _sizes(position_residual(whole, q, t), velocity_residual(scene, q, v, t))
+    good = (is_closed if atol is None else is_closed | (residual[0] <= atol)) & is_admissible
+    sizes, _ = coordinate_sizes(whole.system, q.dtype)
+    moved = jnp.abs(displacement_from(whole, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes
+    places = layout(whole)
+    gaps = jnp.abs(position_residual(bare, q, t)) * (1 - selection.kept)[holonomic_rows(places)]
+    return Assembly(
+        q,
+        v,
+        residual,
+        RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled),  # pyright: ignore[reportArgumentType]
+        jnp.max(moved, initial=0.0),
+        passed,
+        1 - selection.kept,
+        lax.stop_gradient(jnp.zeros_like(selection.kept).at[holonomic_rows(places)].set(gaps)),
+        places,
+    )
+
+
+def _turned_back(scene, guess, q, t):
+    """q with its hinges within half a turn of the guess, where full turns make no difference to the constraints."""
+    if not isinstance(scene.system, Model):
+        return q
+    topology = scene.system.topology
+    hinges = [s.start for kind, s in zip(topology.kinds, topology.q_slices, strict=True) if kind == "revolute"]
+    if not hinges:
+        return q
+    places = np.asarray(hinges)
+    turns = jnp.round(lax.stop_gradient(q - guess)[places] / (2 * np.pi))
+    back = q.at[places].add(-2 * np.pi * turns)
+    before, after = (jnp.max(jnp.abs(position_residual(scene, x, t))) for x in (q, back))
+    _, length = coordinate_sizes(scene.system, q.dtype)
+    rounding = 64 * float(jnp.finfo(q.dtype).eps) * jnp.maximum(length, 1.0)
+    return jnp.where(lax.stop_gradient(after <= before + rounding), back, q)
 
 
 def _with_velocity(scene, q, v, t, rank_tol):
@@ -139,117 +237,6 @@ def _with_velocity(scene, q, v, t, rank_tol):
     for _ in range(2):
         v = v - _product(B, velocity_residual(scene, q, v, t))
     return v
-
-
-def _closed(scene, q, t, rank_tol):
-    """The configuration on the constraints next to a guess, with the derivatives of a minimum."""
-
-    def solve(scene, q, t):
-        return _newton(scene, _nearest(scene, q, t, rank_tol), t, rank_tol)
-
-    def differentiable(scene, q, t):
-        fixed, guess, frozen = constant((scene, q, t))
-        place = lax.stop_gradient(solve(fixed, guess, frozen))
-        e = difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
-        moved = displace(scene.system, q, _stationary(scene, q, t, e, rank_tol))
-        # Going from the guess to the solution and back again costs digits that the solution itself has.
-        return retract(scene.system, place + (moved - lax.stop_gradient(moved)))
-
-    def tangent(scene, q, t, steps):
-        place, change = along(differentiable, (scene, q, t), steps)
-        return place, jnp.zeros_like(place) if change is None else change
-
-    return implicit(scene, (q, t), solve, tangent)
-
-
-def _linearized(scene, guess, t, e):
-    """phi at a displacement e from the guess, and its derivative in e: rows times the velocity for a rate of e."""
-    place = displace(scene.system, guess, e)
-    A = constraint_jacobian(scene, place, t)[holonomic_rows(layout(scene))]
-    if isinstance(scene.system, Model):
-        A = _product(A, jax.jacfwd(lambda e: difference(scene.system, place, displace(scene.system, guess, e)))(e))
-    return position_residual(scene, place, t), A
-
-
-def _nearest(scene, guess, t, rank_tol):
-    """Displacement e from the guess of least |e| in the metric M(guess) with phi = 0, by repeated linearisation."""
-    metric, _ = run(whitened_rows, scene, guess, t)
-
-    def residual(e):
-        return position_residual(scene, displace(scene.system, guess, e), t)
-
-    sizes, _ = coordinate_sizes(scene.system, guess.dtype)
-
-    def improve(state):
-        e, _, count = state
-        phi, A = run(_linearized, scene, guess, t, e)
-        new = _product(right_inverse(metric, A, rank_tol), _product(A, e) - phi)
-        return new, jnp.max(jnp.abs(new - e) / sizes), count + 1
-
-    def unfinished(state):
-        e, change, count = state
-        return (count < _NEAREST_STEPS) & (change > 1e-7) & jnp.isfinite(e).all()
-
-    start = jnp.zeros((scene.nv,), guess.dtype)
-    e, _, _ = lax.while_loop(unfinished, improve, (start, jnp.asarray(jnp.inf, guess.dtype), 0))
-    better = jnp.max(jnp.abs(residual(e))) < jnp.max(jnp.abs(residual(start)))
-    return displace(scene.system, guess, jnp.where(better, e, start))
-
-
-def _stationary(scene, guess, t, e, rank_tol):
-    """The displacement e from the guess, known in value, as a differentiable solution of M(guess) e + A^T lam = 0, phi = 0."""
-    mass = mass_matrix(scene.system, guess, t)
-    metric = mass_factor(mass)
-
-    def residual(e):
-        return position_residual(scene, displace(scene.system, guess, e), t)
-
-    def conditions(z):
-        e, lam = z[: scene.nv], z[scene.nv :]
-        phi, back = jax.vjp(residual, e)
-        return jnp.concatenate([_product(mass, e) + back(lam)[0], phi])
-
-    def solve(linear, right):
-        """By the null space of A, on which the Hessian of the Lagrangian is definite; A may have dependent rows."""
-        matrix = jax.jacfwd(linear)(jnp.zeros_like(right))
-        H, A = matrix[: scene.nv, : scene.nv], matrix[scene.nv :, : scene.nv]
-        B = right_inverse(metric, A, rank_tol)
-        null_projector = jnp.eye(scene.nv, dtype=A.dtype) - _product(B, A)
-        along = _product(B, right[scene.nv :])
-        left = right[: scene.nv] - _product(H, along)
-        # Across the null space M stands in for H, so that the matrix is regular.
-        across = jnp.eye(scene.nv, dtype=A.dtype) - null_projector
-        whole = _product(null_projector.T, _product(H, null_projector)) + _product(across.T, _product(mass, across))
-        step = along + _product(null_projector, jnp.linalg.solve(whole, _product(null_projector.T, left)))
-        return jnp.concatenate([step, _product(B.T, right[: scene.nv] - _product(H, step))])
-
-    A = jax.jacrev(residual)(e)
-    lam = -_product(right_inverse(metric, A, rank_tol).T, _product(mass, e))
-    known = lax.stop_gradient(jnp.concatenate([e, lam]))
-    return lax.custom_root(conditions, known, lambda conditions, known: known, solve)[: scene.nv]
-
-
-def _newton(scene, q, t, rank_tol):
-    """Gauss-Newton steps with a choice of lengths, until the residual is at rounding or no longer falls."""
-    lengths = jnp.asarray(_STEP_LENGTHS, q.dtype)
-
-    def size(q):
-        return jnp.max(jnp.abs(position_residual(scene, q, t)))
-
-    def improve(state):
-        q, error, _, count = state
-        step = -_product(correction(scene, q, t, rank_tol, holonomic=True), position_residual(scene, q, t))
-        tried = jax.vmap(lambda s: retract(scene.system, displace(scene.system, q, s * step)))(lengths)
-        errors = lax.map(size, tried)  # by the kernel of one sample
-        best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.full_like(errors, jnp.inf)))
-        falls = errors[best] < error
-        return jnp.where(falls, tried[best], q), jnp.where(falls, errors[best], error), falls, count + 1
-
-    def unfinished(state):
-        _, error, falls, count = state
-        return falls & (error > 0) & (count < _NEWTON_STEPS)
-
-    return lax.while_loop(unfinished, improve, (q, size(q), jnp.asarray(True), 0))[0]
 
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:

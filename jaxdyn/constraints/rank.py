@@ -130,6 +130,11 @@ def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
     return P, dP
 
 
+def solve_square(A: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """A^-1 right for a regular A, by rotations: without LAPACK, whose calls in a batch can wait for each other for ever."""
+    return _product(pseudo_inverse(A, eps_of(A), True), right)
+
+
 def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:
     """-1 where the determinant is negative, else 1; a constant."""
     return run(_sign, None, lax.stop_gradient(A), otherwise=_sign_by_lapack)

@@ -178,17 +178,29 @@ def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float
     """
     bare = constant(Scene(scene.system, scene.constraints))
     q, t = constant((q, jnp.asarray(t, q.dtype)))
-    B = run(scaled_rows, bare, q, t)
-    apart = rank_tol if rank_tol is not None else _apart(B)
-    kept, pivots = eliminate(B, apart, jnp.zeros_like(B[:, 0]))
-    if rank_tol is None:
-        doubtful = any_in_batch(jnp.sum(kept) < B.shape[0])
-        kept = lax.cond(doubtful, lambda: _kept_far_away(bare, q, t, kept, apart), lambda: kept)
-    none = jnp.zeros((scene.nv,), q.dtype)
-    return Selection(kept, run(_opening, bare, q, none, t, kept))
+    count = layout(bare)[-1].end
+    every = jnp.ones((count,), q.dtype), jnp.zeros((), q.dtype)
+    apart = rank_tol if rank_tol is not None else surely_apart(q)
+
+    def select():
+        kept = eliminate(run(scaled_rows, bare, q, t), apart, jnp.zeros_like(every[0]))[0]
+        if rank_tol is None:
+            kept = _kept_far_away(bare, q, t, kept, apart)
+        return kept, run(_opening, bare, q, t, kept)
+
+    if count > scene.nv:
+        return Selection(*select())
+    doubtful = any_in_batch(~(run(_least_distance, bare, q, t) > apart))
+    return Selection(*lax.cond(doubtful, select, lambda: every))
 
 
-def _apart(like) -> float:
+def _least_distance(scene: Scene, q, t):
+    """Least distance of a row from the span of those before it; NaN where there is none."""
+    B = scaled_rows(scene, q, t)
+    return jnp.min(jnp.diagonal(cholesky(_product(B, B.T))))
+
+
+def surely_apart(like) -> float:
     """Pivot above which rows are independent without a doubt."""
     return max(_DOUBTFUL, 10 * tolerance(None, like))
 
@@ -226,20 +238,33 @@ def _kept_far_away(scene: Scene, q, t, sure, apart: float):
     return jnp.maximum(sure, eliminate(B, 2 * apart, sure)[0])
 
 
-def _opening(scene: Scene, q, v, t, kept):
-    """Largest residual of the dropped rows over their sizes."""
-    phi, psi = position_residual(scene, q, t), velocity_residual(scene, q, v, t)
-    of_position, of_velocity = row_limits(scene, q, v, t, 1.0)
-    dropped = 1 - kept
-    ratios = jnp.abs(phi) / of_position * dropped[holonomic_rows(layout(scene))], jnp.abs(psi) / of_velocity * dropped
-    return jnp.max(jnp.concatenate(ratios), initial=0.0)
+def _opening(scene: Scene, q, t, kept):
+    """Largest phi of the dropped rows over their sizes."""
+    sizes = row_limits(scene, q, jnp.zeros((scene.nv,), q.dtype), t, 1.0)[0]
+    dropped = 1 - kept[holonomic_rows(layout(scene))]
+    return jnp.max(jnp.abs(position_residual(scene, q, t)) / sizes * dropped, initial=0.0)
 
 
-def opening_of_dropped(scene: Scene, q, v, t) -> Float[Array, ""]:
-    """By which part of their size the dropped rows of a scene are open in positions and velocities; a constant."""
+def _opening_rate(scene: Scene, q, v, t, kept):
+    """Largest A v - b of the dropped rows over their sizes."""
+    sizes = row_limits(scene, q, v, t, 1.0)[1]
+    return jnp.max(jnp.abs(velocity_residual(scene, q, v, t)) / sizes * (1 - kept), initial=0.0)
+
+
+def opening_of_dropped(scene: Scene, q, t, v=None) -> Float[Array, ""]:
+    """By which part of their size the dropped rows of a scene are open in positions, and in velocities v; a constant."""
     bare, kept = constant((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
-    q, v, t = constant((q, v, jnp.asarray(t, q.dtype)))
-    return run(_opening, bare, q, v, t, kept.astype(q.dtype))
+    kept, q, t = constant((kept.astype(q.dtype), q, jnp.asarray(t, q.dtype)))
+    opening = run(_opening, bare, q, t, kept)
+    return opening if v is None else jnp.maximum(opening, run(_opening_rate, bare, q, constant(v), t, kept))
+
+
+def gap_of_dropped(scene: Scene, q, t) -> Float[Array, ""]:
+    """Largest |phi| of the dropped rows of a scene, m or rad; a constant."""
+    bare, kept = constant((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
+    q, t = constant((q, jnp.asarray(t, q.dtype)))
+    dropped = 1 - kept.astype(q.dtype)[holonomic_rows(layout(bare))]
+    return jnp.max(jnp.abs(position_residual(bare, q, t)) * dropped, initial=0.0)
 
 
 def most_opening(opening, dtype):
@@ -249,7 +274,7 @@ def most_opening(opening, dtype):
 
 def most_rounding(dtype) -> float:
     """Opening above which rows do not repeat what others say but contradict them."""
-    return 10 * _apart(jnp.zeros((), dtype))
+    return 10 * surely_apart(jnp.zeros((), dtype))
 
 
 def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selection, int]:
@@ -258,7 +283,7 @@ def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selecti
     B = compute(scaled_rows, bare, q, t, given=not is_staged())
     # Pivots of a QR factorisation with column exchanges are those of `eliminate`.
     pivots = _pivots(B)
-    apart = _apart(B) if rank_tol is None else rank_tol
+    apart = surely_apart(B) if rank_tol is None else rank_tol
     if np.sum(pivots > apart) == B.shape[0]:
         return Selection(np.ones(B.shape[0], B.dtype), np.zeros((), B.dtype)), B.shape[0]  # pyright: ignore[reportArgumentType]
     with jax.ensure_compile_time_eval():

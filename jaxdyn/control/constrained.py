@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
 from jaxdyn.constraints.dynamics import projections
-from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.constraints.rank import pseudo_inverse, solve_square, tolerance
 from jaxdyn.control.errors import (
     RateError,
     Target,
@@ -280,7 +280,7 @@ class GaugeInvariant(_ForceLoop):
         push = push - _product(gauge.W, _product(gauge.V2, times(self.kd, eps, "kd")))
         normal = _product(gauge.Gamma_o, gauge.reduced_velocity) + _product(gauge.Lambda_r.T, self.pressed(q, t, state))
         # Of `push` the part of the motion, W V2 V2^T W^-1, in the place of which the normal one stands.
-        free = _product(gauge.V2, _product(gauge.V2.T, jnp.linalg.solve(gauge.W, push)))
+        free = _product(gauge.V2, _product(gauge.V2.T, solve_square(gauge.W, push)))
         tau = _product(gauge.W, free + _product(gauge.V1, normal))
         potential, force = bias_force(system, q, v, t) - _product(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
         return tau + potential if force is None else tau + potential - force
@@ -319,7 +319,7 @@ class GaugeInvariant(_ForceLoop):
         J, _, _ = self._reference_motion(q, jnp.zeros((self.scene.nv,), q.dtype), t)
         B = _product(self._to_quasi_velocities(q, t, J.shape[1]), J)
         kp, kd = as_matrix(self.kp, B[0], "kp"), as_matrix(self.kd, B[0], "kd")
-        turned = jnp.linalg.solve(B, _product(kd, B))
+        turned = solve_square(B, _product(kd, B))
         return _product(turned, kp), kp + turned
 
     def _to_quasi_velocities(self, q, t, m: int) -> Float[Array, "nr nv"]:

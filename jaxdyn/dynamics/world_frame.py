@@ -13,7 +13,6 @@ too. No function here checks its arguments: `dynamics` does.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import (
@@ -28,6 +27,7 @@ from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import _product, cross
 from jaxdyn.model.inertia import rotational_inertia, spatial_inertia, transform_inertia
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.mass_factor import cholesky, solve_factored
 
 
 def mass_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
@@ -72,8 +72,8 @@ def forward_dynamics(
     """a = M^-1 (tau - C v - N + sum J_i^T external_i), by the Cholesky factor of M."""
     frame = tree_frame(model, q)
     inertias = tree_inertias(model, frame)
-    factor = jnp.linalg.cholesky(_mass_matrix(model, frame, inertias))
-    return cho_solve((factor, True), tau - _inverse_dynamics(model, frame, inertias, v, None, external))
+    factor = cholesky(_mass_matrix(model, frame, inertias))
+    return solve_factored(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, external))
 
 
 def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
@@ -84,9 +84,9 @@ def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
     """
     frame = tree_frame(model, q)
     inertias = tree_inertias(model, frame)
-    factor = (jnp.linalg.cholesky(_mass_matrix(model, frame, inertias)), True)
-    a = cho_solve(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, None))
-    return a, cho_solve(factor, force_change(a))
+    factor = cholesky(_mass_matrix(model, frame, inertias))
+    a = solve_factored(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, None))
+    return a, solve_factored(factor, force_change(a))
 
 
 def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:

@@ -15,7 +15,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import compiled
@@ -29,6 +28,7 @@ from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import least_quality
+from jaxdyn.systems.mass_factor import cholesky, solve_factored
 from jaxdyn.systems.system import velocity_to_rate
 
 
@@ -200,8 +200,8 @@ def _solved(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multipliers) -> Ob
     mass = _product(N.T, _product(M, N))
     coriolis = _product(N.T, _product(C, N) + _product(M, Ndot))
     gravity_part, force_part = _product(N.T, gravity), _product(N.T, force)
-    factor = jnp.linalg.cholesky(mass)
-    rate = cho_solve((factor, True), force_part - _product(coriolis, nu) - gravity_part)
+    factor = cholesky(mass)
+    rate = solve_factored(factor, force_part - _product(coriolis, nu) - gravity_part)
     a = _product(N, rate) + _product(Ndot, nu)
     lam = multipliers(_product(M, a) + _product(C, v) + gravity - force)
 

@@ -17,6 +17,7 @@ from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, as_array, check_state
 from jaxdyn.reduction.bases import least_quality, orthonormal
+from jaxdyn.systems.mass_factor import solve_lower
 
 
 class Manipulability(eqx.Module):
@@ -89,7 +90,7 @@ def _measured(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulabilit
     H = scale[:, None] * N[objects]
     along, _, factor = orthonormal(H)
     # thetadot for the columns of `along`: N_hands times T^-T of H = along T^T.
-    X = jnp.linalg.solve(factor, N[hands].T).T
+    X = solve_lower(factor, N[hands].T).T
     force_axes, vectors = _axes(X)
     force_axes, vectors = force_axes[::-1], vectors[:, ::-1]
     some = force_axes > least_quality(q.dtype) ** 1.5 * force_axes[-1]

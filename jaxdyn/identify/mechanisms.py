@@ -17,6 +17,7 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.model.names import columns_in_v
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace, displacement
 
@@ -74,7 +75,7 @@ def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> Float[A
 def _least_squares(A, picked, left):
     """The smallest change that takes away what is left of constraints and of measured coordinates."""
     both = jnp.concatenate([_EXACT * A, picked])
-    return jnp.linalg.solve(both.T @ both + _STAYS * jnp.eye(both.shape[1], dtype=both.dtype), both.T @ left)
+    return solve_positive(both.T @ both + _STAYS * jnp.eye(both.shape[1], dtype=both.dtype), both.T @ left)
 
 
 def completed(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbers, guess: Numbers) -> Log:

@@ -80,8 +80,17 @@ def solution_lines(solution) -> str:
         f"Solution: {words}, t = {short(float(t[0]))} to {short(float(solution.stats['time_reached']))} s of "
         f"{short(float(t[-1]))} s\n  {solution.solver}: {steps} steps, {rejected} rejected\n"
         f"  {t.shape[0]} rows of q ({solution.q.shape[1]}), v ({solution.v.shape[1]})"
-        f"{', ' if more else ''}{', '.join(more)}"
+        f"{', ' if more else ''}{', '.join(more)}{_redundant(solution)}"
     )
+
+
+def _redundant(solution) -> str:
+    """Rows of the constraints that repeat what others say, if there are any."""
+    count = int(solution.stats.get("redundant_rows", 0))
+    if not count:
+        return ""
+    gap = short(float(solution.stats["redundant_gap"]))
+    return f"\n  dropped {count} redundant row{'s' * (count > 1)} of the constraints, open by up to {gap} (m or rad)"
 
 
 def _known(leaf, ndim: int) -> bool:

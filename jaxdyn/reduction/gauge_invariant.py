@@ -18,7 +18,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import compiled
@@ -30,6 +29,7 @@ from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, batch_hint, check_state, or_zeros
 from jaxdyn.reduction.bases import freedoms, orthonormal, split_directions
+from jaxdyn.systems.mass_factor import cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -117,11 +117,11 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     turn = unit if rotation is None else rotation
 
     def root(q, t):
-        return _product(jnp.linalg.cholesky(mass_matrix(system, q, t)), turn)
+        return _product(cholesky(mass_matrix(system, q, t)), turn)
 
     W, Wdot = jax.jvp(root, (q, t), motion)
     A, Adot = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), (q, t), motion)
-    inverse = _product(turn.T, solve_triangular(_product(W, turn.T), unit, lower=True))
+    inverse = _product(turn.T, solve_lower(_product(W, turn.T), unit))
     C = coriolis_matrix(system, q, v, t)
     w = _product(W.T, v)
     Gamma = _product(_product(inverse, C) - Wdot.T, inverse.T)

@@ -18,6 +18,7 @@ from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, o
 from jaxdyn.reduction.bases import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, tangent_basis
 from jaxdyn.reduction.minimal import reduce
 from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -219,7 +220,7 @@ def _substituted(scene, choice: Independent, q, nu, tau, t):
     _, along = jax.jvp(lambda r: -at(r)[rest], (r,), (nu,))
     slope = jax.jacfwd(lambda r: -_product(at(r)[rest], nu))(r)
     terms = _product(push, along - slope)
-    rate = jnp.linalg.solve(right.mass_matrix, right.force - wrong)
+    rate = solve_positive(right.mass_matrix, right.force - wrong)
     value = SpuriousTerms(terms, right.bias_force, wrong, right.nu_rate, rate, right.mass_matrix)
     # How much anything changes with s, at this velocity.
     forms = jax.jacfwd(lambda s: constraint_jacobian(scene, q.at[rest].set(s), t))(q[rest])

@@ -8,6 +8,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import compiled, is_concrete, numpy_for
 from jaxdyn.constraints import rolling_sphere
+from jaxdyn.constraints.rank import solve_square
 from jaxdyn.contact import Sphere, montana
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
@@ -91,7 +92,7 @@ def _sphere_arm_start(
 
 @compiled
 def _rates_of_tip(arm: Model, q, kinematics, twist):
-    return jnp.linalg.solve(body_jacobian(arm, q, "tip"), se3.Ad_apply(kinematics.finger.pose, twist))
+    return solve_square(body_jacobian(arm, q, "tip"), se3.Ad_apply(kinematics.finger.pose, twist))
 
 
 def _surfaces(radius, tip_radius):

@@ -443,4 +443,4 @@ def consistent(scene: Scene, q, v, t):
 
 def repeats(scene: Scene, opening, q, v, t):
     """Whether dropped rows are still met, along a motion that starts with them open by `opening`."""
-    return opening_of_dropped(scene, q, v, t) <= most_opening(opening, q.dtype)
+    return opening_of_dropped(scene, q, t, v) <= most_opening(opening, q.dtype)

@@ -8,7 +8,16 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import map_rows
-from jaxdyn.constraints.selection import is_selected, keep_rows, most_rounding, opening_of_dropped, select_rows
+from jaxdyn.constraints.selection import (
+    all_rows,
+    gap_of_dropped,
+    is_selected,
+    keep_rows,
+    kept_of,
+    most_rounding,
+    opening_of_dropped,
+    select_rows,
+)
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation import contacts as unilateral
@@ -59,7 +68,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         scene, opening = keep_rows(scene, selection.kept), selection.opening
         start_ok, is_free = opening <= most_rounding(q0.dtype), jnp.sum(selection.kept) < scene.nv
     elif is_selected(scene):
-        opening = opening_of_dropped(scene, q0, jnp.zeros_like(v0), ts[0])
+        opening = opening_of_dropped(scene, q0, ts[0])
     if scene.constraints:
         start_ok = start_ok & consistent(scene, q0, v0, ts[0])
         if method.projects:
@@ -171,7 +180,8 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
 
         def is_met(row):
             force = eqs.generalized_force(eqs.args, *row)
-            return method.satisfies(scene, *row[1:], force)  # pyright: ignore[reportCallIssue]
+            # Rows that repeat others at the start may ask for something else later.
+            return method.satisfies(all_rows(scene), *row[1:], force)  # pyright: ignore[reportCallIssue]
 
         met = map_rows(is_met, (y, q, v, ts))
         failures.append(((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows))
@@ -185,6 +195,10 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     rows = jax.tree.map(lambda x: rows_where(reached, x, jnp.nan), rows)
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
+    if opening is not None:
+        gaps = map_rows(lambda row: gap_of_dropped(scene, *row), (q, ts))
+        stats["redundant_rows"] = jnp.sum(1 - kept_of(scene)).astype(jnp.int32)
+        stats["redundant_gap"] = jnp.max(jnp.where(reached, gaps, jnp.zeros_like(gaps)))
     if lost is not None and unilateral.can_end(scene, options["contacts"]):
         stats["lost_contact"] = jnp.where(lost.entry < count, lost.entry, -1)
     if lost is not None and options["limits"] == "stop":

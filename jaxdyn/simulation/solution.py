@@ -112,6 +112,8 @@ class Solution(Outcome):
       along the columns of `jd.contact.wrench_basis`, N and N m.
     - `events`, of a scene with friction that sticks or contacts that open: an `Events` with `time`, `index` and `name`, else
       None. Its `contact_forces` (nt, 3) are the two components of friction and the normal force, N.
+    - Of a scene with constraints that were not all found independent before the run, `stats["redundant_rows"]` is how many rows
+      were dropped because they repeat what others say, and `stats["redundant_gap"]` by how much they are open, m or rad.
     - With `limits`, `stats["passed_limit"]` is the entry of q that was the first to pass one of its limits, or -1.
     - Of a scene with cones `stats["lost_contact"]` is the contact that ended the run, an index among those with a cone, or -1.
     """

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import is_concrete, partition_traced
+from jaxdyn.constraints.selection import keep_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import guards, in_pieces, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
@@ -73,9 +74,10 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
 
     def given(args):
-        """The scene, in the pieces that come behind tau if any do, and tau."""
-        unknown, tau, *positive = args
+        """The scene with its independent rows, in the pieces that come last if any do, and tau."""
+        unknown, tau, kept, *positive = args
         scene = known(unknown)
+        scene = scene if kept is None else keep_rows(scene, kept)
         return in_pieces(scene, pieces, *positive) if positive else scene, tau
 
     @jax.jit
@@ -106,7 +108,8 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
 
     def advance(q, v, tau, t):
         y = method.start(scene, q, v, t)
-        plan, args, ts, size = solver.plan(y), (unknown, tau), jnp.stack([t, t + length]), length / substeps
+        kept = select_rows(known(unknown), q, t, None).kept if scene.constraints else None
+        plan, args, ts, size = solver.plan(y), (unknown, tau, kept), jnp.stack([t, t + length]), length / substeps
         if pieces.names:
             laws = laws_of_pieces(plan, pieces, switching, 4, 3)
             rows = motion_in_pieces(laws, y, args, ts, (0.0, 0.0), size, substeps, substeps + 1, EVENTS, is_direct)[0]

@@ -27,6 +27,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxdyn.compile import pseudo_inverse_by_rotations
 from jaxdyn.constraints.base import (
     constraint_jacobian,
     holonomic_rows,
@@ -36,6 +37,7 @@ from jaxdyn.constraints.base import (
     velocity_residual,
 )
 from jaxdyn.constraints.dynamics import correction
+from jaxdyn.constraints.rank import solve_square
 from jaxdyn.dynamics.kinematics import body_twists, sum_to_coordinates, take, tree_frame
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
@@ -124,7 +126,7 @@ def step(scene: Scene, q, v, carried: Carried, t0, t1, generalized_force: Callab
         return matrix if carried.spare is None else matrix.at[n:, n:].add(carried.spare)
 
     def solve_linear(linear, right):
-        return jnp.linalg.solve(slope(linear, jnp.zeros_like(right)), right)
+        return solve_square(slope(linear, jnp.zeros_like(right)), right)
 
     guess = lax.stop_gradient(2 * v - carried.mean)
     if A is not None:
@@ -163,7 +165,8 @@ def _newton(function, slope, z, n: int):
 
     def renew(state):
         z, _, before, count = state
-        inverse = jnp.linalg.inv(slope(z))
+        matrix = slope(z)
+        inverse = pseudo_inverse_by_rotations(matrix, float(jnp.finfo(z.dtype).eps))
 
         def repeat(state):
             z, change, _, count = state

@@ -3,6 +3,9 @@
 A tree's mass matrix has a zero for every pair of coordinates of different branches. Factored from the last coordinate to
 the first, M = U U^T with U upper triangular, it keeps them all (Featherstone 2008, section 6.5), so that programs of single
 numbers (`jaxdyn.compile`) leave them out. `MassFactor` holds U as the Cholesky factor of the matrix in reversed order.
+
+Outside of such programs, too, they are kernels: LAPACK under XLA takes a thread for each call, and two calls of a large batch at
+once can wait for each other for ever (jaxlib 0.10 to 0.12 on CPU).
 """
 
 from typing import NamedTuple
@@ -12,11 +15,15 @@ from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import compiled, run
 
 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower triangular L with L L^T = matrix, of which the lower triangle is read; NaN where it is not positive definite."""
+    return run(_cholesky, None, matrix)
+
+
+def _cholesky(_, matrix):
     return lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
@@ -39,6 +46,10 @@ def solve_lower(
     factor: Float[Array, "n n"], right: Float[Array, "n *k"], *, transposed: bool = False
 ) -> Float[Array, "n *k"]:
     """L^-1 right, or L^-T right."""
+    return run(_solve_lower, None, factor, right, static=(transposed,))
+
+
+def _solve_lower(transposed: bool, _, factor, right):
     return solve_triangular(factor, right, lower=True, trans=int(transposed))
 
 

@@ -1,0 +1,194 @@
+"""Ways from a guess to the configuration on the constraints that is nearest to it, and the derivative of where they end.
+
+1. `follow_path`: Newton's steps of limited length. Short ones follow the curve along which all residuals shrink in proportion,
+   which stays on the branch of the guess as long as it meets no singular position.
+2. `slide_to_nearest`: along the constraints, to where the change |q - guess| in the metric M(guess) is least.
+3. `polish`: Newton's steps to rounding.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jaxdyn.compile import along, constant, implicit, pseudo_inverse_by_rotations, run
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
+from jaxdyn.constraints.dynamics import correction, right_inverse, whitened_rows
+from jaxdyn.constraints.rank import eps_of, sign_of_determinant, solve_square
+from jaxdyn.constraints.tolerances import coordinate_sizes
+from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.tree import Model, difference
+from jaxdyn.systems.mass_factor import mass_factor
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displace, retract
+
+# Longest step on the way, rad or lengths of the mechanism: within it, rows turn by less than a right angle.
+_LONGEST = 0.3
+_NEAREST_STEPS = 30
+_NEWTON_STEPS = 40
+_STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
+
+
+class Path(NamedTuple):
+    """Where a path from a guess ends, and whether it came through a singular position, where branches meet."""
+
+    q: Array
+    passed_singular: Array
+
+
+def displacement_from(scene: Scene, guess, place):
+    """The displacement (nv,) from a guess to a place."""
+    return difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
+
+
+def _step_to_rows(scene: Scene, q, t, loose: float):
+    """phi, its rows A, and their right inverse B with the shortest columns in the metric M(q).
+
+    What singular values below `loose` would ask for is left out: rows that repeat others but for rounding must not decide.
+    """
+    held = holonomic_rows(layout(scene))
+    metric, Y = run(whitened_rows, scene, q, t)
+    B = metric.unwhiten(pseudo_inverse_by_rotations(Y[:, held], loose).T)
+    return position_residual(scene, q, t), constraint_jacobian(scene, q, t)[held], B
+
+
+def follow_path(scene: Scene, guess, t, loose: float, steps: int) -> Path:
+    """Newton's steps of limited length towards the constraints."""
+    sizes, _ = coordinate_sizes(scene.system, guess.dtype)
+    done = eps_of(guess) ** 0.6
+
+    def improve(state):
+        q, _, passed, A_before, B_before, count = state
+        phi, A, B = _step_to_rows(scene, q, t, loose)
+        step = -_product(B, phi)
+        size = jnp.max(jnp.abs(step) / sizes)
+        step = step * jnp.minimum(1.0, _LONGEST / jnp.where(size > 0, size, jnp.ones_like(size)))
+        # Rows have turned over where a combination of them went through zero.
+        own = jnp.eye(phi.shape[0], dtype=phi.dtype) - _product(A_before, B_before)
+        turned = (count > 0) & (sign_of_determinant(_product(A, B_before) + own) < 0)
+        return retract(scene.system, displace(scene.system, q, step)), size, passed | turned, A, B, count + 1
+
+    def unfinished(state):
+        q, size, *_, count = state
+        return (count < steps) & (size > done) & jnp.isfinite(q).all()
+
+    held = holonomic_rows(layout(scene)).size
+    none = jnp.zeros((held, scene.nv), guess.dtype)
+    state = guess, jnp.asarray(jnp.inf, guess.dtype), jnp.asarray(False), none, none.T, 0
+    q, _, passed, *_ = lax.while_loop(unfinished, improve, state)
+    return Path(q, passed)
+
+
+def _linearize_rows(scene: Scene, guess, t, e):
+    """phi at a displacement e from the guess, and its derivative in e: rows times the velocity for a rate of e."""
+    place = displace(scene.system, guess, e)
+    A = constraint_jacobian(scene, place, t)[holonomic_rows(layout(scene))]
+    if isinstance(scene.system, Model):
+        A = _product(A, jax.jacfwd(lambda e: difference(scene.system, place, displace(scene.system, guess, e)))(e))
+    return position_residual(scene, place, t), A
+
+
+def slide_to_nearest(scene: Scene, guess, start, t, rank_tol):
+    """The displacement of least length in the metric M(guess) with phi = 0, by repeated linearisation from a place near it.
+
+    Steps are limited, and the start is kept where they do not come nearer.
+    """
+    metric, _ = run(whitened_rows, scene, guess, t)
+    sizes, _ = coordinate_sizes(scene.system, guess.dtype)
+    first = displacement_from(scene, guess, start)
+
+    def improve(state):
+        e, _, count = state
+        phi, A = run(_linearize_rows, scene, guess, t, e)
+        step = _product(right_inverse(metric, A, rank_tol), _product(A, e) - phi) - e
+        size = jnp.max(jnp.abs(step) / sizes)
+        step = step * jnp.minimum(1.0, _LONGEST / jnp.where(size > 0, size, jnp.ones_like(size)))
+        return e + step, size, count + 1
+
+    def unfinished(state):
+        e, size, count = state
+        return (count < _NEAREST_STEPS) & (size > 1e-7) & jnp.isfinite(e).all()
+
+    e, size, _ = lax.while_loop(unfinished, improve, (first, jnp.asarray(jnp.inf, guess.dtype), 0))
+    metres = metric.momentum(jnp.stack([e, first], axis=1))
+    nearer = (size <= 1e-6) & (jnp.sum(metres[:, 0] ** 2) <= jnp.sum(metres[:, 1] ** 2) * (1 + 1e-6))
+    return displace(scene.system, guess, jnp.where(nearer & jnp.isfinite(e).all(), e, first))
+
+
+def polish(scene: Scene, q, t, rank_tol):
+    """Gauss-Newton steps with a choice of lengths, until the residual is at rounding or no longer falls."""
+    lengths = jnp.asarray(_STEP_LENGTHS, q.dtype)
+
+    def size(q):
+        return jnp.max(jnp.abs(position_residual(scene, q, t)))
+
+    def improve(state):
+        q, error, _, count = state
+        step = -_product(correction(scene, q, t, rank_tol, holonomic=True), position_residual(scene, q, t))
+        tried = jax.vmap(lambda s: retract(scene.system, displace(scene.system, q, s * step)))(lengths)
+        errors = lax.map(size, tried)  # by the kernel of one sample
+        best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.full_like(errors, jnp.inf)))
+        falls = errors[best] < error
+        return jnp.where(falls, tried[best], q), jnp.where(falls, errors[best], error), falls, count + 1
+
+    def unfinished(state):
+        _, error, falls, count = state
+        return falls & (error > 0) & (count < _NEWTON_STEPS)
+
+    return lax.while_loop(unfinished, improve, (q, size(q), jnp.asarray(True), 0))[0]
+
+
+def nearest_configuration(scene: Scene, guess, start, t, rank_tol):
+    """The configuration on the constraints nearest to a guess, from a start close to it, with the derivatives of a minimum."""
+
+    def solve(scene, guess, start, t):
+        return polish(scene, slide_to_nearest(scene, guess, start, t, rank_tol), t, rank_tol)
+
+    def differentiable(scene, q, start, t):
+        fixed, guess, begun, frozen = constant((scene, q, start, t))
+        place = lax.stop_gradient(solve(fixed, guess, begun, frozen))
+        moved = displace(scene.system, q, _stationary(scene, q, t, displacement_from(scene, guess, place), rank_tol))
+        # Going from the guess to the solution and back again costs digits that the solution itself has.
+        return retract(scene.system, place + (moved - lax.stop_gradient(moved)))
+
+    def tangent(scene, q, start, t, steps):
+        place, change = along(differentiable, (scene, q, start, t), steps)
+        return place, jnp.zeros_like(place) if change is None else change
+
+    return implicit(scene, (guess, lax.stop_gradient(start), t), solve, tangent)
+
+
+def _stationary(scene: Scene, guess, t, e, rank_tol):
+    """The displacement e from the guess, known in value, as a differentiable solution of M(guess) e + A^T lam = 0, phi = 0."""
+    mass = mass_matrix(scene.system, guess, t)
+    metric = mass_factor(mass)
+
+    def residual(e):
+        return position_residual(scene, displace(scene.system, guess, e), t)
+
+    def conditions(z):
+        e, lam = z[: scene.nv], z[scene.nv :]
+        phi, back = jax.vjp(residual, e)
+        return jnp.concatenate([_product(mass, e) + back(lam)[0], phi])
+
+    def solve(linear, right):
+        """By the null space of A, on which the Hessian of the Lagrangian is definite; A may have dependent rows."""
+        matrix = jax.jacfwd(linear)(jnp.zeros_like(right))
+        H, A = matrix[: scene.nv, : scene.nv], matrix[scene.nv :, : scene.nv]
+        B = right_inverse(metric, A, rank_tol)
+        null_projector = jnp.eye(scene.nv, dtype=A.dtype) - _product(B, A)
+        along = _product(B, right[scene.nv :])
+        left = right[: scene.nv] - _product(H, along)
+        # Across the null space M stands in for H, so that the matrix is regular.
+        across = jnp.eye(scene.nv, dtype=A.dtype) - null_projector
+        whole = _product(null_projector.T, _product(H, null_projector)) + _product(across.T, _product(mass, across))
+        step = along + _product(null_projector, solve_square(whole, _product(null_projector.T, left)))
+        return jnp.concatenate([step, _product(B.T, right[: scene.nv] - _product(H, step))])
+
+    A = jax.jacrev(residual)(e)
+    lam = -_product(right_inverse(metric, A, rank_tol).T, _product(mass, e))
+    known = lax.stop_gradient(jnp.concatenate([e, lam]))
+    return lax.custom_root(conditions, known, lambda conditions, known: known, solve)[: scene.nv]
