@@ -153,8 +153,8 @@ def _elbow(base, hinge, length):
 def _legs(count: int) -> Mechanism:
     """A platform on legs of hinges; the coordinates are its centre and its angle in the inclined plane."""
     make, tilt, length, radii, (bar, disk) = jd.scenes.hinge_platform, 0.5, 0.8, (1.2, 0.4), (0.5, 2.0)
-    corners = np.exp(2j * np.pi * np.arange(count) / count)
-    corners = np.stack([corners.real, corners.imag], 1)
+    angles = 2 * np.pi * np.arange(count) / count
+    corners = np.stack([np.cos(angles), np.sin(angles)], 1)
 
     def ends(x):
         c, s = jnp.cos(x[2]), jnp.sin(x[2])
@@ -187,12 +187,15 @@ def tilted_four_bar() -> Mechanism:
     """A planar four-bar linkage whose base is inclined, closed by a joint with all five rows."""
     lengths, masses, tilt, planar = (1.0, 3.0, 2.5, 3.5), (1.0, 3.0, 2.5), 0.7, jd.scenes.four_bar
     crank, coupler, rocker, ground = lengths
-    moments = [jd.inertia.displaced(jd.inertia.rod(m, length, "x"), (length / 2, 0, 0)) for m, length in zip(masses, lengths[:3], strict=True)]
+    bars = [
+        (m, (size / 2, 0.0, 0.0), (0.0, m * size**2 / 12, m * size**2 / 12))
+        for m, size in zip(masses, lengths, strict=False)
+    ]
     pose = lambda x: ((x, 0.0, 0.0), (tilt, 0.0, 0.0))  # noqa: E731
     builder = jd.ModelBuilder("inclined four-bar", gravity=(0.0, 0.0, -GRAVITY))
-    builder.add_body("crank", None, "continuous", moments[0], joint_name="1", pose=pose(0.0))
-    builder.add_body("coupler", "crank", "continuous", moments[1], joint_name="2", pose=(crank, 0.0, 0.0))
-    builder.add_body("rocker", None, "continuous", moments[2], joint_name="3", pose=pose(ground))
+    builder.add_body("crank", None, "continuous", bars[0], joint_name="1", pose=pose(0.0))
+    builder.add_body("coupler", "crank", "continuous", bars[1], joint_name="2", pose=(crank, 0.0, 0.0))
+    builder.add_body("rocker", None, "continuous", bars[2], joint_name="3", pose=pose(ground))
     knee = jd.loop("coupler", (coupler, 0.0, 0.0), "rocker", (rocker, 0.0, 0.0), name="knee")
 
     def ends(x):
@@ -201,7 +204,9 @@ def tilted_four_bar() -> Mechanism:
         tip = elbow + coupler * jnp.stack([jnp.cos(first + second), jnp.sin(first + second)])
         foot = jnp.array([ground, 0.0])
         knee = foot + rocker * jnp.stack([jnp.cos(third), jnp.sin(third)])
-        return _inclined(jnp.stack([jnp.stack([0 * elbow, elbow]), jnp.stack([elbow, tip]), jnp.stack([foot, knee])]), tilt)
+        return _inclined(
+            jnp.stack([jnp.stack([0 * elbow, elbow]), jnp.stack([elbow, tip]), jnp.stack([foot, knee])]), tilt
+        )
 
     start = lambda x, rate: planar.start(angle=x[0], rate=rate[0])  # noqa: E731
     energies = _of_bars(np.array(masses), ends)
@@ -260,7 +265,16 @@ def main(argv=None) -> None:
     if unknown := [name for name in chosen if name not in MECHANISMS]:
         raise ValueError(f"no mechanisms: {', '.join(unknown)}; they are {', '.join(MECHANISMS)}")
     jax.config.update("jax_enable_x64", True)
-    heads = ["mechanism", "rows", "rank", "steps at 1e-6 / 1e-8 / 1e-10", "error", "steps over DOP853's", "RK4", "Dopri8"]
+    heads = [
+        "mechanism",
+        "rows",
+        "rank",
+        "steps at 1e-6 / 1e-8 / 1e-10",
+        "error",
+        "steps over DOP853's",
+        "RK4",
+        "Dopri8",
+    ]
     print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}", flush=True)
     for name in chosen:
         title, build = MECHANISMS[name]

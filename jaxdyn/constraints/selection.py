@@ -107,8 +107,9 @@ class Selection(NamedTuple):
     opening: Float[Array, ""]
 
 
-def keep_rows(scene: Scene, kept: Float[Array, " nc"]) -> Scene:
+def keep_rows(scene: Scene, kept: Float[Array, " nc"] | Float[np.ndarray, " nc"]) -> Scene:
     """The scene with the rows that are not kept set to zero."""
+    kept = jnp.asarray(kept)
     constraints = tuple(
         KeptRows(constraint, kept[place.start : place.end], constraint.name)
         for constraint, place in zip(scene.constraints, layout(scene), strict=True)

@@ -25,7 +25,9 @@ def _sarrus_start(lengths: Row = (1.0, 0.8), height: Number = 0.9, rate: Number 
     for k, length in enumerate(lengths):
         sine = height / (2 * length)
         if is_concrete(sine) and abs(sine) >= 1:
-            raise ValueError(f"height is {float(height):.6g}; bars of length {float(length):.6g} reach up to twice that")
+            raise ValueError(
+                f"height is {float(height):.6g}; bars of length {float(length):.6g} reach up to twice that"
+            )
         angle, turn = xp.arcsin(sine), rate / (2 * length * xp.sqrt(1 - sine**2))
         # The second chain ends at its elbow: the joint on the platform is the one that closes the loop.
         q += [angle, xp.pi - 2 * angle, angle - xp.pi][: 3 - k]

@@ -141,7 +141,9 @@ def _bricard_start(
     if is_concrete(cosine) and abs(cosine) >= 1:
         raise ValueError(f"angle is {float(angle):.6g}; the linkage of twist {float(twist):.6g} does not close there")
     other = xp.arctan2(y, x) - branch * xp.arccos(cosine)
-    by_angle = -(1 + c**2) * xp.sin(angle) * xp.cos(other) - 2 * c * xp.cos(angle) * xp.sin(other) - s**2 * xp.sin(angle)
+    by_angle = (
+        -(1 + c**2) * xp.sin(angle) * xp.cos(other) - 2 * c * xp.cos(angle) * xp.sin(other) - s**2 * xp.sin(angle)
+    )
     by_other = -x * xp.sin(other) + y * xp.cos(other)
     other_rate = -by_angle / by_other * rate
     return as_state([angle, other, angle, other, angle]), as_state([rate, other_rate, rate, other_rate, rate])
