@@ -127,7 +127,7 @@ def goldberg() -> Mechanism:
 
 def bricard() -> Mechanism:
     """Bricard's linkage with threefold symmetry."""
-    return _turning("bricard", np.ones(5), 1.2 * np.array([1, -1, 1, -1, 1]), np.ones(5), 0.8)
+    return _turning("bricard", np.ones(5), 1.2 * np.array([1, -1, 1, -1, 1]), np.ones(5), 0.8, (20, 8))
 
 
 def sarrus() -> Mechanism:

@@ -145,14 +145,14 @@ def test_motion_in_minimal_coordinates(name):
     q, v = begin(one)
     exact = one.states(one.minimal(times, 1e-13)[0])
     outputs = ("energy", "constraint_residual")
-    motion = jd.simulate(one.scene, q, v, times, rtol=1e-11, atol=1e-11, outputs=outputs)
+    motion = jd.simulate(one.scene, q, v, times, rtol=1e-12, atol=1e-12, outputs=outputs)
     assert bool(motion.success) and float(motion.constraint_residual.max()) < 1e-12
     assert distance(motion.q, exact[0]) < 1e-10
     # Between steps velocities are interpolated.
     np.testing.assert_allclose(motion.v, exact[1], rtol=0, atol=1e-9 * (1 + np.abs(exact[1]).max()))
     np.testing.assert_allclose(motion.energy, motion.energy[0], rtol=0, atol=1e-9 * (1 + np.abs(motion.energy[0])))
     steps = int(motion.stats["num_accepted_steps"])
-    assert steps <= 1.5 * one.minimal(times, 1e-11)[1] + 1
+    assert steps <= 1.5 * one.minimal(times, 1e-12)[1] + 1
 
 
 @chosen(fails=("bennett",))
