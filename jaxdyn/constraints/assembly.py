@@ -17,7 +17,14 @@ from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import checked_tolerance, tolerance
-from jaxdyn.constraints.selection import keep_rows, most_rounding, opening_of_dropped, select_rows, surely_apart
+from jaxdyn.constraints.selection import (
+    Selection,
+    keep_rows,
+    most_rounding,
+    opening_of_dropped,
+    select_rows,
+    surely_apart,
+)
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, check_state, or_zeros
@@ -89,9 +96,9 @@ def assemble(
     """Find q with phi(q, t) = 0 and v with A v = b from a rough guess, with the least change in the mass metric.
 
     q minimises |q - guess| in the metric M(guess) among the configurations on the constraints: a local minimum on the branch
-    to which short steps lead that reduce all residuals together. Hinges stay within half a turn of the guess. v is the guess plus
-    the least change in the metric M(q). Rows that repeat others but for the digits of a file are left open by these digits, and the
-    others are closed to rounding (see `Assembly.dropped`).
+    to which short steps lead that reduce all residuals together. Hinges stay within half a turn of the guess. v is the guess
+    plus the least change in the metric M(q). Rows that repeat others but for the digits of a file are left open by these digits,
+    and the others are closed to rounding (see `Assembly.dropped`).
 
     **Arguments:**
 
@@ -179,15 +186,17 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
         fixed, start, time = constant((bare, q, t))
         loose = tolerance(rank_tol, q) if rank_tol is not None else surely_apart(q)
         q, passed = follow_path(fixed, start, time, loose, steps)
-    selection = select_rows(bare, q, t, rank_tol)
-    locked = keep_rows(bare, selection.kept)
+    kept, rounding = select_rows(bare, q, t, rank_tol)
+    # Rows that contradict others are none that can be dropped: what is found is the point of least squares of all.
+    kept = jnp.where(rounding <= most_rounding(q.dtype), kept, jnp.ones_like(kept))
+    locked = keep_rows(bare, Selection(kept, rounding))
     if has_positions:
         q = _turned_back(locked, guess, nearest_configuration(locked, guess, q, t, rank_tol), t)
     if scene is None:
         scene = locked
     else:
         free = Scene(scene.system, scene.constraints)
-        scene = keep_rows(free, select_rows(free, q, t, rank_tol).kept)
+        scene = keep_rows(free, select_rows(free, q, t, rank_tol))
     v = _with_velocity(scene, q, v, t, rank_tol)
     limits = row_limits(locked, q, jnp.zeros_like(v), t, closed_to(q.dtype))[0]
     phi = position_residual(locked, q, t)
@@ -200,7 +209,7 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
     moved = jnp.abs(displacement_from(whole, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes
     places = layout(whole)
-    gaps = jnp.abs(position_residual(bare, q, t)) * (1 - selection.kept)[holonomic_rows(places)]
+    gaps = jnp.abs(position_residual(bare, q, t)) * (1 - kept)[holonomic_rows(places)]
     return Assembly(
         q,
         v,
@@ -208,8 +217,8 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
         RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled),  # pyright: ignore[reportArgumentType]
         jnp.max(moved, initial=0.0),
         passed,
-        1 - selection.kept,
-        lax.stop_gradient(jnp.zeros_like(selection.kept).at[holonomic_rows(places)].set(gaps)),
+        1 - kept,
+        lax.stop_gradient(jnp.zeros_like(kept).at[holonomic_rows(places)].set(gaps)),
         places,
     )
 

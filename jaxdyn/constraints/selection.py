@@ -48,10 +48,12 @@ _TINY_ROW = 1e-3
 
 
 class KeptRows(Constraint):
-    """A constraint whose dropped rows are zero. `kept` (n,) is 1 for rows that stay, 0 for dropped ones."""
+    """A constraint whose dropped rows are zero. `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding` () as in
+    `Selection`."""
 
     inner: Constraint
     kept: Float[Array, " n"]
+    rounding: Float[Array, ""]
     name: str = eqx.field(static=True)
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
@@ -98,20 +100,20 @@ class KeptRows(Constraint):
 
 
 class Selection(NamedTuple):
-    """The rows of a mechanism that count: `kept` (nc,), 1 or 0, and `opening` (), by which the dropped ones are open.
+    """The rows of a mechanism that count: `kept` (nc,), 1 or 0.
 
-    `opening` is relative to the sizes of the rows, as in `row_limits`: rounding of the geometry.
+    `rounding` (): by which part of their size the dropped rows are open, or differ from combinations of the kept ones.
     """
 
     kept: Float[Array, " nc"]
-    opening: Float[Array, ""]
+    rounding: Float[Array, ""]
 
 
-def keep_rows(scene: Scene, kept: Float[Array, " nc"] | Float[np.ndarray, " nc"]) -> Scene:
+def keep_rows(scene: Scene, selection: Selection) -> Scene:
     """The scene with the rows that are not kept set to zero."""
-    kept = jnp.asarray(kept)
+    kept, rounding = map(jnp.asarray, selection)
     constraints = tuple(
-        KeptRows(constraint, kept[place.start : place.end], constraint.name)
+        KeptRows(constraint, kept[place.start : place.end], rounding, constraint.name)
         for constraint, place in zip(scene.constraints, layout(scene), strict=True)
     )
     return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
@@ -135,41 +137,53 @@ def kept_of(scene: Scene) -> Array | None:
     return jnp.concatenate([c.kept for c in scene.constraints]) if is_selected(scene) else None  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def rounding_of(scene: Scene) -> Array | None:
+    """`Selection.rounding`, or None where no rows were chosen."""
+    first = next((c for c in scene.constraints if isinstance(c, KeptRows)), None)
+    return None if first is None else first.rounding
+
+
 def scaled_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     """A for distances in units of the mechanism's length, each row scaled to length 1; rows of rounding alone stay small."""
     sizes, _ = coordinate_sizes(scene.system, q.dtype)
     A = constraint_jacobian(scene, q, t) * sizes[None]
     squares = jnp.sum(A * A, 1)
-    largest = []
-    for place in layout(scene):
-        for start, end in ((place.start, place.nonholonomic), (place.nonholonomic, place.end)):
-            if end > start:
-                largest.append(jnp.broadcast_to(jnp.max(squares[start:end])[None], (end - start,)))
-    largest = jnp.concatenate(largest)
+    largest = _largest_of_each(scene, squares)
     squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
     some = squares > 0
     return A * jnp.where(some, 1 / jnp.sqrt(jnp.where(some, squares, jnp.ones_like(squares))), squares)[:, None]
 
 
+def _largest_of_each(scene: Scene, sizes) -> Array:
+    """For each row (nc,) the largest size among the rows of its constraint, on positions or on velocities."""
+    parts = []
+    for place in layout(scene):
+        for start, end in ((place.start, place.nonholonomic), (place.nonholonomic, place.end)):
+            if end > start:
+                parts.append(jnp.broadcast_to(jnp.max(sizes[start:end])[None], (end - start,)))
+    return jnp.concatenate(parts)
+
+
 def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]) -> tuple[Array, Array]:
-    """Independent rows of B by elimination with pivots: which are kept, (nc,) of 1 and 0, and their pivots (nc,).
+    """Independent rows of B by elimination with pivots: which are kept, (nc,) of 1 and 0, and the largest part () of the others
+    that is no combination of these.
 
     The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
     others; a row is kept where its pivot is above `least`.
     """
-    none = jnp.zeros_like(B[:, 0])
 
     def keep_next(_, state):
-        rest, kept, pivots = state
+        rest, kept = state
         lengths = jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)
         row = jnp.argmax(jnp.where((first > 0) & (lengths > least), lengths + jnp.max(lengths), lengths))
         pivot = lengths[row]
         along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
         taken = pivot > least
         rest = jnp.where(taken, rest - _product(rest, along)[:, None] * along[None], rest)
-        return rest, kept.at[row].add(taken.astype(B.dtype)), pivots.at[row].set(jnp.where(taken, pivot, pivots[row]))
+        return rest, kept.at[row].add(taken.astype(B.dtype))
 
-    return lax.fori_loop(0, min(B.shape), keep_next, (B, none, none))[1:]
+    rest, kept = lax.fori_loop(0, min(B.shape), keep_next, (B, jnp.zeros_like(B[:, 0])))
+    return kept, jnp.max(jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept))
 
 
 def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float | None) -> Selection:
@@ -184,10 +198,10 @@ def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float
     apart = rank_tol if rank_tol is not None else surely_apart(q)
 
     def select():
-        kept = eliminate(run(scaled_rows, bare, q, t), apart, jnp.zeros_like(every[0]))[0]
+        kept, rest = eliminate(run(scaled_rows, bare, q, t), apart, jnp.zeros_like(every[0]))
         if rank_tol is None:
-            kept = _kept_far_away(bare, q, t, kept, apart)
-        return kept, run(_opening, bare, q, t, kept)
+            kept, rest = _kept_far_away(bare, q, t, kept, apart)
+        return kept, jnp.maximum(rest, run(_opening, bare, q, t, kept))
 
     if count > scene.nv:
         return Selection(*select())
@@ -207,7 +221,7 @@ def surely_apart(like) -> float:
 
 
 def _kept_far_away(scene: Scene, q, t, sure, apart: float):
-    """Which rows are independent a finite distance away, where those in `sure` are among them."""
+    """`eliminate` a finite distance away, where the rows in `sure` are among the independent ones."""
     sizes, _ = coordinate_sizes(scene.system, q.dtype)
     least = tolerance(None, q)
     held = holonomic_rows(layout(scene))
@@ -235,20 +249,21 @@ def _kept_far_away(scene: Scene, q, t, sure, apart: float):
     if held.size:
         place = retract(scene.system, lax.fori_loop(0, _NEWTON_STEPS, close, place))
     B = run(scaled_rows, scene, place, t)
-    # Sure rows may be less so there; they stay.
-    return jnp.maximum(sure, eliminate(B, 2 * apart, sure)[0])
+    kept, rest = eliminate(B, 2 * apart, sure)
+    return jnp.maximum(sure, kept), rest  # sure rows may be less so there; they stay
 
 
 def _opening(scene: Scene, q, t, kept):
     """Largest phi of the dropped rows over their sizes."""
-    sizes = row_limits(scene, q, jnp.zeros((scene.nv,), q.dtype), t, 1.0)[0]
-    dropped = 1 - kept[holonomic_rows(layout(scene))]
-    return jnp.max(jnp.abs(position_residual(scene, q, t)) / sizes * dropped, initial=0.0)
+    held = holonomic_rows(layout(scene))
+    # Velocities of zero: the limits of all rows are those of positions. A dropped row may itself be next to nothing.
+    sizes = _largest_of_each(scene, row_limits(scene, q, jnp.zeros((scene.nv,), q.dtype), t, 1.0)[1])[held]
+    return jnp.max(jnp.abs(position_residual(scene, q, t)) / sizes * (1 - kept)[held], initial=0.0)
 
 
 def _opening_rate(scene: Scene, q, v, t, kept):
     """Largest A v - b of the dropped rows over their sizes."""
-    sizes = row_limits(scene, q, v, t, 1.0)[1]
+    sizes = _largest_of_each(scene, row_limits(scene, q, v, t, 1.0)[1])
     return jnp.max(jnp.abs(velocity_residual(scene, q, v, t)) / sizes * (1 - kept), initial=0.0)
 
 
@@ -268,13 +283,16 @@ def gap_of_dropped(scene: Scene, q, t) -> Float[Array, ""]:
     return jnp.max(jnp.abs(position_residual(bare, q, t)) * dropped, initial=0.0)
 
 
-def most_opening(opening, dtype):
-    """How far dropped rows may be open along a motion that starts with an `opening`: ten times that, and rounding."""
-    return 10 * opening + eps_of(jnp.zeros((), dtype)) ** 0.4
+def most_opening(scene: Scene, dtype):
+    """How far dropped rows may be open along a motion: a hundred times as much as they are or differ at its start, and rounding.
+
+    What a file rounds can cancel at the start, as at the configuration in which it was written.
+    """
+    return 100 * rounding_of(scene) + eps_of(jnp.zeros((), dtype)) ** 0.4
 
 
 def most_rounding(dtype) -> float:
-    """Opening above which rows do not repeat what others say but contradict them."""
+    """Rounding above which rows do not repeat what others say but contradict them."""
     return 10 * surely_apart(jnp.zeros((), dtype))
 
 
@@ -288,8 +306,8 @@ def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selecti
     if np.sum(pivots > apart) == B.shape[0]:
         return Selection(np.ones(B.shape[0], B.dtype), np.zeros((), B.dtype)), B.shape[0]  # pyright: ignore[reportArgumentType]
     with jax.ensure_compile_time_eval():
-        kept, opening = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol)
-    return Selection(np.asarray(kept), np.asarray(opening)), int(np.sum(pivots > tolerance(rank_tol, B)))  # pyright: ignore[reportArgumentType]
+        kept, rounding = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol)
+    return Selection(np.asarray(kept), np.asarray(rounding)), int(np.sum(pivots > tolerance(rank_tol, B)))  # pyright: ignore[reportArgumentType]
 
 
 @compiled

@@ -441,6 +441,6 @@ def consistent(scene: Scene, q, v, t):
     return openness(scene, q, v, t, start_limit(q.dtype)) <= 1.0
 
 
-def repeats(scene: Scene, opening, q, v, t):
-    """Whether dropped rows are still met, along a motion that starts with them open by `opening`."""
-    return opening_of_dropped(scene, q, t, v) <= most_opening(opening, q.dtype)
+def meets_dropped_rows(scene: Scene, q, v, t):
+    """Whether the rows that were dropped at the start of a motion are met still."""
+    return opening_of_dropped(scene, q, t, v) <= most_opening(scene, q.dtype)

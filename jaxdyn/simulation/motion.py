@@ -15,7 +15,6 @@ from jaxdyn.constraints.selection import (
     keep_rows,
     kept_of,
     most_rounding,
-    opening_of_dropped,
     select_rows,
 )
 from jaxdyn.contact.forces import coned_contacts
@@ -24,7 +23,7 @@ from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.equations import equations
 from jaxdyn.simulation.integration import integrate
-from jaxdyn.simulation.methods import Method, consistent, is_regular, repeats, start_limit
+from jaxdyn.simulation.methods import Method, consistent, is_regular, meets_dropped_rows, start_limit
 from jaxdyn.simulation.outputs import at_save_point
 from jaxdyn.simulation.solution import RESULTS, Solution, faults_of_inputs, first_of, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
@@ -62,13 +61,12 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
             harmless.at[system.topology.nq :].set(1.0).at[: system.topology.nq].set(neutral(system).astype(q0.dtype))
         )
     q0, v0 = jnp.where(good, q0, harmless), jnp.where(good, v0, jnp.zeros_like(v0))
-    start_ok, opening, is_free = jnp.asarray(True), None, None
+    start_ok, is_free = jnp.asarray(True), None
     if options["selects_rows"]:
         selection = select_rows(scene, q0, ts[0], method.rank_tol)
-        scene, opening = keep_rows(scene, selection.kept), selection.opening
-        start_ok, is_free = opening <= most_rounding(q0.dtype), jnp.sum(selection.kept) < scene.nv
-    elif is_selected(scene):
-        opening = opening_of_dropped(scene, q0, ts[0])
+        scene = keep_rows(scene, selection)
+        start_ok = selection.rounding <= most_rounding(q0.dtype)
+        is_free = jnp.sum(selection.kept) < scene.nv
     if scene.constraints:
         start_ok = start_ok & consistent(scene, q0, v0, ts[0])
         if method.projects:
@@ -172,7 +170,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
 
         def is_closed(row):
             met = consistent(scene, *row)
-            return met if opening is None else met & repeats(scene, opening, *row)
+            return met & meets_dropped_rows(scene, *row) if is_selected(scene) else met
 
         closed = map_rows(is_closed, (q, v, ts))
         failures.append(((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints))
@@ -195,7 +193,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     rows = jax.tree.map(lambda x: rows_where(reached, x, jnp.nan), rows)
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
-    if opening is not None:
+    if is_selected(scene):
         gaps = map_rows(lambda row: gap_of_dropped(scene, *row), (q, ts))
         stats["redundant_rows"] = jnp.sum(1 - kept_of(scene)).astype(jnp.int32)
         stats["redundant_gap"] = jnp.max(jnp.where(reached, gaps, jnp.zeros_like(gaps)))

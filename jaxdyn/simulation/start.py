@@ -63,12 +63,12 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Method]
     limit, t = start_limit(q.dtype), np.asarray(t, q.dtype)
     selection, here = known_selection(scene, q, t, method.rank_tol)
     rank = int(np.sum(selection.kept))
-    selected = scene if rank == len(selection.kept) else keep_rows(scene, selection.kept)
+    selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
     residuals, ratio = start_evidence(selected, q, v, t, limit)
-    if ratio <= 1 and selection.opening > most_rounding(q.dtype):
+    if ratio <= 1 and selection.rounding > most_rounding(q.dtype):
         raise ValueError(
             f"rows of the constraints contradict each other: they depend on others, but are open by "
-            f"{float(selection.opening):.2g} of their size ({open_constraints(scene, q, v, t, limit)}); leave them out"
+            f"{float(selection.rounding):.2g} of their size ({open_constraints(scene, q, v, t, limit)}); leave them out"
         )
     if not ratio <= 1:
         raise ValueError(

@@ -75,9 +75,9 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
 
     def given(args):
         """The scene with its independent rows, in the pieces that come last if any do, and tau."""
-        unknown, tau, kept, *positive = args
+        unknown, tau, selection, *positive = args
         scene = known(unknown)
-        scene = scene if kept is None else keep_rows(scene, kept)
+        scene = scene if selection is None else keep_rows(scene, selection)
         return in_pieces(scene, pieces, *positive) if positive else scene, tau
 
     @jax.jit
@@ -108,8 +108,8 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
 
     def advance(q, v, tau, t):
         y = method.start(scene, q, v, t)
-        kept = select_rows(known(unknown), q, t, None).kept if scene.constraints else None
-        plan, args, ts, size = solver.plan(y), (unknown, tau, kept), jnp.stack([t, t + length]), length / substeps
+        selection = select_rows(known(unknown), q, t, None) if scene.constraints else None
+        plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
         if pieces.names:
             laws = laws_of_pieces(plan, pieces, switching, 4, 3)
             rows = motion_in_pieces(laws, y, args, ts, (0.0, 0.0), size, substeps, substeps + 1, EVENTS, is_direct)[0]
