@@ -158,7 +158,7 @@ def _legs(count: int) -> Mechanism:
 
     def ends(x):
         c, s = jnp.cos(x[2]), jnp.sin(x[2])
-        hinges = x[:2] + radii[1] * corners @ jnp.array([[c, s], [-s, c]])
+        hinges = x[None, :2] + radii[1] * corners @ jnp.array([[c, s], [-s, c]])
         places = []
         for base, hinge in zip(radii[0] * corners, hinges, strict=True):
             elbow = _elbow(base, hinge, length)
