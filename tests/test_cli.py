@@ -11,6 +11,7 @@ import pinocchio
 import pytest
 
 import jaxdyn as jd
+from benchmarks.linkages import bennett
 from jaxdyn.cli import main
 from jaxdyn.identify.logs import as_measured
 from jaxdyn.io import joint_torques
@@ -657,6 +658,20 @@ def test_info_of_a_file_with_a_loop(four_bar, capsys):
     assert "only URDF files can be repaired" in capsys.readouterr().err
     assert main(["info", str(four_bar), "--lock", "knee"]) == 2
     assert "--lock: joints of MJCF files cannot be held" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "digits", [5, pytest.param(8, marks=pytest.mark.slow), pytest.param(17, marks=pytest.mark.slow)]
+)
+def test_info_says_which_rows_repeat_others(digits, tmp_path, capsys):
+    """Bennett's linkage as a file of so many digits: by which its dependent rows are open where it moves."""
+    path, number = tmp_path / "bennett.sdf", re.compile(r"(?<=[ >'])-?\d+\.\d+(e-?\d+)?(?=[ <])")
+    path.write_text(number.sub(lambda x: f"{float(x[0]):.{digits}g}", bennett()))
+    assert main(["info", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "Degrees of freedom after constraints: 1 of 3\nRows that repeat what others say" in text
+    gap = float(re.search(r"hinge_\d: 3 of 5, which stay open by up to (\S+) m or rad", text)[1])
+    assert 10.0 ** -(digits + 3) <= gap + 1e-16 and gap <= 10.0**-digits + 1e-14
 
 
 def test_info_counts_couplings(panda, capsys):

@@ -10,8 +10,9 @@ import numpy as np
 
 from jaxdyn.cli.common import FILE, UNITS, add_model_options, load_scene, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
-from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.constraints.mobility import degrees_of_freedom, nearly_dependent
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
+from jaxdyn.constraints.mobility import degrees_of_freedom
+from jaxdyn.constraints.selection import known_selection
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.load import format_of
 from jaxdyn.io.xml_lines import XmlFile
@@ -138,20 +139,9 @@ def constraint_lines(scene: LoadedScene) -> str:
             "Loops and couplings such as <mimic>, and how far each is open (m or rad)",
             table(heads, [r[: len(heads)] for r in rows]),
         ]
-        try:
-            q = assemble(scene, q).q
-            lines.append("They close: jd.assemble finds a configuration from the reference.")
-        except ValueError as error:
-            lines.append(f"They do not close from the reference: {error}.")
-    near = _closed_near(scene, q)
-    freedom, beside = degrees_of_freedom(scene, q), min(degrees_of_freedom(scene, x) for x in near)
-    here = "" if beside == freedom else f" ({freedom} in the singular position of the reference)"
-    lines.append(f"Degrees of freedom after constraints: {beside} of {scene.nv}{here}")
-    if doubtful := [x for x in (nearly_dependent(scene, x) for x in near) if x is not None]:
-        lines.append(
-            f"Some rows of the loops say the same as others but for {max(doubtful):.0e}, as the file's digits have it: simulate "
-            "with method=jd.Projected(rank_tol=1e-5), or --rank-tol 1e-5"
-        )
+        lines += _closure(scene, q)
+    else:
+        lines.append(f"Degrees of freedom after constraints: {scene.nv} of {scene.nv}")
     if len(scene.starts) > 1:
         lines.append(f"States that the file names: {', '.join(scene.starts)}")
     if scene.actuators is not None:
@@ -159,14 +149,46 @@ def constraint_lines(scene: LoadedScene) -> str:
     return "\n".join(lines)
 
 
+def _closure(scene: LoadedScene, q) -> list[str]:
+    """Whether the loops close from q, the freedom that they leave, and rows that repeat others."""
+    lines, closed = [], []
+    try:
+        q = assemble(scene, q).q
+        closed = [q, *_closed_near(scene, q)]
+        lines.append("They close: jd.assemble finds a configuration from the reference.")
+    except ValueError as error:
+        lines.append(f"They do not close from the reference: {error}.")
+    # Decided a finite distance away from q, because files like to put linkages flat.
+    kept = known_selection(scene, np.asarray(q), 0.0, None)[0].kept
+    freedom, here = scene.nv - int(kept.sum()), degrees_of_freedom(scene, q)
+    more = f" ({here} in the singular position of the reference)" if here > freedom else ""
+    lines.append(f"Degrees of freedom after constraints: {freedom} of {scene.nv}{more}")
+    return lines + _repeats(scene, closed, kept)
+
+
 def _closed_near(scene: LoadedScene, q) -> list:
-    """q and a few closed configurations around it: files like to put linkages flat."""
-    configurations, random = [q], np.random.default_rng(0)
-    for _ in range(2 if scene.constraints else 0):
+    """A few closed configurations around q. Loops of files that name one pose of each body are closed in that pose."""
+    configurations, random = [], np.random.default_rng(0)
+    for _ in range(2):
         step = jnp.asarray(random.uniform(-0.1, 0.1, scene.nv), q.dtype)
         with contextlib.suppress(ValueError):  # not every configuration near by can be closed
             configurations.append(assemble(scene, integrate(scene.system, q, step), guesses=1).q)
     return configurations
+
+
+def _repeats(scene: LoadedScene, closed, kept) -> list[str]:
+    """How many rows of each constraint say the same as others, and by how much they stay open in closed configurations."""
+    gaps = np.zeros((len(closed), len(kept)))
+    for place, q in enumerate(closed):
+        gaps[place, holonomic_rows(layout(scene))] = np.abs(np.asarray(position_residual(scene, q, 0.0)))
+    lines = []
+    for place in layout(scene):
+        dropped = 1 - kept[place.start : place.end]
+        if count := int(dropped.sum()):
+            gap = (gaps[:, place.start : place.end] * dropped).max(initial=0.0)
+            by = f", which stay open by up to {gap:.2g} m or rad" if closed else ""
+            lines.append(f"  {place.name}: {count} of {len(dropped)}{by}")
+    return ["Rows that repeat what others say, and that jd.simulate leaves out", *lines] if lines else []
 
 
 def _gap(constraint, scene: LoadedScene, q) -> str:

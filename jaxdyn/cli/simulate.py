@@ -125,8 +125,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--rank-tol",
         type=real,
         metavar="R",
-        help="rows of loops that say the same as others but for this part count once (default: 1e-9; `jaxdyn info` "
-        "tells when a file needs more)",
+        help="rows of loops whose distance from the span of the others is below this part of their length are left out "
+        "(default: those that stay dependent a finite distance from the start, as `jaxdyn info` lists them)",
     )
     solver.add_argument("--progress", action="store_true", help="show how far the motion has come")
     files = parser.add_argument_group("output")

@@ -33,6 +33,8 @@ from jaxdyn.scenes.linkages import slider_crank as slider_crank
 from jaxdyn.scenes.linkages import windows as windows
 from jaxdyn.scenes.particles import pendulum_in_plane as pendulum_in_plane
 from jaxdyn.scenes.particles import spherical_pendulum as spherical_pendulum
+from jaxdyn.scenes.platforms import hinge_platform as hinge_platform
+from jaxdyn.scenes.platforms import sarrus as sarrus
 from jaxdyn.scenes.reference import andrews as andrews
 from jaxdyn.scenes.reference import andrews_bodies as andrews_bodies
 from jaxdyn.scenes.reference import car_axis as car_axis
@@ -43,6 +45,8 @@ from jaxdyn.scenes.rolling import rolling_disk as rolling_disk
 from jaxdyn.scenes.rolling import suslov as suslov
 from jaxdyn.scenes.rolling_hands import hand_rolling_egg as hand_rolling_egg
 from jaxdyn.scenes.spatial_linkages import bennett as bennett
+from jaxdyn.scenes.spatial_linkages import bricard as bricard
+from jaxdyn.scenes.spatial_linkages import goldberg as goldberg
 from jaxdyn.scenes.vehicles import bicycle as bicycle
 from jaxdyn.scenes.vehicles import car as car
 from jaxdyn.scenes.vehicles import differential_drive as differential_drive
