@@ -107,7 +107,7 @@ def assemble(
     - `guesses`: how many configurations to start from, where all inputs are concrete. The first is the given one; the others,
       tried only where it fails, lie around it at random (the same ones in every call), farther and farther away, by up to pi
       (rad, or lengths of the mechanism).
-    - `steps`: most steps of the path from the guess, each of at most 0.3 rad or lengths of the mechanism.
+    - `steps`: most steps of the path from the guess, each of at most 0.2 rad or lengths of the mechanism.
     - `atol`: m or rad; residuals of positions up to it count as closed. Where the rows cannot all be met q is then the point of
       least squares. By default rows that are independent must close to rounding.
     - `rank_tol`: rows count whose distance from the span of the others is above this part of their length. By default those that

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -26,7 +27,9 @@ from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
 # Longest step on the way, rad or lengths of the mechanism: within it, rows turn by less than a right angle.
-_LONGEST = 0.3
+_LONGEST = 0.2
+# After so many steps, and after each further half of them, a path that has come to an obstacle is pushed aside once.
+_PATIENCE = 40
 _NEAREST_STEPS = 30
 _NEWTON_STEPS = 40
 _STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
@@ -56,8 +59,13 @@ def _step_to_rows(scene: Scene, q, t, loose: float):
 
 
 def follow_path(scene: Scene, guess, t, loose: float, steps: int) -> Path:
-    """Newton's steps of limited length towards the constraints."""
+    """Newton's steps of limited length towards the constraints.
+
+    Where the straight way of the residuals meets an obstacle, such as the end of the reach, the path is pushed aside, and said to
+    have passed a singular position.
+    """
     sizes, _ = coordinate_sizes(scene.system, guess.dtype)
+    aside = jnp.asarray(np.cos(1.0 + 2.4 * np.arange(scene.nv)), guess.dtype)
     done = eps_of(guess) ** 0.6
 
     def improve(state):
@@ -69,7 +77,11 @@ def follow_path(scene: Scene, guess, t, loose: float, steps: int) -> Path:
         # Rows have turned over where a combination of them went through zero.
         own = jnp.eye(phi.shape[0], dtype=phi.dtype) - _product(A_before, B_before)
         turned = (count > 0) & (sign_of_determinant(_product(A, B_before) + own) < 0)
-        return retract(scene.system, displace(scene.system, q, step)), size, passed | turned, A, B, count + 1
+        is_stuck = (count >= _PATIENCE) & ((count - _PATIENCE) % (_PATIENCE // 2) == 0)
+        push = 2 * _LONGEST * aside * jnp.where((count // (_PATIENCE // 2)) % 2 == 0, 1.0, -1.0).astype(guess.dtype)
+        step = jnp.where(is_stuck, push * sizes, step)
+        q = retract(scene.system, displace(scene.system, q, step))
+        return q, size, passed | turned | is_stuck, A, B, count + 1
 
     def unfinished(state):
         q, size, *_, count = state
@@ -94,7 +106,8 @@ def _linearize_rows(scene: Scene, guess, t, e):
 def slide_to_nearest(scene: Scene, guess, start, t, rank_tol):
     """The displacement of least length in the metric M(guess) with phi = 0, by repeated linearisation from a place near it.
 
-    Steps are limited, and the start is kept where they do not come nearer.
+    Steps are limited. A start on the constraints is kept where they do not come nearer; one that the path has left before an
+    obstacle, such as the end of the reach, is not.
     """
     metric, _ = run(whitened_rows, scene, guess, t)
     sizes, _ = coordinate_sizes(scene.system, guess.dtype)
@@ -113,9 +126,13 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol):
         return (count < _NEAREST_STEPS) & (size > 1e-7) & jnp.isfinite(e).all()
 
     e, size, _ = lax.while_loop(unfinished, improve, (first, jnp.asarray(jnp.inf, guess.dtype), 0))
-    metres = metric.momentum(jnp.stack([e, first], axis=1))
-    nearer = (size <= 1e-6) & (jnp.sum(metres[:, 0] ** 2) <= jnp.sum(metres[:, 1] ** 2) * (1 + 1e-6))
-    return displace(scene.system, guess, jnp.where(nearer & jnp.isfinite(e).all(), e, first))
+    whitened = metric.momentum(jnp.stack([e, first], axis=1))
+    is_nearer = jnp.sum(whitened[:, 0] ** 2) <= jnp.sum(whitened[:, 1] ** 2) * (1 + 1e-6)
+    phi = position_residual(scene, displace(scene.system, guess, first), t)
+    _, length = coordinate_sizes(scene.system, guess.dtype)
+    is_stuck = jnp.max(jnp.abs(phi)) > eps_of(guess) ** 0.4 * jnp.minimum(length, 1.0)
+    better = (size <= 1e-6) & (is_nearer | is_stuck) & jnp.isfinite(e).all()
+    return displace(scene.system, guess, jnp.where(better, e, first))
 
 
 def polish(scene: Scene, q, t, rank_tol):

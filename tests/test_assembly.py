@@ -1,0 +1,121 @@
+"""`jd.assemble` far from its guess: branch, half turns, tolerances, redundant rows, large batches."""
+
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+
+FIRST, SECOND = 0.5, 0.4
+
+
+class Tip(jd.constraints.Constraint):
+    """The tip of a planar arm of two bars is at a target."""
+
+    target: jax.Array
+    name: str = "tip"
+
+    def position(self, system, q, t):
+        angles = jnp.stack([q[0], q[0] + q[1]])
+        lengths = jnp.asarray([FIRST, SECOND], q.dtype)
+        return jnp.stack([jnp.sum(lengths * jnp.cos(angles)), jnp.sum(lengths * jnp.sin(angles))]) - self.target
+
+
+def arm(target):
+    builder = jd.ModelBuilder("two bars", gravity=None)
+    for name, parent, length in (("first", None, 0.0), ("second", "first", FIRST)):
+        builder.add_body(name, parent, axis=(0, 0, 1), pose=(length, 0, 0), inertia=(1.0, (0.2, 0, 0), (0.01, 0.05, 0.05)))
+    return jd.Scene(builder.build(), (Tip(target),))
+
+
+GUESS = jnp.asarray([0.3, 1.2])
+
+
+@pytest.fixture(scope="module")
+def targets():
+    """Points of a grid that the arm reaches, not closer than 2 cm to the ends of its reach."""
+    x = np.linspace(-0.95, 0.95, 21)
+    points = np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
+    distance = np.linalg.norm(points, axis=1)
+    return jnp.asarray(points[(distance > FIRST - SECOND + 0.02) & (distance < FIRST + SECOND - 0.02)])
+
+
+def test_targets_all_over_the_workspace_are_reached_on_the_branch_of_the_guess(targets):
+    """Against the closed form: the elbow keeps its sign, and hinges stay within half a turn of the guess."""
+    found = jax.jit(jax.vmap(lambda target: jd.assemble(arm(target), GUESS)))(targets)
+    assert len(targets) > 150 and bool(found.success.all())
+    x, y = np.asarray(targets).T
+    elbow = np.arccos((x**2 + y**2 - FIRST**2 - SECOND**2) / (2 * FIRST * SECOND))
+    shoulder = np.arctan2(y, x) - np.arctan2(SECOND * np.sin(elbow), FIRST + SECOND * np.cos(elbow))
+    q, passed = np.asarray(found.q), np.asarray(found.passed_singular)
+    change = np.abs(q - np.asarray(GUESS))
+    assert change.max() <= np.pi + 1e-9
+    np.testing.assert_allclose(found.distance, change.max(1), atol=1e-12)
+    same = np.sin(q[:, 1]) > 0
+    # A branch that was changed is said; with the elbow bent as at the guess it hardly ever is.
+    assert np.all(same | passed) and same.mean() > 0.9
+    turn = (q[same] - np.stack([shoulder, elbow], axis=1)[same] + np.pi) % (2 * np.pi) - np.pi
+    np.testing.assert_allclose(turn, 0.0, atol=1e-10)
+
+
+def test_shorter_paths_do_not_arrive():
+    target = jnp.asarray([-0.5, -0.3])
+    one, many = (jd.assemble(arm(target), GUESS, steps=steps, guesses=1, throw=False) for steps in (1, 100))
+    assert float(jnp.abs(one.q - many.q).max()) > 1e-3 or not bool(one.success)
+    assert bool(jd.assemble(arm(target), GUESS, guesses=1).success)
+    for name, wrong in (("steps", 0), ("steps", True), ("guesses", 2.0)):
+        with pytest.raises(ValueError, match=f"{name} is {wrong}; give how many"):
+            jd.assemble(arm(target), GUESS, **{name: wrong})
+
+
+def test_what_is_out_of_reach_is_met_as_near_as_can_be():
+    """Least squares: the arm is stretched towards the target."""
+    target = jnp.asarray([0.9, 0.9])
+    far = float(jnp.linalg.norm(target)) - FIRST - SECOND
+    with pytest.raises(ValueError, match="not assembled"):
+        jd.assemble(arm(target), GUESS, guesses=1)
+    found = jd.assemble(arm(target), GUESS, atol=0.3, guesses=1)
+    assert bool(found.success)
+    np.testing.assert_allclose(np.linalg.norm(Tip(target).position(None, found.q, 0.0)), far, rtol=1e-3)
+    for wrong in (-1.0, np.nan):
+        with pytest.raises(ValueError, match="atol is"):
+            jd.assemble(arm(target), GUESS, atol=wrong)
+
+
+def test_redundant_rows_are_said():
+    state = jd.assemble(jd.scenes.bennett(), jd.scenes.bennett.start()[0])
+    assert "redundant rows of" in str(state) and int(state.dropped.sum()) == 3
+    assert jd.assemble(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0]).redundancies() == []
+
+
+BATCHES = """
+    import faulthandler; faulthandler.dump_traceback_later(240, exit=True)
+    import jax; jax.config.update("jax_enable_x64", True)
+    import jax.numpy as jnp, jaxdyn as jd
+    def batch(function, *args):
+        jax.block_until_ready(jax.jit(jax.vmap(function))(*args))
+    scene = jd.scenes.four_bar()
+    q, v = jd.scenes.four_bar.start()
+    angles = jnp.linspace(0.3, 1.0, 512)
+    batch(lambda x: (lambda s: (s.q, s.v, s.residual, s.distance))(jd.assemble(scene, q, hold={"1": x})), angles)
+    qs = jnp.broadcast_to(q, (512, 3)) + 1e-9 * angles[:, None]
+    batch(lambda q: jd.projections(scene, q), qs)
+    batch(lambda q: jd.tangent_basis(scene, q, dof=1), qs)
+    batch(lambda q: jd.second_fundamental_form(scene, q, v), qs)
+    batch(lambda q: jd.constrained_dynamics(scene, q, v, method="schur").acceleration, qs)
+    batch(lambda x: jd.simulate(scene, q, x * v, jnp.linspace(0, 0.1, 3), method="variational", stepsize=0.01).q, angles)
+    batch(lambda x: jd.simulate(scene, q, x * v, jnp.linspace(0, 0.1, 3), method="reduced").q, angles)
+    print("done")
+"""
+
+
+@pytest.mark.slow
+def test_batches_of_512_end():
+    """Batched calls of LAPACK within one program can wait for each other for ever: no function makes any."""
+    run = subprocess.run([sys.executable, "-c", textwrap.dedent(BATCHES)], capture_output=True, text=True, timeout=600)
+    assert run.stdout.split() == ["done"], run.stderr[-2000:]
