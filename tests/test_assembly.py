@@ -29,7 +29,9 @@ class Tip(jd.constraints.Constraint):
 def arm(target):
     builder = jd.ModelBuilder("two bars", gravity=None)
     for name, parent, length in (("first", None, 0.0), ("second", "first", FIRST)):
-        builder.add_body(name, parent, axis=(0, 0, 1), pose=(length, 0, 0), inertia=(1.0, (0.2, 0, 0), (0.01, 0.05, 0.05)))
+        builder.add_body(
+            name, parent, axis=(0, 0, 1), pose=(length, 0, 0), inertia=(1.0, (0.2, 0, 0), (0.01, 0.05, 0.05))
+        )
     return jd.Scene(builder.build(), (Tip(target),))
 
 

@@ -30,15 +30,11 @@ COUNTS = [
 NAMES = [name for name, *_ in COUNTS]
 
 
-SINGULAR = "the rows chosen at the start become dependent on the way, where those of the mechanism keep their rank"
-
-
-def chosen(*fast, fails=()):
+def chosen(*fast):
     """All mechanisms, of which only some are fast tests: each is compiled for some seconds."""
 
     def marks(name):
-        slow = [] if name in fast else [pytest.mark.slow]
-        return [*slow, pytest.mark.xfail(strict=True, reason=SINGULAR)] if name in fails else slow
+        return [] if name in fast else [pytest.mark.slow]
 
     return pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in NAMES])
 
@@ -138,7 +134,7 @@ def test_closures_of_goldberg_and_bricard():
     np.testing.assert_allclose(np.cos(q[:, 3] + q[:, 0] + q[:, 1]), -1, atol=1e-12)
 
 
-@chosen("goldberg", fails=("bennett",))
+@chosen("goldberg")
 def test_motion_in_minimal_coordinates(name):
     """All coordinates at several times, closed loops and energy, with the steps of a mechanism whose rows are independent."""
     one, times = mechanism(name), np.linspace(0.0, mechanism(name).span, 4)
@@ -155,7 +151,7 @@ def test_motion_in_minimal_coordinates(name):
     assert steps <= 1.5 * one.minimal(times, 1e-12)[1] + 1
 
 
-@chosen(fails=("bennett",))
+@chosen()
 def test_fixed_steps_converge_with_their_order(name):
     one = mechanism(name)
     q, v = begin(one)
@@ -216,9 +212,8 @@ def test_a_batch_with_traced_starts(name):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason=SINGULAR)
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
-def test_rows_chosen_at_the_start_may_become_dependent(tolerance):
+def test_rows_that_lose_rank_on_the_way_are_exchanged(tolerance):
     """Four of five rows of Bricard's linkage lose rank where its even angles pass zero, at 0.82 s, but not all five."""
     scene, times = jd.scenes.bricard(), np.array([0.0, 1.0])
     q, v = jd.scenes.bricard.start(branch=-1)

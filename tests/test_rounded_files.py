@@ -130,7 +130,8 @@ def mjcf(path, digits, tilt):
         moments = " ".join(map(str, MOMENTS))
         return (
             f"<body name='{name}' pos='{text(place)}' quat='{text(np.roll(turn.as_quat(), 1))}'>"
-            f"<inertial pos='0.1 0.01 0.05' mass='1.3' diaginertia='{moments}'/><joint name='j_{name}' axis='0 1 0'/>{inner}</body>"
+            f"<inertial pos='0.1 0.01 0.05' mass='1.3' diaginertia='{moments}'/>"
+            f"<joint name='j_{name}' axis='0 1 0'/>{inner}</body>"
         )
 
     bodies = body("crank", body("rod")) + body("rocker")
@@ -198,7 +199,7 @@ def test_a_four_bar_with_few_digits_moves_as_with_all(tmp_path, exact, kind, dig
 
 def test_a_traced_start_drops_the_same_rows(tmp_path):
     path = WRITERS["sdf"](tmp_path / "bars", 5, TILT)
-    angles, motion, start, scene = crank_angles(path)
+    _, motion, start, scene = crank_angles(path)
     traced = jax.jit(lambda q, v: jd.simulate(scene, q, v, TIMES, rtol=1e-9, atol=1e-9))(start.q, start.v)
     assert bool(traced.success) and int(traced.stats["redundant_rows"]) == 3
     np.testing.assert_allclose(traced.q, motion.q, atol=1e-7)

@@ -21,8 +21,8 @@ from jaxdyn.compile import (
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whitened_rows
 from jaxdyn.constraints.projection_derivative import LOST, Corrections, projected
-from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, regular_gram, tolerance
-from jaxdyn.constraints.selection import is_selected
+from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, regular_gram, tolerance, worst_pivot
+from jaxdyn.constraints.selection import LEAST_PIVOT, is_selected, kept_of
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_factored
 from jaxdyn.systems.scene import Scene
@@ -139,8 +139,14 @@ def _by_pivots(scene: Scene, q, v, t, *errors):
     metric, Y = whitened_rows(scene, q, t)
 
     def steps(Y):
-        factor = cholesky(regular_gram(Y) if is_selected(scene) else _product(Y.T, Y))
-        return (lambda residual: metric.unwhiten(_product(Y, solve_factored(factor, residual)))), quality_of(factor)
+        gram = regular_gram(Y) if is_selected(scene) else _product(Y.T, Y)
+        factor = cholesky(gram)
+        quality = quality_of(factor)
+        if is_selected(scene) and is_expanding():
+            # Other rows may serve where these hardly do: `renew_rows`.
+            is_poor = jnp.any(kept_of(scene) == 0) & ~(worst_pivot(factor, gram) > LEAST_PIVOT)
+            quality = jnp.where(is_poor, jnp.nan, quality)
+        return (lambda residual: metric.unwhiten(_product(Y, solve_factored(factor, residual)))), quality
 
     every, quality = steps(Y)
     some = every

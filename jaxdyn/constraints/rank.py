@@ -52,6 +52,11 @@ def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
     return gram + jnp.diag(jnp.where(squares == 0, fill, jnp.zeros_like(squares)))
 
 
+def worst_pivot(factor, gram):
+    """Least pivot over its diagonal entry of the matrix, from a Cholesky factor: one for orthogonal columns."""
+    return jnp.min(jnp.diagonal(factor) ** 2 / jnp.diagonal(gram))
+
+
 def quality_of(factor):
     """Least over largest pivot, from a Cholesky factor."""
     pivots = jnp.diagonal(factor) ** 2

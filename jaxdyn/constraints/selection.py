@@ -1,4 +1,4 @@
-"""Which rows of a mechanism are independent: decided once, at the start of a motion, and kept for all of it.
+"""Which rows of a mechanism are independent: decided at the start of a motion and of a step, and kept in all stages of the step.
 
 In an overconstrained mechanism some rows depend on others, but only on the constraints. The stages of a step lie off them by
 O(h^p), where the same rows are independent: a rank that is counted there removes all freedom. Rows that a file rounds to a few
@@ -7,6 +7,9 @@ digits are never dependent to rounding of the dtype. So rank is a property of th
 - rows that are well apart from the others are independent;
 - the others are looked at a finite distance away, on the constraints of the independent rows. Near a singular position they
   become independent there, and are kept. Rows that stay dependent repeat what others say, and are dropped.
+
+How many rows are independent is decided once. Which ones is decided again where the kept ones come near to depending on each
+other, before a step begins (`renew_rows`).
 
 A dropped row stays in its place as a row of zeros (`KeptRows`), so that shapes, names and multipliers are those of the scene.
 """
@@ -21,7 +24,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import any_in_batch, compiled, compute, constant, is_staged, pseudo_inverse_by_rotations, run
+from jaxdyn.compile import (
+    any_in_batch,
+    compiled,
+    compute,
+    constant,
+    is_expanding,
+    is_rank_safe,
+    is_staged,
+    pseudo_inverse_by_rotations,
+    run,
+)
 from jaxdyn.constraints.base import (
     Constraint,
     constraint_jacobian,
@@ -31,7 +44,7 @@ from jaxdyn.constraints.base import (
     rows,
     velocity_residual,
 )
-from jaxdyn.constraints.rank import eps_of, tolerance
+from jaxdyn.constraints.rank import eps_of, regular_gram, tolerance, worst_pivot
 from jaxdyn.constraints.tolerances import coordinate_sizes, row_limits
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Number, SystemLike
@@ -44,6 +57,9 @@ from jaxdyn.systems.system import displace, retract
 _DOUBTFUL = 1e-3
 # How far away doubtful rows are looked at, rad or lengths of the mechanism, and steps of Newton's method that go there.
 _FAR, _NEWTON_STEPS = 0.2, 12
+# Least pivot of the kept rows' Gram matrix over its diagonal entry, the square of the sine of an angle between rows, above which
+# they are not chosen anew.
+LEAST_PIVOT = 0.01
 # A row below this part of the largest one of its constraint has no direction of its own: it is what rounding has left.
 _TINY_ROW = 1e-3
 
@@ -125,6 +141,11 @@ def is_selected(scene: Scene) -> bool:
     return any(isinstance(constraint, KeptRows) for constraint in scene.constraints)
 
 
+def exchange_rows(scene: Scene, kept: Float[Array, " nc"]) -> Scene:
+    """A scene of `keep_rows` with other rows."""
+    return keep_rows(all_rows(scene), Selection(kept, rounding_of(scene)))
+
+
 def all_rows(scene: Scene) -> Scene:
     """The scene with the rows that `keep_rows` has dropped."""
     if not is_selected(scene):
@@ -165,12 +186,12 @@ def _largest_of_each(scene: Scene, sizes) -> Array:
     return jnp.concatenate(parts)
 
 
-def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]) -> tuple[Array, Array]:
+def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, Array]:
     """Independent rows of B by elimination with pivots: which are kept, (nc,) of 1 and 0, and the largest part () of the others
     that is no combination of these.
 
     The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
-    others; a row is kept where its pivot is above `least`.
+    others; a row is kept where its pivot is above `least`, and `most` rows at most.
     """
 
     def keep_next(_, state):
@@ -179,7 +200,7 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
         row = jnp.argmax(jnp.where((first > 0) & (lengths > least), lengths + jnp.max(lengths), lengths))
         pivot = lengths[row]
         along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
-        taken = pivot > least
+        taken = pivot > least if most is None else (pivot > least) & (jnp.sum(kept) < most)
         rest = jnp.where(taken, rest - _product(rest, along)[:, None] * along[None], rest)
         return rest, kept.at[row].add(taken.astype(B.dtype))
 
@@ -208,6 +229,32 @@ def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float
         return Selection(*select())
     doubtful = any_in_batch(~(run(_least_distance, bare, q, t) > apart))
     return Selection(*lax.cond(doubtful, select, lambda: every))
+
+
+def renew_rows(scene: Scene, q, t) -> Float[Array, " nc"]:
+    """The kept rows of a scene, or as many others where these have come near to depending on each other; a constant.
+
+    At some positions of a mechanism any choice of rows loses rank, though all rows together do not. In a program of numbers,
+    which has no branches, `project_step` flags the sample there, and the step is made again by the operations of JAX.
+    """
+    kept = lax.stop_gradient(kept_of(scene)).astype(q.dtype)
+    if is_expanding():
+        return kept
+    whole = all_rows(scene)
+    bare, q, t = constant((Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype)))
+
+    def choose():
+        B = run(scaled_rows, bare, q, t)
+        return eliminate(B, 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
+
+    dropped = jnp.any(kept == 0)
+    poor = dropped if is_rank_safe() else dropped & ~(run(_worst_pivot, bare, q, t, kept) > LEAST_PIVOT)
+    return lax.cond(any_in_batch(poor), lambda: jnp.where(poor, choose(), kept), lambda: kept)
+
+
+def _worst_pivot(scene: Scene, q, t, kept):
+    B = kept[:, None] * scaled_rows(scene, q, t)
+    return worst_pivot(cholesky(regular_gram(B.T)), regular_gram(B.T))
 
 
 def _least_distance(scene: Scene, q, t):

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import partition_traced
+from jaxdyn.constraints.selection import exchange_rows, renew_rows
 from jaxdyn.forces.piecewise import Pieces, guards, in_pieces, pieces_of, values_and_levels
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
@@ -19,6 +20,9 @@ from jaxdyn.simulation import limits as joint_limits
 from jaxdyn.simulation.methods import Method
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
+
+# Entry of the state: which rows a step keeps, of a mechanism with rows that repeat others.
+KEPT = "kept_rows"
 
 
 class Equations(NamedTuple):
@@ -67,15 +71,17 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
     unknown, known = partition_traced((scene, control, method))
     args, count = tuple(unknown) or None, len(unknown)
 
-    def given(args):
-        """The scene, the control and the method."""
+    def given(args, y=None):
+        """The scene with the rows that the step from y keeps, the control and the method."""
         args = args or ()
         scene, control, method = known(args[:count])
+        if y is not None and KEPT in y:
+            scene = exchange_rows(scene, y[KEPT])
         return in_pieces(scene, pieces, args[count]) if len(args) > count else scene, control, method
 
     def effort(args, y, q, v, t):
         """Of the control before limits, or None when there is none."""
-        scene, control, method = given(args)
+        scene, control, method = given(args, y)
 
         def multipliers(tau):
             force = scene.applied_force(q, v, t)
@@ -86,40 +92,43 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
     def torque(args, y, q, v, t):
         """Of the control, or None when there is none."""
         tau = effort(args, y, q, v, t)
-        return None if tau is None else given(args)[0].limited(tau)
+        return None if tau is None else given(args, y)[0].limited(tau)
 
     pieces = pieces_of(scene, start, q0, v0, t0, functools.partial(effort, args))
 
     def switching(t, y, args):
-        scene, _, method = given(args)
+        scene, _, method = given(args, y)
         q, v = method.to_qv(scene, y, t)
         return values_and_levels(lambda q, v: guards(scene, q, v, t, effort(args, y, q, v, t)), q, v)
 
     def generalized_force(args, y, q, v, t):
         """Tau plus the scene's forces, or None when there are none."""
-        force, tau = given(args)[0].applied_force(q, v, t), torque(args, y, q, v, t)
+        force, tau = given(args, y)[0].applied_force(q, v, t), torque(args, y, q, v, t)
         return force if tau is None else tau if force is None else tau + force
 
     def of_control(args, y, q, v, t, force):
         """Rates of what the control adds to the state."""
-        scene, control, method = given(args)
+        scene, control, method = given(args, y)
         return controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
 
     # diffrax and differentiation call it in many places: it is traced once for all of them.
     @jax.jit
     def derivative(t, y, args):
-        scene, _, method = given(args)
+        scene, _, method = given(args, y)
         rates, force, v = method.evaluated(scene, y, t, functools.partial(generalized_force, args, y))
         if added:
             rates = rates | of_control(args, y, retract(system, y["q"]), v, t, force)
+        if KEPT in y:
+            rates = rates | {KEPT: jnp.zeros_like(y[KEPT])}
         return rates | {"work": power(force, v)} if "work" in y else rates
 
     @jax.jit
     def explicit_part(t, y, args):
         """All rates but those of `implicit_part`."""
-        scene, _, method = given(args)
+        scene, _, method = given(args, y)
         q, v = method.to_qv(scene, y, t)
         rates = method.rates(scene, y, q, v, t, torque(args, y, q, v, t)) | {"q": jnp.zeros_like(y["q"])}
+        rates = rates | ({KEPT: jnp.zeros_like(y[KEPT])} if KEPT in y else {})
         force = generalized_force(args, y, q, v, t) if added or "work" in y else None
         rates = rates | of_control(args, y, q, v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
@@ -127,7 +136,7 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
     @jax.jit
     def implicit_part(t, y, args):
         """dq/dt = H v, and what the scene's forces add to the rates of velocity, on which they act linearly."""
-        scene, _, method = given(args)
+        scene, _, method = given(args, y)
         q, v = method.to_qv(scene, y, t)
         rates = jax.tree.map(jnp.zeros_like, y)
         force = scene.applied_force(q, v, t)
@@ -138,27 +147,31 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
         return rates | {"q": velocity_to_rate(scene.system, q, v)}
 
     def project(t, y, error, args):
-        scene, _, method = given(args)
+        scene, _, method = given(args, y)
         y, error = method.stepped(scene, y, t, error)
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
         y = method.continued(scene, y, t)
+        if KEPT in y:
+            y = y | {KEPT: renew_rows(scene, retract(system, y["q"]), t)}
         if controls.HELD in y:
-            y = y | {controls.HELD: controls.sampled(given(args)[1], y[controls.HELD], *method.to_qv(scene, y, t), t)}
+            y = y | {
+                controls.HELD: controls.sampled(given(args, y)[1], y[controls.HELD], *method.to_qv(scene, y, t), t)
+            }
         return y, error, diffrax.RESULTS.successful
 
     def quality(t, y, args, **_):
-        scene, _, method = given(args)
+        scene, _, method = given(args, y)
         return method.quality(scene, y, t)
 
     def begin(t, y, args):
-        scene, _, method = given(args)
+        scene, _, method = given(args, y)
         return method.begin(scene, y, t)
 
     by_contacts, by_control = unilateral.can_end(scene, options["contacts"]), options["control_ends"]
 
     def allowances(args, y, q, v, t):
         """How far the contacts are from being lost, the joints from their limits, and the control from where it ends."""
-        scene, control, method = given(args)
+        scene, control, method = given(args, y)
         margins = []
         if by_contacts:
             margins.append(
@@ -172,13 +185,13 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
 
     @jax.jit
     def least_allowance(t, y, args):
-        scene, _, method = given(args)
+        scene, _, method = given(args, y)
         q, v = method.to_qv(scene, y, t)
         return jnp.min(allowances(args, y, q, v, t))
 
     @jax.jit
     def advance(t0, t1, y, args, carried):
-        scene, _, method = given(args)
+        scene, _, method = given(args, y)
         return method.advance(scene, y, t0, t1, carried, functools.partial(generalized_force, args, y))
 
     has_margins = by_contacts or by_control or options["limits"] == "stop"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.equations import Equations
+from jaxdyn.simulation.equations import KEPT, Equations
 from jaxdyn.simulation.hybrid.laws import laws_of_pieces
 from jaxdyn.simulation.hybrid.pieces import EVENTS, motion_in_pieces
 from jaxdyn.simulation.methods import Reduced, is_regular
@@ -31,7 +31,7 @@ def integrate(term, project, eqs: Equations, method, y0, ts, steps, options):
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which integrates another vector field
     # Of a method that wraps an explicit one, diffrax says that it is one.
     explicit = isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
-    step_constants = (*method.step_constants, *({controls.HELD} & set(y0)))
+    step_constants = (*method.step_constants, *({controls.HELD, KEPT} & set(y0)))
     if explicit and not continuous:
         solver = ExplicitSteps(solver, project, step_constants, method.projects, field=term.vector_field)
     elif project:

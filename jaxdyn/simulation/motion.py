@@ -6,9 +6,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jaxdyn.compile import map_rows, run
 from jaxdyn.constraints.selection import (
+    exchange_rows,
     gap_of_dropped,
     is_selected,
     keep_rows,
@@ -20,7 +22,7 @@ from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.equations import equations
+from jaxdyn.simulation.equations import KEPT, equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, meets_dropped_rows, start_limit
 from jaxdyn.simulation.outputs import at_save_point
@@ -88,6 +90,8 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     eqx.filter_eval_shape(eqs.generalized_force, eqs.args, states, q0, v0, ts[0])
     y0 = method.start(scene, q0, v0, ts[0]) | states
     first = method.quality(scene, y0, ts[0])
+    if is_selected(scene) and not isinstance(options["solver"], Stepper):
+        y0 = y0 | {KEPT: lax.stop_gradient(kept_of(scene)).astype(q0.dtype)}
     y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
     solver = options["solver"]
     if isinstance(solver, Stepper):
@@ -98,7 +102,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     corrects = (
         method.projects or bool(method.step_constants) if isinstance(solver, LieGroup) else method.corrects(scene)
     )
-    corrects = corrects or controls.HELD in added
+    corrects = corrects or controls.HELD in added or KEPT in y0
     term = diffrax.ODETerm(eqs.derivative)
     if is_split(solver):
         term = diffrax.MultiTerm(diffrax.ODETerm(eqs.explicit_part), diffrax.ODETerm(eqs.implicit_part))
@@ -114,7 +118,8 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
 
     def to_qv(row):
         y, t = row
-        return method.to_qv(scene, method.corrected(scene, y, t), t)
+        own = exchange_rows(scene, y[KEPT]) if KEPT in y else scene
+        return method.to_qv(own, method.corrected(own, y, t), t)
 
     # By the kernels that have put the start on the constraints.
     q, v = map_rows(to_qv, (y, ts))
@@ -186,8 +191,13 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         failures.append(((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows))
 
     of_control = {name: y[name] for name in added}
-    of_row = functools.partial(at_save_point, scene, control, method, eqs, outputs)
-    computed = map_rows(lambda row: of_row(*row), (q, v, ts, of_control))
+
+    def of_row(row):
+        *state, kept = row
+        own = scene if kept is None else exchange_rows(scene, kept)
+        return at_save_point(own, control, method, eqs, outputs, *state)
+
+    computed = map_rows(of_row, (q, v, ts, of_control, y.get(KEPT)))
     rows = {"q": q, "v": v} | computed | ({} if work is None else {"work": work})
     whole = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
     result = first_of([*failures, ((result == RESULTS.successful) & ~whole, RESULTS.nonfinite_state)], result)

@@ -77,9 +77,9 @@ ADVICE = {
     "coarse_steps": "take a smaller stepsize, or None for steps that keep a tolerance; if stiff, solver=jd.Rodas5P(); beyond "
     "some 1e5 steps, float64",
     "coarse_start": "subtract whole turns from q0, use float64, or take fixed steps",
-    "singular_mass_matrix": "give massless bodies an inertia or their joints an armature, or start from a configuration where every "
+    "singular_mass_matrix": "give massless bodies an inertia or their joints an armature, or start where every "
     "joint moves some inertia",
-    "no_freedom": "leave a constraint out, or free a joint; rows that repeat others by more than 1e-3 of their size need a rank_tol, "
+    "no_freedom": "leave a constraint out, or free a joint; rows that repeat others but for more than 1e-3 need a rank_tol, "
     "as in method=jd.Projected(rank_tol=1e-2)",
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
     "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
