@@ -70,7 +70,7 @@ def test_shorter_paths_do_not_arrive():
     one, many = (jd.assemble(arm(target), GUESS, steps=steps, guesses=1, throw=False) for steps in (1, 100))
     assert float(jnp.abs(one.q - many.q).max()) > 1e-3 or not bool(one.success)
     assert bool(jd.assemble(arm(target), GUESS, guesses=1).success)
-    for name, wrong in (("steps", 0), ("steps", True), ("guesses", 2.0)):
+    for name, wrong in (("steps", 0), ("steps", True), ("guesses", -2)):
         with pytest.raises(ValueError, match=f"{name} is {wrong}; give how many"):
             jd.assemble(arm(target), GUESS, **{name: wrong})
 
@@ -83,7 +83,8 @@ def test_what_is_out_of_reach_is_met_as_near_as_can_be():
         jd.assemble(arm(target), GUESS, guesses=1)
     found = jd.assemble(arm(target), GUESS, atol=0.3, guesses=1)
     assert bool(found.success)
-    np.testing.assert_allclose(np.linalg.norm(Tip(target).position(None, found.q, 0.0)), far, rtol=1e-3)
+    # A stretched arm is singular: along it the last steps are as short as the tolerance of the rank has them.
+    np.testing.assert_allclose(np.linalg.norm(Tip(target).position(None, found.q, 0.0)), far, rtol=5e-3)
     for wrong in (-1.0, np.nan):
         with pytest.raises(ValueError, match="atol is"):
             jd.assemble(arm(target), GUESS, atol=wrong)
