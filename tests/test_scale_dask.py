@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import textwrap
 import threading
 import time
 from pathlib import Path
@@ -478,14 +477,28 @@ def test_lists_of_tasks(client):
     assert item == 7 and isinstance(failure, Failure) and "ValueError" in failure.traceback
 
 
-def test_without_a_client_no_dask_is_imported(tmp_path):
-    code = """
-    import sys
-    import jax.numpy as jnp
-    import jaxdyn as jd
-    jd.scale.evaluate(lambda x: {"y": x}, jnp.arange(4.0), out=sys.argv[1], progress=False)
-    assert not {"dask", "distributed"} & sys.modules.keys()
-    """
-    process = start("-c", textwrap.dedent(code), tmp_path / "a.zarr")
-    process.communicate(timeout=LONG)
-    assert process.returncode == 0
+def test_starts_of_a_fit(client):
+    """Two workers share the starts, and the fit from the best one is that of this process."""
+
+    def mass(q, t, p):
+        return jnp.eye(1)
+
+    def bias(q, v, t, p):
+        return p["size"] * jnp.sin(p["rate"] * q)
+
+    t = np.linspace(0.0, 4.0, 200)
+    q = np.sin(t)[:, None]
+    log = jd.identify.Log(t, q, np.cos(t)[:, None], -q, -q + np.sin(3.0 * q))
+    system = jd.ExplicitSystem(mass, bias, 1, parameters={"size": 0.5, "rate": 5.0})
+    options = dict(free=lambda s: [s.parameters["size"], s.parameters["rate"]], error="torque", starts=16, spread=1.0)
+    here, there = (jd.identify.fit_parameters(system, log, client=one, **options) for one in (None, client))
+    np.testing.assert_allclose(there.values, here.values, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(there.values), [1.0, 3.0], rtol=1e-6)
+
+
+def test_without_a_client_no_dask_is_imported(tmp_path, monkeypatch):
+    for name in ("dask", "distributed"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert evaluate(tmp_path / "a.zarr").success
+    with pytest.raises(ImportError, match=r"client= needs distributed: pip install 'jaxdyn\[scale\]'"):
+        evaluate(tmp_path / "b.zarr", object())

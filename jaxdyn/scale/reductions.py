@@ -36,7 +36,7 @@ class Reduction(abc.ABC):
         """
 
     def combine(self, partials: Arrays) -> Arrays:
-        """Fewer partial results that merge to the same; `partials` are of some chunks in their order, with a leading axis of chunks.
+        """Fewer partial results that merge to the same; `partials` are of chunks in their order, with a leading axis of chunks.
 
         By default those that are given. One that returns a single partial result keeps the memory of long runs constant;
         combine([combine([a, b]), c]) and combine([a, b, c]) have to be equal bit for bit.

@@ -20,6 +20,7 @@ from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers.inputs import check_times
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
+from jaxdyn.tasks import DaskClient
 
 SHARE = 0.05  # of the times that are simulated to measure what a rollout costs
 
@@ -86,7 +87,7 @@ def run(
     rows: bool | Sequence[str] = True,
     cost: Cost = None,
     units: Mapping[str, str] | None = None,
-    client: Any = None,
+    client: DaskClient | None = None,
     retries: int = 2,
     devices: Sequence[Any] | None = None,
     lanes: int | None = None,
@@ -216,7 +217,7 @@ def evaluate(
     rows: bool | Sequence[str] = True,
     cost: Cost = None,
     units: Mapping[str, str] | None = None,
-    client: Any = None,
+    client: DaskClient | None = None,
     retries: int = 2,
     devices: Sequence[Any] | None = None,
     lanes: int | None = None,

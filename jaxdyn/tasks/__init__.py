@@ -6,7 +6,9 @@ client is given.
 """
 
 from jaxdyn.tasks.cluster import Cluster as Cluster
+from jaxdyn.tasks.cluster import DaskClient as DaskClient
 from jaxdyn.tasks.cluster import Engine as Engine
+from jaxdyn.tasks.cluster import count_workers as count_workers
 from jaxdyn.tasks.cluster import map_tasks as map_tasks
 from jaxdyn.tasks.local import Failure as Failure
 from jaxdyn.tasks.local import Local as Local

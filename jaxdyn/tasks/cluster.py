@@ -8,9 +8,17 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
 
 from jaxdyn.tasks.local import Failure, Local, package_versions
+
+if TYPE_CHECKING:
+    from distributed import Client as DaskClient
+else:
+    DaskClient = Any  # Dask need not be there; `Cluster` looks at it
 
 logger = logging.getLogger("jaxdyn")
 WINDOW = 4  # tasks that a worker has or waits for: enough that it never idles, few enough that memory stays flat
@@ -31,8 +39,9 @@ class Cluster:
     jaxdyn, before any task. ConnectionError where the scheduler does not come back.
     """
 
-    def __init__(self, client: Any, retries: int = 0, mark: tuple[Path, str] | None = None):
-        self.client, self.retries, self.mark = client, retries, mark
+    def __init__(self, client: DaskClient, retries: int = 0, mark: tuple[Path, str] | None = None):
+        self.client: Any = client
+        self.retries, self.mark = retries, mark
         self._name = f"jaxdyn-{uuid.uuid4().hex[:12]}"
         self._plugin: Any = None
         self._generation = itertools.count()
@@ -56,7 +65,7 @@ class Cluster:
                 self.client.unregister_worker_plugin(self._name)
 
     def send(self, target: Callable[[], Any]) -> None:
-        """Send `target` by cloudpickle, with the settings of JAX of this thread, once to each worker, also to those that join later.
+        """Send `target` by cloudpickle, with the settings of JAX of this thread, to each worker, also to those that join later.
 
         A worker calls it at its first task.
 
@@ -78,7 +87,7 @@ class Cluster:
     @property
     def workers(self) -> int:
         """How many there are now, at least 1."""
-        return max(1, len(self.client.nthreads()))
+        return count_workers(self.client)
 
     @property
     def workers_per_host(self) -> int:
@@ -223,7 +232,7 @@ def _outages() -> tuple[type[BaseException], ...]:
     """What the client raises where the scheduler is gone, or where results are lost with all workers that had them."""
     from concurrent.futures import CancelledError
 
-    from distributed.comm import CommClosedError
+    from distributed.comm.core import CommClosedError
 
     return OSError, CommClosedError, CancelledError
 
@@ -249,15 +258,23 @@ def _check_versions(client: Any) -> None:
                 )
 
 
+def count_workers(client: DaskClient | None) -> int:
+    """Workers of a client now, at least 1; 1 without a client."""
+    if client is None:
+        return 1
+    threads: Any = client.nthreads()
+    return max(1, len(threads))
+
+
 def map_tasks(
-    function: Callable[[Any], Any], items: Iterable[Any], client: Any = None, *, retries: int = 2
+    function: Callable[[Any], Any], items: Iterable[Any], client: DaskClient | None = None, *, retries: int = 2
 ) -> list[Any]:
-    """[function(item) for each item], on the workers of a Dask client where one is given.
+    """[function(item) for each item], on the workers of a Dask client where one is given; arrays come back as those of NumPy.
 
     **Raises:** what the function raises; as `Cluster`.
     """
     if client is None:
-        return [function(item) for item in items]
+        return [_Function(function).call(item) for item in items]
     results = []
     with Cluster(client, retries) as cluster:
         cluster.send(lambda: _Function(function))
@@ -270,7 +287,11 @@ def map_tasks(
 
 class _Function:
     def __init__(self, function: Callable[[Any], Any]):
-        self.call = function
+        self._function = function
+
+    def call(self, item: Any) -> Any:
+        # A process in 32 bits, which the client may be outside of its settings, would read arrays of JAX as such.
+        return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, self._function(item))
 
 
 Engine = Local | Cluster

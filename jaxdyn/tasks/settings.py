@@ -22,7 +22,7 @@ class Settings(NamedTuple):
     def current(cls) -> "Settings":
         """Those in force on this thread."""
         config: Any = jax.config
-        return cls(*(getattr(config, f"jax_{name}") for name in cls._fields[:-1]), compilation_mode())
+        return cls._make([*(getattr(config, f"jax_{name}") for name in cls._fields[:-1]), compilation_mode()])
 
     @contextlib.contextmanager
     def active(self) -> Iterator[None]:
