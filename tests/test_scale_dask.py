@@ -337,6 +337,69 @@ def test_the_scheduler_killed_and_started_again(whole, tmp_path):
         assert_same(run, whole(SLOW))
 
 
+# From the shell
+
+STUDY = """
+scene = "functions.py"
+out = "here.zarr"
+samples = 12
+duration = 0.1
+points = 3
+[parameters]
+damping = { log_uniform = [0.1, 1.0] }
+[options]
+stepsize = 0.01
+lanes = 4  # one lane alone differs in the last bit under JAXDYN_COMPILATION_OPTIONS=least
+[reductions]
+q = { mean = "q" }
+"""
+FUNCTIONS = """
+import jax.numpy as jnp
+import jaxdyn as jd
+
+def scene(p):
+    system = jd.scenes.double_pendulum().system
+    return jd.Scene(system, forces=(jd.JointDamping(p["damping"] * jnp.ones(2)),))
+
+def states(p):
+    return 0.5 * jnp.ones(2), jnp.zeros(2)
+"""
+
+
+@pytest.mark.slow
+def test_sweep_on_clusters(cluster, tmp_path):
+    file = tmp_path / "study.toml"
+    file.write_text(STUDY)
+    (tmp_path / "functions.py").write_text(FUNCTIONS)
+    sweep = ("-m", "jaxdyn", "sweep", file, "--quiet", "--chunk", 3)
+    places = {
+        "here": [],
+        "workers": ["--workers", 2, "--out", tmp_path / "workers.zarr"],
+        "client": ["--client", cluster.scheduler_address, "--out", tmp_path / "client.zarr"],
+    }
+    for options in places.values():
+        process = start(*sweep, *options, stdout=subprocess.PIPE)
+        assert b"12 rollouts, 12 of them computed" in process.communicate(timeout=LONG)[0]
+        assert process.returncode == 0
+    here, workers, there = (files(tmp_path / f"{name}.zarr") for name in places)
+    assert here == workers == there
+
+
+def test_sweep_refuses_places_without_a_scheduler(tmp_path, capsys):
+    import dask
+
+    from jaxdyn.cli import main
+
+    file = tmp_path / "study.toml"
+    file.write_text(STUDY)
+    (tmp_path / "functions.py").write_text(FUNCTIONS)
+    with dask.config.set({"distributed.comm.timeouts.connect": "300ms"}):
+        assert main(["sweep", str(file), "--client", "tcp://127.0.0.1:1"]) == 2
+    assert "--client is tcp://127.0.0.1:1, where no scheduler of Dask answers" in capsys.readouterr().err
+    assert main(["sweep", str(file), "--workers", "0"]) == 2
+    assert "--workers is 0; give at least 1" in capsys.readouterr().err
+
+
 # Errors
 
 

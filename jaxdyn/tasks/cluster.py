@@ -121,11 +121,10 @@ class Cluster:
                 self._recover()
                 window.submit_again()
 
-    def submit(self, method: str, places: list[int], items: list[Any]) -> list[Any]:
-        """Futures of tasks; their keys end in the places."""
+    def submit(self, group: str, method: str, places: list[int], items: list[Any]) -> list[Any]:
+        """Futures of tasks; their keys are of the group and the places."""
         from jaxdyn.tasks.worker import RESOURCE, call_target
 
-        group = f"{self._name}-{method}-{next(self._generation)}"
         return self.client.map(
             call_target,
             [self._name] * len(items),
@@ -136,6 +135,10 @@ class Cluster:
             retries=self.retries,
             pure=False,
         )
+
+    def new_group(self, method: str) -> str:
+        """A name that no task had."""
+        return f"{self._name}-{method}-{next(self._generation)}"
 
     def _recover(self) -> None:
         """Wait for a scheduler, which may be another one at the same address, and for a worker."""
@@ -162,6 +165,8 @@ class _Window:
 
         self._cluster, self._method, self._items = cluster, method, enumerate(items)
         self._completed = as_completed()
+        # One for all tasks: the scheduler remembers each.
+        self._group = cluster.new_group(method)
         self._waiting: dict[int, tuple[Any, Any]] = {}  # item and future by place
         self._ready: dict[int, tuple[Any, Any]] = {}  # item and result by place
         self._next = self._taken = 0
@@ -197,6 +202,7 @@ class _Window:
     def submit_again(self) -> None:
         """All that is under way, whose futures are lost."""
         self._completed.clear()
+        self._group = self._cluster.new_group(self._method)
         lost = {place: item for place, (item, _) in self._waiting.items()}
         self._waiting.clear()
         self._add(lost)
@@ -204,7 +210,7 @@ class _Window:
     def _add(self, new: dict[int, Any]) -> None:
         # Noted first: where submitting fails they are submitted again.
         self._waiting |= {place: (item, None) for place, item in new.items()}
-        futures = self._cluster.submit(self._method, list(new), list(new.values()))
+        futures = self._cluster.submit(self._group, self._method, list(new), list(new.values()))
         self._waiting |= {place: (new[place], future) for place, future in zip(new, futures, strict=True)}
         self._completed.update(futures)
 
