@@ -38,7 +38,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.operations import operations
-from jaxdyn.scale import batch, study
+from jaxdyn.scale import study
 from jaxdyn.tasks import Cluster
 
 QUIET = {"progress": False}
@@ -95,17 +95,17 @@ def four_bars(samples: int, out, **options):
 
 def with_program(run: Callable, *args, **options):
     """A run of `jd.scale` in this process, and the program of its batches."""
-    kept, usual = [], batch.Computation
+    kept, usual = [], study.Computation
 
     def note(*given):
         kept.append(usual(*given))
         return kept[-1]
 
-    batch.Computation = note
+    study.Computation = note
     try:
         return run(*args, **options), kept[-1].program
     finally:
-        batch.Computation = usual
+        study.Computation = usual
 
 
 def store(folder: Path, samples: int) -> None:

@@ -610,7 +610,7 @@ def test_the_extra_is_named(tmp_path, monkeypatch):
 
 
 def test_progress_has_rate_and_time_left(capsys):
-    from jaxdyn.scale.progress import Progress
+    from jaxdyn.tasks import Progress
 
     meter = Progress(100, 10, every=0.0)
     meter._start -= 10.0

@@ -12,12 +12,11 @@ from jaxdyn.model.arguments import Numbers, as_array, as_path
 from jaxdyn.scale.described import Described
 from jaxdyn.scale.lock import lock_store
 from jaxdyn.scale.members import Members, digest
-from jaxdyn.scale.progress import Progress
 from jaxdyn.scale.reducer import Merger, Reducer
 from jaxdyn.scale.reductions import Arrays, check_reductions, describe_reductions
 from jaxdyn.scale.store import FULL, Store, check_place, full_disk, zarr_package
-from jaxdyn.scale.study import LISTED, PILOT_BATCHES, Computation, Facts, Pipeline, Study, local_devices
-from jaxdyn.tasks import Cluster, Engine, Failure, package_versions
+from jaxdyn.scale.study import LISTED, PILOT_BATCHES, Facts, Pipeline, Study, local_devices
+from jaxdyn.tasks import Cluster, Engine, Failure, Progress, package_versions
 
 if TYPE_CHECKING:
     import xarray
@@ -143,40 +142,22 @@ def run_batch(
         if store is not None:
             store.check(description)
             store.remove_leftovers()
-
-        with (
-            Pipeline(options.retries)
-            if options.client is None
-            else Cluster(options.client, options.retries, mark) as engine
-        ):
-            study = Study(
-                outputs.one,
-                batch,
-                pilot,
-                outputs.is_motion,
-                reducer,
-                kept,
-                len(outputs.codes),
-                order,
-                path.absolute(),
-                options.devices,
-                options.lanes,
-                min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers))),
-                options.memory,
-                engine.workers_per_host,
-            )
-            # What is traced here already cannot be sent.
-            engine.send(study.open if options.client is not None else lambda: Computation(study, outputs.traced))
+        engine: Engine = (
+            Pipeline(options.retries) if options.client is None else Cluster(options.client, options.retries, mark)
+        )
+        with engine:
+            most_lanes = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
+            fixed = outputs, batch, pilot, reducer, kept, order, path.absolute(), options.devices
+            study = Study(*fixed, options.lanes, most_lanes, options.memory, engine.workers_per_host)
+            engine.send(study.open)
             facts: Facts = engine.call("facts", store is None)
             description["platform"] = facts.platform
             if store is None:
                 variables = [outputs.variables[name] for name in kept] + reducer.variables
                 variables = [replace(one, compressed=one.compressed or options.compress) for one in variables]
                 chunk = options.chunk or _chunk_size(facts, row_bytes, batch.count, engine.workers, bool(pilot))
-                coordinates = outputs.coordinates(order)
-                store = Store.create(
-                    path, variables, coordinates, description | facts.programs, batch.count, min(chunk, batch.count)
-                )
+                sizes = batch.count, min(chunk, batch.count)
+                store = Store.create(path, variables, outputs.coordinates(order), description | facts.programs, *sizes)
             store.check(description)
             before = store.recorded()
             meter = Progress(batch.count, store.count_rollouts(before), shown=options.progress)
@@ -188,20 +169,19 @@ def run_batch(
             results = merger.results()
             store.put({f"{name}_{part}": value for name, parts in results.items() for part, value in parts.items()})
     needed, waited = merger.steps.tolist()
-    return Run(
+    codes = {name: int(n) for name, n in zip(outputs.codes, merger.codes, strict=True) if n}
+    given = (
         path,
         batch.count,
         store.chunk,
-        {name: int(n) for name, n in zip(outputs.codes, merger.codes, strict=True) if n},
+        codes,
         merger.failed,
         results,
         meter.computed,
         meter.seconds,
         tuple(repaired),
-        facts.lanes,
-        facts.bytes,
-        waited / needed if needed else float("nan"),
     )
+    return Run(*given, facts.lanes, facts.bytes, waited / needed if needed else float("nan"))
 
 
 def _check_options(options: Options) -> None:

@@ -89,10 +89,7 @@ class Program:
         return clock() - before
 
     def _inputs_of(self, lanes: int) -> Any:
-        return jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct((lanes, *x.shape[1:]), jax.dtypes.canonicalize_dtype(x.dtype)),
-            self.members.inputs(np.zeros(1, np.int64)),
-        )
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct((lanes, *x.shape), x.dtype), given_to_one(self.members))
 
     def _needed(self) -> int:
         """Bytes of the program and of the results that are in memory at once, on all devices, by XLA's own account."""
@@ -110,10 +107,14 @@ class Traced:
     """
 
     def __init__(self, one: Callable, members: Members):
+        self._origin = one, members
         trace = jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True)
         operations, self.shapes = trace(given_to_one(members))
         self._call = function_of(operations)
         self._structure = jax.tree.structure(self.shapes)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Traced, self._origin  # what is traced cannot be sent, so that a worker traces it again
 
     def __call__(self, given: Any) -> dict[str, Any]:
         return jax.tree.unflatten(self._structure, self._call(*jax.tree.leaves(given)))

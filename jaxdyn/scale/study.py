@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxdyn.scale.described import Described
 from jaxdyn.scale.members import Members
 from jaxdyn.scale.program import SHARE, Program, Traced, available_memory, default_lanes, fingerprint
 from jaxdyn.scale.reducer import Reducer
@@ -53,20 +54,18 @@ class Summary(NamedTuple):
 class Study:
     """All that decides the rows of a batch, to be sent to workers.
 
-    - `one(drawn, row)`, the arrays of a member; `pilot`, the steps of a short part of it, or None; `is_motion`: by kernels.
-    - `kept`: names of the arrays that are stored; `codes`: how many result codes there are.
+    - `outputs`: the function of a member; `pilot`, the steps of a short part of it, or None.
+    - `kept`: names of the arrays that are stored.
     - `order` (count,): numbers of the rollouts in the order in which they are stored, None for that of their numbers.
     - `lanes` or None: rollouts at once, else at most `most_lanes`; `memory` (bytes) or None: half of what is free on a host,
       shared by the `sharing` processes there. `devices`: None for all of a process.
     """
 
-    one: Callable[[Any, Any], dict[str, Any]]
+    outputs: Described
     members: Members
     pilot: Callable[[Any, Any], dict[str, Any]] | None
-    is_motion: bool
     reducer: Reducer
     kept: tuple[str, ...]
-    codes: int
     order: np.ndarray | None
     path: Path
     devices: Sequence[Any] | None
@@ -85,9 +84,9 @@ class Study:
 
 
 class Computation:
-    """A study compiled in this process; `traced`, its function where it was traced here already."""
+    """A study compiled in this process."""
 
-    def __init__(self, study: Study, traced: Traced | None = None):
+    def __init__(self, study: Study):
         self.study = study
         devices = local_devices(study.devices)
         lanes = study.lanes or max(1, min(default_lanes(devices), study.most_lanes))
@@ -96,8 +95,8 @@ class Computation:
         memory = study.memory
         if memory is None and study.sharing > 1:
             memory = int(SHARE * available_memory(devices) / study.sharing)
-        batch = study.members
-        self.program = Program(traced or Traced(study.one, batch), batch, devices, lanes, memory, study.is_motion)
+        batch, outputs = study.members, study.outputs
+        self.program = Program(outputs.traced, batch, devices, lanes, memory, outputs.is_motion)
         if study.pilot:
             self.pilot = Program(Traced(study.pilot, batch), batch, devices, self.program.lanes, memory, True)
 
@@ -112,7 +111,7 @@ class Computation:
         if measure:
             first = self.study.numbers(slice(0, min(self.program.lanes, self.study.members.count)))
             seconds = self.program.time(first, time.perf_counter)
-            programs[PROGRAM] = fingerprint(self.study.one, self.study.members)
+            programs[PROGRAM] = fingerprint(self.study.outputs.one, self.study.members)
         return Facts(self.program.devices[0].platform, self.program.lanes, self.program.bytes, programs, seconds)
 
     @cached_property
@@ -121,7 +120,7 @@ class Computation:
         store = Store(self.study.path)
         if store.description[LOWERED] != self.program.lowered:
             # Of other lanes, devices or processors; what is computed for one member has to be the same.
-            store.check({PROGRAM: fingerprint(self.study.one, self.study.members)})
+            store.check({PROGRAM: fingerprint(self.study.outputs.one, self.study.members)})
         return store
 
     def chunk(self, chunk: int) -> Summary:
@@ -168,7 +167,7 @@ class Computation:
 
     def _summary(self, chunk: int, codes: np.ndarray, partials: Arrays, steps: tuple[int, int]) -> Summary:
         failed = self.study.numbers(self.store.rows(chunk))[np.flatnonzero(codes)[:LISTED]]
-        return Summary(np.bincount(codes, minlength=self.study.codes), failed, partials, steps)
+        return Summary(np.bincount(codes, minlength=len(self.study.outputs.codes)), failed, partials, steps)
 
 
 class Pipeline(Local):
