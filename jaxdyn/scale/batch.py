@@ -117,7 +117,7 @@ def run_batch(
     _check_options(options)
     reductions = check_reductions(options.reductions)
     outputs = describe(reductions)
-    kept = _kept(outputs, options.rows)
+    kept = _select_rows(outputs, options.rows)
     if isinstance(options.cost, str):
         if options.cost != MEASURED or pilot is None:
             raise ValueError(
@@ -131,7 +131,7 @@ def run_batch(
     description = (
         {f"version of {name}": version for name, version in package_versions().items()}
         | {"float64": bool(jax.config.read("jax_enable_x64"))}
-        | batch.described()
+        | batch.description()
         | words
         | {"order": None if order is None else digest(order), "rows stored": list(kept)}
         | {"reductions": describe_reductions(reductions), "compression": options.compress}
@@ -159,7 +159,7 @@ def run_batch(
                 sizes = batch.count, min(chunk, batch.count)
                 store = Store.create(path, variables, outputs.coordinates(order), description | facts.programs, *sizes)
             store.check(description)
-            before = store.recorded()
+            before = store.recorded_chunks()
             meter = Progress(batch.count, store.count_rollouts(before), shown=options.progress)
             if options.client is not None:
                 meter.note(f"dashboard: {options.client.dashboard_link}")
@@ -263,7 +263,7 @@ def _chunk_size(facts: Facts, row_bytes: int, count: int, workers: int, is_measu
     return max(min(lanes * max(1, int(batches)), count), PILOT_BATCHES * lanes if is_measured else 0)
 
 
-def _kept(described: Described, rows: bool | Sequence[str]) -> tuple[str, ...]:
+def _select_rows(described: Described, rows: bool | Sequence[str]) -> tuple[str, ...]:
     if isinstance(rows, bool):
         return tuple(described.variables) if rows else ("result",)
     unknown = [name for name in rows if name not in described.variables]

@@ -80,10 +80,10 @@ class FunctionRows(NamedTuple):
         return _with_quantities(values | _parameters(parameters) | {"result": code}, self.reductions)
 
 
-def described_motion(
+def describe_motion(
     one: Callable, batch: Members, reductions: Mapping[str, Reduction], units: Mapping[str, str], ts: np.ndarray
 ) -> Described:
-    """Of `one(drawn, row) -> (solution, scene, parameters)` with rows at the times ts (nt,)."""
+    """Trace and describe `one(drawn, row) -> (solution, scene, parameters)` with rows at the times ts (nt,)."""
     rows = MotionRows(one, reductions, {})
     seen = rows.seen
     traced = Traced(rows, batch)
@@ -107,11 +107,10 @@ def described_motion(
     return Described(rows, traced, True, variables, CODES, axes)
 
 
-def described_function(
+def describe_function(
     one: Callable, batch: Members, reductions: Mapping[str, Reduction], units: Mapping[str, str]
 ) -> Described:
-    """Of `one(drawn, row) -> (dictionary of arrays, parameters)`."""
-
+    """Trace and describe `one(drawn, row) -> (dictionary of arrays, parameters)`."""
     rows = FunctionRows(one, reductions)
     traced = Traced(rows, batch)
     shapes = traced.shapes

@@ -121,8 +121,3 @@ def _partial(name: str, part: str) -> str:
 
 def _axes(key: str, ndim: int) -> tuple[str, ...]:
     return tuple(f"{key.rpartition('/')[2]}_{k}" for k in range(ndim))
-
-
-def named(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Results by their names in the store."""
-    return {f"{name}_{part}": value for name, parts in results.items() for part, value in parts.items()}

@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 from jaxdyn.model.arguments import Checked, FilePath, Numbers, as_array
 from jaxdyn.model.printed import scene_lines
 from jaxdyn.scale.batch import Cost, Options, Run, run_batch
-from jaxdyn.scale.described import described_function, described_motion
+from jaxdyn.scale.described import describe_function, describe_motion
 from jaxdyn.scale.members import digest, members
 from jaxdyn.scale.reductions import Reduction
 from jaxdyn.scale.study import STEPS
@@ -68,7 +68,7 @@ class Sample:
     function: Callable[[Any], Mapping[str, Any]]
 
     def __call__(self, drawn: Any, row: Any) -> tuple[Any, Any]:
-        """What its function returns, and its parameters."""
+        """The arrays that its function returns, and its parameters."""
         own = row["parameters"] if drawn is None else drawn
         return self.function(own), own
 
@@ -202,7 +202,7 @@ def run(
     )
     pilot = rollout.pilot if options.get("stepsize") is None else None
     return run_batch(
-        lambda reducing: described_motion(rollout, batch, reducing, shared.units, ts), given, batch, shared, pilot
+        lambda reducing: describe_motion(rollout, batch, reducing, shared.units, ts), given, batch, shared, pilot
     )
 
 
@@ -257,5 +257,5 @@ def evaluate(
         units or {},
     )
     return run_batch(
-        lambda reducing: described_function(Sample(function), batch, reducing, shared.units), {}, batch, shared
+        lambda reducing: describe_function(Sample(function), batch, reducing, shared.units), {}, batch, shared
     )

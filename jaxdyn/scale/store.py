@@ -94,7 +94,7 @@ class Store:
             except PermissionError:
                 raise
             except Exception as error:  # zarr reads the file with few checks: JSON, keys, types
-                raise self._damaged(error) from error
+                raise self._damage_error(error) from error
         if attributes.get("jaxdyn_store") != FORMAT:
             version = attributes.get("jaxdyn_store", "nothing")
             raise ValueError(
@@ -109,9 +109,9 @@ class Store:
             self._arrays: dict[str, Any] = {name: self.group[name] for name in self.names}
             self._record: Any = self.group["record/checksum"]
         except (KeyError, TypeError, ValueError, ArithmeticError, OSError) as error:
-            raise self._damaged(error) from error
+            raise self._damage_error(error) from error
 
-    def _damaged(self, error: Exception) -> ValueError:
+    def _damage_error(self, error: Exception) -> ValueError:
         reason = " ".join(str(error).split()) or type(error).__name__
         return ValueError(
             f"out is {str(self.path)!r}, whose zarr.json is damaged ({type(error).__name__}: {reason}); put it back from a "
@@ -212,8 +212,8 @@ class Store:
         """Whether the chunk is recorded."""
         return self._file("record/checksum", self._record, chunk).exists()
 
-    def recorded(self) -> np.ndarray:
-        """Whether each chunk is recorded (chunks,)."""
+    def recorded_chunks(self) -> np.ndarray:
+        """Mask of the recorded chunks (chunks,)."""
         folder = self._file("record/checksum", self._record, 0).parent.parent
         recorded = np.zeros(self.chunks, bool)
         with contextlib.suppress(FileNotFoundError), os.scandir(folder) as entries:

@@ -28,7 +28,7 @@ LOWERED = "lowered program"
 
 
 class Facts(NamedTuple):
-    """What the compiled program of a worker is: its platform, lanes, memory (bytes), hash, and the seconds of a batch."""
+    """The compiled program of a worker: its platform, lanes, memory (bytes), hash, and the seconds of a batch."""
 
     platform: str
     lanes: int
@@ -38,7 +38,7 @@ class Facts(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """What is returned of a chunk, whose rows are in the store.
+    """The result of a task, of a chunk whose rows are in the store.
 
     `codes`: how many rollouts ended with each; `failed`, numbers of the first that did not succeed; `partials` of reductions;
     `steps`: those that rollouts needed, and that the lanes of their batches waited for, (0, 0) of a chunk that was read.
@@ -101,7 +101,7 @@ class Computation:
             self.pilot = Program(Traced(study.pilot, batch), batch, devices, self.program.lanes, memory, True)
 
     def facts(self, measure: bool) -> Facts:
-        """Of the program; with `measure` a batch is timed and hashed, as a new store needs, else an old one is checked.
+        """Facts of the program; with `measure` a batch is timed and hashed, as a new store needs, else an old one is checked.
 
         **Raises:** ValueError for a store of something else.
         """
@@ -153,7 +153,7 @@ class Computation:
         return self._summary(chunk, arrays.pop("result"), arrays, (0, 0))
 
     def check(self, chunks: tuple[int, np.ndarray]) -> list[tuple[bool, Summary]]:
-        """Of chunks that are in the store, from the first one on: whether it was not whole and is computed again; its summary.
+        """Look through chunks from the first one on: whether it was not whole and is computed again, and its summary.
 
         The flags say of which chunks the files are compared with their sums; the others were just written.
         """
@@ -176,7 +176,7 @@ class Pipeline(Local):
     target: Computation
 
     def map(self, method: str, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        """As in `Local`."""
+        """Results in the order of the items, as in `Local`."""
         if method != "chunk":
             yield from super().map(method, items)
             return

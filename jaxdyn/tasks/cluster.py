@@ -86,12 +86,12 @@ class Cluster:
 
     @property
     def workers(self) -> int:
-        """How many there are now, at least 1."""
+        """Number of workers now, at least 1."""
         return count_workers(self.client)
 
     @property
     def workers_per_host(self) -> int:
-        """How many workers share the fullest host."""
+        """Number of workers that share the fullest host."""
         return max(Counter(address.rpartition(":")[0] for address in self.client.nthreads()).values(), default=1)
 
     def call(self, method: str, item: Any) -> Any:
@@ -235,7 +235,7 @@ class _Window:
 
 
 def _outages() -> tuple[type[BaseException], ...]:
-    """What the client raises where the scheduler is gone, or where results are lost with all workers that had them."""
+    """Errors of the client where the scheduler is gone, or where results are lost with all workers that had them."""
     from concurrent.futures import CancelledError
 
     from distributed.comm.core import CommClosedError

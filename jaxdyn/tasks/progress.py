@@ -1,4 +1,4 @@
-"""How far a run has come: rate and time left, on standard error."""
+"""A meter of progress, with rate and time left, on standard error."""
 
 import sys
 import time
