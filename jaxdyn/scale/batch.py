@@ -161,8 +161,8 @@ def run_batch(
             store.check(description)
             before = store.recorded_chunks()
             meter = Progress(batch.count, store.count_rollouts(before), shown=options.progress)
-            if options.client is not None:
-                meter.note(f"dashboard: {options.client.dashboard_link}")
+            if options.client is not None and (link := options.client.dashboard_link):
+                meter.note(f"dashboard: {link}")
             merger = Merger(reducer, len(outputs.codes), LISTED)
             repaired = _compute_all(engine, store, merger, meter, before, options)
             meter.end()
