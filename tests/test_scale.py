@@ -1,6 +1,7 @@
 """Batches of any size into a store: rows, interruptions, reductions, and how they say no; test_scale_dask.py has clusters."""
 
 import errno
+import itertools
 import json
 import os
 import re
@@ -471,6 +472,54 @@ def test_a_mean_of_large_numbers_does_not_cancel():
     np.testing.assert_allclose(computed["std"], values.std(0, ddof=1), rtol=1.5e-8)
     none = mean.merge({name: part[None] for name, part in parts[0].items()})
     assert none["count"] == 0 and np.isnan(none["mean"]).all() and np.isnan(none["std"]).all()
+
+
+@pytest.mark.parametrize(
+    "reduction",
+    [
+        jd.scale.Mean("y"),
+        jd.scale.Histogram("y", 0.0, 1.0),
+        jd.scale.Quantiles("y", 0.0, 1.0),
+        jd.scale.Worst("y", 3),
+        Extent(),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_partial_results_combine_in_groups_to_the_same_bits(reduction):
+    """As results arrive or all at once; groups without rollouts, and one that was combined before, among them."""
+    values = np.random.default_rng(2).random(200)
+    ends = np.array([0, 0, 3, 40, 41, 41, 120, 200])
+    parts = [reduction.partial(values[a:b], np.arange(a, b)) for a, b in itertools.pairwise(ends)]
+    stacked = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
+    together = {name: value[:1] for name, value in stacked.items()}
+    for begin, end in ((1, 2), (2, 5), (5, 7)):
+        joined = {name: np.concatenate([together[name], value[begin:end]]) for name, value in stacked.items()}
+        together = reduction.combine(joined)
+    assert_equal(reduction.merge(together), reduction.merge(stacked))
+    if not isinstance(reduction, Extent):
+        assert {len(value) for value in together.values()} == {1}
+
+
+def test_a_run_of_many_chunks_merges_as_they_come():
+    from jaxdyn.scale.reducer import COMBINED, Merger, Reducer
+    from jaxdyn.scale.study import Summary
+
+    values = np.random.default_rng(3).random(3 * COMBINED + 7)
+    reductions = {"mean": jd.scale.Mean("y"), "own": Extent()}
+    shapes = {f"quantity of {name}": jax.ShapeDtypeStruct((), np.float64) for name in reductions}
+    reducer = Reducer(reductions, shapes, {})
+    merger = Merger(reducer, 2, 5)
+    for k, value in enumerate(values):
+        rows = {"result": np.array([k % 2]), **dict.fromkeys(shapes, np.array([value]))}
+        merger.add(
+            Summary(
+                np.array([1 - k % 2, k % 2]), np.arange(k, k + k % 2), reducer.partials(rows, np.array([k])), (k, 1)
+            )
+        )
+    results = merger.results()
+    np.testing.assert_allclose(results["mean"]["mean"], values[::2].mean(), rtol=1e-14)
+    assert (results["own"]["least"], results["own"]["most"]) == (values[::2].min(), values[::2].max())
+    assert list(merger.failed) == [1, 3, 5, 7, 9] and merger.codes.sum() == len(values) == merger.steps[1]
 
 
 def test_quantiles_outside_of_the_bins_are_not_made_up():
