@@ -327,7 +327,7 @@ def test_the_scheduler_killed_and_started_again(whole, tmp_path):
             running.wait_for_chunks(5)
             scheduler.kill()
             scheduler.wait()
-            with pytest.raises(ConnectionError, match="did not come back .*what was finished is kept"):
+            with pytest.raises(ConnectionError, match=r"did not come back .*what was finished is kept"):
                 running.end()
         kept = recorded(running.out)
         begin()
@@ -481,7 +481,7 @@ def test_a_store_that_workers_do_not_see_is_refused(client, tmp_path):
             cluster.send(lambda: None)
         mark.write_text("another text")
         with pytest.raises(
-            ValueError, match="another file of that name.*file system that the client and all workers share"
+            ValueError, match=r"another file of that name.*file system that the client and all workers share"
         ):
             cluster.send(lambda: None)
 
