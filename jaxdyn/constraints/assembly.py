@@ -19,7 +19,7 @@ from jaxdyn.constraints.rank import tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, openness, row_limits
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model, difference
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, as_scene
@@ -82,7 +82,7 @@ def assemble(
     scene = as_scene(scene)
     if isinstance(guesses, bool) or not isinstance(guesses, int) or guesses < 1:
         raise ValueError(f"guesses is {guesses!r}; give how many configurations to start from, at least 1")
-    v = or_zeros(v, scene.nv)
+    v = zeros_if_none(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
     layout(locked)  # refuses joints that do not exist

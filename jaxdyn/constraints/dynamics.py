@@ -21,7 +21,7 @@ from jaxdyn.constraints.rank import checked_tolerance, eps_of, least_pivot, pseu
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_factored
 from jaxdyn.systems.scene import Scene, as_scene, checked_force
@@ -96,7 +96,7 @@ def constrained_dynamics(
         raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}")
     rank_tol = checked_tolerance(rank_tol)
     scene = as_scene(scene)
-    tau = or_zeros(tau, scene.nv)
+    tau = zeros_if_none(tau, scene.nv)
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     places = layout(scene)
     if not places:

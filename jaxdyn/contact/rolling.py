@@ -71,7 +71,7 @@ class RollingContact(Touching):
         """Steps on both surfaces toward the points next to each other."""
         return newton_steps(*self.patches(), R, p)
 
-    def followed(self, R: Float[Array, "3 3"], p: Float[Array, "3"], count: int) -> Float[Array, " n"]:
+    def track(self, R: Float[Array, "3 3"], p: Float[Array, "3"], count: int) -> Float[Array, " n"]:
         """The place after some steps of Newton's method."""
         contact = self
         for _ in range(count):

@@ -148,18 +148,18 @@ class RollingModel(Model):
         """
         _check_places(self, q, "q0", "take system.place(q0[: system.topology.nq])")
 
-    def follows(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
+    def is_consistent(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
         """Whether all surfaces are next to each other at their places, in one point each."""
         strict, left = _closeness(self, q)
         return jnp.all(strict & (left <= float(jnp.finfo(q.dtype).eps) ** 0.4))
 
-    def followed(self, q: Float[Array, " nq"], joints: Float[Array, "..."]) -> Float[Array, "..."]:
+    def complete_configuration(self, q: Float[Array, " nq"], joints: Float[Array, "..."]) -> Float[Array, "..."]:
         """q with the places where the surfaces are next to each other for other coordinates of the joints."""
         if not self.contacts:
             return joints
-        return run(_followed, self, q, joints, otherwise=_followed)
+        return run(_complete_configuration, self, q, joints, otherwise=_complete_configuration)
 
-    def followed_rate(
+    def complete_rate(
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], rate: Float[Array, "..."]
     ) -> Float[Array, "..."]:
         """dq/dt, with the rates of the places."""
@@ -168,10 +168,10 @@ class RollingModel(Model):
         return jnp.concatenate([rate, run(_place_rates, self, q, v, otherwise=_place_rates)])
 
 
-def _followed(system: RollingModel, q, joints):
+def _complete_configuration(system: RollingModel, q, joints):
     contacts = system.placed(q)
     poses = relative_poses(contacts, system, joints)
-    return jnp.concatenate([joints, *each(contacts, lambda one, R, p: one.followed(R, p, _STEPS_MOVED), *poses)])
+    return jnp.concatenate([joints, *each(contacts, lambda one, R, p: one.track(R, p, _STEPS_MOVED), *poses)])
 
 
 def _place_rates(system: RollingModel, q, v):
@@ -214,7 +214,7 @@ def _searched(system: RollingModel, joints, near):
         start = _between(contact, R, p) if near is None else _given(contact, near[i])
 
         def improved(_, place, contact=contact, R=R, p=p):
-            return contact.put(place).followed(R, p, 1)
+            return contact.put(place).track(R, p, 1)
 
         coordinates.append(lax.fori_loop(0, _STEPS_SEARCHED, improved, start))
     return jnp.concatenate([joints, *coordinates])

@@ -27,7 +27,7 @@ from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matr
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import least_quality
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -87,7 +87,7 @@ def object_dynamics(
     Source: Murray, Li & Sastry (1994), eqs 6.21-6.25; EQUATIONS section 10 and errata E35-E37.
     """
     check_grasp(grasp)
-    tau = or_zeros(tau, grasp.nv)
+    tau = zeros_if_none(tau, grasp.nv)
     q, tau, t = check_state(grasp.system, q=q, tau=tau, t=t)
     V = as_array(V, "V", q.dtype)
     count, joints = layout(grasp)[-1].end, len(grasp.hand_velocities)
@@ -144,7 +144,7 @@ def hand_dynamics(
     6.3; EQUATIONS section 10.
     """
     check_grasp(grasp)
-    tau = or_zeros(tau, grasp.nv)
+    tau = zeros_if_none(tau, grasp.nv)
     q, tau, t = check_state(grasp.system, q=q, tau=tau, t=t)
     motions = hand_motions(grasp, q, t) if motions is None else motions
     nh, no = len(grasp.hand_velocities), len(grasp.object_velocities)

@@ -15,7 +15,7 @@ from jaxdyn.grasp.contacts import on_object
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Numbers, as_array, batch_hint
-from jaxdyn.model.joining import joined
+from jaxdyn.model.joining import join_all
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Force, Scene
 
@@ -63,7 +63,7 @@ class Grasp(Scene):
             if object.nb != 1:
                 raise ValueError(f"object has {object.nb} bodies, {list(object.body_names)}; pass a Model of one body")
             models, object = [*models, object], object.body_names[0]
-        model = models[0] if len(models) == 1 else joined(models, f"grasp of {object}")
+        model = models[0] if len(models) == 1 else join_all(models, f"grasp of {object}")
         _check_object(model, object)
         if not isinstance(contacts, (tuple, list)) or not contacts:
             raise ValueError(f"contacts is {contacts!r}; pass a list with at least one contact")

@@ -192,7 +192,7 @@ def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constrai
         for k, end in enumerate(ends):
             axis = joint.axes[min(k, len(joint.axes) - 1)].direction if joint.axes else joint.pose[:3, 2]
             # The loop closes as the file places the links: both frames are there, z along the end's own axis.
-            place = f64.turn_from_z(axis)
+            place = f64.rotation_from_z(axis)
             place[:3, 3] = joint.pose[:3, 3]
             poses.append(place if end is None else f64.inverse(file.pose(end)) @ place)
         taken.append(loop(ends[0], poses[0], ends[1], poses[1], LOOPS[joint.kind], name=joint.name))

@@ -180,7 +180,7 @@ def _add_joint(
     if kind in SCREW_KINDS or kind == "planar":
         axis = np.asarray(f64.unit(joint.axis, f"joint {joint.name!r}: axis"))
     if kind == "planar":
-        turn, axis = f64.turn_from_z(axis), _Z
+        turn, axis = f64.rotation_from_z(axis), _Z
     if joint.name in locked:
         screw = np.concatenate([axis, np.zeros(3)] if kind == "prismatic" else [np.zeros(3), axis])
         pose = pose @ turn @ f64.joint_pose(kind, screw, locked[joint.name]) @ f64.inverse(turn)

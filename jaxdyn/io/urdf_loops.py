@@ -232,7 +232,7 @@ def _turned(file: XmlFile, joint, tag: str, world: np.ndarray, what: str) -> np.
     axis = np.array(default) if xyz is None else file.numbers(xyz, 3, f"<{tag}> of {what}")
     if not axis.any():
         raise file.fault(xyz, f"<xyz> of <{tag}> of {what} is zero; give a direction")
-    return f64.turn_from_z(world[:3, :3] @ f64.unit(axis, what))[:3, :3]
+    return f64.rotation_from_z(world[:3, :3] @ f64.unit(axis, what))[:3, :3]
 
 
 def plugin_followers(file: XmlFile) -> dict[str, tuple[Mimic, str]]:

@@ -28,7 +28,7 @@ from jaxdyn.constraints.dynamics import applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import freedoms, orthonormal, split_directions
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import velocity_to_rate
@@ -97,7 +97,7 @@ def gauge_invariant(
     Source: EQUATIONS section 9.
     """
     scene = as_scene(scene)
-    tau = or_zeros(tau, scene.nv)
+    tau = zeros_if_none(tau, scene.nv)
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so there is nothing to decouple; use jd.forward_dynamics")

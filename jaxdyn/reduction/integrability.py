@@ -14,7 +14,7 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.dynamics import tolerance
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, tangent_basis
 from jaxdyn.reduction.minimal import reduce
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -179,7 +179,7 @@ def spurious_terms(
     Source: Murray, Li & Sastry (1994), eq. 6.15; EQUATIONS section 6, errata E32 and E33.
     """
     scene = as_scene(scene)
-    tau = or_zeros(tau, scene.nv)
+    tau = zeros_if_none(tau, scene.nv)
     q, tau, t = check_state(scene.system, q=q, tau=tau, t=t)
     nu = as_array(nu, "nu", q.dtype)
     if not layout(scene):

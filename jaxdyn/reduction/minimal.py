@@ -20,7 +20,7 @@ from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import applied
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import Basis, BasisLike, Moving, Whole, as_basis, least_quality, moving
 from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
 from jaxdyn.systems.scene import Scene, as_scene
@@ -75,7 +75,7 @@ def reduced_dynamics(
     Source: EQUATIONS section 6; Kane & Levinson (1985), section 6.1.
     """
     scene = as_scene(scene)
-    tau = or_zeros(tau, scene.nv)
+    tau = zeros_if_none(tau, scene.nv)
     q, tau, time = check_state(scene.system, q=q, tau=tau, t=t)
     nu = as_array(nu, "nu", q.dtype)
     if layout(scene):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from jaxdyn.model.arguments import Checked, FilePath, Numbers, as_array
-from jaxdyn.model.printed import scene_lines
+from jaxdyn.model.description import scene_lines
 from jaxdyn.scale.batch import Cost, Options, Run, whole
 from jaxdyn.scale.described import described_function, described_motion
 from jaxdyn.scale.driver import STEPS

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdyn.compile import is_concrete
-from jaxdyn.model.arguments import stored
+from jaxdyn.model.arguments import store_leaf
 from jaxdyn.systems.scene import Scene
 
 REGISTRY: dict[str, "NamedScene"] = {}
@@ -54,9 +54,9 @@ def named(
 
 def as_leaf(value):
     """A number as a leaf, which can be differentiated and batched."""
-    return stored(value, float)
+    return store_leaf(value, float)
 
 
 def as_state(values):
     """Numbers of a start as an array: of jax's default type where they are known."""
-    return stored(values, float) if is_concrete(values) else jnp.asarray(values)
+    return store_leaf(values, float) if is_concrete(values) else jnp.asarray(values)

@@ -14,7 +14,7 @@ from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
 from jaxdyn.lie import se3
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia, robots
-from jaxdyn.model.arguments import Checked, Number, Row, stored
+from jaxdyn.model.arguments import Checked, Number, Row, store_leaf
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.tree import Model
@@ -196,7 +196,7 @@ def coordinated_lifting(
         raise ValueError(f"count is {count!r}; give the number of arms, a positive integer")
     fall = (0.0, 0.0, -gravity)
     arm = robots.iiwa(gravity=fall)
-    flange = frame_pose(robots.iiwa(gravity=None), stored(_HOLDING, arm.home.dtype), _FLANGE)
+    flange = frame_pose(robots.iiwa(gravity=None), store_leaf(_HOLDING, arm.home.dtype), _FLANGE)
     xp = numpy_for(flange, radius)
     flange = xp.asarray(flange)
     whole, grips = ModelBuilder("no arm", gravity=fall).build(), []

@@ -125,7 +125,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
             (by_contact, RESULTS.contact_lost),
         ]
     if has_followers(system):
-        follows = jnp.cumsum(~map_rows(system.follows, q)) == 0
+        follows = jnp.cumsum(~map_rows(system.is_consistent, q)) == 0
         ends.insert(0, (~follows.all(), RESULTS.no_single_contact))
         reached = reached & follows
         time_reached = jnp.where(follows.all(), time_reached, jnp.max(jnp.where(reached, ts, ts[0])))

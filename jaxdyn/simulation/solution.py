@@ -14,7 +14,7 @@ from jaxdyn.constraints.codes import Outcome, name_of
 from jaxdyn.contact.forces import coned_contacts
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import FilePath
-from jaxdyn.model.printed import solution_lines
+from jaxdyn.model.description import solution_lines
 from jaxdyn.simulation.controls import at_start
 from jaxdyn.simulation.export import as_xarray, write_csv, write_npz
 from jaxdyn.simulation.limits import joint_of

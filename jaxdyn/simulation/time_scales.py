@@ -14,7 +14,7 @@ from jaxdyn.compile import compiled, is_known, numpy_for
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Checked, Numbers, check_state, stored
+from jaxdyn.model.arguments import Checked, Numbers, check_state, store_leaf
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
@@ -113,7 +113,7 @@ def stiffness(
         values = np.linalg.eigvals(known)
     else:
         values = jnp.linalg.eigvals(matrix)
-    return Stiffness(*(stored(x, matrix.dtype) for x in _rates(values)))
+    return Stiffness(*(store_leaf(x, matrix.dtype) for x in _rates(values)))
 
 
 @compiled

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system
-from jaxdyn.model.printed import scene_lines
+from jaxdyn.model.description import scene_lines
 
 if TYPE_CHECKING:
     Force = Callable[[Any, Array, Array, Array], Array]  # f(system, q, v, t) -> (nv,)

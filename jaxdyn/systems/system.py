@@ -251,7 +251,7 @@ def has_quaternions(system) -> bool:
 
 
 def has_followers(system) -> bool:
-    """Whether q holds numbers behind the joints' coordinates that are functions of these (see `Model.followed`)."""
+    """Whether q holds numbers behind the joints' coordinates that are functions of these (see `Model.complete_configuration`)."""
     return isinstance(system, Model) and system.nq > system.topology.nq
 
 
