@@ -23,7 +23,7 @@ from jaxdyn.constraints.dynamics import whitened_rows
 from jaxdyn.constraints.projection_derivative import LOST, Corrections, projected
 from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, tolerance
 from jaxdyn.lie.so3 import _product
-from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
@@ -139,14 +139,14 @@ def _by_pivots(scene: Scene, q, v, t, *errors):
 
     def steps(Y):
         factor = cholesky(_product(Y.T, Y))
-        return (lambda residual: metric.unwhiten(_product(Y, solve_factored(factor, residual)))), quality_of(factor)
+        return (lambda residual: metric.unwhiten(_product(Y, solve_cholesky(factor, residual)))), quality_of(factor)
 
     every, quality = steps(Y)
     some = every
     if holonomic.size not in (0, Y.shape[1]):
         some, of_holonomic = steps(Y[:, holonomic])
         quality = jnp.minimum(quality, of_holonomic)
-    quality = jnp.where(metric.definite(), quality, jnp.nan)
+    quality = jnp.where(metric.is_definite(), quality, jnp.nan)
     return *_moved(scene, q, v, t, errors, every, some), quality
 
 

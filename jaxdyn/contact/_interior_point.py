@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Int
 from jaxdyn.compile import any_in_batch, run
 from jaxdyn.contact import _jordan as jordan
 from jaxdyn.lie.so3 import _product
-from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
 REFINEMENTS = 4  # steps of Newton's method
 Pattern = tuple[bytes | None, ...]  # of each group, which entries of G may differ from zero; None where all may
@@ -119,7 +119,7 @@ def _start(pattern: Pattern, _, program: Program):
     rows = jnp.concatenate([g.reshape(-1, q.shape[0]) for g in G])
     level = jnp.concatenate([y.reshape(-1) for y in h])
     factor = cholesky(Q + _product(rows.T, rows))
-    x = solve_factored(factor, _product(rows.T, level) - q)
+    x = solve_cholesky(factor, _product(rows.T, level) - q)
     slack = _zip(lambda a, b: b - a, _times(G, x), h)
 
     def inside(groups):
@@ -145,10 +145,10 @@ def _newton(program: Program, s, z):
     def solve(rx, rz, u, is_refined: bool = True):
         """Q dx + G^T dz = -rx, G dx + ds = -rz, W dz + W^-1 ds = u; also W dz and W^-1 ds."""
         right = _zip(lambda w, r, y: w.inverse_times(r) + y, W, rz, u)
-        dx = solve_factored(factor, -rx - _gathered(scaled, right, rx))
+        dx = solve_cholesky(factor, -rx - _gathered(scaled, right, rx))
         wdz = _zip(lambda a, b: a + b, _times(scaled, dx), right)
         if is_refined:  # the matrix squares the condition; what that costs, one step of refinement returns
-            more = solve_factored(factor, -rx - _product(Q, dx) - _gathered(scaled, wdz, rx))
+            more = solve_cholesky(factor, -rx - _product(Q, dx) - _gathered(scaled, wdz, rx))
             dx, wdz = dx + more, _zip(lambda a, b: a + b, wdz, _times(scaled, more))
         wds = _zip(lambda a, b: a - b, u, wdz)
         dz, ds = (_zip(lambda w, y: w.inverse_times(y), W, wdz), _zip(lambda w, y: w.times(y), W, wds))
@@ -274,7 +274,7 @@ def _solve_projected(program: Program, v, width, right_x, right_s, corrections: 
     for _ in range(1 + corrections):
         rx = right_x - _product(Q, dx) + _gathered(G, times(rest, dv), dx)
         rs = _zip(lambda r, a, b: r - a - b, right_s, _times(G, dx), times(D, dv))
-        more = solve_factored(factor, rx + _gathered(G, times(rest, times(inverse, rs)), dx))
+        more = solve_cholesky(factor, rx + _gathered(G, times(rest, times(inverse, rs)), dx))
         dv = _zip(lambda a, b: a + b, dv, times(inverse, _zip(lambda r, a: r - a, rs, _times(G, more))))
         dx = dx + more
     return dx, dv

@@ -21,7 +21,7 @@ from jaxdyn.contact._checks import as_float
 from jaxdyn.contact._interior_point import Point, Program, attached, solve
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers
-from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 
 
 class RESULTS(eqx.Enumeration):
@@ -218,8 +218,8 @@ def _solved(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: flo
         result = RESULTS.where(end.solved, result, RESULTS.stalled)  # pyright: ignore[reportArgumentType]
         result = RESULTS.where(end.infeasible, RESULTS.infeasible, result)  # pyright: ignore[reportArgumentType]
     else:
-        point = Point(-solve_factored(cholesky(program.Q), program.q), (), ())
-    result = RESULTS.where(definite(Q, cholesky(Q)), result, RESULTS.indefinite)  # pyright: ignore[reportArgumentType]
+        point = Point(-solve_cholesky(cholesky(program.Q), program.q), (), ())
+    result = RESULTS.where(is_definite(Q, cholesky(Q)), result, RESULTS.indefinite)  # pyright: ignore[reportArgumentType]
     # Comparisons with NaN are false, and zeros of rows without a bound hide what is not finite in them.
     finite = finite & (jnp.isfinite(point.x).all() | (result != RESULTS.successful))
     result = RESULTS.where(finite, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]

@@ -138,7 +138,7 @@ class EffortLimits(eqx.Module):
         limit = jnp.where(bounded, limit, 0.0)
         return jnp.concatenate([jnp.where(bounded, side * tau - limit, -1.0) for side in (1.0, -1.0)])
 
-    def limited(
+    def clip_effort(
         self, system: SystemLike, tau: Float[Array, " nv"], positive: Bool[Array, " n"] | None = None
     ) -> Float[Array, " nv"]:
         """tau cut off; `positive` (2 nv,): where, if that is known from the signs of `effort_guards`."""

@@ -78,8 +78,8 @@ class _OnePiece(eqx.Module):
             return self.inner.force(system, q, v, t, self.positive)
         return self.inner(system, q, v, t)
 
-    def limited(self, system, tau):
-        cut = getattr(self.inner, "limited", None)
+    def clip_effort(self, system, tau):
+        cut = getattr(self.inner, "clip_effort", None)
         if cut is None:
             return tau
         return cut(system, tau) if self.of_efforts is None else cut(system, tau, self.of_efforts)
@@ -100,8 +100,8 @@ def guards_by_force(scene: Scene, q, v, t, tau) -> list[tuple[Any, Any]]:
                 raise ValueError(f"{type(force).__name__}: guards gives shape {own.shape}; expected (n,)")
         if tau is not None and hasattr(force, "effort_guards"):
             efforts = force.effort_guards(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
-        if tau is not None and hasattr(force, "limited"):
-            tau = force.limited(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
+        if tau is not None and hasattr(force, "clip_effort"):
+            tau = force.clip_effort(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
         rows.append((own, efforts))
     return rows
 

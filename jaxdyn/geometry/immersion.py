@@ -24,9 +24,9 @@ from jaxdyn.compile import is_known
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Checked, Function, Numbers, check_state
-from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
-from jaxdyn.systems.start import place_of
-from jaxdyn.systems.system import SceneLike, System, checked_size, rate_to_velocity
+from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
+from jaxdyn.systems.start import describe_state
+from jaxdyn.systems.system import SceneLike, System, check_size, rate_to_velocity
 
 
 class PullBack(eqx.Module):
@@ -187,7 +187,7 @@ class PulledForce(eqx.Module):
         total = [
             _sum(
                 [jnp.zeros_like(w)]
-                + [checked_force(f(unit, q_unit, w, t), q_unit, unit.nv, f"forces[{i}]") for i, f in enumerate(forces)]
+                + [check_force(f(unit, q_unit, w, t), q_unit, unit.nv, f"forces[{i}]") for i, f in enumerate(forces)]
             )
             for unit, forces, q_unit, w in zip(system.units, self.forces, q, v, strict=True)
         ]
@@ -254,7 +254,7 @@ def constrain_by_immersion(
             )
     units = tuple(scene.system for scene in scenes)
     immersed = ImmersedSystem(
-        units=units, immersion=as_pytree(xi, "xi"), nq=checked_size(nq), moving=bool(moving), joined=joined
+        units=units, immersion=as_pytree(xi, "xi"), nq=check_size(nq), moving=bool(moving), joined=joined
     )
     if force is None and not any(isinstance(unit, Scene) for unit in given):
         return immersed
@@ -313,7 +313,7 @@ def _add_forces(total, forces, argument: str) -> list[Array]:
     """Add the forces that a user gave, one for each unit, to the total of each unit."""
     if len(forces) != len(total):
         raise ValueError(f"{argument} has {len(forces)} entries; give one for each of the {len(total)} systems")
-    return [f + checked_force(g, f, f.shape[0], argument) for f, g in zip(total, forces, strict=True)]
+    return [f + check_force(g, f, f.shape[0], argument) for f, g in zip(total, forces, strict=True)]
 
 
 def _sum(terms):
@@ -331,7 +331,7 @@ def _check_rank(J, s, t) -> None:
     sizes = np.linalg.svd(J, compute_uv=False) if np.isfinite(J).all() else np.full(1, np.nan)
     rank = int(np.sum(sizes > least * sizes.max(initial=0.0)))
     if rank < J.shape[1]:
-        where = f"s = {np.asarray(s).tolist()}" if t is None else place_of(s, t).replace("q =", "s =")
+        where = f"s = {np.asarray(s).tolist()}" if t is None else describe_state(s, t).replace("q =", "s =")
         raise ValueError(
             f"the immersion has rank {rank} at {where}, expected {J.shape[1]}, one for each coordinate; start elsewhere, "
             "or take coordinates that are regular there"

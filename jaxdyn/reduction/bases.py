@@ -19,7 +19,7 @@ from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residu
 from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
-from jaxdyn.systems.mass_factor import cholesky, solve_factored, solve_lower
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -336,7 +336,7 @@ def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Floa
 def minimal_velocity(parametrization: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
     """nu (nr,) with N nu + v0 = v for an admissible v: its coefficients in the columns of N."""
     factor = cholesky(_product(parametrization.N.T, parametrization.N))
-    return solve_factored(factor, _product(parametrization.N.T, v - parametrization.v0))
+    return solve_cholesky(factor, _product(parametrization.N.T, v - parametrization.v0))
 
 
 def least_quality(dtype) -> float:

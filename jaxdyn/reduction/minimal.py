@@ -22,7 +22,7 @@ from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import Basis, BasisLike, Moving, Whole, as_basis, least_quality, moving
-from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 from jaxdyn.systems.scene import Scene, as_scene
 
 
@@ -111,8 +111,8 @@ def solve_reduced(scene: Scene, motion: Moving, q, tau, t) -> ReducedDynamics:
     bias = _product(N.T, inverse_dynamics(scene.system, q, v, drift, t))
     force = _product(N.T, applied(scene, q, v, tau, t))
     factor = cholesky(mass)
-    rate = solve_factored(factor, force - bias)
-    result = RESULTS.where(definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    rate = solve_cholesky(factor, force - bias)
+    result = RESULTS.where(is_definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     is_regular = jnp.abs(quality) > least_quality(q.dtype)
     result = RESULTS.where(is_regular, result, RESULTS.singular_basis)
     return ReducedDynamics(rate, v, _product(N, rate) + drift, mass, bias, force, N, result)

@@ -42,7 +42,7 @@ from jaxdyn.simulation import variational
 from jaxdyn.simulation.solvers import Stepper
 from jaxdyn.simulation.solvers.choice import Solver, Stepsize, is_fixed
 from jaxdyn.systems.scene import Scene, as_pytree
-from jaxdyn.systems.system import rate_to_velocity, retract, retracts, velocity_to_rate
+from jaxdyn.systems.system import needs_retraction, rate_to_velocity, retract, velocity_to_rate
 
 State = dict[str, Any]  # arrays, and pytrees of them, by name
 
@@ -105,7 +105,7 @@ class Method(eqx.Module):
 
     def corrects(self, scene: Scene) -> bool:
         """Whether `stepped` and `corrected` change a state."""
-        return self.projects or retracts(scene.system)
+        return self.projects or needs_retraction(scene.system)
 
     def corrected(self, scene: Scene, y: State, t: Number) -> State:
         """The state put back between steps, where it is saved."""
@@ -318,7 +318,7 @@ class Reduced(Method):
 
     def corrects(self, scene: Scene) -> bool:
         """Where there are holonomic rows, quaternions, or a reference to be renewed."""
-        return bool(holonomic_rows(layout(scene)).size or self.step_constants or retracts(scene.system))
+        return bool(holonomic_rows(layout(scene)).size or self.step_constants or needs_retraction(scene.system))
 
     def stepped(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
         """q on the holonomic constraints, its error without the part normal to them; nu stays."""

@@ -31,7 +31,7 @@ from jaxdyn.simulation.solvers.inputs import (
     usable_steps,
 )
 from jaxdyn.systems.scene import Scene, check_callback
-from jaxdyn.systems.system import displace, has_followers, retract
+from jaxdyn.systems.system import displace, has_dependent_coordinates, retract
 
 
 def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
@@ -124,7 +124,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
             (at_limit, RESULTS.joint_limit_passed),
             (by_contact, RESULTS.contact_lost),
         ]
-    if has_followers(system):
+    if has_dependent_coordinates(system):
         follows = jnp.cumsum(~map_rows(system.is_consistent, q)) == 0
         ends.insert(0, (~follows.all(), RESULTS.no_single_contact))
         reached = reached & follows

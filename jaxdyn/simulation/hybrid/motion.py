@@ -30,7 +30,7 @@ from jaxdyn.simulation.solvers.choice import is_fixed, label, unwrapped
 from jaxdyn.simulation.solvers.differentiable import ROOM
 from jaxdyn.simulation.solvers.fixed_steps import too_coarse
 from jaxdyn.simulation.solvers.inputs import has_unit_quaternions
-from jaxdyn.systems.scene import Scene, check_callback, checked_force
+from jaxdyn.systems.scene import Scene, check_callback, check_force
 from jaxdyn.systems.system import retract
 
 OUTPUTS = ("energy", "acceleration", "multipliers", "contact_forces", "torque")
@@ -77,7 +77,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     q0, v0, ts, rtol, atol, stepsize = numbers
     system, outputs = scene.system, options["outputs"]
     control_of: Any = (
-        None if control is None else lambda _, q, v, t: checked_force(control(q, v, t), q, scene.nv, "control")
+        None if control is None else lambda _, q, v, t: check_force(control(q, v, t), q, scene.nv, "control")
     )
     pieces = pieces_of(scene, (), q0, v0, ts[0], control_of)
     elements = elements_of(scene, pieces)
@@ -93,13 +93,13 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
 
         def effort(q, v, t):
             """Of the control, before limits."""
-            return None if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
+            return None if control is None else check_force(control(q, v, t), q, scene.nv, "control")
 
         def generalized_force(q, v, t):
             force, tau = whole.applied_force(q, v, t), effort(q, v, t)
             if tau is None:
                 return force
-            tau = in_piece.limited(tau)
+            tau = in_piece.clip_effort(tau)
             return tau if force is None else tau + force
 
         return in_piece, generalized_force, lambda q, v, t: guards(scene, q, v, t, effort(q, v, t))
@@ -150,8 +150,8 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
         if "energy" in outputs:
             values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
         if "torque" in outputs:
-            tau = jnp.zeros_like(v) if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
-            values["torque"] = scene_.limited(tau)
+            tau = jnp.zeros_like(v) if control is None else check_force(control(q, v, t), q, scene.nv, "control")
+            values["torque"] = scene_.clip_effort(tau)
         if {"acceleration", "multipliers", "contact_forces"} & set(outputs):
             terms = terms_at(scene_, elements, q, v, t)
             at_time = motion_at(scene_, elements, mode, terms, y["slip"], generalized_force(q, v, t), q, v, t)
