@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import partition_traced
-from jaxdyn.forces.piecewise import Pieces, guards, in_pieces, pieces_of, values_and_levels
+from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
@@ -71,7 +71,7 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
         """The scene, the control and the method."""
         args = args or ()
         scene, control, method = known(args[:count])
-        return in_pieces(scene, pieces, args[count]) if len(args) > count else scene, control, method
+        return fix_pieces(scene, pieces, args[count]) if len(args) > count else scene, control, method
 
     def effort(args, y, q, v, t):
         """Of the control before limits, or None when there is none."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxdyn.compile import is_concrete, partition_traced
 from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.forces.piecewise import guards, in_pieces, pieces_of, values_and_levels
+from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.hybrid.laws import laws_of_pieces
 from jaxdyn.simulation.hybrid.pieces import motion_in_pieces
@@ -76,7 +76,7 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
         """The scene, in the pieces that come behind tau if any do, and tau."""
         unknown, tau, *positive = args
         scene = known(unknown)
-        return in_pieces(scene, pieces, *positive) if positive else scene, tau
+        return fix_pieces(scene, pieces, *positive) if positive else scene, tau
 
     @jax.jit
     def field(t, y, args):

@@ -14,7 +14,7 @@ from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
-from jaxdyn.forces.piecewise import guards, in_pieces, pieces_of
+from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.hybrid import machine
@@ -88,7 +88,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
 
     def given(unknown, positive=None):
         scene, control = known(unknown)
-        in_piece = scene if positive is None or not pieces.names else in_pieces(scene, pieces, positive)
+        in_piece = scene if positive is None or not pieces.names else fix_pieces(scene, pieces, positive)
         whole = extended(in_piece)
 
         def effort(q, v, t):
