@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.io import LoadedScene, load_urdf
-from jaxdyn.io.load import described, format_of, load
+from jaxdyn.io.load import find_description, format_of, load
 from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.joints import KINDS
@@ -71,7 +71,7 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
     """The scene of a file of any format, or of a robot by name, under the options of `add_model_options`; and its file."""
     file = as_path(path, "file")
     if not file.suffix and not file.exists():
-        file = described(path)
+        file = find_description(path)
     kind = format_of(file)
     if args.floating_base and args.fixed_base:
         raise ValueError("--floating-base and --fixed-base contradict each other; give one of them")

@@ -225,7 +225,9 @@ def _inverse_dynamics(model, frame, inertias, v, a, external) -> Float[Array, " 
 
 
 def _inertial_wrench(parameters, twist, acceleration) -> Float[Array, "6"]:
-    """Inertial wrench I A - ad_V^T I V.\n\nWith d = a + omega x v, the acceleration of the point at the frame's origin, it is
+    """Inertial wrench I A - ad_V^T I V.
+
+    With d = a + omega x v, the acceleration of the point at the frame's origin, it is
     (m d + alpha x h + omega x (omega x h), h x d + I alpha + omega x I omega).
     """
     mass, first, inertia = parameters[0], parameters[1:4], rotational_inertia(parameters)

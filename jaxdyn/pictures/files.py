@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.io.loaded import NotTakenWarning
-from jaxdyn.io.mjcf_file import compiled, library, named, pose_of
+from jaxdyn.io.mjcf_file import assign_names, compile_file, import_mujoco, pose_of
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
@@ -166,16 +166,16 @@ def _sdf(file: XmlFile) -> Shapes:
 
 
 def _mjcf(file: XmlFile) -> Shapes:
-    mujoco = library()
-    m, gone = compiled(mujoco, file.path)
-    bodies = named(mujoco, m, file.path).bodies
+    mujoco = import_mujoco()
+    m, gone = compile_file(mujoco, file.path)
+    bodies = assign_names(mujoco, m, file.path).bodies
     shapes = []
     for g in range(m.ngeom):
         kind = _MJCF_KINDS.get(int(m.geom_type[g]))
         if kind is None or m.geom_group[g] >= _SHOWN_GROUPS:
             continue
         size = tuple(float(x) for x in m.geom_size[g])
-        # What `compiled` puts in the place of a missing mesh is a point of no size.
+        # What `compile_file` puts in the place of a missing mesh is a point of no size.
         if gone and kind == "sphere" and size[0] == 1e-3:
             continue
         material = int(m.geom_matid[g])
