@@ -396,7 +396,7 @@ def test_identify_finds_delays_from_a_file_of_options(arm, tmp_path, capsys):
     name = f"{truth.joint_names[0]}.delay"
     assert report["parameters"][name]["fitted"] == delays["seconds"][0]
     assert report["test_logs"]["B.csv"]["percent"] < 1 and abs(report["payload"]["mass"] - 0.7) < 0.02
-    assert "How late torques were recorded" in (tmp_path / "fit.html").read_text()
+    assert "Delays of the torques relative to the positions" in (tmp_path / "fit.html").read_text()
     given = [str(x) for x in delays["seconds"]]
     assert main(["identify", str(file), "--delay", *given]) == 0
     again = json.loads((tmp_path / "fit.json").read_text())

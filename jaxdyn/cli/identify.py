@@ -33,7 +33,7 @@ from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
 from jaxdyn.model.builder import inertia_report, repair_inertias
 from jaxdyn.model.tree import Model
-from jaxdyn.reports.identification import Findings, Judged, content, gains_content, payload_content
+from jaxdyn.reports.identification import Evaluation, Findings, content, gains_content, payload_content
 
 # Fraction of the residual's power far above the motion's band that triggers a warning.
 _VIBRATES = 0.3
@@ -188,7 +188,7 @@ def run(args: argparse.Namespace) -> None:
         outcome=_outcome(final),
         is_refit=not test_paths,
         warnings=[],
-        told=identify.identifiability(model, logs, base_terms(fit.terms), v_s=v_s),
+        identifiability=identify.identifiability(model, logs, base_terms(fit.terms), v_s=v_s),
         choice=judge.choice if isinstance(judge, RobotFit) else None,
     )
     findings.warnings.extend(_warnings(findings))
@@ -267,12 +267,12 @@ def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
     return f"{fit.result.replace('_', ' ')} after {len(fit.history) - 1} steps"
 
 
-def _evaluate(model: Model, result, names: list[str], logs: list[Log]) -> list[Judged]:
+def _evaluate(model: Model, result, names: list[str], logs: list[Log]) -> list[Evaluation]:
     nominal = identify.nominal_parameters(model)
     fit = result.fit if isinstance(result, RobotFit) else result
     logs = [result.aligned(log) for log in logs] if isinstance(result, RobotFit) else logs
     return [
-        Judged(name, log, fit.torques(log), log_regressor(model, log) @ nominal)
+        Evaluation(name, log, fit.torques(log), log_regressor(model, log) @ nominal)
         for name, log in zip(names, logs, strict=True)
     ]
 

@@ -81,7 +81,7 @@ def _identifiability_text(findings: Findings) -> str:
     )
     worst = round(float(first.whiteness.effective_samples.min()))
     return (
-        f"Identifiability: {findings.told.summary()}\n"
+        f"Identifiability: {findings.identifiability.summary()}\n"
         f"Autocorrelation time of the errors on {first.name} (s): {lasting}\n"
         f"Effective sample size of {first.name}: at least {worst} of {len(first.log)}"
     )

@@ -3,25 +3,25 @@
 import numpy as np
 
 from jaxdyn.reports import references
-from jaxdyn.reports.case import Case, named
+from jaxdyn.reports.case import Case, scene_builder
 from jaxdyn.reports.references import Reference
 from jaxdyn.scenes.reference import ANDREWS_ORDER
 
 
 def _andrews_bodies(start) -> Reference:
-    """The known end of Andrews' mechanism in the order of the bodies."""
+    """Published final state of Andrews' mechanism in the order of the bodies."""
     known, order = references.andrews((start[0][np.argsort(ANDREWS_ORDER)], start[1])), np.array(ANDREWS_ORDER)
     return known._replace(q=known.q[:, order], v=known.v[:, order])
 
 
 def _systems(ten: np.ndarray) -> tuple[Case, ...]:
-    """Systems in coordinates, and those joined by an immersion."""
+    """Systems in coordinates, and systems joined by an immersion."""
     return (
         Case(
             "pendulum",
             "Pendulum by its angle, from rest at the level of its axis, 10 s",
             "free",
-            named("pendulum"),
+            scene_builder("pendulum"),
             lambda start: references.swing(ten),
             ten,
             250,
@@ -30,8 +30,8 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "particle_in_plane",
             "Particle thrown in a plane, 1 s: every method of order two is exact",
             "free",
-            named("particle_in_plane"),
-            lambda start: references.thrown(ten / 10),
+            scene_builder("particle_in_plane"),
+            lambda start: references.projectile(ten / 10),
             ten / 10,
             5,
         ),
@@ -39,7 +39,7 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "spherical_pendulum_in_angles",
             "Spherical pendulum by two angles, 5 s",
             "free",
-            named("spherical_pendulum_in_angles"),
+            scene_builder("spherical_pendulum_in_angles"),
             None,
             ten / 2,
             100,
@@ -48,7 +48,7 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "planar_arm",
             "Arm of two joints that falls, by its energies, 2 s",
             "free",
-            named("planar_arm"),
+            scene_builder("planar_arm"),
             None,
             ten / 5,
             100,
@@ -57,7 +57,7 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "spatial_arm",
             "Arm of three joints in space that falls, 2 s",
             "free",
-            named("spatial_arm"),
+            scene_builder("spatial_arm"),
             None,
             ten / 5,
             100,
@@ -66,18 +66,26 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "rigid_body_in_euler_angles",
             "Rigid body by its Euler angles, 1 s: a chart that ends at two poles",
             "free",
-            named("rigid_body_in_euler_angles"),
+            scene_builder("rigid_body_in_euler_angles"),
             None,
             ten / 10,
             50,
         ),
-        Case("free_box", "Box that turns about its middle axis, 2 s", "free", named("free_box"), None, ten / 5, 50),
+        Case(
+            "free_box",
+            "Box that turns about its middle axis, 2 s",
+            "free",
+            scene_builder("free_box"),
+            None,
+            ten / 5,
+            50,
+        ),
         Case(
             "sliding_block",
             "Block that slides to a stop by Coulomb friction, up to nine tenths of its way: exact for every method of order two",
             "free",
-            named("sliding_block", direction=1),
-            lambda start: references.braked(0.06 * ten),
+            scene_builder("sliding_block", direction=1),
+            lambda start: references.sliding_block(0.06 * ten),
             0.06 * ten,
             5,
             conserves=False,
@@ -86,7 +94,7 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "double_pendulum_immersed",
             "Double pendulum of two separate bodies joined by an immersion, 5 s",
             "free",
-            named("double_pendulum", formulation="immersion"),
+            scene_builder("double_pendulum", formulation="immersion"),
             None,
             ten / 2,
             100,
@@ -95,7 +103,7 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "double_pendulum_with_loop",
             "Double pendulum of a pendulum and a separate body, closed by a revolute joint, 5 s",
             "holonomic",
-            named("double_pendulum", formulation="loop"),
+            scene_builder("double_pendulum", formulation="loop"),
             None,
             ten / 2,
             100,
@@ -104,7 +112,7 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "disk_and_link",
             "Disk on the ground under a link that touches it, two bodies joined by an immersion, 0.5 s",
             "free",
-            named("disk_and_link"),
+            scene_builder("disk_and_link"),
             None,
             ten / 20,
             25,
@@ -118,30 +126,38 @@ def _linkages(ten: np.ndarray) -> tuple[Case, ...]:
             "andrews_bodies",
             "Andrews' squeezing mechanism from its seven bodies, 0.03 s (test set for IVP solvers)",
             "holonomic",
-            named("andrews_bodies"),
+            scene_builder("andrews_bodies"),
             _andrews_bodies,
             np.array([0.0, 0.03]),
             250,
             # Its spring and its motor are forces, whose energy is not counted.
             conserves=False,
         ),
-        Case("slider_crank", "Slider-crank, 3 s", "holonomic", named("slider_crank"), None, 0.3 * ten, 100),
+        Case("slider_crank", "Slider-crank, 3 s", "holonomic", scene_builder("slider_crank"), None, 0.3 * ten, 100),
         Case(
             "bennett",
-            "Bennett's linkage, 4 s: five rows of which two are independent",
+            "Bennett's linkage, 4 s: two independent rows of five",
             "holonomic, losing rank",
-            named("bennett"),
+            scene_builder("bennett"),
             None,
             0.4 * ten,
             100,
             reduces=False,
         ),
-        Case("closed_ring", "Ring of six bars that turns, 2 s", "holonomic", named("closed_ring"), None, ten / 5, 50),
+        Case(
+            "closed_ring",
+            "Ring of six bars that turns, 2 s",
+            "holonomic",
+            scene_builder("closed_ring"),
+            None,
+            ten / 5,
+            50,
+        ),
         Case(
             "parallel_manipulator",
             "Redundant parallel manipulator, three legs of two links that carry one point, 2 s",
             "holonomic",
-            named("parallel_manipulator"),
+            scene_builder("parallel_manipulator"),
             None,
             ten / 5,
             50,
@@ -151,32 +167,34 @@ def _linkages(ten: np.ndarray) -> tuple[Case, ...]:
 
 def _vehicles(ten: np.ndarray) -> tuple[Case, ...]:
     return (
-        Case("car", "Car with three wheels on a circle, 4 s", "nonholonomic", named("car"), None, 0.4 * ten, 50),
+        Case(
+            "car", "Car with three wheels on a circle, 4 s", "nonholonomic", scene_builder("car"), None, 0.4 * ten, 50
+        ),
         Case(
             "differential_drive",
             "Robot on two wheels, 4 s",
             "nonholonomic",
-            named("differential_drive"),
+            scene_builder("differential_drive"),
             None,
             0.4 * ten,
             50,
         ),
-        Case("snakeboard", "Snakeboard, 4 s", "nonholonomic", named("snakeboard"), None, 0.4 * ten, 50),
+        Case("snakeboard", "Snakeboard, 4 s", "nonholonomic", scene_builder("snakeboard"), None, 0.4 * ten, 50),
         Case(
             "knife_edge_on_incline",
             "Skate on an inclined plane, 5 s: a cycloid that does not go downhill",
             "nonholonomic",
-            named("knife_edge_on_incline"),
+            scene_builder("knife_edge_on_incline"),
             lambda start: references.skate(ten / 2),
             ten / 2,
             50,
         ),
-        Case("suslov", "Suslov's problem, 5 s", "nonholonomic", named("suslov"), None, ten / 2, 50),
+        Case("suslov", "Suslov's problem, 5 s", "nonholonomic", scene_builder("suslov"), None, ten / 2, 50),
         Case(
             "ball_on_incline",
             "Ball that rolls down an inclined plane, 2 s",
             "nonholonomic",
-            named("ball_on_incline", velocity=(0.5, 0.0)),
+            scene_builder("ball_on_incline", velocity=(0.5, 0.0)),
             lambda start: references.rolling_down(ten / 5),
             ten / 5,
             100,
@@ -185,7 +203,7 @@ def _vehicles(ten: np.ndarray) -> tuple[Case, ...]:
             "ball_on_turntable",
             "Ball on a turntable that is driven, 5 s",
             "driven",
-            named("ball_on_turntable"),
+            scene_builder("ball_on_turntable"),
             None,
             ten / 2,
             100,
@@ -195,7 +213,7 @@ def _vehicles(ten: np.ndarray) -> tuple[Case, ...]:
             "bowling_ball",
             "Bowling ball that slides, 1.5 s",
             "holonomic",
-            named("bowling_ball"),
+            scene_builder("bowling_ball"),
             None,
             0.15 * ten,
             100,
