@@ -1,4 +1,4 @@
-"""Arguments as arrays, refused with their name, their value and the fix."""
+"""Conversion and checks of arguments, with errors that name argument, value and fix."""
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,11 @@ from jaxdyn.model.arguments import store_leaf
 
 
 def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[Array, "..."]:
-    """`value` as an array of floating-point numbers; of the dtype of `like` if that is given.
+    """Convert `value` to a floating-point array, of the dtype of `like` if that is given.
 
     **Raises:** ValueError for another shape, None in it meaning any size, and for known numbers that are not finite.
     """
-    # Known numbers are looked at before they become part of a program that may be traced.
+    # Known numbers are checked before they become part of a traced program.
     known = np.asarray(value) if is_concrete(value) else None
     if known is not None and known.dtype == object:
         raise ValueError(f"{what} is {value!r}; give numbers")
@@ -33,7 +33,7 @@ def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[A
 
 
 def as_number(value, what: str, unit: str, *, zero: bool, like=None) -> Float[Array, ""]:
-    """`value` as one positive number, or zero where that is allowed.
+    """Convert `value` to one positive number, or zero where that is allowed.
 
     **Raises:** ValueError for known numbers below that or not finite.
     """

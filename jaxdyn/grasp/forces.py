@@ -20,7 +20,7 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.closure import ForceClosure
 from jaxdyn.contact.closure import force_closure as _closure
 from jaxdyn.contact.cones import Cones
-from jaxdyn.contact.forces import ConedContact, coned_contacts
+from jaxdyn.contact.forces import ContactWithCone, contacts_with_cones
 from jaxdyn.contact.kinds import components
 from jaxdyn.contact.optimal import optimal_forces
 from jaxdyn.contact.qp import RESULTS
@@ -254,7 +254,7 @@ def joint_torques(
     return _product(Jh.T, lam)
 
 
-def _every_cone(grasp: Grasp, cones) -> tuple[ConedContact, ...]:
+def _every_cone(grasp: Grasp, cones) -> tuple[ContactWithCone, ...]:
     """The contacts with their cones. **Raises:** ValueError where there is one without."""
     names = [place.name for place in layout(grasp)]
     if cones is None and grasp.cones is None:
@@ -262,7 +262,7 @@ def _every_cone(grasp: Grasp, cones) -> tuple[ConedContact, ...]:
             f"the contacts {names} have no cones; give cones, as in jd.contact.friction_cone('hard-finger', mu=0.8), here "
             "or to the Grasp"
         )
-    coned = coned_contacts(grasp, cones)
+    coned = contacts_with_cones(grasp, cones)
     missing = [name for name in names if name not in {contact.name for contact in coned}]
     if missing:
         raise ValueError(f"contacts {missing} have no cone; give one for every contact of {names}")

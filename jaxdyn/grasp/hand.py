@@ -10,7 +10,7 @@ from jaxdyn.compile import compiled, is_concrete
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.cones import Cones
-from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model import float64 as f64
@@ -74,7 +74,7 @@ class Grasp(Scene):
         self.object = object
         layout(self)  # refuses unknown bodies
         if cones is not None:
-            coned_contacts(self)  # refuses cones that do not fit
+            contacts_with_cones(self)  # refuses cones that do not fit
 
     @property
     def object_velocities(self) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import Distance, Loop
-from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.contact.kinds import components
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.grasp.contacts import Contact
@@ -235,7 +235,7 @@ def cones(motion: Motion) -> list[Cone]:
         return drawn
     places = {place.name: place for place in layout(scene)}
     constraints = dict(zip(places, scene.constraints, strict=True))
-    for contact in coned_contacts(scene):
+    for contact in contacts_with_cones(scene):
         constraint, place, cone = constraints[contact.name], places[contact.name], contact.cone
         if cone.mu is None or not isinstance(constraint, Pair):
             continue

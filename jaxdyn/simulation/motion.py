@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import map_rows
-from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
@@ -114,7 +114,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         reached = reached & ~(lost.happened & (ts > lost.time))
         time_reached = jnp.where(lost.happened, lost.time, time_reached)
         by_contacts = unilateral.can_end(scene, options["contacts"])
-        count = len(coned_contacts(scene)) if by_contacts else 0
+        count = len(contacts_with_cones(scene)) if by_contacts else 0
         limits = 2 * q.shape[1] if options["limits"] == "stop" else 0
         at_limit = lost.happened & (lost.entry >= count) & (lost.entry < count + limits)
         by_control = lost.happened & (lost.entry >= count + limits)
