@@ -100,10 +100,11 @@ def _residuals_and_measure(program: Program, point: Point):
 
 
 def _gap(point: Point):
+    # The mean over the cones, each of degree one, as CVXOPT's mu.
     return _dot(point.s, point.z, point.x[0]) / sum(y.shape[0] for y in point.s)
 
 
-def _contradicts(program: Program, point: Point, tol: float):
+def _is_certificate(program: Program, point: Point, tol: float):
     """Decide whether z is a certificate of infeasibility: h.z < 0 with G^T z = 0, z in the cones.
 
     Up to rounding, it excludes every x below 1 / tol.
@@ -122,6 +123,7 @@ def _start(pattern: Pattern, _, program: Program):
     Q, q, G, h = program
     rows = jnp.concatenate([g.reshape(-1, q.shape[0]) for g in G])
     level = jnp.concatenate([y.reshape(-1) for y in h])
+    # x minimises x^T Q x / 2 + q^T x + |G x - h|^2 / 2.
     factor = cholesky(Q + _product(rows.T, rows))
     x = solve_cholesky(factor, _product(rows.T, level) - q)
     slack = _zip(lambda a, b: b - a, _times(G, x), h)
@@ -152,9 +154,8 @@ def _newton(program: Program, s, z):
         right = _zip(lambda w, r, y: w.inverse_times(r) + y, W, rz, u)
         dx = solve_cholesky(factor, -rx - _transpose_times(scaled, right, rx))
         wdz = _zip(lambda a, b: a + b, _times(scaled, dx), right)
-        if (
-            is_refined
-        ):  # the normal matrix squares the condition number; one step of refinement recovers the lost digits
+        # The normal matrix squares the condition number; one step of refinement recovers the lost digits.
+        if is_refined:
             more = solve_cholesky(factor, -rx - _product(Q, dx) - _transpose_times(scaled, wdz, rx))
             dx, wdz = dx + more, _zip(lambda a, b: a + b, wdz, _times(scaled, more))
         wds = _zip(lambda a, b: a - b, u, wdz)
@@ -171,7 +172,7 @@ def _step(program: Program, point: Point, residuals) -> Point:
     mu = _gap(point)
     lam, solve = _newton(program, s, z)
 
-    def exit_rate(wds, wdz):
+    def inverse_step(wds, wdz):
         # s + t ds leaves its cone where W^-1 s + t W^-1 ds does, and z + t dz where W z + t W dz does: both from lam.
         return jnp.max(
             jnp.stack([jordan.inverse_boundary_step(v, dv) for v, dv in zip((*lam, *lam), (*wds, *wdz), strict=True)])
@@ -180,7 +181,8 @@ def _step(program: Program, point: Point, residuals) -> Point:
     # The affine predictor needs no refinement: it only sets the centring parameter and the second-order term.
     *_, wds, wdz = solve(rx, rz, _zip(lambda v: -v, lam), is_refined=False)
     # Mehrotra's heuristic: centre little where the affine step is long.
-    centring = (1 - 1 / jnp.maximum(exit_rate(wds, wdz), 1)) ** 3
+    centring = (1 - 1 / jnp.maximum(inverse_step(wds, wdz), 1)) ** 3
+    # Linearised complementarity with the second-order term (W^-1 ds) o (W dz) of the predictor.
     u = _zip(
         lambda v, a, b: jordan.quotient(
             v, centring * mu * jordan.identity(v) - jordan.product(v, v) - jordan.product(a, b)
@@ -191,7 +193,7 @@ def _step(program: Program, point: Point, residuals) -> Point:
     )
     dx, ds, dz, wds, wdz = solve(rx, rz, u)
     # 0.99 keeps the iterate strictly inside, where the scaling exists.
-    length = 1 / jnp.maximum(exit_rate(wds, wdz) / 0.99, 1)
+    length = 1 / jnp.maximum(inverse_step(wds, wdz) / 0.99, 1)
     move = lambda v, dv: v + length * dv  # noqa: E731
     return Point(move(x, dx), _zip(move, s, ds), _zip(move, z, dz))
 
@@ -226,11 +228,12 @@ def _iteration(pattern: Pattern, tol: float, target: float, _, program: Program,
     new = _step(program, point, residuals)
     inside = jnp.stack([jnp.all(jordan.boundary_distance(v) > 0) for v in (*new.s, *new.z)]).all()
     left, measure = _residuals_and_measure(program, new)
+    # Close to convergence rounding can move a step out of the cones; its rejection ends the iteration.
     valid = inside & jnp.isfinite(measure)
     # Below the tolerance only improvements are accepted.
     taken = valid & ((error > tol) | (measure < error))
     point, residuals, error = _where(taken & going, (new, left, measure), (point, residuals, error))
-    ended = infeasible | (going & valid & _contradicts(program, new, tol))
+    ended = infeasible | (going & valid & _is_certificate(program, new, tol))
     return _State(point, residuals, error, ended, alive & (taken | ~going), steps + going.astype(steps.dtype))
 
 
@@ -242,6 +245,7 @@ def _refinement(pattern: Pattern, _, program: Program, point: Point, error, aliv
     program = _sparse(program, pattern)
     alive = alive & (error > 4 * float(jnp.finfo(error.dtype).eps))
     x, s, z = point
+    # v = s - z determines both, s = P(v) and z = P(v) - v: complementarity holds by construction.
     v = _zip(lambda a, b: a - b, s, z)
 
     def at(x, v):
@@ -276,8 +280,8 @@ def _solve_projection_equations(program: Program, v, width, right_x, right_s, co
     rest = tuple(d.map(lambda x: 1 - x) for d in D)
     inverse = tuple(d.map(lambda x: 1 / (x + delta * (1 - x))) for d in D)
 
-    def times(slopes, y):
-        return _zip(lambda d, x: d.times(x), slopes, y)
+    def times(derivatives, y):
+        return _zip(lambda d, x: d.times(x), derivatives, y)
 
     weighted = _zip(lambda r, i, g: jax.vmap(lambda x: r.times(i.times(x)), 2, 2)(g), rest, inverse, G)
     rows, weighted = (jnp.concatenate([g.reshape(-1, n) for g in groups]) for groups in (G, weighted))
@@ -285,6 +289,7 @@ def _solve_projection_equations(program: Program, v, width, right_x, right_s, co
     # A shift by rounding keeps the matrix positive definite.
     factor = cholesky(normal + jnp.diag(n * eps * jnp.diagonal(normal)))
     dx, dv = jnp.zeros_like(right_x), _zip(jnp.zeros_like, right_s)
+    # Iterative refinement with residuals of the unmodified equations.
     for _ in range(1 + corrections):
         rx = right_x - _product(Q, dx) + _transpose_times(G, times(rest, dv), dx)
         rs = _zip(lambda r, a, b: r - a - b, right_s, _times(G, dx), times(D, dv))
@@ -305,7 +310,7 @@ def _end(pattern: Pattern, tol: float, _, program: Program, last: Point, error, 
     point = _where(better, refined, last)
     solved = (jnp.where(better, less, error) <= tol) & ~infeasible
     # Diverging multipliers may stop before they are a certificate to full precision.
-    return point, solved, infeasible | (~solved & _contradicts(_sparse(program, pattern), point, tol**0.5))
+    return point, solved, infeasible | (~solved & _is_certificate(_sparse(program, pattern), point, tol**0.5))
 
 
 def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End:
@@ -338,6 +343,7 @@ def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End
         refined, count = carry
         return run(_refinement, None, program, *refined, static=(pattern,)), count + 1
 
+    # The projection may raise the residual: the first refinement is accepted up to ten times the error, and `_end` selects.
     carry = ((last, 10 * jnp.maximum(error, tol), ~infeasible), 0)
     (refined, less, _), _ = lax.while_loop(improving, refine, carry)
     rest = (program, last, error, refined, less, infeasible)

@@ -83,12 +83,14 @@ def _reflect(x):
 def scaling(s, z) -> Scaling:
     """Nesterov-Todd scaling of points s and z inside the cones."""
     if s.shape[-1] == 1:
+        # W = sqrt(s / z) and its inverse from one root.
         shared = 1 / jnp.sqrt(s * z)
         return Scaling(jnp.ones_like(s), s * shared, z * shared)
     norm_s, norm_z = jnp.sqrt(determinant(s))[..., None], jnp.sqrt(determinant(z))[..., None]
     beta = jnp.sqrt(norm_s / norm_z)
     s, z = s * (1 / norm_s), z * (1 / norm_z)
     gamma = jnp.sqrt((1 + jnp.sum(s * z, -1, keepdims=True)) / 2)
+    # w is the scaling point of unit determinant, v its square root in the Jordan algebra.
     w = (s + _reflect(z)) / (2 * gamma)
     return Scaling((w + identity(w)) * (1 / jnp.sqrt(2 * (w[..., :1] + 1))), beta, 1 / beta)
 
@@ -112,6 +114,7 @@ def inverse_boundary_step(v, dv):
 def projection(v):
     """Nearest point of the cone, (k, d)."""
     norm = _norm(v[..., 1:])
+    # Eigenvalues are projected on the nonnegative numbers; eigenvectors remain.
     high, low = jnp.maximum(v[..., 0] + norm, 0), jnp.maximum(v[..., 0] - norm, 0)
     if v.shape[-1] == 1:
         return high[..., None]

@@ -103,6 +103,7 @@ def force_closure(
     left, singular, _ = np.linalg.svd(unit)
     rank = int(np.sum(singular > _LEAST * singular[0])) if singular.size and singular[0] > 0 else 0
     nothing, none = np.zeros(G.shape[1]), np.zeros(G.shape[0])
+    # Without full row rank the last left singular vector is a wrench outside the range of G.
     if rank < G.shape[0]:
         return ForceClosure(False, 0.0, nothing, _wrench(left[:, -1], sizes), rank)
     if not len(rows.linear) and not len(rows.second):
@@ -142,6 +143,7 @@ def _stack(cones: list[FrictionCone], faces: int | None, side: str) -> _Rows:
     for cone in cones:
         columns = slice(place, place + _width(cone))
         place = columns.stop
+        # Without friction the cone has no interior along its tangential forces, and without gamma none along its torque.
         used = np.ones(_width(cone), bool)
         if cone.mu is not None and float(cone.mu) == 0:
             used[: 1 if cone.in_plane else 2] = False
@@ -196,12 +198,13 @@ def _largest_margin(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
             raise RuntimeError(f"the linear program of force closure was not solved: {solution.message}")
         forces, upper = solution.x[:-1], solution.x[-1]
         seen = rows.second @ forces
-        slopes = np.linalg.norm(seen[:, 1:], axis=1)
-        margins = np.concatenate([-rows.linear @ forces, seen[:, 0] - slopes])
+        friction = np.linalg.norm(seen[:, 1:], axis=1)
+        margins = np.concatenate([-rows.linear @ forces, seen[:, 0] - friction])
         # Faces are outside the cones, so t is an upper bound; the margin of its forces is a lower one.
         if upper <= _LEAST or margins.min() >= upper - _TIGHT:
             break
-        touching = [(s, y / n) for s, y, n in zip(rows.second, seen[:, 1:], slopes, strict=True) if n > 0]
+        # Tangent planes of the round cones at the current forces cut off the current solution.
+        touching = [(s, y / n) for s, y, n in zip(rows.second, seen[:, 1:], friction, strict=True) if n > 0]
         above = np.concatenate([above, *[(y[0] * s[1] + y[1] * s[2] - s[0])[None] for s, y in touching]])
     else:
         raise RuntimeError(f"force closure: the margin was not found to {_TIGHT} with {_ROUNDS} rounds of faces")

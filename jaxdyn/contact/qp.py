@@ -178,6 +178,7 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     kept = [i for i, block in enumerate(blocks) if block.shape[0]]
 
     # Scales are constants for differentiation, because the solution does not depend on them.
+    # Q gets a unit diagonal and rows unit length, so that `tol` does not depend on units.
     diagonal = jax.lax.stop_gradient(jnp.diagonal(Q))
     across = _unit(jnp.sqrt(jnp.maximum(diagonal, 0)))
     blocks = [block * across[None, None] for block in blocks]
@@ -194,12 +195,14 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
         x0 = _product(inverse, b)
     shortest = [jnp.max(jnp.abs(x0)), jnp.max(jnp.abs(q))]
     shortest += [jnp.max(jnp.sqrt(jnp.sum(x[:, 1:] ** 2, 1)) - x[:, 0], initial=0) for x in levels]
+    # The solution is homogeneous in (q, b, h), whose size is scaled to one.
     size = 1 / _unit(jax.lax.stop_gradient(jnp.max(jnp.stack(shortest))))
     q, b, x0, levels = q / size, b / size, x0 / size, [x / size for x in levels]
 
     result = RESULTS.successful
     program = Program(Q, q, tuple(blocks[i] for i in kept), tuple(levels[i] for i in kept))
     if inverse is not None:
+        # x = x0 + P y; the term 1 - P keeps the matrix definite on the range of A^T.
         unit = jnp.eye(q.shape[0], dtype=q.dtype)
         P = unit - _product(inverse, A)
         program = Program(
@@ -213,6 +216,7 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     steps = jnp.zeros((), jnp.int32)
     if kept:
         pattern = tuple(pattern[i] for i in kept)
+        # The loop is not differentiated: `attach_derivative` differentiates the equations of its solution.
         end = solve(jax.lax.stop_gradient(program), pattern, tol, max_steps)
         point = attach_derivative(pattern, program, jax.lax.stop_gradient(end.point))
         steps = end.steps

@@ -74,6 +74,7 @@ def patch_at(surface: Surface, place) -> Patch:
     square = jnp.sum(across * across)
     length = jnp.sqrt(jnp.where(square > 0, square, jnp.ones_like(square)))
     normal = across / length
+    # Derivative of a unit vector: the part of the cross product's derivative along the normal drops out.
     turns = [cross(bend_u[:, i], v) + cross(u, bend_v[:, i]) for i in range(2)]
     turn = jnp.stack([(turn - jnp.sum(normal * turn) * normal) / length for turn in turns], 1)
     return Patch(surface.point_at(place), along, bend, normal, turn)
@@ -90,6 +91,7 @@ def newton_steps(a: Patch, b: Patch, R, p) -> Steps:
     determinant = d_b[0, 0] * d_b[1, 1] - d_b[0, 1] * d_b[1, 0]
     # Opposed normals, and two regular charts.
     is_regular = (jnp.sum(a.normal * n) < 0) & (jnp.abs(determinant) > 1e-6 * size)
+    # Eliminating the step on B leaves a 2x2 system for the step on A, whose matrix is the relative curvature.
     back = inverse_2x2(d_b, is_regular)
     n_over_d = _product(_product(seen, b.turn), back)
     relative = _product(bend, n) - _product(n_over_d, d_a)

@@ -93,6 +93,7 @@ def wrench_cone_of_polygon(vertices: Numbers, mu: Numbers) -> Float[Array, "k 6"
         raise ValueError(f"vertices is {corners.tolist()}; give at least three corners (m) that are not on a line")
     # Scaling by the polygon's size and mu makes all coordinates of order one.
     scale = np.array([friction, friction, 1.0, size, size, size * friction])
+    # At unit normal force the cone is a polytope in the other five coordinates.
     points = (corner_wrenches(corners, friction) / scale[:, None])[[0, 1, 3, 4, 5]].T
     try:
         facets = ConvexHull(points).equations
@@ -100,6 +101,7 @@ def wrench_cone_of_polygon(vertices: Numbers, mu: Numbers) -> Float[Array, "k 6"
         raise ValueError(
             f"vertices is {corners.tolist()} with mu {friction}: no cone with an interior ({error})"
         ) from error
+    # Homogenised, the offset of a facet is the coefficient of the normal force.
     rows = np.concatenate([facets[:, :2], facets[:, 5:], facets[:, 2:5]], 1)
     # qhull splits facets with more than five corners into simplices; duplicates are merged.
     rows = rows[np.unique(np.round(rows, 9), axis=0, return_index=True)[1]] / scale
