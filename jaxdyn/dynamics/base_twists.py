@@ -1,7 +1,8 @@
 """Products of exponentials in base-frame twists, as Murray, Li & Sastry and Li & Wu write them (EQUATIONS section 2).
 
 With xi_j the twist of joint j in the world frame at q = 0, the pose of body i is
-exp(hat(xi_1) q_1) ... exp(hat(xi_i) q_i) g_i(0), and the adjoints A_ij of the exponentials between bodies j and i map twists from one to the other:
+exp(hat(xi_1) q_1) ... exp(hat(xi_i) q_i) g_i(0), and the adjoints A_ij of the exponentials
+between bodies j and i map twists from one to the other:
 
     J_i = Ad^-1_{g_i(0)} [A_i1 xi_1 ... A_ii xi_i],
     M_ij = sum_l xi_i^T A_li^T M'_l A_lj xi_j,    M'_l = Ad^T_{g_l(0)^-1} M_l Ad_{g_l(0)^-1}.

@@ -119,9 +119,9 @@ class CoulombFriction(eqx.Module):
     """Smoothed Coulomb friction of joints: tau = -level * tanh(v / v_s).
 
     The jump at v = 0 is replaced by a linear range with derivative level / v_s, so that solutions are
-    unique and gradients exist. There is no sticking: under a load below `level` a joint creeps at v = v_s artanh(load / level). Within 1 % of `level` above
-    2.65 v_s. A small v_s makes the equations stiff (rate level / (v_s * inertia)): use an implicit solver or a
-    larger v_s.
+    unique and gradients exist. There is no sticking: under a load below `level` a joint creeps at v = v_s artanh(load /
+    level). The torque is within 1 % of `level` above 2.65 v_s. A small v_s makes the equations stiff (rate level /
+    (v_s * inertia)): use an implicit solver or a larger v_s.
 
     **Arguments:** `level` (N m or N), scalar or one per coordinate; None means the model's `friction` leaf. `v_s`,
     smoothing velocity (rad/s or m/s), positive. `joints`, names of the joints, or None for all.

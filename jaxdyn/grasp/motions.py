@@ -93,7 +93,7 @@ def hand_motions(
 ) -> HandMotions:
     """Bases of the feasible object velocities and of the hand's internal motions, at q.
 
-    In the given units of V and thetadot (m/s beside rad/s), the columns are orthonormal. Where the grasp is
+    In the given units of V and thetadot (m/s and rad/s), the columns are orthonormal. Where the grasp is
     manipulable H = 1, so that w is the object's velocity V. Otherwise the choice of the basis is arbitrary; it is constant under
     differentiation and continued smoothly to other configurations by `HandMotions`.
 

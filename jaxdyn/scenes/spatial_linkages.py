@@ -48,7 +48,7 @@ def bennett(
 
     Links of `lengths` (a, b) (m) and twists (alpha, beta) (rad) with a/sin(alpha) = b/sin(beta); `twist` is alpha.
     q = angles of the three moving links, uniform bars of `mass` (kg); the fourth joint closes the loop. Its five rows
-    for three joints leave one freedom, because only two of them are independent:
+    for three joints leave one degree of freedom, because only two of them are independent:
 
         tan(q1/2) tan(q2/2) = sin((beta + alpha)/2)/sin((beta - alpha)/2),  q3 = -q1.
 
