@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from jaxdyn.reports import timing
-from jaxdyn.reports.timing import interleaved as interleaved
+from jaxdyn.reports.timing import time_interleaved as time_interleaved
 
 OUT = Path(__file__).resolve().parent.parent / "out"
 

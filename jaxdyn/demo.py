@@ -47,8 +47,10 @@ def rollouts(model, count: int, duration: float, progress: bool):
 
 
 def experiment(model, nominal, samples: int):
-    """Two noisy logs of 10 s, for training and for testing: the arm follows random motions by a controller that believes
-    in the nominal model."""
+    """Two noisy logs of 10 s, for training and for testing.
+
+    The arm follows random motions under a controller with the nominal model.
+    """
     ts = np.linspace(0.0, 10.0, samples + 1)
     motions = [random_motion(jax.random.key(seed), jnp.asarray(HOME), jnp.full(7, 0.5), period=5.0) for seed in (1, 2)]
     gains = jnp.asarray(100.0), jnp.asarray(20.0)
@@ -109,7 +111,7 @@ def _balance(solution):
 
 
 def torque_shares(model, base, log) -> np.ndarray:
-    """What a unit of each base parameter does to the joint torques of a log: root mean square, in per cent of the torque."""
+    """Effect of a unit of each base parameter on the joint torques of a log: root mean square, in per cent of the torque."""
     a = np.gradient(log.v, log.t, axis=0)
     columns = jd.identify.regressor(model, log.q, log.v, a)[:, :, base.independent]
     return 100 * np.sqrt(np.mean((columns / np.asarray(log.tau).std(0)[None, :, None]) ** 2, axis=(0, 1)))

@@ -207,7 +207,7 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, c
     write_log(filtered, log)
     args[3] = str(filtered)
     assert main(["identify", *args, "--method", "least-squares", "--report", str(tmp_path / "ls.json")]) == 0
-    assert "taken as filtered" in capsys.readouterr().out
+    assert "used as filtered" in capsys.readouterr().out
     report = json.loads((tmp_path / "ls.json").read_text())
     assert abs(report["torque_error"]["test_percent"] - 1.36) < 0.01
     assert len(report["base_parameters"]["fitted"]) == len(report["base_parameters"]["std"])
@@ -275,13 +275,13 @@ def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsy
     assert main(args) == 0
     text = capsys.readouterr().out
     assert re.search(r"--cutoff auto: 5(\.\d+)? Hz, ten times the band of the motion, 0.5", text)
-    assert "where no rigid body is" not in text
+    assert "beyond rigid-body dynamics" not in text
     chosen = json.loads(report.read_text())
     # Ten times a band that is read from lines 0.08 Hz apart.
     assert chosen["cutoff_hz"] == pytest.approx(5, abs=0.9) and chosen["torque_error"]["test_percent"] < 0.5
     assert main([*args, "--cutoff", "14"]) == 0
     text = capsys.readouterr().out
-    assert re.search(r"1.csv: (9\d|100) % .* where no rigid body is: vibration; try --cutoff [456]", text)
+    assert re.search(r"1.csv: (9\d|100) % .* beyond rigid-body dynamics: vibration; try --cutoff [456]", text)
     given = json.loads(report.read_text())
     assert given["cutoff_hz"] == 14 and given["torque_error"]["test_percent"] > 2
     assert main([*args, "--cutoff", "low"]) == 2
@@ -397,7 +397,7 @@ def test_identify_finds_delays_from_a_file_of_options(arm, tmp_path, capsys):
     name = f"{truth.joint_names[0]}.delay"
     assert report["parameters"][name]["fitted"] == delays["seconds"][0]
     assert report["test_logs"]["B.csv"]["percent"] < 1 and abs(report["payload"]["mass"] - 0.7) < 0.02
-    assert "How late torques were recorded" in (tmp_path / "fit.html").read_text()
+    assert "Delays of the torques relative to the positions" in (tmp_path / "fit.html").read_text()
     given = [str(x) for x in delays["seconds"]]
     assert main(["identify", str(file), "--delay", *given]) == 0
     again = json.loads((tmp_path / "fit.json").read_text())
@@ -406,10 +406,10 @@ def test_identify_finds_delays_from_a_file_of_options(arm, tmp_path, capsys):
         again["test_logs"]["B.csv"]["percent"], report["test_logs"]["B.csv"]["percent"], rtol=1e-6
     )
     for option, words in (
-        (["auto", "0.1"], "stand alone"),
+        (["auto", "0.1"], "exclude other values"),
         (["late"], "--delay: 'late'"),
         (["0.1", "0.1"], "each of 3 torques"),
-        (["0.1", "--method", "least-squares"], "knows no delay"),
+        (["0.1", "--method", "least-squares"], "does not support delays"),
     ):
         parts = ["--urdf", str(tmp_path / "true.urdf"), "--log", str(tmp_path / "A.csv")]
         assert main(["identify", *parts, "--delay", *option]) == 2
@@ -466,8 +466,8 @@ def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys
     files = ["--report", str(tmp_path / "fit.json"), "--html", str(tmp_path / "fit.html")]
     known = ["--payload-mass", "0.7", "--payload-centre", "0.05", "0", "0.1"]
     assert main([*args, *files, *known]) == 0
-    assert "Drives, torque = gain * what the logs hold" in capsys.readouterr().out
-    assert "Drives, torque = gain" in (tmp_path / "fit.html").read_text()
+    assert "Drive gains, torque = gain * logged value" in capsys.readouterr().out
+    assert "Drive gains, torque = gain" in (tmp_path / "fit.html").read_text()
     report = json.loads((tmp_path / "fit.json").read_text())
     drives = report["drive_gains"]
     told = np.array([name in drives["told"] for name in truth.joint_names])
@@ -500,7 +500,7 @@ def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):
     ]
     assert main(args) == 0
     text = capsys.readouterr().out
-    assert "chosen over" in text and "left out:" in text and "What is written was then fitted to all" in text
+    assert "chosen over" in text and "held out:" in text and "The written robot was then fitted to all" in text
     assert "A.csv (last 30 %)" in text and "B.csv (last 30 %)" in text
 
 
@@ -577,8 +577,8 @@ def test_identify_by_trajectory_from_a_log_taken_as_filtered(arm, tmp_path, caps
         (["identify", "--urdf", "ARM", "--log", "GOOD"], "too few"),
         (["identify", "--urdf", "ARM", "--log", "GOOD", "GOOD"], "given twice"),
         (["identify", "--urdf", "ARM", "--log", "GOOD", "--rename", "m1"], "as motor1=shoulder"),
-        (["identify", "--urdf", "ARM", "--log", "GOOD", "--test-log", "GOOD"], "a log that is fitted tells no error"),
-        (["identify", "--urdf", "ARM", "--log", "GOOD", "--terms", "auto", "dahl"], "auto stands alone"),
+        (["identify", "--urdf", "ARM", "--log", "GOOD", "--test-log", "GOOD"], "a training log is no test of the fit"),
+        (["identify", "--urdf", "ARM", "--log", "GOOD", "--terms", "auto", "dahl"], "auto excludes other terms"),
         (["identify", "--urdf", "ARM", "--log", "GOOD", "--v-s", "fast"], "--v-s: 'fast' is no finite number"),
         (
             ["identify", "--urdf", "ARM", "--log", "GOOD", "--method", "trajectory", "--terms", "dahl"],
@@ -645,19 +645,19 @@ def test_info_of_a_file_with_a_loop(four_bar, capsys):
     assert main(["info", str(four_bar)]) == 0
     text = capsys.readouterr().out
     assert "3 moving bodies, 3 degrees of freedom" in text
-    assert "They close: jd.assemble finds a configuration from the reference." in text
+    assert "The constraints can be assembled: jd.assemble finds a configuration from the reference." in text
     assert "Degrees of freedom after constraints: 1 of 3 (2 in the singular position of the reference)" in text
-    assert "Actuators: motor" in text and "States that the file names: reference, open" in text
+    assert "Actuators: motor" in text and "Named states: reference, open" in text
     with pytest.warns(jd.NotTakenWarning):
         scene = jd.load(four_bar)
     line = next(line for line in text.splitlines() if scene.constraints[0].name in line)
     gap = np.abs(scene.constraints[0].position(scene.system, scene.starts["open"].q, 0.0)).max()
     assert f"{gap:.2g}" in line.split()
-    assert "Not taken from the file:" in text and "contact" in text
+    assert "Unsupported elements of the file:" in text and "contact" in text
     assert main(["info", str(four_bar), "--repair", "x.urdf"]) == 2
     assert "only URDF files can be repaired" in capsys.readouterr().err
     assert main(["info", str(four_bar), "--lock", "knee"]) == 2
-    assert "--lock: joints of MJCF files cannot be held" in capsys.readouterr().err
+    assert "--lock: joints of MJCF files cannot be locked" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -687,7 +687,7 @@ def test_simulate_a_file_with_a_loop(four_bar, tmp_path, capsys):
     with pytest.warns(jd.NotTakenWarning):
         assert main([*args, "--start", "open"]) == 0
     text = capsys.readouterr().out
-    assert "loops closed at the start by moving joints by up to" in text
+    assert "loops assembled at the start by joint displacements of up to" in text
     assert float(text.split("at most ")[1].split(" J")[0]) < 1e-7
     with pytest.warns(jd.NotTakenWarning):
         scene = jd.load(four_bar)
@@ -695,7 +695,7 @@ def test_simulate_a_file_with_a_loop(four_bar, tmp_path, capsys):
     assert max(gaps) < 1e-10
     with pytest.warns(jd.NotTakenWarning):
         assert main([*args, "--start", "home"]) == 2
-    assert "--start is 'home'; the file names reference, open" in capsys.readouterr().err
+    assert "--start is 'home'; the named states are reference, open" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -752,7 +752,7 @@ STUDY = {"scene": '"pendulum"', "out": '"o.zarr"', "samples": "2", "duration": "
         ("points = 100000000000000", "points 100000000000000: .* GB of results"),
         ("samples = 1e3", "samples is 1000.0; see"),
         ("seed = 100000000000000000000", "seed is 1000"),
-        ("outputs = [1]", r"outputs is \[1\]; give names"),
+        ("outputs = [1]", r"outputs is \[1\]; give a list of names"),
         ("parameters = 3", "parameters is 3; see"),
         ("[options]\nfoo = 1", r"\[options\] foo is 1; options are atol, "),
         ("[parameters]\nmass = nan", "parameter mass is nan; give a finite number"),
@@ -779,8 +779,8 @@ BALL = '<body name="aa"><freejoint/><geom size="0.1"/></body>'
     ("bodies", "rest", "base"),
     [
         ("", "", "fixed base, 2 moving bodies"),
-        (BALL, "", "fixed base beside free bodies aa, 3"),
-        (BALL, '<equality><weld body1="aa"/></equality>', r"fixed base \(held by constraints\), 3"),
+        (BALL, "", "fixed base and free bodies aa, 3"),
+        (BALL, '<equality><weld body1="aa"/></equality>', r"fixed base \(by constraints\), 3"),
     ],
 )
 def test_info_says_what_stands_on_the_world(bodies, rest, base, tmp_path, capsys):
@@ -790,7 +790,7 @@ def test_info_says_what_stands_on_the_world(bodies, rest, base, tmp_path, capsys
     assert main(["info", str(tmp_path / "arm.xml")]) == 0
     text = capsys.readouterr().out
     assert re.search(base, text.splitlines()[0])
-    assert "arm_j1" in text and "Inertias: every body that moves has a physical inertia." in text
+    assert "arm_j1" in text and "Inertias: every moving body has a physical inertia." in text
 
 
 def test_info_and_simulate_expand_xacro(tmp_path, capsys):

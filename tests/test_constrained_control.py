@@ -284,7 +284,7 @@ def test_arm_on_a_sphere(contact):
         )
     ts = TS[:11]
     solution = jd.simulate(scene, q0, v0, ts, control=law, stepsize=0.01, outputs=("multipliers",))
-    lam = np.asarray(law.wanted_force(q0, 0.0))
+    lam = np.asarray(law.reference_force(q0, 0.0))
     np.testing.assert_allclose(solution.multipliers, np.tile(lam, (ts.size, 1)), atol=1e-7)
     if contact == "frictionless":
         errors = np.asarray(jax.vmap(lambda q: task(q) - goal)(solution.q))
@@ -328,7 +328,7 @@ def test_gains_are_tuned_over_perturbed_systems():
         (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, ki=-2.0), "ki is -2.0"),
         (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, internal=[1.0]), "internal is given without"),
         (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, actuated=[0, 7]), "actuated is"),
-        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, actuated=[0], ki=1.0), "leave them out"),
+        (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, actuated=[0], ki=1.0), "omit them"),
         (
             lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, force=jnp.zeros(2))(*_state(s)),
             r"force has shape \(2,\), expected \(1,\)",

@@ -147,7 +147,7 @@ def test_bodies_with_dependent_rows():
     assert_close(computed.multipliers, want.multipliers, 1e-10)
     wrong = quick(lambda q, v: gauge_invariant(scene, q, v, dof=1).result == RESULTS.singular_basis)
     assert bool(wrong(q, v))
-    with pytest.raises(ValueError, match=r"3 constraint rows leave no freedom of nv = 3: .* give dof"):
+    with pytest.raises(ValueError, match=r"3 constraint rows leave no degree of freedom of nv = 3: .* give dof"):
         jax.jit(lambda q, v: gauge_invariant(scene, q, v))(q, v)
     with pytest.raises(ValueError, match=r"rotation has shape \(2, 2\), expected \(3, 3\)"):
         gauge_invariant(scene, q, v, rotation=jnp.eye(2), dof=1)

@@ -329,7 +329,7 @@ def test_bad_immersions_and_metrics_are_refused():
         constrain_by_immersion(particle, torus, 0)
     with pytest.raises(ValueError, match="forces or constraints in s, whose share in q is not known"):
         reaction_force(Scene(on_sphere, forces=(drag,)), one, one)
-    with pytest.raises(ValueError, match="system is a LagrangianSystem; pass what constrain_by_immersion returned"):
+    with pytest.raises(ValueError, match="system is a LagrangianSystem; pass the result of constrain_by_immersion"):
         reaction_force(particle, jnp.ones(3), jnp.ones(3))
     with pytest.raises(ValueError, match="kind is 'third'; choose from first, second"):
         geometry.christoffel_symbols(bumpy, jnp.ones(3), "third")

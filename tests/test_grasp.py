@@ -465,7 +465,7 @@ def test_refusals():
         Grasp(block(), "obj", [held])
     with pytest.raises(ValueError, match="object has 5 bodies"):
         Grasp(fingers, scenes.hand_with_bar().system, [held])
-    with pytest.raises(ValueError, match="one of them has to be the object"):
+    with pytest.raises(ValueError, match="one of them must be the object"):
         Grasp(fingers, block(), [rolling_sphere("a", None, 0.1, surface_body="b")])
     with pytest.raises(ValueError, match="is on 'b', the object of the grasp is 'obj'"):
         Grasp(fingers, block(), [contact("rigid", "a", None, object="b")])

@@ -55,7 +55,7 @@ def test_wanted_acceleration_and_forces_are_those_that_follow(ball):
     @quick
     def compute(law, q, v):
         full = jd.constrained_dynamics(grasp, q, v, law(q, v, 0.0))
-        return full, law.acceleration(q, v), law.wanted_forces(q, v), law.is_regular(q, v)
+        return full, law.acceleration(q, v), law.reference_forces(q, v), law.is_regular(q, v)
 
     full, a, lam, regular = compute(law, q, v)
     assert bool(regular)

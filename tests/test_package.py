@@ -299,7 +299,7 @@ def test_public_signatures_say_what_they_take_and_return():
         if isinstance(node, ast.FunctionDef):
             functions[f"{home}:{node.name}"] = vague(node, is_method=False)
             for mark in node.decorator_list:  # the start of a named scene, `jd.scenes.<name>.start`
-                if isinstance(mark, ast.Call) and name_of(mark.func) == "named":
+                if isinstance(mark, ast.Call) and name_of(mark.func) == "register_scene":
                     _, start = definition(f"jaxdyn.{home}.{name_of(mark.args[0])}")
                     functions[f"{home}:{node.name}.start"] = vague(start, is_method=False)
             continue

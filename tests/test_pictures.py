@@ -12,9 +12,9 @@ import pytest
 import jaxdyn as jd
 from jaxdyn.io import NotTakenWarning
 from jaxdyn.model import float64 as f64
-from jaxdyn.pictures import inferred, motion
+from jaxdyn.pictures import default_solids, motion
 from jaxdyn.pictures.drawing import cone_sides
-from jaxdyn.pictures.solids import SIZES, Shape, Shapes, finer, joined, sharpened, simplified
+from jaxdyn.pictures.solids import SIZES, Shape, Shapes, merge_meshes, refine, sharpen, simplify
 
 
 def volume(vertices, faces) -> float:
@@ -49,17 +49,17 @@ def test_triangles_of_solids_enclose_their_volume(kind, size, exact):
     assert volume(vertices, faces) == pytest.approx(exact, rel=1e-12 if kind == "box" else 0.04)
     mirrored = Shape("body", "mesh", (1.0, -1.0, 1.0), pose, vertices=vertices, faces=faces)
     assert volume(*mirrored.triangles()) > 0
-    again = sharpened(*joined([(vertices, faces)]))
+    again = sharpen(*merge_meshes([(vertices, faces)]))
     assert volume(*again) == pytest.approx(volume(vertices, faces), rel=1e-12)
 
 
 def test_simplified_meshes_are_small_and_close():
     vertices, faces = Shape("b", "ellipsoid", (1.0, 0.8, 0.6)).triangles()
-    few, triangles = simplified(vertices, faces, 100)
+    few, triangles = simplify(vertices, faces, 100)
     assert len(few) <= 100 < len(vertices)
     assert np.abs(np.ptp(few, axis=0) / np.ptp(vertices, axis=0) - 1).max() < 0.15
     assert volume(few, triangles) == pytest.approx(volume(vertices, faces), rel=0.2)
-    assert simplified(vertices, faces, 10_000)[0] is vertices
+    assert simplify(vertices, faces, 10_000)[0] is vertices
 
 
 @pytest.mark.parametrize("moments", [(0.01, 0.02, 0.025), (0.02, 0.02, 0.03), (0.02, 0.02, 0.005), (0.02, 0.02, 0.02)])
@@ -68,7 +68,7 @@ def test_solids_of_inertia_have_that_inertia(moments):
     com, mass = np.array([0.1, 0.05, -0.02]), 2.0
     inertia = (mass, com, turn @ np.diag(moments) @ turn.T)
     model = jd.ModelBuilder("one").add_body("body", joint="spherical", inertia=inertia).build()
-    (solid,) = [shape for shape in inferred.completed(jd.Scene(model), Shapes()) if shape.kind != "capsule"]
+    (solid,) = [shape for shape in default_solids.complete_solids(jd.Scene(model), Shapes()) if shape.kind != "capsule"]
     vertices, faces = solid.triangles()
     computed = inertia_of(vertices - com, faces, mass)
     # Round solids are polygons of 24 sides.
@@ -84,7 +84,7 @@ def test_every_scene_of_bodies_has_solids_and_a_stage():
     with_bodies = {name: scene for name, scene in built.items() if isinstance(scene.system, jd.Model)}
     assert len(with_bodies) > 20
     for name, scene in with_bodies.items():
-        shapes = inferred.completed(scene, Shapes())
+        shapes = default_solids.complete_solids(scene, Shapes())
         assert shapes and shapes.frames() <= set(scene.system.frame_names), name
         for shape in shapes:
             assert volume(*shape.triangles()) > 0, name
@@ -144,8 +144,8 @@ def test_solids_of_urdf(urdf, solids):
     np.testing.assert_allclose(box.pose[:3, :3], f64.rotation_from_rpy((0, 0, 0.3)))
     # The lower arm has the tip's ball; nothing of inertia is added to bodies that have a solid.
     model = jd.load_urdf(urdf)
-    assert {shape.source for shape in inferred.completed(jd.Scene(model), solids)} == {"file"}
-    whole = inferred.completed(jd.Scene(model), Shapes([box]))
+    assert {shape.source for shape in default_solids.complete_solids(jd.Scene(model), solids)} == {"file"}
+    whole = default_solids.complete_solids(jd.Scene(model), Shapes([box]))
     assert [shape.frame for shape in whole if shape.source == "inertia"] == ["lower"]
 
 
@@ -244,7 +244,7 @@ def test_marks_and_forces_of_a_loop(turning):
     for sign in (1.0, -1.0):
         poses = motion.poses_of(scene.system, (np.asarray(solution.q[0, 0]) + sign * dq)[None])
         places = [
-            inferred.place_of(scene.system, poses, body) @ np.asarray(pose)
+            default_solids.frame_poses(scene.system, poses, body) @ np.asarray(pose)
             for body, pose in scene.constraints[0].ends()
         ]
         computed.append(places[1][0, :3, 3] - places[0][0, :3, 3])
@@ -299,7 +299,9 @@ def test_what_a_hand_holds_is_seen_through_and_has_its_shape():
     """A ball with contacts on its surface, a cube of the same three moments, a bar between two contacts."""
     shapes = {}
     for name, held in (("hand_with_ball", "ball"), ("allegro_with_cube", "cube"), ("hand_with_bar", "bar")):
-        shapes[name] = [s for s in inferred.completed(getattr(jd.scenes, name)(), Shapes()) if s.frame == held]
+        shapes[name] = [
+            s for s in default_solids.complete_solids(getattr(jd.scenes, name)(), Shapes()) if s.frame == held
+        ]
     (ball,), (cube,) = shapes["hand_with_ball"], shapes["allegro_with_cube"]
     assert ball.kind == "ellipsoid" and ball.size == pytest.approx((0.1,) * 3) and 0 < ball.opacity < 0.5
     assert cube.kind == "box" and cube.size == pytest.approx((0.06,) * 3) and 0 < cube.opacity < 0.5
@@ -308,7 +310,7 @@ def test_what_a_hand_holds_is_seen_through_and_has_its_shape():
 
 def test_triangles_are_cut_and_stay_the_surface():
     vertices, faces = Shape("b", "box", (1.0, 0.5, 0.1)).triangles()
-    many, cut = finer(vertices, faces, 0.2)
+    many, cut = refine(vertices, faces, 0.2)
     sides = np.linalg.norm(many[np.roll(cut, -1, 1)] - many[cut], axis=2)
     assert sides.max() <= 0.2 and len(cut) > len(faces)
     assert volume(many, cut) == pytest.approx(0.05, rel=1e-12)
@@ -354,7 +356,7 @@ def test_draw_refuses(turning, tmp_path):
 
         jd.draw(scene, solution.q[0, 0], Figure().add_subplot())
     if shutil.which("ffmpeg") is None:
-        with pytest.raises(ValueError, match="there is no ffmpeg; install it"):
+        with pytest.raises(ValueError, match="ffmpeg is not installed; install it"):
             jd.animate(scene, solution, tmp_path / "turn.mp4")
     other = jd.scenes.slider_crank() if scene.nq != 3 else jd.scenes.windows()
     with pytest.raises(ValueError, match="is the scene that of the solution"):

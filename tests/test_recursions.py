@@ -330,7 +330,7 @@ def test_nearly_parallel_axes():
     pose = np.array(
         [[1, 0, 0, 0.3], [0, np.cos(tilt), -np.sin(tilt), 0.2], [0, np.sin(tilt), np.cos(tilt), 0.1], [0, 0, 0, 1]]
     )
-    home = frames._screws(pose, 1e-15)
+    home = frames._decompose(pose, 1e-15)
     assert abs(home.e) + abs(home.d) + np.abs(home.shift).max() < 1
 
 

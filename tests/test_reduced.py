@@ -213,7 +213,7 @@ def test_a_singular_choice_is_reported():
         jax.vmap(lambda q: reduced_dynamics(scene, q, jnp.ones(1), basis=(0,)).result == RESULTS.singular_basis)
     )
     assert codes(jnp.stack([jnp.asarray([0.6, -0.8]), level])).tolist() == [False, True]
-    with pytest.raises(ValueError, match=r"basis does not serve at this q: choose other .*, here \(1,\) of 2"):
+    with pytest.raises(ValueError, match=r"basis is not valid at this q: choose other .*, here \(1,\) of 2"):
         reduced_dynamics(scene, level, jnp.ones(1), basis=(0,))
     # The same row twice; lam = -(m/l^2)(|v|^2 - g y) gives the motion of EQUATIONS section 6.
     twice = Scene(scene.system, scene.constraints * 2)

@@ -23,22 +23,22 @@ from jaxdyn.reports.measure import Contestant, Motion, evaluations, flop_counter
 from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
 from jaxdyn.reports.records import Known
 from jaxdyn.reports.references import (
-    braked,
     car_axis,
     coin,
     falling_table,
     free_top,
     integral,
     plane_pendulum,
+    projectile,
     rolling_down,
     skate,
     sleigh,
+    sliding_block,
     sphere_pendulum,
     swing,
-    thrown,
     windows,
 )
-from jaxdyn.reports.timing import interleaved
+from jaxdyn.reports.timing import time_interleaved
 from jaxdyn.simulation.solvers import RK4
 from jaxdyn.simulation.solvers.choice import checked_method
 from jaxdyn.simulation.start import chosen_method
@@ -94,8 +94,8 @@ def test_the_report_knows_every_scene():
 # Of closed forms: times, and the rates of a state by the equations of motion as a textbook has them, from q[0] and v[0].
 EQUATIONS = {
     "swing": (swing, lambda q, v: [*v, -9.81 * np.sin(q[0])]),
-    "thrown": (thrown, lambda q, v: [*v, 0.0, -9.81]),
-    "braked": (braked, lambda q, v: [*v, -0.3 * 9.81]),
+    "thrown": (projectile, lambda q, v: [*v, 0.0, -9.81]),
+    "braked": (sliding_block, lambda q, v: [*v, -0.3 * 9.81]),
     # The pull of the slope along the blade; what is across it the blade takes.
     "skate": (skate, lambda q, v: [v[0] * np.cos(q[2]), v[0] * np.sin(q[2]), v[2], 9.81 / 2 * np.cos(q[2]), 0.0, 0.0]),
 }
@@ -304,7 +304,9 @@ def body():
 
 @pytest.fixture(scope="module")
 def rungs(body):
-    return ladder(body, "free", "Tsit5", [1e-4, 1e-7], "float64", body.programs.lanes(1), flop_counter(body, "free"))
+    return ladder(
+        body, "free", "Tsit5", [1e-4, 1e-7], "float64", body.programs.batch_starts(1), flop_counter(body, "free")
+    )
 
 
 @pytest.fixture(scope="module")
@@ -361,7 +363,7 @@ def test_peers_and_failures_are_recorded(records):
 
 def test_batches_start_along_the_motion(body):
     """Lanes of a batch are later states of the reference's motion, with their times."""
-    q, v, ts = body.programs.lanes(25)
+    q, v, ts = body.programs.batch_starts(25)
     assert np.ptp(ts - body.reference.ts, axis=1).max() < 1e-14
     np.testing.assert_allclose(ts[:, 0], 2.0 * np.arange(25) / 25)
     want = free_top(ts[:, 0])
@@ -410,7 +412,7 @@ def test_batches_above_the_largest_are_left_out(small, rungs, monkeypatch):
     monkeypatch.setattr(running, "cases", lambda: {"free_body": cases()["free_body"]._replace(largest=1)})
     measured = jd.report("free_body", rounds=1, batches=(1, 64), echo=lines.append)
     assert {r.batch for r in measured.records} == {1}
-    assert "batches above 1 are left out" in lines[0]
+    assert "batches above 1 are skipped" in lines[0]
     measured = jd.report("free_body", rounds=1, batches=(1, 4), integrators=[("free", "Tsit5")])
     assert {(r.batch, r.label) for r in measured.records} == {(1, "free, Tsit5"), (4, "free, Tsit5")}
 
@@ -430,7 +432,7 @@ def test_interleaved_drops_who_is_slow():
     def call(name):
         calls[name] += 1
 
-    times = interleaved({name: lambda name=name: call(name) for name in calls}, 5, least=0.0, most=-1.0)
+    times = time_interleaved({name: lambda name=name: call(name) for name in calls}, 5, least=0.0, most=-1.0)
     assert times["slow"]["rounds"] == times["fast"]["rounds"] == 3
     assert calls == {"slow": 5, "fast": 5}  # two to see how long it takes
     assert times["slow"]["best"] <= times["slow"]["median"]
@@ -514,7 +516,7 @@ def test_command(small, rungs, capsys):
         (["report", "free_body", "--rounds", "0"], "--rounds is 0"),
         (["report", "free_body", "--integrator", "Dopri8"], "integrators"),
         (["report", "free_body", "--integrator", "free:Euler"], "Euler"),
-        (["report", "four_bar", "free_body", "--way", "projected:Dopri8"], "free_body cannot take"),
+        (["report", "four_bar", "free_body", "--way", "projected:Dopri8"], "free_body does not support"),
         (["report", "free_body", "--way", "fre:Dopri8"], "integrators"),
     ):
         assert main(wrong) == 2
@@ -530,9 +532,7 @@ def test_empty_arguments_are_refused(name):
 
 def test_a_journal_that_is_not_text_is_named(tmp_path):
     (tmp_path / "records.jsonl").write_bytes(b"\xff\xfe{}\n{}\n")
-    with pytest.raises(
-        ValueError, match=r"out has .*records\.jsonl, which is no text in UTF-8.*name another directory"
-    ):
+    with pytest.raises(ValueError, match=r"out has .*records\.jsonl, which is not UTF-8 text.*name another directory"):
         Journal(tmp_path, {})
 
 
@@ -549,12 +549,12 @@ def test_a_page_without_matplotlib_is_refused_before_the_runs(small, tmp_path, m
 
 
 def test_a_batch_fails_with_any_of_its_trajectories(body):
-    q, v, ts = body.programs.lanes(2)
+    q, v, ts = body.programs.batch_starts(2)
     bad = np.stack([v[0], np.nan * v[1]])
     rung = ladder(body, "free", "Tsit5", [1e-4], "float64", (q, bad, ts), flop_counter(body, "free", 2))[0]
     assert rung.motion(rung.call()).result == "nonfinite_start"
     with pytest.raises(RuntimeError, match="no starts for a batch"):
-        Programs(body.scene, (q[0], np.nan * v[0]), body.programs.ts).lanes(2)
+        Programs(body.scene, (q[0], np.nan * v[0]), body.programs.ts).batch_starts(2)
 
 
 def test_report_needs_float64():

@@ -364,13 +364,13 @@ BAD = [
     (lambda: placed_on(bump, near=[0.0, 0.0]), "near has shape"),
     (lambda: one_body(Plane(), Sphere(0.3)).system.place(BALL[:3]), "joints has shape"),
     (lambda: simulated(lambda system: system.place(BALL + 0.05 * jnp.eye(7)[2])), "open by 0.05"),
-    (lambda: simulated(lambda system: system.place(BALL).at[7].set(0.5)), "is 0.5 .m or rad. from where"),
+    (lambda: simulated(lambda system: system.place(BALL).at[7].set(0.5)), "is 0.5 .m or rad. from the closest points"),
     (lambda: simulated(lambda system: BALL), "q0 has shape"),
     (
         lambda: jd.constraint_jacobian(
             jd.Scene(scenes.sphere_arm().system, one_body(Plane(), Sphere(0.3)).system.rows), jnp.zeros(6)
         ),
-        "none of the system",
+        "not in the system",
     ),
     (
         lambda: jd.join(one_body(Plane(), Sphere(0.3)).system, scenes.sphere_arm().system, prefix=("a", "b")),

@@ -389,11 +389,11 @@ BAD = {
     "number": (model_of(link("a", rest="<inertial><mass>2kg</mass></inertial>")), "<mass> of link 'a' is '2kg'"),
     "circle": (
         model_of("<link name='a'><pose relative_to='b'/></link><link name='b'><pose relative_to='a'/></link>"),
-        "hang on each other in a circle",
+        "refer to each other in a cycle",
     ),
     "attached": (
         model_of(link("a") + "<frame name='f' attached_to='g'/><frame name='g' attached_to='f'/>"),
-        "in a circle",
+        "in a cycle",
     ),
     "limits": (
         model_of(link("a") + joint("j", "world", "a", axis="<xyz>0 0 1</xyz><limit><lower>2</lower><upper>1</upper></limit>")),
@@ -430,7 +430,7 @@ def test_bad_files_are_refused_with_file_and_line(tmp_path, fault):
     ("text", "message"),
     [
         ("<robot/>", "the root element is <robot>"),
-        ("<sdf version='2.0'/>", "the version is '2.0'; 1.4 to 1.12 are read"),
+        ("<sdf version='2.0'/>", "the version is '2.0'; 1.4 to 1.12 are supported"),
         ("", "malformed XML: no element found"),
         (
             '<!DOCTYPE s [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]><sdf version="1.6">&b;</sdf>',

@@ -122,8 +122,8 @@ def test_stop_holds_a_joint_and_never_pulls():
 def test_limits_cut_the_control_and_nothing_else():
     limits, tau = jd.EffortLimits([1.0, jnp.inf]), jnp.asarray([-3.0, 50.0])
     scene = jd.Scene(arm(), forces=(limits,))
-    np.testing.assert_array_equal(scene.limited(tau), [-1.0, 50.0])
-    np.testing.assert_array_equal(jax.jacfwd(scene.limited)(tau), [[0, 0], [0, 1]])
+    np.testing.assert_array_equal(scene.clip_effort(tau), [-1.0, 50.0])
+    np.testing.assert_array_equal(jax.jacfwd(scene.clip_effort)(tau), [[0, 0], [0, 1]])
     np.testing.assert_array_equal(scene.applied_force(jnp.zeros(2), jnp.ones(2)), [0, 0])
 
 
@@ -139,7 +139,7 @@ def test_limits_cut_the_control_and_nothing_else():
         (lambda: jd.JointStops(-1.0), "stiffness"),
         (lambda: jd.JointStops(joints="9")(arm(), jnp.zeros(2), jnp.zeros(2), 0.0), "9"),
         (lambda: jd.EffortLimits(-1.0), "negative"),
-        (lambda: jd.EffortLimits([1.0]).limited(arm(), jnp.zeros(2)), "shape"),
+        (lambda: jd.EffortLimits([1.0]).clip_effort(arm(), jnp.zeros(2)), "shape"),
     ],
 )
 def test_what_does_not_fit_is_refused(make, words):

@@ -267,11 +267,11 @@ def test_bad_loops_arguments(tmp_path):
     with pytest.raises(ValueError, match="names no loops"):
         jd.load(path, loops=empty)
     empty.write_text("[", encoding="utf-8")
-    with pytest.raises(ValueError, match="no YAML"):
+    with pytest.raises(ValueError, match="malformed YAML"):
         jd.load(path, loops=empty)
     sdf = tmp_path / "x.sdf"
     sdf.write_text("<sdf version='1.7'/>", encoding="utf-8")
-    with pytest.raises(ValueError, match="is SDF, which holds its loops itself"):
+    with pytest.raises(ValueError, match="is SDF, which states its loops in the file"):
         jd.load(sdf, loops=empty)
 
 

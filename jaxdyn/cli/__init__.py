@@ -1,5 +1,4 @@
-"""The command line: `jaxdyn info`, `jaxdyn simulate`, `jaxdyn sweep`, `jaxdyn excite`, `jaxdyn identify`, `jaxdyn report` and
-`jaxdyn export`."""
+"""Command line: `jaxdyn info`, `simulate`, `sweep`, `excite`, `identify`, `report` and `export`."""
 
 import argparse
 import sys
@@ -9,6 +8,7 @@ import jax
 
 from jaxdyn import __version__
 from jaxdyn.cli import excite, export, identify, info, report, simulate, sweep
+from jaxdyn.cli.common import help_format
 
 COMMANDS = (info, simulate, sweep, excite, identify, report, export)
 _EPILOG = """\
@@ -26,13 +26,13 @@ Exit status: 0 done; 1 the computation failed; 2 wrong input or arguments.
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command with the arguments given (those of the process by default) and return the exit status."""
+    """Run a command with the given arguments (by default those of the process) and return the exit status."""
     parser = argparse.ArgumentParser(
         prog="jaxdyn",
-        description="Rigid-body dynamics of robots: look at a file, simulate it, alone and in studies of many rollouts, identify "
-        "its inertias from a log; report error against run time, and export functions to C.",
+        description="Rigid-body dynamics of robots: inspect a file, simulate it, run studies of many rollouts, identify "
+        "inertias from logs, report error against run time, and export functions to C.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=help_format,
     )
     parser.add_argument("--version", action="version", version=f"jaxdyn {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
@@ -43,16 +43,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             help=module.HELP,
             description=module.DESCRIPTION,
             epilog=module.EPILOG,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=help_format,
         )
         module.add_arguments(command)
-        command.add_argument("--debug", action="store_true", help="show where in the program an error arose")
+        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
         command.set_defaults(run=module.run)
     args = parser.parse_args(argv)
+    # Commands are programs of their own, so they may choose float64; the library never does.
     jax.config.update("jax_enable_x64", True)
     try:
         return args.run(args) or 0
-    except BrokenPipeError:  # the reader (`head`, `less`) has seen enough
+    except BrokenPipeError:  # the reader (`head`, `less`) closed the pipe
         sys.stderr.close()
         return 0
     except (ValueError, OSError, ImportError) as error:

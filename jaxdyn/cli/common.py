@@ -1,4 +1,4 @@
-"""What the commands share: options of the model, vectors on the command line, files to write."""
+"""Shared parts of the commands: options of the model, vectors on the command line, output files."""
 
 import argparse
 import contextlib
@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.io import LoadedScene, load_urdf
-from jaxdyn.io.load import described, format_of, load
+from jaxdyn.io.load import find_description, format_of, load
 from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.joints import KINDS
@@ -20,17 +20,24 @@ from jaxdyn.model.text_table import short as short
 from jaxdyn.model.text_table import table as table
 from jaxdyn.model.tree import Model
 
-# Unit of one number of q, for joints with one.
+# Unit of q of joints with one coordinate.
 UNITS = {"revolute": "rad", "continuous": "rad", "helical": "rad", "prismatic": "m"}
 
 
 FILE = "a URDF, xacro, MJCF or SDF file, or a name of robot_descriptions such as go2_description"
 
 
-def add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Options that decide which mechanism a file becomes."""
-    group = parser.add_argument_group("model")
-    group.add_argument("--floating-base", action="store_true", help="let the root link move freely (6 more freedoms)")
+def help_format(prog: str) -> argparse.HelpFormatter:
+    """Help formatter that keeps options and their texts on one line where they fit."""
+    return argparse.RawDescriptionHelpFormatter(prog, max_help_position=29)
+
+
+def add_model_options(parser: argparse.ArgumentParser, title: str = "model") -> None:
+    """Add the options that determine the mechanism of a file."""
+    group = parser.add_argument_group(title)
+    group.add_argument(
+        "--floating-base", action="store_true", help="let the root link move freely (6 more degrees of freedom)"
+    )
     group.add_argument("--fixed-base", action="store_true", help="fix the root links of an SDF file to the world")
     group.add_argument(
         "--lock",
@@ -38,7 +45,7 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="JOINT[=VALUE]",
-        help="hold these joints of a URDF file, at neutral or at a value (rad, m)",
+        help="lock these joints of a URDF file, at neutral or at a value (rad, m)",
     )
     group.add_argument(
         "--mimic",
@@ -51,27 +58,27 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME=VALUE",
-        help="of a file .xacro, which is expanded first",
+        help="arguments of a .xacro file, which is expanded first",
     )
     group.add_argument(
         "--gravity",
         nargs=3,
         type=real,
         metavar=("X", "Y", "Z"),
-        help="m/s^2 (default: as the file says, of a URDF 0 0 -9.81 in axes of the root link)",
+        help="gravity, m/s^2 (default: that of the file; for URDF 0 0 -9.81 in axes of the root link)",
     )
 
 
 def load_model(path: str, args: argparse.Namespace) -> Model:
-    """The model of a URDF file under the options of `add_model_options`."""
+    """Load the model of a URDF file under the options of `add_model_options`."""
     return _movable(load_urdf(path, mimic=args.mimic or "ignore", **_urdf_options(args)), path)
 
 
 def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathlib.Path]:
-    """The scene of a file of any format, or of a robot by name, under the options of `add_model_options`; and its file."""
+    """Load the scene of a file or a named robot under the options of `add_model_options`; return it with its file."""
     file = as_path(path, "file")
     if not file.suffix and not file.exists():
-        file = described(path)
+        file = find_description(path)
     kind = format_of(file)
     if args.floating_base and args.fixed_base:
         raise ValueError("--floating-base and --fixed-base contradict each other; give one of them")
@@ -80,7 +87,7 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
         _movable(scene.system, path)
         return scene, file
     if args.lock:
-        raise ValueError(f"--lock: joints of {kind.upper()} files cannot be held; change the file, or use a URDF")
+        raise ValueError(f"--lock: joints of {kind.upper()} files cannot be locked; change the file, or use a URDF")
     if args.mimic or args.arguments:
         option = "--mimic" if args.mimic else "--arguments"
         raise ValueError(f"{option}: {file} is {kind.upper()}; leave it out")
@@ -101,7 +108,7 @@ def _lock(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def xacro_arguments(args: argparse.Namespace) -> dict[str, str]:
-    """What the file's `<xacro:arg>` are set to. **Raises:** ValueError for what is no NAME=VALUE."""
+    """Values of the file's `<xacro:arg>` elements. **Raises:** ValueError for items other than NAME=VALUE."""
     if bad := [item for item in args.arguments if item.find("=") < 1]:
         raise ValueError(f"--arguments {bad[0]}: give NAME=VALUE")
     return {name: value for name, _, value in (item.partition("=") for item in args.arguments)}
@@ -124,7 +131,7 @@ def _movable(model: Model, path: str) -> Model:
 
 
 def number(text: str, what: str) -> float:
-    """A finite number, or a ValueError that says where it stood."""
+    """Parse a finite number. **Raises:** ValueError that names the option."""
     with contextlib.suppress(ValueError):
         if np.isfinite(value := parse_number(text)):
             return value
@@ -132,7 +139,7 @@ def number(text: str, what: str) -> float:
 
 
 def real(text: str) -> float:
-    """The type of options that are numbers: finite, in decimal digits."""
+    """Argument type of finite numbers in decimal digits."""
     with contextlib.suppress(ValueError):
         if np.isfinite(value := parse_number(text)):
             return value
@@ -140,7 +147,7 @@ def real(text: str) -> float:
 
 
 def whole(text: str) -> int:
-    """The type of options that are whole numbers, of at most 63 bits."""
+    """Argument type of integers of at most 18 digits."""
     with contextlib.suppress(ValueError):
         if "_" not in text and abs(value := int(text)) < 2**62:
             return value
@@ -148,7 +155,7 @@ def whole(text: str) -> int:
 
 
 def check_least(args: argparse.Namespace, **least: int) -> None:
-    """Options, by their names in `args`, that must not be smaller than a number. **Raises:** ValueError that names one."""
+    """Check lower bounds of options, by their names in `args`. **Raises:** ValueError that names one."""
     for name, bound in least.items():
         values = getattr(args, name)
         for value in values if isinstance(values, list) else [] if values is None else [values]:
@@ -157,20 +164,20 @@ def check_least(args: argparse.Namespace, **least: int) -> None:
 
 
 def check_memory(count: float, options: str) -> None:
-    """Refuse what would write more double-precision numbers than the machine has memory for.
+    """Refuse results with more double-precision numbers than the machine has memory for.
 
     **Raises:** ValueError that names the options.
     """
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**36
     if not 8 * count < memory:
         raise ValueError(
-            f"{options}: {8 * count / 2**30:.3g} GB of results, and the machine has {memory / 2**30:.3g} GB; ask for fewer rows "
+            f"{options}: {8 * count / 2**30:.3g} GB of results, and the machine has {memory / 2**30:.3g} GB; request fewer rows "
             "or motions"
         )
 
 
 def vector(model: Model, items: Sequence[str], start, what: str) -> np.ndarray:
-    """Coordinates from the command line: as many numbers as `start` has, or JOINT=NUMBER[,NUMBER...] to change some of it."""
+    """Parse coordinates: as many numbers as `start` has, or JOINT=NUMBER[,NUMBER...] to change some of them."""
     start = np.array(start, float)
     slices = model.topology.q_slices if what == "--q0" else model.topology.v_slices
     items = [part for item in items for part in (item.split(",") if "=" not in item else [item])]
@@ -194,14 +201,14 @@ def vector(model: Model, items: Sequence[str], start, what: str) -> np.ndarray:
 
 
 def per_coordinate(model: Model, values: Sequence[float], what: str) -> np.ndarray:
-    """One number for all velocity coordinates, or one each."""
+    """Broadcast one number to all velocity coordinates, or check one each."""
     if len(values) not in (1, model.nv):
         raise ValueError(f"{what} has {len(values)} numbers; give 1, or {model.nv}, one per velocity coordinate")
     return np.broadcast_to(np.array(values, float), (model.nv,)).copy()
 
 
 def coordinate_labels(model: Model) -> tuple[list[str], list[str]]:
-    """A label with its unit for each number of v, and the unit of its torque."""
+    """Label of each velocity coordinate, and the unit of its generalised force."""
     labels, torque_units = [], []
     for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
         for i in range(KINDS[kind].nv):
@@ -212,7 +219,7 @@ def coordinate_labels(model: Model) -> tuple[list[str], list[str]]:
 
 
 def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathlib.Path | None:
-    """A file to write, checked before any work is done: its type is known and its directory exists."""
+    """Path of an output file, checked before any work is done: known suffix, existing directory."""
     if text is None:
         return None
     path = as_path(text, option)
@@ -224,7 +231,7 @@ def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathl
 
 
 class Stopwatch:
-    """Wall-clock seconds since it was made."""
+    """Wall-clock time since construction, in seconds."""
 
     def __init__(self):
         self._start = time.perf_counter()

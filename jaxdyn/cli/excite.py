@@ -1,4 +1,4 @@
-"""`jaxdyn excite`: a motion that tells the parameters of a robot best, for `jaxdyn identify`."""
+"""`jaxdyn excite`: an exciting motion that identifies the parameters of a robot best, for `jaxdyn identify`."""
 
 import argparse
 
@@ -21,47 +21,53 @@ from jaxdyn.identify import TERMS
 from jaxdyn.identify.exciting import OBJECTIVES
 from jaxdyn.io import write_log
 
-HELP = "find a motion within limits that tells inertias and friction best"
+HELP = "optimise an exciting motion within limits for the identification of inertias and friction"
 DESCRIPTION = """\
 Find a periodic motion of all joints (a finite Fourier series that starts at rest), within limits of position, velocity and
-torque, whose measured torques tell the robot's inertias and friction best, and write it for a controller.
+torque, whose measured torques identify the robot's inertias and friction best, and write it for a controller.
 """
 EPILOG = """\
 examples:
   jaxdyn excite panda.urdf --lock panda_finger_joint1 panda_finger_joint2 --out motion.csv --plot motion.png
   jaxdyn excite arm.urdf --period 20 --harmonics 8 --velocity 1.0 --torque 50 --objective condition --out motion.csv
 
-The CSV file has columns t, q_.., v_.., a_.. and tau_.., the torques that the file's own bodies need (N m). Run it, log q and
-tau, and give the log to `jaxdyn identify`. Contacts with the ground, or of the robot with itself, are not looked at: look at
+The CSV file has columns t, q_.., v_.., a_.. and tau_.., the torques of the file's bodies (N m). Run it, log q and
+tau, and pass the log to `jaxdyn identify`. Contacts with the ground and self-collisions are not checked: inspect
 the motion before you run it.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    parser.add_argument("urdf", help="the robot; its limits of position, velocity and effort hold")
+    """Add the arguments of the command."""
+    parser.add_argument("urdf", help="the robot; its limits of position, velocity and effort are respected")
     add_model_options(parser)
     parser.add_argument("--out", metavar="FILE", help="write the motion, .csv or .npz")
-    parser.add_argument("--plot", metavar="FILE", help="draw it to FILE.png, .pdf or .svg")
-    parser.add_argument("--period", type=real, default=10.0, metavar="S", help="of the motion, s (default: 10)")
+    parser.add_argument("--plot", metavar="FILE", help="plot the motion to FILE.png, .pdf or .svg")
+    parser.add_argument("--period", type=real, default=10.0, metavar="S", help="period of the motion, s (default: 10)")
+    parser.add_argument("--periods", type=whole, default=1, metavar="N", help="number of periods to write (default: 1)")
+    parser.add_argument("--harmonics", type=whole, default=5, metavar="N", help="harmonics of the series (default: 5)")
+    parser.add_argument("--rate", type=real, default=100.0, metavar="HZ", help="samples per second (default: 100)")
     parser.add_argument(
-        "--periods", type=whole, default=1, metavar="N", help="written one after the other (default: 1)"
+        "--terms", nargs="*", choices=TERMS, default=TERMS, help="terms to identify in addition to the bodies"
     )
-    parser.add_argument("--harmonics", type=whole, default=5, metavar="N", help="of the series (default: 5)")
-    parser.add_argument("--rate", type=real, default=100.0, metavar="HZ", help="rows a second (default: 100)")
-    parser.add_argument("--terms", nargs="*", choices=TERMS, default=TERMS, help="to be identified beside the bodies")
-    parser.add_argument("--objective", choices=OBJECTIVES, default="logdet", help="what is best (default: logdet)")
-    parser.add_argument("--margin", type=real, default=0.9, help="share of all limits that is used (default: 0.9)")
     parser.add_argument(
-        "--velocity", nargs="+", type=real, metavar="V", help="limits instead of the file's, rad/s, m/s"
+        "--objective", choices=OBJECTIVES, default="logdet", help="measure of excitation (default: logdet)"
     )
-    parser.add_argument("--torque", nargs="+", type=real, metavar="T", help="limits instead of the file's, N m, N")
-    parser.add_argument("--seed", type=whole, default=0, help="of the random motions to start from (default: 0)")
-    parser.add_argument("--steps", type=whole, default=300, metavar="N", help="of the search (default: 300)")
+    parser.add_argument("--margin", type=real, default=0.9, help="fraction of all limits to use (default: 0.9)")
+    parser.add_argument(
+        "--velocity", nargs="+", type=real, metavar="V", help="velocity limits instead of the file's, rad/s, m/s"
+    )
+    parser.add_argument(
+        "--torque", nargs="+", type=real, metavar="T", help="torque limits instead of the file's, N m, N"
+    )
+    parser.add_argument("--seed", type=whole, default=0, help="seed of the random initial motions (default: 0)")
+    parser.add_argument(
+        "--steps", type=whole, default=300, metavar="N", help="steps of the optimisation (default: 300)"
+    )
 
 
 def run(args: argparse.Namespace) -> None:
-    """Search, say what it brings, write the motion."""
+    """Optimise, print the gain, write the motion."""
     out, plot = (
         output_path(args.out, (".csv", ".npz"), "--out"),
         output_path(args.plot, (".png", ".pdf", ".svg"), "--plot"),
@@ -71,6 +77,7 @@ def run(args: argparse.Namespace) -> None:
     if not args.period > 0:
         raise ValueError(f"--period is {args.period} s; give a positive time")
     check_least(args, harmonics=1, steps=0, seed=0)
+    # Nyquist: rows must resolve the highest harmonic, or the log cannot represent the motion.
     if args.rate * args.period <= 2 * args.harmonics:
         raise ValueError(
             f"--rate {args.rate:g} --period {args.period:g}: {args.rate * args.period:.3g} rows a period do not hold "
@@ -102,7 +109,7 @@ def run(args: argparse.Namespace) -> None:
     labels, units = coordinate_labels(model)
     print(
         f"condition of the regressor {motion.condition:.4g}, of a random motion within the same limits "
-        f"{motion.start_condition:.4g}; log-det of the information larger by {motion.logdet:.3g}"
+        f"{motion.start_condition:.4g}; log det of the information matrix larger by {motion.logdet:.3g}"
     )
     print("limits used: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in motion.used.items()))
     q, v, tau = (np.asarray(x) for x in (log.q, log.v, log.tau))

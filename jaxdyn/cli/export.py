@@ -1,4 +1,4 @@
-"""`jaxdyn export`: a function of a robot's dynamics as an object file for C or CasADi."""
+"""`jaxdyn export`: functions of a robot's dynamics as object files for C or CasADi."""
 
 import argparse
 from collections.abc import Callable
@@ -11,8 +11,8 @@ from jaxdyn.export.exported import ABIS, HOST, TARGETS
 
 HELP = "write a function of a robot as an object file for C or CasADi"
 DESCRIPTION = """\
-Compile a function of a robot's dynamics to an object file that needs no Python, with a C header, a test program and a build file,
-or with CasADi's interface. The robot is compiled in.
+Compile a function of a robot's dynamics to an object file that needs no Python, with a C header, a test program and a
+build file, or with CasADi's interface. The robot's parameters are compiled in.
 """
 EPILOG = """\
 examples:
@@ -23,7 +23,7 @@ examples:
 FOLDER/NAME.h documents the C function; `cc NAME_test.c NAME.o -lm && ./a.out` compares it with reference results.
 """
 
-# For each function what it takes: q, v and a third vector.
+# Arguments of each function: q, v and a third vector.
 _ARGUMENTS = {
     "forward_dynamics": ("q", "v", "tau"),
     "constrained_dynamics": ("q", "v", "tau"),
@@ -37,26 +37,33 @@ _ARGUMENTS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("file", help=FILE)
     add_model_options(parser)
     parser.add_argument(
-        "--function", choices=tuple(_ARGUMENTS), default="forward_dynamics", help="(default: forward_dynamics)"
+        "--function",
+        choices=tuple(_ARGUMENTS),
+        default="forward_dynamics",
+        help="function to export (default: forward_dynamics)",
     )
-    parser.add_argument("--name", help="of the C function (default: that of --function)")
-    parser.add_argument("--jacobian", action="store_true", help="add the derivatives of the result by each argument")
-    parser.add_argument("--batch", action="store_true", help="add a function of many samples, in vector registers")
-    parser.add_argument("--out", metavar="FOLDER", required=True, help="made where it does not exist")
+    parser.add_argument("--name", help="name of the C function (default: that of --function)")
     parser.add_argument(
-        "--target", default=HOST, help=f"{HOST}, {', '.join(TARGETS)}, or an LLVM triple (default: {HOST})"
+        "--jacobian", action="store_true", help="add the Jacobians of the result with respect to each argument"
     )
-    parser.add_argument("--cpu", help="the processor, as LLVM writes it, as cortex-a72")
-    parser.add_argument("--features", help="of the processor, as LLVM writes them, as +neon")
-    parser.add_argument("--abi", choices=ABIS, default="c", help="(default: c)")
+    parser.add_argument("--batch", action="store_true", help="add a vectorised function of many samples")
+    parser.add_argument("--out", metavar="FOLDER", required=True, help="output folder, created if missing")
+    parser.add_argument(
+        "--target",
+        default=HOST,
+        help=f"target platform: {HOST}, {', '.join(TARGETS)}, or an LLVM triple (default: {HOST})",
+    )
+    parser.add_argument("--cpu", help="processor in LLVM's notation, such as cortex-a72")
+    parser.add_argument("--features", help="processor features in LLVM's notation, such as +neon")
+    parser.add_argument("--abi", choices=ABIS, default="c", help="calling interface (default: c)")
 
 
 def run(args: argparse.Namespace) -> None:
-    """Export the function, and say where the files are."""
+    """Export the function and print the paths of its files."""
     scene, _ = load_scene(args.file, args)
     names, example = _ARGUMENTS[args.function], np.asarray(jd.neutral(scene.system), float)
     rest = np.zeros(scene.system.nv)
@@ -74,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _function_of(scene, name: str) -> Callable:
-    """The function of arrays alone, whose parameters have the names that the header shows."""
+    """Function of arrays only, with the parameter names of the C header."""
     system = scene.system
     if name == "constrained_dynamics":
         return lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration

@@ -1,4 +1,4 @@
-"""`jaxdyn identify fit.toml`: the options of the command in a file."""
+"""`jaxdyn identify fit.toml`: options of the command in a file."""
 
 import argparse
 import tomllib
@@ -6,27 +6,27 @@ from typing import Any
 
 from jaxdyn.model.arguments import as_path
 
-# Files, which are named as seen from the folder that the TOML file is in.
+# Options with paths, relative to the folder of the TOML file.
 _FILES = ("urdf", "log", "test_log", "payload_log", "out", "report", "html", "plot")
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that raises ValueError."""
+    """Parser that raises ValueError instead of exiting."""
 
     def error(self, message):
         raise ValueError(message)
 
 
 def with_file(args: argparse.Namespace, add_arguments) -> argparse.Namespace:
-    """The arguments with those of the TOML file `args.file` where the command line leaves the default.
+    """Merge the arguments with those of the TOML file `args.file` where the command line leaves the default.
 
-    **Raises:** ValueError, with the file, for broken TOML, a name that is no option, and a value that the option does not take.
+    **Raises:** ValueError, with the file, for malformed TOML, an unknown option, and an invalid value.
     """
     if args.file is None:
         return args
     path = as_path(args.file, "file")
     if path.suffix.lower() != ".toml":
-        raise ValueError(f"{path}: options are read from a file .toml; the robot is --urdf, a log --log")
+        raise ValueError(f"{path}: options are read from a .toml file; the robot is --urdf, a log --log")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
@@ -37,6 +37,7 @@ def with_file(args: argparse.Namespace, add_arguments) -> argparse.Namespace:
     add_arguments(parser)
     defaults = vars(parser.parse_args([]))
     tokens: list[str] = []
+    # Through the same parser as the command line, so that types and choices are checked once.
     for name, value in table.items():
         if name.replace("-", "_") not in defaults or name == "file":
             names = ", ".join(option.replace("_", "-") for option in defaults if option != "file")
@@ -53,7 +54,7 @@ def with_file(args: argparse.Namespace, add_arguments) -> argparse.Namespace:
 
 
 def _tokens(name: str, value: Any, path) -> list[str]:
-    """What one would write on the command line for one entry."""
+    """Convert one entry to command-line tokens."""
     option = f"--{name.replace('_', '-')}"
     if isinstance(value, bool):
         return [option] if value else []

@@ -1,4 +1,4 @@
-"""Logs of `jaxdyn identify`: which files, under which names, filtered how."""
+"""Logs of `jaxdyn identify`: files, names and filtering."""
 
 import pathlib
 
@@ -12,12 +12,12 @@ from jaxdyn.model.tree import Model
 
 
 def log_paths(args) -> tuple[list[str], list[str]]:
-    """Files to fit and files to judge by. **Raises:** ValueError for a file that is given twice."""
+    """Training and test files. **Raises:** ValueError for a file that is given twice."""
     seen: dict[pathlib.Path, str] = {}
     for path in [*args.log, *args.test_log]:
         place = pathlib.Path(path).resolve()
         if place in seen:
-            where = "--test-log: a log that is fitted tells no error" if path in args.test_log else "--log"
+            where = "--test-log: a training log is no test of the fit" if path in args.test_log else "--log"
             raise ValueError(f"{where}: {path} is given twice")
         seen[place] = path
     return list(args.log), list(args.test_log)
@@ -30,12 +30,12 @@ def log_names(paths: list[str]) -> list[str]:
 
 
 def raw_log(model: Model, path: str, args) -> Log:
-    """The log of a file as it was recorded. **Raises:** ValueError for logs that do not fit the model."""
+    """Read the log of a file as recorded. **Raises:** ValueError for logs that do not fit the model."""
     raw = read_log(path, joint_names=model.joint_names, rename=_renaming(args.rename))
     if raw.q.shape[1] != model.nq or raw.nv != model.nv:
         raise ValueError(
             f"{path}: the log has {raw.q.shape[1]} columns of q and {raw.nv} of tau, the model has {model.nq} and "
-            f"{model.nv} (joints {', '.join(model.joint_names)}); hold joints that were not logged with --lock"
+            f"{model.nv} (joints {', '.join(model.joint_names)}); lock joints that were not logged with --lock"
         )
     if len(raw) < 2:
         raise ValueError(f"{_span(path, raw)}; a log needs more than one sample")
@@ -43,11 +43,11 @@ def raw_log(model: Model, path: str, args) -> Log:
 
 
 def log_cutoff(logs: list[Log], args) -> float | None:
-    """The cut-off (Hz) of all logs, None where none is filtered here; says what "auto" chose and why.
+    """Cut-off frequency (Hz) of all logs, None where none is filtered here; print the choice of "auto" and its reason.
 
-    **Raises:** ValueError for a cut-off that is no positive number, and for logs that tell none.
+    **Raises:** ValueError for an invalid cut-off, and for logs that do not determine one.
     """
-    logs = [log for log in logs if not (args.filtered or _is_filtered(log))]
+    logs = [log for log in logs if not (args.filtered or _has_derivatives(log))]
     if args.cutoff != "auto":
         cutoff = number(args.cutoff, "--cutoff")
         if not cutoff > 0:
@@ -59,33 +59,38 @@ def log_cutoff(logs: list[Log], args) -> float | None:
         choice = identify.choose_cutoff(logs)
     except ValueError as error:
         raise ValueError(f"--cutoff auto: {error}") from None
-    # Three digits are what a spectrum is worth.
+    # A spectrum determines no more than three digits.
     cutoff = float(f"{choice.frequency:.3g}")
     how = f"ten times the band of the motion, {choice.motion:.3g} Hz"
     if choice.vibration is not None:
         how = f"below a vibration at {choice.vibration:.3g} Hz; the motion is below {choice.motion:.3g} Hz"
     elif cutoff < 9.9 * choice.motion:
-        how = f"what the sampling allows; the motion is below {choice.motion:.3g} Hz"
+        how = f"limited by the sampling rate; the motion is below {choice.motion:.3g} Hz"
     print(f"--cutoff auto: {cutoff:g} Hz, {how}")
     return cutoff
 
 
-def filtered_log(raw: Log, path: str, args, cutoff: float | None) -> Log:
-    """The log, filtered unless it has been; says so. **Raises:** ValueError for logs that are too short for the filter."""
+def filter_log(raw: Log, path: str, args, cutoff: float | None) -> Log:
+    """Filter a log unless it has v and a, and print how.
+
+    **Raises:** ValueError for logs that are too short for the filter.
+    """
     span = _span(path, raw)
-    if _is_filtered(raw):
-        print(f"{span}, with v and a: taken as filtered")
+    if _has_derivatives(raw):
+        print(f"{span}, with v and a: used as filtered")
         return raw
     if args.filtered:
-        print(f"{span}, taken as filtered; what is missing of v and a is made by differences")
+        print(f"{span}, used as filtered; missing v and a are computed by differences")
         v = np.gradient(np.asarray(raw.q), np.asarray(raw.t), axis=0) if raw.v is None else raw.v
         a = np.gradient(np.asarray(v), np.asarray(raw.t), axis=0)
         return Log(raw.t, raw.q, v, a, raw.tau, joint_names=raw.joint_names)
     rate = (len(raw) - 1) / float(raw.t[-1] - raw.t[0])
-    if cutoff is None:  # the logs that are fitted are filtered, and this one is not
+    if cutoff is None:  # all training logs are filtered already, this one is raw
         cutoff = log_cutoff([raw], args)
         assert cutoff is not None
+    # 15 samples per cut-off period: more would be correlated by the filter and add no information.
     every = max(1, int(rate / (15 * cutoff))) if args.every is None else args.every
+    # The filter's transient at the ends lasts about one and a half periods of the cut-off.
     trim = 25 * every if args.trim is None else args.trim
     if every < 1 or trim < 0:
         raise ValueError(f"--every is {every}, --trim is {trim}; give --every of at least 1 and --trim of at least 0")
@@ -104,7 +109,7 @@ def _span(path: str, raw: Log) -> str:
     return f"{path}: {len(raw)} samples, {float(raw.t[-1] - raw.t[0]):.4g} s"
 
 
-def _is_filtered(raw: Log) -> bool:
+def _has_derivatives(raw: Log) -> bool:
     return raw.a is not None and raw.v is not None
 
 

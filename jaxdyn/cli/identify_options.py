@@ -1,4 +1,4 @@
-"""What `jaxdyn identify` was asked for, and the fit that it asks for."""
+"""Options of `jaxdyn identify`, and the fit that they describe."""
 
 import math
 from typing import NamedTuple
@@ -10,12 +10,12 @@ from jaxdyn.cli.common import number
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.model.tree import Model
 
-# Of the simulation in a trajectory fit (s).
+# Longest step of the simulation in a trajectory fit, s.
 _LONGEST_STEP = 0.0025
 
 
 class Options(NamedTuple):
-    """How a fit is to be made; what is "auto" is chosen by the fit."""
+    """Options of a fit; values of "auto" are chosen by the fit."""
 
     method: str
     terms: str | tuple[str, ...]
@@ -27,15 +27,18 @@ class Options(NamedTuple):
 
 
 def parse_options(args) -> Options:
-    """Options from the command line. **Raises:** ValueError for what the method does not take, and for what is no number."""
+    """Parse options of the command line.
+
+    **Raises:** ValueError for options that the method does not support, and invalid numbers.
+    """
     simple = args.method != "feasible"
     terms = args.terms
     if terms is None or terms == ["auto"]:
         terms = TERMS if simple else "auto"
     elif "auto" in terms:
-        raise ValueError(f"--terms {' '.join(terms)}: auto stands alone; it chooses the terms")
+        raise ValueError(f"--terms {' '.join(terms)}: auto excludes other terms")
     elif simple and set(terms) & set(EXTRA):
-        raise ValueError(f"--terms {' '.join(terms)}: --method {args.method} takes {', '.join(TERMS)}; the others need "
+        raise ValueError(f"--terms {' '.join(terms)}: --method {args.method} supports {', '.join(TERMS)}; the others need "
                          "--method feasible")  # fmt: skip
     v_s = args.v_s if args.v_s == "auto" else number(args.v_s, "--v-s")
     prior = args.prior if args.prior == "auto" else number(args.prior, "--prior")
@@ -44,22 +47,22 @@ def parse_options(args) -> Options:
     robust = {"auto": "auto", "none": None}.get(args.robust, args.robust)
     robust = number(robust, "--robust") if robust not in ("auto", None) else robust
     if args.payload_centre is not None and args.payload_mass is None:
-        raise ValueError("--payload-centre: without --payload-mass; give both, or neither and the payload is found")
+        raise ValueError("--payload-centre: without --payload-mass; give both, or neither to identify the payload")
     weights = "auto" if args.weights == "auto" else None
     delay = parse_delay(args.delay)
     if simple and delay != 0.0:
         raise ValueError(
-            f"--delay {' '.join(args.delay)}: --method {args.method} knows no delay; take --method feasible"
+            f"--delay {' '.join(args.delay)}: --method {args.method} does not support delays; use --method feasible"
         )
     return Options(args.method, terms if isinstance(terms, str) else tuple(terms), v_s, prior, robust, weights, delay)
 
 
 def find_gains(model: Model, unloaded: list[Log], loaded: list[Log], options: Options, args) -> identify.DriveGains:
-    """Gains of the drives by the known payload. **Raises:** ValueError where an option that it needs is missing."""
+    """Fit the gains of the drives by a known payload. **Raises:** ValueError where a required option is missing."""
     if args.payload_centre is None or not loaded:
         raise ValueError(
-            f"--payload-mass {args.payload_mass:g}: gains need --payload-log, logs with it, and --payload-centre X Y Z, where "
-            "its centre of mass is in the frame of the link that holds it"
+            f"--payload-mass {args.payload_mass:g}: gains need --payload-log, logs with the payload, and --payload-centre X Y Z, "
+            "its centre of mass in the frame of the link that holds it"
         )
     terms = TERMS if options.terms == "auto" else tuple(term for term in TERMS if term in options.terms)
     return identify.fit_gains(
@@ -75,30 +78,30 @@ def find_gains(model: Model, unloaded: list[Log], loaded: list[Log], options: Op
 
 
 def parse_delay(words: list[str]) -> str | float | tuple[float, ...]:
-    """ "auto", zero for none, seconds, or those of each torque. **Raises:** ValueError for anything else."""
+    """Parse a delay: "auto", zero for none, seconds, or those of each torque. **Raises:** ValueError for anything else."""
     if words in (["auto"], ["none"]):
         return "auto" if words == ["auto"] else 0.0
     if {"auto", "none"} & set(words):
-        raise ValueError(f"--delay {' '.join(words)}: auto and none stand alone")
+        raise ValueError(f"--delay {' '.join(words)}: auto and none exclude other values")
     seconds = tuple(number(word, "--delay") for word in words)
     return seconds[0] if len(seconds) == 1 else seconds
 
 
-def settled(options: Options, result) -> Options:
-    """The options with what a fit chose in place of "auto"."""
+def resolve_options(options: Options, result) -> Options:
+    """Replace "auto" in the options by the choices of a fit."""
     if not isinstance(result, RobotFit):
         return options
     setting = result.choice.setting
     delay = options.delay
     if delay == "auto" and (result.delays is None or not np.any(result.delays.seconds)):
-        delay = 0.0  # none that helps
+        delay = 0.0  # no delay lowers the error
     return options._replace(
         terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust, delay=delay
     )
 
 
 def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit | Fit | LeastSquares:
-    """The fit of some logs by the method asked for."""
+    """Fit logs by the requested method."""
 
     def show(step, loss, _):
         if args.progress:
@@ -107,7 +110,7 @@ def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit 
     def tell(trial):
         if args.progress:
             extra = ", ".join(f"{name} {list(joints)}" for name, joints in trial.setting.extra)
-            print(f"  left out: {trial.percent:.3f} % with v_s {trial.setting.v_s:g}, prior {trial.setting.prior:g}, "
+            print(f"  held out: {trial.percent:.3f} % with v_s {trial.setting.v_s:g}, prior {trial.setting.prior:g}, "
                   f"robust {trial.setting.robust}, terms {extra or 'none more'}", flush=True)  # fmt: skip
 
     if options.method == "least-squares":
@@ -136,6 +139,6 @@ def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit 
         horizon=min(max(1, round(args.horizon / dt)), len(log) - 1),
         steps=args.steps,
         callback=show,
-        # Fixed steps: in a batch of segments, adaptive ones cost every segment what the stiffest needs.
+        # Fixed steps: in a batch of segments, adaptive ones cost every segment as many steps as the stiffest needs.
         substeps=max(1, math.ceil(dt / _LONGEST_STEP)),
     )

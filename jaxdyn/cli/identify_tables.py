@@ -1,4 +1,4 @@
-"""Tables that `jaxdyn identify` prints."""
+"""Tables printed by `jaxdyn identify`."""
 
 import numpy as np
 
@@ -12,30 +12,30 @@ from jaxdyn.reports.identification import Findings, total_percent
 _BASE_ROWS = 200
 
 
-def judged_table(findings: Findings) -> str:
-    """Torque errors, in per cent: of what was not fitted first, of all joints together and of each."""
+def error_table(findings: Findings) -> str:
+    """Torque errors in per cent: test data first, all joints together and each."""
     labels, _ = coordinate_labels(findings.model)
     rows = []
     for kind, group in (("test", findings.tests), ("fitted", findings.train)):
         rows += [[one.name, kind, f"{one.percent:.2f}", *_each(one.percent_by_joint)] for one in group]
     text = (
-        f"torque error: {total_percent(findings.tests):.2f} % on what was not fitted, {total_percent(findings.train):.2f} % on "
-        f"what was; {total_percent(findings.tests, 'nominal'):.1f} % with the URDF's own numbers\n"
+        f"torque error: {total_percent(findings.tests):.2f} % on test data, {total_percent(findings.train):.2f} % on "
+        f"training data; {total_percent(findings.tests, 'nominal'):.1f} % with the URDF's parameters\n"
     )
-    text += "Torque error in per cent of the torque measured\n" + table(["log", "", "all", *labels], rows)
+    text += "Torque error in per cent of the measured torque\n" + table(["log", "", "all", *labels], rows)
     if findings.is_refit:
         text += (
-            f"\nWhat is written was then fitted to all samples: {total_percent(findings.final):.2f} % on them; the tables "
+            f"\nThe written robot was then fitted to all samples: {total_percent(findings.final):.2f} % on them; the tables "
             "below are of that fit."
         )
     return text
 
 
 def tables(findings: Findings) -> str:
-    """Joints and bodies, or base parameters; what was chosen."""
+    """Tables of joints and bodies, or of base parameters, and the chosen settings."""
     parts = [_joint_table(findings)]
     result, model = findings.result, findings.model
-    parts.append(_told_text(findings))
+    parts.append(_identifiability_text(findings))
     if isinstance(result, LeastSquares):
         rows = [[name, short(x0), short(x), short(s, 2)] for name, x0, x, s in result.table()]
         header = ["combination", "URDF", "fitted", "std"]
@@ -72,8 +72,8 @@ def _joint_table(findings: Findings) -> str:
     return f"Joints: errors on {first.name}, friction and rotor inertia\n" + table(header, rows)
 
 
-def _told_text(findings: Findings) -> str:
-    """What the logs tell, and what the error on the first test log is worth."""
+def _identifiability_text(findings: Findings) -> str:
+    """Identifiability of the parameters, and autocorrelation of the errors on the first test log."""
     labels = coordinate_labels(findings.model)[0]
     first = findings.tests[0]
     lasting = ", ".join(
@@ -81,15 +81,16 @@ def _told_text(findings: Findings) -> str:
     )
     worst = round(float(first.whiteness.effective_samples.min()))
     return (
-        f"What the logs tell: {findings.told.summary()}\n"
-        f"Errors on {first.name} last (s): {lasting}; its {len(first.log)} samples are worth {worst} independent ones or more"
+        f"Identifiability: {findings.identifiability.summary()}\n"
+        f"Autocorrelation time of the errors on {first.name} (s): {lasting}\n"
+        f"Effective sample size of {first.name}: at least {worst} of {len(first.log)}"
     )
 
 
 def _choice_text(choice: Choice, model: Model) -> str:
     setting, labels = choice.setting, coordinate_labels(model)[0]
     extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
-    how = f", chosen over {len(choice.trials)} settings, each judged on {choice.by} left out in turn"
+    how = f", chosen over {len(choice.trials)} settings by cross-validation over {choice.by}"
     loss = "squares" if setting.robust is None else f"Huber's beyond {setting.robust:g}"
     return (
         f"v_s {setting.v_s:g}, prior {setting.prior:g}, loss {loss}, extra terms: {extra}{how if choice.trials else ''}"
@@ -97,13 +98,13 @@ def _choice_text(choice: Choice, model: Model) -> str:
 
 
 def delays_text(delays: Delays, labels) -> str:
-    """How late torques are, in ms, with half of the 95 % intervals of those that were found."""
+    """Delays of the torques, in ms, with half-widths of the 95 % intervals of fitted ones."""
     half = 1e3 * delays.factor * delays.std
     cells = [
         f"{label} {1e3 * d:.1f}" + (f" +- {h:.1f}" if np.isfinite(h) and d else "")
         for label, d, h in zip(labels, delays.seconds, half, strict=True)
     ]
-    none = "; zero where a delay lowers no error on parts left out" if delays.squares is not None else ", as given"
+    none = "; zero where a delay lowers no error on held-out parts" if delays.squares is not None else ", as given"
     return f"Delays of the torques against the positions (ms): {', '.join(cells)}{none}"
 
 
@@ -115,7 +116,7 @@ def _robot_base_table(result: RobotFit, model: Model) -> str:
         [name, short(x0), short(x), short(result.intervals.factor * s, 2), source]
         for name, x0, x, s, source in zip(base.names, start, base.values, base.std, base.sources, strict=True)
     ]
-    text = "Base parameters: URDF, fitted, half of the 95 % interval, and what settled them"
+    text = "Base parameters: URDF, fitted, half-width of the 95 % interval, and source"
     return text + "\n" + table(["combination", "URDF", "fitted", "+-", "from"], rows[:_BASE_ROWS])
 
 
@@ -130,26 +131,26 @@ def _mass_table(findings: Findings) -> str:
     for name, old, new in zip(model.body_names, np.asarray(model.inertias), fitted, strict=True):
         centre = [short(x, 3) for x in new[1:4] / new[0]] if new[0] > 0 else ["-"] * 3
         rows.append([name, short(old[0]), short(new[0]), sources.get(f"{name}.m", "-"), *centre])
-    text = "Bodies: mass (kg) in the URDF and fitted, what settled it, fitted centre of mass (m)"
+    text = "Bodies: mass (kg) in the URDF and fitted, source, fitted centre of mass (m)"
     return text + "\n" + table(["body", "URDF", "fitted", "from", "x", "y", "z"], rows)
 
 
 def gains_text(gains: DriveGains, labels) -> str:
-    """Gains of the drives with half of their 95 % intervals, and which joints the payload did not tell."""
+    """Gains of the drives with half-widths of their 95 % intervals, and joints whose gain is not identifiable."""
     half = gains.factor * gains.std
     cells = ", ".join(
         f"{label} {short(float(g))} +- {short(float(h), 2)}"
         for label, g, h in zip(labels, gains.gains, half, strict=True)
     )
     rest = [label for label in labels if label not in gains.told]
-    line = f"Drives, torque = gain * what the logs hold, by the known payload: {cells}"
+    line = f"Drive gains, torque = gain * logged value, from the known payload: {cells}"
     if rest:
-        line += f"\nThe payload hardly tells the gains of {', '.join(rest)}: they are about the others' median"
+        line += f"\nHardly identifiable from the payload, near the others' median: gains of {', '.join(rest)}"
     return line
 
 
 def payload_text(payload: Payload) -> str:
-    """Mass, centre and inertia of what the robot held, with half of the 95 % intervals."""
+    """Mass, centre of mass and inertia of the payload, with half-widths of the 95 % intervals."""
     half = payload.factor * payload.std
     numbers = [
         f"{name} {short(float(x))} +- {short(float(h), 2)}"

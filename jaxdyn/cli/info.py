@@ -1,4 +1,4 @@
-"""`jaxdyn info`: what a file describes, what is wrong with it, and what of it is not taken."""
+"""`jaxdyn info`: contents of a file, its faults, and its unsupported elements."""
 
 import argparse
 import collections
@@ -22,9 +22,9 @@ from jaxdyn.model.tree import Model, integrate
 
 HELP = "bodies, joints, limits, loops, frames and faulty inertias of a URDF, MJCF or SDF file"
 DESCRIPTION = """\
-Print what a file describes: bodies with mass, joints with axes and limits in the order of q and v, loops and
-couplings with their gaps, degrees of freedom that these leave, frames, actuators, states that the file names,
-bodies whose inertia no solid can have, and what the file holds that is not taken.
+Print the contents of a file: bodies with mass, joints with axes and limits in the order of q and v, loops and
+couplings with their gaps, remaining degrees of freedom, frames, actuators, named states,
+bodies with unphysical inertias, and unsupported elements.
 """
 EPILOG = """\
 examples:
@@ -41,7 +41,7 @@ Units: kg, m, rad, rad/s or m/s, N m or N, kg m^2.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("file", help=FILE)
     add_model_options(parser)
     parser.add_argument(
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> None:
     """Print the report, and write the repaired model if asked."""
     out = output_path(args.repair, (".urdf",), "--repair")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotTakenWarning)  # what it names is printed below
+        warnings.simplefilter("ignore", NotTakenWarning)  # its content is printed below
         scene, file = load_scene(args.file, args)
     model, is_urdf = scene.system, format_of(file) == "urdf"
     if out is not None and not is_urdf:
@@ -66,26 +66,26 @@ def run(args: argparse.Namespace) -> None:
     print(constraint_lines(scene))
     if is_urdf:
         print(_problems(urdf_inertia_report(file, arguments=xacro_arguments(args)), body_problems))
-        print(_unused(source))
+        print(_unsupported(source))
     else:
         print(_body_problems(body_problems))
     if scene.not_taken or not is_urdf:
-        print("\n".join(["\nNot taken from the file:", *(scene.not_taken or ["nothing"])]))
+        print("\n".join(["\nUnsupported elements of the file:", *(scene.not_taken or ["none"])]))
     if out is not None:
         repaired = repair_inertias(model)
         save_urdf(repaired, out)
         changed = [name for name, *_ in body_problems if name not in dict(inertia_report(repaired))]
-        print(f"\nWrote {out}: inertias of {len(changed)} bodies repaired{_listed(changed)}.")
+        print(f"\nWrote {out}: inertias of {len(changed)} bodies repaired{_name_list(changed)}.")
 
 
 def _of_the_file(problems: list[tuple[str, str]], file: XmlFile) -> list[tuple[str, str]]:
-    """The problems without the massless bodies that a loader puts between the joints of one body."""
+    """Drop the massless bodies that a loader inserts between the joints of one body."""
     names = {element.get("name") for element in file.root.iter() if element.tag in ("link", "body")}
     return [(body, text) for body, text in problems if text != "massless" or body.rpartition("::")[2] in names]
 
 
 def _base(scene: LoadedScene) -> str:
-    """Whether the mechanism stands on the world: by its joints, or by constraints that hold a free root."""
+    """Kind of base: fixed by joints, fixed by constraints on a free root, or floating."""
     model, top = scene.system, scene.system.topology
     free = [
         i for i, (parent, kind) in enumerate(zip(top.parents, top.kinds, strict=True)) if parent < 0 and kind == "free"
@@ -95,18 +95,19 @@ def _base(scene: LoadedScene) -> str:
         rows = np.asarray(constraint_jacobian(scene, scene.starts["reference"].q, jnp.zeros(())), np.float64)
         _, singular, right = np.linalg.svd(rows)
         rank = int(np.sum(singular > 1e-9 * singular.max(initial=0.0)))
+        # A root is held if no velocity in the null space of the constraints moves it.
         held = [i for i in free if np.abs(right[rank:, top.v_slices[i]]).max(initial=0.0) < 1e-6]
     floating = [model.body_names[i] for i in free if i not in held]
     roots = top.parents.count(-1)
     if not floating:
-        return "fixed base" + " (held by constraints)" * bool(held)
+        return "fixed base" + " (by constraints)" * bool(held)
     if len(free) == roots:
         return "floating base" if roots == 1 else f"{len(floating)} floating bases"
-    return f"fixed base beside free bodies {', '.join(floating)}"
+    return f"fixed base and free bodies {', '.join(floating)}"
 
 
 def describe(scene: LoadedScene, source: str) -> str:
-    """The model in words and tables."""
+    """Description of the model in tables."""
     model, base = scene.system, _base(scene)
     mass = float(np.asarray(model.inertias)[:, 0].sum())
     quaternions = "" if model.nq == model.nv else f" (q has {model.nq} numbers, v has {model.nv})"
@@ -126,7 +127,7 @@ def describe(scene: LoadedScene, source: str) -> str:
 
 
 def constraint_lines(scene: LoadedScene) -> str:
-    """Loops and couplings with their gaps at every state that the file names, the freedom that they leave; drives."""
+    """Table of loops and couplings with their gaps at every named state, remaining degrees of freedom, and actuators."""
     lines, q = [""], scene.starts["reference"].q
     if scene.constraints:
         rows = []
@@ -136,14 +137,14 @@ def constraint_lines(scene: LoadedScene) -> str:
             rows.append([one.name, type(one).__name__.lower(), str(holonomic + nonholonomic), *gaps])
         heads = ["constraint", "kind", "rows", *(f"gap at {name!r}" for name in list(scene.starts)[:4])]
         lines += [
-            "Loops and couplings such as <mimic>, and how far each is open (m or rad)",
+            "Loops and couplings such as <mimic>, with their gaps (m or rad)",
             table(heads, [r[: len(heads)] for r in rows]),
         ]
         lines += _closure(scene, q)
     else:
         lines.append(f"Degrees of freedom after constraints: {scene.nv} of {scene.nv}")
     if len(scene.starts) > 1:
-        lines.append(f"States that the file names: {', '.join(scene.starts)}")
+        lines.append(f"Named states: {', '.join(scene.starts)}")
     if scene.actuators is not None:
         lines.append(f"Actuators: {', '.join(scene.actuators.names)}")
     return "\n".join(lines)
@@ -171,7 +172,7 @@ def _closed_near(scene: LoadedScene, q) -> list:
     configurations, random = [], np.random.default_rng(0)
     for _ in range(2):
         step = jnp.asarray(random.uniform(-0.1, 0.1, scene.nv), q.dtype)
-        with contextlib.suppress(ValueError):  # not every configuration near by can be closed
+        with contextlib.suppress(ValueError):  # not every configuration nearby can be assembled
             configurations.append(assemble(scene, integrate(scene.system, q, step), guesses=1).q)
     return configurations
 
@@ -239,20 +240,20 @@ def _frames(model: Model) -> str:
         carried["world" if body < 0 else model.body_names[body]].append(name)
     if not carried:
         return "Frames: those of the bodies."
-    lines = [f"Frames: those of the {model.nb} bodies, and fixed to them"]
+    lines = [f"Frames: those of the {model.nb} bodies, and others fixed to them"]
     return "\n".join(lines + [f"  {body}: {', '.join(names)}" for body, names in carried.items()])
 
 
 def _problems(links: list[tuple[str, str]], bodies: list[tuple[str, str]]) -> str:
     if not links:
-        text = "\nInertias: every link that moves has a physical inertia."
+        text = "\nInertias: every moving link has a physical inertia."
     else:
-        text = f"\nInertia problems, link by link as the file states them ({len(links)})\n" + table(
+        text = f"\nInertia problems of the links, as stated in the file ({len(links)})\n" + table(
             ("link", "problem"), links
         )
     if bodies:
-        text += f"\nOf the merged bodies, which are what moves, {len(bodies)} are affected{_listed([b for b, _ in bodies])}."
-        text += "\nThe model is used as it is; --repair writes a physical one."
+        text += f"\nAfter merging fixed links, {len(bodies)} bodies are affected{_name_list([b for b, _ in bodies])}."
+        text += "\nThe model is used unchanged; --repair writes a physical one."
     elif links:
         text += "\nOnce fixed links are merged, every body has a physical inertia."
     return text
@@ -260,27 +261,27 @@ def _problems(links: list[tuple[str, str]], bodies: list[tuple[str, str]]) -> st
 
 def _body_problems(bodies: list[tuple[str, str]]) -> str:
     if not bodies:
-        return "\nInertias: every body that moves has a physical inertia."
+        return "\nInertias: every moving body has a physical inertia."
     rows = table(("body", "problem"), bodies)
     return f"\nInertia problems ({len(bodies)}); jd.repair_inertias(scene.system) gives physical ones\n{rows}"
 
 
-def _listed(names: list[str]) -> str:
+def _name_list(names: list[str]) -> str:
     return f": {', '.join(names)}" if names else ""
 
 
-def _unused(file: XmlFile) -> str:
-    """What the file holds that the model does not, counted by element."""
+def _unsupported(file: XmlFile) -> str:
+    """Count the elements of the file that the model does not represent."""
     counts: collections.Counter[str] = collections.Counter()
     for element in file.root:
         if element.tag == "gazebo" and (
             element.find("joint") is not None or element.find("plugin/mimicJoint") is not None
         ):
-            continue  # a loop or a coupling
+            continue  # loops and couplings are represented
         if element.tag not in ("link", "joint"):
             counts[element.tag] += 1
             continue
         used = {"inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic"}
         counts.update(part.tag for part in element if part.tag not in used)
     names = ", ".join(f"{count} <{tag}>" for tag, count in sorted(counts.items()))
-    return f"\nIn the file and not used: {names or 'nothing'}."
+    return f"\nUnused elements of the file: {names or 'none'}."

@@ -1,4 +1,4 @@
-"""Robots whose file gives some moving link no inertia at all, read for a fit that is to find it."""
+"""Loader of robots with massless moving links, for fits that are to identify their inertias."""
 
 import argparse
 import pathlib
@@ -10,12 +10,12 @@ from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.arguments import parse_number
 from jaxdyn.model.tree import Model
 
-# What a link without inertia is given to start from: this share of the heaviest link's mass, as a ball of this radius (m).
+# Initial inertia of a massless link: this fraction of the heaviest link's mass, as a ball of this radius (m).
 _SHARE, _RADIUS = 1e-2, 0.05
 
 
 def load_for_repair(path: str, args: argparse.Namespace) -> tuple[Model, list[str]]:
-    """The model, and the links that were given a small ball because the file could not be read without one.
+    """Load a model; massless moving links get a small ball if it cannot be loaded without. Return it with their names.
 
     **Raises:** ValueError as `load_model`, where such a ball does not help.
     """
@@ -24,7 +24,7 @@ def load_for_repair(path: str, args: argparse.Namespace) -> tuple[Model, list[st
     except ValueError:
         try:
             tree = ET.ElementTree(XmlFile(path, "URDF").root)
-            names = _give_balls(tree.getroot())  # pyright: ignore[reportArgumentType]
+            names = _add_balls(tree.getroot())  # pyright: ignore[reportArgumentType]
         except ValueError:
             tree, names = None, []
         if tree is None or not names:
@@ -35,8 +35,8 @@ def load_for_repair(path: str, args: argparse.Namespace) -> tuple[Model, list[st
             return load_model(str(file), args), names
 
 
-def _give_balls(robot: ET.Element) -> list[str]:
-    """Give links that a joint moves and that have no mass a ball; their names."""
+def _add_balls(robot: ET.Element) -> list[str]:
+    """Give massless moving links a ball; return their names."""
     moved = {
         child.get("link")
         for joint in robot.iterfind("joint")

@@ -1,14 +1,14 @@
-"""`jaxdyn report`: error against run time of scenes whose motion is known."""
+"""`jaxdyn report`: error against run time of scenes with known motions."""
 
 import argparse
 
 from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
 from jaxdyn.reports import cases, report
 
-HELP = "error against run time of scenes whose motion is known"
+HELP = "error against run time of scenes with known motions"
 DESCRIPTION = """\
-Integrate scenes whose motion is known by several methods, solvers, tolerances and steps; print how wrong and how fast each run
-is, and write a page with log-log plots.
+Integrate scenes with known motions by several methods, solvers, tolerances and steps; print error and run time of each
+run, and write a page with log-log plots.
 """
 EPILOG = """\
 examples:
@@ -18,24 +18,22 @@ examples:
   jaxdyn report --full --out out/report
 
 Without --full: the usual integrators, four tolerances each, a quarter of a minute to two minutes a scene, of which
-most is compilation. With it: every sensible integrator, in both dtypes, alone and in batches, hours for all scenes; started again
-with the same --out, it goes on where it stopped.
+most is compilation. With it: every sensible integrator, in both dtypes, single and in batches, hours for all scenes; restarted
+with the same --out, it resumes.
 
 output (--out DIR):
   report.html      one page: plots, tables, the machine; needs no network
   report.json      the same as data; jaxdyn.reports.Report.from_json reads it
   report.txt       what is printed
-  records.jsonl    finished groups of runs, from which an interrupted call goes on
+  records.jsonl    finished groups of runs, from which an interrupted call resumes
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="names of scenes (see --list); all with --full")
-    parser.add_argument("--list", action="store_true", help="print the scenes and leave")
-    parser.add_argument(
-        "--full", action="store_true", help="every sensible method and solver; goes on where it stopped"
-    )
+    parser.add_argument("--list", action="store_true", help="print the scenes and exit")
+    parser.add_argument("--full", action="store_true", help="every sensible method and solver; resumable")
     parser.add_argument("--out", metavar="DIR", help="directory for the page, the data and the text")
     parser.add_argument("--dtype", nargs="+", metavar="T", help="float64, float32 (default: float64; both with --full)")
     parser.add_argument("--batch", nargs="+", type=whole, metavar="N", help="trajectories at once (default: 1; 1 256)")
@@ -44,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--way",
         nargs="+",
         metavar="I",
-        help="method:solver, e.g. projected:Dopri8, in place of the usual ones (--way: its former name)",
+        help="method:solver, e.g. projected:Dopri8, instead of the usual ones (--way: its former name)",
     )
     parser.add_argument("--rounds", type=whole, default=20, metavar="N", help="timings of each run (default: 20)")
 

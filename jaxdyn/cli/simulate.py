@@ -1,4 +1,4 @@
-"""`jaxdyn simulate`: motions of a robot under chosen torques, to a file and a picture."""
+"""`jaxdyn simulate`: motions of a robot under chosen torques, written, plotted or shown."""
 
 import argparse
 import csv
@@ -40,7 +40,7 @@ HELP = "simulate a robot of a URDF, MJCF or SDF file, one motion or a batch, and
 DESCRIPTION = """\
 Simulate the robot from a given state under chosen joint torques. Loops and couplings of the file are closed at the
 start and stay closed; its springs, damping and friction act. Energy minus work is printed as a check of the
-integration: it has to be tiny.
+integration: it must be close to zero.
 """
 EPILOG = """\
 examples:
@@ -52,8 +52,8 @@ examples:
   jaxdyn simulate robot.xml --start home --duration 1 --html motion.html
 
 torques (--torque):
-  zero             none: the robot falls
-  gravity          carries the robot's weight, N(q)
+  zero             no torques: the robot falls
+  gravity          compensates gravity, N(q)
   random           smooth random torques (three harmonics of 0.5 Hz), another one for each motion
   gravity+random   both
   FILE.csv, .npz   replays the columns tau1, tau2, ... (N m, N) of a log with t (s) and q1, q2, ...; it starts at
@@ -69,7 +69,7 @@ _KINDS = ("zero", "gravity", "random", "gravity+random")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("file", help=FILE)
     add_model_options(parser)
     motion = parser.add_argument_group("motion")
@@ -77,18 +77,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion.add_argument(
         "--sample", type=real, default=0.01, metavar="S", help="time between output rows, s (default: 0.01)"
     )
-    motion.add_argument("--start", default="reference", metavar="NAME", help="a state that the file names (a keyframe)")
+    motion.add_argument("--start", default="reference", metavar="NAME", help="a named state of the file (a keyframe)")
     motion.add_argument(
-        "--q0", nargs="+", metavar="Q", help="start: all of q, or JOINT=VALUE to change some of it (rad, m)"
+        "--q0", nargs="+", metavar="Q", help="initial q: all of it, or JOINT=VALUE to change some of it (rad, m)"
     )
     motion.add_argument(
-        "--v0", nargs="+", metavar="V", help="start velocity, in the same way (default: that of the start; rad/s, m/s)"
+        "--v0", nargs="+", metavar="V", help="initial v, in the same form (default: that of --start; rad/s, m/s)"
     )
     motion.add_argument("--batch", type=whole, default=1, metavar="N", help="number of motions (default: 1)")
     motion.add_argument(
-        "--spread", type=real, default=0.0, metavar="D", help="standard deviation of the start around q0"
+        "--spread", type=real, default=0.0, metavar="D", help="standard deviation of the initial state around q0"
     )
-    motion.add_argument("--seed", type=whole, default=0, help="of random torques and starts (default: 0)")
+    motion.add_argument("--seed", type=whole, default=0, help="seed of random torques and starts (default: 0)")
     forces = parser.add_argument_group("forces")
     forces.add_argument(
         "--torque", default="zero", metavar="KIND", help="zero, gravity, random, gravity+random or a log"
@@ -120,7 +120,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     solver.add_argument(
         "--rtol", type=real, default=1e-8, help="tolerance of adaptive steps (order 8), the default: 1e-8"
     )
-    solver.add_argument("--max-steps", type=whole, metavar="N", help="give up after so many steps")
+    solver.add_argument("--max-steps", type=whole, metavar="N", help="stop after this number of steps")
     solver.add_argument(
         "--rank-tol",
         type=real,
@@ -128,11 +128,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="rows of loops whose distance from the span of the others is below this part of their length are left out "
         "(default: those that stay dependent a finite distance from the start, as `jaxdyn info` lists them)",
     )
-    solver.add_argument("--progress", action="store_true", help="show how far the motion has come")
+    solver.add_argument("--progress", action="store_true", help="show the progress of the motion")
     files = parser.add_argument_group("output")
     files.add_argument("--out", metavar="FILE", help="write the motions to FILE.csv or FILE.npz")
     files.add_argument(
-        "--plot", metavar="FILE", help="draw positions, velocities and torques to FILE.png, .pdf or .svg"
+        "--plot", metavar="FILE", help="plot positions, velocities and torques to FILE.png, .pdf or .svg"
     )
     files.add_argument(
         "--html", metavar="FILE", help="write the motion as a page FILE.html that plays in a browser, offline too"
@@ -141,7 +141,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate, print a summary, write the files; 1 if a motion could not be computed to its end."""
+    """Simulate, print a summary, write the files; return 1 if a motion stopped early."""
     out = output_path(args.out, (".csv", ".npz"), "--out")
     plot = output_path(args.plot, (".png", ".pdf", ".svg"), "--plot")
     page = output_path(args.html, (".html",), "--html")
@@ -207,9 +207,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _excitation(scene: LoadedScene, args):
-    """Control (with a leading axis of motions in its leaves), start and duration."""
+    """Control, with a leading axis of motions in its leaves, initial state and duration."""
     if args.start not in scene.starts:
-        raise ValueError(f"--start is {args.start!r}; the file names {', '.join(scene.starts)}")
+        raise ValueError(f"--start is {args.start!r}; the named states are {', '.join(scene.starts)}")
     model, start = scene.system, scene.starts[args.start]
     q0, v0, duration = np.asarray(start.q), np.asarray(start.v), 2.0
     size = _torque_size(model, args)
@@ -222,6 +222,7 @@ def _excitation(scene: LoadedScene, args):
         if (log.q.shape[1], log.nv) != (model.nq, model.nv):
             raise ValueError(f"--torque {args.torque}: the log has {log.q.shape[1]} columns of q and {log.nv} of tau, the "
                              f"model needs {model.nq} and {model.nv}; use --lock for joints that were not logged")  # fmt: skip
+        # Replays start from the recorded state; without it the open-loop torques would diverge at once.
         q0, v0 = np.asarray(log.q)[0], v0 if log.v is None else np.asarray(log.v)[0]
         t = np.asarray(log.t) - float(log.t[0])
         duration = float(t[-1])
@@ -244,7 +245,7 @@ def _torque_size(model: Model, args) -> jax.Array:
 
 
 def _starts(scene: Scene, q0, v0, args) -> tuple[jax.Array, jax.Array]:
-    """Positions (n, nq) and velocities (n, nv) at which the motions start, on the constraints."""
+    """Initial positions (n, nq) and velocities (n, nv) of the motions, on the constraints."""
     away = args.spread * jax.random.normal(jax.random.key(args.seed + 1), (args.batch, scene.nv))
     starts = jax.vmap(lambda step: integrate(scene.system, jnp.asarray(q0), step))(away)
     speeds = jnp.broadcast_to(jnp.asarray(v0), (args.batch, scene.nv))
@@ -253,12 +254,12 @@ def _starts(scene: Scene, q0, v0, args) -> tuple[jax.Array, jax.Array]:
     closed = [assemble(scene, q, v) for q, v in zip(starts, speeds, strict=True)]
     moved = max(float(jnp.abs(x.q - q).max()) for x, q in zip(closed, starts, strict=True))
     if moved > 1e-9:
-        print(f"loops closed at the start by moving joints by up to {moved:.3g} (rad, m)")
+        print(f"loops assembled at the start by joint displacements of up to {moved:.3g} (rad, m)")
     return jnp.stack([x.q for x in closed]), jnp.stack([x.v for x in closed])
 
 
 def _forces(scene: LoadedScene, args) -> list:
-    """The file's forces, its joints' damping and friction replaced where options say so."""
+    """Forces of the file, with joint damping and friction replaced by options."""
     forces = list(scene.forces)
     for option, force in (("damping", JointDamping), ("friction", CoulombFriction)):
         if (given := getattr(args, option)) is None:
@@ -271,9 +272,9 @@ def _forces(scene: LoadedScene, args) -> list:
 
 
 def _simulate(scene: Scene, control, carry: Model | None, starts, speeds, ts, options) -> tuple[Solution, jax.Array]:
-    """All motions and the torques at their rows, with a leading axis of motions."""
+    """Simulate all motions; return them with the torques at their rows, with a leading axis of motions."""
 
-    # Model and options are closed over: known numbers make a faster program.
+    # Model and options are captured as constants, which makes a faster program.
     @eqx.filter_jit
     def batch(control, starts, speeds):
         def one(control, q0, v0):
@@ -296,11 +297,12 @@ def _summarise(model: Model, solution: Solution, done: np.ndarray) -> None:
     drift = np.abs(energy - energy[:, :1] - work).max()
     exchanged = max(np.ptp(energy, axis=1).max(), np.abs(work).max())
     print(
-        f"energy minus work of torques and friction: at most {drift:.2e} J off its start, of {exchanged:.4g} J exchanged"
+        f"energy minus work of torques and friction: at most {drift:.2e} J from its initial value, "
+        f"for {exchanged:.4g} J exchanged"
     )
     outside = _outside(model, np.asarray(solution.q)[done])
     if outside:
-        print(f"joints beyond their limits on the way (limits are not enforced): {', '.join(outside)}")
+        print(f"joints beyond their limits during the motion (limits are not enforced): {', '.join(outside)}")
 
 
 def _outside(model: Model, q: np.ndarray) -> list[str]:
@@ -322,4 +324,5 @@ def _write(path: pathlib.Path, count: int, ts, solution: Solution, tau) -> None:
         writer.writerow(header)
         for k in range(count):
             rows = np.column_stack([ts, *(arrays[name][k] for name in ("q", "v", "tau", "energy"))])
+            # repr is the shortest text that reads back as the same double.
             writer.writerows([str(k + 1)] * (count > 1) + [repr(float(x)) for x in row] for row in rows)

@@ -1,4 +1,4 @@
-"""`jaxdyn sweep`: a study of many rollouts, described by a file, into a store that can be gone on with."""
+"""`jaxdyn sweep`: resumable studies of many rollouts, described by a file, into a Zarr store."""
 
 import argparse
 import contextlib
@@ -20,7 +20,7 @@ from jaxdyn.model.arguments import as_path
 from jaxdyn.model.tree import integrate, neutral
 from jaxdyn.simulation.run import simulate
 
-HELP = "simulate a study of many rollouts into a Zarr store, started again it goes on where it stopped"
+HELP = "simulate a study of many rollouts into a Zarr store; resumable"
 DESCRIPTION = """\
 Simulate many rollouts whose parameters are drawn as a file says. Finished chunks are kept: the same command started
 again after an interruption computes the rest. With a Dask scheduler the workers of a cluster share the work.
@@ -35,22 +35,22 @@ examples:
 study.toml:
   scene = "rolling_disk"      a scene of jd.scenes, a file .urdf, or a file .py with functions
                               scene(parameters) and states(parameters) -> (q0, v0)
-  out = "disks.zarr"          beside the study, unless it is a whole path
+  out = "disks.zarr"          relative to the folder of the study
   samples = 100000
   seed = 0
   duration = 1.0              s
   points = 11                 rows of each rollout
   outputs = ["energy"]        as in jd.simulate
-  rows = true                 false: codes and reductions alone; or a list of names
-  cost = "mass"               a parameter with which rollouts take longer
+  rows = true                 false: result codes and reductions only; or a list of names
+  cost = "mass"               a parameter that grows with the run time of a rollout
 
   [parameters]                drawn for each rollout; arguments of a scene of jd.scenes and of its start;
-                              of a .urdf q0 and v0, displacements from neutral (size is nv)
+                              for a .urdf: q0 and v0, displacements from neutral (size is nv)
   mass = { uniform = [1.0, 3.0], units = "kg" }
   radius = { normal = [0.5, 0.01], units = "m" }     mean, standard deviation
   # damping = { log_uniform = [1e-3, 1.0], size = 2 }
 
-  [options]                   of jd.simulate: stepsize, rtol, atol, method, max_steps
+  [options]                   options of jd.simulate: stepsize, rtol, atol, method, max_steps
   stepsize = 0.01
 
   [reductions]
@@ -84,7 +84,7 @@ _KEYS: dict[str, tuple[type, ...]] = {
     "options": (dict,),
     "reductions": (dict,),
 }
-# Options of `jd.simulate` that a file can say, and of `jd.scale.run`.
+# Options of `jd.simulate` that a file can set, and of `jd.scale.run`.
 _OPTIONS = {"lanes", "memory", "compress", "verify", *inspect.signature(simulate).parameters}
 _OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "progress", "throw"}
 
@@ -114,18 +114,18 @@ def run(args: argparse.Namespace) -> int:
         if not 1 <= args.devices <= 4096:
             raise ValueError(f"--devices is {args.devices}; give 1 to 4096")
         jax.config.update("jax_num_cpu_devices", args.devices)
-    given = _required(study, path, "samples") if args.samples is None else args.samples
-    duration, points = float(_required(study, path, "duration")), study.get("points", 2)
+    given = _require(study, path, "samples") if args.samples is None else args.samples
+    duration, points = float(_require(study, path, "duration")), study.get("points", 2)
     if not 0 < duration < np.inf or points < 2 or given < 1:
         raise ValueError(
             f"{path}: samples is {given}, duration {duration} s, points {points}; give at least one sample, a positive duration "
             "and at least two points"
         )
     check_memory(float(points), f"{path}: points {points}")
-    out = path.parent / _required(study, path, "out") if args.out is None else as_path(args.out, "--out")
+    out = path.parent / _require(study, path, "out") if args.out is None else as_path(args.out, "--out")
     parameters = study.get("parameters", {})
-    draw = drawing(parameters)
-    scene, states = _scene(_required(study, path, "scene"), path, tuple(parameters))
+    draw = make_draw(parameters)
+    scene, states = _scene(_require(study, path, "scene"), path, tuple(parameters))
     ts = np.linspace(0.0, duration, points)
     cost = study.get("cost")
     if cost is not None and cost not in parameters:
@@ -177,13 +177,14 @@ def _connect(args: argparse.Namespace) -> Iterator[Any]:
         yield client
 
 
-def drawing(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
+def make_draw(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
     """A function that draws the parameters of one rollout from its key; each has a key of its own, by the order of their names.
 
-    **Raises:** ValueError for what is neither a number nor a distribution.
+    **Raises:** ValueError for values that are neither numbers nor distributions.
     """
     drawn: dict[str, tuple[str, float, float, tuple[int, ...]]] = {}
     known: dict[str, float] = {}
+    # Sorted, so that the order in the file does not change the samples of a seed.
     for name in sorted(parameters):
         one = parameters[name]
         if type(one) in (int, float) and np.isfinite(one):
@@ -219,7 +220,7 @@ def _read(path: pathlib.Path) -> dict[str, Any]:
     try:
         study = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no TOML: {error}") from error
+        raise ValueError(f"{path} is malformed TOML: {error}") from error
     if unknown := study.keys() - _KEYS:
         raise ValueError(f"{path} has {', '.join(sorted(unknown))}; a study has {', '.join(sorted(_KEYS))}")
     for name, value in study.items():
@@ -227,7 +228,7 @@ def _read(path: pathlib.Path) -> dict[str, Any]:
         if type(value) not in kinds or (type(value) is int and abs(value) >= 2**62):
             raise ValueError(f"{path}: {name} is {value!r}; see `jaxdyn sweep --help`")
         if isinstance(value, list) and not all(isinstance(one, str) for one in value):
-            raise ValueError(f"{path}: {name} is {value!r}; give names")
+            raise ValueError(f"{path}: {name} is {value!r}; give a list of names")
     options = study.get("options", {})
     if bad := [name for name, value in options.items() if name not in _OPTIONS or isinstance(value, (list, dict))]:
         raise ValueError(
@@ -239,7 +240,7 @@ def _read(path: pathlib.Path) -> dict[str, Any]:
     return study
 
 
-def _required(study: Mapping[str, Any], path: pathlib.Path, name: str) -> Any:
+def _require(study: Mapping[str, Any], path: pathlib.Path, name: str) -> Any:
     if name not in study:
         raise ValueError(f"{path} has no {name}; see `jaxdyn sweep --help`")
     return study[name]
@@ -259,7 +260,7 @@ def _reduction(name: str, given: Any) -> scale.Reduction:
 
 
 def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[Any, Any]:
-    """Functions of the parameters: the scene, and where it starts."""
+    """Functions of the parameters: the scene, and its initial state."""
     file = path.parent / name
     if file.suffix == ".py":
         spec = importlib.util.spec_from_file_location(file.stem, file)
@@ -290,22 +291,22 @@ def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[
             f"{path}: {name} has no parameter {', '.join(sorted(unknown))}; it has {', '.join(sorted(of_scene | of_start))}"
         )
 
-    def known_numbers(error: Exception) -> ValueError:
+    def refusal(error: Exception) -> ValueError:
         return ValueError(
-            f"{path}: the scene {name!r} is built from known numbers, so that {', '.join(parameters)} cannot be drawn; write a "
-            f"file .py whose scene(parameters) puts them in with model.replace. {str(error).splitlines()[0]}"
+            f"{path}: the scene {name!r} is built from concrete numbers, so that {', '.join(parameters)} cannot be drawn; "
+            f"write a file .py whose scene(parameters) sets them with model.replace. {str(error).splitlines()[0]}"
         )
 
     def build(p: Mapping[str, Any]) -> Any:
         try:
             return named(**{key: value for key, value in p.items() if key in of_scene})
         except (jax.errors.JAXTypeError, TypeError, ValueError) as error:
-            raise known_numbers(error) from error
+            raise refusal(error) from error
 
     def start(p: Mapping[str, Any]) -> Any:
         try:
             return named.start(**{key: value for key, value in p.items() if key in of_start})
         except (jax.errors.JAXTypeError, TypeError, ValueError) as error:
-            raise known_numbers(error) from error
+            raise refusal(error) from error
 
     return build, start

@@ -27,7 +27,7 @@ from jaxdyn.constraints.selection import (
 )
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import displace
@@ -131,7 +131,7 @@ def assemble(
             raise ValueError(f"{name} is {count!r}; give {what}, at least 1")
     if atol is not None and (not is_concrete(atol) or not 0 <= float(atol) < np.inf):
         raise ValueError(f"atol is {atol!r}; give a length (m) or an angle (rad) that is not negative, or None")
-    v = or_zeros(v, scene.nv)
+    v = zeros_if_none(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
     layout(locked)  # refuses joints that do not exist

@@ -30,10 +30,10 @@ from jaxdyn.constraints.selection import is_selected
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_factored
-from jaxdyn.systems.scene import Scene, as_scene, checked_force
+from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
+from jaxdyn.systems.scene import Scene, as_scene, check_force
 
 METHODS = ("rank_aware", "schur", "range_space")
 
@@ -105,7 +105,7 @@ def constrained_dynamics(
         raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}")
     rank_tol = checked_tolerance(rank_tol)
     scene = as_scene(scene)
-    tau = or_zeros(tau, scene.nv)
+    tau = zeros_if_none(tau, scene.nv)
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     places = layout(scene)
     if not places:
@@ -133,7 +133,7 @@ def _by_pivots(scene: Scene, q, v, tau, t):
     metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
     normal = cholesky(regular_gram(Y) if is_selected(scene) else _product(Y.T, Y))
     lam = _refined(normal, Y, wanted)
-    quality = jnp.where(metric.definite(), quality_of(normal), jnp.nan)
+    quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
     return metric.unwhiten(free + _product(Y, lam)), lam, quality
 
 
@@ -180,7 +180,7 @@ def _repaired(scene: Scene, solution, state, rank_tol) -> ConstrainedDynamics:
 
 def applied(scene: Scene, q, v, tau, t) -> Array:
     """tau plus the scene's forces, (nv,)."""
-    tau = jnp.zeros_like(v) if tau is None else checked_force(tau, q, scene.nv, "tau")
+    tau = jnp.zeros_like(v) if tau is None else check_force(tau, q, scene.nv, "tau")
     force = scene.applied_force(q, v, t)
     return tau if force is None else tau + force
 
@@ -188,7 +188,7 @@ def applied(scene: Scene, q, v, tau, t) -> Array:
 def _free(scene, q, v, force, t) -> ConstrainedDynamics:
     metric = mass_factor(mass_matrix(scene.system, q, t))
     a = metric.solve(force - bias_force(scene.system, q, v, t))
-    result = RESULTS.where(metric.definite(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
 
 
@@ -209,7 +209,7 @@ def _shortest_push(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, ran
     limit = max(eps_of(Y) ** 0.5, tolerance(rank_tol, Y))
     met = jnp.all(missed <= limit * (sizes + jnp.max(sizes)))
     result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
-    result = RESULTS.where(metric.definite(), result, RESULTS.singular_mass_matrix)
+    result = RESULTS.where(metric.is_definite(), result, RESULTS.singular_mass_matrix)
     return ConstrainedDynamics(metric.unwhiten(free + pushed), lam, rank, result, layout(scene))
 
 
@@ -223,8 +223,8 @@ def _weighted(scene: Scene, q, v, force, t, A):
 
 def _refined(factor, Y, right):
     """(Y^T Y)^-1 right from the Cholesky factor: one correction takes the squared condition number out of the error."""
-    x = solve_factored(factor, right)
-    return x + solve_factored(factor, right - _product(Y.T, _product(Y, x)))
+    x = solve_cholesky(factor, right)
+    return x + solve_cholesky(factor, right - _product(Y.T, _product(Y, x)))
 
 
 def _shortest(Y, wanted, rank_tol):
@@ -248,7 +248,7 @@ def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics
 def _by_delassus(scene: Scene, q, v, tau, t):
     metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
     lam, fine = _solve_delassus(_product(Y.T, Y), wanted, scene.nv)
-    return metric.unwhiten(free + _product(Y, lam)), lam, fine, metric.definite()
+    return metric.unwhiten(free + _product(Y, lam)), lam, fine, metric.is_definite()
 
 
 def _by_bodies(scene: Scene, q, v, tau, t):
@@ -265,7 +265,7 @@ def _solve_delassus(delassus, wanted, nv: int):
     pivots = jnp.diagonal(factor)
     # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
     fine = jnp.min(pivots) > (10 * nv * eps_of(delassus)) ** 0.5 * jnp.max(pivots)
-    return solve_factored(factor, wanted), fine
+    return solve_cholesky(factor, wanted), fine
 
 
 def projections(

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_expanding
 from jaxdyn.constraints.base import Constraint
-from jaxdyn.dynamics.kinematics import Carried, carried, take
+from jaxdyn.dynamics.kinematics import BodyFrames, body_frames, take
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Number, SystemLike
@@ -30,10 +30,10 @@ from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 
 
-def frames_on(model: Model, q, bodies: Sequence[str | None], poses, v=None) -> Carried:
+def frames_on(model: Model, q, bodies: Sequence[str | None], poses, v=None) -> BodyFrames:
     """Frames at the given poses (4, 4) in bodies or named frames (None: the world); with v, their twists too."""
     places, offsets = places_on(model, bodies, poses, q.dtype)
-    frames = carried(model, q, places, v)
+    frames = body_frames(model, q, places, v)
     return frames._replace(pose=_product(frames.pose, offsets))
 
 
@@ -48,13 +48,13 @@ def places_on(model: Model, bodies: Sequence[str | None], poses, dtype) -> tuple
     return places, offsets
 
 
-def _both_frames(members, system, q, v=None) -> Carried:
+def _both_frames(members, system, q, v=None) -> BodyFrames:
     """Frames A of all the constraints, then frames B."""
     ends = [member.ends()[side] for side in (0, 1) for member in members]
     return frames_on(system, q, [body for body, _ in ends], [pose for _, pose in ends], v)
 
 
-def _seen_from_a(frames: Carried):
+def _seen_from_a(frames: BodyFrames):
     """Rotations (n, 3, 3) and positions (n, 3) of frames B seen from frames A, and the displacement between their trees (n, 3).
 
     Positions are subtracted tree by tree: a robot far from the world's origin loses nothing.

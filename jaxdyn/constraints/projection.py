@@ -24,7 +24,7 @@ from jaxdyn.constraints.projection_derivative import LOST, Corrections, projecte
 from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, regular_gram, tolerance, worst_pivot
 from jaxdyn.constraints.selection import LEAST_PIVOT, is_selected, kept_of
 from jaxdyn.lie.so3 import _product
-from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
@@ -146,14 +146,14 @@ def _by_pivots(scene: Scene, q, v, t, *errors):
             # Other rows may serve where these hardly do: `renew_rows`.
             is_poor = jnp.any(kept_of(scene) == 0) & ~(worst_pivot(factor, gram) > LEAST_PIVOT)
             quality = jnp.where(is_poor, jnp.nan, quality)
-        return (lambda residual: metric.unwhiten(_product(Y, solve_factored(factor, residual)))), quality
+        return (lambda residual: metric.unwhiten(_product(Y, solve_cholesky(factor, residual)))), quality
 
     every, quality = steps(Y)
     some = every
     if holonomic.size not in (0, Y.shape[1]):
         some, of_holonomic = steps(Y[:, holonomic])
         quality = jnp.minimum(quality, of_holonomic)
-    quality = jnp.where(metric.definite(), quality, jnp.nan)
+    quality = jnp.where(metric.is_definite(), quality, jnp.nan)
     return *_moved(scene, q, v, t, errors, every, some), quality
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import any_in_batch, is_concrete, is_expanding, pseudo_inverse_by_rotations, run, unless
 from jaxdyn.lie.so3 import _product
-from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
 # Operations of the normal equations up to which they are written out: LLVM takes 50 to 100 microseconds for each of them.
 _MAX_ROWS_INLINE = 10_000
@@ -98,13 +98,13 @@ class LeastSquares(NamedTuple):
         """The shortest w with Y^T w = right."""
         if self.factor is None:
             return _product(self.inverse.T, right)
-        return _product(self.Y, solve_factored(self.factor, right))
+        return _product(self.Y, solve_cholesky(self.factor, right))
 
     def multipliers(self, w):
         """The smallest x with Y x = w, for w that is a sum of columns."""
         if self.factor is None:
             return _product(self.inverse, w)
-        return solve_factored(self.factor, _product(self.Y.T, w))
+        return solve_cholesky(self.factor, _product(self.Y.T, w))
 
 
 def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
@@ -119,7 +119,7 @@ def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
 def _by_normal_equations(_, Y):
     """(Y^T Y)^-1 Y^T, and the least over the largest pivot of Y^T Y."""
     factor = cholesky(regular_gram(Y))
-    inverse = solve_factored(factor, Y.T)
+    inverse = solve_cholesky(factor, Y.T)
     # One step of Newton and Schulz takes the squared condition number out of the error.
     return 2 * inverse - _product(_product(inverse, Y), inverse), quality_of(factor)
 

@@ -48,7 +48,7 @@ from jaxdyn.constraints.rank import eps_of, regular_gram, tolerance, worst_pivot
 from jaxdyn.constraints.tolerances import coordinate_sizes, row_limits
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Number, SystemLike
-from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
@@ -130,7 +130,7 @@ def keep_rows(scene: Scene, selection: Selection) -> Scene:
     """The scene with the rows that are not kept set to zero."""
     kept, rounding = map(jnp.asarray, selection)
     constraints = tuple(
-        KeptRows(constraint, kept[place.start : place.end], rounding, constraint.name)
+        KeptRows(constraint, kept[place.start : place.end], rounding, constraint.name)  # pyright: ignore[reportArgumentType]
         for constraint, place in zip(scene.constraints, layout(scene), strict=True)
     )
     return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
@@ -154,15 +154,14 @@ def all_rows(scene: Scene) -> Scene:
     return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
 
 
-def kept_of(scene: Scene) -> Array | None:
-    """1 for rows that stay and 0 for dropped ones, (nc,), or None where none was looked at."""
-    return jnp.concatenate([c.kept for c in scene.constraints]) if is_selected(scene) else None  # pyright: ignore[reportAttributeAccessIssue]
+def kept_of(scene: Scene) -> Array:
+    """1 for rows that stay and 0 for dropped ones, (nc,), of a scene of `keep_rows`."""
+    return jnp.concatenate([c.kept for c in scene.constraints])
 
 
-def rounding_of(scene: Scene) -> Array | None:
-    """`Selection.rounding`, or None where no rows were chosen."""
-    first = next((c for c in scene.constraints if isinstance(c, KeptRows)), None)
-    return None if first is None else first.rounding
+def rounding_of(scene: Scene) -> Array:
+    """`Selection.rounding` of a scene of `keep_rows`."""
+    return scene.constraints[0].rounding
 
 
 def scaled_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
@@ -404,6 +403,6 @@ def _spread(scene: Scene, q, t, lam, kept):
     A, kept = constraint_jacobian(scene, q, t), kept.astype(q.dtype)
     own = kept[:, None] * A
     gram = _product(own, own.T) + jnp.diag(1 - kept)
-    C = solve_factored(cholesky(gram), _product(own, ((1 - kept)[:, None] * A).T)).T
-    shared = solve_factored(cholesky(jnp.eye(A.shape[0], dtype=A.dtype) + _product(C.T, C)), kept * lam)
+    C = solve_cholesky(cholesky(gram), _product(own, ((1 - kept)[:, None] * A).T)).T
+    shared = solve_cholesky(cholesky(jnp.eye(A.shape[0], dtype=A.dtype) + _product(C.T, C)), kept * lam)
     return kept * shared + _product(C, shared)

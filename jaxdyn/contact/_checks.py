@@ -1,4 +1,4 @@
-"""Arguments as arrays, refused with their name, their value and the fix."""
+"""Conversion and checks of arguments, with errors that name argument, value and fix."""
 
 import jax
 import jax.numpy as jnp
@@ -6,22 +6,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_concrete
-from jaxdyn.model.arguments import stored
+from jaxdyn.model.arguments import store_leaf
 
 
 def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[Array, "..."]:
-    """`value` as an array of floating-point numbers; of the dtype of `like` if that is given.
+    """Convert `value` to a floating-point array, of the dtype of `like` if that is given.
 
     **Raises:** ValueError for another shape, None in it meaning any size, and for known numbers that are not finite.
     """
-    # Known numbers are looked at before they become part of a program that may be traced.
+    # Known numbers are checked before they become part of a traced program.
     known = np.asarray(value) if is_concrete(value) else None
     if known is not None and known.dtype == object:
         raise ValueError(f"{what} is {value!r}; give numbers")
     array = value if isinstance(value, jax.Array) else jnp.asarray(value) if known is None else known
     if like is None:
         like = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float
-    array = jnp.asarray(array, like) if isinstance(array, jax.Array) else stored(array, like)
+    array = jnp.asarray(array, like) if isinstance(array, jax.Array) else store_leaf(array, like)
     if shape is not None and (
         array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
     ):
@@ -33,7 +33,7 @@ def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[A
 
 
 def as_number(value, what: str, unit: str, *, zero: bool, like=None) -> Float[Array, ""]:
-    """`value` as one positive number, or zero where that is allowed.
+    """Convert `value` to one positive number, or zero where that is allowed.
 
     **Raises:** ValueError for known numbers below that or not finite.
     """

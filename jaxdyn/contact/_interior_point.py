@@ -1,12 +1,12 @@
-"""Interior point for a quadratic program with second-order cones, and the derivative of its solution.
+"""Interior-point method for quadratic programs with second-order cones, and the derivative of the solution.
 
     minimise x^T Q x / 2 + q^T x    with    h_i - G_i x in K_i
 
 for groups i of cones of one dimension: G_i (k, d, n), h_i (k, d). Numbers are of order one (`jaxdyn.contact.qp` scales them).
 
-Predictor and corrector of Mehrotra with the scaling of Nesterov and Todd; then a Newton step on the equations of the
-projection, x, v: Q x + q + G^T z = 0, G x + s = h, s = P(v), z = s - v, which has no small numbers to divide by.
-A step of either is one kernel (`jaxdyn.compile`), and so are the start and the derivative; the loops are JAX's.
+Mehrotra's predictor-corrector with Nesterov-Todd scaling; then Newton steps on the equations of the
+projection, x, v: Q x + q + G^T z = 0, G x + s = h, s = P(v), z = s - v, which divide by no small numbers.
+Each step is one kernel (`jaxdyn.compile`), and so are the start and the derivative; the loops are JAX's.
 Source: Vandenberghe, The CVXOPT linear and quadratic cone program solvers (2010).
 """
 
@@ -22,14 +22,15 @@ from jaxtyping import Array, Bool, Int
 from jaxdyn.compile import any_in_batch, run
 from jaxdyn.contact import _jordan as jordan
 from jaxdyn.lie.so3 import _product
-from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
-REFINEMENTS = 4  # steps of Newton's method
-Pattern = tuple[bytes | None, ...]  # of each group, which entries of G may differ from zero; None where all may
+# Steps of Newton's method after the interior point; it converges quadratically, in two or three.
+REFINEMENTS = 4
+Pattern = tuple[bytes | None, ...]  # for each group, the mask of entries of G that may be nonzero; None for all
 
 
 class Program(NamedTuple):
-    """Q (n, n), q (n,), and of each group of cones G (k, d, n) and h (k, d)."""
+    """Data of a quadratic program: Q (n, n), q (n,), and for each group of cones G (k, d, n) and h (k, d)."""
 
     Q: Array
     q: Array
@@ -38,14 +39,14 @@ class Program(NamedTuple):
 
 
 def _sparse(program: Program, pattern: Pattern) -> Program:
-    """The program whose known zeros a kernel sees."""
+    """Insert known zeros, which the kernel then omits."""
     known = [None if y is None else np.frombuffer(y, bool) for y in pattern]
     G = [g if y is None else jnp.where(y.reshape(g.shape), g, 0) for g, y in zip(program.G, known, strict=True)]
     return program._replace(G=tuple(G))
 
 
 class Point(NamedTuple):
-    """x (n,), slacks s and multipliers z, each (k, d) of each group."""
+    """Iterate: x (n,), slacks s and multipliers z, each (k, d) for each group."""
 
     x: Array
     s: tuple
@@ -53,7 +54,7 @@ class Point(NamedTuple):
 
 
 class End(NamedTuple):
-    """The last point, how many steps led to it, whether it is a solution, and whether there is none."""
+    """Result: the last point, the number of steps, and flags of a solution and of infeasibility."""
 
     point: Point
     steps: Int[Array, ""]
@@ -62,11 +63,11 @@ class End(NamedTuple):
 
 
 def _times(G, x):
-    """G x of each group, (k, d)."""
+    """Product G x of each group, (k, d)."""
     return tuple(_product(g.reshape(-1, x.shape[0]), x).reshape(g.shape[:2]) for g in G)
 
 
-def _gathered(G, z, like):
+def _transpose_times(G, z, like):
     """Sum of G^T z over the groups, (n,)."""
     parts = [_product(g.reshape(-1, g.shape[-1]).T, y.reshape(-1)) for g, y in zip(G, z, strict=True)]
     return sum(parts, jnp.zeros_like(like))
@@ -86,26 +87,30 @@ def _dot(a, b, like):
 
 
 def _residuals(program: Program, point: Point):
-    """Q x + q + G^T z, and G x + s - h."""
+    """Residuals Q x + q + G^T z, and G x + s - h."""
     x, s, z = point
-    stationary = _product(program.Q, x) + program.q + _gathered(program.G, z, x)
+    stationary = _product(program.Q, x) + program.q + _transpose_times(program.G, z, x)
     return stationary, _zip(lambda a, b, c: a + b - c, _times(program.G, x), s, program.h)
 
 
-def _measured(program: Program, point: Point):
-    """The residuals; and the largest of them, or the mean product of slacks and multipliers where that is larger."""
+def _residuals_and_measure(program: Program, point: Point):
+    """Residuals, and the larger of their maximum and the duality gap."""
     rx, rz = _residuals(program, point)
     return (rx, rz), jnp.maximum(_largest((rx,), rz), _gap(point))
 
 
 def _gap(point: Point):
+    # The mean over the cones, each of degree one, as CVXOPT's mu.
     return _dot(point.s, point.z, point.x[0]) / sum(y.shape[0] for y in point.s)
 
 
-def _contradicts(program: Program, point: Point, tol: float):
-    """Whether h.z < 0 with G^T z = 0 and z in the cones, which contradicts any x; within rounding, any x below 1 / tol."""
+def _is_certificate(program: Program, point: Point, tol: float):
+    """Decide whether z is a certificate of infeasibility: h.z < 0 with G^T z = 0, z in the cones.
+
+    Up to rounding, it excludes every x below 1 / tol.
+    """
     level = -_dot(program.h, point.z, point.x[0])
-    return (level > 0) & (jnp.max(jnp.abs(_gathered(program.G, point.z, point.x))) < tol * level)
+    return (level > 0) & (jnp.max(jnp.abs(_transpose_times(program.G, point.z, point.x))) < tol * level)
 
 
 def _where(condition, new, old):
@@ -113,42 +118,45 @@ def _where(condition, new, old):
 
 
 def _start(pattern: Pattern, _, program: Program):
-    """Least squares of the slacks, moved inside the cones (CVXOPT's start); its residuals and their measure."""
+    """Initial point: least-squares slacks, shifted into the cones (as in CVXOPT), with residuals and error measure."""
     program = _sparse(program, pattern)
     Q, q, G, h = program
     rows = jnp.concatenate([g.reshape(-1, q.shape[0]) for g in G])
     level = jnp.concatenate([y.reshape(-1) for y in h])
+    # x minimises x^T Q x / 2 + q^T x + |G x - h|^2 / 2.
     factor = cholesky(Q + _product(rows.T, rows))
-    x = solve_factored(factor, _product(rows.T, level) - q)
+    x = solve_cholesky(factor, _product(rows.T, level) - q)
     slack = _zip(lambda a, b: b - a, _times(G, x), h)
 
     def inside(groups):
-        least = jnp.min(jnp.stack([jnp.min(jordan.depth(v), initial=jnp.inf) for v in groups]))
+        least = jnp.min(jnp.stack([jnp.min(jordan.boundary_distance(v), initial=jnp.inf) for v in groups]))
         size = jnp.maximum(_largest(groups), 1)
         # Far enough from the boundary that the first steps are not cut short.
         shift = jnp.where(least > 0.1 * size, 0, jnp.maximum(-least, 0) + size)
         return _zip(lambda v: v + shift * jordan.identity(v), groups)
 
     point = Point(x, inside(slack), inside(_zip(lambda v: -v, slack)))
-    return point, *_measured(program, point)
+    return point, *_residuals_and_measure(program, point)
 
 
 def _newton(program: Program, s, z):
-    """The scaled points, and the solution (dx, ds, dz) of the linear equations for right-hand sides."""
+    """Scaled point lam, and a solver (dx, ds, dz) of the Newton equations for right-hand sides."""
     Q, _, G, _ = program
     W = _zip(jordan.scaling, s, z)
     n = Q.shape[0]
+    # W^-1 G once: both right-hand sides of the step use the same factor.
     scaled = _zip(lambda w, g: jax.vmap(w.inverse_times, 2, 2)(g), W, G)
     rows = jnp.concatenate([g.reshape(-1, n) for g in scaled])
     factor = cholesky(Q + _product(rows.T, rows))
 
     def solve(rx, rz, u, is_refined: bool = True):
-        """Q dx + G^T dz = -rx, G dx + ds = -rz, W dz + W^-1 ds = u; also W dz and W^-1 ds."""
+        """Solve Q dx + G^T dz = -rx, G dx + ds = -rz, W dz + W^-1 ds = u; return also W^-1 ds and W dz."""
         right = _zip(lambda w, r, y: w.inverse_times(r) + y, W, rz, u)
-        dx = solve_factored(factor, -rx - _gathered(scaled, right, rx))
+        dx = solve_cholesky(factor, -rx - _transpose_times(scaled, right, rx))
         wdz = _zip(lambda a, b: a + b, _times(scaled, dx), right)
-        if is_refined:  # the matrix squares the condition; what that costs, one step of refinement returns
-            more = solve_factored(factor, -rx - _product(Q, dx) - _gathered(scaled, wdz, rx))
+        # The normal matrix squares the condition number; one step of refinement recovers the lost digits.
+        if is_refined:
+            more = solve_cholesky(factor, -rx - _product(Q, dx) - _transpose_times(scaled, wdz, rx))
             dx, wdz = dx + more, _zip(lambda a, b: a + b, wdz, _times(scaled, more))
         wds = _zip(lambda a, b: a - b, u, wdz)
         dz, ds = (_zip(lambda w, y: w.inverse_times(y), W, wdz), _zip(lambda w, y: w.times(y), W, wds))
@@ -158,18 +166,23 @@ def _newton(program: Program, s, z):
 
 
 def _step(program: Program, point: Point, residuals) -> Point:
-    """One step of predictor and corrector."""
+    """Take one predictor-corrector step."""
     x, s, z = point
     rx, rz = residuals
     mu = _gap(point)
     lam, solve = _newton(program, s, z)
 
-    def exit_rate(wds, wdz):
+    def inverse_step(wds, wdz):
         # s + t ds leaves its cone where W^-1 s + t W^-1 ds does, and z + t dz where W z + t W dz does: both from lam.
-        return jnp.max(jnp.stack([jordan.exit_rate(v, dv) for v, dv in zip((*lam, *lam), (*wds, *wdz), strict=True)]))
+        return jnp.max(
+            jnp.stack([jordan.inverse_boundary_step(v, dv) for v, dv in zip((*lam, *lam), (*wds, *wdz), strict=True)])
+        )
 
+    # The affine predictor needs no refinement: it only sets the centring parameter and the second-order term.
     *_, wds, wdz = solve(rx, rz, _zip(lambda v: -v, lam), is_refined=False)
-    centring = (1 - 1 / jnp.maximum(exit_rate(wds, wdz), 1)) ** 3
+    # Mehrotra's heuristic: centre little where the affine step is long.
+    centring = (1 - 1 / jnp.maximum(inverse_step(wds, wdz), 1)) ** 3
+    # Linearised complementarity with the second-order term (W^-1 ds) o (W dz) of the predictor.
     u = _zip(
         lambda v, a, b: jordan.quotient(
             v, centring * mu * jordan.identity(v) - jordan.product(v, v) - jordan.product(a, b)
@@ -179,14 +192,17 @@ def _step(program: Program, point: Point, residuals) -> Point:
         wdz,
     )
     dx, ds, dz, wds, wdz = solve(rx, rz, u)
-    length = 1 / jnp.maximum(exit_rate(wds, wdz) / 0.99, 1)
+    # 0.99 keeps the iterate strictly inside, where the scaling exists.
+    length = 1 / jnp.maximum(inverse_step(wds, wdz) / 0.99, 1)
     move = lambda v, dv: v + length * dv  # noqa: E731
     return Point(move(x, dx), _zip(move, s, ds), _zip(move, z, dz))
 
 
 class _State(NamedTuple):
-    """Where the interior point is: the point, its residuals, their measure, whether there is no solution, whether the last step
-    was taken, and the number of steps."""
+    """State of the iteration: point, residuals, their measure, and flags.
+
+    `infeasible`: a certificate was found; `alive`: the last step was accepted; `steps`: their number.
+    """
 
     point: Point
     residuals: tuple
@@ -196,38 +212,40 @@ class _State(NamedTuple):
     steps: Array
 
 
-def _going(state: _State, target: float):
-    """Whether a sample has not ended."""
+def _is_running(state: _State, target: float):
+    """Decide whether a sample is still iterating."""
     return (state.error > target) & ~state.infeasible & state.alive
 
 
 def _iteration(pattern: Pattern, tol: float, target: float, _, program: Program, state: "_State") -> "_State":
-    """The next point, its residuals and their measure, whether it is a certificate, and whether it was taken.
+    """Take the next step, and accept or reject it.
 
-    A sample that has ended stays as it is: in a batch the others go on.
+    A sample that has ended is kept unchanged, while others of its batch continue.
     """
     program = _sparse(program, pattern)
     point, residuals, error, infeasible, alive, steps = state
-    going = _going(state, target)
+    going = _is_running(state, target)
     new = _step(program, point, residuals)
-    inside = jnp.stack([jnp.all(jordan.depth(v) > 0) for v in (*new.s, *new.z)]).all()
-    left, measure = _measured(program, new)
+    inside = jnp.stack([jnp.all(jordan.boundary_distance(v) > 0) for v in (*new.s, *new.z)]).all()
+    left, measure = _residuals_and_measure(program, new)
+    # Close to convergence rounding can move a step out of the cones; its rejection ends the iteration.
     valid = inside & jnp.isfinite(measure)
-    # Below the tolerance only what is better is taken.
+    # Below the tolerance only improvements are accepted.
     taken = valid & ((error > tol) | (measure < error))
     point, residuals, error = _where(taken & going, (new, left, measure), (point, residuals, error))
-    ended = infeasible | (going & valid & _contradicts(program, new, tol))
+    ended = infeasible | (going & valid & _is_certificate(program, new, tol))
     return _State(point, residuals, error, ended, alive & (taken | ~going), steps + going.astype(steps.dtype))
 
 
 def _refinement(pattern: Pattern, _, program: Program, point: Point, error, alive):
-    """A Newton step on the equations of the projection, its residual, and whether it was taken, where that is less.
+    """Take a Newton step on the equations of the projection where it lowers the residual; return residual and acceptance.
 
-    A sample that is at rounding already, or whose last step was not taken, stays as it is.
+    A sample at rounding level, or whose last step was rejected, is kept unchanged.
     """
     program = _sparse(program, pattern)
     alive = alive & (error > 4 * float(jnp.finfo(error.dtype).eps))
     x, s, z = point
+    # v = s - z determines both, s = P(v) and z = P(v) - v: complementarity holds by construction.
     v = _zip(lambda a, b: a - b, s, z)
 
     def at(x, v):
@@ -236,74 +254,75 @@ def _refinement(pattern: Pattern, _, program: Program, point: Point, error, aliv
         rx, rz = _residuals(program, point)
         return point, rx, rz, _largest((rx,), rz)
 
-    # Points of the interior point are not complementary; the projection makes them so, at the price of a residual.
+    # Interior points are not complementary; the projection makes them so, at the price of a residual.
     here, rx, rz, residual = at(x, v)
-    dx, dv = _solve_projected(program, v, float(jnp.finfo(x.dtype).eps), -rx, _zip(lambda r: -r, rz), 1)
+    dx, dv = _solve_projection_equations(program, v, float(jnp.finfo(x.dtype).eps), -rx, _zip(lambda r: -r, rz), 1)
     there, *_, less = at(x + dx, _zip(lambda a, b: a + b, v, dv))
-    # Not less is also what a residual that is not a number is.
+    # A NaN residual compares false, so that it is rejected.
     better = less < residual
     new, residual = _where(better, there, here), jnp.where(better, less, residual)
     better = (residual < error) & alive
     return _where(better, new, point), jnp.where(better, residual, error), better
 
 
-def _solve_projected(program: Program, v, width, right_x, right_s, corrections: int):
-    """(dx, dv) with Q dx + G^T (D - 1) dv = right_x and G dx + D dv = right_s, D the projection's derivative at v.
+def _solve_projection_equations(program: Program, v, width, right_x, right_s, corrections: int):
+    """Solve for (dx, dv) with Q dx + G^T (D - 1) dv = right_x and G dx + D dv = right_s, D the projection's derivative at v.
 
-    With dv eliminated, which takes D + delta (1 - D) for D; what that changes, and rounding, corrections return. Rows that
-    are active and dependent leave their multipliers open: they are then those that the corrections find, and dx does not
-    see them.
+    dv is eliminated with D + delta (1 - D) instead of D; corrections remove this change and rounding. Dependent active rows
+    leave their multipliers undetermined; the corrections then select some, and dx does not
+    depend on them.
     """
     Q, _, G, _ = program
     n = Q.shape[0]
     eps = float(jnp.finfo(Q.dtype).eps)
     delta = eps**0.5
-    D = tuple(jordan.projection_slope(y, width) for y in v)
+    D = tuple(jordan.projection_derivative(y, width) for y in v)
     rest = tuple(d.map(lambda x: 1 - x) for d in D)
     inverse = tuple(d.map(lambda x: 1 / (x + delta * (1 - x))) for d in D)
 
-    def times(slopes, y):
-        return _zip(lambda d, x: d.times(x), slopes, y)
+    def times(derivatives, y):
+        return _zip(lambda d, x: d.times(x), derivatives, y)
 
     weighted = _zip(lambda r, i, g: jax.vmap(lambda x: r.times(i.times(x)), 2, 2)(g), rest, inverse, G)
     rows, weighted = (jnp.concatenate([g.reshape(-1, n) for g in groups]) for groups in (G, weighted))
     normal = Q + _product(rows.T, weighted)
-    # Rounding must not cost the matrix its definiteness.
+    # A shift by rounding keeps the matrix positive definite.
     factor = cholesky(normal + jnp.diag(n * eps * jnp.diagonal(normal)))
     dx, dv = jnp.zeros_like(right_x), _zip(jnp.zeros_like, right_s)
+    # Iterative refinement with residuals of the unmodified equations.
     for _ in range(1 + corrections):
-        rx = right_x - _product(Q, dx) + _gathered(G, times(rest, dv), dx)
+        rx = right_x - _product(Q, dx) + _transpose_times(G, times(rest, dv), dx)
         rs = _zip(lambda r, a, b: r - a - b, right_s, _times(G, dx), times(D, dv))
-        more = solve_factored(factor, rx + _gathered(G, times(rest, times(inverse, rs)), dx))
+        more = solve_cholesky(factor, rx + _transpose_times(G, times(rest, times(inverse, rs)), dx))
         dv = _zip(lambda a, b: a + b, dv, times(inverse, _zip(lambda r, a: r - a, rs, _times(G, more))))
         dx = dx + more
     return dx, dv
 
 
 def width_of(dtype):
-    """Distance from a kink of the projection, in scaled numbers, over which its derivative is rounded off."""
+    """Distance from a kink of the projection, in scaled numbers, over which its derivative is smoothed."""
     return float(jnp.finfo(dtype).eps) ** 0.5
 
 
 def _end(pattern: Pattern, tol: float, _, program: Program, last: Point, error, refined: Point, less, infeasible):
-    """The better point, whether it is a solution, and whether there is none."""
+    """Select the better point; return it with flags of a solution and of infeasibility."""
     better = (less <= jnp.maximum(error, tol)) & ~infeasible
     point = _where(better, refined, last)
     solved = (jnp.where(better, less, error) <= tol) & ~infeasible
-    # Multipliers that grow without bound may stop before they are a certificate to the last digit.
-    return point, solved, infeasible | (~solved & _contradicts(_sparse(program, pattern), point, tol**0.5))
+    # Diverging multipliers may stop before they are a certificate to full precision.
+    return point, solved, infeasible | (~solved & _is_certificate(_sparse(program, pattern), point, tol**0.5))
 
 
 def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End:
-    """Steps until residuals and gap are below `tol`, and the solution refined."""
+    """Solve a program: interior-point steps until residuals and gap are below `tol`, then refinement."""
     eps = float(jnp.finfo(program.q.dtype).eps)
-    # A step costs less than what it gains in accuracy, so steps go on below `tol` while they help.
+    # Further steps are cheap for their gain in accuracy, so iterations continue below `tol` while they help.
     target = max(1e-3 * tol, 8 * eps)
 
-    # Where a sample has ended its numbers are kept by the kernel itself, so that the loop has one condition for the batch.
+    # The kernel itself keeps samples that have ended, so that the loop has one condition for the batch.
     def going(carry):
         state, count = carry
-        return (count < max_steps) & any_in_batch(_going(state, target))
+        return (count < max_steps) & any_in_batch(_is_running(state, target))
 
     def advance(carry):
         state, count = carry
@@ -315,7 +334,7 @@ def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End
     state, _ = lax.while_loop(going, advance, (begin, 0))
     last, _, error, infeasible, _, steps = state
 
-    # Newton's method ends within rounding in two or three steps, where the interior point would lose its digits.
+    # Newton's method reaches rounding in two or three steps, where interior-point scalings lose digits.
     def improving(carry):
         (_, error, alive), count = carry
         return (count < REFINEMENTS) & any_in_batch(alive & (error > 4 * eps))
@@ -324,6 +343,7 @@ def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End
         refined, count = carry
         return run(_refinement, None, program, *refined, static=(pattern,)), count + 1
 
+    # The projection may raise the residual: the first refinement is accepted up to ten times the error, and `_end` selects.
     carry = ((last, 10 * jnp.maximum(error, tol), ~infeasible), 0)
     (refined, less, _), _ = lax.while_loop(improving, refine, carry)
     rest = (program, last, error, refined, less, infeasible)
@@ -332,27 +352,27 @@ def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def attached(pattern: Pattern, program: Program, point: Point) -> Point:
-    """The solution `point` of the program, with the derivative that the program gives it."""
+def attach_derivative(pattern: Pattern, program: Program, point: Point) -> Point:
+    """Attach to the solution `point` its derivative with respect to the program."""
     return point
 
 
-@attached.defjvp
-def _attached_jvp(pattern: Pattern, primals, tangents):
+@attach_derivative.defjvp
+def _attach_derivative_jvp(pattern: Pattern, primals, tangents):
     program, point = primals
-    # Derivatives of higher order see that the point moves too.
-    point = attached(pattern, program, point)
-    return point, run(_change, None, program, point, tangents[0], static=(pattern,))
+    # The recursion lets higher-order derivatives account for the motion of the point.
+    point = attach_derivative(pattern, program, point)
+    return point, run(_tangent, None, program, point, tangents[0], static=(pattern,))
 
 
-def _change(pattern: Pattern, _, program: Program, point: Point, change: Program) -> Point:
-    """How the solution changes with the program."""
+def _tangent(pattern: Pattern, _, program: Program, point: Point, change: Program) -> Point:
+    """Tangent of the solution for a tangent of the program."""
     program, change = _sparse(program, pattern), _sparse(change, pattern)
     x, s, z = point
-    right_x = -_product(change.Q, x) - change.q - _gathered(change.G, z, x)
+    right_x = -_product(change.Q, x) - change.q - _transpose_times(change.G, z, x)
     right_s = _zip(lambda a, b: b - a, _times(change.G, x), change.h)
     v = _zip(lambda a, b: a - b, s, z)
     width = width_of(x.dtype)
-    dx, dv = _solve_projected(program, v, width, right_x, right_s, 2)
-    ds = _zip(lambda y, dy: jordan.projection_slope(y, width).times(dy), v, dv)
+    dx, dv = _solve_projection_equations(program, v, width, right_x, right_s, 2)
+    ds = _zip(lambda y, dy: jordan.projection_derivative(y, width).times(dy), v, dv)
     return Point(dx, ds, _zip(lambda a, b: a - b, ds, dv))

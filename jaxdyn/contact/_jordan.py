@@ -1,6 +1,6 @@
-"""Second-order cones {v : v0 >= |v1|} of R^d, many at once: arrays (k, d). Half-lines are those of d = 1.
+"""Second-order cones {v : v0 >= |v1|} of R^d, many at once: arrays (k, d). Half-lines have d = 1.
 
-Products, the scaling of Nesterov and Todd, rates at which steps reach the boundary, the projection and its derivative.
+Products, Nesterov-Todd scaling, steps to the boundary, the projection and its derivative.
 
 Source: Vandenberghe, The CVXOPT linear and quadratic cone program solvers (2010), sections 3-5; for the projection
 Fukushima, Luo & Tseng, SIAM J. Optim. 12 (2002), 436-460.
@@ -12,12 +12,12 @@ import jax.numpy as jnp
 
 
 def identity(like):
-    """e = (1, 0, ...) of each cone, (k, d)."""
+    """Identity e = (1, 0, ...) of the Jordan algebra of each cone, (k, d)."""
     return jnp.zeros_like(like).at[..., 0].set(1)
 
 
 def _norm(rest):
-    """|rest| along the last axis, with zero derivative where it vanishes."""
+    """Norm |rest| along the last axis, with zero derivative where it vanishes."""
     if rest.shape[-1] == 0:
         return jnp.zeros(rest.shape[:-1], rest.dtype)
     square = jnp.sum(rest * rest, -1)
@@ -25,13 +25,13 @@ def _norm(rest):
     return jnp.where(safe, jnp.sqrt(jnp.where(safe, square, jnp.ones_like(square))), jnp.zeros_like(square))
 
 
-def depth(v):
-    """v0 - |v1|, (k,): the smaller eigenvalue, positive inside the cone."""
+def boundary_distance(v):
+    """Distance to the boundary v0 - |v1|, (k,): the smaller eigenvalue, positive inside the cone."""
     return v[..., 0] - _norm(v[..., 1:])
 
 
 def determinant(v):
-    """v0^2 - |v1|^2, (k,), without cancellation near the boundary."""
+    """Determinant v0^2 - |v1|^2, (k,), without cancellation near the boundary."""
     norm = _norm(v[..., 1:])
     return (v[..., 0] - norm) * (v[..., 0] + norm)
 
@@ -43,7 +43,7 @@ def product(a, b):
 
 
 def quotient(a, b):
-    """x with product(a, x) = b."""
+    """Jordan quotient: x with product(a, x) = b."""
     inverse = 1 / a[..., :1]
     if a.shape[-1] == 1:
         return b * inverse
@@ -53,7 +53,7 @@ def quotient(a, b):
 
 
 class Scaling(NamedTuple):
-    """W of Nesterov and Todd, W z = W^-1 s: W = beta (2 v v^T - J), J = diag(1, -1, ...), of each cone; `inverse` is 1 / beta.
+    """Nesterov-Todd scaling W of each cone, W z = W^-1 s: W = beta (2 v v^T - J), J = diag(1, -1, ...); `inverse` is 1 / beta.
 
     On a half-line v = 1.
     """
@@ -63,40 +63,42 @@ class Scaling(NamedTuple):
     inverse: jnp.ndarray
 
     def times(self, x):
-        """W x."""
-        return self.beta * _mirrored(self.v, x)
+        """Product W x."""
+        return self.beta * _reflect_about(self.v, x)
 
     def inverse_times(self, x):
-        """W^-1 x."""
-        return self.inverse * _mirrored(_reflected(self.v), x)
+        """Product W^-1 x."""
+        return self.inverse * _reflect_about(_reflect(self.v), x)
 
 
-def _mirrored(v, x):
-    """(2 v v^T - J) x."""
-    return x if x.shape[-1] == 1 else 2 * v * jnp.sum(v * x, -1, keepdims=True) - _reflected(x)
+def _reflect_about(v, x):
+    """Product (2 v v^T - J) x."""
+    return x if x.shape[-1] == 1 else 2 * v * jnp.sum(v * x, -1, keepdims=True) - _reflect(x)
 
 
-def _reflected(x):
+def _reflect(x):
     return jnp.concatenate([x[..., :1], -x[..., 1:]], -1)
 
 
 def scaling(s, z) -> Scaling:
-    """The scaling of points s and z inside the cones."""
+    """Nesterov-Todd scaling of points s and z inside the cones."""
     if s.shape[-1] == 1:
+        # W = sqrt(s / z) and its inverse from one root.
         shared = 1 / jnp.sqrt(s * z)
         return Scaling(jnp.ones_like(s), s * shared, z * shared)
     norm_s, norm_z = jnp.sqrt(determinant(s))[..., None], jnp.sqrt(determinant(z))[..., None]
     beta = jnp.sqrt(norm_s / norm_z)
     s, z = s * (1 / norm_s), z * (1 / norm_z)
     gamma = jnp.sqrt((1 + jnp.sum(s * z, -1, keepdims=True)) / 2)
-    w = (s + _reflected(z)) / (2 * gamma)
+    # w is the scaling point of unit determinant, v its square root in the Jordan algebra.
+    w = (s + _reflect(z)) / (2 * gamma)
     return Scaling((w + identity(w)) * (1 / jnp.sqrt(2 * (w[..., :1] + 1))), beta, 1 / beta)
 
 
-def exit_rate(v, dv):
-    """Largest 1/t, of all cones, of the t > 0 at which v + t dv leaves them, for v inside; zero or less where it never does.
+def inverse_boundary_step(v, dv):
+    """Inverse 1/t of the largest step t at which v + t dv reaches the boundary of a cone, for v inside; 0 where it never does.
 
-    Inverses are of v alone: a program has each of them once, for all dv and for `quotient`.
+    Only entries of v are inverted: a program computes each inverse once, for all dv and for `quotient`.
     """
     second = -dv[..., 0] * (1 / v[..., 0])
     if v.shape[-1] == 1:
@@ -104,7 +106,7 @@ def exit_rate(v, dv):
     a = dv[..., 0] ** 2 - jnp.sum(dv[..., 1:] ** 2, -1)
     b = v[..., 0] * dv[..., 0] - jnp.sum(v[..., 1:] * dv[..., 1:], -1)
     c = determinant(v)
-    # Of the least positive root of a t^2 + 2 b t + c, in the form that does not cancel, and of the root of v0 + t dv0.
+    # Inverses of the least positive root of a t^2 + 2 b t + c, in the form that does not cancel, and of the root of v0 + t dv0.
     first = (jnp.sqrt(jnp.maximum(b * b - a * c, 0)) - b) * (1 / c)
     return jnp.max(jnp.maximum(first, second), initial=0)
 
@@ -112,6 +114,7 @@ def exit_rate(v, dv):
 def projection(v):
     """Nearest point of the cone, (k, d)."""
     norm = _norm(v[..., 1:])
+    # Eigenvalues are projected on the nonnegative numbers; eigenvectors remain.
     high, low = jnp.maximum(v[..., 0] + norm, 0), jnp.maximum(v[..., 0] - norm, 0)
     if v.shape[-1] == 1:
         return high[..., None]
@@ -121,10 +124,10 @@ def projection(v):
     return jnp.concatenate([mean[..., None], rest], -1)
 
 
-class Slope(NamedTuple):
+class ProjectionDerivative(NamedTuple):
     """Derivatives D (k, d, d) of the projection, by their eigenvalues (k,), all between 0 and 1.
 
-    `high` is that of (1, u), `low` that of (1, -u), `across` that of (0, x) with x at right angles to u (k, d - 1), which is a
+    `high` belongs to (1, u), `low` to (1, -u), `across` to (0, x) with x orthogonal to u (k, d - 1), which is a
     unit vector, or zero where the three eigenvalues are equal.
     """
 
@@ -134,11 +137,11 @@ class Slope(NamedTuple):
     u: jnp.ndarray
 
     def map(self, function):
-        """The matrices with the same eigenvectors and a function of the eigenvalues."""
-        return Slope(function(self.high), function(self.low), function(self.across), self.u)
+        """Matrices with the same eigenvectors and a function of the eigenvalues."""
+        return ProjectionDerivative(function(self.high), function(self.low), function(self.across), self.u)
 
     def times(self, x):
-        """D x, of x (k, d)."""
+        """Product D x, x (k, d)."""
         if x.shape[-1] == 1:
             return self.high[..., None] * x
         along = jnp.sum(self.u * x[..., 1:], -1)
@@ -147,8 +150,8 @@ class Slope(NamedTuple):
         return jnp.concatenate([(up + down)[..., None], rest], -1)
 
 
-def projection_slope(v, width) -> Slope:
-    """Derivative of the projection, rounded off over `width` about its kinks, where it is a mean.
+def projection_derivative(v, width) -> ProjectionDerivative:
+    """Derivative of the projection, smoothed over `width` about its kinks, where it is the mean of both sides.
 
     With the eigenvalues v0 -+ |v1| and p(x) = (x + sqrt(x^2 + 4 width^2)) / 2 instead of max(x, 0): p' along (1, -+u), and
     the divided difference of p across.
@@ -159,4 +162,4 @@ def projection_slope(v, width) -> Slope:
     # (p(high) - p(low)) / (high - low), without the difference.
     across = (1 + (high + low) / (root_high + root_low)) / 2
     u = v[..., 1:] / jnp.where(norm > 0, norm, 1)[..., None]
-    return Slope((1 + high / root_high) / 2, (1 + low / root_low) / 2, across, u)
+    return ProjectionDerivative((1 + high / root_high) / 2, (1 + low / root_low) / 2, across, u)

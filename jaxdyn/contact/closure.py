@@ -1,7 +1,7 @@
-"""Force closure: whether contact forces within their cones can balance every wrench on the object.
+"""Force closure: the ability of contact forces within their cones to balance every wrench on the object.
 
 A grasp with map G and cones FC has force closure, G(FC) = R^p, if and only if G has full rank and there are internal forces
-strictly inside the cones, G f = 0 with f in int(FC). So that is what is looked for, by the largest least margin of them.
+strictly inside the cones, G f = 0 with f in int(FC). Both are tested, the latter by maximising the least margin.
 
 Source: Murray, Li & Sastry (1994), definition 5.2 and proposition 5.3; EQUATIONS section 10.
 """
@@ -20,21 +20,21 @@ from jaxdyn.model.arguments import Checked, Numbers
 
 _FIRST_FACES = 8
 _ROUNDS = 60
-_TIGHT = 1e-9  # distance of the bounds at which cutting ends
-_LEAST = 1e-8  # margins and singular values below this, of the largest, are zero
+_TIGHT = 1e-9  # distance of the bounds at which the cutting-plane iteration ends
+_LEAST = 1e-8  # relative to the largest; margins and singular values below are zero
 
 
 class ForceClosure(eqx.Module):
-    """Whether a grasp has force closure, how far from losing it, and the reason where it has none.
+    """Force closure of a grasp: the decision, its margin, and a certificate where it fails.
 
-    - `closed`: bool. `margin`: the largest t such that internal forces f, G f = 0, with total normal force 1 N have every
-      margin of every cone at least t (for a friction cone mu f_n - |f_t|, so t is dimensionless: newtons of margin per
-      newton of grip). Zero where the grasp is open, infinite where no contact has a bound.
+    - `closed`: the decision. `margin`: the largest t such that internal forces f, G f = 0, with total normal force 1 N
+      have every margin of every cone at least t (for a friction cone mu f_n - |f_t|, so t is dimensionless: newtons of
+      margin per newton of grip). Zero where the grasp is open, infinite where no contact has a bound.
     - `forces` (m,): those internal forces; zeros where there are none.
     - `direction` (p,): where open, a unit wrench on the object that contact forces cannot balance, in the units and
-      axes of G's rows; zeros where closed. direction . (G f) >= 0 (to 1e-8) for all forces f in the cones, and to balance
-      it takes G f = -direction.
-    - `rank`: of G, in its columns along which there are forces.
+      axes of G's rows; zeros where closed. direction . (G f) >= 0 (to 1e-8) for all forces f in the cones, so balancing
+      it would need G f = -direction.
+    - `rank`: of G, in the columns along which forces are possible.
     """
 
     closed: bool = eqx.field(static=True)
@@ -45,9 +45,9 @@ class ForceClosure(eqx.Module):
 
 
 class _Rows(NamedTuple):
-    """All cones side by side: linear rows (k, m), second-order rows (j, 3, m), and the total normal force (m,).
+    """All cones combined: linear rows (k, m), second-order rows (j, 3, m), and the total normal force (m,).
 
-    `kept` (m,): columns of G that they act on; directions in which a friction coefficient of zero leaves no force are not.
+    `kept` (m,): columns of G with forces; directions without force, by a friction coefficient of zero, are excluded.
     """
 
     linear: np.ndarray
@@ -63,10 +63,11 @@ def force_closure(
     faces: int | None = None,
     side: Checked[str] = "inscribed",
 ) -> ForceClosure:
-    """Whether the grasp with map G has force closure, with a margin, or with a wrench that it cannot resist.
+    """Decide force closure of the grasp with map G, with a margin or with a wrench that it cannot resist.
 
-    Round cones are taken as they are: a linear program (HiGHS) with faces around them is solved, and faces are added where
-    its forces leave the cones, until the margin is found to 1e-9. With `faces` the cones are pyramids instead, one program.
+    Round cones are handled exactly by cutting planes: a linear program (HiGHS) is solved, and faces are added where
+    its forces leave the cones, until the margin is determined to 1e-9. With `faces` the cones are pyramids instead, one
+    program.
 
     **Arguments:**
 
@@ -93,20 +94,21 @@ def force_closure(
     every = _as_cones([cones] if isinstance(cones, FrictionCone) else cones, G.shape[1])
     if side not in SIDES:
         raise ValueError(f"side is {side!r}; choose from {', '.join(SIDES)}")
-    rows = _stacked(every, faces, side)
-    # Rows of G in N and in N m are made comparable before any of them is called zero.
+    rows = _stack(every, faces, side)
+    # Rows of G in N and N m are normalised before their rank is decided.
     sizes = np.linalg.norm(G[:, rows.kept], axis=1)
-    # What is left of a sum that cancels is no row.
+    # Rows that are only rounding of a cancellation count as zero.
     sizes = np.where(sizes > 1e-13 * sizes.max(initial=0), sizes, 0.0)
     unit = np.where(sizes[:, None] > 0, G[:, rows.kept], 0.0) / np.where(sizes > 0, sizes, 1)[:, None]
     left, singular, _ = np.linalg.svd(unit)
     rank = int(np.sum(singular > _LEAST * singular[0])) if singular.size and singular[0] > 0 else 0
     nothing, none = np.zeros(G.shape[1]), np.zeros(G.shape[0])
+    # Without full row rank the last left singular vector is a wrench outside the range of G.
     if rank < G.shape[0]:
         return ForceClosure(False, 0.0, nothing, _wrench(left[:, -1], sizes), rank)
     if not len(rows.linear) and not len(rows.second):
         return ForceClosure(True, float("inf"), nothing, none, rank)
-    margin, forces, twist = _widest(unit, rows)
+    margin, forces, twist = _largest_margin(unit, rows)
     if margin <= _LEAST:
         return ForceClosure(False, 0.0, nothing, _wrench(twist, sizes), rank)
     nothing[rows.kept] = forces
@@ -114,7 +116,7 @@ def force_closure(
 
 
 def _as_cones(cones, count: int) -> list[FrictionCone]:
-    """The cones, rows as those of a surface. **Raises:** ValueError where they do not fit `count` columns."""
+    """Convert rows to cones, as of a surface. **Raises:** ValueError where they do not fit `count` columns."""
     if not isinstance(cones, (tuple, list)):
         raise ValueError(f"cones is a {type(cones).__name__}; pass a list with one cone per contact")
     every = []
@@ -126,7 +128,7 @@ def _as_cones(cones, count: int) -> list[FrictionCone]:
     sizes = [_width(cone) for cone in every]
     if sum(sizes) != count:
         raise ValueError(
-            f"cones have {sizes} components, {sum(sizes)} in all, and G has {count} columns; they have to agree"
+            f"cones have {sizes} components, {sum(sizes)} in all, and G has {count} columns; they must agree"
         )
     return every
 
@@ -135,12 +137,13 @@ def _width(cone: FrictionCone) -> int:
     return cone.size if cone.rows is None else cone.rows.shape[1]
 
 
-def _stacked(cones: list[FrictionCone], faces: int | None, side: str) -> _Rows:
+def _stack(cones: list[FrictionCone], faces: int | None, side: str) -> _Rows:
     total = sum(_width(cone) for cone in cones)
     linear, second, normal, kept, place = [np.zeros((0, total))], [np.zeros((0, 3, total))], np.zeros(total), [], 0
     for cone in cones:
         columns = slice(place, place + _width(cone))
         place = columns.stop
+        # Without friction the cone has no interior along its tangential forces, and without gamma none along its torque.
         used = np.ones(_width(cone), bool)
         if cone.mu is not None and float(cone.mu) == 0:
             used[: 1 if cone.in_plane else 2] = False
@@ -149,7 +152,7 @@ def _stacked(cones: list[FrictionCone], faces: int | None, side: str) -> _Rows:
         kept.append(used)
         rows = np.asarray(cone.linear_rows() if faces is None else cone.pyramid(faces, side), float)
         cones_of = np.asarray(cone.second_order_rows(), float)
-        if not used.all():  # what is left of the cone is that it presses, and perhaps its friction
+        if not used.all():  # the remaining conditions: a nonnegative normal force, and perhaps friction
             rows = np.concatenate(
                 [rows[np.abs(rows[:, used]).sum(1) > 0], -np.eye(len(used))[-1 if cone.in_plane else 2][None]]
             )
@@ -170,9 +173,9 @@ def _stacked(cones: list[FrictionCone], faces: int | None, side: str) -> _Rows:
     )
 
 
-def _widest(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
-    """Largest least margin t of forces f with G f = 0 and normal force 1; f; and y with y.(G f) >= -t for all f in the cones."""
-    # scipy's optimisers take long to import, so only who calls this pays for it.
+def _largest_margin(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
+    """Largest margin t of forces f with G f = 0 and normal force 1; f; and y with y.(G f) >= -t for all f in the cones."""
+    # Imported here because scipy's optimisers take long to import.
     from scipy.optimize import linprog
 
     angles = 2 * np.pi / _FIRST_FACES * np.arange(_FIRST_FACES)
@@ -189,18 +192,19 @@ def _widest(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
         limits = np.concatenate([above, np.ones((len(above), 1))], 1)
         solution = linprog(cost, limits, np.zeros(len(limits)), equal, right, bounds=(None, None), options=options)
         if solution.status == 2:
-            # No internal forces press at all: the normal force is a combination of the rows of G, n = G^T y.
+            # No internal force has a normal component: the normal force is a combination of the rows of G, n = G^T y.
             return -np.inf, np.zeros(G.shape[1]), np.linalg.lstsq(G.T, rows.normal, rcond=None)[0]
         if solution.status != 0:
             raise RuntimeError(f"the linear program of force closure was not solved: {solution.message}")
         forces, upper = solution.x[:-1], solution.x[-1]
         seen = rows.second @ forces
-        slopes = np.linalg.norm(seen[:, 1:], axis=1)
-        margins = np.concatenate([-rows.linear @ forces, seen[:, 0] - slopes])
-        # The faces lie around the cones, so t is an upper bound; what its forces have is a lower one.
+        friction = np.linalg.norm(seen[:, 1:], axis=1)
+        margins = np.concatenate([-rows.linear @ forces, seen[:, 0] - friction])
+        # Faces are outside the cones, so t is an upper bound; the margin of its forces is a lower one.
         if upper <= _LEAST or margins.min() >= upper - _TIGHT:
             break
-        touching = [(s, y / n) for s, y, n in zip(rows.second, seen[:, 1:], slopes, strict=True) if n > 0]
+        # Tangent planes of the round cones at the current forces cut off the current solution.
+        touching = [(s, y / n) for s, y, n in zip(rows.second, seen[:, 1:], friction, strict=True) if n > 0]
         above = np.concatenate([above, *[(y[0] * s[1] + y[1] * s[2] - s[0])[None] for s, y in touching]])
     else:
         raise RuntimeError(f"force closure: the margin was not found to {_TIGHT} with {_ROUNDS} rounds of faces")
@@ -212,6 +216,6 @@ def _widest(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def _wrench(twist, sizes) -> np.ndarray:
-    """Unit wrench in G's own units, of the vector that multiplies its scaled rows."""
+    """Unit wrench in G's units, from the multiplier of its scaled rows."""
     direction = twist / np.where(sizes > 0, sizes, 1)
     return direction / np.linalg.norm(direction)

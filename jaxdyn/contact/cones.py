@@ -1,4 +1,4 @@
-"""Friction cones: which forces a contact can transmit without pulling, slipping or spinning.
+"""Friction cones: the forces that a contact can transmit without pulling, slipping or spinning.
 
 Contact forces f (m,) are along the columns of the contact's wrench basis (`wrench_basis`), with z the normal into the
 object, so that f_n >= 0 presses. With friction coefficient mu and, for soft fingers, gamma (m):
@@ -30,13 +30,13 @@ SIDES = ("inscribed", "circumscribed")
 
 
 class FrictionCone(eqx.Module):
-    """The forces that one contact can transmit; made by `friction_cone` and `surface_cone`.
+    """Cone of forces that one contact can transmit, built by `friction_cone` and `surface_cone`.
 
     - `kind`, `in_plane`: of the contact. `mu` (): friction coefficient. `gamma` (): m, radius of a soft finger's torque.
     - `rows` (k, 6): U of a surface, U w <= 0.
 
-    It has `linear_rows` and `second_order_rows`, which together are the cone exactly, `pyramid`, which is a linear one
-    inside or around it, and `margins` and `margin`, how far within it a force is.
+    It has `linear_rows` and `second_order_rows`, which together describe the cone exactly, `pyramid`, a linear cone
+    inside or around it, and `margins` and `margin`, the distance of a force from the boundary.
     """
 
     kind: str = eqx.field(static=True)
@@ -51,7 +51,7 @@ class FrictionCone(eqx.Module):
         return 6 if self.kind == "surface" else len(components(self.kind, self.in_plane, "cone"))
 
     def linear_rows(self) -> Float[Array, "k m"]:
-        """L (k, m) of the inequalities L f <= 0 that are linear; (0, m) if there are none."""
+        """Rows L (k, m) of the linear inequalities L f <= 0; (0, m) if there are none."""
         if self.rows is not None:
             return self.rows
         if self.kind == "frictionless":
@@ -66,7 +66,7 @@ class FrictionCone(eqx.Module):
         return jnp.stack([jnp.stack([zero, zero, -self.gamma, sign * one]) for sign in (1.0, -1.0)])
 
     def second_order_rows(self) -> Float[Array, "j 3 m"]:
-        """S (j, 3, m) of the inequalities |(S f)_1, (S f)_2| <= (S f)_0, j = 0 or 1.
+        """Rows S (j, 3, m) of the inequalities |(S f)_1, (S f)_2| <= (S f)_0, j = 0 or 1.
 
         It is (mu f_n, fx, fy) for a spatial contact with friction.
         """
@@ -77,12 +77,12 @@ class FrictionCone(eqx.Module):
         return jnp.stack([self.mu * unit[2], unit[0], unit[1]])[None]
 
     def pyramid(self, faces: int = 8, side: str = "inscribed") -> Float[Array, "k m"]:
-        """Rows P (k, m) of a pyramid P f <= 0 that stands for the cone.
+        """Rows P (k, m) of a pyramid P f <= 0 that approximates the cone.
 
         The faces' normals are at the angles 2 pi i / faces from x. An "inscribed" pyramid lies within the cone: each
-        of its forces is one without slip, and mu is lost by a factor of at least cos(pi / faces), 1/sqrt(2) for four.
+        of its forces is one without slip, and mu is reduced by at most the factor cos(pi / faces), 1/sqrt(2) for four.
         A "circumscribed" one contains the cone; with four faces it is |fx|, |fy| <= mu f_n. Cones that are linear are
-        returned as they are.
+        returned unchanged.
 
         **Arguments:** `faces`: at least 3. `side`: "inscribed" or "circumscribed".
 
@@ -105,12 +105,12 @@ class FrictionCone(eqx.Module):
         return jnp.concatenate([jnp.asarray(normals, self.mu.dtype) + along, linear])
 
     def margins(self, force: Numbers, smoothing: Numbers = 0.0) -> Float[Array, " k"]:
-        """How far the force is from violating each inequality, (j + k,): mu f_n - |(fx, fy)|, then -L f.
+        """Margins of a force in each inequality, (j + k,): mu f_n - |(fx, fy)|, then -L f.
 
         Inside the cone all are positive, on its boundary the least is zero. Units are those of the rows: N for forces,
         N m for a soft finger's gamma f_n -+ tz, and those of its rows for a surface.
 
-        **Arguments:** `force` (m,), N and N m. `smoothing` (), N: |(fx, fy)| is taken as sqrt(fx^2 + fy^2 + smoothing^2)
+        **Arguments:** `force` (m,), N and N m. `smoothing` (), N: |(fx, fy)| is replaced by sqrt(fx^2 + fy^2 + smoothing^2)
         - that is smooth at a force along the normal too, and the margin is then too small by at most `smoothing`, on the
         safe side. With zero the margin has a kink there, at which its derivative is that along the normal.
 
@@ -150,7 +150,7 @@ def _is_zero(smoothing) -> bool:
 
 
 def _length(parts, smoothing):
-    """sqrt(sum of squares + smoothing^2), with zero derivative where it vanishes."""
+    """Smoothed norm sqrt(sum of squares + smoothing^2), with zero derivative where it vanishes."""
     square = jnp.sum(jnp.stack(parts) ** 2)
     if not _is_zero(smoothing):
         square = square + jnp.asarray(smoothing, square.dtype) ** 2
@@ -161,7 +161,7 @@ def _length(parts, smoothing):
 def friction_cone(
     kind: str, mu: Numbers | None = None, gamma: Numbers | None = None, *, in_plane: bool = False
 ) -> FrictionCone:
-    """The cone of forces that a contact of this kind can transmit (see `FrictionCone`).
+    """Friction cone of a contact of a given kind (see `FrictionCone`).
 
     **Arguments:**
 
@@ -191,7 +191,7 @@ def friction_cone(
 
 
 def surface_cone(rows: Numbers) -> FrictionCone:
-    """The cone of wrenches U w <= 0 that a surface in contact can transmit.
+    """Cone of wrenches U w <= 0 that a surface contact can transmit.
 
     **Arguments:** `rows` U (k, 6), from `wrench_cone` or `wrench_cone_of_polygon`. Rows that bound a torque (their
     coefficients of torques are not zero) should be divided by a length to have margins in N throughout.
@@ -205,7 +205,7 @@ def surface_cone(rows: Numbers) -> FrictionCone:
 
 
 if TYPE_CHECKING:
-    # Of all contacts, of each of them, or by their names.
+    # One cone for all contacts, one for each, or a dictionary by their names.
     Cones = FrictionCone | Sequence[FrictionCone] | Mapping[str, FrictionCone] | None
 else:
-    Cones = Any  # `coned_contacts` looks at them
+    Cones = Any  # `contacts_with_cones` checks them

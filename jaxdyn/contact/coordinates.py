@@ -1,7 +1,7 @@
-"""Contact coordinates of two surfaces, from how their bodies lie to each other: the inverse of `relative_pose`.
+"""Contact coordinates of two surfaces from the relative pose of their bodies, the inverse of `relative_pose`.
 
-Of spheres and planes the places next to each other are known at once. Those of other surfaces come from Newton's method
-(`touching`), of which the last two steps are differentiated: that gives derivatives up to the third order.
+For spheres and planes the closest points are known in closed form. Those of other surfaces come from Newton's method
+(`touching`), with its last two steps differentiated, which gives derivatives up to the third order.
 """
 
 import jax.numpy as jnp
@@ -18,11 +18,11 @@ _ROUNDS, _DIFFERENTIATED = 12, 2
 
 
 def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -> Float[Array, "5"]:
-    """Contact coordinates eta (5,) of the places where two surfaces are next to each other.
+    """Contact coordinates eta (5,) of the closest points of two surfaces.
 
-    Surfaces that touch are in contact there. Of others these are the places with opposite normals on one line, and
-    `relative_pose(surface_o, surface_f, eta)` is the given pose moved along that line. Both charts must have a frame there, and
-    the surfaces one such pair of places (`ContactKinematics.strict`).
+    Touching surfaces are in contact there. For others these are the points with opposite normals on one line, and
+    `relative_pose(surface_o, surface_f, eta)` is the given pose translated along that line. Both charts must have a
+    frame there, and the surfaces one such pair of points (`ContactKinematics.strict`).
 
     **Arguments:**
 
@@ -31,8 +31,8 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
 
     **Returns:** eta = (u_o, v_o, u_f, v_f, psi) (5,), in the units of the charts and rad; differentiable three times.
 
-    **Raises:** ValueError for what is no surface, a pose of another shape, two planes, and a `Parametrised` surface, which does
-    not say which of its places is next to a point.
+    **Raises:** ValueError for an invalid surface, a pose of another shape, two planes, and a `Parametrised` surface, whose
+    closest points are not known.
 
     ```python
     ball, tip = jd.contact.Sphere(0.1), jd.contact.Sphere(0.02)
@@ -48,13 +48,13 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
     if isinstance(surface_o, Plane) and isinstance(surface_f, Plane):
         raise ValueError("surface_o and surface_f are both planes, which do not touch in one point")
     R, p = pose[:3, :3], pose[:3, 3]
-    # Opposite to a plane's normal; to others along the line of the frames' origins.
+    # Initial points: opposite to a plane's normal, for others along the line of the frames' origins.
     place_o = surface_o.toward(-R[:, 2] if isinstance(surface_f, Plane) else p)
     place_f = surface_f.toward(-R[2] if isinstance(surface_o, Plane) else -_product(p, R))
     if place_o is None or place_f is None:
         which = surface_o if place_o is None else surface_f
         raise ValueError(
-            f"surface {type(which).__name__} does not say which of its places is next to a point; take a Sphere, Ellipsoid, "
+            f"surface {type(which).__name__} does not give its closest point to another point; use a Sphere, Ellipsoid, "
             "Plane or Cylinder"
         )
     if not all(isinstance(surface, Sphere | Plane) for surface in (surface_o, surface_f)):
@@ -66,12 +66,14 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
 
 
 def _by_newton(surface_o: Surface, surface_f: Surface, R, p, places):
-    def stepped(R, p, places):
+    def step(R, p, places):
         steps = newton_steps(patch_at(surface_o, places[0]), patch_at(surface_f, places[1]), R, p)
-        return surface_o.moved(places[0], steps.on_a), surface_f.moved(places[1], steps.on_b)
+        return surface_o.displace(places[0], steps.on_a), surface_f.displace(places[1], steps.on_b)
 
+    # Converged points are constants for differentiation; the last steps restore their derivatives (implicit function
+    # theorem).
     constants = lax.stop_gradient((R, p))
-    places = lax.fori_loop(0, _ROUNDS, lambda _, places: stepped(*constants, places), lax.stop_gradient(places))
+    places = lax.fori_loop(0, _ROUNDS, lambda _, places: step(*constants, places), lax.stop_gradient(places))
     for _ in range(_DIFFERENTIATED):
-        places = stepped(R, p, places)
+        places = step(R, p, places)
     return places

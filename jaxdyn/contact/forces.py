@@ -1,4 +1,4 @@
-"""The force of each contact of a scene, and its margin from pulling and slipping, from the multipliers of the scene's rows."""
+"""Contact forces of a scene and their margins from pulling and slipping, from the multipliers of its rows."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from jaxdyn.systems.scene import Scene
 
 
 class ContactForces(eqx.Module):
-    """Forces of the contacts and how far they are from leaving their cones.
+    """Contact forces and their margins in the friction cones.
 
     - `forces`: by the contact's name, (m,), along the columns of its wrench basis, the normal into the object; N and N m.
     - `margins`: by name, (), the cone's margin: positive while the contact neither pulls nor slips.
@@ -26,8 +26,8 @@ class ContactForces(eqx.Module):
     margin: Float[Array, "..."]
 
 
-class ConedContact(NamedTuple):
-    """A contact with a friction cone: its name, its multipliers in the order of its wrench basis, and the cone."""
+class ContactWithCone(NamedTuple):
+    """Contact with a friction cone: its name, its multipliers in the order of its wrench basis, and the cone."""
 
     name: str
     rows: np.ndarray
@@ -37,7 +37,7 @@ class ConedContact(NamedTuple):
 def contact_forces(
     scene: Scene, multipliers: Float[Array, " nc"], cones: Cones = None, smoothing: Numbers = 0.0
 ) -> ContactForces:
-    """The force of each contact, and its margin in its friction cone.
+    """Force of each contact, and its margin in its friction cone.
 
     **Arguments:**
 
@@ -45,12 +45,12 @@ def contact_forces(
     - `multipliers` (nc,): of the scene's rows: `.multipliers` of `jd.constrained_dynamics`, `.contact_forces` of
       `object_dynamics`, or one sample of a solution's.
     - `cones`: a `FrictionCone` for all contacts, a list with one per constraint, or a dictionary by name; by default those
-      of the scene. Constraints that a dictionary does not name are left out.
+      of the scene. Constraints missing in a dictionary are skipped.
     - `smoothing`: N, of `FrictionCone.margin`.
 
     **Returns:** `ContactForces`.
 
-    **Raises:** ValueError for another number of multipliers, no cones, names of no contact, cones of another kind than their
+    **Raises:** ValueError for another number of multipliers, no cones, unknown names, cones of another kind than their
     contact, and constraints with a cone that are no contacts.
 
     Source: Murray, Li & Sastry (1994), section 5.2; the cone is to be tested on all of lam (EQUATIONS section 10).
@@ -64,14 +64,14 @@ def contact_forces(
             f"{batch_hint(multipliers, (1,))}"
         )
     forces, margins = {}, {}
-    for contact in coned_contacts(scene, cones):
+    for contact in contacts_with_cones(scene, cones):
         forces[contact.name] = multipliers[contact.rows]
         margins[contact.name] = contact.cone.margin(forces[contact.name], smoothing)
     return ContactForces(forces, margins, jnp.min(jnp.stack(list(margins.values()))))
 
 
-def coned_contacts(scene: Scene, cones=None) -> tuple[ConedContact, ...]:
-    """The contacts of the scene that have a cone, in the order of its constraints.
+def contacts_with_cones(scene: Scene, cones=None) -> tuple[ContactWithCone, ...]:
+    """Contacts of the scene with a cone, in the order of its constraints.
 
     **Raises:** ValueError as `contact_forces` does.
     """
@@ -92,7 +92,7 @@ def coned_contacts(scene: Scene, cones=None) -> tuple[ConedContact, ...]:
                 f"cone of contact {place.name!r} is of kind {cone.kind!r} with {cone.size} components, the contact has "
                 f"{len(order)}; give the cone of the contact's kind"
             )
-        coned.append(ConedContact(place.name, place.start + np.array(order, int), cone))
+        coned.append(ContactWithCone(place.name, place.start + np.array(order, int), cone))
     return tuple(coned)
 
 
@@ -110,5 +110,5 @@ def _by_name(cones, names: list[str]) -> dict[str, FrictionCone]:
         )
     for name, cone in cones.items():
         if not isinstance(cone, FrictionCone):
-            raise ValueError(f"cone of contact {name!r} is {cone!r}; take jd.contact.friction_cone(...)")
+            raise ValueError(f"cone of contact {name!r} is {cone!r}; use jd.contact.friction_cone(...)")
     return cones

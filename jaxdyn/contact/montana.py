@@ -1,13 +1,13 @@
-"""Montana's equations of contact: how the place of a contact moves on two surfaces that stay in touch.
+"""Montana's equations of contact: kinematics of a contact point on two surfaces in contact.
 
-Contact coordinates eta = (u_o, v_o, u_f, v_f, psi): where the contact is on the object's and on the finger's surface, and the
-angle from one Gauss frame to the other. Frames C_o, C_f are the Gauss frames there, with normals opposite to each other:
+Contact coordinates eta = (u_o, v_o, u_f, v_f, psi): the position of the contact on the object's and on the finger's surface, and
+the angle from one Gauss frame to the other. Frames C_o, C_f are the Gauss frames there, with normals opposite to each other:
 
     R_{co,cf} = [R_psi 0; 0 -1],   R_psi = [cos psi, -sin psi; -sin psi, -cos psi],
     g_of = g_oCo(alpha_o) g_psi g_fCf(alpha_f)^-1.
 
 L_o and L_f are fixed in the bodies and coincide with C_o and C_f now. V_c = (vx, vy, vz, wx, wy, wz) is the body twist of L_f
-against L_o; touching is vz = 0, and then, with R_o = [0 -1; 1 0],
+relative to L_o; contact is vz = 0, and then, with R_o = [0 -1; 1 0],
 
     V_c = J_c eta_dot,   J_c = [ R_psi M_o,       -M_f,         0;
                                  0,                0,           0;
@@ -42,10 +42,10 @@ from jaxdyn.model.arguments import Numbers
 class ContactKinematics(eqx.Module):
     """Kinematics of one contact at eta (see `montana`).
 
-    - `J_c` (6, 5): V_c = J_c eta_dot, twists of the finger against the object in the axes of C_f, at the contact.
+    - `J_c` (6, 5): V_c = J_c eta_dot, twists of the finger relative to the object in the axes of C_f, at the contact.
     - `forward` (5, 6): eta_dot = forward V_c where vz = 0; its column of vz is zero, forward J_c = 1.
-    - `J_F` (6, 5): V_of = J_F eta_dot, body twist of the finger's frame against the object's, in the finger's axes.
-    - `relative_curvature` (2, 2): K_f + R_psi K_o R_psi, 1/m. `strict` (): whether it is invertible and the surfaces lie
+    - `J_F` (6, 5): V_of = J_F eta_dot, body twist of the finger's frame relative to the object's, in the finger's axes.
+    - `relative_curvature` (2, 2): K_f + R_psi K_o R_psi, 1/m. `strict` (): true where it is invertible and the surfaces are
       outside each other (both eigenvalues positive); where not, `forward` is finite without meaning.
     - `g_of` (4, 4): pose of the finger's frame in the object's. `object`, `finger`: `SurfaceGeometry` of the surfaces.
     """
@@ -61,7 +61,7 @@ class ContactKinematics(eqx.Module):
 
     @property
     def rolling(self) -> Float[Array, "5 2"]:
-        """eta_dot = rolling (wx, wy): rates of contact coordinates when the surfaces neither slip nor spin."""
+        """Matrix of eta_dot = rolling (wx, wy), rates of contact coordinates without slip and spin."""
         return self.forward[:, 3:5]
 
 
@@ -70,16 +70,16 @@ def _turn(psi):
     return jnp.stack([jnp.stack([c, -s]), jnp.stack([-s, -c])])
 
 
-def _checked(eta) -> Float[Array, "5"]:
+def _as_eta(eta) -> Float[Array, "5"]:
     return as_float(eta, "eta", (5,))
 
 
 def relative_pose(surface_o: Surface, surface_f: Surface, eta: Numbers) -> Float[Array, "4 4"]:
-    """g_of (4, 4): pose of the finger's body frame in the object's when the surfaces touch at eta.
+    """Pose g_of (4, 4) of the finger's body frame in the object's when the surfaces touch at eta.
 
     **Arguments:** as of `montana`. **Raises:** as `montana`. Source: EQUATIONS section 8.
     """
-    eta = _checked(eta)
+    eta = _as_eta(eta)
     geometry_o, geometry_f = surface_geometry(surface_o, eta[:2]), surface_geometry(surface_f, eta[2:4])
     return _pose(geometry_o, geometry_f, eta[4])
 
@@ -90,7 +90,7 @@ def _pose(geometry_o, geometry_f, psi):
 
 
 def montana(surface_o: Surface, surface_f: Surface, eta: Numbers) -> ContactKinematics:
-    """Montana's equations of contact at eta: J_c, its inverse on vz = 0, and what they are made of.
+    """Montana's equations of contact at eta: J_c, its inverse on vz = 0, and related quantities.
 
     The forward form is, with Kt = R_psi K_o R_psi,
 
@@ -105,8 +105,8 @@ def montana(surface_o: Surface, surface_f: Surface, eta: Numbers) -> ContactKine
 
     **Returns:** `ContactKinematics`, differentiable in eta and in the surfaces.
 
-    **Raises:** ValueError for what is no surface, eta of another shape, coordinates at which a chart ends, and surfaces that
-    cut into each other or whose relative curvature is singular (two planes), when this is known.
+    **Raises:** ValueError for an invalid surface, eta of another shape, coordinates at which a chart ends, and surfaces that
+    penetrate each other or whose relative curvature is singular (two planes), when this is known.
 
     ```python
     ball, tip = jd.contact.Sphere(0.1), jd.contact.Sphere(0.02)
@@ -115,7 +115,7 @@ def montana(surface_o: Surface, surface_f: Surface, eta: Numbers) -> ContactKine
 
     Source: Montana (1988); Murray, Li & Sastry (1994), eqs 5.28-5.32; EQUATIONS section 8.
     """
-    eta = _checked(eta)
+    eta = _as_eta(eta)
     for surface in (surface_o, surface_f):
         check_surface(surface)
     kinematics = _montana(surface_o, surface_f, eta)
@@ -125,7 +125,7 @@ def montana(surface_o: Surface, surface_f: Surface, eta: Numbers) -> ContactKine
         raise ValueError(
             f"eta is {np.asarray(eta).tolist()}, where the relative curvature "
             f"{np.asarray(kinematics.relative_curvature).tolist()} is not positive definite; the surfaces do not touch in "
-            "one point from outside, choose more convex ones or another place"
+            "one point from outside, choose more convex ones or another point"
         )
     return kinematics
 
@@ -148,6 +148,7 @@ def _montana(surface_o, surface_f, eta) -> ContactKinematics:
     relative = f.curvature + seen
     strict = is_positive(relative)
     flexibility = inverse_2x2(relative, strict)
+    # Constant 0/1 matrices, so that the kernel drops the zero products.
     # Columns (vx, vy, vz, wx, wy, wz) of (-wy, wx) and of (vx, vy).
     rolled = jnp.asarray(np.array([[0, 0, 0, 0, -1, 0], [0, 0, 0, 1, 0, 0]]), eta.dtype)
     slid = jnp.asarray(np.array([[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]), eta.dtype)
@@ -178,7 +179,7 @@ def _montana(surface_o, surface_f, eta) -> ContactKinematics:
 
 
 def is_positive(matrix) -> Any:
-    """Whether a symmetric (2, 2) matrix is positive definite beyond rounding."""
+    """Decide whether a symmetric (2, 2) matrix is positive definite beyond rounding."""
     trace, size = matrix[0, 0] + matrix[1, 1], jnp.sum(matrix * matrix)
     determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
     return (trace > 0) & (determinant > 1e2 * float(jnp.finfo(matrix.dtype).eps) * size)

@@ -1,4 +1,4 @@
-"""Contact forces of least size that add up to a wrench and keep a margin from the boundary of every cone."""
+"""Optimal contact forces: least norm, a given resultant wrench, and a margin from the boundary of every cone."""
 
 from collections.abc import Sequence
 
@@ -21,16 +21,16 @@ def optimal_forces(
     weights: Numbers | None = None,
     tol: float | None = None,
 ) -> QPSolution:
-    """Contact forces f nearest to `target` with G f = wrench, and every margin of every cone at least `preload`.
+    """Contact forces f closest to `target` with G f = wrench and all margins at least `preload`.
 
         minimise (f - f0)^T diag(weights) (f - f0) / 2   with   G f = wrench,  margins(f) >= preload
 
-    A second-order cone program, by `solve_qp`: batched, and differentiable in G, the wrench, the coefficients of friction and
-    all others. Rows of G may be dependent, as those of a grasp that cannot resist every wrench are.
+    A second-order cone program, by `solve_qp`: batched, and differentiable in G, the wrench, the friction coefficients and
+    all other arguments. Rows of G may be dependent, as for a grasp that cannot resist every wrench.
 
     **Arguments:**
 
-    - `G` (p, m): grasp map. `wrench` (p,): that the contact forces have to exert on the object; to hold it against gravity,
+    - `G` (p, m): grasp map. `wrench` (p,): the resultant of the contact forces on the object; to hold it against gravity,
       minus its weight; N and N m.
     - `cones`: one per contact, in the order of G's columns.
     - `preload` (): N, least margin of each contact (`FrictionCone.margins`).
@@ -50,9 +50,7 @@ def optimal_forces(
     sizes = [cone.size for cone in cones]
     m = sum(sizes)
     if m != G.shape[1]:
-        raise ValueError(
-            f"cones have {sizes} components, {m} in all, and G has {G.shape[1]} columns; they have to agree"
-        )
+        raise ValueError(f"cones have {sizes} components, {m} in all, and G has {G.shape[1]} columns; they must agree")
     preload = as_float(preload, "preload", (), G.dtype)
     target = jnp.zeros((m,), G.dtype) if target is None else as_float(target, "target", (m,), G.dtype)
     weights = jnp.ones((m,), G.dtype) if weights is None else as_float(weights, "weights", (m,), G.dtype)
@@ -63,14 +61,14 @@ def optimal_forces(
 def cone_bounds(cones, preload, dtype) -> dict:
     """Rows and cones of `solve_qp`, by their names there, for margins of at least `preload` in every cone.
 
-    The forces are those of the cones one after the other.
+    Forces are concatenated in the order of the cones.
     """
     sizes = [cone.size for cone in cones]
     linear, second, place = [], [], 0
     for cone, size in zip(cones, sizes, strict=True):
         sides = (place, sum(sizes) - place - size)
-        linear.append(_widened(cone.linear_rows().astype(dtype), sides))
-        second.append(_widened(cone.second_order_rows().astype(dtype), sides))
+        linear.append(_pad_rows(cone.linear_rows().astype(dtype), sides))
+        second.append(_pad_rows(cone.second_order_rows().astype(dtype), sides))
         place += size
     rows, round_rows = jnp.concatenate(linear), jnp.concatenate(second)
     lifted = jnp.zeros(round_rows.shape[:2], dtype).at[:, 0].set(-preload)
@@ -78,6 +76,6 @@ def cone_bounds(cones, preload, dtype) -> dict:
     return bounds | ({"cones": [(-round_rows, lifted)]} if round_rows.shape[0] else {})
 
 
-def _widened(rows: Float[Array, "..."], sides) -> Float[Array, "..."]:
-    """Rows of one contact's force as rows of all forces."""
+def _pad_rows(rows: Float[Array, "..."], sides) -> Float[Array, "..."]:
+    """Pad rows of one contact's force to rows of all forces."""
     return jnp.pad(rows, [(0, 0)] * (rows.ndim - 1) + [sides])

@@ -1,9 +1,9 @@
-"""Quadratic programs with linear rows and second-order cones, as contact forces ask for: many small ones, differentiated.
+"""Small quadratic programs with linear rows and second-order cones, batched and differentiable, for contact forces.
 
-See `solve_qp`. Before the interior point (`jaxdyn.contact._interior_point`) come a change of variables that gives Q a unit
+See `solve_qp`. The interior point (`jaxdyn.contact._interior_point`) is preceded by a change of variables that gives Q a unit
 diagonal, rows of unit length, one scale for lengths of x, and the removal of equality rows: with A^+ the pseudo-inverse of
 their matrix and P = 1 - A^+ A, x = A^+ b + P y satisfies them however many of them are dependent, and the objective is
-the same in y, with y^T (1 - P) y / 2 added, which y = P y makes zero.
+the same in y, with the added term y^T (1 - P) y / 2, zero at y = P y.
 """
 
 from collections.abc import Sequence
@@ -18,27 +18,27 @@ from jaxtyping import Array, Float, Int
 from jaxdyn.compile import compiled, is_concrete, is_staged
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
-from jaxdyn.contact._interior_point import Point, Program, attached, solve
+from jaxdyn.contact._interior_point import Point, Program, attach_derivative, solve
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers
-from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 
 
 class RESULTS(eqx.Enumeration):
-    """How a quadratic program ended."""
+    """Result codes of a quadratic program."""
 
     successful = "successful"
     infeasible = "No x satisfies the rows and cones of the quadratic program."
-    stalled = "The quadratic program was not solved to the tolerance in the steps that it was given."
+    stalled = "The quadratic program was not solved to the tolerance within the given steps."
     indefinite = "The matrix Q of the quadratic program is not positive definite."
     nonfinite = "The data of the quadratic program, or its solution, are not finite."
 
 
 class QPSolution(eqx.Module):
-    """Solution of a quadratic program; its equations are Q x + q + G^T z + A^T y - sum S^T w = 0.
+    """Solution of a quadratic program, with Q x + q + G^T z + A^T y - sum S^T w = 0.
 
-    - `x` (n,): the minimiser. `result`: one of `jaxdyn.contact.RESULTS`; where it is not `successful`, all else is the
-      last iterate.
+    - `x` (n,): the minimiser. `result`: one of `jaxdyn.contact.RESULTS`; where it is not `successful`, all other fields are the
+      last iterate's.
     - `multipliers` z (m,): of the rows G x <= h, zero or positive. `slack` (m,): h - G x.
     - `equality_multipliers` y (p,): of A x = b; of least norm where rows are dependent.
     - `cone_multipliers` w, `cone_slack`, for each group of cones (k, d): both in their cones, the slack is c - S x.
@@ -58,7 +58,7 @@ class QPSolution(eqx.Module):
 if TYPE_CHECKING:
     ConeRows = tuple[Numbers, Numbers]  # S (k, d, n) and c (k, d)
 else:
-    ConeRows = Any  # `solve_qp` looks at them
+    ConeRows = Any  # `solve_qp` checks them
 
 
 def solve_qp(
@@ -75,10 +75,10 @@ def solve_qp(
 ) -> QPSolution:
     """Minimise x^T Q x / 2 + q^T x with G x <= h, A x = b, and c - S x in second-order cones.
 
-    An interior point, each step of it a kernel (see `compilation`): it compiles, batches (`jax.vmap`) and is
+    An interior-point method whose steps are kernels (see `compilation`): it compiles, batches (`jax.vmap`) and is
     differentiated in all arrays, forward and reverse, by the equations of the solution, also where forces are on the
-    boundary of their cone or at its apex. Where a row is active with a multiplier of zero, the solution has one-sided
-    derivatives alone, and their mean is returned. Zeros of G and S that are known while a program is traced cost nothing,
+    boundary of their cone or at its apex. Where a row is active with a multiplier of zero, the solution has only one-sided
+    derivatives, and their mean is returned. Zeros of G and S that are known while tracing cost nothing,
     if there are no equality rows.
 
     **Arguments:**
@@ -110,7 +110,7 @@ def solve_qp(
         raise ValueError(f"Q has shape {Q.shape}, expected (n, n) with n > 0")
     q = as_float(q, "q", (n,), Q.dtype)
     _check_definite(Q)
-    given = G  # as it was given: what becomes an array while a program is traced is not known any more
+    given = G  # the original: conversion to an array under tracing would make it unknown
     G, h = _pair(G, h, "G", "h", n, Q.dtype)
     A, b = _pair(A, b, "A", "b", n, Q.dtype)
     pairs: list[Any] = [cones] if len(cones) == 2 and hasattr(cones[0], "ndim") else list(cones)
@@ -125,12 +125,13 @@ def solve_qp(
     groups = [G if given is None else given, *(pair[0] for pair in pairs)]
     pattern = tuple(_pattern(g, A) for g in groups)
     if tol is None:
+        # Convergence is superlinear near the end, so the exponent is that which float32 and float64 both reach.
         tol = max(1e-9, float(jnp.finfo(Q.dtype).eps) ** 0.575)
     if not 0 < float(tol) < 1:
         raise ValueError(f"tol is {tol}; give a number between 0 and 1")
     if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
         raise ValueError(f"max_steps is {max_steps!r}; give a positive integer")
-    return _solved(Q, q, G, h, A, b, tuple(checked), pattern, float(tol), int(max_steps))
+    return _solve(Q, q, G, h, A, b, tuple(checked), pattern, float(tol), int(max_steps))
 
 
 def _pair(matrix, level, name: str, right: str, n: int, dtype):
@@ -144,8 +145,8 @@ def _pair(matrix, level, name: str, right: str, n: int, dtype):
 
 
 def _pattern(rows, A) -> bytes | None:
-    """Which entries of a group's rows may differ from zero; None where all may."""
-    # Calls with known numbers share one program, whatever their zeros are; equality rows mix columns.
+    """Mask of the entries of a group's rows that may be nonzero; None for all."""
+    # Outside of a trace all calls share one program, without regard to zeros; equality rows mix columns.
     known = is_staged() and is_concrete(rows) and not A.shape[0]
     return (np.asarray(rows) != 0).tobytes() if known else None
 
@@ -165,18 +166,19 @@ def _unit(sizes):
 
 
 @compiled
-def _solved(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: float, max_steps: int) -> QPSolution:
+def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: float, max_steps: int) -> QPSolution:
     data = [Q, q, G, A, b, *(x for pair in cones for x in pair)]
     finite = jnp.stack([jnp.isfinite(x).all() for x in data]).all() & ~jnp.isnan(h).any()
     Q = (Q + Q.T) / 2
     bounded = jnp.isfinite(h)
-    # A row without a bound becomes 0 <= 1; one that nothing satisfies, 0 <= -1.
+    # A row without a bound becomes 0 <= 1; an infeasible one, h = -inf, becomes 0 <= -1.
     G_used, h_used = jnp.where(bounded[:, None], G, 0), jnp.where(bounded, h, jnp.where(h > 0, 1, -1).astype(h.dtype))
     blocks, levels = [G_used[:, None, :]], [h_used[:, None]]
     blocks, levels = [*blocks, *(S for S, _ in cones)], [*levels, *(c for _, c in cones)]
     kept = [i for i, block in enumerate(blocks) if block.shape[0]]
 
-    # Scales are no functions of the data: the solution does not depend on them.
+    # Scales are constants for differentiation, because the solution does not depend on them.
+    # Q gets a unit diagonal and rows unit length, so that `tol` does not depend on units.
     diagonal = jax.lax.stop_gradient(jnp.diagonal(Q))
     across = _unit(jnp.sqrt(jnp.maximum(diagonal, 0)))
     blocks = [block * across[None, None] for block in blocks]
@@ -193,12 +195,14 @@ def _solved(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: flo
         x0 = _product(inverse, b)
     shortest = [jnp.max(jnp.abs(x0)), jnp.max(jnp.abs(q))]
     shortest += [jnp.max(jnp.sqrt(jnp.sum(x[:, 1:] ** 2, 1)) - x[:, 0], initial=0) for x in levels]
+    # The solution is homogeneous in (q, b, h), whose size is scaled to one.
     size = 1 / _unit(jax.lax.stop_gradient(jnp.max(jnp.stack(shortest))))
     q, b, x0, levels = q / size, b / size, x0 / size, [x / size for x in levels]
 
     result = RESULTS.successful
     program = Program(Q, q, tuple(blocks[i] for i in kept), tuple(levels[i] for i in kept))
     if inverse is not None:
+        # x = x0 + P y; the term 1 - P keeps the matrix definite on the range of A^T.
         unit = jnp.eye(q.shape[0], dtype=q.dtype)
         P = unit - _product(inverse, A)
         program = Program(
@@ -212,15 +216,17 @@ def _solved(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: flo
     steps = jnp.zeros((), jnp.int32)
     if kept:
         pattern = tuple(pattern[i] for i in kept)
+        # The loop is not differentiated: `attach_derivative` differentiates the equations of its solution.
         end = solve(jax.lax.stop_gradient(program), pattern, tol, max_steps)
-        point = attached(pattern, program, jax.lax.stop_gradient(end.point))
+        point = attach_derivative(pattern, program, jax.lax.stop_gradient(end.point))
         steps = end.steps
         result = RESULTS.where(end.solved, result, RESULTS.stalled)  # pyright: ignore[reportArgumentType]
         result = RESULTS.where(end.infeasible, RESULTS.infeasible, result)  # pyright: ignore[reportArgumentType]
     else:
-        point = Point(-solve_factored(cholesky(program.Q), program.q), (), ())
-    result = RESULTS.where(definite(Q, cholesky(Q)), result, RESULTS.indefinite)  # pyright: ignore[reportArgumentType]
-    # Comparisons with NaN are false, and zeros of rows without a bound hide what is not finite in them.
+        point = Point(-solve_cholesky(cholesky(program.Q), program.q), (), ())
+    result = RESULTS.where(is_definite(Q, cholesky(Q)), result, RESULTS.indefinite)  # pyright: ignore[reportArgumentType]
+    # Comparisons with NaN are false, and zeroed rows without a bound hide nonfinite entries, so finiteness is checked
+    # separately.
     finite = finite & (jnp.isfinite(point.x).all() | (result != RESULTS.successful))
     result = RESULTS.where(finite, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
 
@@ -234,6 +240,7 @@ def _solved(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: flo
         gradient = _product(Q, x) + q
         for block, multiplier in zip(blocks, z, strict=True):
             gradient = gradient + jnp.einsum("kdn,kd->n", block, multiplier)
+        # The multipliers of least norm, of all that satisfy stationarity with dependent rows.
         y = -_product(inverse.T, gradient) * equality_scale * size
     z = [x * r[:, None] * size for x, r in zip(z, row_scales, strict=True)]
     s = [x / r[:, None] * size for x, r in zip(s, row_scales, strict=True)]

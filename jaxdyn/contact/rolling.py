@@ -1,4 +1,4 @@
-"""Two surfaces that touch and roll: the rows of a contact at a place that the configuration holds (see `rolling_model`)."""
+"""Rolling contact of two surfaces: constraint rows at the contact point stored in the configuration (see `rolling_model`)."""
 
 import dataclasses
 from typing import Any
@@ -17,7 +17,7 @@ from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
 
 
 class RollingContact(Touching):
-    """Two surfaces that touch and roll; made by `jd.rolling_contact`. Body A carries `shape_a`, body B `shape_b`."""
+    """Rolling contact of two surfaces, built by `jd.rolling_contact`. Body A carries `shape_a`, body B `shape_b`."""
 
     name: str = eqx.field(static=True)
     body: str | None = eqx.field(static=True)
@@ -34,71 +34,72 @@ class RollingContact(Touching):
 
     @property
     def place_size(self) -> int:
-        """Number of numbers that its places take in q."""
+        """Number of dependent coordinates of the contact in q."""
         return self.shape_a.place_size + self.shape_b.place_size
 
-    def put(self, place: Float[Array, " n"]) -> "RollingContact":
-        """The contact at a place, the numbers for A before those for B."""
+    def with_place(self, place: Float[Array, " n"]) -> "RollingContact":
+        """Contact at given places, the coordinates for A before those for B."""
         size = self.shape_a.place_size
         return dataclasses.replace(self, places=(place[:size], place[size:]), about=None)
 
     def structure_key(self) -> tuple:
-        """Which rows there are, and on what kinds of surfaces."""
+        """Key of the rows and the kinds of surfaces."""
         return self.contact, self.spin, self.count, jax.tree.structure((self.shape_a, self.shape_b))
 
     def touching(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> TouchingPoint:
-        """The points next to each other, by one step of Newton's method from the places."""
+        """Closest points, by one step of Newton's method from the stored places."""
         a, b = self.patches()
         steps = newton_steps(a, b, R, p)
         point = _product(R, b.at(steps.on_b)) + p
-        # For surfaces that touch, the gap along the normal of the place has the first and second derivatives of the gap.
+        # For touching surfaces, the gap along the normal of the place has the first and second derivatives of the true gap.
         gap = jnp.sum(a.normal * (point - a.at(steps.on_a)))
         normal = a.normal_at(steps.on_a)
         return TouchingPoint(point, normal, gap, tangents(normal)[: self.count])
 
     def patches(self) -> tuple[Patch, Patch]:
-        """Both surfaces about their places."""
+        """Second-order patches of both surfaces about their places."""
         if self.about is not None:
             return self.about
-        place_a, place_b = self.placed()
+        place_a, place_b = self.current_places()
         return patch_at(self.shape_a, place_a), patch_at(self.shape_b, place_b)
 
-    def prepared(self) -> "RollingContact":
-        """The same with the surfaces about their places computed."""
+    def with_patches(self) -> "RollingContact":
+        """Contact with its patches computed and stored."""
         return dataclasses.replace(self, about=self.patches())
 
     def steps(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Steps:
-        """Steps on both surfaces toward the points next to each other."""
+        """Newton steps on both surfaces towards the closest points."""
         return newton_steps(*self.patches(), R, p)
 
-    def followed(self, R: Float[Array, "3 3"], p: Float[Array, "3"], count: int) -> Float[Array, " n"]:
-        """The place after some steps of Newton's method."""
+    def track(self, R: Float[Array, "3 3"], p: Float[Array, "3"], count: int) -> Float[Array, " n"]:
+        """Places after `count` steps of Newton's method."""
         contact = self
         for _ in range(count):
             steps = contact.steps(R, p)
-            contact = contact.put(contact.stepped(steps.on_a, steps.on_b))
-        return jnp.concatenate(contact.placed())
+            contact = contact.with_place(contact.step_place(steps.on_a, steps.on_b))
+        return jnp.concatenate(contact.current_places())
 
-    def stepped(self, on_a: Float[Array, "2"], on_b: Float[Array, "2"]) -> Float[Array, " n"]:
-        """The place at steps on both surfaces."""
-        place_a, place_b = self.placed()
-        return jnp.concatenate([self.shape_a.moved(place_a, on_a), self.shape_b.moved(place_b, on_b)])
+    def step_place(self, on_a: Float[Array, "2"], on_b: Float[Array, "2"]) -> Float[Array, " n"]:
+        """Places displaced by steps on both surfaces."""
+        place_a, place_b = self.current_places()
+        return jnp.concatenate([self.shape_a.displace(place_a, on_a), self.shape_b.displace(place_b, on_b)])
 
     def place_rate(self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]) -> Float[Array, " n"]:
-        """Rate of the place for a twist U of B against A."""
+        """Rate of the places for a twist U of B relative to A."""
         patches = self.patches()
 
         def along(twist):
             steps = newton_steps(*patches, *displaced(R, p, twist))
             return steps.on_a, steps.on_b
 
+        # The rate of a converged Newton step is that of the implicit function theorem: Montana's forward equations.
         on, rate = jax.jvp(along, (jnp.zeros_like(U),), (U,))
-        return jax.jvp(self.stepped, on, rate)[1]
+        return jax.jvp(self.step_place, on, rate)[1]
 
     def coordinates(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Float[Array, "5"]:
-        """Contact coordinates (u_a, v_a, u_b, v_b, psi) of the place in the charts of the surfaces."""
+        """Contact coordinates (u_a, v_a, u_b, v_b, psi) of the places in the charts of the surfaces."""
         from_charts = []
-        for shape, place in zip((self.shape_a, self.shape_b), self.placed(), strict=True):
+        for shape, place in zip((self.shape_a, self.shape_b), self.current_places(), strict=True):
             alpha = shape.coordinates_at(place)
             along = jax.jacfwd(shape.point)(alpha)[:, 0]
             from_charts.append((alpha, along / jnp.sqrt(jnp.sum(along * along))))
@@ -109,18 +110,18 @@ class RollingContact(Touching):
         psi = jnp.arctan2(-jnp.sum(seen * y_a), jnp.sum(seen * x_a))
         return jnp.concatenate([alpha_a, alpha_b, psi[None]])
 
-    def placed(self) -> tuple[Array, Array]:
-        """Places on A and on B. **Raises:** ValueError for a contact that has not been put at one."""
+    def current_places(self) -> tuple[Array, Array]:
+        """Places on A and on B. **Raises:** ValueError for a contact without places."""
         if self.places is None:
             raise ValueError(
-                f"rolling contact {self.name!r} is not part of a system that knows its places; give it to "
-                "jd.RollingModel(model, [contact]) and take the constraints of that"
+                f"rolling contact {self.name!r} is not part of a system with its places; pass it to "
+                "jd.RollingModel(model, [contact]) and use the constraints of that"
             )
         return self.places
 
 
 class Rolling(Pair):
-    """The rows of one contact of a `RollingModel`; see `RollingModel.rows`."""
+    """Constraint rows of one contact of a `RollingModel`; see `RollingModel.rows`."""
 
     name: str = eqx.field(static=True)
     index: int = eqx.field(static=True)
@@ -131,27 +132,27 @@ class Rolling(Pair):
     count: int = eqx.field(static=True)
 
     def at(self, system: Any, q: Float[Array, " nq"]) -> "RollingContact":
-        """The contact at its place in q."""
+        """Contact at its places in q."""
         contact = self._of(system)
-        return contact.put(q[system.place_slices[self.index]]).prepared()
+        return contact.with_place(q[system.place_slices[self.index]]).with_patches()
 
     def declared(self, system):
-        """The contact of the system."""
+        """Contact of the system."""
         return self._of(system)
 
     def sizes(self, system, dtype):
-        """As of the contact."""
+        """Numbers of rows of the contact."""
         return self._of(system).sizes(system, dtype)
 
     def wrench_components(self):
-        """As of the contact: normal force, those that do not slip, and the torque that does not spin."""
+        """Order of the contact's multipliers: friction forces, normal force, torque of spin."""
         return Touching.wrench_components(self)  # pyright: ignore[reportArgumentType]
 
     def _of(self, system) -> RollingContact:
         contacts = getattr(system, "contacts", ())
         if not self.index < len(contacts) or contacts[self.index].name != self.name:
             raise ValueError(
-                f"rolling contact {self.name!r} is none of the system; take the rows of the RollingModel that is simulated"
+                f"rolling contact {self.name!r} is not in the system; use the rows of the simulated RollingModel"
             )
         return contacts[self.index]
 
@@ -169,22 +170,22 @@ def rolling_contact(
     contact: bool = True,
     name: str | None = None,
 ) -> RollingContact:
-    """Two smooth surfaces that touch in one point and roll on each other, for a `RollingModel`.
+    """Rolling contact of two smooth surfaces that touch in one point, for a `RollingModel`.
 
-    Rows: the gap (a positive multiplier presses B off A), the two slips, and with `spin` the turning about the normal.
+    Rows: the gap (a positive multiplier presses B off A), the two slips, and with `spin` the rotation about the normal.
 
     **Arguments:**
 
     - `body_a`, `body_b`: bodies or frames that carry the surfaces; None for the world.
     - `surface_a`, `surface_b`: `jd.contact.Sphere`, `Plane`, `Cylinder`, `Ellipsoid`, or `Parametrised` for any other smooth
-      surface, whose chart should hold wherever the contact goes; outward normals as the surfaces say. One may be concave, as
+      surface, whose chart must cover all contact points; outward normals as defined by the surfaces. One may be concave, as
       long as the relative curvature is positive.
     - `pose_a`, `pose_b`: of the surface's frame in its body: None, (4, 4), (3,) or (xyz, rpy).
     - `spin`: whether the contact resists spinning about the normal too, as a soft finger. `slip`: whether it slides without
       friction. `contact`: whether the gap is a row.
     - `name`: for errors and reports.
 
-    **Raises:** ValueError for what is no surface, a bad pose, or no rows at all; when used, for unknown bodies.
+    **Raises:** ValueError for an invalid surface, a bad pose, or no rows at all; when used, for unknown bodies.
 
     Source: Montana (1988); Murray, Li & Sastry (1994), section 5.6; EQUATIONS section 8.
     """

@@ -1,9 +1,9 @@
-"""Surfaces that roll on each other: where they touch is part of the configuration, and the rows are those of a contact.
+"""Models with rolling contacts: contact points are dependent coordinates of the configuration.
 
-A `RollingModel` is a `Model` whose q goes on behind the joints' coordinates with the places of its contacts on both surfaces.
-They have no inertia and no velocities of their own: where the surfaces are next to each other is a function of the joints'
-coordinates, and the places say which of its values. Their rates are those of Montana's equations, for any velocity; steps and
-projections take them along by Newton's method. So v, M, h and tau are those of the model.
+A `RollingModel` is a `Model` whose q appends the places of its contacts on both surfaces to the joints' coordinates.
+They have no inertia and no velocities: the closest points are a function of the joints'
+coordinates, and the places select its branch. Their rates follow from Montana's equations, for any velocity; steps and
+projections update them by Newton's method. So v, M, h and tau are those of the model.
 
 Source: Montana (1988); Murray, Li & Sastry (1994), section 5.6; EQUATIONS section 8.
 """
@@ -25,25 +25,25 @@ from jaxdyn.constraints.frames import each, relative_motions, relative_poses
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.contact.rolling import Rolling, RollingContact
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_shapes
+from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_shapes, warn
 from jaxdyn.model.tree import Model
 
-# Newton steps where the joints have moved by a step of an integration.
+# Newton steps after a step of the integration; the second one makes the first derivatives exact.
 _STEPS_MOVED = 2
-# Of the search for a place, from a start found in so many turns between the surfaces.
+# Newton steps of the initial search, and alternating projections between the surfaces for its start.
 _STEPS_SEARCHED, _TURNS = 30, 8
 
 
 class RollingModel(Model):
-    """A `Model` with surfaces that roll on each other. q = (joints' coordinates, places of the contacts), v as of the model.
+    """Model with rolling contacts: q = (joints' coordinates, places of the contacts), v of the model.
 
     **Arguments:** `model`: a `Model`; `contacts`: a list of `jd.rolling_contact(...)`.
 
-    The places are numbers without a chart that ends: a unit vector (3) on a sphere or an ellipsoid, (u, v) on a plane, a
-    cylinder and a `Parametrised` surface. `place` finds them, `contact_coordinates` gives them in the surfaces' charts. Functions
-    of a `Model` take it as it is; `jd.neutral` and `jd.random_configuration` give the joints' coordinates alone.
+    Places are coordinates without chart singularities: a unit vector (3) on a sphere or an ellipsoid, (u, v) on a plane, a
+    cylinder and a `Parametrised` surface. `place` computes them, `contact_coordinates` converts them to the surfaces'
+    charts. Functions of a `Model` accept it; `jd.neutral` and `jd.random_configuration` give only the joints' coordinates.
 
-    **Raises:** ValueError for what is no model or no list of rolling contacts, equal names and unknown bodies.
+    **Raises:** ValueError for an invalid model or list of rolling contacts, equal names and unknown bodies.
 
     ```python
     tip, ball = jd.contact.Sphere(0.02), jd.contact.Ellipsoid([0.1, 0.1, 0.12])
@@ -56,7 +56,7 @@ class RollingModel(Model):
     contacts: tuple[RollingContact, ...] = ()
 
     def __init__(self, model: Checked[Model | None] = None, contacts: Sequence = (), **fields: Any):
-        if fields:  # of `dataclasses.replace`, with fields that have been looked at
+        if fields:  # from `dataclasses.replace`, with checked fields
             for name, value in fields.items():
                 setattr(self, name, value)
             self.contacts = tuple(contacts)
@@ -75,7 +75,7 @@ class RollingModel(Model):
         self.contacts = tuple(contacts)
 
     def replace(self, **leaves: PyTree) -> "RollingModel":
-        """A copy with some leaves of the model replaced; the contacts stay."""
+        """Copy with some leaves of the model replaced, and the same contacts."""
         model = Model(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Model)})
         return RollingModel(model.replace(**leaves), self.contacts)
 
@@ -86,33 +86,38 @@ class RollingModel(Model):
 
     @property
     def place_slices(self) -> tuple[slice, ...]:
-        """Where the place of each contact stands in q."""
+        """Slice of the places of each contact in q."""
         ends = np.cumsum([self.topology.nq] + [contact.place_size for contact in self.contacts]).tolist()
         return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
 
     @property
     def rows(self) -> tuple[Rolling, ...]:
-        """The constraints of its contacts, for a `Scene` or a `Grasp` with this model."""
+        """Constraints of the contacts, for a `Scene` or a `Grasp` with this model."""
         fields = "name", "body", "surface_body", "contact", "spin", "count"
         return tuple(
             Rolling(index=i, **{field: getattr(one, field) for field in fields}) for i, one in enumerate(self.contacts)
         )
 
+    def contacts_at(self, q: Float[Array, " nq"]) -> tuple[RollingContact, ...]:
+        """Contacts at their places in q."""
+        return tuple(one.with_place(q[at]) for one, at in zip(self.contacts, self.place_slices, strict=True))
+
     def placed(self, q: Float[Array, " nq"]) -> tuple[RollingContact, ...]:
-        """The contacts at their places in q."""
-        return tuple(one.put(q[at]) for one, at in zip(self.contacts, self.place_slices, strict=True))
+        """Deprecated name of `contacts_at`."""
+        warn("RollingModel.placed is deprecated; call contacts_at", DeprecationWarning)
+        return self.contacts_at(q)
 
     def place(self, joints: Numbers, near: Numbers | None = None) -> Float[Array, " nq"]:
-        """q (nq,) for the coordinates of the joints: with the places where the surfaces are next to each other.
+        """Configuration q (nq,) for the joints' coordinates, with the closest points of the surfaces as places.
 
         **Arguments:**
 
         - `joints` (model nq,): as of the model. The surfaces need not touch: `jd.assemble` closes the gaps.
-        - `near`: coordinates to begin the search from, a row (u_a, v_a, u_b, v_b) for each contact, in the charts of its
-          surfaces (a fifth number, psi, is not read). By default from the directions of the bodies' frames to each other,
-          which a `Parametrised` surface does not know: there it is needed.
+        - `near`: initial contact coordinates of the search, a row (u_a, v_a, u_b, v_b) for each contact, in the charts of its
+          surfaces (a fifth number, psi, is not read). By default from the relative positions of the bodies' frames,
+          which does not work for a `Parametrised` surface: there it is required.
 
-        **Raises:** ValueError for wrong shapes, and, on concrete numbers, where no such place is found, and for surfaces that do
+        **Raises:** ValueError for wrong shapes, and, on concrete numbers, where the search fails, and for surfaces that do
         not touch in one point from outside there (a bowl too deep, two planes).
         """
         joints = as_array(joints, "joints", self.home.dtype)
@@ -127,72 +132,72 @@ class RollingModel(Model):
                 raise ValueError(
                     f"near has shape {near.shape}, expected {(count, 4)}, (u_a, v_a, u_b, v_b) of each contact"
                 )
-        q = _searched(self, joints, near)
+        q = _search_places(self, joints, near)
         _check_places(self, q, "joints", "give near=, coordinates next to the contact")
         return q
 
     def contact_coordinates(self, q: Float[Array, " nq"]) -> Float[Array, "n 5"]:
-        """eta = (u_a, v_a, u_b, v_b, psi) of each contact, in the charts of its surfaces: what `jd.contact.montana` takes.
+        """Contact coordinates eta = (u_a, v_a, u_b, v_b, psi) of each contact, as for `jd.contact.montana`.
 
         psi is the angle (rad) between the Gauss frames of these charts: R_AB = [cos psi, -sin psi; -sin psi, -cos psi] in the
         tangent plane.
         """
         (q,) = check_shapes(self, q=q)
-        contacts = self.placed(q)
+        contacts = self.contacts_at(q)
         return jnp.stack(each(contacts, RollingContact.coordinates, *relative_poses(contacts, self, q)))
 
     def check_start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> None:
-        """Refuse places at which a motion cannot start.
+        """Refuse invalid initial places.
 
         **Raises:** ValueError, on concrete numbers, that names the contact, as `place` does.
         """
-        _check_places(self, q, "q0", "take system.place(q0[: system.topology.nq])")
+        _check_places(self, q, "q0", "use system.place(q0[: system.topology.nq])")
 
-    def follows(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
-        """Whether all surfaces are next to each other at their places, in one point each."""
-        strict, left = _closeness(self, q)
-        return jnp.all(strict & (left <= float(jnp.finfo(q.dtype).eps) ** 0.4))
+    def is_consistent(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
+        """Decide whether all places are closest points, with one point of contact each."""
+        strict, residuals = _closeness(self, q)
+        return jnp.all(strict & (residuals <= float(jnp.finfo(q.dtype).eps) ** 0.4))
 
-    def followed(self, q: Float[Array, " nq"], joints: Float[Array, "..."]) -> Float[Array, "..."]:
-        """q with the places where the surfaces are next to each other for other coordinates of the joints."""
+    def complete_configuration(self, q: Float[Array, " nq"], joints: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Configuration with the places updated for other coordinates of the joints."""
         if not self.contacts:
             return joints
-        return run(_followed, self, q, joints, otherwise=_followed)
+        return run(_complete_configuration, self, q, joints, otherwise=_complete_configuration)
 
-    def followed_rate(
+    def complete_rate(
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], rate: Float[Array, "..."]
     ) -> Float[Array, "..."]:
-        """dq/dt, with the rates of the places."""
+        """Rate dq/dt, including the places."""
         if not self.contacts:
             return rate
         return jnp.concatenate([rate, run(_place_rates, self, q, v, otherwise=_place_rates)])
 
 
-def _followed(system: RollingModel, q, joints):
-    contacts = system.placed(q)
+def _complete_configuration(system: RollingModel, q, joints):
+    contacts = system.contacts_at(q)
     poses = relative_poses(contacts, system, joints)
-    return jnp.concatenate([joints, *each(contacts, lambda one, R, p: one.followed(R, p, _STEPS_MOVED), *poses)])
+    return jnp.concatenate([joints, *each(contacts, lambda one, R, p: one.track(R, p, _STEPS_MOVED), *poses)])
 
 
 def _place_rates(system: RollingModel, q, v):
-    contacts = system.placed(q)
+    contacts = system.contacts_at(q)
     return jnp.concatenate(each(contacts, RollingContact.place_rate, *relative_motions(contacts, system, q, v)))
 
 
 @eqx.filter_jit
 def _closeness(system: RollingModel, q):
-    """Of each contact, whether it is in one point, and how far its place is off (m, rad)."""
-    contacts = system.placed(q)
+    """For each contact, the flag of a single contact point, and the residual of its places (m, rad)."""
+    contacts = system.contacts_at(q)
     steps = each(contacts, RollingContact.steps, *relative_poses(contacts, system, q))
-    return jnp.stack([step.is_strict for step in steps]), jnp.stack([step.left for step in steps])
+    return jnp.stack([step.is_strict for step in steps]), jnp.stack([step.residual for step in steps])
 
 
 def _check_places(system: RollingModel, q, what: str, fix: str) -> None:
     if not is_known(system, q):
         return
     with jax.ensure_compile_time_eval():
-        strict, left = map(np.asarray, _closeness(system, jnp.asarray(q)))
-    for contact, is_strict, off in zip(system.contacts, strict, left, strict=True):
+        strict, residuals = map(np.asarray, _closeness(system, jnp.asarray(q)))
+    for contact, is_strict, off in zip(system.contacts, strict, residuals, strict=True):
         if not is_strict:
             raise ValueError(
                 f"{what}: the surfaces of contact {contact.name!r} do not touch in one point from outside (their relative "
@@ -200,32 +205,32 @@ def _check_places(system: RollingModel, q, what: str, fix: str) -> None:
             )
         if not off <= float(np.finfo(q.dtype).eps) ** 0.4:
             raise ValueError(
-                f"{what}: the place of contact {contact.name!r} is {off:.3g} (m or rad) from where its surfaces are next to "
-                f"each other; {fix}"
+                f"{what}: the place of contact {contact.name!r} is {off:.3g} (m or rad) from the closest points of its surfaces "
+                f"; {fix}"
             )
 
 
 @eqx.filter_jit
-def _searched(system: RollingModel, joints, near):
+def _search_places(system: RollingModel, joints, near):
     rotations, positions = relative_poses(system.contacts, system, joints)
     coordinates = []
     for i, contact in enumerate(system.contacts):
         R, p = rotations[i], positions[i]
-        start = _between(contact, R, p) if near is None else _given(contact, near[i])
+        start = _between(contact, R, p) if near is None else _place_of_coordinates(contact, near[i])
 
-        def improved(_, place, contact=contact, R=R, p=p):
-            return contact.put(place).followed(R, p, 1)
+        def improve(_, place, contact=contact, R=R, p=p):
+            return contact.with_place(place).track(R, p, 1)
 
-        coordinates.append(lax.fori_loop(0, _STEPS_SEARCHED, improved, start))
+        coordinates.append(lax.fori_loop(0, _STEPS_SEARCHED, improve, start))
     return jnp.concatenate([joints, *coordinates])
 
 
-def _given(contact: RollingContact, alpha):
+def _place_of_coordinates(contact: RollingContact, alpha):
     return jnp.concatenate([contact.shape_a.place_of(alpha[:2]), contact.shape_b.place_of(alpha[2:4])])
 
 
 def _between(contact: RollingContact, R, p):
-    """Places on the two surfaces toward each other, found in turns."""
+    """Initial places by alternating projections between the two surfaces."""
     a, b = contact.shape_a, contact.shape_b
     point = p
     for _ in range(_TURNS):
@@ -239,5 +244,5 @@ def _between(contact: RollingContact, R, p):
     else:
         return jnp.concatenate([place_a, place_b])
     raise ValueError(
-        f"contact {contact.name!r} has a surface given by its parametrisation alone; give near=, coordinates next to the contact"
+        f"contact {contact.name!r} has a surface given only by its parametrisation; give near=, coordinates close to the contact"
     )

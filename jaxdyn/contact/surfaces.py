@@ -1,4 +1,4 @@
-"""Smooth surfaces by their parametrisation, with metric, curvature and torsion at a point.
+"""Smooth surfaces by parametrisation, with metric, curvature and torsion at a point.
 
 A surface is f(u, v) (3,), in the axes of the body that carries it. With alpha = (u, v) and the Gauss frame
 x = f_u / |f_u|, z the outward normal, y = z x x,
@@ -8,7 +8,7 @@ x = f_u / |f_u|, z the outward normal, y = z x x,
     torsion     T = y^T x_alpha M^-1.
 
 For an orthogonal chart (f_u . f_v = 0) M is diagonal and these are Montana's; for any other, M is upper triangular and the
-equations of contact hold as they are, because M enters by M alphadot alone.
+equations of contact hold unchanged, because M enters only by M alphadot.
 
 Source: Montana, Int. J. Robotics Research 7 (1988), 17-32; Murray, Li & Sastry (1994), section 5.6.1.
 """
@@ -25,77 +25,82 @@ from jaxdyn.compile import compiled, is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.lie.so3 import _product, cross
-from jaxdyn.model.arguments import Checked, Function, Numbers
+from jaxdyn.model.arguments import Checked, Function, Numbers, warn
 from jaxdyn.systems.scene import as_pytree
 
 
 class Surface(eqx.Module):
-    """Base of all surfaces: `point` is the parametrisation, chosen so that f_u x f_v points out of the body."""
+    """Base class of surfaces; `point` is the parametrisation, with f_u x f_v pointing out of the body."""
 
     def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
-        """f(u, v) (3,), m, in the body's axes."""
+        """Point f(u, v) (3,), m, in the body's axes."""
         raise NotImplementedError
 
     def chart_margin(self, alpha: Float[Array, "2"]) -> Float[Array, ""]:
-        """How far alpha is from where the chart ends, in its own units; infinite for a chart without end."""
+        """Distance of alpha from the end of the chart, in its own units; infinite for a chart without end."""
         return jnp.full((), jnp.inf, alpha.dtype)
 
-    # Where a contact is on the surface, while it rolls: numbers without a place at which they end. For a surface whose chart
-    # covers all of it these are (u, v). On ellipsoids they are a unit vector, about which a chart is made anew everywhere.
+    # Places: coordinates of a rolling contact without singularities. For a surface whose chart
+    # covers all of it these are (u, v). On ellipsoids they are a unit vector, with a new chart about each point.
 
     @property
     def place_size(self) -> int:
-        """Number of numbers that say where on the surface."""
+        """Number of coordinates of a place."""
         return 2
 
     def place_of(self, alpha: Float[Array, "2"]) -> Float[Array, " n"]:
-        """The numbers of the point with coordinates alpha."""
+        """Place of the point with coordinates alpha."""
         return alpha
 
     def coordinates_at(self, place: Float[Array, " n"]) -> Float[Array, "2"]:
-        """alpha (2,) of a place."""
+        """Chart coordinates alpha (2,) of a place."""
         return place
 
-    def moved(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
-        """The place at `step` in a chart about `place`, oriented as f is."""
+    def displace(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
+        """Place at `step` in a chart about `place`, with the orientation of f."""
         return place + step
+
+    def moved(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
+        """Deprecated name of `displace`."""
+        warn("Surface.moved is deprecated; call displace", DeprecationWarning)
+        return self.displace(place, step)
 
     def point_at(self, place: Float[Array, " n"]) -> Float[Array, "3"]:
         """Point of the surface, m, in the body's axes."""
         return self.point(place)
 
     def toward(self, point: Float[Array, "3"]) -> Float[Array, " n"] | None:
-        """A place about where the surface is next to a point of the body, m; None where that is not known."""
+        """Place close to a point of the body, m; None where that is not known."""
         return None
 
 
 class Plane(Surface):
-    """The plane z = 0 of the body, f = (u, v, 0); outward is +z."""
+    """Plane z = 0 of the body, f = (u, v, 0); outward is +z."""
 
     def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
-        """(u, v, 0), m."""
+        """Point (u, v, 0), m."""
         return jnp.concatenate([alpha, jnp.zeros_like(alpha[:1])])
 
     def toward(self, point: Float[Array, "3"]) -> Float[Array, " n"]:
-        """The place below the point."""
+        """Place below the point."""
         return point[:2]
 
 
-# Rows of the rotation that turns the axes of a chart into those of the body: its poles are then on z, x, or y.
+# Permutations from the axes of the chart to those of the body, with the poles on z, x, or y.
 _POLES = {"z": (0, 1, 2), "x": (1, 2, 0), "y": (2, 0, 1)}
 
 
-def _checked_poles(poles: str) -> str:
+def _check_poles(poles: str) -> str:
     if poles not in _POLES:
         raise ValueError(f"poles is {poles!r}; choose from {', '.join(_POLES)}, the axis on which the chart ends")
     return poles
 
 
 class Ellipsoid(Surface):
-    """An ellipsoid about the body's origin, f = (a cos u cos v, -b cos u sin v, c sin u), |u| < pi / 2.
+    """Ellipsoid about the body's origin, f = (a cos u cos v, -b cos u sin v, c sin u), |u| < pi / 2.
 
     **Arguments:** `semi_axes` (a, b, c): along the body's x, y, z, m. `poles`: "z", "x" or "y", the axis on which the chart
-    ends; for another one than z, the axes of the formula are permuted in a cycle.
+    ends; for another one than z, the axes of the formula are permuted cyclically.
 
     **Raises:** ValueError for semi-axes that are not positive, and an unknown axis.
     """
@@ -107,10 +112,10 @@ class Ellipsoid(Surface):
         self.semi_axes = as_float(semi_axes, "semi_axes", (3,))
         if is_concrete(self.semi_axes) and not bool(jnp.all((self.semi_axes > 0) & jnp.isfinite(self.semi_axes))):
             raise ValueError(f"semi_axes is {np.asarray(self.semi_axes).tolist()}; give three positive lengths (m)")
-        self.poles = _checked_poles(poles)
+        self.poles = _check_poles(poles)
 
     def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
-        """f(u, v), m."""
+        """Point f(u, v), m."""
         return self.point_at(self.place_of(alpha))
 
     def chart_margin(self, alpha: Float[Array, "2"]) -> Float[Array, ""]:
@@ -118,40 +123,40 @@ class Ellipsoid(Surface):
         return jnp.pi / 2 - jnp.abs(alpha[0])
 
     def coordinates(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
-        """alpha (2,) of a point of the surface (of any point: of that on its ray in the stretched space)."""
+        """Chart coordinates alpha (2,) of a point of the surface; other points are projected along rays of the scaled space."""
         x, y, z = jnp.unstack((point / self.semi_axes.astype(point.dtype))[np.array(_POLES[self.poles])])
         return jnp.stack([jnp.arctan2(z, jnp.sqrt(x * x + y * y)), jnp.arctan2(-y, x)])
 
     @property
     def place_size(self) -> int:
-        """3, of a unit vector."""
+        """Size 3 of a unit vector."""
         return 3
 
     def place_of(self, alpha: Float[Array, "2"]) -> Float[Array, " n"]:
-        """The unit vector n (3,) with f = (a, b, c) n."""
+        """Unit vector n (3,) with f = (a, b, c) n."""
         u, v = jnp.unstack(alpha)
         unit = jnp.stack([jnp.cos(u) * jnp.cos(v), -jnp.cos(u) * jnp.sin(v), jnp.sin(u)])
         return unit[np.argsort(_POLES[self.poles])]
 
     def coordinates_at(self, place: Float[Array, " n"]) -> Float[Array, "2"]:
-        """alpha (2,) of a place."""
+        """Chart coordinates alpha (2,) of a place."""
         return self.coordinates(self.point_at(place))
 
-    def moved(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
-        """The unit vector at `step` in the plane that touches the unit sphere there."""
+    def displace(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
+        """Unit vector after `step` in the tangent plane of the unit sphere."""
         return unit_or(place + _product(step, tangents(place)), place)
 
     def point_at(self, place: Float[Array, " n"]) -> Float[Array, "3"]:
-        """(a, b, c) n, m."""
+        """Point (a, b, c) n, m."""
         return self.semi_axes.astype(place.dtype) * place
 
     def toward(self, point: Float[Array, "3"]) -> Float[Array, " n"]:
-        """The unit vector to the point in the stretched space; any one to the centre."""
+        """Unit vector towards the point in the scaled space; (1, 0, 0) for the centre."""
         return unit_or(point / self.semi_axes.astype(point.dtype), jnp.asarray([1.0, 0.0, 0.0], point.dtype))
 
 
 class Sphere(Ellipsoid):
-    """A sphere about the body's origin, f = R (cos u cos v, -cos u sin v, sin u), |u| < pi / 2.
+    """Sphere about the body's origin, f = R (cos u cos v, -cos u sin v, sin u), |u| < pi / 2.
 
     M = diag(R, R cos u), K = 1 / R, T = (0, -tan(u) / R).
 
@@ -163,7 +168,7 @@ class Sphere(Ellipsoid):
     def __init__(self, radius: Numbers, poles: str = "z"):
         radius = as_number(radius, "radius", "m", zero=False)
         self.semi_axes = jnp.stack([radius] * 3)
-        self.poles = _checked_poles(poles)
+        self.poles = _check_poles(poles)
 
     @property
     def radius(self) -> Float[Array, ""]:
@@ -172,7 +177,7 @@ class Sphere(Ellipsoid):
 
 
 class Cylinder(Surface):
-    """A cylinder about the body's z axis, f = (R cos u, R sin u, v). K = diag(1 / R, 0), T = 0.
+    """Cylinder about the body's z axis, f = (R cos u, R sin u, v). K = diag(1 / R, 0), T = 0.
 
     **Arguments:** `radius`: m. **Raises:** ValueError for a radius that is not positive.
     """
@@ -183,20 +188,20 @@ class Cylinder(Surface):
         self.radius = as_number(radius, "radius", "m", zero=False)
 
     def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
-        """(R cos u, R sin u, v), m."""
+        """Point (R cos u, R sin u, v), m."""
         u, v = jnp.unstack(alpha)
         radius = self.radius.astype(alpha.dtype)
         return jnp.stack([radius * jnp.cos(u), radius * jnp.sin(u), v])
 
     def toward(self, point: Float[Array, "3"]) -> Float[Array, " n"]:
-        """The place at the angle and the height of the point."""
+        """Place at the angle and the height of the point."""
         x, y, z = jnp.unstack(point)
         on_axis = (x == 0) & (y == 0)
         return jnp.stack([jnp.arctan2(y, jnp.where(on_axis, jnp.ones_like(x), x)), z])
 
 
 class Parametrised(Surface):
-    """Any smooth surface, by its parametrisation.
+    """Smooth surface given by its parametrisation.
 
     **Arguments:**
 
@@ -219,8 +224,8 @@ class Parametrised(Surface):
         self.flip = bool(flip)
 
     def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
-        """f(alpha), m; with u and v exchanged if f was to be flipped."""
-        # Exchanging the coordinates turns f_u x f_v around.
+        """Point f(alpha), m, with u and v exchanged for `flip`."""
+        # Exchanging the coordinates reverses f_u x f_v.
         value = jnp.asarray(self.f(alpha[::-1] if self.flip else alpha), alpha.dtype)
         if value.shape != (3,):
             raise ValueError(f"surface: f returned shape {value.shape}, expected (3,), a point")
@@ -228,11 +233,11 @@ class Parametrised(Surface):
 
 
 class SurfaceGeometry(eqx.Module):
-    """A surface at one point of its chart.
+    """Differential geometry of a surface at one point of its chart.
 
     - `point` (3,), m; `frame` (3, 3): columns x, y and the outward normal z.
     - `metric` M (2, 2), m per unit of the chart; `curvature` K (2, 2), 1/m; `torsion` T (2,), 1/m.
-    - `regular` (): whether f_u and f_v are independent here; where not, the chart ends.
+    - `regular` (): true where f_u and f_v are independent; elsewhere the chart ends.
     """
 
     point: Float[Array, "3"]
@@ -256,7 +261,7 @@ def surface_geometry(surface: Checked[Surface], alpha: Numbers) -> SurfaceGeomet
 
     **Returns:** `SurfaceGeometry`; where the chart ends, numbers are finite without meaning and `regular` is False.
 
-    **Raises:** ValueError for a surface that is none, alpha of another shape, and a known alpha where the chart ends.
+    **Raises:** ValueError for an invalid surface, alpha of another shape, and a known alpha where the chart ends.
 
     Source: Murray, Li & Sastry (1994), eqs 5.23-5.26; EQUATIONS section 8.
     """
@@ -267,31 +272,31 @@ def surface_geometry(surface: Checked[Surface], alpha: Numbers) -> SurfaceGeomet
 
 
 def check_surface(surface) -> None:
-    """**Raises:** ValueError for what is no surface."""
+    """Check the type of a surface. **Raises:** ValueError for another type."""
     if not isinstance(surface, Surface):
         raise ValueError(
-            f"surface is a {type(surface).__name__}; take Plane, Sphere, Cylinder, Ellipsoid or Parametrised"
+            f"surface is a {type(surface).__name__}; use Plane, Sphere, Cylinder, Ellipsoid or Parametrised"
         )
 
 
 def check_regular(surface: Surface, alpha, geometry: SurfaceGeometry) -> None:
-    """**Raises:** ValueError for known numbers where the chart ends."""
+    """Refuse concrete points where the chart ends. **Raises:** ValueError."""
     if is_concrete(geometry.regular) and not bool(geometry.regular):
         raise ValueError(
-            f"alpha is {np.asarray(alpha).tolist()}, where the chart of the {type(surface).__name__} ends and has no frame; "
+            f"alpha is {np.asarray(alpha).tolist()}, where the chart of the {type(surface).__name__} is singular; "
             "choose another chart of the same surface (poles=) there"
         )
 
 
 def geometry_at(surface: Surface, alpha: Float[Array, "2"]) -> SurfaceGeometry:
-    """`surface_geometry` without its checks."""
+    """Compute `surface_geometry` without its checks."""
     tangents = jax.jacfwd(surface.point)(alpha)
     # rates (3, 3, 2): of the columns of the frame along u and v.
     frame, fine = _frame_of(surface, alpha)
     rates = jax.jacfwd(lambda a: _frame_of(surface, a)[0])(alpha)
     y = frame[:, 1]
     metric = _product(frame[:, :2].T, tangents)
-    # M is upper triangular: its inverse in closed form, of numbers that are not zero.
+    # M is upper triangular: its inverse in closed form, with safe denominators.
     a, b, d = metric[0, 0], metric[0, 1], metric[1, 1]
     a, d = (jnp.where(fine, value, jnp.ones_like(value)) for value in (a, d))
     inverse = jnp.stack([jnp.stack([1 / a, -b / (a * d)]), jnp.stack([jnp.zeros_like(a), 1 / d])])
@@ -304,10 +309,11 @@ _geometry = compiled(geometry_at)
 
 
 def _frame_of(surface, alpha):
-    """Columns x, y, z of the Gauss frame, and whether there is one."""
+    """Columns x, y, z of the Gauss frame, and the flag of a regular chart."""
     fu, fv = jax.jacfwd(surface.point)(alpha).T
     normal = cross(fu, fv)
     uu, nn, vv = jnp.sum(fu * fu), jnp.sum(normal * normal), jnp.sum(fv * fv)
+    # Relative to the fourth power of the tangents' length, the size of |f_u x f_v|^2 for a square parametrisation.
     fine = nn > 1e3 * float(jnp.finfo(alpha.dtype).eps) ** 2 * jnp.maximum(uu, vv) ** 2
     x = fu / jnp.sqrt(jnp.where(fine, uu, jnp.ones_like(uu)))
     z = normal / jnp.sqrt(jnp.where(fine, nn, jnp.ones_like(nn)))

@@ -1,8 +1,8 @@
-"""Forces that stick, slip and let go: dry friction, and contacts that hold on one side.
+"""Forces with modes: dry friction that sticks and slips, and unilateral contacts.
 
-They are listed among the forces of a scene. `jd.simulate` follows the modes of each of them from event to event
-(`jaxdyn.simulation.hybrid`); as functions of a state alone they have no value, because at rest the force depends on what it
-has to hold.
+They are listed among the forces of a scene. `jd.simulate` tracks the modes of each of them from event to event
+(`jaxdyn.simulation.hybrid`); they are no functions of the state, because at rest the force depends on the applied
+load.
 """
 
 from typing import Any
@@ -20,39 +20,39 @@ from jaxdyn.systems.scene import Scene, as_pytree
 
 
 class WithModes(eqx.Module):
-    """A force that has modes: sticking or slipping, closed or open."""
+    """Base class of forces with modes: sticking or slipping, closed or open."""
 
     name: eqx.AbstractVar[str]
 
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
-        """There is no force without a mode. **Raises:** ValueError."""
+        """Refuse evaluation without a mode. **Raises:** ValueError."""
         raise ValueError(
-            f"{type(self).__name__} {self.name!r} has modes, which jd.simulate follows; for a force that is a function of the "
-            "state take jd.CoulombFriction, and for contacts that are held on both sides constraints (jd.rolling_sphere)"
+            f"{type(self).__name__} {self.name!r} has modes, which jd.simulate tracks; for a force that is a function of the "
+            "state use jd.CoulombFriction, and for bilateral contacts constraints (jd.rolling_sphere)"
         )
 
 
 class DryFriction(WithModes):
-    """Coulomb friction that sticks and slips: |f| <= mu_s N at rest, f = -mu N w/|w| while it slides with w.
+    """Coulomb friction that sticks and slips: |f| <= mu_s N at rest, f = -mu N w/|w| while it slides with velocity w.
 
-    N is a number, a function, or the size of the multiplier of one of the scene's constraints, of which the friction is then a
-    part: both are found from the same equations.
+    N is a number, a function, or the magnitude of a multiplier of the scene's constraints, whose friction
+    is then solved simultaneously.
 
     **Arguments:**
 
     - `coefficient`: mu of sliding. `static`: mu_s of rest; None for the same.
-    - `normal`: N, in N: a number, a function normal(system, q, v, t) -> (), which holds nothing where it is negative, or the
+    - `normal`: N, in N: a number, a function normal(system, q, v, t) -> (), without friction where it is negative, or the
       name of a constraint with one row, or of a contact (its normal force).
-    - `along`: what slides: the index of a velocity, a function A(q, t) -> (nv,) or (2, nv) with w = A v, or a constraint with
-      one or two rows on the velocity, as `jd.Pfaffian(A, b)` for a belt that moves.
-    - `smoothing`: v_s, m/s: instead of modes, f = -mu N tanh(|w|/v_s) w/|w|. It never sticks, it creeps, at the velocity
+    - `along`: sliding velocity: the index of a velocity, a function A(q, t) -> (nv,) or (2, nv) with w = A v, or a
+      constraint with one or two rows on the velocity, as `jd.Pfaffian(A, b)` for a belt that moves.
+    - `smoothing`: v_s, m/s: instead of modes, f = -mu N tanh(|w|/v_s) w/|w|. It never sticks but creeps at the velocity
       v_s artanh(load/(mu N)) under a load below mu N; while it slides the force is within 1 % above 2.65 v_s.
-    - `name`: of its events.
+    - `name`: name of its events.
 
-    **Raises:** ValueError for coefficients and normal forces that are negative, a static one below the other, an index that is
-    none, a constraint that holds positions, and smoothing that is not positive.
+    **Raises:** ValueError for coefficients and normal forces that are negative, a static one below the other, an invalid
+    index, a constraint on positions, and smoothing that is not positive.
 
     Source: EQUATIONS section 11 and erratum E42.
 
@@ -79,7 +79,7 @@ class DryFriction(WithModes):
         smoothing: Numbers | None = None,
         name: str = "friction",
     ):
-        self.name = _checked_name(name, "DryFriction")
+        self.name = _check_name(name, "DryFriction")
         self.coefficient, self.static = _coefficients(coefficient, static, f"DryFriction {name!r}")
         self.constraint = normal if isinstance(normal, str) else None
         if isinstance(normal, str):
@@ -106,24 +106,24 @@ class DryFriction(WithModes):
 
 
 class UnilateralContact(WithModes):
-    """A contact that pushes and does not pull, with Coulomb friction: open, or closed and sticking or slipping.
+    """Unilateral contact with Coulomb friction: open, or closed and sticking or slipping.
 
-    It closes by an impact: without rebound p is the least impulse, in the metric of the mass matrix, that keeps the bodies
-    from each other, and it lies in the friction cone. With a coefficient e of restitution the velocity of the gap after
-    the impact is at least -e times the one before (Newton's hypothesis, for each contact); friction takes no rebound. It
-    opens where its normal force would have to pull.
+    It closes by an impact: without restitution p is the least impulse, in the metric of the mass matrix, that prevents
+    penetration, and it lies in the friction cone. With a coefficient e of restitution the velocity of the gap after
+    the impact is at least -e times the one before (Newton's hypothesis, for each contact); restitution does not apply
+    to friction. It opens where its normal force would become negative.
 
     **Arguments:**
 
     - `contact`: a constraint with a gap and up to two rows without slip: `jd.rolling_sphere(...)`, `jd.rolling_wheel(...)`; or
       see `ground_contact`. The gap is positive where the contact is open.
     - `friction`: mu while it slides; `static`: mu at rest, None for the same.
-    - `restitution`: e, from 0 to 1. Contacts that hit at once with friction and different coefficients may gain energy
-      by Newton's hypothesis. A body that bounces to rest has infinitely many impacts: rebounds below
-      eps^0.3 m/s (2e-5 in float64) are none.
-    - `name`: of its events; by default that of the constraint.
+    - `restitution`: e, from 0 to 1. Simultaneous impacts with friction and different coefficients may gain energy
+      by Newton's hypothesis. A body that bounces to rest has infinitely many impacts: rebound velocities below
+      eps^0.3 m/s (2e-5 in float64) count as zero.
+    - `name`: name of its events; by default that of the constraint.
 
-    **Raises:** ValueError for what is no contact, and bad coefficients.
+    **Raises:** ValueError for an invalid contact or coefficients.
     """
 
     contact: Constraint
@@ -143,11 +143,11 @@ class UnilateralContact(WithModes):
     ):
         if not (isinstance(contact, Constraint) and contact.wrench_components() is not None):
             raise ValueError(
-                f"UnilateralContact: contact is {contact!r}; give a constraint with a gap, as jd.rolling_sphere(...), or take "
+                f"UnilateralContact: contact is {contact!r}; give a constraint with a gap, as jd.rolling_sphere(...), or use "
                 "jd.ground_contact(body, point, friction=0.5)"
             )
         self.contact = contact
-        self.name = _checked_name(contact.name if name is None else name, "UnilateralContact")
+        self.name = _check_name(contact.name if name is None else name, "UnilateralContact")
         owner = f"UnilateralContact {self.name!r}"
         self.coefficient, self.static = _coefficients(friction, static, owner)
         self.restitution = jnp.asarray(as_array(restitution, f"{owner}: restitution"), float)
@@ -168,7 +168,7 @@ def ground_contact(
     plane_body: str | None = None,
     name: str | None = None,
 ) -> UnilateralContact:
-    """Contact of a point of a body, or a sphere on it, with the ground, which holds on one side.
+    """Unilateral contact of a point of a body, or a sphere on it, with the ground.
 
     **Arguments:**
 
@@ -212,33 +212,33 @@ def gap_contact(
     restitution: Numbers = 0.0,
     name: str = "contact",
 ) -> UnilateralContact:
-    """Contact by functions of the coordinates, of systems without bodies too, which holds on one side.
+    """Unilateral contact given by functions of the coordinates, also for systems without bodies.
 
     **Arguments:**
 
     - `gap`: gap(q, t) -> () in m, positive where the contact is open; differentiable twice.
-    - `along`: A(q, t) -> (nv,) or (2, nv): the velocity with which the contact slides is A v, m/s; None without friction.
+    - `along`: A(q, t) -> (nv,) or (2, nv): the sliding velocity is A v, m/s; None without friction.
     - `friction`, `static`, `restitution`: see `UnilateralContact`. `name`: of its events.
 
-    **Raises:** ValueError for what cannot be called and bad coefficients; when used, for shapes that do not fit.
+    **Raises:** ValueError for invalid functions and coefficients; when used, for shapes that do not fit.
 
     ```python
     stop = jd.gap_contact(lambda q, t: 0.5 - q[0], restitution=0.3, name="stop")
     ```
     """
-    name = _checked_name(name, "gap_contact")
+    name = _check_name(name, "gap_contact")
     rows = None if along is None else as_pytree(along, f"gap_contact {name!r}: along")
     touching = _Gap(gap=as_pytree(gap, f"gap_contact {name!r}: gap"), along=rows, name=name)
     return UnilateralContact(touching, friction, static=static, restitution=restitution, name=name)
 
 
 def has_modes(scene: Scene) -> bool:
-    """Whether a scene lists forces that have modes."""
+    """Decide whether a scene has forces with modes."""
     return any(isinstance(force, WithModes) for force in scene.forces)
 
 
 class _Coordinate(Constraint):
-    """One of the velocities."""
+    """Constraint row that selects one velocity coordinate."""
 
     index: int = eqx.field(static=True)
     name: str = eqx.field(static=True)
@@ -250,14 +250,14 @@ class _Coordinate(Constraint):
 
 
 class _Gap(Constraint):
-    """A contact by its gap and the directions in which it slides."""
+    """Contact given by its gap and sliding directions."""
 
     gap: Any
     along: Any
     name: str = eqx.field(static=True)
 
     def wrench_components(self):
-        """Of a contact; without a frame in space."""
+        """Empty order of multipliers: a contact without a frame in space."""
         return ()
 
     def position(self, system, q, t):
@@ -270,14 +270,14 @@ class _Gap(Constraint):
         return None if self.along is None else Pfaffian(self.along, name=self.name).velocity(system, q, v, t)
 
 
-def _checked_name(name: Any, owner: str) -> str:
+def _check_name(name: Any, owner: str) -> str:
     if not isinstance(name, str) or not name:
         raise ValueError(f"{owner}: name is {name!r}; give a non-empty string")
     return name
 
 
 def _coefficients(sliding: Any, static: Any, owner: str):
-    """Both as leaves."""
+    """Check sliding and static coefficients and convert them to leaves."""
     both = [
         jnp.asarray(as_array(x, f"{owner}: coefficient"), float)
         for x in (sliding, sliding if static is None else static)

@@ -1,4 +1,4 @@
-"""Wrench cones of surfaces in contact: the wrenches at one point that forces at the corners can add up to.
+"""Wrench cones of surface contacts: the resultant wrenches of admissible forces at the corners.
 
 At each corner |fx|, |fy| <= mu fz. The sums of such forces and of their torques form a cone {w : U w <= 0} in R^6.
 Source: Caron, Pham & Nakamura (2015), Stability of surface contacts for humanoid robots; EQUATIONS section 11.
@@ -12,7 +12,7 @@ from jaxdyn.compile import is_concrete
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.model.arguments import Numbers
 
-# Signs of (Y, X) and of mu (tx, ty) in the rows that bound the torque about the normal, first from below, then from above.
+# Signs of (Y, X) and of mu (tx, ty) in the bounds of the torque about the normal, lower ones first.
 _YAW = (
     (-1, -1, 1, 1, -1),
     (-1, 1, 1, -1, -1),
@@ -26,15 +26,15 @@ _YAW = (
 
 
 def wrench_cone(half_x: Numbers, half_y: Numbers, mu: Numbers) -> Float[Array, "16 6"]:
-    """Wrench cone of a rectangle in contact: U (16, 6) with U w <= 0, in closed form.
+    """Wrench cone of a rectangular contact: U (16, 6) with U w <= 0, in closed form.
 
-    With X, Y the half sides and w = (f, tau) at the centre, in the axes of the surface, z the normal that presses:
+    With X, Y the half sides and w = (f, tau) at the centre, in the axes of the surface, z the normal:
 
         |fx|, |fy| <= mu fz;   |tx| <= Y fz;   |ty| <= X fz;   tmin <= tz <= tmax,
         tmin = -mu (X + Y) fz + |Y fx - mu tx| + |X fy - mu ty|,
         tmax =  mu (X + Y) fz - |Y fx + mu tx| - |X fy + mu ty|.
 
-    It is exact for the pyramids |fx|, |fy| <= mu fz at the corners; `mu / sqrt(2)` keeps every corner within the round
+    It is exact for the pyramids |fx|, |fy| <= mu fz at the corners; `mu / sqrt(2)` keeps every corner within the circular
     cone of mu.
 
     **Arguments:** `half_x`, `half_y` (): half lengths along x and y, m. `mu` (): friction coefficient, zero or positive.
@@ -58,14 +58,14 @@ def wrench_cone(half_x: Numbers, half_y: Numbers, mu: Numbers) -> Float[Array, "
 
 
 def corner_wrenches(vertices: Float[np.ndarray, "n 2"], mu: float) -> Float[np.ndarray, "6 k"]:
-    """Generators (6, 4 n) of the wrench cone: the edges of each corner's pyramid, of unit normal force, at the origin."""
+    """Generators (6, 4 n) of the wrench cone: the edges of each corner's pyramid with unit normal force, about the origin."""
     forces = np.array([[a * mu, b * mu, 1.0] for a in (1, -1) for b in (1, -1)])
     places = np.concatenate([vertices, np.zeros((len(vertices), 1))], 1)
     return np.concatenate([np.concatenate([forces, np.cross(place, forces)], 1) for place in places]).T
 
 
 def wrench_cone_of_polygon(vertices: Numbers, mu: Numbers) -> Float[Array, "k 6"]:
-    """Wrench cone of a convex polygon in contact: U (k, 6) with U w <= 0.
+    """Wrench cone of a convex polygonal contact: U (k, 6) with U w <= 0.
 
     It is the cone of the wrenches of forces at the corners, each within |fx|, |fy| <= mu fz; its facets are those of
     the convex hull, in five dimensions, of the corners' extreme wrenches for fz = 1 (qhull). A rectangle's are the rows of
@@ -80,28 +80,30 @@ def wrench_cone_of_polygon(vertices: Numbers, mu: Numbers) -> Float[Array, "k 6"
 
     Source: Caron, Pham & Nakamura (2015), section III (double description; here by a convex hull).
     """
-    # scipy takes a tenth of a second to import, so only who calls this pays for it.
+    # Imported here because scipy takes a tenth of a second.
     from scipy.spatial import ConvexHull, QhullError
 
     if not is_concrete(vertices, mu):
-        raise ValueError("vertices and mu are traced; the facets are found for known numbers, call this outside of jit")
+        raise ValueError("vertices and mu are traced; facets need concrete numbers, call this outside of jit")
     corners = np.asarray(as_float(vertices, "vertices", (None, 2)), float)
     friction = float(as_number(mu, "mu", "", zero=False))
     size = np.ptp(corners, axis=0).max() if len(corners) else 0.0
     flat = corners - corners.mean(0) if len(corners) else corners
     if len(corners) < 3 or not np.isfinite(corners).all() or np.linalg.svd(flat)[1][-1] < 1e-9 * size:
         raise ValueError(f"vertices is {corners.tolist()}; give at least three corners (m) that are not on a line")
-    # Measured in the polygon's size and in mu, all coordinates are of order one.
+    # Scaling by the polygon's size and mu makes all coordinates of order one.
     scale = np.array([friction, friction, 1.0, size, size, size * friction])
+    # At unit normal force the cone is a polytope in the other five coordinates.
     points = (corner_wrenches(corners, friction) / scale[:, None])[[0, 1, 3, 4, 5]].T
     try:
         facets = ConvexHull(points).equations
     except QhullError as error:
         raise ValueError(
-            f"vertices is {corners.tolist()} with mu {friction}: no cone with an inside ({error})"
+            f"vertices is {corners.tolist()} with mu {friction}: no cone with an interior ({error})"
         ) from error
+    # Homogenised, the offset of a facet is the coefficient of the normal force.
     rows = np.concatenate([facets[:, :2], facets[:, 5:], facets[:, 2:5]], 1)
-    # Facets with more than five corners come in several pieces.
+    # qhull splits facets with more than five corners into simplices; duplicates are merged.
     rows = rows[np.unique(np.round(rows, 9), axis=0, return_index=True)[1]] / scale
     torques, forces = np.abs(rows[:, 3:]).max(1), np.abs(rows[:, :2]).max(1)
     turns = torques * size > 1e-9 * (np.abs(rows[:, 2]) + forces)

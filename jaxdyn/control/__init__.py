@@ -1,8 +1,8 @@
 """Control laws: Modules called as `law(q, v, t) -> tau`, with gains and targets as leaves.
 
-`gains` checks gains, `errors` writes what a law controls as rows of constraints, `motion` holds the laws of free motion,
+`gains` checks gains, `errors` defines control errors as constraint rows, `motion` contains the laws of free motion,
 `constrained` those of motion and force on constraints, `grasping` that of an object in a hand, and `feet`, `legs` and
-`whole_body` are for robots whose base has no motor.
+`whole_body` are for robots with an unactuated base.
 
 Sources: EQUATIONS sections 8 to 10.
 """

@@ -1,12 +1,12 @@
-"""Laws of motion and force on constraints: what moves follows a target, and what is held is pressed as wanted.
+"""Hybrid laws: motion along constraints follows a target, and constraint forces follow a reference.
 
     tau = M a + h - forces + A^T (-lam_d + KI z),    dz/dt = lam - lam_d,
 
-with the acceleration a that the constraints allow, A a = gamma, and the task asks for. As a is what then happens,
+with the acceleration a that satisfies the constraints, A a = gamma, and the task. As the plant then accelerates by a,
 A^T (lam - lam_d + KI z) = 0: the loops of motion and of force are separate, whatever the rows are, holonomic or not.
-With q = psi(x), qdot = J xdot, a is  J (xdd_d - Kv ed - Kp e) + Jdot xdot,  as the documents write it.
+With q = psi(x), qdot = J xdot, a is  J (xdd_d - Kv ed - Kp e) + Jdot xdot,  in the notation of the documents.
 
-The force loop goes through the integral z alone, so tau does not depend on lam of the same moment.
+The force loop goes through the integral z alone, so tau does not depend on the current lam.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,13 +29,13 @@ from jaxdyn.control.errors import (
     least_acceleration,
     regularity,
     row_rank,
-    wanted_rows,
+    target_rows,
 )
 from jaxdyn.control.gains import as_matrix, gain, non_negative, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, batch_hint, check_state
+from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, batch_hint, check_state, warn
 from jaxdyn.reduction.gauge_invariant import gauge_invariant
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.scene import Scene, as_pytree
@@ -43,14 +43,14 @@ from jaxdyn.systems.system import SceneLike, velocity_to_rate
 
 
 class _ForceLoop(Controller):
-    """Laws whose state is the integral of lam - lam_d, (nc,), where they have integral action."""
+    """Base class of laws whose state is the integral of lam - lam_d, (nc,), with integral action."""
 
     scene: eqx.AbstractVar[Scene]
     force: eqx.AbstractVar[Callable | None]
     ki: eqx.AbstractVar[Array | None]
 
     def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nc"] | None:
-        """No integral yet."""
+        """Zero integral at the start; None without integral action."""
         return None if self.ki is None else jnp.zeros((_count(self.scene),), q.dtype)
 
     def rate(
@@ -61,11 +61,11 @@ class _ForceLoop(Controller):
         state: PyTree,
         multipliers: Float[Array, " nc"],
     ) -> Float[Array, " nc"]:
-        """lam - lam_d."""
-        return multipliers - self.wanted_force(q, t)
+        """Rate lam - lam_d of the integral."""
+        return multipliers - self.reference_force(q, t)
 
-    def wanted_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nc"]:
-        """lam_d (nc,)."""
+    def reference_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nc"]:
+        """Reference lam_d (nc,) of the multipliers."""
         count = _count(self.scene)
         if self.force is None:
             return jnp.zeros((count,), q.dtype)
@@ -77,9 +77,15 @@ class _ForceLoop(Controller):
             )
         return jnp.asarray(force, q.dtype)
 
-    def pressed(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
-        """-lam_d + KI z."""
-        wanted = -self.wanted_force(q, t)
+    def wanted_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nc"]:
+        """Deprecated name of `reference_force`."""
+        warn("wanted_force is deprecated; call reference_force", DeprecationWarning)
+        return self.reference_force(q, t)
+
+    def force_command(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
+        # The sign follows M a + h = tau + A^T lam: a reference multiplier is cancelled by the opposite torque.
+        """Force command -lam_d + KI z."""
+        wanted = -self.reference_force(q, t)
         return wanted if state is None or self.ki is None else wanted + times(self.ki, state, "ki")
 
 
@@ -89,10 +95,10 @@ class HybridForce(_ForceLoop):
     For constraints of every kind. A task of positions x(q), `of="position"`, follows x_d(t) by the gains `kp` and `kd`; a task
     of velocities u(q, v), linear in v, `of="velocity"`, follows u_d(t) by  du/dt - du_d/dt = -Kp (u - u_d): for nonholonomic
     constraints, whose velocities v = J u are free and whose positions are not. Where task and constraints together leave
-    some motion open, it is the one of least acceleration in the metric M.
+    some motion undetermined, it has the least acceleration in the metric M.
 
-    Errors decay as the gains say where the model is that of the plant. With a wrong one, M' and h' in the law, the force is
-    off by  -(A M^-1 A^T)^-1 A M^-1 ((M' - M) a + h' - h),  which integral action takes away: lam - lam_d decays with KI.
+    Errors decay as set by the gains for an exact model. With model errors, M' and h' in the law, the force is
+    off by  -(A M^-1 A^T)^-1 A M^-1 ((M' - M) a + h' - h),  which integral action removes: lam - lam_d decays with KI.
 
     **Arguments:**
 
@@ -100,17 +106,17 @@ class HybridForce(_ForceLoop):
     - `task`: x(q) -> (m,), or u(q, v) -> (m,); `target`: (m,), or a function of t, differentiable twice (once for velocities).
     - `kp`, `kd`: positive definite, numbers, (m,) or (m, m); 1/s^2 and 1/s, or 1/s for `kp` of velocities, without `kd`.
     - `force`: lam_d (nc,), or a function of t; None for zero. `ki` (1/s): positive definite, or None for no integral action.
-    - `actuated`: indices of the velocities that have a motor; None: all. Of their torques those of least size are taken that
-      give the motion, plus what `internal` (na,), N m, has along directions that change forces alone: with as many motors as
-      freedoms there are none. Forces are then not controlled, and `force` and `ki` are to be left out.
-    - `least_regularity`: a number from 0 to 1. Where `regularity(q, v, t)` falls to it, a simulation ends, with the code
-      `control_singular` and the time. None: it goes on, the task followed as near as can be.
+    - `actuated`: indices of the actuated velocities; None: all. The torques of least norm are used that
+      give the motion, plus the part of `internal` (na,), N m, along directions that change only forces: with as many motors as
+      degrees of freedom there are none. Forces are then not controlled, and `force` and `ki` must be omitted.
+    - `least_regularity`: a number from 0 to 1. Where `regularity(q, v, t)` falls to it, a simulation ends with the code
+      `control_singular` and the time. None: it continues, with the task followed in the least-squares sense.
 
-    **Raises:** ValueError for a scene without constraints, gains that are not positive definite, gains or a task that do not fit
-    `of`; (when called) for shapes that do not fit.
+    **Raises:** ValueError for a scene without constraints, gains that are not positive definite, gains or a task
+    inconsistent with `of`; (when called) for inconsistent shapes.
 
-    Source: EQUATIONS section 8 (the documents' law for holonomic and for nonholonomic constraints, and for motors that are
-    fewer than joints); Murray, Li & Sastry (1994), section 6.4.
+    Source: EQUATIONS section 8 (the documents' law for holonomic and for nonholonomic constraints, and for fewer motors
+    than joints); Murray, Li & Sastry (1994), section 6.4.
     """
 
     scene: Scene
@@ -147,30 +153,31 @@ class HybridForce(_ForceLoop):
         self.internal = None if internal is None else jnp.asarray(as_array(internal, "internal"), float)
         self.least_regularity = None if least_regularity is None else non_negative(least_regularity, "least_regularity")
         if self.actuated is None and self.internal is not None:
-            raise ValueError("internal is given without actuated; name the velocities that have a motor")
+            raise ValueError("internal is given without actuated; name the actuated velocities")
         if self.actuated is not None and not (self.force is None and self.ki is None):
-            raise ValueError("force or ki is given with actuated, where forces follow from the motion; leave them out")
+            raise ValueError("force or ki is given with actuated, where forces follow from the motion; omit them")
         if self.internal is not None and self.internal.shape != (len(self.actuated or ()),):
             raise ValueError(f"internal has shape {self.internal.shape}; give one torque per motor of {self.actuated}")
 
     def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
-        """The acceleration that the law asks for, (nv,): on the constraints, and towards the target."""
+        """Commanded acceleration (nv,), consistent with the constraints."""
         t = jnp.asarray(t, q.dtype)
         A, wanted = self._rows(q, v, t)
         return least_acceleration(self.scene.system, q, t, A, wanted, jnp.zeros_like(v))
 
     def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
-        """Whether the constraints leave all of the task free, so that the law can do what it promises."""
+        """Decide whether task and constraints are independent, as the error equations require."""
         t = jnp.asarray(t, q.dtype)
         A = constraint_jacobian(self.scene, q, t)
         both, _ = self._rows(q, v, t)
+        # Ranks add exactly where no direction of the task is fixed by the constraints.
         return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
 
     def regularity(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, ""]:
-        """How far the law is from where task and constraints lose rank, 1 to 0.
+        """Distance of the law from a singularity of task and constraints, 1 to 0.
 
         The least sine of the angle, in the metric M^-1, between a row of the task and the span of the constraints' and
-        the rows of the task before it. Beside a singular place the law's accelerations grow as its inverse.
+        the rows of the task before it. Close to a singularity the law's accelerations grow as its inverse.
         """
         t = jnp.asarray(t, q.dtype)
         both, _ = self._rows(q, v, t)
@@ -178,7 +185,7 @@ class HybridForce(_ForceLoop):
         return regularity(self.scene.system, q, t, both[:count], both[count:])
 
     def allowance(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""] | None:
-        """Of `regularity`, above the least one."""
+        """Margin of `regularity` above the least one."""
         if self.least_regularity is None:
             return None
         return self.regularity(q, v, t) - self.least_regularity.astype(q.dtype)
@@ -191,11 +198,13 @@ class HybridForce(_ForceLoop):
         state: PyTree = None,
         multipliers: Float[Array, " nc"] | None = None,
     ) -> Float[Array, " nv"]:
-        """Torques (nv,), N m or N."""
+        """Joint torques (nv,), N m or N."""
         t = jnp.asarray(t, q.dtype)
         tau = torque_for(self.scene, q, v, self.acceleration(q, v, t), t)
         if self.actuated is None:
-            return tau + _product(constraint_jacobian(self.scene, q, t).T, self.pressed(q, t, state))
+            return tau + _product(constraint_jacobian(self.scene, q, t).T, self.force_command(q, t, state))
+        # Projected by P_omega the constraint forces vanish, so that the motors' torques need only match along the
+        # motion.
         P_omega, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)  # pyright: ignore[reportArgumentType]
         by_motors = P_omega[:, motors]
         inverse = pseudo_inverse(by_motors, tolerance(None, P_omega), True)
@@ -206,19 +215,22 @@ class HybridForce(_ForceLoop):
         return jnp.zeros_like(tau).at[motors].set(pushed)
 
     def _rows(self, q, v, t):
+        # Constraints come first: `regularity` splits the rows at their count.
         row = rows(self.scene, q, v, t)
-        A, wanted = wanted_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
+        A, wanted = target_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
         return jnp.concatenate([row.A, A]), jnp.concatenate([row.gamma, wanted])
 
 
 class GaugeInvariant(_ForceLoop):
-    """Hybrid law in quasi velocities: with eps = B (ed + Kp e), B = V2^T W^T J,
+    """Hybrid law of motion and force in quasi velocities.
+
+    With eps = B (ed + Kp e), B = V2^T W^T J,
 
         u_r = sdot + Gamma_r s - Kd eps,  s = B (xd_d - Kp e):   d eps/dt = -(Gamma_r + Kd) eps,
         u_o = Gamma_o w_r - Lam_r^T lam_d + Lam_r^T KI z:        (lam - lam_d) + KI z = 0.
 
-    Gamma_r is skew, so |eps| decays for every Kd > 0, for Kd = k 1 exactly as exp(-k t), and does not depend on the choice of
-    W and V: the square of |eps| is the kinetic energy, times two, of the velocity error ed + Kp e. Unlike `HybridForce` it
+    Gamma_r is skew, so |eps| decays for every Kd > 0, for Kd = k 1 exactly as exp(-k t), independently of the choice of
+    W and V: |eps|^2 / 2 is the kinetic energy of the velocity error ed + Kp e. Unlike `HybridForce` it
     cancels no Coriolis force of the error.
 
     With V2^T V2dot = 0,  sdot + Gamma_r s = V2^T W^-1 (M J (xdd_d - Kp ed) + (M Jdot + C J)(xd_d - Kp e)).
@@ -226,13 +238,14 @@ class GaugeInvariant(_ForceLoop):
     **Arguments:**
 
     - `scene`: with constraints A v = 0; its forces are compensated.
-    - `task`: x(q) -> (nr,), as many coordinates as freedoms; `target`: (nr,), or a function of t, differentiable twice.
-    - `kp` (1/s), of ed + Kp e; `kd` (1/s), of eps: positive definite, numbers, (nr,) or (nr, nr). A `kd` that is no number acts
-      along V2, which is carried along.
+    - `task`: x(q) -> (nr,), as many coordinates as degrees of freedom; `target`: (nr,), or a function of t,
+      differentiable twice.
+    - `kp` (1/s), of ed + Kp e; `kd` (1/s), of eps: positive definite, numbers, (nr,) or (nr, nr). A `kd` other than a
+      number acts in the basis V2, which is parallel-transported.
     - `force`, `ki` as in `HybridForce`.
 
     **Raises:** ValueError for a scene without constraints, gains that are not positive definite; (when called) for shapes that
-    do not fit and a task of another size than the freedoms.
+    are inconsistent and a task of another size than the number of degrees of freedom.
 
     Source: EQUATIONS section 9 and errata E23 to E26.
     """
@@ -269,7 +282,7 @@ class GaugeInvariant(_ForceLoop):
         state: PyTree = None,
         multipliers: Float[Array, " nc"] | None = None,
     ) -> Float[Array, " nv"]:
-        """Torques (nv,), N m or N."""
+        """Joint torques (nv,), N m or N."""
         scene, system, t = self.scene, self.scene.system, jnp.asarray(t, q.dtype)
         J, along, change = self._reference_motion(q, v, t)
         M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)  # pyright: ignore[reportArgumentType]
@@ -278,7 +291,9 @@ class GaugeInvariant(_ForceLoop):
         eps = _product(gauge.V2.T, _product(gauge.W.T, v - along))
         push = _product(M, change) + _product(C, along)
         push = push - _product(gauge.W, _product(gauge.V2, times(self.kd, eps, "kd")))
-        normal = _product(gauge.Gamma_o, gauge.reduced_velocity) + _product(gauge.Lambda_r.T, self.pressed(q, t, state))
+        normal = _product(gauge.Gamma_o, gauge.reduced_velocity) + _product(
+            gauge.Lambda_r.T, self.force_command(q, t, state)
+        )
         # Of `push` the part of the motion, W V2 V2^T W^-1, in the place of which the normal one stands.
         free = _product(gauge.V2, _product(gauge.V2.T, solve_square(gauge.W, push)))
         tau = _product(gauge.W, free + _product(gauge.V1, normal))
@@ -286,7 +301,7 @@ class GaugeInvariant(_ForceLoop):
         return tau + potential if force is None else tau + potential - force
 
     def composite_error(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nr"]:
-        """The composite error eps = B (ed + Kp e) = V2^T W^T (v - J (xd_d - Kp e)), (nr,), in sqrt(J).
+        """Composite error eps = B (ed + Kp e) = V2^T W^T (v - J (xd_d - Kp e)), (nr,), in sqrt(J).
 
         |eps|^2 / 2 is the kinetic energy of the velocity error ed + Kp e. The components depend on the gauge, the norm not.
 
@@ -302,11 +317,11 @@ class GaugeInvariant(_ForceLoop):
     def equivalent_gains(
         self, q: Float[Array, " nq"], t: Number = 0.0
     ) -> tuple[Float[Array, "nr nr"], Float[Array, "nr nr"]]:
-        """Gains (Kp', Kd') with which this law is  xdd_d - Kd' ed - Kp' e  in task coordinates, as `HybridForce` writes it:
+        """Gains (Kp', Kd') of the equivalent `HybridForce` law  xdd_d - Kd' ed - Kp' e  in task coordinates.
 
             Kp' = B^-1 Kd B Kp,   Kd' = Kp + B^-1 Kd B,   B = V2^T W^T J.
 
-        The two laws then differ by (Bdot + Gamma_r B)(ed + Kp e) alone, a Coriolis force of the composite error. For a number
+        The two laws then differ only by (Bdot + Gamma_r B)(ed + Kp e), a Coriolis force of the composite error. For a number
         Kd = k these are k Kp and Kp + k, whatever q.
 
         **Arguments:** `q` (nq,), on the constraints; `t`, s.
@@ -323,19 +338,19 @@ class GaugeInvariant(_ForceLoop):
         return _product(turned, kp), kp + turned
 
     def _to_quasi_velocities(self, q, t, m: int) -> Float[Array, "nr nv"]:
-        """V2^T W^T, which takes velocities to the m quasi velocities along the constraints."""
+        """Matrix V2^T W^T from velocities to the m quasi velocities along the constraints."""
         gauge = gauge_invariant(self.scene, q, jnp.zeros((self.scene.nv,), q.dtype), None, t, dof=m)
         return _product(gauge.V2.T, gauge.W.T)
 
     def _reference_motion(self, q, v, t):
-        """J (nv, nr), the velocity J s of the reference rates s = xd_d - Kp e, and its rate, (nv,) each."""
+        """Jacobian J (nv, nr), velocity J s for the reference rates s = xd_d - Kp e, and its rate, (nv,) each."""
         scene, system = self.scene, self.scene.system
         errors = Scene(system, (self.error,))
         m = self.error.sizes(system, q.dtype)[0]
         if m + _count(scene) < scene.nv:
             raise ValueError(
                 f"task returned {m} coordinates, and the constraints have {_count(scene)} rows of nv = {scene.nv}; give as many "
-                "coordinates as freedoms"
+                "coordinates as degrees of freedom"
             )
         motion = velocity_to_rate(system, q, v), jnp.ones_like(t)
 
@@ -343,23 +358,25 @@ class GaugeInvariant(_ForceLoop):
             return jnp.concatenate([constraint_jacobian(scene, q, t), constraint_jacobian(errors, q, t)])
 
         def reference(q, t):
-            """xd_d - Kp e."""
+            """Reference rates xd_d - Kp e."""
             speed = -rows(errors, q, jnp.zeros_like(v), t).velocity
             return speed - times(self.kp, self.error.position(system, q, t), "kp")  # pyright: ignore[reportArgumentType]
 
         stacked, turning = jax.jvp(both, (q, t), motion)
+        # The inverse of the stacked rows gives J = d v / d xd on the constraints as its last columns.
         inverse = pseudo_inverse(stacked, tolerance(None, stacked))
         J = inverse[:, -m:]
         s, sdot = jax.jvp(reference, (q, t), motion)
         along = _product(J, s)
+        # d/dt of [A; T]^-1 [0; s]: the rate of the inverse enters as -inverse (turning) inverse.
         return J, along, _product(J, sdot) - _product(inverse, _product(turning, along))
 
 
 def constrained(scene: Any) -> Scene:
-    """A scene with constraints. **Raises:** ValueError for anything else."""
+    """Require a scene with constraints. **Raises:** ValueError for anything else."""
     if not isinstance(scene, Scene) or not scene.constraints:
         raise ValueError(
-            "scene has no constraints, so there is no force to control; take jd.control.ComputedTorque or "
+            "scene has no constraints, so there is no force to control; use jd.control.ComputedTorque or "
             "jd.control.OperationalSpace"
         )
     layout(scene)

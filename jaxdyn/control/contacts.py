@@ -16,21 +16,22 @@ from jaxdyn.systems.system import velocity_to_rate
 
 
 class ContactCoordinates(eqx.Module):
-    """The contact coordinates of a tip on an object that stands still, as tasks of `HybridForce`.
+    """Contact coordinates of a fingertip on an object at rest, as tasks of `HybridForce`.
 
     As a function of q it is eta = (u_o, v_o, u_f, v_f, psi) (5,): the task of a tip that slides, five coordinates of the
-    motion that a frictionless contact leaves free. `rolling` is alpha_f_dot (2,), the rates of (u_f, v_f): the task of
+    motion free in a frictionless contact. `rolling` is alpha_f_dot (2,), the rates of (u_f, v_f): the task of
     velocities of a tip that rolls without spin. The laws are then, with the rows J_F of Montana's equations
     (`jd.contact.montana`) and M, C, N of the arm in the twist of the tip,
 
         F_m = M J_F (eta_dd_d - Kd ed - Kp e) + (M J_F_dot + C J_F) eta_dot + N + A^T (-lam_d + KI z),    tau = J^T F_m,
 
-    and the same with J_f alpha_f_dot in the place of J_F eta_dot for a tip that rolls.
+    and the same with J_f alpha_f_dot in place of J_F eta_dot for a tip that rolls.
 
-    **Arguments:** `model`: a `Model`; `frame`: the tip's, a body or frame; `object`, `finger`: surfaces (`jd.contact.Sphere` ...)
-    of the object and of the tip, each in its frame; `pose`: of the object's frame in the world, (4, 4), (3,), (xyz, rpy) or None.
+    **Arguments:** `model`: a `Model`; `frame`: the tip's, a body or frame; `object`, `finger`: surfaces
+    (`jd.contact.Sphere` ...) of the object and of the tip, each in its frame; `pose`: of the
+    object's frame in the world, (4, 4), (3,), (xyz, rpy) or None.
 
-    **Raises:** ValueError for what is no model or no surface, an unknown frame and a bad pose; (when called) as
+    **Raises:** ValueError for an invalid model, surface or pose and an unknown frame; (when called) as
     `jd.contact.contact_coordinates`.
 
     ```python
@@ -65,10 +66,10 @@ class ContactCoordinates(eqx.Module):
         self.pose = pose_leaf(pose, "ContactCoordinates: pose")
 
     def __call__(self, q: Float[Array, " nq"]) -> Float[Array, "5"]:
-        """eta (5,), in the units of the charts and rad."""
+        """Contact coordinates eta (5,), in the units of the charts and rad."""
         seen = _product(se3.inverse(self.pose.astype(q.dtype)), frame_pose(self.model, q, self.frame))
         return contact_coordinates(self.object, self.finger, seen)
 
     def rolling(self, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "2"]:
-        """alpha_f_dot (2,): rates of the place on the tip, in the units of its chart, 1/s."""
+        """Rates alpha_f_dot (2,) of the contact point on the tip, in the units of its chart per second."""
         return jax.jvp(self, (q,), (velocity_to_rate(self.model, q, v),))[1][2:4]

@@ -1,8 +1,8 @@
-"""What a law controls: errors e(q, t), and errors of rates w(q, v, t), that are to vanish.
+"""Control errors e(q, t), and errors of rates w(q, v, t), as constraint rows.
 
-An error is written as a constraint that the motion need not satisfy yet. Its rows are those of any constraint
+An error is a constraint that the motion need not satisfy. Its rows are those of any constraint
 (`jaxdyn.constraints.base`): de/dt = A v - b and d2e/dt2 = A a - gamma, on manifold-valued q and moving targets too. A law
-asks for the acceleration that makes an error decay,
+commands an acceleration for which the error decays,
 
     A a = gamma - Kd de/dt - Kp e     of positions,        A a = gamma - Kp w     of rates,
 
@@ -34,13 +34,13 @@ from jaxdyn.systems.system import displacement
 if TYPE_CHECKING:
     Target = Numbers | Callable[[Array], Any]
 else:
-    Target = Any  # `as_target` looks at it
+    Target = Any  # `as_target` checks it
 
 TASKS = {"position": (3,), "orientation": (3, 3), "pose": (4, 4)}
 
 
 class Fixed(eqx.Module):
-    """A target that does not move."""
+    """Constant target."""
 
     value: Array
 
@@ -49,9 +49,9 @@ class Fixed(eqx.Module):
 
 
 def as_target(target: Target, name: str = "target") -> Callable:
-    """A target as a function of time: a function as it is, numbers as one that is constant.
+    """Convert a target to a function of time; numbers become a constant one.
 
-    **Raises:** ValueError for what is neither, and for a function of anything but t.
+    **Raises:** ValueError for other types, and for a function of other arguments than t.
     """
     if callable(target):
         return as_pytree(target, name, "t")
@@ -59,8 +59,8 @@ def as_target(target: Target, name: str = "target") -> Callable:
     return Fixed(jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float))
 
 
-def placed(target: Callable, t, shape: tuple, like) -> Array:
-    """A target at a time, in the dtype of `like`. **Raises:** ValueError for another shape."""
+def target_value(target: Callable, t, shape: tuple, like) -> Array:
+    """Value of a target at time t, in the dtype of `like`. **Raises:** ValueError for another shape."""
     values = target(t)
     if jnp.shape(values) != shape:
         raise ValueError(f"target has shape {jnp.shape(values)}, expected {shape}{batch_hint(values, shape)}")
@@ -68,18 +68,18 @@ def placed(target: Callable, t, shape: tuple, like) -> Array:
 
 
 class ConfigurationError(Constraint):
-    """The displacement (nv,) from the target q_d(t) (nq,) to q, along the manifold of the system."""
+    """Displacement (nv,) from the target q_d(t) (nq,) to q, along the manifold of the system."""
 
     target: Callable
     name: str = eqx.field(static=True, default="configuration")
 
     def position(self, system, q, t):
-        """q - q_d, and the twists from the target in joints that turn in space."""
-        return displacement(system, placed(self.target, t, q.shape, q), q)
+        """Displacement q - q_d; twists from the target for joints with rotations in space."""
+        return displacement(system, target_value(self.target, t, q.shape, q), q)
 
 
 class FrameError(Constraint):
-    """How far a named frame is from its target: p - p_d in world axes, log(R_d^T R) in the target's axes, or both."""
+    """Error of a named frame: p - p_d in world axes, log(R_d^T R) in the target's axes, or both."""
 
     target: Callable
     frame: str = eqx.field(static=True)
@@ -87,8 +87,8 @@ class FrameError(Constraint):
     name: str = eqx.field(static=True, default="frame")
 
     def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, " m"]:
-        """(3,) m, (3,) rad, or both."""
-        pose, target = frame_pose(system, q, self.frame), placed(self.target, t, TASKS[self.task], q)
+        """Error of position (3,), m, of orientation (3,), rad, or both."""
+        pose, target = frame_pose(system, q, self.frame), target_value(self.target, t, TASKS[self.task], q)
         if self.task == "position":
             return pose[:3, 3] - target
         turned = so3.log(_product(target[:3, :3].T, pose[:3, :3]))
@@ -96,37 +96,37 @@ class FrameError(Constraint):
 
 
 class TaskError(Constraint):
-    """task(q) - target(t), (m,)."""
+    """Error task(q) - target(t), (m,)."""
 
     task: Callable
     target: Callable
     name: str = eqx.field(static=True, default="task")
 
     def position(self, system, q, t):
-        """task(q) - target(t)."""
+        """Error task(q) - target(t)."""
         value = jnp.asarray(self.task(q), q.dtype)
         if value.ndim != 1:
             raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
-        return value - placed(self.target, t, value.shape, q)
+        return value - target_value(self.target, t, value.shape, q)
 
 
 class RateError(Constraint):
-    """task(q, v) - target(t), (m,), of velocities: the task is linear in v."""
+    """Error task(q, v) - target(t), (m,), of velocities, linear in v."""
 
     task: Callable
     target: Callable
     name: str = eqx.field(static=True, default="rates")
 
     def velocity(self, system, q, v, t):
-        """task(q, v) - target(t)."""
+        """Error task(q, v) - target(t)."""
         value = jnp.asarray(self.task(q, v), q.dtype)
         if value.ndim != 1:
             raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
-        return value - placed(self.target, t, value.shape, q)
+        return value - target_value(self.target, t, value.shape, q)
 
 
 def frame_error(model: Any, frame: str, target: Any, task: str) -> FrameError:
-    """The error of a frame. **Raises:** ValueError for an unknown task or frame, and for what is no `Model`."""
+    """Error of a frame. **Raises:** ValueError for an unknown task or frame, and for anything but a `Model`."""
     if task not in TASKS:
         raise ValueError(f"task is {task!r}; choose from {', '.join(TASKS)}")
     if not isinstance(model, Model):
@@ -135,8 +135,8 @@ def frame_error(model: Any, frame: str, target: Any, task: str) -> FrameError:
     return FrameError(as_target(target), frame, task)  # pyright: ignore[reportCallIssue]
 
 
-def wanted_rows(system, error: Constraint, kp, kd, q, v, t) -> tuple[Float[Array, "m nv"], Float[Array, " m"]]:
-    """A (m, nv) and the right side (m,) of A a = gamma - Kd de/dt - Kp e, or gamma - Kp w without `kd`."""
+def target_rows(system, error: Constraint, kp, kd, q, v, t) -> tuple[Float[Array, "m nv"], Float[Array, " m"]]:
+    """Matrix A (m, nv) and right-hand side (m,) of A a = gamma - Kd de/dt - Kp e, or gamma - Kp w without `kd`."""
     scene = Scene(system, (error,))
     row = rows(scene, q, v, t)
     if kd is None:
@@ -145,43 +145,49 @@ def wanted_rows(system, error: Constraint, kp, kd, q, v, t) -> tuple[Float[Array
 
 
 def least_acceleration(system, q, t, A, wanted, start) -> Float[Array, " nv"]:
-    """The acceleration nearest to `start` (nv,), in the metric M, with A a = wanted; where rows of A depend, as near as
-    can be."""
+    """Acceleration closest to `start` (nv,), in the metric M, with A a = wanted.
+
+    Inconsistent rows are met in the least-squares sense.
+    """
     metric = mass_factor(mass_matrix(system, q, t))
+    # With M = L L^T, |a - start|_M is Euclidean in L^T a, where a pseudo-inverse gives the minimum.
     Y = metric.whiten(A.T)
     missing = wanted - _product(A, start)
     return start + metric.unwhiten(_product(pseudo_inverse(Y, tolerance(None, Y)).T, missing))
 
 
-def ordered_acceleration(system, q, t, orders, start) -> Float[Array, " nv"]:
-    """The acceleration nearest to `start` (nv,), in the metric M, that meets pairs (A, wanted) in their order.
+def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"]:
+    """Acceleration closest to `start` (nv,), in the metric M, that meets pairs (A, wanted) by priority.
 
-    Each is met, as near as can be, by what all before it leave free; where it cannot be, those before are not disturbed.
+    Each is met, in the least-squares sense, in the null space of all before it, which it does not disturb.
     """
     metric = mass_factor(mass_matrix(system, q, t))
     free, a = jnp.eye(start.shape[0], dtype=start.dtype), start
     for A, wanted in orders:
         Y = metric.whiten(A.T)
         left = _product(free, Y)
-        # Where those before have taken all of the rows, rounding is left of them, which is no direction.
+        # Rows spanned by those of higher priority leave rounding errors, which must not count as directions.
         sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, Y)]
         left = jnp.where(sizes[0] > tolerance(None, Y) ** 2 * sizes[1], left, jnp.zeros_like(left))
         inverse = pseudo_inverse(left, tolerance(None, left)).T
         a = a + metric.unwhiten(_product(inverse, wanted - _product(A, a)))
+        # inverse left^T projects on the range of `left`, so that `free` remains an orthogonal projection.
         free = free - _product(inverse, left.T)
     return a
 
 
 def regularity(system, q, t, A, T) -> Float[Array, ""]:
-    """How far the rows T (m, nv) of a task are from depending on each other and on the rows A (nc, nv) of constraints, 0 to 1.
+    """Distance, 0 to 1, of the rows T (m, nv) of a task from dependence on each other and on constraints A (nc, nv).
 
-    The least sine of the angle, in the metric M^-1, between a row of T and the span of A and the rows of T before it.
+    Defined as the least sine of the angle, in the metric M^-1, between a row of T and the span of A and the rows of T
+    before it.
     """
     metric = mass_factor(mass_matrix(system, q, t))
     Y, Z = metric.whiten(A.T), metric.whiten(T.T)
     Z = Z - _product(Y, _product(pseudo_inverse(Y, tolerance(None, Y)), Z))
     sizes = jnp.sum(metric.whiten(T.T) ** 2, 0)
     free, least = list(Z.T), []
+    # Gram-Schmidt by hand: every quotient is safe at zero, so that derivatives are finite at a singularity too.
     for i, row in enumerate(free):
         square = jnp.sum(row * row)
         some = square > 0
@@ -194,5 +200,5 @@ def regularity(system, q, t, A, T) -> Float[Array, ""]:
 
 
 def row_rank(matrix: Float[Array, "m n"]) -> Array:
-    """Number of independent rows, ()."""
+    """Number of independent rows, (), the trace of a projection."""
     return jnp.round(jnp.sum(pseudo_inverse(matrix, tolerance(None, matrix), True) * matrix.T))

@@ -1,4 +1,4 @@
-"""Feet: where a robot with legs touches the ground, which forces it may take there, and the rows that hold it there."""
+"""Feet of legged robots: contact frames, admissible ground forces, and the rows that fix a foot to the ground."""
 
 import dataclasses
 from typing import Any
@@ -21,16 +21,16 @@ from jaxdyn.model.tree import Model
 _FLAT = ("rigid", "surface")
 
 
-class HeldFoot(Loop):
-    """A foot that stays where it is; its multipliers are the components of its force."""
+class FootConstraint(Loop):
+    """Constraint of a foot fixed to the ground; its multipliers are the components of its force."""
 
     def wrench_components(self):
-        """All rows, in the order of the wrench: a point's forces, or a weld's forces and torques."""
+        """Order of all rows in the wrench: a point's forces, or a weld's forces and torques."""
         return tuple(range(self.kind.count))
 
 
 class Foot(eqx.Module):
-    """A place on a body that touches the ground; made by `foot`.
+    """Contact of a body with the ground, built by `foot`.
 
     Its force f (m,), N and N m, is along the columns of the wrench basis of its cone's kind, in the contact frame: z is the
     normal out of the ground. A point's contact frame has the axes of the `ground`, a flat foot's those of its `pose`.
@@ -48,48 +48,48 @@ class Foot(eqx.Module):
 
     @property
     def is_flat(self) -> bool:
-        """Whether the foot takes torques about all axes, and stands with its own attitude."""
+        """True where the foot transmits torques about all axes and keeps its attitude."""
         return self.cone.kind in _FLAT
 
     def contact_pose(self, model: Model, q: Float[Array, " nq"]) -> Float[Array, "4 4"]:
-        """The contact frame in the world."""
+        """Pose of the contact frame in the world."""
         pose = _product(frame_pose(model, q, self.frame), self.pose.astype(q.dtype))
         return pose if self.is_flat else pose.at[:3, :3].set(self.ground.astype(q.dtype))
 
     def jacobian(self, model: Model, q: Float[Array, " nq"]) -> Float[Array, "m nv"]:
-        """J (m, nv): J v are the velocities of the foot along the components of its force, and J^T f the force on v."""
+        """Jacobian J (m, nv): velocities J v along the components of the force f, generalised force J^T f."""
         to_contact = _product(se3.inverse(frame_pose(model, q, self.frame)), self.contact_pose(model, q))
         twist = _product(se3.Ad(se3.inverse(to_contact)), body_jacobian(model, q, self.frame))
         kind = "rigid" if self.cone.kind == "surface" else self.cone.kind
         return _product(jnp.asarray(wrench_basis(kind).T, q.dtype), twist)
 
-    def hold(self, model: Model, q: Float[Array, " nq"]) -> HeldFoot:
-        """The constraint that keeps the foot where it is at q (nq,): a point, or a weld for a flat foot.
+    def hold(self, model: Model, q: Float[Array, " nq"]) -> FootConstraint:
+        """Constraint that fixes the foot at its pose for q (nq,): a point, or a weld for a flat foot.
 
-        Its multipliers are the foot's force in its contact frame, so that the scene may give it the foot's cone
+        Its multipliers are the foot's force in its contact frame, so that the foot's cone applies to it
         (`jd.control.standing`).
         """
         local = self.pose if self.is_flat else self.pose.at[:3, :3].set(jnp.eye(3, dtype=self.pose.dtype))
         joint = "weld" if self.is_flat else "point"
         hold_loop = loop(None, self.contact_pose(model, q), self.frame, local, joint, name=self.frame)
-        return HeldFoot(**{part.name: getattr(hold_loop, part.name) for part in dataclasses.fields(hold_loop)})
+        return FootConstraint(**{part.name: getattr(hold_loop, part.name) for part in dataclasses.fields(hold_loop)})
 
 
 def foot(
     frame: str, cone: Checked[FrictionCone], *, pose: Numbers | None = None, ground: Numbers | None = None
 ) -> Foot:
-    """A place on a body that touches the ground, and the cone of forces that it may take from it.
+    """Contact of a body with the ground, with the cone of admissible ground forces.
 
     **Arguments:**
 
     - `frame`: name of a body or frame of the model.
     - `cone`: from `jd.contact.friction_cone`, for a point, or `jd.contact.surface_cone(jd.contact.wrench_cone(...))` for a
       flat foot.
-    - `pose`: of the place in the frame: None (identity), (4, 4), (3,) or (xyz, rpy); m and rad. Of a point only the position
-      counts; a flat foot's z is the normal out of the ground.
-    - `ground` (3, 3): axes of the ground in the world, z its normal; by default those of the world. For points alone.
+    - `pose`: of the contact point in the frame: None (identity), (4, 4), (3,) or (xyz, rpy); m and rad. For a point
+      only the position counts; a flat foot's z is the normal out of the ground.
+    - `ground` (3, 3): axes of the ground in the world, z its normal; by default those of the world. Only for points.
 
-    **Raises:** ValueError for a cone that is none, a bad pose, and axes that are no rotation.
+    **Raises:** ValueError for an invalid cone or pose, and axes that are no rotation.
     """
     if not isinstance(cone, FrictionCone) or cone.in_plane:
         raise ValueError(f"foot {frame!r}: cone is {cone!r}; give one in space from jd.contact.friction_cone(...)")
@@ -100,14 +100,14 @@ def foot(
         raise ValueError(f"foot {frame!r}: ground has shape {rotation.shape}; give a rotation (3, 3)")
     if is_concrete(rotation):
         known = np.asarray(rotation, float)
-        # Numbers as people write them, with some six digits.
+        # The tolerance admits rotations typed with about six digits.
         if np.abs(known @ known.T - np.eye(3)).max() > 1e-5 or np.linalg.det(known) < 0:
             raise ValueError(f"foot {frame!r}: ground is {known.tolist()}, which is no rotation; give orthogonal axes")
     return Foot(frame, cone, pose_leaf(pose, f"foot {frame!r}: pose"), jnp.asarray(rotation, float))
 
 
 def check_feet(model: Any, feet: Any) -> tuple[Foot, ...]:
-    """Feet of a model. **Raises:** ValueError for what is no list of feet, frames it does not have, and twice the same."""
+    """Check the feet of a model. **Raises:** ValueError for other types, unknown frames and repeated ones."""
     if not isinstance(model, Model):
         raise ValueError(f"model is a {type(model).__name__}, which has no bodies; pass a Model")
     if not isinstance(feet, (tuple, list)) or not all(isinstance(one, Foot) for one in feet):
@@ -116,5 +116,5 @@ def check_feet(model: Any, feet: Any) -> tuple[Foot, ...]:
         frame_index(model, one.frame)
     names = [one.frame for one in feet]
     if len(set(names)) < len(names):
-        raise ValueError(f"contacts name a frame twice: {names}; give every place a frame of its own")
+        raise ValueError(f"contacts name a frame twice: {names}; give every contact a frame of its own")
     return tuple(feet)

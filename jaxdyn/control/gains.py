@@ -1,4 +1,4 @@
-"""Gains of control laws: a number, one number per row of an error, or a matrix; leaves, checked where they are known."""
+"""Gains of control laws: a number, one number per row of an error, or a matrix; leaves, checked where they are concrete."""
 
 from typing import Any
 
@@ -11,9 +11,9 @@ from jaxdyn.model.arguments import as_array, batch_hint, is_concrete
 
 
 def gain(value: Any, name: str) -> Array:
-    """A gain as an array leaf: (), (n,) for a diagonal matrix, or (n, n).
+    """Convert a gain to an array leaf: (), (n,) for a diagonal matrix, or (n, n).
 
-    **Raises:** ValueError, where the numbers are known, for a gain that is not positive definite: its symmetric part has
+    **Raises:** ValueError, for concrete numbers, for a gain that is not positive definite: its symmetric part has
     an eigenvalue that is zero, negative or not finite.
     """
     array = as_array(value, name)
@@ -22,6 +22,7 @@ def gain(value: Any, name: str) -> Array:
             f"{name} has shape {array.shape}; give a number, (n,) for a diagonal matrix, or a matrix (n, n)"
         )
     if is_concrete(array):
+        # Only the symmetric part enters e . K e, so it alone decides definiteness.
         known = np.asarray(array, float)
         least = np.linalg.eigvalsh((known + known.T) / 2).min() if _is_matrix(known) else known.min(initial=np.inf)
         if not (np.isfinite(known).all() and least > 0):
@@ -30,9 +31,9 @@ def gain(value: Any, name: str) -> Array:
 
 
 def non_negative(value: Any, name: str) -> Array:
-    """A number that damps or weighs, as a leaf: (), zero allowed.
+    """Convert a damping or weight to a leaf: (), zero allowed.
 
-    **Raises:** ValueError for another shape and, where it is known, for a negative number.
+    **Raises:** ValueError for another shape and, for a concrete negative number.
     """
     number = as_array(value, name)
     if number.ndim:
@@ -43,7 +44,7 @@ def non_negative(value: Any, name: str) -> Array:
 
 
 def times(gain: Array, error: Float[Array, " n"], name: str) -> Float[Array, " n"]:
-    """K e for a gain of any of the shapes. **Raises:** ValueError for one of another size."""
+    """Product K e for a gain of any shape. **Raises:** ValueError for one of another size."""
     if gain.ndim and gain.shape[0] != error.shape[0]:
         raise ValueError(
             f"{name} has shape {gain.shape} for an error of {error.shape[0]} rows; give a number, {error.shape} or "
@@ -54,7 +55,7 @@ def times(gain: Array, error: Float[Array, " n"], name: str) -> Float[Array, " n
 
 
 def as_matrix(gain: Array, like: Float[Array, " n"], name: str) -> Float[Array, "n n"]:
-    """The gain as a matrix (n, n)."""
+    """Matrix (n, n) of a gain."""
     unit = jnp.eye(like.shape[0], dtype=like.dtype)
     return jnp.stack([times(gain, column, name) for column in unit], 1)
 

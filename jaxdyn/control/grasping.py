@@ -1,11 +1,11 @@
-"""Control of a grasped object by the hand: motion of the object and internal force, by the torques of the fingers alone.
+"""Control of a grasped object by the hand: motion of the object and internal force, by the torques of the fingers only.
 
-With the acceleration a that the contacts allow and the object's error asks for, and contact forces that carry the object,
+With the acceleration a that satisfies the contacts and the object's error equation, and contact forces that carry the object,
 
     lam_d = G^+ F_o + (1 - G^+ G) lam_0,    F_o = (M a + h - forces) in the rows of the object,
     tau_f = (M a + h - forces) in the rows of the fingers + J_h^T lam_d.
 
-The equations of the whole are then satisfied by this a with lam = lam_d, and where the rows are independent by these alone. For
+The full equations are then satisfied by this a with lam = lam_d, uniquely where the rows are independent. For
 square J_h it is  tau = J_h^T (G^+ (M~ a_o + C~ V + N~) + lam_N) + ..., computed torque in the object's velocity on SE(3).
 
 Sources: Murray, Li & Sastry (1994), section 6.4 (eqs 6.39-6.41); Li, Hsu & Sastry (1989); EQUATIONS section 10.
@@ -18,20 +18,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
-from jaxdyn.control.errors import Target, as_target, least_acceleration, row_rank, wanted_rows
+from jaxdyn.control.errors import Target, as_target, least_acceleration, row_rank, target_rows
 from jaxdyn.control.gains import gain, non_negative, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import velocity_rows
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Checked, Number, Numbers, batch_hint
+from jaxdyn.model.arguments import Checked, Number, Numbers, batch_hint, warn
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.system import displacement
 
 
 class ObjectError(Constraint):
-    """The displacement (no,) of a grasped object from its target: differences of coordinates, or a twist for a free body."""
+    """Displacement (no,) of a grasped object from its target: coordinate differences, or a twist for a free body."""
 
     target: Callable
     grasp: Grasp
@@ -48,6 +48,7 @@ class ObjectError(Constraint):
                 f"target has shape {jnp.shape(target)}, expected {(count,)}, the coordinates of {self.grasp.object!r}"
                 f"{batch_hint(target, (count,))}"
             )
+        # Only the object's coordinates differ from q, so that its displacement is the only nonzero part.
         wanted = q.at[place].set(jnp.asarray(target, q.dtype))
         return displacement(system, wanted, q)[velocity_rows(self.grasp)[1]]
 
@@ -56,14 +57,14 @@ class GraspForce(Controller):
     """Motion of a grasped object and internal force:  edd + Kd ed + Kp e = 0  and  (lam - lam_d) + KI z = 0.
 
     e (no,) is the displacement from the target to the object: differences of its coordinates, and for a free body the twist
-    that leads from the target to it. It decays as the gains say where the model is that of the plant; contact forces are those
-    of least size that carry the object, plus the internal part of `preload`. With integral action the internal part of
-    lam - lam_d, which a wrong model of the fingers leaves, decays with `ki`. Redundant fingers move with the least
-    acceleration from  -damping v, in the metric M; where they cannot follow the object in all directions, it is followed as
-    near as can be (`is_regular`).
+    that leads from the target to it. It decays as set by the gains for an exact model; contact forces are those
+    of least norm that carry the object, plus the internal part of `preload`. With integral action the internal part of
+    lam - lam_d, which errors of the fingers' model cause, decays with `ki`. Redundant fingers move with the least
+    acceleration from  -damping v, in the metric M; where they cannot follow the object in all directions, it is followed in
+    the least-squares sense (`is_regular`).
 
-    The law does not look at cones: the `preload` has to keep the forces inside; `jd.simulate` ends where a contact with a cone
-    is lost, and `outputs=("contact_forces", "contact_margins")` shows how far from that it is.
+    The law ignores cones: the `preload` must keep the forces inside; `jd.simulate` ends where a contact with a cone
+    is lost, and `outputs=("contact_forces", "contact_margins")` gives the margins.
 
     **Arguments:**
 
@@ -71,13 +72,13 @@ class GraspForce(Controller):
     - `target`: coordinates of the object (position and unit quaternion of a free one), or a function of t that returns them,
       differentiable twice.
     - `kp` (1/s^2), `kd` (1/s): positive definite, numbers, (no,) or (no, no).
-    - `preload`: a number (N), with which contacts press, or forces (nc,) in the order of the grasp's rows, or a function
-      of t that returns either; the internal part of it is taken.
+    - `preload`: a number (N), the normal force of the contacts, or forces (nc,) in the order of the grasp's rows, or a function
+      of t that returns either; its internal part is used.
     - `ki` (1/s): positive definite, of the internal force; None for no integral action.
-    - `damping` (1/s): zero or positive, of motions of the fingers that leave the object where it is.
+    - `damping` (1/s): zero or positive, of the internal motions of the fingers.
 
-    **Raises:** ValueError for what is no grasp and for gains that are not positive definite; (when called) for shapes that do
-    not fit.
+    **Raises:** ValueError for anything but a grasp and for gains that are not positive definite; (when called) for inconsistent
+    shapes.
 
     ```python
     law = jd.control.GraspForce(grasp, q_object, kp=25.0, kd=10.0, preload=4.0)
@@ -115,7 +116,7 @@ class GraspForce(Controller):
         self.damping = non_negative(damping, "damping")
 
     def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nc"] | None:
-        """No integral yet."""
+        """Zero integral at the start; None without integral action."""
         return None if self.ki is None else jnp.zeros((layout(self.grasp)[-1].end,), q.dtype)
 
     def rate(
@@ -126,22 +127,27 @@ class GraspForce(Controller):
         state: PyTree,
         multipliers: Float[Array, " nc"],
     ) -> Float[Array, " nc"]:
-        """The internal part of lam - lam_0, (nc,)."""
+        """Internal part of lam - lam_0, (nc,)."""
         return self._internal(q, t, multipliers - as_preload(self.grasp, self.preload(t), q.dtype))
 
     def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
-        """The acceleration that the law asks for, (nv,): on the contacts, and of the object towards its target."""
+        """Commanded acceleration (nv,), consistent with the contacts and the object's error equation."""
         t = jnp.asarray(t, q.dtype)
         A, wanted = self._rows(q, v, t)
         return least_acceleration(self.grasp.system, q, t, A, wanted, -self.damping.astype(v.dtype) * v)
 
-    def wanted_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
-        """lam_d (nc,): contact forces that carry the object, with the internal part of the preload."""
+    def reference_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
+        """Reference contact forces lam_d (nc,) that carry the object, with the internal part of the preload."""
         t = jnp.asarray(t, q.dtype)
         return self._forces(q, t, torque_for(self.grasp, q, v, self.acceleration(q, v, t), t), None)
 
+    def wanted_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
+        """Deprecated name of `reference_forces`."""
+        warn("GraspForce.wanted_forces is deprecated; call reference_forces", DeprecationWarning)
+        return self.reference_forces(q, v, t)
+
     def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
-        """Whether the fingers can follow every motion of the object, so that the law can do what it promises."""
+        """Decide whether the fingers can follow every motion of the object, as the error equation requires."""
         t = jnp.asarray(t, q.dtype)
         both, _ = self._rows(q, v, t)
         A = constraint_jacobian(self.grasp, q, t)
@@ -155,7 +161,7 @@ class GraspForce(Controller):
         state: PyTree = None,
         multipliers: Float[Array, " nc"] | None = None,
     ) -> Float[Array, " nv"]:
-        """Torques (nv,), N m or N: those of the fingers, and zero on the object."""
+        """Joint torques (nv,), N m or N, zero on the object."""
         t = jnp.asarray(t, q.dtype)
         hands, _ = velocity_rows(self.grasp)
         push = torque_for(self.grasp, q, v, self.acceleration(q, v, t), t)
@@ -167,14 +173,16 @@ class GraspForce(Controller):
         G = constraint_jacobian(self.grasp, q, t)[:, velocity_rows(self.grasp)[1]].T
         preload = as_preload(self.grasp, self.preload(t), q.dtype)
         if state is not None and self.ki is not None:
+            # The integral acts on forces, whose sign is that of lam: no torque of the object's motion changes.
             preload = preload - times(self.ki, state, "ki")
         return split_forces(G, push[velocity_rows(self.grasp)[1]], preload)
 
     def _internal(self, q, t, forces):
         G = constraint_jacobian(self.grasp, q, t)[:, velocity_rows(self.grasp)[1]].T
+        # With zero wrench `split_forces` is the projection on the internal forces.
         return split_forces(G, jnp.zeros((G.shape[0],), q.dtype), forces)
 
     def _rows(self, q, v, t):
         row = rows(self.grasp, q, v, t)
-        A, wanted = wanted_rows(self.grasp.system, self.error, self.kp, self.kd, q, v, t)
+        A, wanted = target_rows(self.grasp.system, self.error, self.kp, self.kd, q, v, t)
         return jnp.concatenate([row.A, A]), jnp.concatenate([row.gamma, wanted])

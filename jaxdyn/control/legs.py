@@ -1,9 +1,9 @@
-"""Inverse dynamics of robots with legs: torques and ground forces together, as the base has no motor.
+"""Inverse dynamics of legged robots: torques and ground forces for an unactuated base.
 
     M a + h = S^T tau + sum of J_i^T f_i,    f_i in its cone.
 
-The rows without a motor say which forces balance the motion, the others give the torques: with G = (J^T)_base and
-w = (M a + h)_base,  G f = w  and  tau = (M a + h - J^T f)_motors, so that a quadratic program in f alone is left.
+The unactuated rows determine the forces that balance the motion, the others give the torques: with G = (J^T)_base and
+w = (M a + h)_base,  G f = w  and  tau = (M a + h - J^T f)_motors, which leaves a quadratic program in f.
 """
 
 from collections.abc import Sequence
@@ -27,13 +27,13 @@ from jaxdyn.model.tree import Model
 
 
 class LeggedDynamics(eqx.Module):
-    """Torques and ground forces of a wanted acceleration.
+    """Torques and ground forces for a given acceleration.
 
-    - `tau` (nv,), N m: zero where there is no motor. `forces` (m,), N and N m: of all feet, in their order, each in its
-      contact frame (`Foot`). `margins` (k,): how far each foot's force is from leaving its cone; negative outside.
+    - `tau` (nv,), N m: zero for unactuated velocities. `forces` (m,), N and N m: of all feet, in their order, each in its
+      contact frame (`Foot`). `margins` (k,): distance of each foot's force from the boundary of its cone; negative outside.
     - `result`: one of `jd.contact.RESULTS`; `infeasible` where no forces in the cones balance the motion within the
-      limits of the torques (`missing_wrench` says what is missing). Forces are then the shortest that do so without cones and
-      limits, which leave one of these.
+      limits of the torques (`missing_wrench` gives the remainder). Forces are then those of least norm without cones and
+      limits, of which one is violated.
     """
 
     tau: Float[Array, " nv"]
@@ -44,7 +44,7 @@ class LeggedDynamics(eqx.Module):
 
     @property
     def success(self) -> Array:
-        """Whether `result` is `successful`."""
+        """True where `result` is `successful`."""
         return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
 
     def by_foot(self) -> dict[str, Array]:
@@ -67,28 +67,28 @@ def underactuated_inverse_dynamics(
     effort_limit: Numbers | None = None,
     tol: float | None = None,
 ) -> LeggedDynamics:
-    """Torques and contact forces that give the acceleration a, the forces inside their cones.
+    """Torques and contact forces, inside their cones, for the acceleration a.
 
         minimise torque_weight |tau|^2 + force_weight |f|^2
         with M a + h = S^T tau + sum of J_i^T f_i,  margins(f_i) >= preload,  |tau| <= effort_limit
 
-    One small quadratic program a sample (`jd.contact.solve_qp`): batched, and differentiable in the state, the
-    acceleration, the model and the coefficients of friction. The feet are not asked to stand still: take an `a` with
-    J a + Jdot v = 0 for feet that do.
+    One small quadratic program per sample (`jd.contact.solve_qp`): batched, and differentiable in the state, the
+    acceleration, the model and the coefficients of friction. Feet are not constrained to be at rest: choose an `a` with
+    J a + Jdot v = 0 for feet at rest.
 
     **Arguments:**
 
-    - `q` (nq,), `v` (nv,), `a` (nv,), the wanted acceleration.
+    - `q` (nq,), `v` (nv,), `a` (nv,), the given acceleration.
     - `contacts`: list of `jd.control.foot(frame, cone)`; empty in flight.
-    - `passive`: indices of the velocities without a motor; by default those of all free joints.
-    - `preload` (), N: least margin of every cone. `torque_weight`, `force_weight`: the second one positive, N m against N.
-    - `effort_limit`: N m, a number or one per velocity, of which those of motors count; None: no limit.
+    - `passive`: indices of the unactuated velocities; by default those of all free joints.
+    - `preload` (), N: least margin of every cone. `torque_weight`, `force_weight`: the second one positive, for N m and N.
+    - `effort_limit`: N m, a number or one per velocity, of which only actuated ones are used; None: no limit.
     - `tol`: of `solve_qp`.
 
     **Returns:** `LeggedDynamics`.
 
-    **Raises:** ValueError for shapes that do not fit, frames that the model does not have, a list that holds anything but
-    feet, a model whose every velocity has a motor.
+    **Raises:** ValueError for inconsistent shapes, unknown frames, a list with other entries than
+    feet, a fully actuated model.
 
     Source: Righetti, Buchli, Mistry, Kalakrishnan & Schaal (2013), section 3; EQUATIONS section 11.
 
@@ -110,6 +110,7 @@ def underactuated_inverse_dynamics(
         result = RESULTS.where(jnp.any(needed[base] != 0), RESULTS.infeasible, RESULTS.successful)  # pyright: ignore[reportArgumentType]
         tau = needed.at[base].set(0)
         return LeggedDynamics(tau, jnp.zeros((0,), q.dtype), jnp.zeros((0,), q.dtype), result, ())
+    # With tau eliminated, |tau|^2 = |needed - across^T f|^2: only f remains in the program.
     J = jnp.concatenate([one.jacobian(model, q) for one in feet])
     across, along = J[:, motors], J[:, base].T
     Q = torque_weight * _product(across, across.T) + force_weight * jnp.eye(J.shape[0], dtype=q.dtype)
@@ -122,11 +123,12 @@ def underactuated_inverse_dynamics(
             )
         limit = jnp.broadcast_to(limit, (model.nv,))[motors]
         rows, levels = bounds.get("G", jnp.zeros((0, J.shape[0]), q.dtype)), bounds.get("h", jnp.zeros((0,), q.dtype))
+        # |tau| <= limit with tau = needed - across^T f: two linear rows per motor.
         bounds["G"] = jnp.concatenate([rows, -across.T, across.T])
         bounds["h"] = jnp.concatenate([levels, limit - needed[motors], limit + needed[motors]])
     linear = -torque_weight * _product(across, needed[motors])
     optimum = solve_qp(Q, linear, A=along, b=needed[base], tol=tol, **bounds)
-    # What a program without a solution ends with grows without bound.
+    # The last iterate of an infeasible program diverges, so it is replaced by the least-norm forces.
     shortest = _product(pseudo_inverse(along.T, tolerance(None, along)).T, needed[base])
     forces = jnp.where(optimum.result == RESULTS.infeasible, shortest, optimum.x)  # pyright: ignore[reportArgumentType]
     sizes = np.cumsum([one.size for one in feet])[:-1]
@@ -150,10 +152,10 @@ def missing_wrench(
     *,
     passive: tuple[int, ...] | None = None,
 ) -> Float[Array, " np"]:
-    """What feet in their cones leave of the generalised force that an acceleration needs at the base: (M a + h)_base - G f.
+    """Remainder of the generalised force at the base that feet in their cones cannot exert: (M a + h)_base - G f.
 
-    f is the one in the cones for which it is shortest. Zero, but for the tolerance of the program and some 1e-6 of its
-    size, where the feet can carry the robot.
+    f in the cones minimises its norm. Zero, up to the tolerance of the program and about 1e-6 of its
+    norm, where the feet can carry the robot.
 
     **Arguments:** as of `underactuated_inverse_dynamics`.
 
@@ -168,14 +170,14 @@ def missing_wrench(
     if not feet:
         return needed
     G = jnp.concatenate([one.jacobian(model, q) for one in feet])[:, base].T
-    # Forces that add up to nothing are kept short, as they would not be determined.
+    # The small term determines internal forces, which the remainder does not.
     Q = _product(G.T, G) + 1e-6 * jnp.eye(G.shape[1], dtype=q.dtype)
     bounds = cone_bounds([one.cone for one in feet], jnp.zeros((), q.dtype), q.dtype)
     return needed - _product(G, solve_qp(Q, -_product(G.T, needed), **bounds).x)
 
 
 def passive_velocities(model: Model, passive: Sequence[int] | None) -> np.ndarray:
-    """Indices of the velocities without a motor. **Raises:** ValueError for none, and for indices that there are not."""
+    """Indices of the unactuated velocities. **Raises:** ValueError for none, and for indices out of range."""
     top = model.topology
     if passive is None:
         places = [
@@ -186,8 +188,8 @@ def passive_velocities(model: Model, passive: Sequence[int] | None) -> np.ndarra
         indices = np.concatenate([*places, np.zeros(0, int)])
         if not indices.size:
             raise ValueError(
-                f"model {model.name!r} has no free joint, so every velocity has a motor; take jd.inverse_dynamics, or name "
-                "the velocities without one in passive"
+                f"model {model.name!r} has no free joint, so it is fully actuated; use jd.inverse_dynamics, or name "
+                "the unactuated velocities in passive"
             )
         return indices
     indices = np.unique(np.asarray(passive, int))

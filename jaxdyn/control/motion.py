@@ -1,6 +1,6 @@
-"""Laws of free motion: computed torque, operational space, stiffness in space.
+"""Laws of free motion: computed torque, operational space, Cartesian stiffness.
 
-Each is an equinox Module called as `law(q, v, t) -> tau (nv,)`, which is what `jd.simulate(control=...)` takes. Gains and
+Each is an equinox Module called as `law(q, v, t) -> tau (nv,)`, as `jd.simulate(control=...)` takes. Gains and
 targets are leaves. Sources: Murray, Li & Sastry (1994), section 4.5; Khatib (1987); Hogan (1985); EQUATIONS section 8.
 """
 
@@ -19,7 +19,7 @@ from jaxdyn.control.errors import (
     as_target,
     frame_error,
     least_acceleration,
-    wanted_rows,
+    target_rows,
 )
 from jaxdyn.control.gains import gain, non_negative, times
 from jaxdyn.dynamics.quantities import gravity_force, inverse_dynamics
@@ -33,9 +33,9 @@ from jaxdyn.systems.system import SceneLike, displacement
 class ComputedTorque(eqx.Module):
     """Computed torque: tau = M(q) a + C(q, v) v + N(q) - forces of the scene, with the a of  edd + Kd ed + Kp e = 0.
 
-    e (nv,) is the displacement from the target to q: q - q_d, and in joints that turn in space the twist that leads from
-    the target to q. Each error decays exactly as the gains say, where the model is that of the plant: for scalar gains
-    with the roots of s^2 + kd s + kp. At an error of half a turn the twist jumps.
+    e (nv,) is the displacement from the target to q: q - q_d, and for joints with rotations in space the twist from
+    the target to q. Each error decays exactly as set by the gains for an exact model: for scalar gains
+    with the roots of s^2 + kd s + kp. The twist is discontinuous at an error of half a turn.
 
     **Arguments:**
 
@@ -44,7 +44,7 @@ class ComputedTorque(eqx.Module):
     - `kp` (1/s^2), `kd` (1/s): numbers, (nv,), or positive definite matrices (nv, nv).
 
     **Raises:** ValueError for gains that are not positive definite and for a scene with constraints; (when called) for
-    shapes that do not fit.
+    inconsistent shapes.
 
     Source: Murray, Li & Sastry (1994), eq. 4.47; EQUATIONS section 8 without constraints.
 
@@ -65,22 +65,23 @@ class ComputedTorque(eqx.Module):
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
 
     def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
-        """Torques (nv,), N m or N."""
+        """Joint torques (nv,), N m or N."""
         t = jnp.asarray(t, q.dtype)
         system = self.scene.system
         error = ConfigurationError(self.target)  # pyright: ignore[reportCallIssue]
-        A, a = wanted_rows(system, error, self.kp, self.kd, q, v, t)
+        A, a = target_rows(system, error, self.kp, self.kd, q, v, t)
+        # For v = dq/dt the rows are the unit matrix, and the right-hand side is the acceleration itself.
         if not _is_flat(system):
             a = least_acceleration(system, q, t, A, a, jnp.zeros_like(v))
         return torque_for(self.scene, q, v, a, t)
 
 
 class OperationalSpace(eqx.Module):
-    """Operational space: the error of a frame obeys  edd + Kd ed + Kp e = 0, and what is left of the motion is damped.
+    """Operational space: the error of a frame obeys  edd + Kd ed + Kp e = 0, and the null motion is damped.
 
-    tau = M a + h - forces with a = J^ x* + (1 - J^ J) a0, J^ = M^-1 J^T (J M^-1 J^T)^-1: the acceleration nearest, in the
+    tau = M a + h - forces with a = J^ x* + (1 - J^ J) a0, J^ = M^-1 J^T (J M^-1 J^T)^-1: the acceleration closest, in the
     metric M, to a0 = -damping v - stiffness (displacement from the posture). The null motion does not disturb the task.
-    Where J loses rank the task is not met along the lost direction, and what is asked for there is left out.
+    Where J loses rank the task is dropped along the singular direction.
 
     **Arguments:**
 
@@ -88,10 +89,10 @@ class OperationalSpace(eqx.Module):
     - `frame`: name of the frame; `task`: "position" (error in world axes, m), "orientation" (log(R_d^T R), rad) or "pose".
     - `target`: (3,), (3, 3) or (4, 4) by the task, or a function of t that returns it, differentiable twice.
     - `kp` (1/s^2), `kd` (1/s): numbers, (m,), or positive definite matrices.
-    - `damping` (1/s), `stiffness` (1/s^2) of the null motion, zero or positive; `posture` (nq,): where it rests.
+    - `damping` (1/s), `stiffness` (1/s^2) of the null motion, zero or positive; `posture` (nq,): its equilibrium.
 
     **Raises:** ValueError for gains that are not positive definite, unknown frames and tasks, a scene with constraints, a
-    `stiffness` without a posture; (when called) for shapes that do not fit.
+    `stiffness` without a posture; (when called) for inconsistent shapes.
 
     Source: Khatib (1987), eqs 20 and 52; EQUATIONS section 10, workspace dynamics.
     """
@@ -128,9 +129,9 @@ class OperationalSpace(eqx.Module):
             raise ValueError(f"posture has shape {self.posture.shape}, expected {(self.scene.nq,)} = (nq,)")
 
     def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
-        """Torques (nv,), N m or N."""
+        """Joint torques (nv,), N m or N."""
         system, t = self.scene.system, jnp.asarray(t, q.dtype)
-        A, wanted = wanted_rows(system, self.error, self.kp, self.kd, q, v, t)
+        A, wanted = target_rows(system, self.error, self.kp, self.kd, q, v, t)
         rest = -self.damping.astype(v.dtype) * v
         if self.posture is not None:
             rest = rest - self.stiffness.astype(v.dtype) * displacement(system, self.posture, q)
@@ -138,20 +139,20 @@ class OperationalSpace(eqx.Module):
 
 
 class CartesianStiffness(eqx.Module):
-    """A frame held by a spring and a damper in space: tau = N(q) - J^T (K e + D ed) - joint_damping v.
+    """Cartesian stiffness and damping of a frame: tau = N(q) - J^T (K e + D ed) - joint_damping v.
 
-    Nothing of the inertia is cancelled, so the arm is passive for a fixed target: with the energy T + e . K e / 2 it gives
-    away what it takes, e . K e / 2 + T falling by ed . D ed + joint_damping v . v a second. At rest under a force F, along
-    the rows of the error, it yields by K e = F.
+    No inertia is cancelled, so the arm is passive for a fixed target: the energy T + e . K e / 2
+    decreases at the rate ed . D ed + joint_damping v . v. At rest under a force F, along
+    the rows of the error, the deflection solves K e = F.
 
     **Arguments:**
 
     - `model`: a `Model`; `frame`, `task`, `target` as in `OperationalSpace`.
     - `stiffness` K (N/m, N m/rad) and `damping` D (N s/m, N m s/rad): numbers, (m,), or positive definite matrices.
-    - `joint_damping` (N m s/rad or N s/m), zero or positive: of the motion that the frame does not see.
+    - `joint_damping` (N m s/rad or N s/m), zero or positive: of the null motion.
 
-    **Raises:** ValueError for gains that are not positive definite, unknown frames and tasks; (when called) for shapes
-    that do not fit.
+    **Raises:** ValueError for gains that are not positive definite, unknown frames and tasks; (when called) for
+    inconsistent shapes.
 
     Source: Hogan (1985), part I; Murray, Li & Sastry (1994), section 4.6.
     """
@@ -179,7 +180,7 @@ class CartesianStiffness(eqx.Module):
         self.joint_damping = non_negative(joint_damping, "joint_damping")
 
     def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
-        """Torques (nv,), N m or N."""
+        """Joint torques (nv,), N m or N."""
         scene, t = Scene(self.model, (self.error,)), jnp.asarray(t, q.dtype)
         row, error = rows(scene, q, v, t), position_residual(scene, q, t)
         push = times(self.stiffness, error, "stiffness") + times(self.damping, row.velocity, "damping")
@@ -187,22 +188,22 @@ class CartesianStiffness(eqx.Module):
 
 
 def unconstrained(scene: Any) -> Scene:
-    """A scene without constraints. **Raises:** ValueError for one that has some."""
+    """Require a scene without constraints. **Raises:** ValueError for one with some."""
     scene = as_scene(scene)
     if scene.constraints:
         raise ValueError(
-            f"scene has {len(scene.constraints)} constraints, whose forces this law does not know; take "
+            f"scene has {len(scene.constraints)} constraints, whose forces this law does not model; use "
             "jd.control.HybridForce or jd.control.GaugeInvariant"
         )
     return scene
 
 
 def _is_flat(system) -> bool:
-    """Whether v = dq/dt, so that the rows of an error of configuration are a unit matrix."""
+    """Decide whether v = dq/dt, so that the rows of a configuration error are a unit matrix."""
     return not (isinstance(system, Model) and {"planar", "spherical", "free"} & set(system.topology.kinds))
 
 
 def torque_for(scene: Scene, q, v, a, t) -> Float[Array, " nv"]:
-    """M a + h less the scene's forces, (nv,): what has to be added to give the acceleration without constraint forces."""
+    """Torques M a + h minus the scene's forces, (nv,), for the acceleration a without constraint forces."""
     tau, force = inverse_dynamics(scene.system, q, v, a, t), scene.applied_force(q, v, t)
     return tau if force is None else tau - force

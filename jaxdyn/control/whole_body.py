@@ -1,12 +1,12 @@
-"""Control of the whole body of a robot with legs: its centre of mass, the attitude of its base and its posture.
+"""Whole-body control of legged robots: centre of mass, attitude of the base and posture.
 
-The acceleration is asked for in three orders, each as far as those before leave it free:
+The acceleration satisfies tasks of three priorities, each in the null space of those before:
 
-    J a = -Jdot v                                   the feet stay where they are,
+    J a = -Jdot v                                   the feet are at rest,
     c: edd + Kd ed + Kp e = 0,  base: the same      centre of mass and attitude follow their targets,
     a near -damping v - stiffness (q - posture)     the rest, in the metric M.
 
-Torques and forces of the feet follow from it (`jaxdyn.control.legs`), the forces inside their cones.
+Torques and ground forces follow from it (`jaxdyn.control.legs`), inside their cones.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,14 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import is_concrete
 from jaxdyn.constraints.base import Constraint, rows
-from jaxdyn.control.errors import FrameError, as_target, frame_error, ordered_acceleration, placed, wanted_rows
+from jaxdyn.control.errors import (
+    FrameError,
+    as_target,
+    frame_error,
+    hierarchical_acceleration,
+    target_rows,
+    target_value,
+)
 from jaxdyn.control.feet import Foot, check_feet
 from jaxdyn.control.gains import gain, non_negative
 from jaxdyn.control.legs import LeggedDynamics, missing_wrench, passive_velocities, underactuated_inverse_dynamics
@@ -30,23 +37,23 @@ from jaxdyn.systems.system import displacement
 
 
 class CenterError(Constraint):
-    """The centre of mass less its target, (3,), m, in world axes."""
+    """Error of the centre of mass, (3,), m, in world axes."""
 
     target: Callable
     name: str = eqx.field(static=True, default="centre of mass")
 
     def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, "3"]:
-        """c(q) - c_d(t)."""
-        return center_of_mass(system, q) - placed(self.target, t, (3,), q)
+        """Error c(q) - c_d(t)."""
+        return center_of_mass(system, q) - target_value(self.target, t, (3,), q)
 
 
 class WholeBody(eqx.Module):
-    """Centre of mass and attitude of the base by  edd + Kd ed + Kp e = 0, the forces of the feet inside their cones.
+    """Centre of mass and attitude of the base by  edd + Kd ed + Kp e = 0, with ground forces inside their cones.
 
     tau comes from `jd.underactuated_inverse_dynamics` for the acceleration of `acceleration(q, v, t)`. Errors decay exactly as
-    the gains say where the model is that of the plant, the feet stay, and their forces can give the acceleration. Whether they
-    can is told by `dynamics(q, v, t).result`; where they cannot, forces leave a cone, a simulation of `jd.control.standing`
-    ends with `contact_lost`, and `missing_wrench(q, v, t)` says what is missing. Forces of feet that are held are those of
+    set by the gains for an exact model, while the feet are at rest and their forces can give the acceleration. The code
+    `dynamics(q, v, t).result` reports this; otherwise forces leave a cone, a simulation of `jd.control.standing`
+    ends with `contact_lost`, and `missing_wrench(q, v, t)` gives the remainder. Forces of constrained feet are those of
     the program where their rows are independent: with points, up to three of them or legs of three joints and more.
 
     **Arguments:**
@@ -54,16 +61,16 @@ class WholeBody(eqx.Module):
     - `model`: a `Model`; `contacts`: list of `jd.control.foot(frame, cone)`.
     - `com`: target c_d of the centre of mass, (3,) in world axes, m, or a function of t, differentiable twice.
     - `kp` (1/s^2), `kd` (1/s): of the centre of mass, positive definite: numbers, (3,) or (3, 3).
-    - `orientation`: target R_d (3, 3) of the frame `base`, or a function of t; None: its attitude is left to the posture.
+    - `orientation`: target R_d (3, 3) of the frame `base`, or a function of t; None: its attitude follows from the posture.
       `base`: name of a frame or body, by default the model's first body. `turn_kp`, `turn_kd`: its gains, of the error
       log(R_d^T R); by default `kp` and `kd`.
-    - `posture` (nq,): where the rest of the motion rests, with `stiffness` (1/s^2) and `damping` (1/s), zero or positive.
+    - `posture` (nq,): equilibrium of the remaining motion, with `stiffness` (1/s^2) and `damping` (1/s), zero or positive.
     - `preload` (), N; `torque_weight`, `force_weight`, `effort_limit`, `passive`: of `jd.underactuated_inverse_dynamics`.
 
-    **Raises:** ValueError for gains that are not positive definite, frames that the model does not have, what is no list of
-    feet or an empty one, a `stiffness` without a posture; (when called) for shapes that do not fit.
+    **Raises:** ValueError for gains that are not positive definite, unknown frames, no list of
+    feet or an empty one, a `stiffness` without a posture; (when called) for inconsistent shapes.
 
-    Source: Righetti, Buchli, Mistry, Kalakrishnan & Schaal (2013), section 3; Sentis & Khatib (2005), for the orders;
+    Source: Righetti, Buchli, Mistry, Kalakrishnan & Schaal (2013), section 3; Sentis & Khatib (2005), for the priorities;
     EQUATIONS section 11.
 
     ```python
@@ -133,24 +140,24 @@ class WholeBody(eqx.Module):
             raise ValueError(f"posture has shape {self.posture.shape}, expected {(model.nq,)} = (nq,)")
 
     def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
-        """The acceleration that the law asks for, (nv,)."""
+        """Commanded acceleration, (nv,)."""
         t = jnp.asarray(t, q.dtype)
         rest = -self.damping.astype(v.dtype) * v
         if self.posture is not None:
             rest = rest - self.stiffness.astype(v.dtype) * displacement(self.model, self.posture, q)
-        return ordered_acceleration(self.model, q, t, self._orders(q, v, t), rest)
+        return hierarchical_acceleration(self.model, q, t, self._orders(q, v, t), rest)
 
     def shortfall(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " m"]:
-        """What the acceleration leaves of the tasks, (m,): rows of the centre of mass (m/s^2), then of the attitude (rad/s^2).
+        """Residual of the tasks, (m,): rows of the centre of mass (m/s^2), then of the attitude (rad/s^2).
 
-        Zero where the feet and the joints leave the tasks free, so that the law can do what it promises.
+        Zero where feet and joints do not restrict the tasks, so that the error equations hold.
         """
         t = jnp.asarray(t, q.dtype)
         A, wanted = self._orders(q, v, t)[1]
         return wanted - _product(A, self.acceleration(q, v, t))
 
     def dynamics(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> LeggedDynamics:
-        """Torques, forces of the feet and their margins, and whether the feet can carry what is asked (`result`)."""
+        """Torques, ground forces and their margins, with `result` for their feasibility."""
         return underactuated_inverse_dynamics(
             self.model,
             q,
@@ -165,19 +172,19 @@ class WholeBody(eqx.Module):
         )
 
     def missing_wrench(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " np"]:
-        """What feet in their cones leave of the generalised force at the base, (np,): `jd.control.missing_wrench`."""
+        """Remainder of the generalised force at the base, (np,): `jd.control.missing_wrench`."""
         return missing_wrench(self.model, q, v, self.acceleration(q, v, t), list(self.feet), passive=self.passive)
 
     def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
-        """Torques (nv,), N m or N: zero where there is no motor."""
+        """Joint torques (nv,), N m or N, zero for unactuated velocities."""
         return self.dynamics(q, v, t).tau
 
     def _orders(self, q, v, t):
-        """Rows and right sides of the feet, then of the tasks."""
+        """Rows and right-hand sides of the feet, then of the tasks."""
         feet = rows(Scene(self.model, [one.hold(self.model, q) for one in self.feet]), q, v, t)
-        tasks = [wanted_rows(self.model, self.center, self.kp, self.kd, q, v, t)]
+        tasks = [target_rows(self.model, self.center, self.kp, self.kd, q, v, t)]
         if self.turn is not None:
-            tasks.append(wanted_rows(self.model, self.turn, self.turn_kp, self.turn_kd, q, v, t))
+            tasks.append(target_rows(self.model, self.turn, self.turn_kp, self.turn_kd, q, v, t))
         A, wanted = (jnp.concatenate(x) for x in zip(*tasks, strict=True))
         return (feet.A, feet.gamma), (A, wanted)
 
@@ -189,14 +196,14 @@ def standing(
     *,
     forces: Checked[Sequence[Force]] = (),
 ) -> Scene:
-    """A scene in which feet are held where they are at q (nq,), with their friction cones.
+    """Scene with feet fixed at their poses for q (nq,), with their friction cones.
 
-    A simulation ends with `contact_lost` where one of them pulls or slips; outputs "contact_forces" and "contact_margins" are
+    A simulation ends with `contact_lost` where one of them lifts or slips; outputs "contact_forces" and "contact_margins" are
     by the names of the feet's frames. `forces`: of the scene.
 
-    **Raises:** ValueError for what is no list of feet, or an empty one, and frames that the model does not have.
+    **Raises:** ValueError for anything but a nonempty list of feet, and unknown frames.
     """
     feet = check_feet(model, contacts)
     if not feet:
-        raise ValueError("contacts is empty; take the model itself, or name the feet that stand on the ground")
+        raise ValueError("contacts is empty; use the model itself, or name the feet on the ground")
     return Scene(model, [one.hold(model, q) for one in feet], forces=forces, cones=[one.cone for one in feet])

@@ -1,12 +1,13 @@
 """Products of exponentials in base-frame twists, as Murray, Li & Sastry and Li & Wu write them (EQUATIONS section 2).
 
-With xi_j the twist of joint j in the world frame at q = 0, body i stands at exp(hat(xi_1) q_1) ... exp(hat(xi_i) q_i) g_i(0), and
-the adjoints A_ij of the exponentials between bodies j and i carry twists from one to the other:
+With xi_j the twist of joint j in the world frame at q = 0, the pose of body i is
+exp(hat(xi_1) q_1) ... exp(hat(xi_i) q_i) g_i(0), and the adjoints A_ij of the exponentials
+between bodies j and i map twists from one to the other:
 
     J_i = Ad^-1_{g_i(0)} [A_i1 xi_1 ... A_ii xi_i],
     M_ij = sum_l xi_i^T A_li^T M'_l A_lj xi_j,    M'_l = Ad^T_{g_l(0)^-1} M_l Ad_{g_l(0)^-1}.
 
-This is the form to read and to check against; `mass_matrix` and `mass_matrix_derivative` use recursions instead.
+This form serves reading and checking; `mass_matrix` and `mass_matrix_derivative` use recursions instead.
 """
 
 import jax
@@ -24,8 +25,8 @@ from jaxdyn.model.tree import Model, neutral
 def base_twists(model: Model) -> Float[Array, "nv 6"]:
     """Twist of every joint in the world frame at the neutral configuration, xi_j = Ad_{g_j(0)} S_j.
 
-    **Returns:** (nv, 6), one row (v, omega) for each velocity coordinate: m/rad and rad/rad of a joint that turns, m/m of one
-    that slides.
+    **Returns:** (nv, 6), one row (v, omega) for each velocity coordinate: m/rad and rad/rad for a joint that rotates,
+    m/m for one that translates.
 
     Source: Murray, Li & Sastry (1994), section 3.2; EQUATIONS section 2.
     """
@@ -59,8 +60,10 @@ def link_adjoints(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb nb 6
 
 def _link_adjoints(model: Model, q):
     poses, home = forward_kinematics(model, q), forward_kinematics(model, neutral(model))
-    # What takes the neutral pose of a body to the pose at q: the product of the exponentials down to this body.
+    # poses home^-1 is the product of the exponentials down to each body: g_i(q) = product g_i(0).
     products = _product(poses, jax.vmap(se3.inverse)(home))
+    # All pairs at once, although half of them are masked: one batched product is a shorter program than a loop over
+    # paths.
     between = jax.vmap(jax.vmap(lambda a, b: se3.Ad(_product(se3.inverse(a), b)), (None, 0)), (0, None))(
         products, products
     )

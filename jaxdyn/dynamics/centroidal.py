@@ -1,4 +1,4 @@
-"""The centre of mass, and momentum about it (EQUATIONS section 11)."""
+"""Centre of mass, and momentum about it (EQUATIONS section 11)."""
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
 
 def _center_of_mass(model: Model, q):
     mass, first, origin, shift = first_moments(model, tree_frame(model, q))
+    # Positions relative to the tree's root: far from the world's origin, absolute positions would lose digits.
     return origin + jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
 
 
@@ -66,6 +67,7 @@ def centroidal_momentum_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Ar
 
 def _centroidal_momentum_matrix(model: Model, q):
     frame = tree_frame(model, q)
+    # Column k is the momentum of the composite body moved by coordinate k alone, which is Orin's formula A = X^T I J.
     composite = sum_to_coordinates(model, tree_inertias(model, frame))
     momenta = jax.vmap(momentum)(composite, frame.subspace)
     return _about_center(model, frame, momenta, model.topology.dof_body).T
@@ -90,9 +92,10 @@ def com_jacobian(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3 nv"]:
 
 
 def _about_center(model: Model, frame: TreeFrame, momenta: Array, bodies=None) -> Array:
-    """Momenta (n, 6) taken in tree frames, of the given bodies, moved to the centre of mass."""
+    """Shift momenta (n, 6) of the given bodies from their tree frames to the centre of mass."""
     mass, first, _, shift = first_moments(model, frame)
     center = jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
+    # The moment of momentum about another point changes by lever x l; the linear part stays.
     lever = shift - center[None]
     lever = lever if bodies is None else take(lever, bodies)
     angular = momenta[:, 3:] + jax.vmap(cross)(lever, momenta[:, :3])

@@ -1,4 +1,4 @@
-"""Velocity and acceleration of a frame as a user measures them: of its origin, in world axes."""
+"""Velocity and acceleration of a frame's origin in world axes, as instruments measure them."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -48,6 +48,7 @@ def _jacobian(body: int, tree, q):
     model, offset = tree
     frame = tree_frame(model, q)
     columns = twist_columns(model, frame, body, offset, frame.subspace)
+    # The body Jacobian holds both parts in the frame's axes at its origin; rotating them changes axes, not the point.
     turn = _product(frame.pose[body], jnp.asarray(offset))[:3, :3]
     return jnp.concatenate([_product(turn, columns[:, :3].T), _product(turn, columns[:, 3:].T)])
 
@@ -75,6 +76,7 @@ def frame_velocity(
 def _velocity(body: int, tree, q, v):
     model, offset = tree
     frame = tree_frame(model, q)
+    # The tree frame has the world's axes, so only the point of reference moves: v_p = v + omega x r.
     twist, lever = body_twists(model, frame, v)[body], _product(frame.pose[body], jnp.asarray(offset))[:3, 3]
     return jnp.concatenate([twist[:3] + cross(twist[3:], lever), twist[3:]])
 
@@ -112,9 +114,10 @@ def _acceleration(body: int, tree, q, v, a):
     frame = tree_frame(model, q)
     twists = body_twists(model, frame, v)
     rows = frame.subspace * a[:, None] + subspace_rate(model, frame, twists) * v[:, None]
-    # The tree's axes are the world's, and its origin is fixed: rates of the twist taken there.
+    # The tree frame is inertial, with the world's axes: rates of twists are componentwise.
     rate = jnp.sum(twist_columns(model, frame, body, offset, rows), axis=0)
     twist = jnp.sum(twist_columns(model, frame, body, offset, frame.subspace * v[:, None]), axis=0)
     turn = _product(frame.pose[body], jnp.asarray(offset))[:3, :3]
+    # From the rate of the body twist to the acceleration of the origin: dv/dt + omega x v.
     linear = rate[:3] + cross(twist[3:], twist[:3])
     return jnp.concatenate([_product(turn, linear[:, None])[:, 0], _product(turn, rate[3:, None])[:, 0]])

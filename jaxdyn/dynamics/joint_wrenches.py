@@ -1,4 +1,4 @@
-"""What joints transmit: the wrench through each joint of a tree in motion."""
+"""Joint wrenches: the wrench transmitted through each joint of a tree in motion."""
 
 import jax
 import jax.numpy as jnp
@@ -25,15 +25,15 @@ def joint_wrench(
     external: Float[Array, "nb 6"] | None = None,
     axes: str = "body",
 ) -> Float[Array, "*nb 6"]:
-    """Wrench that a joint transmits in a motion: (f, tau) of what carries the body ON the body, drive included.
+    """Wrench transmitted by a joint in a motion: (f, tau) of the parent ON the body, drive included.
 
-    F_i = sum over the bodies j that joint i carries of (the rate of momentum of j - its weight - external_j). Its part along
-    the joint's freedoms is the joint's force: S_i^T F_i = tau_i - armature a_i, with tau of `inverse_dynamics`; the rest is
-    what the bearing holds. Rotors are left out of it.
+    F_i = sum over the bodies j that joint i carries of (the rate of momentum of j - its weight - external_j). Its component along
+    the joint's motion subspace is the joint's force: S_i^T F_i = tau_i - armature a_i, with tau of `inverse_dynamics`;
+    the rest is the bearing's reaction. Rotors are not included.
 
     **Arguments:**
 
-    - `q` (nq,), `v` (nv,), `a` (nv,): the motion; a as `forward_dynamics` or `constrained_dynamics` gives it.
+    - `q` (nq,), `v` (nv,), `a` (nv,): the motion; a from `forward_dynamics` or `constrained_dynamics`.
     - `joint`: name of a moving joint; None: all of them.
     - `external` (nb, 6): other wrenches (f, tau) ON each body, at its frame's origin and in its axes (N, N m). Those of closed
       loops are `jd.body_wrenches(scene, q, multipliers)`.
@@ -57,6 +57,7 @@ def joint_wrench(
         return jnp.zeros((0, 6), q.dtype)
     function = _in_world if axes == "world" else _in_bodies
     given = (q, v, a) if external is None else (q, v, a, external)
+    # Beyond MAX_BODIES a scalar program would compile for too long.
     wrenches = function(model, *given) if model.nb > MAX_BODIES else run(function, model, *given)
     return wrenches if index is None else wrenches[index]
 

@@ -1,11 +1,11 @@
 """Kinematics of trees: products of exponentials, Jacobians of named frames and their rates.
 
-Body i stands at T_i = (product over its ancestors j, root first, of home_j exp(hat(S_j) q_j)), the product of
-exponentials of Murray, Li & Sastry (1994), eq. 3.3, with body frames in place of base-frame screws. The product along
+The pose of body i is T_i = (product over its ancestors j, root first, of home_j exp(hat(S_j) q_j)), the product of
+exponentials of Murray, Li & Sastry (1994), eq. 3.3, with body frames instead of base-frame screws. The product along
 the tree is taken by pointer jumping: after step k every body holds the product of its last 2^k joints, so log2(depth)
 batched 4x4 products give all poses and the program stays short however many bodies there are.
 
-Everything that is summed over bodies lives in one *tree frame*: axes parallel to the world's, origin at the origin of
+Quantities summed over bodies are expressed in one *tree frame*: axes parallel to the world's, origin at the origin of
 the tree's root body. Positions in it are built without ever adding the root's own position, so a robot far from the
 world's origin is computed exactly as one at home.
 """
@@ -47,7 +47,9 @@ def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4
     topology = model.topology
     home, screws = map(jnp.asarray, geometry(model))
     order, transforms = [], []
-    for kind, bodies in _groups(topology):
+    # One batched evaluation per joint kind, instead of one per joint: the program does not grow with the number of
+    # bodies.
+    for kind, bodies in _bodies_by_kind(topology):
         if kind in SCREW_KINDS:
             coordinates = np.array([topology.q_slices[i].start for i in bodies])
             place = jax.vmap(functools.partial(screw_transform, kind))
@@ -59,8 +61,8 @@ def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4
         order.extend(bodies)
     if not transforms:
         return home
-    moved = transforms[0] if len(transforms) == 1 else jnp.concatenate(transforms)
-    return _product(home, take(moved, np.argsort(order)))
+    transforms_by_kind = transforms[0] if len(transforms) == 1 else jnp.concatenate(transforms)
+    return _product(home, take(transforms_by_kind, np.argsort(order)))
 
 
 def body_subspace(model: Model) -> Float[Array, "nv 6"]:
@@ -90,32 +92,35 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     mask = np.ones((topology.nb, 4, 4), bool)
     mask[is_root, :3, 3] = False
     pose = jnp.where(mask, local, jnp.zeros_like(local))
-    pose = _along_tree(topology, pose)
+    pose = _tree_products(topology, pose)
     subspace = jax.vmap(se3.Ad_apply)(take(pose, topology.dof_body), body_subspace(model))
     return TreeFrame(pose, origin, subspace)
 
 
-def _along_tree(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
+def _tree_products(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
     """Products of the poses of all bodies above each body, root first.
 
-    As operations on arrays by pointer jumping, in log2(depth) products of all bodies; as single numbers one product a body.
+    On arrays by pointer jumping, with log2(depth) products of all bodies; in scalar programs with one product per body.
     """
+    # A scalar program runs sequentially: pointer jumping would only multiply its operations by log2(depth).
     if is_expanding():
         products: list = []
         for i, parent in enumerate(topology.parents):
             products.append(pose[i] if parent < 0 else _product(products[parent], pose[i]))
         return jnp.stack(products) if products else pose
+    # The extra row is the world: a jump beyond the root multiplies by the identity.
     world = jnp.eye(4, dtype=pose.dtype)[None]
     for table in topology.jumps:
         pose = _product(jnp.concatenate([pose, world])[table], pose)
     return pose
 
 
-class Carried(NamedTuple):
-    """A few frames, and the coordinates that move them.
+class BodyFrames(NamedTuple):
+    """Frames of selected bodies, and the coordinates that move them.
 
-    - `pose` (n, 4, 4): in the tree frame of the body that carries it; `origin` (n, 3): of that tree frame in the world.
-    - `coordinates` (k,): velocity coordinates that move any of them; `subspace` (k, 6): their rows of `TreeFrame.subspace`.
+    - `pose` (n, 4, 4): in the tree frame of its body; `origin` (n, 3): of that tree frame in the world.
+    - `coordinates` (k,): velocity coordinates that move at least one of them; `subspace` (k, 6): their rows of
+      `TreeFrame.subspace`.
     - `velocity_mask` (n, k) of bool: which frame each of these coordinates moves.
     - `twist`, `bias` (n, 6): twist of each frame, as a twist of the fixed frame that now coincides with the tree frame, and
       its rate at a = 0; None when no velocity was given.
@@ -130,10 +135,10 @@ class Carried(NamedTuple):
     bias: Float[Array, "n 6"] | None = None
 
 
-def carried(
+def body_frames(
     model: Model, q: Float[Array, " nq"], bodies: Sequence[int], v: Float[Array, " nv"] | None = None
-) -> Carried:
-    """The frames of a few bodies (-1 is the world), and with v their twists, computed on their ancestors alone."""
+) -> BodyFrames:
+    """Frames of selected bodies (-1 is the world), and with v their twists, computed from their ancestors only."""
     topology, n = model.topology, len(bodies)
     named = np.array([body for body in bodies if body >= 0], int)
     kept = np.flatnonzero(topology.ancestors[named].any(0)).tolist()
@@ -141,16 +146,17 @@ def carried(
         pose = jnp.broadcast_to(jnp.eye(4, dtype=q.dtype), (n, 4, 4))
         none, at_rest = np.zeros(0, int), None if v is None else jnp.zeros((n, 6), q.dtype)
         nowhere = jnp.zeros((0, 6), q.dtype)
-        return Carried(pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), at_rest, at_rest)
-    coordinates = _places(topology.v_slices, kept)
+        return BodyFrames(pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), at_rest, at_rest)
+    coordinates = _coordinate_indices(topology.v_slices, kept)
+    # Constraints touch few bodies of a large tree; the remaining bodies need not be placed at all.
     if len(kept) < model.nb:
-        model, q = _pruned(model, kept), take(q, _places(topology.q_slices, kept))
+        model, q = _prune(model, kept), take(q, _coordinate_indices(topology.q_slices, kept))
     frame = tree_frame(model, q)
     index = np.array([kept.index(body) if body >= 0 else len(kept) for body in bodies])
     pose = jnp.concatenate([frame.pose, jnp.eye(4, dtype=q.dtype)[None]])
     origin = jnp.concatenate([frame.origin, jnp.zeros((1, 3), q.dtype)])
     moved_by = np.concatenate([model.topology.dof_ancestors, np.zeros((1, model.nv), bool)])[index]
-    frames = Carried(take(pose, index), take(origin, index), frame.subspace, coordinates, moved_by)
+    frames = BodyFrames(take(pose, index), take(origin, index), frame.subspace, coordinates, moved_by)
     if v is None:
         return frames
     v = take(v, coordinates)
@@ -160,19 +166,20 @@ def carried(
     return frames._replace(twist=sums[:, :6], bias=sums[:, 6:])
 
 
-def _pruned(model: Model, kept: list[int]) -> Model:
-    """The model with some of its bodies alone, which include the parent of each; what kinematics does not read is left out."""
+def _prune(model: Model, kept: list[int]) -> Model:
+    """Restrict a model to bodies that include each other's parents; leaves that kinematics does not use are dropped."""
     old, index = model.topology, np.array(kept)
 
-    def chosen(names):
+    def select(names):
         return tuple(names[i] for i in kept)
 
-    parents = tuple(kept.index(parent) if parent >= 0 else -1 for parent in chosen(old.parents))
-    names = chosen(old.body_names)
+    # Parents precede children in `kept` because it is sorted, so the result is a valid topology.
+    parents = tuple(kept.index(parent) if parent >= 0 else -1 for parent in select(old.parents))
+    names = select(old.body_names)
     topology = Topology(
-        old.name, parents, chosen(old.kinds), names, chosen(old.joint_names), names, tuple(range(len(kept)))
+        old.name, parents, select(old.kinds), names, select(old.joint_names), names, tuple(range(len(kept)))
     )
-    at_q, at_v = _places(old.q_slices, kept), _places(old.v_slices, kept)
+    at_q, at_v = _coordinate_indices(old.q_slices, kept), _coordinate_indices(old.v_slices, kept)
     return Model(
         home=take(model.home, index),
         screws=take(model.screws, index),
@@ -190,7 +197,7 @@ def _pruned(model: Model, kept: list[int]) -> Model:
     )
 
 
-def _places(slices, kept: list[int]) -> np.ndarray:
+def _coordinate_indices(slices, kept: list[int]) -> np.ndarray:
     return np.concatenate([np.arange(slices[i].start, slices[i].stop) for i in kept])
 
 
@@ -231,11 +238,11 @@ def forward_kinematics(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb
 
 def _world_poses(model: Model, q):
     frame = tree_frame(model, q)
-    return _moved(frame.pose, frame.origin)
+    return _translate(frame.pose, frame.origin)
 
 
-def _moved(pose: Float[Array, "*n 4 4"], shift: Float[Array, "*n 3"]) -> Float[Array, "*n 4 4"]:
-    """Poses with their positions moved by a shift in the axes that they are given in."""
+def _translate(pose: Float[Array, "*n 4 4"], shift: Float[Array, "*n 3"]) -> Float[Array, "*n 4 4"]:
+    """Translate poses by a shift in the axes of their reference frame."""
     step = jnp.concatenate([shift[..., None], jnp.zeros_like(shift[..., :1, None])], -2)
     return jnp.concatenate([pose[..., :3], pose[..., 3:] + step], -1)
 
@@ -247,7 +254,7 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
 
     **Returns:** (4, 4), maps frame coordinates to world coordinates (m).
 
-    **Raises:** ValueError for an unknown name (near names are listed) or a q that does not fit.
+    **Raises:** ValueError for an unknown name (similar names are listed) or a q that does not fit.
     """
     (q,) = check_shapes(model, q=q)
     body, offset = named_frame(model, name)
@@ -258,8 +265,8 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
 
 def _pose_in_body(body: int, tree, q):
     model, offset = tree
-    frames = carried(model, q, [body])
-    return _moved(_product(frames.pose[0], jnp.asarray(offset)), frames.origin[0])
+    frames = body_frames(model, q, [body])
+    return _translate(_product(frames.pose[0], jnp.asarray(offset)), frames.origin[0])
 
 
 def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -309,7 +316,7 @@ def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) ->
 def _spatial_jacobian(body: int, model: Model, q):
     frame = tree_frame(model, q)
     shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frame.origin[body])
-    return jax.vmap(se3.Ad_apply, (None, 0), 1)(shift, _moving(model, body, frame.subspace))
+    return jax.vmap(se3.Ad_apply, (None, 0), 1)(shift, _mask_path(model, body, frame.subspace))
 
 
 def jacobian_dot_v(
@@ -342,7 +349,7 @@ def _jacobian_dot_v(body: int, tree, q, v):
 
 
 def kinematic_part(model: Model) -> Model:
-    """The model as kinematics read it, so that programs do not depend on its other numbers."""
+    """Model without gravity and armature, so that programs of kinematics do not depend on them."""
     if all(x is None for x in (model.gravity, model.armature)):
         return model
     return model.replace(gravity=None, armature=None)
@@ -356,30 +363,31 @@ def take(rows: Array, index: np.ndarray) -> Array:
     return rows[index]
 
 
-def _groups(topology: Topology) -> list[tuple[str, np.ndarray]]:
+def _bodies_by_kind(topology: Topology) -> list[tuple[str, np.ndarray]]:
     labels = np.array(["revolute" if kind == "continuous" else kind for kind in topology.kinds], str)
     return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]
 
 
 def named_frame(model: Model, name: str | None) -> tuple[int, Any]:
     """Body that carries a frame (-1: the world) and the frame's pose in it, of numpy where it is known."""
+    # None means the world everywhere in the package, with the identity as its pose.
     if name is None:
         return -1, np.eye(4, dtype=model.home.dtype)
     index = frame_index(model, name)
-    # A known pose is one of numpy, which is the same number in every call: programs are kept by it.
+    # A known pose stays a numpy array with the same value in every call: compiled programs are cached by it.
     poses = model.frame_poses
     return model.topology.frame_bodies[index], numpy_for(poses).asarray(poses)[index]
 
 
-def _moving(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:
-    """Rows of the coordinates that move a body, the others zero."""
+def _mask_path(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:
+    """Rows of the coordinates that move a body; other rows are zero."""
     on_path = model.topology.dof_ancestors[body] if body >= 0 else np.zeros(model.nv, bool)
     return jnp.where(on_path[:, None], rows, jnp.zeros_like(rows))
 
 
 def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Given, rows: Array) -> Float[Array, "nv 6"]:
-    """Twists of the tree frame (one per coordinate) seen from a frame that stands at `offset` in a body."""
+    """Twists of the tree frame (one per coordinate) in the axes and at the origin of a frame at `offset` in a body."""
     if body < 0:
         return jnp.zeros_like(rows)
     pose = _product(tree.pose[body], jnp.asarray(offset))
-    return jax.vmap(se3.Ad_inv_apply, (None, 0))(pose, _moving(model, body, rows))
+    return jax.vmap(se3.Ad_inv_apply, (None, 0))(pose, _mask_path(model, body, rows))

@@ -1,12 +1,12 @@
-"""The Newton-Euler equations of the whole tree as block matrices in link frames, literally as written on paper.
+"""Newton-Euler equations of the whole tree as block matrices in link frames, as written on paper.
 
 With A_i = Ad^-1 of the pose of link i in its parent, in block (i, parent(i)) of Gamma, and G = (I - Gamma)^-1,
 
     V = G P0 V_0 + G xi v,    Vdot = G (xi a + P0 Vdot_0 + ad_xi P0 V_0 + ad_xi Gamma V),
     F = G^T (M Vdot + Pt^T F_t + ad_V^T M V),    tau = xi^T F
 
-(EQUATIONS section 4). This is the form to read, to teach and to check against: it costs O(nb^3). What users call runs
-on `world_frame` or `recursions`, and shares with this module the joints' own transforms and screws alone.
+(EQUATIONS section 4). This form serves reading, teaching and checking: it costs O(nb^3). The public functions use
+`world_frame` or `recursions`, which share only the joints' transforms and screws with this module.
 """
 
 import equinox as eqx
@@ -32,7 +32,7 @@ class NewtonEulerMatrices(eqx.Module):
     - `Gamma` (6n, 6n): A_i in block (i, parent(i)); nilpotent, its index is the depth of the tree.
     - `xi` (6n, nv): joint screws, a block of 6 x (coordinates of the joint) for each body.
     - `M` (6n, 6n): spatial inertias of the bodies, block diagonal.
-    - `P0` (6n, 6): A_i for the bodies that hang on the world.
+    - `P0` (6n, 6): A_i for the bodies attached to the world.
     - `Pt` (6, 6n): body twist of the tip frame from the body twists, or None without a tip.
     - `ad_xi`, `ad_V`, `ad_V_T` (6n, 6n): blkdiag(-ad of xi_i v_i), blkdiag(-ad of V_i), blkdiag(-ad^T of V_i). The
       minus signs are part of the definition.
@@ -56,13 +56,13 @@ class NewtonEulerMatrices(eqx.Module):
 
     @property
     def mass_matrix(self) -> Float[Array, "nv nv"]:
-        """M(q) = xi^T G^T M G xi (nv, nv), without armature."""
+        """Mass matrix M(q) = xi^T G^T M G xi (nv, nv), without armature."""
         jacobian = self.jacobians
         return _product(jacobian.T, _product(self.M, jacobian))
 
     @property
     def jacobians(self) -> Float[Array, "n6 nv"]:
-        """G xi (6n, nv): the body Jacobians of all bodies, stacked."""
+        """Body Jacobians G xi (6n, nv) of all bodies, stacked."""
         return _product(self.G, self.xi)
 
     @property
@@ -82,17 +82,19 @@ class NewtonEulerMatrices(eqx.Module):
 
     @property
     def C0(self) -> Float[Array, "nv nv"]:
-        """C0 = xi^T G^T (M G ad_xi Gamma + ad_V^T M) G xi (nv, nv), as printed by Li & Wu.
+        """Coriolis matrix C0 = xi^T G^T (M G ad_xi Gamma + ad_V^T M) G xi (nv, nv), as printed by Li & Wu.
 
-        C0 v is the vector of Coriolis and centrifugal forces, but Mdot - 2 C0 is not skew. Use `Cs` where that matters.
+        C0 v is the vector of Coriolis and centrifugal forces, but Mdot - 2 C0 is not skew. Use `Cs` where skew symmetry
+        matters.
         """
         return self._coriolis(_product(self.ad_V_T, self.M))
 
     @property
     def Cs(self) -> Float[Array, "nv nv"]:
-        """Cs = xi^T G^T (M G ad_xi Gamma + ad_V^T M - M ad_V) G xi (nv, nv): Cs v = C0 v and Mdot - 2 Cs is skew."""
+        """Coriolis matrix Cs = xi^T G^T (M G ad_xi Gamma + ad_V^T M - M ad_V) G xi (nv, nv): Cs v = C0 v, Mdot - 2 Cs skew."""
         return self._coriolis(_product(self.ad_V_T, self.M) - _product(self.M, self.ad_V))
 
+    # Cs and C0 differ by M ad_V alone, whose product with the twists V vanishes: ad_V V = 0.
     def _coriolis(self, transport):
         jacobian = self.jacobians
         inner = _product(self.M, _product(self.G, _product(self.ad_xi, self.Gamma))) + transport
@@ -128,12 +130,15 @@ def _matrices(model: Model, q, v, tip: str | None) -> NewtonEulerMatrices:
     columns = body_subspace(model).T[None]
     own = np.arange(n)[:, None, None] == topology.dof_body[None, None]
     xi = jnp.where(own, columns, jnp.zeros_like(columns)).reshape(6 * n, topology.nv)
+    # Gamma^depth = 0, because a path from the root has at most `depth` bodies.
     g = _nilpotent_inverse(gamma, int(topology.depths.max(initial=1)))
 
     rates = _product(xi, v)
     twists = _product(g, rates)
+    # The minus signs follow the documents' definition of the blocks, not the usual ad.
     ad_xi = -jax.vmap(se3.ad)(rates.reshape(n, 6))
     ad_v = -jax.vmap(se3.ad)(twists.reshape(n, 6))
+    # The fictitious acceleration of the base replaces gravity on every body.
     at_rest = jnp.zeros((3,), model.home.dtype)
     gravity = at_rest if model.gravity is None else model.gravity
     return NewtonEulerMatrices(
@@ -152,7 +157,7 @@ def _matrices(model: Model, q, v, tip: str | None) -> NewtonEulerMatrices:
 
 
 def _nilpotent_inverse(gamma, depth: int):
-    """(I - Gamma)^-1 = I + Gamma + ... + Gamma^(depth-1), as the product of the factors I + Gamma^(2^k)."""
+    """Inverse (I - Gamma)^-1 = I + Gamma + ... + Gamma^(depth-1), as the product of the factors I + Gamma^(2^k)."""
     identity = jnp.eye(gamma.shape[0], dtype=gamma.dtype)
     total, power, terms = identity + gamma, gamma, 2
     while terms < depth:

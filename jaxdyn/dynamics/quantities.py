@@ -1,11 +1,11 @@
-"""The dynamics of a model as users call it: M(q) a + C(q, v) v + N(q) = tau + sum of J_i^T f_i.
+"""Public functions of the dynamics of a model: M(q) a + C(q, v) v + N(q) = tau + sum of J_i^T f_i.
 
 All functions take one sample, are pure, and can be batched, compiled and differentiated in every argument and in every
 leaf of the model. Velocities and accelerations are the model's v and a (body-fixed, not dq/dt). Joint damping and
 friction are forces of a scene and do not enter here; rotor inertia (armature) does.
 
 Every function raises a ValueError that names the argument when a shape does not fit the model. Those with a time `t`
-(s) take any `System` in the model's place; a Model's dynamics do not depend on it.
+(s) accept any `System` instead of a model; a Model's dynamics do not depend on it.
 """
 
 import functools
@@ -38,7 +38,7 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0)
     Source: Murray, Li & Sastry (1994), eq. 4.19; EQUATIONS sections 2 and 4.
     """
     if isinstance(model, System):
-        return _of_system(model, "mass_matrix", *check_state(model, q=q, t=t))
+        return _system_quantity(model, "mass_matrix", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     return by_recursion(recursions.crba, world_frame.mass_matrix, model, q)
 
@@ -58,20 +58,20 @@ def coriolis_matrix(
     Source: EQUATIONS section 4, Cs and erratum E11.
     """
     if isinstance(model, System):
-        return _of_system(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
+        return _system_quantity(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
     return by_recursion(world_frame.coriolis_matrix, world_frame.coriolis_matrix, model, q, v)
 
 
 def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, " nv"]:
-    """Generalised gravity force N(q) = +dV/dq along the velocity coordinates; it stands on the left, with M a.
+    """Generalised gravity force N(q) = +dV/dq along the velocity coordinates; it is on the left-hand side, with M a.
 
     **Arguments:** `q` (nq,).
 
-    **Returns:** (nv,), N m or N: the torques that hold the mechanism at rest. Zero when `model.gravity` is None.
+    **Returns:** (nv,), N m or N: the torques that keep the mechanism at rest. Zero when `model.gravity` is None.
     """
     if isinstance(model, System):
-        return _of_system(model, "gravity_force", *check_state(model, q=q, t=t))
+        return _system_quantity(model, "gravity_force", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         return jnp.zeros((model.nv,), model.home.dtype)
@@ -81,14 +81,14 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.
 def bias_force(
     model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
 ) -> Float[Array, " nv"]:
-    """Bias force h = C(q, v) v + N(q): what tau must be for zero acceleration a.
+    """Bias force h = C(q, v) v + N(q): the forces tau of zero acceleration a.
 
     **Arguments:** `q` (nq,); `v` (nv,).
 
     **Returns:** (nv,), N m or N.
     """
     if isinstance(model, System):
-        return _of_system(model, "bias_force", *check_state(model, q=q, v=v, t=t))
+        return _system_quantity(model, "bias_force", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
     return by_recursion(recursions.bias_force, _bias_force, model, q, v)
 
@@ -113,8 +113,9 @@ def inverse_dynamics(
     """
     if isinstance(model, System):
         q, v, a, t, _ = check_state(model, q=q, v=v, a=a, t=t, external=external)
-        return _of_system(model, "inverse_dynamics", q, v, a, t)
+        return _system_quantity(model, "inverse_dynamics", q, v, a, t)
     q, v, a, external = check_shapes(model, q=q, v=v, a=a, external=external)
+    # The recursion does not take wrenches: a kernel without them is smaller, and their forces are one linear term.
     tau = by_recursion(recursions.rnea, _inverse_dynamics, model, q, v, a)
     return tau if external is None else tau - generalized_force(model, q, external)
 
@@ -143,17 +144,18 @@ def forward_dynamics(
     if isinstance(model, System):
         q, v, tau, time, _ = check_state(model, q=q, v=v, tau=tau, t=t, external=external)
         model.check_start(q, v, time)
-        return _of_system(model, "forward_dynamics", q, v, tau, time)
+        return _system_quantity(model, "forward_dynamics", q, v, tau, time)
     q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
     if external is not None:
         tau = tau + generalized_force(model, q, external)
+    # The derivative of the solve is M^-1 times that of inverse dynamics, so ABA itself is never differentiated.
     if model.nb > MAX_BODIES or model.nb == 0:
         return _solve_for_acceleration(model, q, v, tau)
-    return run(recursions.aba, model, q, v, tau, otherwise=_solve_for_acceleration, tangent=_acceleration_change)
+    return run(recursions.aba, model, q, v, tau, otherwise=_solve_for_acceleration, tangent=_acceleration_tangent)
 
 
-def _public(recursion: Callable) -> Callable:
-    """recursion(model, *args) as a kernel of arguments that were checked."""
+def _kernel_with_checks(recursion: Callable) -> Callable:
+    """Compile a recursion as a kernel with checks of its arguments."""
     by_kernel, signature = native(recursion), inspect.signature(recursion)
 
     @functools.wraps(recursion)
@@ -165,17 +167,17 @@ def _public(recursion: Callable) -> Callable:
 
 
 rnea, crba, aba, mass_matrix_sqrt = map(
-    _public, (recursions.rnea, recursions.crba, recursions.aba, recursions.mass_matrix_sqrt)
+    _kernel_with_checks, (recursions.rnea, recursions.crba, recursions.aba, recursions.mass_matrix_sqrt)
 )
 
-# Beyond, programs of single numbers compile for longer than a few seconds, and recursions run as loops over the bodies.
+# Scalar programs of more bodies compile for longer than a few seconds; recursions then run as loops over the bodies.
 MAX_BODIES = 128
 # In small batches the mask form of the matrices is as fast as the loops.
 _MAX_BODIES_IN_MATRICES = 16
 
 
 def by_recursion(recursion, matrices, model: Model, *args):
-    """recursion(model, *args) as a kernel, else by products of matrices."""
+    """Evaluate recursion(model, *args) as a kernel, or by products of matrices where there is no kernel."""
     if model.nb > MAX_BODIES or model.nb == 0:
         return matrices(model, *args)
     return run(recursion, model, *args, otherwise=matrices)
@@ -190,30 +192,31 @@ def _bias_force(model: Model, q, v):
 
 
 def _solve_for_acceleration(model: Model, q, v, tau):
-    """Forward dynamics where there is no kernel, differentiated by the implicit function theorem."""
+    """Forward dynamics without a kernel, differentiated by the implicit function theorem."""
     form = scans if model.nb > _MAX_BODIES_IN_MATRICES else world_frame
 
     def tangent(model, q, v, tau, steps):
         return form.forward_dynamics_tangent(
-            model, q, v, tau, _force_change(_inverse_dynamics, model, q, v, tau, steps)
+            model, q, v, tau, _force_tangent(_inverse_dynamics, model, q, v, tau, steps)
         )
 
     return implicit(model, (q, v, tau), form.forward_dynamics, tangent)
 
 
-def _acceleration_change(model: Model, q, v, tau, steps):
-    """M^-1 (dtau - dID at fixed a) for changes in the leaves of (model, q, v, tau)."""
-    return recursions.aba_tangent(model, q, v, tau, _force_change(recursions.rnea, model, q, v, tau, steps))[1]
+def _acceleration_tangent(model: Model, q, v, tau, steps):
+    """Tangent M^-1 (dtau - dID at fixed a) of the acceleration, for tangents of the leaves of (model, q, v, tau)."""
+    return recursions.aba_tangent(model, q, v, tau, _force_tangent(recursions.rnea, model, q, v, tau, steps))[1]
 
 
-def _force_change(inverse, model, q, v, tau, steps):
-    """a -> dtau - dID(q, v, a) at fixed a."""
+def _force_tangent(inverse, model, q, v, tau, steps):
+    """Function a -> dtau - dID(q, v, a) at fixed a."""
     *steps, tau_step = steps
 
     def change(a):
+        # None marks a zero tangent, for which nothing is computed.
         total = jnp.zeros_like(tau) if tau_step is None else tau_step
-        _, moved = along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
-        return total if moved is None else total - moved
+        _, rate = along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
+        return total if rate is None else total - rate
 
     return change
 
@@ -224,7 +227,7 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
     **Arguments:** `q` (nq,); `external` (nb, 6), wrench (f, tau) ON each body, at its frame's origin and in its axes
     (N, N m).
 
-    **Returns:** (nv,), N m or N; it stands on the right, with tau.
+    **Returns:** (nv,), N m or N; it is on the right-hand side, with tau.
     """
     q, external = check_shapes(model, q=q, external=external)
     return by_recursion(world_frame.generalized_force, world_frame.generalized_force, model, q, external)
@@ -240,7 +243,7 @@ def kinetic_energy(
     **Returns:** (), J.
     """
     if isinstance(model, System):
-        return _of_system(model, "kinetic_energy", *check_state(model, q=q, v=v, t=t))
+        return _system_quantity(model, "kinetic_energy", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
     return by_recursion(_kinetic_energy, _kinetic_energy, model, q, v)
 
@@ -263,7 +266,7 @@ def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers =
     **Returns:** (), J. Zero when `model.gravity` is None.
     """
     if isinstance(model, System):
-        return _of_system(model, "potential_energy", *check_state(model, q=q, t=t))
+        return _system_quantity(model, "potential_energy", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         return jnp.zeros((), model.home.dtype)
@@ -271,6 +274,7 @@ def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers =
 
 
 def _potential_energy(model: Model, q):
+    # Centres relative to the tree's root first; only their sum meets the large world position.
     mass, first, origin, shift = first_moments(model, tree_frame(model, q))
     gravity: Any = model.gravity
     return -jnp.sum(gravity * (jnp.sum(mass) * origin + jnp.sum(first + mass[:, None] * shift, axis=0)))
@@ -324,14 +328,14 @@ def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t: Number
     Source: Murray, Li & Sastry (1994), eq. 4.23; EQUATIONS section 0.
     """
     if isinstance(model, System):
-        return _of_system(model, "christoffel_symbols", *check_state(model, q=q, t=t))
+        return _system_quantity(model, "christoffel_symbols", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "christoffel_symbols")
     return symbols(mass_matrix_derivative(model, q))
 
 
-def _of_system(system: System, name: str, *args):
-    """A quantity of a system that is no tree of bodies."""
+def _system_quantity(system: System, name: str, *args):
+    """Evaluate a quantity of a system that is no tree of bodies."""
     return run(_method, system, *args, static=(name,))
 
 
@@ -352,7 +356,7 @@ def _check_coordinates(model: Model, name: str) -> None:
 def first_moments(model: Model, frame: TreeFrame):
     """Masses (nb,), first moments (nb, 3) in the tree frames, world position (3,) of the first tree's origin, and shifts.
 
-    A shift (3,) is the place of a body's tree frame relative to the first one: zero, not a difference of far
+    A shift (3,) is the position of a body's tree frame relative to the first one: exactly zero, not a difference of distant
     positions, for one tree.
     """
     mass = model.inertias[:, 0]

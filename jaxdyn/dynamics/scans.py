@@ -1,7 +1,7 @@
-"""The recursions as loops over the bodies: time in proportion to their number, a program that does not grow with it.
+"""Recursions as loops over the bodies: run time proportional to their number, program size independent of it.
 
-For mechanisms of hundreds of bodies, whose matrices would cost the third power and whose recursion, written out, would
-take minutes to compile. Link frames as in EQUATIONS sections 4 and 5, so that long chains lose nothing by distance.
+For mechanisms of hundreds of bodies: matrices cost O(nb^3), and unrolled recursions
+take minutes to compile. Link frames as in EQUATIONS sections 4 and 5, so that long chains lose no digits by distance.
 Joints of several degrees of freedom are eliminated at once; all joints are padded to the largest of them.
 """
 
@@ -22,7 +22,7 @@ from jaxdyn.systems.mass_factor import solve_positive
 
 
 class _Links(NamedTuple):
-    """Per body: its parent (the world is nb), Ad of the parent's frame seen from it, subspace (d, 6), spatial inertia."""
+    """Data of each body: its parent (the world is nb), Ad from the parent's frame, subspace (d, 6), spatial inertia."""
 
     parent: Int[Array, " nb"]
     down: Float[Array, "nb 6 6"]
@@ -31,7 +31,7 @@ class _Links(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """M factored: per body D^-1 (d, d) and D^-1 U^T (d, 6) of its articulated inertia."""
+    """Factorisation of M: per body D^-1 (d, d) and D^-1 U^T (d, 6) of its articulated inertia."""
 
     links: _Links
     inverse: Float[Array, "nb d d"]
@@ -39,7 +39,7 @@ class Factor(NamedTuple):
 
 
 def _padding(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """For each body the places (nb, d) of its velocities in v, and which of them are its own."""
+    """Indices (nb, d) of each body's velocities in v, and the mask of those that its joint has."""
     slices = model.topology.v_slices
     most = max(part.stop - part.start for part in slices)
     places = np.array([part.start for part in slices])[:, None] + np.arange(most)
@@ -48,7 +48,7 @@ def _padding(model: Model) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _per_body(model: Model, rows: Array) -> Array:
-    """Rows (nv, ...) as (nb, d, ...), zero where a joint has fewer than d."""
+    """Gather rows (nv, ...) as (nb, d, ...), with zeros where a joint has fewer than d."""
     places, own = _padding(model)
     return jnp.where(own.reshape(own.shape + (1,) * (rows.ndim - 1)), rows[places], jnp.zeros((), rows.dtype))
 
@@ -61,8 +61,9 @@ def _links(model: Model, q) -> _Links:
 
 
 def _wrenches(model: Model, links: _Links, v, a) -> Float[Array, "nb 6"]:
-    """Wrench that each body's motion needs in its own frame, gravity included: the outward pass of Newton-Euler."""
+    """Inertial wrench of each body in its own frame, gravity included: the outward pass of Newton-Euler."""
     zero = jnp.zeros((model.nb + 1, 6), v.dtype)
+    # Row nb is the world, accelerated against gravity, so that roots need no case of their own.
     rest = zero if model.gravity is None else zero.at[-1, :3].set(-model.gravity)
     own_v = jnp.einsum("bd,bdk->bk", _per_body(model, v), links.subspace)
     own_a = jnp.zeros_like(own_v) if a is None else jnp.einsum("bd,bdk->bk", _per_body(model, a), links.subspace)
@@ -80,7 +81,7 @@ def _wrenches(model: Model, links: _Links, v, a) -> Float[Array, "nb 6"]:
 
 
 def inverse_dynamics(model: Model, q, v, a) -> Float[Array, " nv"]:
-    """tau = M a + C v + N (nv,) by the recursive Newton-Euler algorithm; `a` None means zero."""
+    """Inverse dynamics tau = M a + C v + N (nv,) by the recursive Newton-Euler algorithm; `a` None means zero."""
     links = _links(model, q)
     wrenches = _wrenches(model, links, v, a)
 
@@ -89,6 +90,7 @@ def inverse_dynamics(model: Model, q, v, a) -> Float[Array, " nv"]:
         wrench = total[i]
         return total.at[parent].add(_product(down.T, wrench)), _product(subspace, wrench)
 
+    # One row more for the world, which collects the roots' wrenches and is dropped.
     start = jnp.concatenate([wrenches, jnp.zeros((1, 6), v.dtype)])
     each = jnp.arange(model.nb), links.parent, links.down, links.subspace
     tau = _flat(model, lax.scan(inward, start, each, reverse=True)[1])
@@ -100,10 +102,10 @@ def _flat(model: Model, values: Float[Array, "nb d"]) -> Float[Array, " nv"]:
 
 
 def _factorize(model: Model, links: _Links) -> Factor:
-    """Articulated inertias from the leaves to the root."""
+    """Factorise the articulated inertias from the leaves to the root."""
     dtype, own = links.down.dtype, jnp.asarray(_padding(model)[1])
     armature = jnp.zeros((model.nv,), dtype) if model.armature is None else model.armature
-    # Coordinates that a joint does not have get a pivot of one and no coupling.
+    # Padding coordinates get a pivot of one and no coupling: their accelerations are zero and change nothing.
     extra = jnp.where(own, _per_body(model, armature), jnp.ones((), dtype))
 
     def inward(total, link):
@@ -121,7 +123,7 @@ def _factorize(model: Model, links: _Links) -> Factor:
 
 
 def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
-    """M^-1 (tau - forces that the wrenches ask for), by two sweeps."""
+    """Solve M a = tau - (generalised forces of the wrenches) by two sweeps."""
     links, dtype = factor.links, tau.dtype
     numbers = jnp.arange(model.nb)
 
@@ -146,7 +148,7 @@ def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
 
 
 def forward_dynamics(model: Model, q, v, tau) -> Float[Array, " nv"]:
-    """a = M^-1 (tau - C v - N) (nv,) by the articulated-body algorithm."""
+    """Forward dynamics a = M^-1 (tau - C v - N) (nv,) by the articulated-body algorithm."""
     links = _links(model, q)
     return _solve(model, _factorize(model, links), tau, _wrenches(model, links, v, None))
 

@@ -1,4 +1,4 @@
-"""Dynamics of an arm as one of its frames feels them: mass, Coriolis forces and gravity in the workspace.
+"""Workspace (operational space) dynamics of an arm: mass matrix, Coriolis forces and gravity at one of its frames.
 
 With V = J v the velocity of the frame, in the metric of M, and Jbar = M^-1 J^T Lambda:
 
@@ -6,7 +6,7 @@ With V = J v the velocity of the frame, in the metric of M, and Jbar = M^-1 J^T 
     Lambda Vdot + mu + p = F.
 
 J Jbar = 1, and for a square J it is the inverse: Lambda = M_x = J^-T M J^-1, mu = C_x V with
-C_x = J^-T (C - M J^-1 Jdot) J^-1, p = N_x = J^-T N. Where J loses rank Lambda has no bound. There it is damped: scaled to a
+C_x = J^-T (C - M J^-1 Jdot) J^-1, p = N_x = J^-T N. Where J loses rank Lambda is unbounded and is damped: scaled to a
 unit diagonal, S = D J M^-1 J^T D, with the least eigenvalue s of S,
 
     Lambda = D (S + max(0, least - s) 1)^-1 D.
@@ -30,16 +30,16 @@ from jaxdyn.systems.mass_factor import mass_factor, solve_positive
 
 
 class WorkspaceDynamics(eqx.Module):
-    """M_x Vdot + mu + p = F in the velocity V = J v of a frame (see `workspace_dynamics`); m is its number of components.
+    """Terms of M_x Vdot + mu + p = F in the velocity V = J v (m,) of a frame (see `workspace_dynamics`).
 
     - `mass_matrix` (m, m): M_x, also called Lambda. `coriolis_matrix` (m, m): C_x, with dM_x/dt - 2 C_x skew.
-    - `coriolis_force` (m,): mu; C_x V where J is square, and for a redundant arm what its inner motion adds too.
+    - `coriolis_force` (m,): mu; C_x V where J is square, for a redundant arm with a term of its internal motion.
     - `gravity_force` (m,): N_x, also called p.
     - `jacobian` (m, nv): J. `jacobian_rate` (m, nv): Jdot along v, so that Vdot = J a + Jdot v.
     - `inverse` (nv, m): Jbar, the dynamically consistent inverse; joint velocities Jbar V have the least kinetic energy of
-      those that move the frame with V. Jbar^T tau is the force on the frame that tau stands for, J^T F the torques of F.
+      those that move the frame with V. Jbar^T tau is the force on the frame equivalent to tau, J^T F the torques of F.
     - `condition` (): least eigenvalue of J M^-1 J^T scaled to a unit diagonal, 0 where J has lost rank, at most 1.
-    - `damped` (): whether that is below `least`, so that Lambda is the damped one, finite and smaller than the true one.
+    - `damped` (): true where that is below `least`, so that Lambda is damped: finite and smaller than the exact one.
     """
 
     mass_matrix: Float[Array, "m m"]
@@ -70,15 +70,15 @@ def workspace_dynamics(
     - `frame`: one of `model.frame_names`. `q` (nq,), `v` (nv,).
     - `axes`: "body" for the frame's body twist, in its own axes; "world" for the velocity of its origin and the angular
       velocity in world axes.
-    - `rows`: components of (vx, vy, vz, wx, wy, wz) that are taken, at most as many as the model has freedoms: of an arm
+    - `rows`: components of (vx, vy, vz, wx, wy, wz) to use, at most nv of them: for an arm
       in the x-y plane e.g. (0, 1, 5).
-    - `least`: value of `condition` below which Lambda is damped; eps^0.4 by default, 5e-7 in float64. An entry that no joint
-      moves is damped everywhere, and stands for nothing: leave it out of `rows`.
+    - `least`: value of `condition` below which Lambda is damped; eps^0.4 by default, 5e-7 in float64. Components that no joint
+      moves are damped everywhere and have no meaning: leave them out of `rows`.
 
     **Returns:** `WorkspaceDynamics`; m, m/s and N for linear components, rad, rad/s and N m for angular ones. Damped, M_x
-    is positive definite and finite with a finite gradient, and J Jbar and dM_x/dt - 2 C_x are not 1 and skew any more.
+    is positive definite and finite with a finite gradient, and J Jbar and dM_x/dt - 2 C_x are no longer 1 and skew.
 
-    **Raises:** ValueError for shapes that do not fit, an unknown frame, axes, components that are none or more than nv, and
+    **Raises:** ValueError for shapes that do not fit, an unknown frame, axes, components other than these or more than nv, and
     a `least` outside of (0, 1).
 
     ```python
@@ -117,12 +117,14 @@ def _workspace(model: Model, choice: _Choice, q, v) -> WorkspaceDynamics:
     factor = mass_factor(mass_matrix(model, q))
     whitened = factor.whiten(J.T)
     scale, scaled = _unit_diagonal(_product(whitened.T, whitened))
-    # Where joints are as many as components, the least eigenvalue is that of a square of a matrix: never below zero but for
+    # The scaled matrix is a Gram matrix: its least eigenvalue is negative only by
     # rounding.
     condition = jnp.maximum(jnp.linalg.eigvalsh(scaled)[0], jnp.zeros((), q.dtype))
+    # Damping starts at the threshold and grows linearly, so that Lambda is continuous in q; its slope jumps there.
     damping = jnp.maximum(choice.least - condition, jnp.zeros_like(condition))
     unit = jnp.eye(J.shape[0], dtype=q.dtype)
     mass = scale[:, None] * solve_positive(scaled + damping * unit, unit) * scale[None]
+    # The two-sided scaling leaves rounding in the skew part; callers factor this matrix.
     mass = 0.5 * (mass + mass.T)
     inverse = _product(factor.unwhiten(whitened), mass)
     C = coriolis_matrix(model, q, v)
@@ -140,10 +142,10 @@ def _workspace(model: Model, choice: _Choice, q, v) -> WorkspaceDynamics:
 
 
 def _unit_diagonal(matrix):
-    """D (m,) and D matrix D with ones on its diagonal; a row of zeros stays one, with 1 in D."""
+    """Scale a matrix to D matrix D with a unit diagonal; rows of zeros keep the factor 1 in D (m,)."""
     diagonal = jnp.diagonal(matrix)
-    moved = diagonal > 0
+    nonzero = diagonal > 0
     scale = jnp.where(
-        moved, 1.0 / jnp.sqrt(jnp.where(moved, diagonal, jnp.ones_like(diagonal))), jnp.ones_like(diagonal)
+        nonzero, 1.0 / jnp.sqrt(jnp.where(nonzero, diagonal, jnp.ones_like(diagonal))), jnp.ones_like(diagonal)
     )
     return scale, scale[:, None] * matrix * scale[None]

@@ -1,13 +1,13 @@
-"""The dynamics as matrix products: M(q) = S^T G^T I G S with G the constant ancestor mask.
+"""Dynamics as matrix products: M(q) = S^T G^T I G S with G the constant ancestor mask.
 
-In link frames G = (I - Gamma)^-1 holds an adjoint in every block (EQUATIONS section 4; `link_form`). Written in one
-frame for the whole tree those adjoints become identities, and G becomes the constant 0/1 matrix that says which joint
-moves which body. Velocities, accelerations and forces are then products with a constant matrix instead of recursions:
+In link frames G = (I - Gamma)^-1 holds an adjoint in every block (EQUATIONS section 4; `link_frame`). Written in one
+frame for the whole tree those adjoints become identities, and G becomes the constant 0/1 matrix of the joints that
+move each body. Velocities, accelerations and forces are then products with a constant matrix instead of recursions:
 
     V = G (S v),   A = G (S a + Sdot v) + A_0,   F_i = I_i A_i - ad_{V_i}^T I_i V_i,   tau = S . (G^T F).
 
 The frame is the tree frame of `kinematics`. Inertias are sums of ten numbers, so composite inertias are one product
-too. No function here checks its arguments: `dynamics` does.
+too. No function here checks its arguments: `quantities` does.
 """
 
 import jax
@@ -27,17 +27,17 @@ from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import _product, cross
 from jaxdyn.model.inertia import rotational_inertia, spatial_inertia, transform_inertia
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
 
 def mass_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
-    """M_kl = S_k . I_c S_l with I_c the composite inertia of all bodies that both coordinates move, plus armature."""
+    """Mass matrix M_kl = S_k . I_c S_l with I_c the composite inertia of all bodies that both coordinates move, plus armature."""
     frame = tree_frame(model, q)
     return _mass_matrix(model, frame, tree_inertias(model, frame))
 
 
 def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
-    """N_k = -S_k . (m g, m c x g) summed over the bodies that coordinate k moves: +dV/dq."""
+    """Gravity force N_k = -S_k . (m g, m c x g) summed over the bodies that coordinate k moves: +dV/dq."""
     if model.gravity is None:
         return jnp.zeros((model.nv,), model.home.dtype)
     frame = tree_frame(model, q)
@@ -57,7 +57,7 @@ def inverse_dynamics(
     a: Float[Array, " nv"] | None,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
-    """tau = M a + C v + N - sum J_i^T external_i; `a` None means zero and compiles no acceleration terms."""
+    """Inverse dynamics tau = M a + C v + N - sum J_i^T external_i; `a` None means zero and compiles no acceleration terms."""
     frame = tree_frame(model, q)
     return _inverse_dynamics(model, frame, tree_inertias(model, frame), v, a, external)
 
@@ -69,11 +69,11 @@ def forward_dynamics(
     tau: Float[Array, " nv"],
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
-    """a = M^-1 (tau - C v - N + sum J_i^T external_i), by the Cholesky factor of M."""
+    """Forward dynamics a = M^-1 (tau - C v - N + sum J_i^T external_i), by the Cholesky factor of M."""
     frame = tree_frame(model, q)
     inertias = tree_inertias(model, frame)
     factor = cholesky(_mass_matrix(model, frame, inertias))
-    return solve_factored(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, external))
+    return solve_cholesky(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, external))
 
 
 def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
@@ -85,19 +85,21 @@ def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
     frame = tree_frame(model, q)
     inertias = tree_inertias(model, frame)
     factor = cholesky(_mass_matrix(model, frame, inertias))
-    a = solve_factored(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, None))
-    return a, solve_factored(factor, force_change(a))
+    a = solve_cholesky(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, None))
+    return a, solve_cholesky(factor, force_change(a))
 
 
 def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:
-    """sum of J_i^T f_i over the bodies, J_i the body Jacobian of body i."""
+    """Generalised force: sum of J_i^T f_i over the bodies, J_i the body Jacobian of body i."""
     frame = tree_frame(model, q)
     wrenches = jax.vmap(se3.Ad_inv_T_apply)(frame.pose, external)
     return jnp.sum(frame.subspace * sum_to_coordinates(model, wrenches), axis=1)
 
 
 def coriolis_matrix(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "nv nv"]:
-    """C = sum of J_i^T (I_i Jdot_i - ad_{V_i}^T I_i J_i) over the bodies: Cs of EQUATIONS section 4 in the tree frame.
+    """Coriolis matrix C = sum of J_i^T (I_i Jdot_i - ad_{V_i}^T I_i J_i) over the bodies.
+
+    This is Cs of EQUATIONS section 4 in the tree frame.
 
     In a link frame Cs has the blocks J^T M Jdot + J^T (M ad_V - ad_V^T M) J; with J_s = Ad J, Jdot_s = Ad (Jdot + ad_V
     J) the term M ad_V joins the first. C + C^T = Mdot because Idot = -ad_V^T I - I ad_V.
@@ -107,6 +109,7 @@ def coriolis_matrix(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]
     subspace, rate = frame.subspace, subspace_rate(model, frame, twists)
     inertia = jax.vmap(spatial_inertia)(tree_inertias(model, frame))
     transport = -_product(jax.vmap(se3.ad)(twists).transpose(0, 2, 1), inertia)
+    # Both matrices are summed over subtrees by one product instead of two.
     flat = jnp.concatenate([inertia.reshape(-1, 36), transport.reshape(-1, 36)], axis=1)
     moved = sum_to_coordinates(model, flat)
     inertia, transport = moved[:, :36].reshape(-1, 6, 6), moved[:, 36:].reshape(-1, 6, 6)
@@ -117,7 +120,7 @@ def coriolis_matrix(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]
     below = _product(row_inertia, rate.T) + _product(row_transport, subspace.T)
     column = _product(inertia, rate[..., None])[..., 0] + _product(transport, subspace[..., None])[..., 0]
     above = _product(subspace, column.T)
-    deeper = _deeper(model)
+    deeper = _descendant_mask(model)
     zero = jnp.zeros_like(below)
     return jnp.where(deeper, below, zero) + jnp.where(np.tril(deeper, -1).T, above, zero)
 
@@ -125,7 +128,7 @@ def coriolis_matrix(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]
 def torque_regressor(
     model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"]
 ) -> Float[Array, "nv nb10"]:
-    """Y with Y pi = M a + C v + N without armature, pi the ten numbers of all bodies, one body after the other."""
+    """Regressor Y with Y pi = M a + C v + N without armature, pi the ten numbers of all bodies, one body after the other."""
     frame = tree_frame(model, q)
     twists = body_twists(model, frame, v)
     accelerations = _accelerations(model, frame, twists, v, a)
@@ -138,7 +141,7 @@ def torque_regressor(
 
 
 def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
-    """D_ijk = dM_ij/dq_k in closed form (Property 2 of EQUATIONS section 2), for joints with v = dq/dt.
+    """Derivative D_ijk = dM_ij/dq_k in closed form (Property 2 of EQUATIONS section 2), for joints with v = dq/dt.
 
     D_ijk = T_ijk + T_jik, T_ijk = [S_i, S_k] . I_c S_j with I_c the inertia moved by all of i, j, k; zero unless they
     lie on one path to the root with joint i strictly above joint k. The bracket is the motion of S_i as seen by the
@@ -154,7 +157,7 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     by_j = jnp.einsum(
         "ikx,jx->ijk", brackets, jax.vmap(momentum)(composite, subspace), precision=jax.lax.Precision.HIGHEST
     )
-    deeper = _deeper(model)
+    deeper = _descendant_mask(model)
     above = np.tril(deeper, -1).T  # [i, k]: joint i strictly above joint k
     zero = jnp.zeros_like(by_k)
     term = jnp.where(above[:, None, :] & deeper.T[None], by_k, zero)
@@ -175,16 +178,17 @@ def momentum(parameters: Float[Array, "10"], twist: Float[Array, "6"]) -> Float[
     return jnp.concatenate([mass * v + cross(omega, first), angular])
 
 
-def _deeper(model: Model) -> np.ndarray:
-    """(nv, nv) of bool: [k, l] is true when coordinate l moves the body of coordinate k and is not listed after k."""
+def _descendant_mask(model: Model) -> np.ndarray:
+    """Mask (nv, nv), true at [k, l] when coordinate l moves the body of coordinate k and is not listed after k."""
     return np.tril(model.topology.dof_ancestors[model.topology.dof_body])
 
 
 def _mass_matrix(model: Model, frame: TreeFrame, inertias: Float[Array, "nb 10"]) -> Float[Array, "nv nv"]:
     composite = sum_to_coordinates(model, inertias)
+    # Only entries of ancestors are valid: elsewhere the composite inertia is that of an unrelated subtree.
     forces = jax.vmap(momentum)(composite, frame.subspace)
     products = _product(forces, frame.subspace.T)
-    deeper = _deeper(model)
+    deeper = _descendant_mask(model)
     zero = jnp.zeros_like(products)
     matrix = jnp.where(deeper, products, zero) + jnp.where(np.tril(deeper, -1).T, products.T, zero)
     return matrix if model.armature is None else matrix + jnp.diag(model.armature)
@@ -202,13 +206,13 @@ def _accelerations(model, frame, twists, v, a) -> Float[Array, "nb 6"]:
 
 
 def joint_wrenches(model: Model, frame: TreeFrame, v, a, external) -> Float[Array, "nb 6"]:
-    """Wrench through each joint, in the tree frame: the sum of what moves the bodies that it carries."""
+    """Wrench through each joint, in the tree frame: the sum of the wrenches on the bodies that it carries."""
     wrenches = _body_wrenches(model, frame, tree_inertias(model, frame), v, a, external)
     return _product(jnp.asarray(model.topology.ancestors.T, wrenches.dtype), wrenches)
 
 
 def _body_wrenches(model, frame, inertias, v, a, external) -> Float[Array, "nb 6"]:
-    """What the joints of each body exert on it together: its rate of momentum less its weight and the external wrench."""
+    """Resultant of the joint wrenches on each body: its rate of momentum less its weight and the external wrench."""
     twists = body_twists(model, frame, v)
     wrenches = jax.vmap(_inertial_wrench)(inertias, twists, _accelerations(model, frame, twists, v, a))
     return wrenches if external is None else wrenches - jax.vmap(se3.Ad_inv_T_apply)(frame.pose, external)
@@ -221,8 +225,11 @@ def _inverse_dynamics(model, frame, inertias, v, a, external) -> Float[Array, " 
 
 
 def _inertial_wrench(parameters, twist, acceleration) -> Float[Array, "6"]:
-    """I A - ad_V^T I V. With d = a + omega x v, the acceleration of the point at the frame's origin, it is
-    (m d + alpha x h + omega x (omega x h), h x d + I alpha + omega x I omega)."""
+    """Inertial wrench I A - ad_V^T I V.
+
+    With d = a + omega x v, the acceleration of the point at the frame's origin, it is
+    (m d + alpha x h + omega x (omega x h), h x d + I alpha + omega x I omega).
+    """
     mass, first, inertia = parameters[0], parameters[1:4], rotational_inertia(parameters)
     omega, alpha = twist[3:], acceleration[3:]
     point = acceleration[:3] + cross(omega, twist[:3])
@@ -232,7 +239,7 @@ def _inertial_wrench(parameters, twist, acceleration) -> Float[Array, "6"]:
 
 
 def _wrench_regressor(twist, acceleration) -> Float[Array, "6 10"]:
-    """The matrix of `_inertial_wrench` as a linear function of the ten numbers."""
+    """Matrix of `_inertial_wrench` as a linear function of the ten inertial parameters."""
     omega, alpha = twist[3:], acceleration[3:]
     point = acceleration[:3] + cross(omega, twist[:3])
     turn = so3.hat(omega)
@@ -246,6 +253,6 @@ def _wrench_regressor(twist, acceleration) -> Float[Array, "6 10"]:
 
 
 def _inertia_times(w: Float[Array, "3"]) -> Float[Array, "3 6"]:
-    """The matrix L(w) with I w = L(w) (Ixx, Ixy, Iyy, Ixz, Iyz, Izz)."""
+    """Matrix L(w) with I w = L(w) (Ixx, Ixy, Iyy, Ixz, Iyz, Izz)."""
     x, y, z, zero = w[0], w[1], w[2], jnp.zeros_like(w[0])
     return jnp.stack([x, y, zero, z, zero, zero, zero, x, y, zero, z, zero, zero, zero, zero, x, y, z]).reshape(3, 6)

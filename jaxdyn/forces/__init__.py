@@ -1,4 +1,4 @@
-"""Forces that a `Scene` adds to a system: joint springs, drives and friction, and dissipation functions.
+"""Generalised forces listed in a `Scene`: joint springs, drives and friction, and dissipation functions.
 
 Imports `dynamics` and what is below it.
 """

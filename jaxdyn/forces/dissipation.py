@@ -1,4 +1,4 @@
-"""Forces that take energy away: Rayleigh's dissipation function, and Coulomb friction for sliding in a given direction."""
+"""Dissipative forces: Rayleigh's dissipation function, and Coulomb friction for sliding in a given direction."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,9 +15,9 @@ from jaxdyn.systems.scene import as_pytree
 
 
 class RayleighDissipation(eqx.Module):
-    """Friction with a dissipation function: tau = -dR/dv.
+    """Dissipative force tau = -dR/dv of a dissipation function R.
 
-    It takes the power v . dR/dv: 2R where R is quadratic in v, (n + 1) R where it is of degree n + 1.
+    The dissipated power is v . dR/dv: 2R where R is quadratic in v, (n + 1) R where it is of degree n + 1.
 
     **Arguments:** `function`, R(q, v, t) -> () in W, differentiable; a plain function is static, a Module or
     `jax.tree_util.Partial` carries numbers as leaves.
@@ -44,24 +44,27 @@ class RayleighDissipation(eqx.Module):
         return -jax.grad(value)(v)
 
 
-_ROUNDING = 100.0  # m/s (rad/s) times eps
+# Rounding of a velocity of about 100 m/s (rad/s), times eps: a sliding velocity that ends at zero within it is no reversal.
+_ROUNDING = 100.0
 
 
 class SlidingFriction(PiecewiseForce):
-    """Coulomb friction of a contact that slides: tau = -sign(A v) mu N A^T, for the sliding velocity A v.
+    """Coulomb friction of a sliding contact: tau = -sign(A v) mu N A^T, for the sliding velocity A v.
 
-    At A v = 0 the sign is that of `direction`, so that the force is smooth while it slides that way and where it comes to rest.
-    A contact that turns round is braked the other way. One that sticks is not held: fixed steps change the sign of the force from
-    step to step, so that velocities stay as small as a step's change; adaptive ones end the run with the code `too_many_events`.
+    At A v = 0 the sign is that of `direction`, so that the force is smooth while the contact slides that way and where it
+    comes to rest.
+    After a reversal the force opposes the new direction. Sticking is not modelled: fixed steps change the sign of the
+    force from step to step, so that velocities stay as small as a step's change; adaptive ones end the run with the
+    code `too_many_events`.
 
     **Arguments:**
 
     - `coefficient`: mu.
     - `normal`: N, in N, a number or a function normal(system, q, v, t) -> (); where it is negative there is no friction.
-    - `direction`: 1 or -1, the sign of A v where the motion starts and where it is zero.
-    - `along`: index of the coordinate that slides, or a function A(q, t) -> (nv,).
+    - `direction`: 1 or -1, the sign of A v at the start and where it is zero.
+    - `along`: index of the sliding coordinate, or a function A(q, t) -> (nv,).
 
-    **Raises:** ValueError for another direction, a negative coefficient or normal force, an index that is none; (when called)
+    **Raises:** ValueError for another direction, a negative coefficient or normal force, an invalid index; (when called)
     for one beyond the system's velocities, and for shapes that do not fit.
 
     Source: EQUATIONS section 11 and erratum E42.
@@ -84,7 +87,7 @@ class SlidingFriction(PiecewiseForce):
                 f"SlidingFriction: direction is {direction!r}; give the sign of the sliding velocity, 1 or -1"
             )
         if is_concrete(coefficient) and not (np.asarray(coefficient) >= 0).all():
-            raise ValueError(f"SlidingFriction: coefficient is {coefficient}; give mu >= 0 and turn direction round")
+            raise ValueError(f"SlidingFriction: coefficient is {coefficient}; give mu >= 0 and reverse direction")
         if not callable(normal) and is_concrete(normal) and not (np.asarray(normal) >= 0).all():
             raise ValueError(
                 f"SlidingFriction: normal is {normal}; give the size of the normal force (N), zero or more"
@@ -100,7 +103,7 @@ class SlidingFriction(PiecewiseForce):
     def guards(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " 1"]:
-        """The sliding velocity along `direction`, (1,); rounding of one that ends at zero is no reversal."""
+        """Sliding velocity along `direction`, (1,), offset by rounding so that coming to rest is no reversal."""
         along = self.direction * jnp.sum(self._row(q, v, t) * v)
         return (along + _ROUNDING * float(jnp.finfo(v.dtype).eps))[None]
 
@@ -112,7 +115,7 @@ class SlidingFriction(PiecewiseForce):
         t: Number,
         positive: Bool[Array, " 1"],
     ) -> Float[Array, " nv"]:
-        """Against `direction` where `positive` says that it slides that way, else along it, (nv,)."""
+        """Friction force (nv,) opposite to `direction` where `positive` is true, else along it."""
         row = self._row(q, v, t)
         normal: Any = self.normal(system, q, v, t) if callable(self.normal) else self.normal
         if jnp.shape(row) != v.shape or jnp.shape(normal) != ():
@@ -120,6 +123,7 @@ class SlidingFriction(PiecewiseForce):
                 f"SlidingFriction: along gives shape {jnp.shape(row)}, normal {jnp.shape(normal)}; expected {v.shape} = "
                 "(nv,) and ()"
             )
+        # A contact cannot pull: a negative normal force gives no friction instead of friction of the wrong sign.
         limit = self.coefficient.astype(v.dtype) * jnp.maximum(jnp.asarray(normal, v.dtype), 0.0)
         return jnp.where(positive[0], -self.direction, self.direction) * limit * row
 
@@ -129,12 +133,12 @@ class SlidingFriction(PiecewiseForce):
 
 
 class _Coordinate(eqx.Module):
-    """One of the velocities."""
+    """Row A that selects one velocity coordinate."""
 
     index: int = eqx.field(static=True)
 
     def row(self, v):
-        """The row that picks it."""
+        """Unit row (nv,) of the coordinate."""
         if self.index >= v.shape[0]:
             raise ValueError(f"SlidingFriction: along is {self.index}, but the system has nv = {v.shape[0]}")
         return jnp.zeros_like(v).at[self.index].set(1)

@@ -1,4 +1,4 @@
-"""Limits of joints: stops that push back, and the largest effort that actuators give."""
+"""Joint limits: elastic stops at position limits, and actuator effort limits."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,23 +9,23 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.forces.piecewise import PiecewiseForce
-from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete, warn
 from jaxdyn.model.tree import Model
 
 
 class JointStops(PiecewiseForce):
-    """Stops at the position limits of the model's joints, as springs with dampers that push and never pull.
+    """Unilateral spring-damper stops at the position limits of a model's joints.
 
-    Beyond a limit by x, with the velocity x' outwards, tau = -max(k x + d x', 0); else none. `jd.simulate` ends a step where a
-    joint meets a stop or leaves it (see `PiecewiseForce`). A joint that is driven against its
-    stop with tau comes to rest tau/k beyond it. The rate sqrt(k/M) has to be followed by the steps; with d = 2 sqrt(k M) the
-    stop does not throw the joint back.
+    Beyond a limit by x, with the velocity x' outwards, tau = -max(k x + d x', 0); else zero. `jd.simulate` ends a step where a
+    joint reaches a stop or leaves it (see `PiecewiseForce`). A joint pressed against its
+    stop with tau comes to rest tau/k beyond it. Steps must resolve the frequency sqrt(k/M); with d = 2 sqrt(k M) the
+    joint does not rebound.
 
-    **Arguments:** `stiffness` k (N m/rad or N/m) and `damping` d (N m s/rad or N s/m), numbers; `joints`, names of joints of one
-    coordinate, or None for all of those that have a finite limit.
+    **Arguments:** `stiffness` k (N m/rad or N/m) and `damping` d (N m s/rad or N s/m), numbers; `joints`, names of
+    joints of one coordinate, or None for all that have a finite limit.
 
     **Raises:** ValueError for numbers that are not positive; (when called) for a system without joints, unknown joints, and
-    named ones that have no limit or several coordinates.
+    named ones with several coordinates.
 
     ```python
     scene = jd.Scene(robot, forces=[jd.JointStops(1e4, 50.0)])
@@ -46,7 +46,8 @@ class JointStops(PiecewiseForce):
     def guards(
         self, system: Checked[Model], q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " n"]:
-        """k x + min(d x', 0) of the lower limits, then of the upper ones: x where a stop is met, its force where it is left."""
+        """Switching functions k x + min(d x', 0) of the lower limits, then of the upper ones."""
+        # At contact (x = 0, x' > 0) this is k x; at separation (x' < 0) it is the force, which must not become a pull.
         return jnp.concatenate([jnp.where(bounded, k * x + jnp.minimum(d * rate, 0.0), -1.0)
                                 for bounded, k, x, d, rate in self._beyond(system, q, v)])  # fmt: skip
 
@@ -58,20 +59,20 @@ class JointStops(PiecewiseForce):
         t: Number,
         positive: Bool[Array, " n"],
     ) -> Float[Array, " nv"]:
-        """The force of the stops that are met, (nv,)."""
+        """Force of the active stops, (nv,)."""
         total, at_v = jnp.zeros_like(v), self._indices(system)[1]
-        met = positive.reshape(2, -1)
+        is_active = positive.reshape(2, -1)
         for side, (bounded, k, x, d, rate) in enumerate(self._beyond(system, q, v)):
-            push = jnp.where(met[side] & bounded, k * x + d * rate, 0.0)
+            push = jnp.where(is_active[side] & bounded, k * x + d * rate, 0.0)
             total = total.at[at_v].add(push if side == 0 else -push)
         return total
 
     def _indices(self, system):
-        places = self._places(system)
+        places = self._joint_pairs(system)
         return tuple(np.array(x, int) for x in zip(*places, strict=True)) if places else (np.zeros(0, int),) * 2
 
     def _beyond(self, system, q, v):
-        """Of the lower limits and of the upper ones: which there are, and k, x, d and x' outwards."""
+        """Data of the lower and of the upper limits: mask of the finite ones, and k, x, d and x' outwards."""
         at_q, at_v = self._indices(system)
         k, d = self.stiffness.astype(q.dtype), self.damping.astype(q.dtype)
         sides = []
@@ -82,10 +83,10 @@ class JointStops(PiecewiseForce):
             sides.append((bounded, k, sign * (q[at_q] - jnp.where(bounded, edge, 0.0)), d, sign * v[at_v]))
         return sides
 
-    def _places(self, system) -> list[tuple[int, int]]:
-        """Where the joints stand in q and v."""
+    def _joint_pairs(self, system) -> list[tuple[int, int]]:
+        """Indices of the joints in q and v."""
         if not isinstance(system, Model):
-            raise ValueError(f"JointStops: a {type(system).__name__} has no joints with limits; it takes a Model")
+            raise ValueError(f"JointStops: a {type(system).__name__} has no joints with limits; pass a Model")
         top = system.topology
         names = top.joint_names if self.joints is None else self.joints
         missing = [name for name in names if name not in top.joint_names]
@@ -107,12 +108,12 @@ class JointStops(PiecewiseForce):
 
 
 class EffortLimits(eqx.Module):
-    """The efforts of a control, or of `jd.stepper`, cut off at the limits of the actuators: -limit <= tau <= limit.
+    """Saturation of the efforts of a control, or of `jd.stepper`, at actuator limits: -limit <= tau <= limit.
 
-    It acts on tau, not on the scene's other forces; as a force it is zero.
+    It acts on tau, not on the scene's other forces; its own generalised force is zero.
 
-    **Arguments:** `limit` (N m or N), a number or one per velocity coordinate; None takes the model's `effort_limit`. Infinite
-    ones do not cut.
+    **Arguments:** `limit` (N m or N), a number or one per velocity coordinate; None means the model's `effort_limit`. Infinite
+    limits have no effect.
 
     **Raises:** ValueError for limits that are negative; (when used) for a wrong shape, or a system without limits.
     """
@@ -132,8 +133,9 @@ class EffortLimits(eqx.Module):
         return jnp.zeros_like(v)
 
     def effort_guards(self, system: SystemLike, tau: Float[Array, " nv"]) -> Float[Array, " n"]:
-        """tau - limit, then -limit - tau, (2 nv,): negative where nothing is cut off."""
+        """Switching functions tau - limit, then -limit - tau, (2 nv,): negative where tau is within its limits."""
         limit = self._limit(system, tau)
+        # inf - inf would be NaN in a gradient; infinite limits get a constant negative guard instead.
         bounded = jnp.isfinite(limit)
         limit = jnp.where(bounded, limit, 0.0)
         return jnp.concatenate([jnp.where(bounded, side * tau - limit, -1.0) for side in (1.0, -1.0)])
@@ -141,7 +143,14 @@ class EffortLimits(eqx.Module):
     def limited(
         self, system: SystemLike, tau: Float[Array, " nv"], positive: Bool[Array, " n"] | None = None
     ) -> Float[Array, " nv"]:
-        """tau cut off; `positive` (2 nv,): where, if that is known from the signs of `effort_guards`."""
+        """Deprecated name of `clip_effort`."""
+        warn("EffortLimits.limited is deprecated; call clip_effort", DeprecationWarning)
+        return self.clip_effort(system, tau, positive)
+
+    def clip_effort(
+        self, system: SystemLike, tau: Float[Array, " nv"], positive: Bool[Array, " n"] | None = None
+    ) -> Float[Array, " nv"]:
+        """Clip tau (nv,) to the limits; `positive` (2 nv,), the signs of `effort_guards`, fixes which entries are clipped."""
         limit = self._limit(system, tau)
         if positive is None:
             return jnp.clip(tau, -limit, limit)

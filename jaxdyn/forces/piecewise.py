@@ -1,8 +1,8 @@
-"""Forces that are smooth in pieces: what tells their pieces apart, said once, and a scene whose forces keep to given pieces.
+"""Piecewise smooth forces: their switching functions, and scenes with forces fixed to given pieces.
 
-A force with a kink or a jump declares switching functions. `jd.simulate` ends a step where one of them changes its sign, so that
-no step goes across a kink, and the derivatives of the motion are those of the pieces, put together by what the time of the change
-depends on.
+A force with a kink or a jump declares switching functions. `jd.simulate` ends a step where one of them changes its
+sign, so that no step crosses a kink, and the derivatives of the motion are those of the pieces, joined by the
+derivative of the switching time.
 """
 
 import abc
@@ -19,13 +19,13 @@ from jaxdyn.systems.scene import Scene
 
 
 class PiecewiseForce(eqx.Module):
-    """A force that is smooth but where one of its switching functions changes its sign.
+    """Base class of forces that are smooth except where one of their switching functions changes its sign.
 
-    Derive a class with two methods. As a force it takes the piece in which the state is.
+    Subclasses define two methods. A call evaluates the piece of the current state.
 
     - `guards(system, q, v, t) -> (n,)`: the switching functions, each smooth near its own zeros, in any unit.
-    - `force(system, q, v, t, positive) -> (nv,)`: the force in the piece in which those guards are positive that `positive` (n,)
-      marks. For a given `positive` it is smooth, across the zeros of the guards too.
+    - `force(system, q, v, t, positive) -> (nv,)`: the force in the piece whose positive guards are marked by
+      `positive` (n,). For a fixed `positive` it is smooth, also across the zeros of the guards.
 
     ```python
     class Backlash(jd.PiecewiseForce):
@@ -58,7 +58,7 @@ class PiecewiseForce(eqx.Module):
         t: Number,
         positive: Bool[Array, " n"],
     ) -> Float[Array, " nv"]:
-        """The force (nv,) in the piece that `positive` marks."""
+        """Force (nv,) in the piece that `positive` marks."""
 
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
@@ -66,8 +66,8 @@ class PiecewiseForce(eqx.Module):
         return self.force(system, q, v, t, self.guards(system, q, v, t) > 0)
 
 
-class _OnePiece(eqx.Module):
-    """A force of a scene that keeps to the piece it is told."""
+class _FixedPiece(eqx.Module):
+    """Force of a scene fixed to one piece."""
 
     inner: Any
     positive: Any
@@ -78,21 +78,21 @@ class _OnePiece(eqx.Module):
             return self.inner.force(system, q, v, t, self.positive)
         return self.inner(system, q, v, t)
 
-    def limited(self, system, tau):
-        cut = getattr(self.inner, "limited", None)
+    def clip_effort(self, system, tau):
+        cut = getattr(self.inner, "clip_effort", None)
         if cut is None:
             return tau
         return cut(system, tau) if self.of_efforts is None else cut(system, tau, self.of_efforts)
 
 
 def guards_by_force(scene: Scene, q, v, t, tau) -> list[tuple[Any, Any]]:
-    """Of each force its switching functions, and those of how it cuts off `tau` (nv,); None where it has none.
+    """Switching functions of each force and of its clipping of `tau` (nv,); None where it has none.
 
-    `tau`: of the control before limits; None where there is none, or where it does not depend on the state.
+    `tau`: effort of the control before limits; None without a control, or where it does not depend on the state.
     """
     rows = []
     for force in scene.forces:
-        force = force.inner if isinstance(force, _OnePiece) else force
+        force = force.inner if isinstance(force, _FixedPiece) else force
         own = efforts = None
         if isinstance(force, PiecewiseForce):
             own = jnp.asarray(force.guards(scene.system, q, v, t), q.dtype)
@@ -100,21 +100,22 @@ def guards_by_force(scene: Scene, q, v, t, tau) -> list[tuple[Any, Any]]:
                 raise ValueError(f"{type(force).__name__}: guards gives shape {own.shape}; expected (n,)")
         if tau is not None and hasattr(force, "effort_guards"):
             efforts = force.effort_guards(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
-        if tau is not None and hasattr(force, "limited"):
-            tau = force.limited(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
+        # Limits act one after the other: the next one sees the clipped effort.
+        if tau is not None and hasattr(force, "clip_effort"):
+            tau = force.clip_effort(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
         rows.append((own, efforts))
     return rows
 
 
 class Pieces(NamedTuple):
-    """The switching functions of a scene: of each force how many of its own there are and how many of how it cuts off efforts."""
+    """Layout of a scene's switching functions: for each force the numbers of its own and of its effort limits."""
 
     counts: tuple[tuple[int, int], ...]
     names: tuple[str, ...]
 
 
 def pieces_of(scene: Scene, y, q, v, t, tau_of: Callable | None) -> Pieces:
-    """The switching functions of a scene under a control, tau_of(y, q, v, t), at one state; None without a control."""
+    """Layout of the switching functions of a scene under a control, tau_of(y, q, v, t), at one state; None without a control."""
 
     if not any(isinstance(force, PiecewiseForce) or hasattr(force, "effort_guards") for force in scene.forces):
         return Pieces(((0, 0),) * len(scene.forces), ())
@@ -123,6 +124,7 @@ def pieces_of(scene: Scene, y, q, v, t, tau_of: Callable | None) -> Pieces:
         return guards_by_force(scene, q, v, t, None if tau_of is None else tau_of(y, q, v, t))
 
     counts, names = [], []
+    # Shapes alone are needed, so nothing is computed or compiled.
     for i, (force, parts) in enumerate(zip(scene.forces, jax.eval_shape(shapes, y, q, v, t), strict=True)):
         counts.append(tuple(0 if part is None else part.shape[0] for part in parts))
         names += [f"{type(force).__name__} ({i}): switch {k}" for k in range(sum(counts[-1]))]
@@ -130,26 +132,26 @@ def pieces_of(scene: Scene, y, q, v, t, tau_of: Callable | None) -> Pieces:
 
 
 def guards(scene: Scene, q, v, t, tau) -> Float[Array, " n"]:
-    """All switching functions of a scene's forces, (n,)."""
+    """Values of all switching functions of a scene's forces, (n,)."""
     parts = [part for pair in guards_by_force(scene, q, v, t, tau) for part in pair if part is not None]
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), q.dtype)
 
 
-def in_pieces(scene: Scene, pieces: Pieces, positive: Bool[Array, " n"]) -> Scene:
-    """The scene with forces that keep to the pieces that `positive` marks."""
+def fix_pieces(scene: Scene, pieces: Pieces, positive: Bool[Array, " n"]) -> Scene:
+    """Copy of a scene with its forces fixed to the pieces that `positive` marks."""
     forces, place = [], 0
     for force, (own, efforts) in zip(scene.forces, pieces.counts, strict=True):
         middle, end = place + own, place + own + efforts
         marks = positive[place:middle], positive[middle:end] if efforts else None
-        forces.append(_OnePiece(force, *marks) if own + efforts else force)
+        forces.append(_FixedPiece(force, *marks) if own + efforts else force)
         place = end
     return eqx.tree_at(lambda scene: scene.forces, scene, tuple(forces))
 
 
 def values_and_levels(switching: Callable, q, v):
-    """switching(q, v) (k,), and the size of its rounding.
+    """Values of switching(q, v) (k,), and their rounding errors.
 
-    That follows from what cancels in a function g: dg along (q, v) is the size of its terms.
+    The derivative of a function along its own argument (q, v) measures the size of the terms that cancel in it.
     """
     values, sizes = jax.jvp(switching, (q, v), (q, v))
     return values, jax.lax.stop_gradient(100 * float(jnp.finfo(q.dtype).eps) * (jnp.abs(sizes) + jnp.abs(values)))

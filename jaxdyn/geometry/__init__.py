@@ -1,4 +1,4 @@
-"""Metric geometry of systems: covariant derivatives, and systems made by an immersion (EQUATIONS sections 7 and 12).
+"""Metric geometry: covariant derivatives, and systems constrained by an immersion (EQUATIONS sections 7 and 12).
 
 Imports `dynamics` and what is below it.
 """

@@ -11,8 +11,9 @@ from jaxdyn.systems.mass_factor import solve_positive
 
 
 def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Array, " n"]) -> Float[Array, " n"]:
-    """B(c, a) of Arnold, defined by <B(c, a), b> = <[a, b], c> for all b, with <x, y> = x . inertia y.
+    """Arnold's bilinear form B(c, a), defined by <B(c, a), b> = <[a, b], c> for all b.
 
+    The inner product is <x, y> = x . inertia y.
     On SO(3) inertia B(c, a) = (inertia c) x a; on SE(3) inertia B(c, a) = ad_a^T (inertia c). Without forces a rigid body moves
     by Euler's equations dV/dt = B(V, V): the geodesics of the metric, as the left translations of Lemma 7.1 show.
 
@@ -26,6 +27,7 @@ def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Ar
     Source: Arnold (1989), Mathematical Methods of Classical Mechanics, appendix 2; Loparo & Vakalis, section 7; EQUATIONS
     section 12.
     """
+    # Integer inertias are promoted first: their dtype must not round c and a.
     given = as_array(inertia, "inertia")
     inertia = as_array(given, "inertia", given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else float)
     c, a = as_array(c, "c", inertia.dtype), as_array(a, "a", inertia.dtype)
@@ -41,6 +43,7 @@ def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Ar
 
 @compiled
 def _arnold_form(inertia, c, a):
+    # Euler's equations in momentum form; B follows by one solve with the inertia, which is never inverted.
     momentum = _product(inertia, c)
     force = so3.cross(momentum, a) if a.shape[0] == 3 else se3.adT_apply(a, momentum)
     return solve_positive(inertia, force)

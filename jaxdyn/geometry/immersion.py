@@ -1,11 +1,11 @@
-"""Immersions q = xi(s, t): what lives on q pulled back to s, and the motion of systems that an immersion holds together.
+"""Immersions q = xi(s, t): tensors on q pulled back to s, and the dynamics of systems constrained to their image.
 
-For a system with M a + h = F + R and velocity v = J(s, t) sdot + v0(s, t) on q = xi, c = Jdot sdot + v0dot, the forces R of
-the constraint do no virtual work, J^T R = 0, so that they are gone from
+For a system with M a + h = F + R and velocity v = J(s, t) sdot + v0(s, t) on q = xi, c = Jdot sdot + v0dot, the reaction
+forces R do no virtual work, J^T R = 0, and drop out of
 
     J^T M J sddot + J^T (M c + h) = J^T F,   a = J sddot + c,   R = M a + h - F.
 
-Several systems, each a unit of its own, add their sides: rho = sum of J_i^T M_i J_i, force = sum of J_i^T F_i, and no
+Several systems, called units, add their contributions: rho = sum of J_i^T M_i J_i, force = sum of J_i^T F_i, and no
 matrix of all units is formed. Source: EQUATIONS section 12; Loparo & Vakalis on interacting bodies, after Kron.
 """
 
@@ -24,9 +24,9 @@ from jaxdyn.compile import is_known
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Checked, Function, Numbers, check_state
-from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
-from jaxdyn.systems.start import place_of
-from jaxdyn.systems.system import SceneLike, System, checked_size, rate_to_velocity
+from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
+from jaxdyn.systems.start import describe_state
+from jaxdyn.systems.system import SceneLike, System, check_size, rate_to_velocity
 
 
 class PullBack(eqx.Module):
@@ -43,16 +43,19 @@ class PullBack(eqx.Module):
             raise ValueError(
                 f"field returned shape {value.shape}, expected ({q.shape[0]}, ...) with q = xi(s) {q.shape}"
             )
+        # Forward mode: an immersion has fewer inputs than outputs, m < n.
         J = jax.jacfwd(self.immersion)(s)
+        # Under tracing the rank is unknown; concrete calls refuse singular points.
         if is_known(J):
             _check_rank(J, s, None)
+        # One index at a time: m n^k products instead of a contraction over all indices at once.
         for axis in range(value.ndim):
             value = jnp.moveaxis(_product(jnp.moveaxis(value, axis, -1), J), -1, axis)
         return value
 
 
 def pull_back(field: Function, immersion: Function) -> PullBack:
-    """The pull-back of a covariant tensor by q = xi(s): J^T g J of a metric, J^T F of a one-form, V(xi(s)) of a function.
+    """Pull-back of a covariant tensor by q = xi(s): J^T g J of a metric, J^T F of a one-form, V(xi(s)) of a function.
 
     **Arguments:**
 
@@ -70,7 +73,7 @@ def pull_back(field: Function, immersion: Function) -> PullBack:
 
 
 class _Motion(NamedTuple):
-    """One unit on the immersion: its q, v, the matrix J of v = J sdot + ..., and c, the rate of v at sddot = 0."""
+    """Motion of one unit on the immersion: its q, v, the matrix J of v = J sdot + ..., and c, the rate of v at sddot = 0."""
 
     q: Array
     v: Array
@@ -79,7 +82,7 @@ class _Motion(NamedTuple):
 
 
 class ImmersedSystem(System):
-    """Systems held on q = xi(s, t), as a system in s; made by `constrain_by_immersion`."""
+    """Systems constrained to q = xi(s, t), in coordinates s, as built by `constrain_by_immersion`."""
 
     units: tuple
     immersion: Callable
@@ -102,32 +105,33 @@ class ImmersedSystem(System):
 
     def velocities(self, s, v, t) -> tuple[Array, ...]:
         """Velocity of each unit at s and sdot = v, each (nv,) of its system."""
-        q, rates = self._pushed(self.configurations, s, t, v)
+        q, rates = self._push_forward(self.configurations, s, t, v)
         return tuple(rate_to_velocity(*of) for of in zip(self.units, q, rates, strict=True))
 
-    def _pushed(self, function, s, t, v):
-        """`function(s, t)` and its rate along the motion; time stands still where xi does not depend on it."""
+    def _push_forward(self, function, s, t, v):
+        """Value of `function(s, t)` and its rate along the motion; t is held fixed where xi does not depend on it."""
         if self.moving:
             return jax.jvp(function, (s, t), (v, jnp.ones_like(t)))
         return jax.jvp(lambda s: function(s, t), (s,), (v,))
 
-    def _columns(self, s, t):
-        """J (nv, m) of each unit."""
+    def _unit_jacobians(self, s, t):
+        """Configuration of each unit, and its Jacobian J (nv, m)."""
         q, push = jax.linearize(lambda s: self.configurations(s, t), s)
         rates = jax.vmap(push)(jnp.eye(self.nq, dtype=s.dtype))
         columns = jax.vmap(lambda *rates: [rate_to_velocity(*of) for of in zip(self.units, q, rates, strict=True)])
         return q, [J.T for J in columns(*rates)]
 
     def motions(self, s, v, t) -> list[_Motion]:
-        """Where each unit is and how it moves."""
-        q, J = self._columns(s, t)
-        w, drift = self._pushed(lambda s, t: self.velocities(s, v, t), s, t, v)
+        """Position, velocity, Jacobian and drift of each unit."""
+        q, J = self._unit_jacobians(s, t)
+        # A derivative along the motion with sddot = 0 gives c = Jdot sdot + v0dot; Jdot itself is never formed.
+        w, drift = self._push_forward(lambda s, t: self.velocities(s, v, t), s, t, v)
         return [_Motion(*of) for of in zip(q, w, J, drift, strict=True)]
 
     def mass_matrix(self, s, t):
         """rho = sum of J^T M J, (m, m)."""
-        placed = zip(self.units, *self._columns(s, t), strict=True)
-        return _sum(_product(J.T, _product(dynamics.mass_matrix(unit, q, t), J)) for unit, q, J in placed)
+        jacobians = zip(self.units, *self._unit_jacobians(s, t), strict=True)
+        return _sum(_product(J.T, _product(dynamics.mass_matrix(unit, q, t), J)) for unit, q, J in jacobians)
 
     def bias_force(self, s, v, t):
         """Sum of J^T (M c + h), (m,)."""
@@ -138,36 +142,37 @@ class ImmersedSystem(System):
         return self._inverse(s, v, t, a)
 
     def _inverse(self, s, v, t, a):
-        needed = self._needed(self.motions(s, v, t), a, t)
-        return _sum(_product(motion.J.T, force) for motion, force in needed)
+        forces = self._unit_forces(self.motions(s, v, t), a, t)
+        return _sum(_product(motion.J.T, force) for motion, force in forces)
 
-    def _needed(self, motions, a, t):
-        """Each unit's motion, and the force it takes."""
+    def _unit_forces(self, motions, a, t):
+        """Yield each unit's motion and the generalised force M (J a + c) + h that it requires."""
         for unit, motion in zip(self.units, motions, strict=True):
             acceleration = motion.drift if a is None else motion.drift + _product(motion.J, a)
             yield motion, dynamics.inverse_dynamics(unit, motion.q, motion.v, acceleration, t)
 
     def gravity_force(self, s, t):
         """Bias force at rest, (m,); sum of J^T N where xi does not move."""
+        # With xi(s, t) the bias force at rest also has J^T M c, of the motion that time imposes.
         if self.moving:
             return super().gravity_force(s, t)
-        placed = zip(self.units, *self._columns(s, t), strict=True)
-        return _sum(_product(J.T, dynamics.gravity_force(unit, q, t)) for unit, q, J in placed)
+        jacobians = zip(self.units, *self._unit_jacobians(s, t), strict=True)
+        return _sum(_product(J.T, dynamics.gravity_force(unit, q, t)) for unit, q, J in jacobians)
 
     def kinetic_energy(self, s, v, t):
         """Sum of the units' kinetic energies, (), J."""
-        placed = zip(self.units, self.configurations(s, t), self.velocities(s, v, t), strict=True)
-        return _sum(dynamics.kinetic_energy(unit, q, w, t) for unit, q, w in placed)
+        states = zip(self.units, self.configurations(s, t), self.velocities(s, v, t), strict=True)
+        return _sum(dynamics.kinetic_energy(unit, q, w, t) for unit, q, w in states)
 
     def potential_energy(self, s, t):
         """Sum of the units' potential energies, (), J."""
-        placed = zip(self.units, self.configurations(s, t), strict=True)
-        return _sum(dynamics.potential_energy(unit, q, t) for unit, q in placed)
+        states = zip(self.units, self.configurations(s, t), strict=True)
+        return _sum(dynamics.potential_energy(unit, q, t) for unit, q in states)
 
     def check_start(self, q, v, t) -> None:
-        """As for any system; also that the immersion has full rank."""
+        """Check the start as for any system, and that the immersion has full rank."""
         if is_known(self, q, v, t):
-            _check_rank(np.concatenate([np.asarray(J) for J in _columns_compiled(self, q, t)]), q, t)
+            _check_rank(np.concatenate([np.asarray(J) for J in _compiled_unit_jacobians(self, q, t)]), q, t)
         super().check_start(q, v, t)
 
 
@@ -182,18 +187,19 @@ class PulledForce(eqx.Module):
         total = [
             _sum(
                 [jnp.zeros_like(w)]
-                + [checked_force(f(unit, q_unit, w, t), q_unit, unit.nv, f"forces[{i}]") for i, f in enumerate(forces)]
+                + [check_force(f(unit, q_unit, w, t), q_unit, unit.nv, f"forces[{i}]") for i, f in enumerate(forces)]
             )
             for unit, forces, q_unit, w in zip(system.units, self.forces, q, v, strict=True)
         ]
         if self.common is None:
             return total
         common_forces = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
-        return _added(total, common_forces, "force")
+        return _add_forces(total, common_forces, "force")
 
     def __call__(self, system, s, v, t):
         if not isinstance(system, ImmersedSystem):
             raise ValueError(f"a pulled-back force needs its immersed system, not a {type(system).__name__}")
+        # J^T F as a vector-Jacobian product of the velocities, which are affine in sdot: J is not formed.
         _, pull = jax.vjp(lambda v: system.velocities(s, v, t), v)
         return pull(tuple(self.on_units(system, system.configurations(s, t), system.velocities(s, v, t), t)))[0]
 
@@ -206,10 +212,10 @@ def constrain_by_immersion(
     moving: bool = False,
     force: Function | None = None,
 ) -> ImmersedSystem | Scene:
-    """The motion of a system held on q = xi(s), or of several independent ones joined by it, as a system in s.
+    """System in s of one system constrained to q = xi(s), or of several independent ones that xi joins.
 
-    M becomes rho = J^T M J, forces become J^T F, and the reaction forces are gone; `reaction_force` gives them. Equal to
-    the same constraint by multipliers, without multipliers, and without drift from the constraint.
+    M becomes rho = J^T M J, forces become J^T F, and the reaction forces drop out; `reaction_force` gives them. The motion
+    is that of the same constraint with multipliers, without drift from the constraint.
 
     **Arguments:**
 
@@ -221,12 +227,12 @@ def constrain_by_immersion(
     - `nq`: number of coordinates s; sdot is their velocity.
     - `moving`: whether xi takes the time.
     - `force`: force(q, v, t) -> (nv,), N m or N, on the system, or a tuple of them for a tuple of systems, then of the
-      tuples of their q and v: what acts between them. None for none.
+      tuples of their q and v: the interaction between them. None for none.
 
     **Returns:** a system in s; a `Scene` with the pulled-back forces when a `Scene` or `force` was given.
 
-    **Raises:** ValueError for what is no system, a scene with constraints, an nq that is no positive integer; (when used)
-    for configurations of a wrong shape; before a motion from concrete numbers is computed, for an immersion of a rank
+    **Raises:** ValueError for an argument that is no system, a scene with constraints, an nq that is no positive integer;
+    (when used) for configurations of a wrong shape; before a motion from concrete numbers is computed, for an immersion of a rank
     below nq, with the rank and the point.
 
     Source: EQUATIONS section 12.
@@ -248,7 +254,7 @@ def constrain_by_immersion(
             )
     units = tuple(scene.system for scene in scenes)
     immersed = ImmersedSystem(
-        units=units, immersion=as_pytree(xi, "xi"), nq=checked_size(nq), moving=bool(moving), joined=joined
+        units=units, immersion=as_pytree(xi, "xi"), nq=check_size(nq), moving=bool(moving), joined=joined
     )
     if force is None and not any(isinstance(unit, Scene) for unit in given):
         return immersed
@@ -264,23 +270,23 @@ def reaction_force(
     force: Numbers | None = None,
     t: Numbers = 0.0,
 ) -> Array | tuple[Array, ...]:
-    """Force R = M a + h - F with which an immersion holds its system, in the coordinates of the system; J^T R = 0.
+    """Reaction force R = M a + h - F of an immersion, in the coordinates of its system; J^T R = 0.
 
     **Arguments:**
 
-    - `system`: what `constrain_by_immersion` returned.
+    - `system`: a result of `constrain_by_immersion`.
     - `q`, `v` (nq,): s and sdot. `t`, s.
     - `force`: force on the system (nv,), N m or N, one for each unit when it is a tuple, besides the forces of its scene.
       None for zero.
 
     **Returns:** (nv,) of the system, or a tuple, one for each unit.
 
-    **Raises:** ValueError for what is not immersed, forces that were not pulled back, and shapes that do not fit.
+    **Raises:** ValueError for a system that is not immersed, forces that were not pulled back, and shapes that do not fit.
     """
     scene = as_scene(system)
     immersed = scene.system
     if not isinstance(immersed, ImmersedSystem):
-        raise ValueError(f"system is a {type(immersed).__name__}; pass what constrain_by_immersion returned")
+        raise ValueError(f"system is a {type(immersed).__name__}; pass the result of constrain_by_immersion")
     if any(not isinstance(f, PulledForce) for f in scene.forces) or scene.constraints:
         raise ValueError(
             "the scene has forces or constraints in s, whose share in q is not known; list forces on the systems that go "
@@ -289,39 +295,43 @@ def reaction_force(
     q, v, t = check_state(immersed, q=q, v=v, t=t)
     motions = immersed.motions(q, v, t)
     places, speeds = [m.q for m in motions], [m.v for m in motions]
+    # The generalised force comes from the same per-unit forces that are subtracted below, so that J^T R = 0 to rounding.
     applied = [jnp.zeros_like(w) for w in speeds]
     if force is not None:
-        applied = _added(applied, force if immersed.joined else (force,), "force")
+        applied = _add_forces(applied, force if immersed.joined else (force,), "force")
     for pulled in scene.forces:
         applied = [a + f for a, f in zip(applied, pulled.on_units(immersed, places, speeds, t), strict=True)]
     tau = _sum(_product(m.J.T, f) for m, f in zip(motions, applied, strict=True))
     a = dynamics.forward_dynamics(immersed, q, v, tau, t)
-    reactions = tuple(needed - f for (_, needed), f in zip(immersed._needed(motions, a, t), applied, strict=True))
+    reactions = tuple(
+        required - f for (_, required), f in zip(immersed._unit_forces(motions, a, t), applied, strict=True)
+    )
     return reactions if immersed.joined else reactions[0]
 
 
-def _added(total, forces, argument: str) -> list[Array]:
-    """Forces on each unit, and others that a user gave."""
+def _add_forces(total, forces, argument: str) -> list[Array]:
+    """Add the forces that a user gave, one for each unit, to the total of each unit."""
     if len(forces) != len(total):
         raise ValueError(f"{argument} has {len(forces)} entries; give one for each of the {len(total)} systems")
-    return [f + checked_force(g, f, f.shape[0], argument) for f, g in zip(total, forces, strict=True)]
+    return [f + check_force(g, f, f.shape[0], argument) for f, g in zip(total, forces, strict=True)]
 
 
 def _sum(terms):
     return reduce(add, terms)
 
 
-_columns_compiled = eqx.filter_jit(lambda system, q, t: system._columns(q, t)[1])
+_compiled_unit_jacobians = eqx.filter_jit(lambda system, q, t: system._unit_jacobians(q, t)[1])
 
 
 def _check_rank(J, s, t) -> None:
     """Refuse a matrix (n, m) of a rank below m."""
     J = np.asarray(J, float)
+    # The usual threshold of a numerical rank, max(n, m) eps, with a margin of 10 for the rounding of xi's derivative.
     least = 10 * max(J.shape) * float(np.finfo(np.asarray(s).dtype).eps)
     sizes = np.linalg.svd(J, compute_uv=False) if np.isfinite(J).all() else np.full(1, np.nan)
     rank = int(np.sum(sizes > least * sizes.max(initial=0.0)))
     if rank < J.shape[1]:
-        where = f"s = {np.asarray(s).tolist()}" if t is None else place_of(s, t).replace("q =", "s =")
+        where = f"s = {np.asarray(s).tolist()}" if t is None else describe_state(s, t).replace("q =", "s =")
         raise ValueError(
             f"the immersion has rank {rank} at {where}, expected {J.shape[1]}, one for each coordinate; start elsewhere, "
             "or take coordinates that are regular there"

@@ -2,8 +2,8 @@
 
 A metric is a function g(q) -> (n, n), symmetric positive definite, or a system whose mass matrix it is (a `System`, or a
 `Model` with v = dq/dt), at t = 0. The connection is that of Levi-Civita: no torsion, and the metric is constant along it. The
-symbols of the second kind are Gamma^i_jk = 1/2 g^il (dg_lj/dq_k + dg_lk/dq_j - dg_jk/dq_l). What needs their product with
-two vectors alone does not form them.
+symbols of the second kind are Gamma^i_jk = 1/2 g^il (dg_lj/dq_k + dg_lk/dq_j - dg_jk/dq_l). Functions that need only
+their product with two vectors do not form them.
 
 Newton's law in these terms: flat(nabla_v v) = F, with a one-form F. Source: EQUATIONS sections 0, 7 and 12; do Carmo
 (1992), Riemannian Geometry, chapters 2 to 4.
@@ -32,11 +32,11 @@ KINDS = ("first", "second")
 if TYPE_CHECKING:
     Metric = Callable[..., Any] | Model | System | Scene
 else:
-    Metric = Any  # `_at` looks at it
+    Metric = Any  # `_as_function` checks it
 
 
-def _whole(function: Callable) -> Callable:
-    """`function(metric, *args)`, one program for a system. What a plain function captures may change: it is called each time."""
+def _compile_for_systems(function: Callable) -> Callable:
+    """Compile `function(metric, *args)` for a system; evaluate it anew for a plain function, whose captured values may change."""
     program = compiled(function)
 
     @functools.wraps(function)
@@ -52,7 +52,7 @@ def flat(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[
     **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
     """
     q, v = _vectors(metric, q=q, v=v)
-    return _product(_at(metric)(q), v)
+    return _product(_as_function(metric)(q), v)
 
 
 def sharp(metric: Metric, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -63,9 +63,9 @@ def sharp(metric: Metric, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float
     return _sharp(metric, *_vectors(metric, q=q, p=p))
 
 
-@_whole
+@_compile_for_systems
 def _sharp(metric, q, p):
-    return solve_positive(_at(metric)(q), p)
+    return solve_positive(_as_function(metric)(q), p)
 
 
 def christoffel_symbols(metric: Metric, q: Float[Array, " n"], kind: str = "second") -> Float[Array, "n n n"]:
@@ -82,9 +82,9 @@ def christoffel_symbols(metric: Metric, q: Float[Array, " n"], kind: str = "seco
     return _symbols(metric, *_vectors(metric, q=q), kind)
 
 
-@_whole
+@_compile_for_systems
 def _symbols(metric, q, kind):
-    g = _at(metric)
+    g = _as_function(metric)
     first = symbols(jax.jacfwd(g)(q))
     return first if kind == "first" else solve_positive(g(q), first.reshape(q.shape[0], -1)).reshape(first.shape)
 
@@ -92,26 +92,27 @@ def _symbols(metric, q, kind):
 def connection(
     metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Gamma(v, w)^i = Gamma^i_jk v_j w_k, symmetric and bilinear in v and w; the symbols are not formed.
+    """Connection Gamma(v, w)^i = Gamma^i_jk v_j w_k, symmetric and bilinear in v and w; the symbols are not formed.
 
     **Arguments:** `metric` as above; `q`, `v`, `w` (n,). **Returns:** (n,).
     """
     return _connection(metric, *_vectors(metric, q=q, v=v, w=w))
 
 
-@_whole
+@_compile_for_systems
 def _connection(metric, q, v, w):
-    g = _at(metric)
+    g = _as_function(metric)
+    # The three terms of the symbols as two directional derivatives and one gradient: O(1) evaluations of g, no n^3 array.
     _, along_v = jax.jvp(lambda q: _product(g(q), w), (q,), (v,))
     _, along_w = jax.jvp(lambda q: _product(g(q), v), (q,), (w,))
-    slope = jax.grad(lambda q: jnp.sum(v * _product(g(q), w)))(q)
-    return solve_positive(g(q), 0.5 * (along_v + along_w - slope))
+    gradient = jax.grad(lambda q: jnp.sum(v * _product(g(q), w)))(q)
+    return solve_positive(g(q), 0.5 * (along_v + along_w - gradient))
 
 
 def covariant_rate(
     metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"], rate: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Covariant derivative along a curve, Dw/dt = dw/dt + Gamma(dq/dt, w), of a vector w(t) that is carried along.
+    """Covariant derivative Dw/dt = dw/dt + Gamma(dq/dt, w) of a vector field w(t) along a curve.
 
     With w = v = dq/dt and rate = a it is the covariant acceleration nabla_v v. It is zero for parallel transport.
 
@@ -134,7 +135,9 @@ def covariant_derivative(
 
 
 def geodesic_acceleration(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-    """d2q/dt2 = -Gamma(v, v) of the geodesic through q with velocity v. `jd.MetricSystem(metric, n)` simulates it.
+    """Acceleration d2q/dt2 = -Gamma(v, v) of the geodesic through q with velocity v.
+
+    `jd.MetricSystem(metric, n)` simulates it.
 
     **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
     """
@@ -142,7 +145,7 @@ def geodesic_acceleration(metric: Metric, q: Float[Array, " n"], v: Float[Array,
 
 
 def riemann_tensor(metric: Metric, q: Float[Array, " n"]) -> Float[Array, "n n n n"]:
-    """Curvature tensor R^i_jkl, with R(u, w) z = nabla_u nabla_w z - nabla_w nabla_u z - nabla_[u,w] z:
+    """Curvature tensor R^i_jkl, with R(u, w) z = nabla_u nabla_w z - nabla_w nabla_u z - nabla_[u,w] z.
 
         (R(u, w) z)^i = R^i_jkl z^j u^k w^l,
         R^i_jkl = dGamma^i_lj/dq_k - dGamma^i_kj/dq_l + Gamma^i_km Gamma^m_lj - Gamma^i_lm Gamma^m_kj.
@@ -154,11 +157,12 @@ def riemann_tensor(metric: Metric, q: Float[Array, " n"]) -> Float[Array, "n n n
     return _curvature(metric, *_vectors(metric, q=q))
 
 
-@_whole
+@_compile_for_systems
 def _curvature(metric, q):
     gamma = _symbols(metric, q, "second")
-    slope = jax.jacfwd(lambda q: _symbols(metric, q, "second"))(q)
-    half = slope.transpose(0, 2, 3, 1) + jnp.einsum("ikm,mlj->ijkl", gamma, gamma)
+    derivative = jax.jacfwd(lambda q: _symbols(metric, q, "second"))(q)
+    # R is antisymmetric in k and l: half of its terms, minus the same with k and l exchanged.
+    half = derivative.transpose(0, 2, 3, 1) + jnp.einsum("ikm,mlj->ijkl", gamma, gamma)
     return half - half.transpose(0, 1, 3, 2)
 
 
@@ -172,12 +176,13 @@ def sectional_curvature(
     return _sectional(metric, *_vectors(metric, q=q, u=u, w=w))
 
 
-@_whole
+@_compile_for_systems
 def _sectional(metric, q, u, w):
-    g = _at(metric)(q)
-    turned = jnp.einsum("ijkl,j,k,l->i", _curvature(metric, q), w, u, w)
+    g = _as_function(metric)(q)
+    curvature = jnp.einsum("ijkl,j,k,l->i", _curvature(metric, q), w, u, w)
+    # Lowering the index with g makes <R(u, w) w, u> a scalar in any coordinates.
     dot = lambda a, b: jnp.sum(a * _product(g, b))  # noqa: E731
-    return dot(turned, u) / (dot(u, u) * dot(w, w) - dot(u, w) ** 2)
+    return dot(curvature, u) / (dot(u, u) * dot(w, w) - dot(u, w) ** 2)
 
 
 def _vectors(metric, **arguments) -> tuple[Array, ...]:
@@ -195,11 +200,12 @@ def _vectors(metric, **arguments) -> tuple[Array, ...]:
     return tuple(as_array(value, name, dtype) for name, value in arguments.items())
 
 
-def _at(metric) -> Callable:
+def _as_function(metric) -> Callable:
     """The metric as a function of q.
 
-    **Raises:** ValueError for what gives no metric.
+    **Raises:** ValueError for an argument that gives no metric.
     """
+    # The formulas are those of a coordinate basis, v = dq/dt; quasi-velocities would need the structure constants too.
     if isinstance(metric, Model) and metric.nq != metric.nv:
         raise ValueError(
             f"metric is model {metric.name!r} with nq = {metric.nq}, nv = {metric.nv}; a metric needs coordinates with "
@@ -218,7 +224,7 @@ def _at(metric) -> Callable:
 
     given: Callable = metric
 
-    def checked(q):
+    def evaluate(q):
         g = given(q)
         if jnp.shape(g) != (q.shape[0], q.shape[0]):
             raise ValueError(
@@ -226,4 +232,4 @@ def _at(metric) -> Callable:
             )
         return jnp.asarray(g, q.dtype)
 
-    return checked
+    return evaluate

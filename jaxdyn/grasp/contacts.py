@@ -1,4 +1,4 @@
-"""Contacts between a finger and an object: which components of the relative twist they remove.
+"""Contacts between a finger and an object as constraints on components of the relative twist.
 
 A contact frame on the object has its z along the normal, into the object. With the wrench basis B of the contact, whose
 columns are the wrenches that it can transmit, in that frame,
@@ -24,7 +24,7 @@ from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
 
 
 class Contact(Pair):
-    """A contact at a place that is fixed on the object; made by `contact`."""
+    """Contact at a point fixed on the object, built by `contact`."""
 
     name: str = eqx.field(static=True)
     kind: str = eqx.field(static=True)
@@ -45,32 +45,32 @@ class Contact(Pair):
 
     @property
     def _spins(self) -> bool:
-        # Turning about the normal alone is not the rate of a function of the configuration.
+        # Rotation about the normal alone is not the rate of a function of the configuration.
         return self.kind == "soft-finger"
 
     def sizes(self, system: SystemLike, dtype: DType) -> tuple[int, int]:
-        """All rows are holonomic but the one of a soft finger's torque."""
+        """Numbers of holonomic rows and of others: only a soft finger's torque row is nonholonomic."""
         check_bodies(self.name, system, (self.object, self.finger))
         return len(self.components) - int(self._spins), int(self._spins)
 
     def wrench_components(self) -> tuple[int, ...] | None:
-        """The rows are the components themselves."""
+        """Order of the rows in the wrench: they are its components."""
         return tuple(range(len(self.components)))
 
     def structure_key(self) -> tuple:
-        """The kind of contact."""
+        """Key of the kind of contact."""
         return self.kind, self.in_plane
 
     def pose_residual(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Float[Array, " nh"] | None:
         """Position, and where the contact constrains it orientation, of the contact frame in the fingertip's, (n,), m and rad."""
-        # The fingertip moves against the object as the object moves against the fingertip, with the other sign.
+        # Frame A is on the object, so p is the fingertip's position relative to it; rows are object minus fingertip.
         residual = p if self.kind != "rigid" else jnp.concatenate([p, jnp.stack(attitude(R))])
         return -residual[np.array([i for i in self.components if i < residual.shape[0]])]
 
     def twist_residual(
         self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]
     ) -> Float[Array, " np"] | None:
-        """Angular velocity of the object against the finger about the normal, (1,), rad/s, for a soft finger."""
+        """Angular velocity of the object relative to the finger about the normal, (1,), rad/s, for a soft finger."""
         return -U[5:] if self._spins else None
 
 
@@ -84,7 +84,7 @@ def contact(
     in_plane: bool = False,
     name: str | None = None,
 ) -> Contact:
-    """A contact of a fingertip at a place fixed on the object.
+    """Contact of a fingertip at a point fixed on the object.
 
     Rows: the components of the object's twist relative to the finger, in the contact frame, along the columns of
     `wrench_basis(kind)`. Their multipliers are the components of the wrench on the object (N, N m). A frictionless
@@ -93,12 +93,12 @@ def contact(
     **Arguments:**
 
     - `kind`: "frictionless", "hard-finger" (a point with friction), "soft-finger" or "rigid".
-    - `finger`: body or frame that touches, or None for the world, as a table; `finger_pose`: of the fingertip in it, by
-      default its own frame. The origin is the point that touches; the axes matter in a rigid contact alone, where they are
+    - `finger`: body or frame in contact, or None for the world, as a table; `finger_pose`: of the fingertip in it, by
+      default its own frame. The origin is the contact point; the axes matter only in a rigid contact, where they are
       those of the contact frame.
     - `pose`: of the contact frame in the object: z is the normal into the object. Poses are None (identity), (4, 4), (3,)
       or (xyz, rpy); m and rad.
-    - `object`: body that is touched; None: the one of the `Grasp` that the contact is given to, the world in a `Scene`.
+    - `object`: body in contact; None: the object of the `Grasp`, the world in a `Scene`.
     - `in_plane`: only rows within the x-z plane of the contact frame, for mechanisms that move in that plane.
     - `name`: for errors and reports; by default that of the finger, or "world".
 
@@ -122,10 +122,10 @@ def contact(
 def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
     """Contacts of named fingertips at points of the object, from its points and inward normals.
 
-    **Arguments:** `places`: by the name of a finger's body or frame, whose origin touches, (point (3,), normal (3,)) on the
-    object, in its frame: m, and the direction into the object. `kind`: as of `contact`.
+    **Arguments:** `places`: by the name of a finger's body or frame, whose origin is the contact point, (point (3,),
+    normal (3,)) on the object, in its frame: m, and the direction into the object. `kind`: as of `contact`.
 
-    **Returns:** one `Contact` each; z of its frame is the normal, x and y any directions across.
+    **Returns:** one `Contact` each; z of its frame is the normal, x and y any orthogonal directions.
 
     **Raises:** ValueError for no places, points and normals that are not (3,), and normals of length zero.
 
@@ -151,9 +151,9 @@ def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
 
 
 def on_object(constraint: Constraint, name: str) -> Constraint:
-    """The constraint as a contact of the object `name`.
+    """Convert a constraint to a contact of the object `name`.
 
-    **Raises:** ValueError for a contact of another body, and for rolling that does not touch the object.
+    **Raises:** ValueError for a contact on another body, and for rolling between other bodies.
     """
     if isinstance(constraint, Contact):
         if constraint.object not in (None, name):
@@ -167,6 +167,6 @@ def on_object(constraint: Constraint, name: str) -> Constraint:
         if name not in (constraint.body, constraint.surface_body):
             raise ValueError(
                 f"rolling contact {constraint.name!r} is between {constraint.body!r} and {constraint.surface_body!r}; "
-                f"one of them has to be the object, {name!r}"
+                f"one of them must be the object, {name!r}"
             )
     return constraint

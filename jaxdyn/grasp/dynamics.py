@@ -1,4 +1,4 @@
-"""Equations of motion of a grasped object: the hand's inertia and torques as they act through the contacts.
+"""Equations of motion of a grasped object, with the hand's inertia and torques acting through the contacts.
 
 With J_h square and regular, X = J_h^-1 G^T gives the joint velocities thetadot = X V, and with N = [X; 1]
 
@@ -26,25 +26,26 @@ from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matr
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import least_quality
-from jaxdyn.systems.mass_factor import cholesky, solve_factored
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.system import velocity_to_rate
 
 
 class ObjectDynamics(Outcome):
-    """M~ nudot + C~ nu + N~ = F of a grasped object, its solution and the contact forces.
+    """Equations of motion M~ nudot + C~ nu + N~ = F of a grasped object, their solution and the contact forces.
 
     nu (nr,) is the object's velocity V with `object_dynamics`, and (w, u) with `hand_dynamics`.
 
     - `mass_matrix`, `coriolis_matrix` (nr, nr); `gravity_force`, `force` (nr,): M~, C~, N~, F; wrenches in the object's
       frame for the velocity of a free body. M~ is symmetric, dM~/dt - 2 C~ skew.
-    - `input_map` (nr, nh): of the joints' torques, F = input_map tau_f + what acts on the object: G J_h^-T with V.
+    - `input_map` (nr, nh): of the joints' torques, F = input_map tau_f + forces on the object: G J_h^-T with V.
     - `rate` (nr,): nudot. `velocity`, `acceleration` (nv,): of all joints, v = N nu and its rate.
     - `contact_forces` (nc,): on the object, along the contacts' components, N and N m.
     - `basis` (nv, nr): N.
-    - `result`: one of `jd.RESULTS`; `singular_basis` where the hand Jacobian is singular, or of another rank than `motions`.
-    - `layout`: name and place of each contact's rows.
+    - `result`: one of `jd.RESULTS`; `singular_basis` where the hand Jacobian is singular, or its rank differs from that
+      of `motions`.
+    - `layout`: name and row range of each contact.
     """
 
     mass_matrix: Float[Array, "nr nr"]
@@ -81,13 +82,13 @@ def object_dynamics(
 
     **Returns:** `ObjectDynamics`.
 
-    **Raises:** ValueError for shapes that do not fit, and for contacts with another number of rows than the hand has
+    **Raises:** ValueError for inconsistent shapes, and where the number of contact rows differs from that of the hand's
     joints, so that J_h is not square: use `hand_dynamics` then.
 
     Source: Murray, Li & Sastry (1994), eqs 6.21-6.25; EQUATIONS section 10 and errata E35-E37.
     """
     check_grasp(grasp)
-    tau = or_zeros(tau, grasp.nv)
+    tau = zeros_if_none(tau, grasp.nv)
     q, tau, t = check_state(grasp.system, q=q, tau=tau, t=t)
     V = as_array(V, "V", q.dtype)
     count, joints = layout(grasp)[-1].end, len(grasp.hand_velocities)
@@ -113,26 +114,26 @@ def hand_dynamics(
     *,
     motions: HandMotions | None = None,
 ) -> ObjectDynamics:
-    """Equations of motion of any hand, redundant or not able to follow every motion of its object.
+    """Equations of motion of any hand, also redundant or nonmanipulable ones.
 
     Formulation: minimal velocities nu = (w, u), w of the object velocities V = H w that the fingers can follow, u of the
     internal motions of the hand; thetadot = J_h^+ G^T H w + K u with the pseudo-inverse J_h^+ and K a basis of ker J_h. No
     chart is laid on the object's configuration, nor any quantity damped. Where J_h is square and regular it is
     `object_dynamics`, and nu = V.
 
-    Contact forces that fingers take up in their structure, which no torque changes, are found from the object's equation
-    too; where rows depend on each other, the forces of least norm, as in `jd.constrained_dynamics`.
+    Structural contact forces, which no torque changes, follow from the object's equation
+    too; for dependent rows, the forces of least norm, as in `jd.constrained_dynamics`.
 
     **Arguments:**
 
     - `q` (nq,), on the contacts; `nu` (nw + nk,): (w, u).
     - `tau` (nv,), of the fingers' joints and on the object, N m or N (None: zero); `t`, s. The grasp's forces are added.
-    - `motions`: references of H and K, `hand_motions` of a place nearby; by default of q itself. Along a motion keep them,
-      so that nu means the same: dM~/dt - 2 C~ is skew for H and K continued from fixed references.
+    - `motions`: references of H and K, `hand_motions` of a configuration nearby; by default of q itself. Along a motion
+      keep them, so that nu keeps its meaning: dM~/dt - 2 C~ is skew for H and K continued from fixed references.
 
     **Returns:** `ObjectDynamics`, in nu.
 
-    **Raises:** ValueError for shapes that do not fit, and as `hand_motions` does.
+    **Raises:** ValueError for inconsistent shapes, and as `hand_motions` does.
 
     ```python
     motions = jd.grasp.hand_motions(grasp, q)
@@ -144,14 +145,14 @@ def hand_dynamics(
     6.3; EQUATIONS section 10.
     """
     check_grasp(grasp)
-    tau = or_zeros(tau, grasp.nv)
+    tau = zeros_if_none(tau, grasp.nv)
     q, tau, t = check_state(grasp.system, q=q, tau=tau, t=t)
     motions = hand_motions(grasp, q, t) if motions is None else motions
     nh, no = len(grasp.hand_velocities), len(grasp.object_velocities)
     if motions.object.shape[0] != no or motions.internal.shape[0] != nh:
         raise ValueError(
             f"motions has rows for {motions.object.shape[0]} velocities of an object and {motions.internal.shape[0]} joints, "
-            f"the grasp has {no} and {nh}; take jd.grasp.hand_motions(grasp, q)"
+            f"the grasp has {no} and {nh}; use jd.grasp.hand_motions(grasp, q)"
         )
     nu = as_array(nu, "nu", q.dtype)
     if nu.shape != (motions.size(grasp),):
@@ -175,25 +176,28 @@ def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     # From J_h X = G^T: J_h Xdot = Gdot^T - J_hdot X, which is Adot N.
     Xdot = _product(inverse, _product(push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)), N))
     Ndot = jnp.zeros_like(N).at[hands].set(Xdot)
+    # The trace of J_h^+ J_h is the rank of J_h.
     whole = jnp.round(jnp.sum(inverse * Jh.T)) == hands.size
     condition = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
+    # The condition number that the dtype resolves: beyond it the basis N has no correct digits.
     is_regular = whole & (condition * least_quality(q.dtype) < 1)
-    return _solved(grasp, q, V, tau, t, N, Ndot, is_regular, lambda left: -_product(inverse.T, left[hands]))
+    return _solve_dynamics(grasp, q, V, tau, t, N, Ndot, is_regular, lambda left: -_product(inverse.T, left[hands]))
 
 
 @compiled
 def _solve_motions(grasp: Grasp, motions: HandMotions, q, nu, tau, t) -> ObjectDynamics:
     place, push = jax.linearize(lambda q, t: motions.at(grasp, q, t), q, t)
+    # N is linearised with its configuration, so that Ndot is exact for any basis.
     v = _product(place.N, nu)
     Ndot = push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)).N
     is_regular = place.quality > least_quality(q.dtype)
     A = constraint_jacobian(grasp, q, t)
     inverse = pseudo_inverse(A, tolerance(None, A))
-    return _solved(grasp, q, nu, tau, t, place.N, Ndot, is_regular, lambda left: _product(inverse.T, left))
+    return _solve_dynamics(grasp, q, nu, tau, t, place.N, Ndot, is_regular, lambda left: _product(inverse.T, left))
 
 
-def _solved(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multipliers) -> ObjectDynamics:
-    """The equations in nu, v = N nu, and their solution; `multipliers` of A^T lam = M a + C v + g - tau (nv,)."""
+def _solve_dynamics(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multipliers) -> ObjectDynamics:
+    """Solve the equations in nu, v = N nu; `multipliers` solves A^T lam = M a + C v + g - tau (nv,)."""
     system, v = grasp.system, _product(N, nu)
     M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)
     gravity, force = gravity_force(system, q, t), applied(grasp, q, v, tau, t)
@@ -201,7 +205,7 @@ def _solved(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multipliers) -> Ob
     coriolis = _product(N.T, _product(C, N) + _product(M, Ndot))
     gravity_part, force_part = _product(N.T, gravity), _product(N.T, force)
     factor = cholesky(mass)
-    rate = solve_factored(factor, force_part - _product(coriolis, nu) - gravity_part)
+    rate = solve_cholesky(factor, force_part - _product(coriolis, nu) - gravity_part)
     a = _product(N, rate) + _product(Ndot, nu)
     lam = multipliers(_product(M, a) + _product(C, v) + gravity - force)
 

@@ -1,4 +1,4 @@
-"""Contact forces of a hand: those that exert a wanted wrench on the object, internal ones, and the torques that they take.
+"""Contact forces of a hand: those of a given wrench on the object, internal ones, and the joint torques.
 
 The forces lam with G lam = F are  lam = G^+ F + E c:  the columns of E span the internal forces, ker G. At rest the joints
 exert them with tau = J_h^T lam, so that tau . thetadot = lam . J_h thetadot = lam . G^T V = F . V for motions on the contacts.
@@ -20,7 +20,7 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.closure import ForceClosure
 from jaxdyn.contact.closure import force_closure as _closure
 from jaxdyn.contact.cones import Cones
-from jaxdyn.contact.forces import ConedContact, coned_contacts
+from jaxdyn.contact.forces import ContactWithCone, contacts_with_cones
 from jaxdyn.contact.kinds import components
 from jaxdyn.contact.optimal import optimal_forces
 from jaxdyn.contact.qp import RESULTS
@@ -33,13 +33,13 @@ from jaxdyn.reduction.bases import orthonormal, split_directions
 
 
 class HandForces(eqx.Module):
-    """Contact forces within their cones, and the torques of the joints that exert them at rest; of `hold`.
+    """Contact forces within their cones, and the joint torques that exert them at rest; see `hold`.
 
     - `contact_forces` (nc,): on the object, in the order of the grasp's rows, N and N m.
     - `torques` (nh,): J_h^T times them, of the joints in the order of `grasp.hand_velocities`, without the weight of the
       fingers; N m or N.
     - `result`: one of `jaxdyn.contact.RESULTS`; `infeasible` where no forces in the cones exert the wrench.
-    - `layout`: name and place of each contact's rows.
+    - `layout`: name and row range of each contact.
     """
 
     contact_forces: Float[Array, " nc"]
@@ -49,7 +49,7 @@ class HandForces(eqx.Module):
 
     @property
     def success(self) -> Bool[Array, ""]:
-        """Whether `result` is successful."""
+        """True where `result` is successful."""
         return self.result == RESULTS.successful
 
     def by_contact(self) -> dict[str, Array]:
@@ -65,8 +65,8 @@ def internal_force_basis(
     **Arguments:**
 
     - `q` (nq,); `t`, s.
-    - `reference` (nc, ni): a basis of a place nearby, of which this is the smooth continuation, E = P R T^-1 with
-      P = 1 - G^+ G and T the Cholesky factor of R^T P R. By default a basis of this place, arbitrary and constant under
+    - `reference` (nc, ni): a basis at a configuration nearby, which is continued smoothly, E = P R T^-1 with
+      P = 1 - G^+ G and T the Cholesky factor of R^T P R. By default an arbitrary basis at q, constant under
       differentiation; where q is traced it has as many columns as for a G of full rank.
 
     **Raises:** ValueError for a reference of another shape.
@@ -82,13 +82,13 @@ def internal_force_basis(
     reference = jnp.asarray(as_array(reference, "reference", G.dtype))
     if reference.ndim != 2 or reference.shape[0] != G.shape[1]:
         raise ValueError(
-            f"reference has shape {reference.shape}, expected ({G.shape[1]}, ni); take internal_force_basis(grasp, q)"
+            f"reference has shape {reference.shape}, expected ({G.shape[1]}, ni); use internal_force_basis(grasp, q)"
         )
     return orthonormal(reference - _product(inverse, _product(G, reference)))[0] if reference.shape[1] else reference
 
 
 def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
-    """Contact forces that press with 1 N along every normal, (nc,).
+    """Contact forces (nc,) with 1 N along every normal.
 
     **Raises:** ValueError for a constraint of the grasp that has no normal force.
     """
@@ -101,6 +101,8 @@ def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
         if isinstance(constraint, Contact):
             normal = components(constraint.kind, constraint.in_plane, place.name).index(2)
         else:
+            # Normal component by the number of wrench components: (normal), (tangent, normal), (tangent, tangent,
+            # normal, ...).
             normal = {1: 0, 2: 1}.get(len(order), 2)
         forces[place.start + order[normal]] = 1.0
     return forces
@@ -109,18 +111,18 @@ def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
 def forces_for_wrench(
     grasp: Grasp, q: Float[Array, " nq"], wrench: Float[Array, " no"], preload: Numbers = 0.0, t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
-    """Contact forces lam = G^+ F + (1 - G^+ G) lam_0 that exert the wrench F on the object, with a chosen internal force.
+    """Contact forces lam = G^+ F + (1 - G^+ G) lam_0 with the resultant wrench F and a given internal force.
 
     **Arguments:**
 
-    - `wrench` F (no,): on the object, in its own axes for a free body; N and N m. Of a wrench that the contacts cannot
-      exert the nearest one.
-    - `preload` lam_0: a number (N), with which every contact presses, or forces (nc,), of either the internal part.
-      Pressing is internal by itself where the normals balance, as those of an antipodal grasp.
+    - `wrench` F (no,): on the object, in its own axes for a free body; N and N m. A wrench that the contacts cannot
+      exert is projected to the closest one.
+    - `preload` lam_0: a number (N), the normal force of every contact, or forces (nc,); only the internal part is used.
+      Equal normal forces are internal where the normals balance, as in an antipodal grasp.
 
-    **Raises:** ValueError for shapes that do not fit, and for a number with constraints that have no normal force.
+    **Raises:** ValueError for inconsistent shapes, and for a number with constraints without normal force.
 
-    Cones are not looked at: `hold` finds forces within them.
+    Cones are not considered: `hold` computes forces within them.
 
     Source: Murray, Li & Sastry (1994), section 6.3, eq. 6.25; EQUATIONS section 10.
     """
@@ -132,12 +134,12 @@ def forces_for_wrench(
 
 
 def split_forces(G: Float[Array, "no nc"], wrench, preload) -> Float[Array, " nc"]:
-    """G^+ F + (1 - G^+ G) lam_0."""
+    """Contact forces G^+ F + (1 - G^+ G) lam_0."""
     return preload + _product(pseudo_inverse(G, tolerance(None, G)), wrench - _product(G, preload))
 
 
 def as_preload(grasp: Grasp, preload: Any, dtype) -> Float[Array, " nc"]:
-    """Contact forces (nc,) from a number, with which contacts press, or from forces. **Raises:** ValueError."""
+    """Contact forces (nc,) from a number, the normal force, or from forces. **Raises:** ValueError."""
     preload, count = as_array(preload, "preload", dtype), layout(grasp)[-1].end
     if preload.ndim == 0:
         if is_known(preload) and float(preload) == 0:
@@ -160,7 +162,7 @@ def hold(
     preload: Numbers = 0.0,
     t: Numbers = 0.0,
 ) -> HandForces:
-    """Least contact forces within their cones that exert a wrench on the object, and the torques for them at rest.
+    """Contact forces of least norm within their cones for a wrench on the object, with their torques at rest.
 
     A second-order cone program (`jd.contact.optimal_forces`): batched by `jax.vmap`, and differentiable in q, the
     grasp's leaves, coefficients of friction and the wrench.
@@ -168,14 +170,14 @@ def hold(
     **Arguments:**
 
     - `q` (nq,), on the contacts; `t`, s.
-    - `wrench` (no,): to be exerted by the contacts, N and N m. By default what holds the object still: the opposite of its
+    - `wrench` (no,): to be exerted by the contacts, N and N m. By default the wrench of equilibrium: the opposite of its
       weight and of the grasp's forces on it.
-    - `cones`: as in `jd.grasp.contact_forces`, by default those of the grasp; every contact has to have one.
+    - `cones`: as in `jd.grasp.contact_forces`, by default those of the grasp; every contact needs one.
     - `preload`: N, least margin of every contact from its cone.
 
     **Returns:** `HandForces`.
 
-    **Raises:** ValueError for shapes that do not fit and for contacts without a cone.
+    **Raises:** ValueError for inconsistent shapes and for contacts without a cone.
 
     ```python
     forces = jd.grasp.hold(grasp, q, preload=0.5)
@@ -198,6 +200,7 @@ def hold(
     wrench = weight if wrench is None else wrench
     G = A[:, np.array(grasp.object_velocities, int)].T
     optimum = optimal_forces(G[:, order], wrench, [contact.cone for contact in contacts], preload=preload)
+    # `order` maps the forces of the cones, in the order of components, back to the rows of the grasp.
     forces = jnp.zeros((A.shape[0],), A.dtype).at[order].set(optimum.x)
     torques = -_product(A[:, np.array(grasp.hand_velocities, int)].T, forces)
     return HandForces(forces, torques, optimum.result, layout(grasp))
@@ -205,7 +208,7 @@ def hold(
 
 @compiled
 def _static(grasp: Grasp, q, t):
-    """The rows, and the wrench of the contacts with the object at rest."""
+    """Constraint rows, and the contact wrench of static equilibrium."""
     at_rest = jnp.zeros((grasp.nv,), q.dtype)
     force = gravity_force(grasp.system, q, t) - applied(grasp, q, at_rest, at_rest, t)
     return constraint_jacobian(grasp, q, t), force[np.array(grasp.object_velocities, int)]
@@ -214,9 +217,9 @@ def _static(grasp: Grasp, q, t):
 def force_closure(
     grasp: Grasp, q: Float[Array, " nq"], *, cones: Cones = None, t: Numbers = 0.0, required: bool = False
 ) -> ForceClosure:
-    """Whether the contacts of the grasp can resist every wrench on the object; see `jd.contact.force_closure`.
+    """Force closure of a grasp: the ability to resist every wrench on the object; see `jd.contact.force_closure`.
 
-    **Arguments:** `q` (nq,), known numbers; `cones` as in `hold`. `required`: refuse a grasp without force closure.
+    **Arguments:** `q` (nq,), concrete numbers; `cones` as in `hold`. `required`: refuse a grasp without force closure.
 
     **Returns:** `ForceClosure`, its forces in the order of the grasp's rows.
 
@@ -243,7 +246,7 @@ def force_closure(
 def joint_torques(
     grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Numbers = 0.0
 ) -> Float[Array, " nh"]:
-    """J_h^T lam (nh,): torques of the joints that exert the contact forces lam (nc,) at rest, without the fingers' weight.
+    """Joint torques J_h^T lam (nh,) that exert the contact forces lam (nc,) at rest, without the fingers' weight.
 
     Source: Murray, Li & Sastry (1994), eq. 5.31; EQUATIONS section 10.
     """
@@ -254,15 +257,15 @@ def joint_torques(
     return _product(Jh.T, lam)
 
 
-def _every_cone(grasp: Grasp, cones) -> tuple[ConedContact, ...]:
-    """The contacts with their cones. **Raises:** ValueError where there is one without."""
+def _every_cone(grasp: Grasp, cones) -> tuple[ContactWithCone, ...]:
+    """Contacts with their cones. **Raises:** ValueError for a contact without one."""
     names = [place.name for place in layout(grasp)]
     if cones is None and grasp.cones is None:
         raise ValueError(
             f"the contacts {names} have no cones; give cones, as in jd.contact.friction_cone('hard-finger', mu=0.8), here "
             "or to the Grasp"
         )
-    coned = coned_contacts(grasp, cones)
+    coned = contacts_with_cones(grasp, cones)
     missing = [name for name in names if name not in {contact.name for contact in coned}]
     if missing:
         raise ValueError(f"contacts {missing} have no cone; give one for every contact of {names}")

@@ -1,4 +1,4 @@
-"""A grasp: one model of the fingers and the object, with the contacts between them as constraints."""
+"""Grasps: one model of the fingers and the object, with the contacts between them as constraints."""
 
 from collections.abc import Sequence
 
@@ -10,18 +10,18 @@ from jaxdyn.compile import compiled, is_concrete
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.cones import Cones
-from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Numbers, as_array, batch_hint
-from jaxdyn.model.joining import joined
+from jaxdyn.model.joining import join_all
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Force, Scene
 
 
 class Grasp(Scene):
-    """Fingers that hold an object: a scene with the rows A = [-J_h  G^T], so that multipliers are forces on the object.
+    """Grasp of an object by fingers: a scene with rows A = [-J_h  G^T], whose multipliers are forces on the object.
 
     It is a `Scene`, so `constrained_dynamics`, `assemble`, `projections` and `simulate` act on it as on any other one.
     For motion in the velocity of the object alone, with the joints of the fingers recovered from J_h thetadot = G^T V:
@@ -35,13 +35,13 @@ class Grasp(Scene):
       a body that `fingers` has already. Models are joined into one, `grasp.system`; the order of its trees is that of
       the names of their first joints.
     - `contacts`: `contact(...)` for contacts fixed on the object; `jd.rolling_sphere` and `jd.rolling_wheel` between a
-      finger and the object, either of which may be the one that rolls: pressing is a positive normal force; other
+      finger and the object, either of which may be the one that rolls: compression is a positive normal force; other
       constraints of the library.
-    - `forces`, `cones`: as of a `Scene`. Without cones contacts are two-sided: they pull as well as press.
+    - `forces`, `cones`: as of a `Scene`. Without cones contacts are bilateral.
 
-    **Raises:** ValueError for models that do not fit together, an object that is no single body of its own, or whose inertia
+    **Raises:** ValueError for incompatible models, an object that is no single body of its own, or whose inertia
     is not positive definite, an empty list of contacts, contacts with bodies or frames that the models do not have, contacts
-    that prescribe a slip, and cones that do not fit their contacts.
+    that prescribe a slip, and cones of other sizes than their contacts.
 
     Source: Murray, Li & Sastry (1994), sections 5.5 and 6.3; EQUATIONS section 10.
     """
@@ -63,7 +63,7 @@ class Grasp(Scene):
             if object.nb != 1:
                 raise ValueError(f"object has {object.nb} bodies, {list(object.body_names)}; pass a Model of one body")
             models, object = [*models, object], object.body_names[0]
-        model = models[0] if len(models) == 1 else joined(models, f"grasp of {object}")
+        model = models[0] if len(models) == 1 else join_all(models, f"grasp of {object}")
         _check_object(model, object)
         if not isinstance(contacts, (tuple, list)) or not contacts:
             raise ValueError(f"contacts is {contacts!r}; pass a list with at least one contact")
@@ -74,7 +74,7 @@ class Grasp(Scene):
         self.object = object
         layout(self)  # refuses unknown bodies
         if cones is not None:
-            coned_contacts(self)  # refuses cones that do not fit
+            contacts_with_cones(self)  # refuses cones that do not fit
 
     @property
     def object_velocities(self) -> tuple[int, ...]:
@@ -90,7 +90,7 @@ class Grasp(Scene):
 
 
 def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nc nh"]:
-    """Hand Jacobian J_h (nc, nh): J_h thetadot are the velocities of the fingertips along the contacts' components.
+    """Hand Jacobian J_h (nc, nh): fingertip velocities J_h thetadot along the contacts' components.
 
     Source: Murray, Li & Sastry (1994), eq. 5.28; EQUATIONS section 10.
     """
@@ -99,7 +99,7 @@ def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Flo
 
 
 def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "no nc"]:
-    """Grasp map G (no, nc): G lam is the generalised force of the contact forces lam on the object.
+    """Grasp map G (no, nc): generalised force G lam of the contact forces lam on the object.
 
     For a free body it is the wrench (f, tau) at the origin and in the axes of the body frame, and
     G = [Ad_{g_oc}^-T B] of all contacts. G^T V are the velocities of the object at the contacts.
@@ -118,7 +118,7 @@ def _columns(grasp: Grasp, q, t, columns: tuple[int, ...]) -> Float[Array, "nc k
 def internal_forces(
     grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
-    """Part of contact forces that does not move the object: (1 - G^+ G) lam, with G lam_N = 0.
+    """Internal part of contact forces, which does not move the object: (1 - G^+ G) lam, with G lam_N = 0.
 
     The split depends on the units of forces and torques where contacts transmit both, as any orthogonal one.
 
@@ -136,7 +136,7 @@ def internal_forces(
 
 
 def check_grasp(grasp) -> None:
-    """Refuse what is no `Grasp`."""
+    """Refuse anything but a `Grasp`."""
     if not isinstance(grasp, Grasp):
         raise ValueError(f"grasp is a {type(grasp).__name__}; pass a jd.grasp.Grasp")
 
@@ -151,10 +151,11 @@ def _check_object(model: Model, name: str) -> None:
     if top.nb == 1:
         raise ValueError(f"there are no fingers beside the object {name!r}; pass their models")
     if is_concrete(model.inertias):
+        # Coordinates of the spatial inertia that the joint's velocities see; other joints get no inertia check.
         moved = {"free": range(6), "planar": (0, 1, 5)}.get(top.kinds[body], ())
         matrix = f64.spatial_inertia(np.asarray(model.inertias, float)[body])[np.ix_(moved, moved)]
         if len(moved) and not (least := np.linalg.eigvalsh(matrix)[0]) > 0:
             raise ValueError(
                 f"inertia of the object {name!r} is not positive definite: the least eigenvalue of its spatial inertia is "
-                f"{least:.3g}; give it a mass and an inertia about every axis, as of jd.inertia.box(mass, size)"
+                f"{least:.3g}; give it a mass and an inertia about every axis, as from jd.inertia.box(mass, size)"
             )

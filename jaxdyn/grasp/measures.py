@@ -1,8 +1,8 @@
-"""How well a hand moves its object, and how hard it pushes it: ellipsoids of object velocities and of wrenches.
+"""Manipulability of a hand: ellipsoids of object velocities and of wrenches.
 
 Joint velocities thetadot = X w, X = J_h^+ G^T H, are the shortest ones that give the object the velocity V = H w. Those with
 |thetadot| <= 1 give the velocities of an ellipsoid whose semi-axes are 1 / sigma_i(X); torques with |tau| <= 1 give the
-wrenches X^T tau of one with the semi-axes sigma_i(X) in the same directions: the same principal directions are fast and weak.
+wrenches X^T tau of one with the semi-axes sigma_i(X) in the same directions: fast directions are weak ones.
 """
 
 import equinox as eqx
@@ -21,19 +21,19 @@ from jaxdyn.systems.mass_factor import solve_lower
 
 
 class Manipulability(eqx.Module):
-    """Ellipsoids of the object's velocities and of wrenches on it, and what they say in one number.
+    """Ellipsoids of the object's velocities and of wrenches on it, and scalar measures of them.
 
     Angular velocities count `length` times, so that all is in m/s and N per unit of joint velocity and torque.
 
     - `velocity_axes` (nw,): semi-axes of the ellipsoid of object velocities for |thetadot| <= 1, longest first; infinite
       for a motion of the object that the fingers need not follow. `force_axes` (nw,): their inverses, of the
       ellipsoid of wrenches for |tau| <= 1.
-    - `directions` (no, nw): twists of the object along them, of unit length as they are counted; constants.
-    - `sigma_min` (): least velocity axis. `isotropy` (): least over largest, 1 for a sphere. `volume` (): product of the velocity
-      axes, Yoshikawa's measure.
+    - `directions` (no, nw): twists of the object along them, of unit length in this scaling; constants.
+    - `sigma_min` (): least velocity axis. `isotropy` (): least over largest, 1 for a sphere. `volume` (): product of
+      the velocity axes, Yoshikawa's measure.
     - `grasp_axes` (no,): semi-axes of the wrenches G lam for |lam| <= 1, the singular values of G, longest first.
       `grasp_isotropy` (): least over largest.
-    - `is_manipulable` (): whether the fingers can follow every velocity of the object.
+    - `is_manipulable` (): true where the fingers can follow every velocity of the object.
     """
 
     velocity_axes: Float[Array, " nw"]
@@ -52,8 +52,8 @@ def manipulability(
 ) -> Manipulability:
     """Velocity and force ellipsoids of the object in the hand (see `Manipulability`).
 
-    First derivatives of the axes are right; where two are equal, of a mean of both. Second ones and those of the directions
-    are not given.
+    First derivatives of the axes are exact; for equal axes they are those of their mean. Second ones and those of the
+    directions are not available.
 
     **Arguments:**
 
@@ -64,7 +64,7 @@ def manipulability(
 
     **Returns:** `Manipulability`.
 
-    **Raises:** ValueError for a length that is not positive, for shapes that do not fit, and for a hand whose object cannot
+    **Raises:** ValueError for a length that is not positive, for inconsistent shapes, and for a hand whose object cannot
     move at all.
 
     Source: Yoshikawa (1985); Murray, Li & Sastry (1994), sections 5.5 and 5.6 (definition 5.6 of manipulable grasps).
@@ -79,20 +79,22 @@ def manipulability(
         raise ValueError(
             f"the fingers cannot follow any velocity of {grasp.object!r} here, so there is nothing to measure"
         )
-    return _measured(grasp, motions, q, length, t)
+    return _measure(grasp, motions, q, length, t)
 
 
 @compiled
-def _measured(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability:
+def _measure(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability:
     hands, objects = velocity_rows(grasp)
     N = motions.at(grasp, q, t).N[:, : motions.object.shape[1]]
     scale = _scale(grasp, length)
     H = scale[:, None] * N[objects]
+    # In an orthonormal basis of object velocities the axes do not depend on the choice of H.
     along, _, factor = orthonormal(H)
     # thetadot for the columns of `along`: N_hands times T^-T of H = along T^T.
     X = solve_lower(factor, N[hands].T).T
     force_axes, vectors = _axes(X)
     force_axes, vectors = force_axes[::-1], vectors[:, ::-1]
+    # Axes of the square root of the dtype's resolution are zero: the fingers need not move.
     some = force_axes > least_quality(q.dtype) ** 1.5 * force_axes[-1]
     velocity_axes = jnp.where(some, 1 / jnp.where(some, force_axes, jnp.ones_like(force_axes)), jnp.inf)
     G = constraint_jacobian(grasp, q, t)[:, objects].T / scale[:, None]
@@ -111,7 +113,9 @@ def _measured(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulabilit
 
 
 def _axes(X: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
-    """Singular values of X, largest first, and the right vectors, constants: |X v_i| has the right first derivative."""
+    """Singular values |X v_i| of X, largest first, and the right vectors v_i, constants."""
+    # By stationarity of singular values, |X v_i| with constant v_i has the exact first derivative, without SVD's
+    # division\n# by differences of singular values.
     vectors = lax.stop_gradient(jnp.linalg.svd(lax.stop_gradient(X))[2]).T
     square = jnp.sum(_product(X, vectors) ** 2, 0)
     some = square > 0
@@ -119,7 +123,7 @@ def _axes(X: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, "m m
 
 
 def _scale(grasp: Grasp, length) -> Float[Array, " no"]:
-    """What a unit of each velocity of the object counts."""
+    """Scale of each velocity of the object, `length` for angular ones."""
     top = grasp.system.topology
     kind = top.kinds[top.body_names.index(grasp.object)]
     one = jnp.ones_like(length)

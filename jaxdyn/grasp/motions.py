@@ -1,14 +1,14 @@
-"""What a hand can do with its object: object velocities that the fingers follow, and internal motions of the hand.
+"""Motions of a hand with its object: object velocities that the fingers follow, and internal motions.
 
-The contacts ask for J_h thetadot = G^T V. With a hand Jacobian of any shape and rank the velocities that satisfy this are
+The contacts require J_h thetadot = G^T V. With a hand Jacobian of any shape and rank the velocities that satisfy this are
 
     V = H w,    thetadot = J_h^+ G^T H w + K u,
 
 where the columns of H span the object velocities V with G^T V in the range of J_h, all of them where the grasp is
-manipulable, and those of K the kernel of J_h: motions of redundant fingers that leave their tips where they are.
+manipulable, and those of K the kernel of J_h: motions of redundant fingers with their tips at rest.
 
 Source: Murray, Li & Sastry (1994), section 6.3 (redundant hands by an internal motion beside the object's, hands that are not
-manipulable by a basis of the motions that they allow); EQUATIONS section 10.
+manipulable by a basis of their feasible motions); EQUATIONS section 10.
 """
 
 from typing import Any
@@ -28,25 +28,25 @@ from jaxdyn.systems.scene import Scene
 
 
 class HandMotions(Basis):
-    """The basis N of velocities nu = (w, u) of a grasp, from references at one place; made by `hand_motions`.
+    """Basis N of the velocities nu = (w, u) of a grasp, from references at one configuration; see `hand_motions`.
 
     - `object` (no, nw): reference R_o of H = P R_o T^-1, with P = 1 - B^+ B, B = (1 - J_h J_h^+) G^T, and T the Cholesky
-      factor of R_o^T P R_o. With nw = no it is H itself, the same at every place.
+      factor of R_o^T P R_o. With nw = no it is H itself, constant.
     - `internal` (nh, nk): reference R_i of K, likewise of 1 - J_h^+ J_h.
 
     H and K are as smooth as J_h and G wherever their ranks are constant: no signs or pivots are chosen. It is a
-    basis for `jd.reduced_dynamics` and, around the place of its references, for `jd.Reduced`.
+    basis for `jd.reduced_dynamics` and, around the configuration of its references, for `jd.Reduced`.
     """
 
     object: Float[Array, "no nw"]
     internal: Float[Array, "nh nk"]
 
     def size(self, scene: Scene) -> int:
-        """nw + nk."""
+        """Number of velocities nw + nk."""
         return self.object.shape[1] + self.internal.shape[1]
 
     def at(self, scene: Scene, q: Float[Array, " nq"], t: Number) -> Parametrization:
-        """N (nv, nw + nk): H in the rows of the object, (J_h^+ G^T H, K) in those of the joints."""
+        """Basis N (nv, nw + nk): H in the rows of the object, (J_h^+ G^T H, K) in those of the joints."""
         hands, objects = velocity_rows(scene)
         A = constraint_jacobian(scene, q, t)
         Jh, seen = -A[:, hands], A[:, objects]
@@ -62,18 +62,20 @@ class HandMotions(Basis):
             N = N.at[hands, H.shape[1] :].set(K)
             pivot = jnp.minimum(pivot, least)
         fits = fits & (jnp.round(jnp.sum(inverse * Jh.T)) == rank)
+        # |J_h^+| |A|, an upper bound of the condition number that needs no SVD.
         size = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
         size = jnp.where(size > 0, size, jnp.ones_like(size))
         good = fits & jnp.isfinite(pivot)
         return Parametrization(N, jnp.zeros((scene.nv,), A.dtype), jnp.where(good, pivot / size, jnp.zeros_like(size)))
 
     def _object(self, A, Jh, seen, inverse):
-        """H, its least pivot, and whether it has as many columns as the object has velocities to follow."""
+        """H, its least pivot, and the flag that its number of columns is that of the feasible object velocities."""
         reference = self.object.astype(A.dtype)
         lost = seen - _product(Jh, _product(inverse, seen))
         if reference.shape[0] == reference.shape[1]:
             whole = jnp.max(jnp.abs(lost), initial=0.0) <= _negligible(A) * jnp.max(jnp.abs(A))
             return reference, jnp.ones((), A.dtype), whole
+        # B, whose kernel are the feasible velocities; its rank follows from the trace of a projection.
         across = pseudo_inverse(lost, tolerance(None, lost), True)
         fits = jnp.round(jnp.sum(across * lost.T)) == reference.shape[0] - reference.shape[1]
         if not reference.shape[1]:
@@ -82,28 +84,28 @@ class HandMotions(Basis):
         return H, pivot, fits
 
     def advice(self, scene: Scene, q: Float[Array, " nq"], t: Number) -> str:
-        """The basis of this place."""
-        return "take jd.grasp.hand_motions(grasp, q) for it"
+        """Advise the basis at this configuration."""
+        return "use jd.grasp.hand_motions(grasp, q)"
 
 
 def hand_motions(
     grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0, *, sizes: tuple[int, int] | None = None
 ) -> HandMotions:
-    """Bases of the object velocities that the fingers can follow and of the hand's internal motions, at q.
+    """Bases of the feasible object velocities and of the hand's internal motions, at q.
 
-    With units of V and thetadot taken as they are (m/s beside rad/s), the columns are orthonormal. Where the grasp is
-    manipulable H = 1, so that w is the object's velocity V. Which basis it is is arbitrary otherwise; it is constant under
-    differentiation and continued smoothly to other places by `HandMotions`.
+    In the given units of V and thetadot (m/s and rad/s), the columns are orthonormal. Where the grasp is
+    manipulable H = 1, so that w is the object's velocity V. Otherwise the choice of the basis is arbitrary; it is constant under
+    differentiation and continued smoothly to other configurations by `HandMotions`.
 
     **Arguments:**
 
     - `q` (nq,), on the contacts; `t`, s.
-    - `sizes`: (nw, nk), numbers of columns of H and K. By default those of the ranks at q where q is known; where it is
+    - `sizes`: (nw, nk), numbers of columns of H and K. By default those of the ranks at q where q is concrete; where it is
       traced those of a J_h of full rank.
 
     **Returns:** `HandMotions`: `.object` (no, nw), `.internal` (nh, nk).
 
-    **Raises:** ValueError where neither the object nor the hand can move, and for sizes that are not possible.
+    **Raises:** ValueError where neither the object nor the hand can move, and for impossible sizes.
 
     ```python
     motions = jd.grasp.hand_motions(grasp, q)
@@ -120,6 +122,7 @@ def hand_motions(
     if sizes is None:
         if is_known(grasp, q, t):
             sizes = no - int(ranks[0]), nh - int(ranks[1])
+        # A traced q has no rank to read: generic rank is assumed.
         else:
             rank = min(count, nh)
             sizes = max(no - (count - rank), 0), nh - rank
@@ -128,7 +131,7 @@ def hand_motions(
         raise ValueError(f"sizes is {sizes}; give (nw, nk) with nw from 0 to {no} and nk from 0 to {nh}")
     if nw + nk == 0:
         raise ValueError(
-            f"the contacts leave neither the object {grasp.object!r} nor the hand any motion here; take contacts with fewer "
+            f"the contacts leave neither the object {grasp.object!r} nor the hand any motion here; use contacts with fewer "
             "rows, or give sizes=(nw, nk) where q is traced"
         )
     whole = jnp.eye(no, dtype=q.dtype) if nw == no else split_directions(on_object)[:, no - nw :]
@@ -136,19 +139,19 @@ def hand_motions(
 
 
 def velocity_rows(grasp: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Indices in v of the joints' velocities and of the object's."""
+    """Indices in v of the velocities of the joints and of the object."""
     return np.array(grasp.hand_velocities, int), np.array(grasp.object_velocities, int)
 
 
 @compiled
 def _projections(grasp: Grasp, q, t):
-    """1 - B^+ B and 1 - J_h^+ J_h, and the ranks of B and J_h."""
+    """Projections 1 - B^+ B and 1 - J_h^+ J_h, and the ranks of B and J_h."""
     hands, objects = velocity_rows(grasp)
     A = constraint_jacobian(grasp, q, t)
     Jh, seen = -A[:, hands], A[:, objects]
     inverse = pseudo_inverse(Jh, tolerance(None, Jh), True)
     lost = seen - _product(Jh, _product(inverse, seen))
-    # Rounding is not a direction that the fingers cannot follow.
+    # Entries at rounding level are set to zero, so that they do not count as rank.
     lost = jnp.where(jnp.abs(lost) <= _negligible(A) * jnp.max(jnp.abs(A)), jnp.zeros_like(lost), lost)
     across = pseudo_inverse(lost, tolerance(None, lost), True)
     on_object = jnp.eye(objects.size, dtype=A.dtype) - _product(across, lost)
@@ -157,5 +160,5 @@ def _projections(grasp: Grasp, q, t):
 
 
 def _negligible(like) -> float:
-    """Relative size of an entry that is rounding."""
+    """Relative size below which an entry is rounding error."""
     return eps_of(like) ** 0.6

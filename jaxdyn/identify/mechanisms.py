@@ -15,7 +15,7 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.mobility import degrees_of_freedom
 from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
-from jaxdyn.model.names import columns_in_v
+from jaxdyn.model.names import velocity_indices
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_scene
@@ -32,7 +32,7 @@ def observed_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
     **Raises:** ValueError for those that do not exist.
     """
     if isinstance(system, Model):
-        return tuple(int(i) for i in columns_in_v(system, observed))
+        return tuple(int(i) for i in velocity_indices(system, observed))
     columns = tuple(observed)
     if not all(isinstance(i, int) and 0 <= i < system.nv for i in columns) or len(set(columns)) < len(columns):
         raise ValueError(

@@ -1,8 +1,8 @@
-"""A body carried by one or several joints whose axes may pass beside its origin, as a chain of bodies of a `Model`.
+"""Bodies with several joints, or with joint axes off the body origin, as chains of bodies of a `Model`.
 
-A joint of a `Model` turns its body about an axis through the body's origin. Formats let the axis pass anywhere, and put
-several joints between two bodies. Each joint k moves what follows it by D_k(x) = Trans(a_k) J_k(x) Trans(-a_k), with the
-anchor a_k and the axis in the axes of the body, so that the body stands at
+A joint of a `Model` rotates its body about an axis through the body's origin. Formats let the axis pass anywhere, and put
+several joints between two bodies. Each joint k displaces all after it by D_k(x) = Trans(a_k) J_k(x) Trans(-a_k), with the
+anchor a_k and the axis in the axes of the body, so that the pose of the body is
 
     pose D_1(q_1 - r_1) D_2(q_2 - r_2) ...
 
@@ -22,7 +22,7 @@ from jaxdyn.model.tree import Model
 
 
 class Link(NamedTuple):
-    """One joint of a chain: axis (3,) and anchor (3,) in the body's axes and frame, reference in rad or m."""
+    """Joint of a chain: axis (3,) and anchor (3,) in the body's axes and frame, reference in rad or m."""
 
     name: str
     kind: str
@@ -34,21 +34,21 @@ class Link(NamedTuple):
 
 
 class Names:
-    """Names that are in use. Formats keep joints, bodies and sites in spaces of their own; a model has one of frames."""
+    """Names in use. Formats have separate namespaces of joints, bodies and sites; a model has one of frames."""
 
     def __init__(self):
         self._used: set[str] = set()
 
     def new(self, wanted: str) -> str:
-        """The name wanted, with underscores behind it while it is taken."""
+        """Reserve a name, with underscores appended while it is taken."""
         while wanted in self._used:
             wanted += "_"
         self._used.add(wanted)
         return wanted
 
 
-def built(builder: ModelBuilder, path) -> Model:
-    """The model of a file. **Raises:** ValueError of `ModelBuilder.build`, with the file and without advice for URDF."""
+def build_model(builder: ModelBuilder, path) -> Model:
+    """Build the model of a file. **Raises:** ValueError of `ModelBuilder.build`, with the file and without advice for URDF."""
     try:
         return builder.build()
     except ValueError as error:
@@ -65,17 +65,18 @@ def add_chain(
     joints: list[Link],
     inertia,
 ) -> None:
-    """Add a body with its joints. The frame `body` is the body's own; names in between are BODY_JOINT.
+    """Add a body with its joints. The frame `body` is the body's own; intermediate bodies are named BODY_JOINT.
 
     `pose` (4, 4) is that of the body's frame in the parent's where all joints are at their references; without joints
-    the body is fixed. Names that are made here are taken from `frames` and `joint_names`, which hold those of the file.
+    the body is fixed. New names are reserved in `frames` and `joint_names`, which hold those of the file.
     """
     here, carrier = np.asarray(pose, float), parent
     for k, joint in enumerate(joints):
+        # Translations and free joints do not depend on the anchor.
         turns = joint.kind not in ("prismatic", "free")
         anchor = np.eye(4)
         if turns:
-            # Along its own axis an anchor has no effect; leaving that part out leaves more bodies as they are.
+            # The anchor's component along the axis has no effect; dropping it avoids intermediate bodies.
             along = joint.axis * (joint.axis @ joint.anchor) if joint.kind in SCREW_KINDS else np.zeros(3)
             shift = joint.anchor - along
             anchor[:3, 3] = np.where(np.abs(shift) > 1e-15 * np.abs(joint.anchor).max(initial=0.0), shift, 0.0)
@@ -86,7 +87,9 @@ def add_chain(
             slide = np.zeros(3) if joint.kind != "prismatic" else joint.axis
             screw = np.concatenate([slide, joint.axis if turns else np.zeros(3)])
             if joint.reference:
+                # D(x - r) = D(-r) D(x): the reference position moves into the home pose, and q keeps the file's zero.
                 home = home @ f64.joint_pose(joint.kind, screw, np.array([-joint.reference]))
+        # Only the body itself carries the inertia; intermediate bodies are massless.
         last = k == len(joints) - 1 and not anchor[:3, 3].any()
         between = joint.name if joint.name.startswith(body) else f"{body}_{joint.name}"
         name = body if last else frames.new(between)

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written beside the final name, then renamed."""
+"""Atomic writes of files: a temporary file in the same folder, then a rename."""
 
 import contextlib
 import os
@@ -8,11 +8,12 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
-    """A path to write to in the folder of `path` and with its ending; at the end of the block it becomes `path`.
+    """Temporary path with the folder and suffix of `path`; at the end of the block it replaces `path`.
 
-    When the block raises, what was written is removed and a file that was there before stays.
+    When the block raises, the temporary file is removed and an existing file stays.
     """
     path = pathlib.Path(path)
+    # The process id keeps two processes that write the same file apart.
     part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         yield part
@@ -22,6 +23,6 @@ def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Write a text, UTF-8, as `replacing` does."""
+    """Write a UTF-8 text atomically."""
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""One call for every format: the scene of a file, or of a robot that the package robot_descriptions knows by name."""
+"""Loader for every format: the scene of a file, or of a robot known by name to the package robot_descriptions."""
 
 import difflib
 import importlib
@@ -16,7 +16,7 @@ from jaxdyn.io.loaded import LoadedScene, Start, warn_not_taken
 from jaxdyn.io.mjcf import load_mjcf
 from jaxdyn.io.sdf import load_sdf
 from jaxdyn.io.urdf import urdf_model
-from jaxdyn.io.urdf_loops import closing, closures_of, motors_of, plugin_followers
+from jaxdyn.io.urdf_loops import loop_constraints, motors_of, plugin_followers, read_closures
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.arguments import Checked, DType, FilePath, Numbers, as_path
 from jaxdyn.model.builder import GRAVITY
@@ -37,34 +37,34 @@ def load(
     arguments: Mapping[str, Any] | None = None,
     dtype: DType | None = None,
 ) -> LoadedScene:
-    """The scene of a URDF, xacro, MJCF or SDF file, or of a robot by its name in the package robot_descriptions.
+    """Load the scene of a URDF, xacro, MJCF or SDF file, or of a robot by its name in the package robot_descriptions.
 
-    All formats give a `LoadedScene`, with the `Model` in `.system`. That of a URDF has the file's mimicked joints as
+    All formats give a `LoadedScene`, with the `Model` in `.system`. For a URDF it has the file's mimicked joints as
     couplings, its joint damping and dry friction (smoothed at 0.01 rad/s) as forces, and the start "reference", q = 0. A URDF
-    is a tree; loops are taken from a YAML file beside it (`closed_loop`: pairs of frames, `type`: 3d or 6d; `name_mot`: motors,
-    which become `.actuators`; `joint_name` and `joint_type`: joints that are balls or held), and from joints and mimicking
+    is a tree; loops come from a YAML file next to it (`closed_loop`: pairs of frames, `type`: 3d or 6d; `name_mot`: motors,
+    which become `.actuators`; `joint_name` and `joint_type`: spherical or locked joints), and from joints and mimicking
     plugins in `<gazebo>` elements (`jaxdyn.io.urdf_loops`). They close with `jd.assemble(scene, scene.starts["reference"].q)`.
     `load_urdf` returns the `Model` of the tree alone.
 
     **Arguments:**
 
     - `source`: a path; or a name such as "go2_description" or "go2_mj_description", whose file robot_descriptions has in its
-      cache. What it does not have there it fetches by git, once, if there is a network.
-    - `floating_base`: whether the root moves freely. None: as the format has it: fixed in a URDF, free in SDF. MJCF says so
-      itself.
+      cache. Files missing there are downloaded by git once, if there is a network.
+    - `floating_base`: whether the root moves freely. None: the default of the format: fixed in URDF, free in SDF. MJCF files
+      state it.
     - `lock`, `gravity`, of a URDF: as for `load_urdf`.
     - `mimic`, of a URDF: "couple" (the default), "ignore" or "error", as for `load_urdf`; plugins in `<gazebo>` elements that
-      mimic a joint count too. "ignore" loads files whose joints follow some that are not there.
-    - `loops`: the YAML file of a URDF's loops. None: the one with the URDF's name beside it, if there is one; False: no YAML
-      file.
+      mimic a joint count too. "ignore" loads files whose joints follow missing ones.
+    - `loops`: the YAML file of a URDF's loops. None: the one with the URDF's name in its folder, if there is one;
+      False: no YAML file.
     - `arguments`: of the `<xacro:arg>` elements of a file whose name ends in .xacro, {"prefix": "left_"}. The package xacro
       expands it to a URDF; lines in errors are those of the expanded text.
     - `dtype`: as for `ModelBuilder`.
 
     **Returns:** `LoadedScene`.
 
-    **Raises:** ValueError for a file that does not exist or is of no known format, an unknown name (near ones are listed), a
-    robot that could not be fetched, an option that the loader of the format does not have, loops between frames that
+    **Raises:** ValueError for a file that does not exist or is of no known format, an unknown name (similar ones are listed), a
+    robot that could not be downloaded, an option that the loader of the format does not have, loops between frames that
     do not exist; and as the loader of the format does. ImportError without the package that reads the format.
 
     ```python
@@ -74,7 +74,7 @@ def load(
     """
     path = as_path(source, "source")
     if not path.suffix and not path.exists():
-        path = described(str(source))
+        path = find_description(str(source))
     kind = format_of(path)
     if kind == "urdf":
         return _urdf_scene(
@@ -88,17 +88,19 @@ def load(
         )
     if loops is not None:
         raise ValueError(
-            f"loops is {loops!r}, but {path} is {kind.upper()}, which holds its loops itself; leave it out"
+            f"loops is {loops!r}, but {path} is {kind.upper()}, which states its loops in the file; leave it out"
         )
     of_urdf = {"lock": (lock or (), ()), "mimic": (mimic, None), "gravity": (gravity, GRAVITY)}
     of_urdf["arguments"] = (arguments or None, None)
     for name, (value, default) in of_urdf.items():
         if value is not default:
-            raise ValueError(f"{name} is {value!r}, but {path} is {kind.upper()}: it is of URDF files; leave it out")
+            raise ValueError(
+                f"{name} is {value!r}, but {path} is {kind.upper()}: it applies to URDF files; leave it out"
+            )
     if kind == "mjcf":
         if floating_base is not None:
             raise ValueError(
-                f"floating_base is {floating_base}, but {path} is MJCF, which says so by <freejoint>; leave it out"
+                f"floating_base is {floating_base}, but {path} is MJCF, which states it by <freejoint>; leave it out"
             )
         return load_mjcf(path, dtype=dtype)
     return load_sdf(path, floating_base=floating_base is not False, dtype=dtype)
@@ -114,9 +116,10 @@ def _urdf_scene(
     loops: Checked[FilePath | bool | None],
     dtype: DType | None,
 ) -> LoadedScene:
-    closures = closures_of(file.source, loops)
+    closures = read_closures(file.source, loops)
     if isinstance(lock, str):
         raise ValueError(f"lock is {lock!r}; give a list of joint names or a mapping of name to value")
+    # Joints locked by the user override those locked by the YAML file.
     locked = lock if isinstance(lock, Mapping) else dict.fromkeys(lock)
     model = urdf_model(
         file,
@@ -128,7 +131,7 @@ def _urdf_scene(
         balls=closures.balls,
         followers=plugin_followers(file),
     )
-    rows, not_taken = closing(closures, file, model)
+    rows, not_taken = loop_constraints(closures, file, model)
     warn_not_taken(file.path, not_taken)
     forces: list = []
     for leaf, force in ((model.damping, JointDamping), (model.friction, CoulombFriction)):
@@ -141,7 +144,7 @@ def _urdf_scene(
 
 
 def format_of(path: pathlib.Path) -> str:
-    """ "urdf" (.xacro too), "mjcf" or "sdf", by the suffix, and of .xml files by the name of the root element.
+    """Format "urdf" (.xacro too), "mjcf" or "sdf", by the suffix; for .xml files by the name of the root element.
 
     **Raises:** ValueError for a file that cannot be read, and for other suffixes and elements.
     """
@@ -155,10 +158,10 @@ def format_of(path: pathlib.Path) -> str:
     return kind
 
 
-def described(name: str) -> pathlib.Path:
-    """The file of a robot that robot_descriptions knows.
+def find_description(name: str) -> pathlib.Path:
+    """Path of the file of a robot in robot_descriptions.
 
-    **Raises:** ValueError for an unknown name, a robot without a file that is read here, and one that cannot be fetched;
+    **Raises:** ValueError for an unknown name, a robot without a supported file, and one that cannot be downloaded;
     ImportError without the package.
     """
     try:
@@ -175,10 +178,10 @@ def described(name: str) -> pathlib.Path:
         raise ValueError(f"{name!r} is neither a file nor a robot of robot_descriptions; {hint}")
     try:
         module = importlib.import_module(f"robot_descriptions.{name}")
-    except Exception as error:  # of git, the network or the disk
+    except Exception as error:  # git, the network or the disk raise anything
         reason = (str(error).strip() or type(error).__name__).splitlines()[-1]
         raise ValueError(
-            f"{name!r} is not in the cache of robot_descriptions and could not be fetched: {reason}"
+            f"{name!r} is not in the cache of robot_descriptions and could not be downloaded: {reason}"
         ) from error
     for attribute in ("URDF_PATH", "MJCF_PATH", "XACRO_PATH"):
         if (path := getattr(module, attribute, None)) is not None:

@@ -1,4 +1,4 @@
-"""What a file gives beyond the mechanism: starts, named actuators, and a list of what was not taken."""
+"""Contents of a file beyond the mechanism: starts, named actuators, and a list of unsupported elements."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -16,15 +16,15 @@ from jaxdyn.systems.scene import Force, Scene
 
 
 class NotTakenWarning(UserWarning):
-    """A file holds things that the model does not have; the message names them."""
+    """Warning of elements of a file that the model does not represent; the message names them."""
 
 
 class UnitsWarning(UserWarning):
-    """Numbers of a file look as if they were in other units than m, kg and rad; the message names them."""
+    """Warning of numbers of a file that look like other units than m, kg and rad; the message names them."""
 
 
 class Start(eqx.Module):
-    """A state that a file names: `q` (nq,), `v` (nv,) in the model's coordinates, `control` (nu,) of its actuators.
+    """Named state of a file: `q` (nq,), `v` (nv,) in the model's coordinates, `control` (nu,) of its actuators.
 
     `control` is None where the file gives none. Units as for the model: m, rad, m/s, rad/s.
     """
@@ -37,10 +37,10 @@ class Start(eqx.Module):
 class Actuators(eqx.Module):
     """Named actuators: generalised forces from controls.
 
-    An actuator pulls along a length l(q) with the force f = gain u + bias, where gain and bias are affine in l and its
+    An actuator acts along a length l(q) with the force f = gain u + bias, where gain and bias are affine in l and its
     rate: gain = g0 + g1 l + g2 ldot, bias = b0 + b1 l + b2 ldot. That covers motors (f = g0 u), position and velocity
-    servos, dampers and general actuators without a state of their own. The force is held within `force_range`, the sum
-    of all at each coordinate within `effort_range`, the control within `control_range`.
+    servos, dampers and general actuators without a state of their own. The force is clipped to `force_range`, the sum
+    of all at each coordinate to `effort_range`, the control to `control_range`.
 
     Lengths are linear in q, l = moment q, with the coordinates that have v = dq/dt; actuators at a site have no
     length (l = 0) and act with a wrench fixed in the site's frame.
@@ -81,11 +81,13 @@ class Actuators(eqx.Module):
         rows = moment
         for i, site in enumerate(self.sites):
             if site is not None:
+                # A wrench fixed in the site's frame acts by the body Jacobian; such a row depends on q.
                 rows = rows.at[i].set(self.wrenches[i].astype(q.dtype) @ body_jacobian(system, q, site))
         state = jnp.stack([jnp.ones_like(length), length, rows @ v], axis=1)
         gain, bias, control_range, limits, force_range = (
             x.astype(q.dtype) for x in (self.gain, self.bias, self.control_range, self.force_range, self.effort_range)
         )
+        # MuJoCo's order: clip the control, then each force, then the sum at each coordinate.
         control = jnp.clip(jnp.asarray(control, q.dtype), control_range[:, 0], control_range[:, 1])
         force = jnp.sum(gain * state, 1) * control + jnp.sum(bias * state, 1)
         force = jnp.clip(force, limits[:, 0], limits[:, 1])
@@ -93,17 +95,17 @@ class Actuators(eqx.Module):
 
 
 class LoadedScene(Scene):
-    """The scene of a file: a `Scene` in every respect, and what else the file holds.
+    """Scene of a file: a `Scene` with the file's starts and actuators.
 
     - `system`, `constraints`, `forces`: as in `Scene`. The system is a `Model`.
     - `starts`: states by name. "reference" is the placement that the file describes; the others are its keyframes. They
-      are as in the file: put them on the constraints with `jd.assemble(scene, scene.starts[name].q)`.
+      are unchanged: project them to the constraints with `jd.assemble(scene, scene.starts[name].q)`.
     - `actuators`: `Actuators`, called as `scene.actuators(scene.system, q, v, control)` to give tau (nv,); None when
       there are none.
-    - `not_taken`: in words, what the file holds and the scene does not. `NotTakenWarning` says the same at load.
+    - `not_taken`: descriptions of the file's elements that the scene does not represent, as in `NotTakenWarning`.
     """
 
-    # Defaults as `Scene` has them; `__init__` sets all three.
+    # Dataclass fields after `Scene`'s defaults need defaults; `__init__` sets all three.
     starts: dict[str, Start] = eqx.field(default_factory=dict)
     actuators: Actuators | None = None
     not_taken: tuple[str, ...] = eqx.field(static=True, default=())
@@ -124,8 +126,8 @@ class LoadedScene(Scene):
         self.not_taken = tuple(not_taken)
 
 
-def listed(what: str, names: Iterable[str], most: int = 8) -> list[str]:
-    """One entry for `not_taken`: what it is and the names, the first few of many; empty when there are none."""
+def summarize(what: str, names: Iterable[str], most: int = 8) -> list[str]:
+    """One entry of `not_taken`: a description and the first names; empty when there are none."""
     names = list(names)
     if not names:
         return []
@@ -134,18 +136,18 @@ def listed(what: str, names: Iterable[str], most: int = 8) -> list[str]:
 
 
 def warn_not_taken(path, not_taken: Iterable[str]) -> None:
-    """Warn once, naming all that was not taken from a file."""
+    """Warn once, naming all elements of a file that are not represented."""
     if not_taken:
         warn(f"{path}: not taken from the file: {'; '.join(not_taken)}", NotTakenWarning)
 
 
-# A robot arm turns by two or three turns at most, and its links are shorter than this; ships and cranes are named too.
+# Robot joints turn by two or three turns at most, and links are shorter than 100 m; ships and cranes may trigger the warning.
 _MOST_TURNS, _LONGEST = 4.0, 100.0
-_NO_LIMIT = 1e15  # files write 1e16 where they mean none
+_NO_LIMIT = 1e15  # files write 1e16 for no limit
 
 
 def warn_of_units(path, model: Model) -> None:
-    """Warn where limits look like degrees, or places and inertias like millimetres; nothing is changed."""
+    """Warn where limits look like degrees, or positions and inertias like millimetres; nothing is changed."""
     top, doubts = model.topology, []
     lower, upper = np.asarray(model.lower), np.asarray(model.upper)
     for name, kind, place in zip(top.joint_names, top.kinds, top.q_slices, strict=True):
@@ -154,7 +156,8 @@ def warn_of_units(path, model: Model) -> None:
             doubts.append(f"limits {lower[place][0]:g} to {upper[place][0]:g} rad of joint {name!r} (degrees?)")
     for name, home, parameters in zip(top.body_names, np.asarray(model.home), np.asarray(model.inertias), strict=True):
         if (far := np.linalg.norm(home[:3, 3])) > _LONGEST:
-            doubts.append(f"body {name!r} {far:g} m from the one that carries it (millimetres?)")
+            doubts.append(f"body {name!r} {far:g} m from its parent (millimetres?)")
+        # sqrt(I/m) is a length whatever the mass: kg mm^2 gives a radius 1000 times too large.
         mass, _, moment = f64.about_com(parameters)
         if mass > 0 and (radius := np.sqrt(np.abs(moment).max() / mass)) > _LONGEST:
             doubts.append(f"radius of gyration {radius:g} m of body {name!r} (inertia in kg mm^2 or g mm^2?)")

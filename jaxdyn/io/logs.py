@@ -1,4 +1,4 @@
-"""Logs as files: CSV or NPZ with named columns t, q1.., v1.., a1.., tau1.. (or q_<joint name> ...)."""
+"""Log files: CSV or NPZ with named columns t, q1.., v1.., a1.., tau1.. (or q_<joint name> ...)."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import Checked, FilePath, as_path, parse_number
 
 _SIGNALS = ("q", "v", "a", "tau")
-_NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit behind a column's name
+_NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit after a column's name
 
 
 def read_log(
@@ -27,19 +27,19 @@ def read_log(
     Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1,
     ...` torques. The numbers may be replaced by joint names: `q_shoulder, tau_shoulder`. In an NPZ archive each column
     is an array (n,), or a signal is one array (n, columns) named `q`, `v`, `a`, `tau`. Columns of other names are
-    ignored, and so is a unit in brackets behind a name of a CSV file, `q_shoulder [rad]`; numbers are taken in SI units.
+    ignored, and so is a unit in brackets after a name of a CSV file, `q_shoulder [rad]`; numbers are taken in SI units.
     Columns of a CSV file may be separated by commas, semicolons or tabs; numbers have a decimal point.
 
     **Arguments:** `path`; `joint_names`: order of the joints in the result for columns with joint names (a model's
-    `joint_names`); columns of other joints are left out. Without it the order of the file's tau columns. `rename`: from
-    names of joints in the file to those wanted, {"motor1": "shoulder"}. `rollout`: which motion of a file that holds
+    `joint_names`); columns of other joints are ignored. Without it the order of the file's tau columns. `rename`: from
+    names of joints in the file to those of the model, {"motor1": "shoulder"}. `rollout`: which motion of a file that holds
     several, as `Solution.to_csv` and `to_npz` write them of a batch; the first is 1.
 
     **Returns:** `jd.identify.Log`; v and a are None when the file has none. Make them with `jd.identify.from_raw`.
 
     **Raises:** FileNotFoundError; ValueError, with the path, for another file type, a cell that is no number (line and
-    column), a first line that is no header, missing or repeated columns (with the `rename` that would give the joints their
-    names, where there are as many), and all that `Log` refuses (NaN, unequal lengths, time running backwards).
+    column), a first line that is no header, missing or repeated columns (with a `rename` that gives the joints their
+    names, where there are as many), and everything that `Log` refuses (NaN, unequal lengths, time running backwards).
     """
     path = as_path(path)
     readers = {".csv": _read_csv, ".npz": _read_npz}
@@ -49,14 +49,14 @@ def read_log(
         raise FileNotFoundError(f"{path}: no such log file")
     columns = _one_motion(readers[path.suffix.lower()](path), rollout, path)
     try:
-        columns = _renamed(columns, rename or {})
+        columns = _rename(columns, rename or {})
         return _assemble(columns, None if joint_names is None else tuple(joint_names))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
 def _one_motion(columns: dict[str, np.ndarray], rollout: int | None, path) -> dict[str, np.ndarray]:
-    """The columns of one motion of a file with a column `rollout`, or with signals (rollouts, n, columns)."""
+    """Columns of one motion of a file with a column `rollout`, or with signals (rollouts, n, columns)."""
     numbers = columns.pop("rollout", None)
     stacked = {name: len(columns[name]) for name in _SIGNALS if name in columns}
     known = sorted(set(np.asarray(numbers, int).tolist())) if numbers is not None else []
@@ -75,7 +75,7 @@ def _one_motion(columns: dict[str, np.ndarray], rollout: int | None, path) -> di
 
 
 def write_log(path: FilePath, log: Log) -> None:
-    """Write a log as CSV (every number at full precision) or NPZ, with columns as `read_log` reads them.
+    """Write a log as CSV (every number at full precision) or NPZ, with columns in the format of `read_log`.
 
     Columns carry joint names when the log knows them and has one coordinate per joint, else numbers.
 
@@ -96,6 +96,7 @@ def write_log(path: FilePath, log: Log) -> None:
         with path.open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(columns)
+            # repr is the shortest text that reads back as the same double.
             writer.writerows([repr(float(x)) for x in row] for row in zip(*columns.values(), strict=True))
     else:
         raise ValueError(f"{path}: log files are .csv or .npz, not {path.suffix!r}")
@@ -104,6 +105,7 @@ def write_log(path: FilePath, log: Log) -> None:
 def _read_csv(path) -> dict[str, np.ndarray]:
     data = path.read_bytes()
     try:
+        # Spreadsheet programs put a byte order mark in front.
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
@@ -111,8 +113,8 @@ def _read_csv(path) -> dict[str, np.ndarray]:
     with io.StringIO(text, newline="") as file:
         first = file.readline()
         file.seek(0)
-        names = re.sub(r"\[[^\]]*\]", "", first)  # units may hold any sign
-        # A semicolon beside commas is that of a country that writes 0,5.
+        names = re.sub(r"\[[^\]]*\]", "", first)  # units may contain separators
+        # Semicolons win over commas: locales with decimal commas separate by semicolons.
         separator = next((sign for sign in ";,\t" if sign in names), ",")
         reader = csv.reader(file, delimiter=separator)
         header = [_NOTE.sub("", name.strip()) for name in next(reader, [])]
@@ -202,8 +204,8 @@ def _assemble(columns: dict[str, np.ndarray], joint_names) -> Log:
     return Log(columns["t"], **stacked, joint_names=None if by_number else labels)
 
 
-def _renamed(columns: dict[str, np.ndarray], names) -> dict[str, np.ndarray]:
-    """Columns with the joints' names replaced. **Raises:** ValueError for a name that no column has."""
+def _rename(columns: dict[str, np.ndarray], names) -> dict[str, np.ndarray]:
+    """Rename the joints of columns. **Raises:** ValueError for a name that no column has."""
     result, used = {}, set()
     for column, values in columns.items():
         signal, _, joint = column.partition("_")
@@ -217,7 +219,7 @@ def _renamed(columns: dict[str, np.ndarray], names) -> dict[str, np.ndarray]:
 
 
 def _mapping(columns: dict[str, str], labels) -> str:
-    """The mapping that would do, where the file has as many joints of other names."""
+    """Suggest a mapping where the file has as many joints under other names."""
     others = [label for label in columns if label not in labels]
     wanted = [label for label in labels if label not in columns]
     if not others or len(others) != len(wanted) or others[0].isdecimal():
@@ -227,7 +229,7 @@ def _mapping(columns: dict[str, str], labels) -> str:
 
 
 def _signal_columns(columns, signal: str) -> dict[str, str]:
-    """Label (number or joint name) to column name, for one signal; mixing both kinds is refused."""
+    """Map labels (number or joint name) to column names of one signal; mixing both kinds is refused."""
     numbered = {
         name[len(signal) :]: name for name in columns if name.startswith(signal) and name[len(signal) :].isdecimal()
     }

@@ -1,9 +1,9 @@
-"""Reading MJCF files: mujoco's own compiler reads the file, and what it compiled becomes a scene.
+"""MJCF loader: mujoco's compiler reads the file, and the compiled model becomes a scene.
 
-Defaults, includes, inertias from geometry, angles in degrees and the twenty other rules of the format are mujoco's to
-apply. Compiled numbers are in SI units; quaternions are (w, x, y, z) of unit length. Two conventions differ: a free
-joint's velocity is linear in world axes there, and here a twist in the body's; a joint of one degree of freedom has a
-reference `qpos0` there, at which the body stands where the file puts it, and here the same number in its home pose.
+Defaults, includes, inertias from geometry, angles in degrees and the other rules of the format are left to the
+compiler. Compiled numbers are in SI units; quaternions are (w, x, y, z) of unit length. Two conventions differ: a free
+joint's linear velocity is in world axes there and in the body's here; a joint of one degree of freedom has a
+reference `qpos0` there, the coordinate of the file's placement, which the home pose contains here.
 """
 
 import os
@@ -13,9 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
-from jaxdyn.io.chains import Link, Names, add_chain, built
-from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of_units
-from jaxdyn.io.mjcf_file import BALL, FREE, HINGE, SIZES, SLIDE, Compiled, compiled, library, named, pose_of
+from jaxdyn.io.chains import Link, Names, add_chain, build_model
+from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn_of_units
+from jaxdyn.io.mjcf_file import (
+    BALL,
+    FREE,
+    HINGE,
+    SIZES,
+    SLIDE,
+    CompiledFile,
+    assign_names,
+    compile_file,
+    import_mujoco,
+    pose_of,
+)
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import DType, as_path
@@ -25,17 +36,17 @@ from jaxdyn.model.tree import Model
 
 
 def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedScene:
-    """The scene of an MJCF file (MuJoCo's XML), compiled by the mujoco package.
+    """Load the scene of an MJCF file (MuJoCo's XML), compiled by the mujoco package.
 
-    Taken are bodies with their inertias, joints (hinge, slide, ball, free; several on one body become a chain of
+    Supported are bodies with their inertias, joints (hinge, slide, ball, free; several on one body become a chain of
     massless bodies BODY_JOINT), armature, limits (as the model's `lower`, `upper`), damping, springs and dry friction
     of joints, gravity; `equality` of kind connect, weld, joint and tendon as exact constraints, where MuJoCo softens
     them; tendons that are linear in the joints' coordinates; actuators without a state of their own; sites as frames;
-    keyframes as starts. Every body keeps a frame of its name, which is its frame in the file. Names that the file leaves
-    out are "bodyN" and BODY_joint (BODY_jointK of several), names in use get an underscore behind them, and a site with
+    keyframes as starts. Every body keeps its frame of the file under its name. Missing names
+    become "bodyN" and BODY_joint (BODY_jointK of several), names in use get an underscore appended, and a site with
     the name of a body is SITE_site.
 
-    `load_urdf` returns a `Model`, since a URDF holds a tree and nothing else; `load_mjcf` and `load_sdf` return a
+    `load_urdf` returns a `Model`, since a URDF describes only a tree; `load_mjcf` and `load_sdf` return a
     `LoadedScene`, a `Scene` with that model as `.system`.
 
     Coordinates: hinge and slide have MuJoCo's numbers; ball and free joints have MuJoCo's configuration (a free body's q
@@ -46,30 +57,30 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
     0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is MuJoCo's qpos0), `.actuators`, `.not_taken`.
 
-    **Warns:** `NotTakenWarning` naming what the scene does not have: contact geometry, muscles and other actuators with
+    **Warns:** `NotTakenWarning` naming unsupported elements: contact geometry, muscles and other actuators with
     a state, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and the like.
 
     `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
 
-    **Raises:** ValueError with the file (and the line, where mujoco says it) for a file that cannot be read or
+    **Raises:** ValueError with the file (and the line, where mujoco gives it) for a file that cannot be read or
     compiled; for a joint that moves no inertia. ImportError without mujoco.
     """
-    mujoco = library()
+    mujoco = import_mujoco()
     given = str(as_path(path))
-    m, missing = compiled(mujoco, given)
-    file = named(mujoco, m, given)
+    m, missing = compile_file(mujoco, given)
+    file = assign_names(mujoco, m, given)
     model = _model(file, dtype)
     rows, left = constraints(file, model)
     tendons, also = tendon_forces(file, model)
     drives, idle = actuators(file, model)
-    not_taken = (*missing, *left, *also, *idle, *_unused(file))
+    not_taken = (*missing, *left, *also, *idle, *_unsupported(file))
     warn_not_taken(path, not_taken)
     warn_of_units(path, model)
     forces = (*_joint_forces(file, model), *tendons)
     return LoadedScene(model, rows, forces, starts=_starts(file, model, drives), actuators=drives, not_taken=not_taken)
 
 
-def _model(file: Compiled, dtype) -> Model:
+def _model(file: CompiledFile, dtype) -> Model:
     m = file.m
     gravity = None if file.off("GRAVITY") or not m.opt.gravity.any() else m.opt.gravity
     name = m.names.split(b"\0", 1)[0].decode() or "mechanism"
@@ -84,37 +95,39 @@ def _model(file: Compiled, dtype) -> Model:
         joints = range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]) if m.body_jntnum[b] else ()
         links = [_link(file, j, armature, damping) for j in joints]
         inertia = (m.body_mass[b], *_central_inertia(m, b))
+        # MuJoCo's free joint has the world pose as its configuration, so the home pose is the identity.
         free = bool(links) and links[0].kind == "free"
         pose = np.eye(4) if free else pose_of(m.body_pos[b], m.body_quat[b])
         parent = file.bodies[m.body_parentid[b]]
         add_chain(builder, frames, joint_names, str(file.bodies[b]), parent, pose, links, inertia)
     for s, site in enumerate(file.sites):
         builder.add_frame(site, file.bodies[m.site_bodyid[s]], pose_of(m.site_pos[s], m.site_quat[s]))
-    return built(builder, file.path)
+    return build_model(builder, file.path)
 
 
 def _central_inertia(m, b: int) -> tuple[np.ndarray, np.ndarray]:
     """Centre of mass (3,) and inertia (3, 3) about it in the body's frame.
 
-    Where the compiler finds the inertial frame within some nanometres of the body's, MuJoCo takes them as one.
+    Where the inertial frame is within some nanometres of the body's, MuJoCo treats them as equal.
     """
     same_frame, same_turn = m.body_sameframe[b] == 1, m.body_sameframe[b] in (1, 3)  # mjtSameFrame: BODY, BODYROT
     turn = np.eye(3) if same_turn else pose_of(np.zeros(3), m.body_iquat[b])[:3, :3]
     return np.zeros(3) if same_frame else m.body_ipos[b].copy(), turn @ np.diag(m.body_inertia[b]) @ turn.T
 
 
-def _rotors(file: Compiled) -> tuple[np.ndarray, np.ndarray]:
-    """Armature and damping (nv,) of the joints, with what actuators on joints add to them."""
+def _rotors(file: CompiledFile) -> tuple[np.ndarray, np.ndarray]:
+    """Armature and damping (nv,) of the joints, including the contributions of actuators on joints."""
     m = file.m
     armature, damping = m.dof_armature.copy(), m.dof_damping.copy()
     for i in range(m.nactuator):
         if m.actuator_trntype[i] in (0, 1) and m.jnt_type[j := m.actuator_trnid[i, 0]] in (SLIDE, HINGE):
+            # Rotor quantities reflect through the gear with its square.
             armature[m.jnt_dofadr[j]] += m.actuator_gear[i, 0] ** 2 * m.actuator_armature[i]
             damping[m.jnt_dofadr[j]] += m.actuator_gear[i, 0] ** 2 * m.actuator_damping[i]
     return armature, damping * (not file.off("DAMPER"))
 
 
-def _link(file: Compiled, j: int, armature: np.ndarray, damping: np.ndarray) -> Link:
+def _link(file: CompiledFile, j: int, armature: np.ndarray, damping: np.ndarray) -> Link:
     m = file.m
     kind = m.jnt_type[j]
     dofs = slice(m.jnt_dofadr[j], m.jnt_dofadr[j] + SIZES[kind][1])
@@ -132,7 +145,7 @@ def _link(file: Compiled, j: int, armature: np.ndarray, damping: np.ndarray) -> 
     return Link(file.joints[j], word, m.jnt_axis[j].copy(), m.jnt_pos[j].copy(), float(reference), leaves)
 
 
-def _joint_forces(file: Compiled, model: Model) -> list:
+def _joint_forces(file: CompiledFile, model: Model) -> list:
     m, forces = file.m, []
     scalars = [j for j in range(m.njnt) if m.jnt_type[j] in (SLIDE, HINGE, BALL) and m.jnt_stiffness[j]]
     if scalars and not file.off("SPRING"):
@@ -146,7 +159,7 @@ def _joint_forces(file: Compiled, model: Model) -> list:
     return forces
 
 
-def _starts(file: Compiled, model: Model, drives) -> dict[str, Start]:
+def _starts(file: CompiledFile, model: Model, drives) -> dict[str, Start]:
     m, dtype = file.m, model.home.dtype
 
     def start(qpos, qvel, control=None) -> Start:
@@ -163,8 +176,8 @@ def _starts(file: Compiled, model: Model, drives) -> dict[str, Start]:
     return starts
 
 
-def _state(file: Compiled, model: Model, qpos, qvel) -> tuple[np.ndarray, np.ndarray]:
-    """MuJoCo's state in our coordinates."""
+def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np.ndarray]:
+    """Convert MuJoCo's state to the model's coordinates."""
     m = file.m
     q = np.concatenate([np.zeros(0), *(joint_neutral(kind) for kind in model.topology.kinds)])
     v = np.zeros(model.nv)
@@ -174,14 +187,15 @@ def _state(file: Compiled, model: Model, qpos, qvel) -> tuple[np.ndarray, np.nda
         here, rate = qpos[m.jnt_qposadr[j] :][:nq].copy(), qvel[m.jnt_dofadr[j] :][:nv].copy()
         if nq > 1:
             here[-4:] /= np.linalg.norm(here[-4:])
+        # World-frame linear velocity there, body-frame here.
         if nq == 7:
             rate[:3] = f64.joint_pose("free", np.zeros(6), here)[:3, :3].T @ rate[:3]
         q[model.topology.q_slices[i]], v[model.topology.v_slices[i]] = here, rate
     return q, v
 
 
-def _unused(file: Compiled) -> list[str]:
-    """What the file holds and the scene does not, apart from constraints, tendons and actuators."""
+def _unsupported(file: CompiledFile) -> list[str]:
+    """Elements of the file that the scene does not represent, apart from constraints, tendons and actuators."""
     m, mujoco = file.m, file.mujoco
     free = [file.joints[j] for j in range(m.njnt) if m.jnt_type[j] == FREE]
 
@@ -198,20 +212,22 @@ def _unused(file: Compiled) -> list[str]:
     sensors = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_SENSOR, i) or f"sensor{i}" for i in range(m.nsensor)]
     flexes = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_FLEX, i) or f"flex{i}" for i in range(m.nflex)]
     return [
-        *listed("contact geometry of bodies", names),
-        *listed("limit of ball joints", joints(lambda j: m.jnt_type[j] == BALL and m.jnt_limited[j])),
-        *listed("spring of free joints", joints(lambda j: m.jnt_type[j] == FREE and m.jnt_stiffness[j])),
-        *listed("nonlinear spring of joints", joints(lambda j: m.jnt_stiffnesspoly[j].any())),
-        *listed("plastic spring of joints", joints(lambda j: m.jnt_plasticadr[j] >= 0)),
-        *listed("nonlinear damping of joints", dofs(m.dof_dampingpoly.any(1))),
-        *listed(
+        *summarize("contact geometry of bodies", names),
+        *summarize("limit of ball joints", joints(lambda j: m.jnt_type[j] == BALL and m.jnt_limited[j])),
+        *summarize("spring of free joints", joints(lambda j: m.jnt_type[j] == FREE and m.jnt_stiffness[j])),
+        *summarize("nonlinear spring of joints", joints(lambda j: m.jnt_stiffnesspoly[j].any())),
+        *summarize("plastic spring of joints", joints(lambda j: m.jnt_plasticadr[j] >= 0)),
+        *summarize("nonlinear damping of joints", dofs(m.dof_dampingpoly.any(1))),
+        *summarize(
             "gyroscopic part of the armature of free joints (MuJoCo adds it in world axes)",
             [name for name in dofs(m.dof_armature) if name in free],
         ),
-        *listed("gravity compensation of bodies", (str(file.bodies[b]) for b in np.flatnonzero(m.body_gravcomp) if b)),
-        *listed("mocap bodies, fixed here", (str(file.bodies[b]) for b in range(m.nbody) if m.body_mocapid[b] >= 0)),
-        *listed("fluid forces", fluid),
-        *listed("flexible bodies", flexes),
+        *summarize(
+            "gravity compensation of bodies", (str(file.bodies[b]) for b in np.flatnonzero(m.body_gravcomp) if b)
+        ),
+        *summarize("mocap bodies, fixed here", (str(file.bodies[b]) for b in range(m.nbody) if m.body_mocapid[b] >= 0)),
+        *summarize("fluid forces", fluid),
+        *summarize("flexible bodies", flexes),
         *(["plugins"] if m.nplugin else []),
-        *listed("sensors", sensors),
+        *summarize("sensors", sensors),
     ]

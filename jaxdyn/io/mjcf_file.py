@@ -1,4 +1,4 @@
-"""MJCF files compiled by the mujoco package, with a name for everything that a model names."""
+"""MJCF files compiled by the mujoco package, with unique names of all elements."""
 
 import re
 from typing import Any, NamedTuple
@@ -10,11 +10,11 @@ from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
 
 FREE, BALL, SLIDE, HINGE = range(4)  # mjtJoint
-SIZES = ((7, 6), (4, 3), (1, 1), (1, 1))  # numbers in q and v of each
+SIZES = ((7, 6), (4, 3), (1, 1), (1, 1))  # sizes of q and v of each
 
 
-class Compiled(NamedTuple):
-    """A compiled file, with a name for each thing, whether the file has one or not.
+class CompiledFile(NamedTuple):
+    """Compiled file with a name for each element, named in the file or not.
 
     `m` is mujoco's MjModel; `bodies` (None: the world), `joints`, `sites`, `tendons` and `actuators` are named by their
     numbers in it.
@@ -30,11 +30,11 @@ class Compiled(NamedTuple):
     actuators: list[str]
 
     def off(self, flag: str) -> bool:
-        """Whether the file's <flag> switches something off, e.g. "GRAVITY"."""
+        """Decide whether the file's <flag> disables a feature, e.g. "GRAVITY"."""
         return bool(self.m.opt.disableflags & int(getattr(self.mujoco.mjtDisableBit, f"mjDSBL_{flag}")))
 
 
-def library():
+def import_mujoco():
     try:
         import mujoco
     except ImportError as error:
@@ -42,9 +42,9 @@ def library():
     return mujoco
 
 
-def compiled(mujoco, path: str):
-    """The compiled file, and what was left out of it because a file that it names is missing."""
-    # mujoco also reads URDF, and loads what it can of files that are none; its parser knows no line of a broken one.
+def compile_file(mujoco, path: str):
+    """Compile a file without the assets whose files are missing; return it with a list of these."""
+    # Parsed here first: mujoco also accepts URDF and fragments of other files, and its parser gives no line for malformed XML.
     file = XmlFile(path, "MJCF")
     if file.root.tag != "mujoco":
         raise file.fault(
@@ -56,8 +56,9 @@ def compiled(mujoco, path: str):
     try:
         spec = mujoco.MjSpec.from_file(path)
     except ValueError as error:
-        raise ValueError(_located(path, error)) from error
+        raise ValueError(_add_location(path, error)) from error
     missing: list[str] = []
+    # Each failed compilation names one missing file; the loop ends because every pass removes an asset.
     while True:
         try:
             return spec.compile(), missing
@@ -65,11 +66,11 @@ def compiled(mujoco, path: str):
             name = re.search(r"[Ee]rror opening file '(.*?)'", str(error))
             if name is None or not (gone := _without_file(mujoco, spec, name[1])):
                 hint = f" (already left out: {'; '.join(missing)})" if missing else ""
-                raise ValueError(_located(path, error) + hint) from error
+                raise ValueError(_add_location(path, error) + hint) from error
             missing.append(gone)
 
 
-def _located(path: str, error: Exception) -> str:
+def _add_location(path: str, error: Exception) -> str:
     text = " ".join(str(error).split())
     lines = re.findall(r"[Ll]ine(?: number=| )(\d+)", text)
     where = f"{path}:{lines[-1]}" if lines and int(lines[-1]) else path
@@ -77,13 +78,13 @@ def _located(path: str, error: Exception) -> str:
 
 
 def _without_file(mujoco, spec, name: str) -> str:
-    """Leave a mesh, height field, skin or texture out. Returns in words what was left out, or "" for no such file.
+    """Delete a mesh, height field, skin or texture. Return a description of it, or "" for no such file.
 
     Geoms that show it become points without mass and keep their names, which sensors and contact pairs may name.
     """
 
     def is_it(file: str) -> bool:
-        # The compiler names the file as it looked for it, below the folder of its kind.
+        # The compiler's message has the path with the asset folder in front.
         return bool(file) and (name == file or name.replace("\\", "/").endswith("/" + file))
 
     for asset in [*spec.meshes, *spec.hfields]:
@@ -93,7 +94,7 @@ def _without_file(mujoco, spec, name: str) -> str:
         for geom in spec.geoms:
             if asset.name not in (geom.meshname, geom.hfieldname):
                 continue
-            # An explicit <inertial> stands on its own; else the mass of this geom is gone with its shape.
+            # Without an explicit <inertial> the mass of this geom is lost with its shape.
             if geom.mass != 0 and not geom.parent.explicitinertial and geom.parent.name != "world":
                 heavy.add(geom.parent.name or "(unnamed)")
             geom.meshname = geom.hfieldname = ""
@@ -116,13 +117,15 @@ def _without_file(mujoco, spec, name: str) -> str:
     return ""
 
 
-def named(mujoco, m, path: str) -> Compiled:
+def assign_names(mujoco, m, path: str) -> CompiledFile:
     def all_of(kind: str, count: int) -> list[str]:
         code = getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
         return [mujoco.mj_id2name(m, code, i) or "" for i in range(count)]
 
-    def filled(raw: list[str], default, taken: Names) -> list[str]:
-        given = [taken.new(name) if name else "" for name in raw]  # the file's names first: none of them changes
+    def fill_names(raw: list[str], default, taken: Names) -> list[str]:
+        given = [
+            taken.new(name) if name else "" for name in raw
+        ]  # the file's names first, so that none of them changes
         return [name or taken.new(default(i)) for i, name in enumerate(given)]
 
     def joint_default(j: int) -> str:
@@ -131,16 +134,16 @@ def named(mujoco, m, path: str) -> Compiled:
         return f"{bodies[body]}_joint{j - m.body_jntadr[body] if several else ''}"
 
     frames = Names()
-    bodies: list[str | None] = [None, *filled(all_of("BODY", m.nbody)[1:], lambda i: f"body{i + 1}", frames)]
+    bodies: list[str | None] = [None, *fill_names(all_of("BODY", m.nbody)[1:], lambda i: f"body{i + 1}", frames)]
     known = set(bodies)
     sites = [f"{site}_site" if site in known else site for site in all_of("SITE", m.nsite)]
-    sites = filled(sites, lambda i: f"site{i}", frames)
-    joints = filled(all_of("JOINT", m.njnt), joint_default, Names())
-    tendons = filled(all_of("TENDON", m.ntendon), lambda i: f"tendon{i}", Names())
-    names = filled(all_of("ACTUATOR", m.nactuator), lambda i: f"actuator{i}", Names())
-    return Compiled(path, mujoco, m, bodies, joints, sites, tendons, names)
+    sites = fill_names(sites, lambda i: f"site{i}", frames)
+    joints = fill_names(all_of("JOINT", m.njnt), joint_default, Names())
+    tendons = fill_names(all_of("TENDON", m.ntendon), lambda i: f"tendon{i}", Names())
+    names = fill_names(all_of("ACTUATOR", m.nactuator), lambda i: f"actuator{i}", Names())
+    return CompiledFile(path, mujoco, m, bodies, joints, sites, tendons, names)
 
 
 def pose_of(position, quaternion) -> np.ndarray:
-    """(4, 4) from a position and a quaternion (w, x, y, z) of any length."""
+    """Pose (4, 4) from a position and a quaternion (w, x, y, z) of any length."""
     return f64.joint_pose("free", np.zeros(6), np.concatenate([position, quaternion]))

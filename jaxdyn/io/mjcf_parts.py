@@ -1,12 +1,12 @@
-"""Constraints, tendons and actuators of a compiled MJCF file, each with a list of those that were not taken."""
+"""Constraints, tendons and actuators of a compiled MJCF file, each with a list of the unsupported ones."""
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.constraints.base import Constraint, Holonomic
 from jaxdyn.constraints.loops import gear, lock_joint, loop
-from jaxdyn.io.loaded import Actuators, listed
-from jaxdyn.io.mjcf_file import HINGE, SLIDE, Compiled, pose_of
+from jaxdyn.io.loaded import Actuators, summarize
+from jaxdyn.io.mjcf_file import HINGE, SLIDE, CompiledFile, pose_of
 from jaxdyn.io.tendons import PolynomialCoupling, TendonForce
 from jaxdyn.model.names import body_index
 from jaxdyn.model.tree import Model
@@ -16,8 +16,8 @@ _ON_JOINT, _IN_PARENT, _ON_TENDON, _AT_SITE = 0, 1, 3, 4  # mjtTrn
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 
 
-def constraints(file: Compiled, model: Model) -> tuple[list[Constraint], list[str]]:
-    """The `equality` elements as exact constraints, and in words those that were not taken."""
+def constraints(file: CompiledFile, model: Model) -> tuple[list[Constraint], list[str]]:
+    """Exact constraints of the `equality` elements, and descriptions of the unsupported ones."""
     m, taken, left = file.m, [], {}
     for i in range(m.neq):
         name = file.mujoco.mj_id2name(m, file.mujoco.mjtObj.mjOBJ_EQUALITY, i) or f"equality{i}"
@@ -33,10 +33,10 @@ def constraints(file: Compiled, model: Model) -> tuple[list[Constraint], list[st
             made, reason = None, "equalities of flexible bodies"
         taken += [] if made is None else [made]
         left.setdefault(reason, []).extend([name] if made is None else [])
-    return taken, [line for reason, names in left.items() for line in listed(reason, names)]
+    return taken, [line for reason, names in left.items() for line in summarize(reason, names)]
 
 
-def _loop(file: Compiled, model: Model, i: int, name: str) -> tuple[Constraint | None, str]:
+def _loop(file: CompiledFile, model: Model, i: int, name: str) -> tuple[Constraint | None, str]:
     m = file.m
     first, second, data = int(m.eq_obj1id[i]), int(m.eq_obj2id[i]), m.eq_data[i]
     if m.eq_objtype[i] == int(file.mujoco.mjtObj.mjOBJ_SITE):
@@ -51,12 +51,12 @@ def _loop(file: Compiled, model: Model, i: int, name: str) -> tuple[Constraint |
         ]
     if len({body_index(model, body) for body, _ in ends}) == 1:
         return None, "equalities between two parts of one body"
-    points = m.eq_type[i] == _CONNECT or data[10] == 0  # without torque scale a weld holds the point alone
+    points = m.eq_type[i] == _CONNECT or data[10] == 0  # without torque scale a weld constrains the point only
     (body_a, pose_a), (body_b, pose_b) = ends
     return loop(body_a, pose_a, body_b, pose_b, "spherical" if points else "weld", name=name), ""
 
 
-def _coupling(file: Compiled, model: Model, i: int, name: str) -> tuple[Constraint | None, str]:
+def _coupling(file: CompiledFile, model: Model, i: int, name: str) -> tuple[Constraint | None, str]:
     m = file.m
     first, second, c = int(m.eq_obj1id[i]), int(m.eq_obj2id[i]), m.eq_data[i, :5]
     if m.eq_type[i] == _JOINT:
@@ -64,6 +64,8 @@ def _coupling(file: Compiled, model: Model, i: int, name: str) -> tuple[Constrai
         if second < 0:
             return lock_joint(file.joints[first], r[0] + c[0], name=name), ""
         if not c[2:].any():
+            # MuJoCo's polynomial is in displacements from qpos0; with c2 = c3 = c4 = 0 it is a gear with a shifted
+            # offset.
             return gear(file.joints[first], file.joints[second], c[1], r[0] + c[0] - c[1] * r[1], name=name), ""
         rows = [{first: 1.0}, {second: 1.0}]
     else:
@@ -79,13 +81,13 @@ def _coupling(file: Compiled, model: Model, i: int, name: str) -> tuple[Constrai
     return Holonomic(residual, name=name), ""
 
 
-def _places(file: Compiled, model: Model, joint: int) -> tuple[int, int]:
-    """Where a joint's coordinate stands in our q and v."""
+def _places(file: CompiledFile, model: Model, joint: int) -> tuple[int, int]:
+    """Indices of a joint's coordinate in the model's q and v."""
     i = model.joint_names.index(file.joints[joint])
     return model.topology.q_slices[i].start, model.topology.v_slices[i].start
 
 
-def _row(file: Compiled, tendon: int) -> dict[int, float] | None:
+def _row(file: CompiledFile, tendon: int) -> dict[int, float] | None:
     """Coefficients by joint of a tendon that is linear in the joints' coordinates, None for any other."""
     m, row = file.m, {}
     for w in range(m.tendon_adr[tendon], m.tendon_adr[tendon] + m.tendon_num[tendon]):
@@ -96,8 +98,8 @@ def _row(file: Compiled, tendon: int) -> dict[int, float] | None:
     return row
 
 
-def tendon_forces(file: Compiled, model: Model) -> tuple[list[TendonForce], list[str]]:
-    """Springs and dampers of linear tendons, and in words what tendons do that was not taken."""
+def tendon_forces(file: CompiledFile, model: Model) -> tuple[list[TendonForce], list[str]]:
+    """Springs and dampers of linear tendons, and descriptions of unsupported features of tendons."""
     m = file.m
     springs = m.tendon_stiffness * (not file.off("SPRING"))
     dampers = m.tendon_damping * (not file.off("DAMPER"))
@@ -108,12 +110,12 @@ def tendon_forces(file: Compiled, model: Model) -> tuple[list[TendonForce], list
         return [name for t, name in enumerate(file.tendons) if condition(t)]
 
     left = [
-        *listed("forces of spatial tendons", those(lambda t: rows[t] is None and (springs[t] or dampers[t]))),
-        *listed("limits of tendons", those(lambda t: m.tendon_limited[t])),
-        *listed("dry friction of tendons", those(lambda t: m.tendon_frictionloss[t])),
-        *listed("armature of tendons", those(lambda t: m.tendon_armature[t])),
-        *listed("plastic springs of tendons", those(lambda t: m.tendon_plasticadr[t] >= 0)),
-        *listed(
+        *summarize("forces of spatial tendons", those(lambda t: rows[t] is None and (springs[t] or dampers[t]))),
+        *summarize("limits of tendons", those(lambda t: m.tendon_limited[t])),
+        *summarize("dry friction of tendons", those(lambda t: m.tendon_frictionloss[t])),
+        *summarize("armature of tendons", those(lambda t: m.tendon_armature[t])),
+        *summarize("plastic springs of tendons", those(lambda t: m.tendon_plasticadr[t] >= 0)),
+        *summarize(
             "nonlinear springs or damping of tendons",
             those(lambda t: m.tendon_stiffnesspoly[t].any() or m.tendon_dampingpoly[t].any()),
         ),
@@ -133,8 +135,8 @@ def tendon_forces(file: Compiled, model: Model) -> tuple[list[TendonForce], list
     return [force], left
 
 
-def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]]:
-    """The actuators without a state of their own, None without any, and in words those that were not taken."""
+def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[str]]:
+    """Actuators without internal state, None without any, and descriptions of the unsupported ones."""
     m, left = file.m, {}
     taken = []
     for i, name in enumerate(file.actuators):
@@ -142,8 +144,8 @@ def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]
             left.setdefault(reason, []).append(name)
         else:
             taken.append(i)
-    lines = [line for reason, names in left.items() for line in listed(f"actuators {reason}", names)]
-    lines += listed(
+    lines = [line for reason, names in left.items() for line in summarize(f"actuators {reason}", names)]
+    lines += summarize(
         "armature or damping of actuators on tendons and sites",
         (
             file.actuators[i]
@@ -169,6 +171,7 @@ def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]
         if kind == _AT_SITE:
             sites[k], wrenches[k] = file.sites[target], pull
             continue
+        # Joints and fixed tendons are the same: one row of coefficients.
         row = {target: 1.0} if kind != _ON_TENDON else _row(file, target) or {}
         for joint, coefficient in row.items():
             moment[k, _places(file, model, joint)[1]] += pull[0] * coefficient
@@ -176,6 +179,7 @@ def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]
     def ranges_of(limited, ranges, off: bool) -> np.ndarray:
         return np.where((limited[taken] != 0)[:, None] & (not off), ranges[taken], [-np.inf, np.inf])
 
+    # Fixed gains and absent biases may leave stale parameters in the arrays.
     no_gain = m.actuator_gaintype[taken] == int(file.mujoco.mjtGain.mjGAIN_FIXED)
     no_bias = m.actuator_biastype[taken] == int(file.mujoco.mjtBias.mjBIAS_NONE)
     gain, bias = m.actuator_gainprm[taken, :3].copy(), m.actuator_biasprm[taken, :3].copy()
@@ -195,8 +199,8 @@ def actuators(file: Compiled, model: Model) -> tuple[Actuators | None, list[str]
     return Actuators(names, tuple(sites), tuple(int(x) for x in places), *leaves), lines
 
 
-def _fault(file: Compiled, i: int) -> str:
-    """Why an actuator is not taken, in words that follow "actuators"; empty when it is."""
+def _fault(file: CompiledFile, i: int) -> str:
+    """Reason why an actuator is unsupported, to follow "actuators"; empty when it is supported."""
     m, mujoco = file.m, file.mujoco
     dynamics, gain, bias = m.actuator_dyntype[i], m.actuator_gaintype[i], m.actuator_biastype[i]
     kind, target = m.actuator_trntype[i], [int(x) for x in m.actuator_trnid[i]]

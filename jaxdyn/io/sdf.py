@@ -1,4 +1,4 @@
-"""Reading SDF files (the format of Gazebo), versions 1.4 to 1.12: trees, loops, gearboxes, nested models, worlds."""
+"""SDF loader (the format of Gazebo), versions 1.4 to 1.12: trees, loops, gearboxes, nested models, worlds."""
 
 import os
 from collections.abc import Iterable
@@ -9,8 +9,8 @@ import numpy as np
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.loops import gear, lock_joint, loop
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
-from jaxdyn.io.chains import Link, Names, add_chain, built
-from jaxdyn.io.loaded import LoadedScene, Start, listed, warn_not_taken, warn_of_units
+from jaxdyn.io.chains import Link, Names, add_chain, build_model
+from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn_of_units
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
 from jaxdyn.io.urdf import ROOT_JOINT
@@ -23,48 +23,48 @@ from jaxdyn.model.tree import Model
 
 _KINDS = dict(revolute="revolute", continuous="revolute", revolute2="revolute", universal="revolute")
 _KINDS |= dict(prismatic="prismatic", screw="helical", ball="spherical")
-_SECOND = "_axis2"  # behind the name of a joint of two axes: its second one
+_SECOND = "_axis2"  # suffix of a two-axis joint's second coordinate
 _PARALLEL = 1e-4  # files give right angles with four or five digits
 _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
 _SKIPPED = ("collision", "sensor", "plugin", "battery", "particle_emitter", "projector", "audio_source")
 
 
 def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DType | None = None) -> LoadedScene:
-    """The scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.
+    """Load the scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.
 
-    Taken are links with their inertias, all joints (of two axes as two joints, JOINT and JOINT_axis2), limits (as the
+    Supported are links with their inertias, all joints (of two axes as two joints, JOINT and JOINT_axis2), limits (as the
     model's `lower`, `upper`), damping, dry friction and springs of joints, gearboxes and mimicked axes as couplings,
     frames, nested models (their names start with MODEL::), static models, and the world's gravity. A joint that closes a
-    loop becomes a constraint; which ones do is chosen so that springs, damping and limits keep a coordinate, and balls
-    are cut first (`jaxdyn.io.sdf_joints.spanning_tree`). Where the format sets a default it is taken: a link without
+    loop becomes a constraint; the choice keeps coordinates for springs, damping and limits, and cuts ball joints
+    first (`jaxdyn.io.sdf_joints.spanning_tree`). Defaults of the format apply: a link without
     <inertial> has 1 kg and 1 kg m^2 about each axis.
 
-    `load_urdf` returns a `Model`, since a URDF holds a tree and nothing else; `load_mjcf` and `load_sdf` return a
+    `load_urdf` returns a `Model`, since a URDF describes only a tree; `load_mjcf` and `load_sdf` return a
     `LoadedScene`, a `Scene` with that model as `.system`.
 
-    Coordinates: zero is the placement of the file; a positive angle turns the child against the parent about the axis,
+    Coordinates: zero is the placement of the file; a positive angle rotates the child relative to the parent about the axis,
     also where the tree runs from child to parent. The coordinates of a free root (joint "root_joint", or LINK_root_joint
     of several) are its link's pose in the world. Every link keeps a frame of its name.
 
     **Arguments:**
 
     - `path`: the file.
-    - `floating_base`: whether what no joint ties to the world moves freely, as the format has it; False fixes the root
-      links where the file puts them. The root of a part is its model's canonical link.
+    - `floating_base`: whether parts without a joint to the world move freely, the default of the format; False fixes the root
+      links at the file's placement. The root of a part is its model's canonical link.
     - `dtype`: as for `ModelBuilder`.
 
     **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
     0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is the placement of the file, on which all loops close),
     `.actuators` (None), `.not_taken`. Gravity is that of the file's world (its default is 9.8 m/s^2), 9.81 m/s^2
-    downwards where the file holds a model alone.
+    downwards where the file has no world.
 
-    **Warns:** `NotTakenWarning` naming what the scene does not have: collisions, sensors, plugins, includes, screws that
+    **Warns:** `NotTakenWarning` naming unsupported elements: collisions, sensors, plugins, includes, screws that
     close loops, springs and damping of joints that close loops, and the like.
 
     `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
 
     **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, entity declarations,
-    another version, unknown names or types, poses in a circle, bad numbers, inertias that are to be computed from
+    another version, unknown names or types, cyclic poses, bad numbers, inertias to be computed from
     shapes; for a joint that moves no inertia.
     """
     file = SdfFile(path)
@@ -77,7 +77,7 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
     tree = {edge.joint.name: edge.joint for edge in edges if edge.joint is not None}
     loops, left = _loops(file, model, cut)
     couplings, also = _couplings(file, joints, tree)
-    not_taken = (*left, *also, *_unused(file))
+    not_taken = (*left, *also, *_unsupported(file))
     warn_not_taken(path, not_taken)
     warn_of_units(path, model)
     starts = {"reference": _start(file, model, roots)}
@@ -85,7 +85,7 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
 
 
 def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, dtype) -> tuple[Model, dict[str, str]]:
-    """The model, and the joints of its free roots with the link of each."""
+    """Build the model; return it with the joints of its free roots and the link of each."""
     first = next(iter(file.models.values())).element.get("name")
     name = first if len(file.models) == 1 or file.world is None else ""
     name = name or (file.world.get("name") if file.world is not None else "") or "mechanism"
@@ -93,6 +93,7 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
     if file.world is not None:
         gravity_element = file.world.find("gravity")
         gravity = (
+            # The format's default is 9.8, not 9.81.
             np.array([0.0, 0.0, -9.8]) if gravity_element is None else file.numbers(gravity_element, 3, "the world")
         )
         gravity = gravity if gravity.any() else None
@@ -114,6 +115,7 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
             place = f64.inverse(file.pose(edge.carrier)) @ place if edge.carrier is not None else place
         elif edge.body in free:
             root = names.new(ROOT_JOINT if len(free) == 1 else f"{edge.body}_{ROOT_JOINT}")
+            # The free joint's coordinates are the world pose of the link, so its home pose is the identity.
             roots[root] = edge.body
             links, place = [Link(root, "free", np.zeros(3), np.zeros(3), 0.0, {})], np.eye(4)
         element = file.links[edge.body][0] if edge.joint is None else edge.joint.element
@@ -125,7 +127,7 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
         carrier = file.link_of(frame)
         pose = file.pose(frame) if carrier is None else f64.inverse(file.pose(carrier)) @ file.pose(frame)
         builder.add_frame(frames.new(frame), carrier, pose)
-    return built(builder, file.path), roots
+    return build_model(builder, file.path), roots
 
 
 def _axis_names(joint: Joint) -> list[str]:
@@ -133,7 +135,7 @@ def _axis_names(joint: Joint) -> list[str]:
 
 
 def _links(edge: Edge, place: np.ndarray) -> list[Link]:
-    """The chain that carries a body: axes and anchor in its frame, the other way round for a joint taken backwards."""
+    """Chain of joints of a body: axes and anchor in its frame, reversed where the tree runs from child to parent."""
     joint = edge.joint
     if joint is None or joint.kind == "fixed":
         return []
@@ -146,6 +148,7 @@ def _links(edge: Edge, place: np.ndarray) -> list[Link]:
         word = "continuous" if kind == "revolute" and not axis.limited else kind
         direction = sign * place[:3, :3].T @ axis.direction
         links.append(Link(name, word, direction, anchor, 0.0, axis.leaves, joint.pitch))
+    # Two-axis joints reverse their order as well as their sign.
     return links[::-1] if edge.backwards else links
 
 
@@ -153,11 +156,12 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
     element, what = file.links[link][0], f"link {link!r}"
     inertial = element.find("inertial")
     if inertial is None:
+        # The format's default inertial: 1 kg and the unit matrix.
         return np.asarray(f64.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what))
     if (inertial.get("auto") or "").strip().lower() in ("1", "true"):
         raise file.fault(
             inertial,
-            f"the inertia of {what} is to be computed from its shapes, which is not done here; write <mass> "
+            f"the inertia of {what} is to be computed from its shapes, which is not supported; write <mass> "
             "and <inertia> (`gz sdf --inertial-stats FILE` prints them)",
         )
     get = lambda tag, default: file.number(inertial, f"inertia/{tag}", default, what)  # noqa: E731
@@ -172,12 +176,12 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
 
 
 def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constraint], list[str]]:
-    """Constraints that close the loops, and in words what of them was not taken."""
+    """Loop constraints, and descriptions of unsupported features of loop joints."""
     taken, left = [], {}
     for joint in cut:
         ends = (joint.parent, joint.child)
         if len(bodies := {body_index(model, end) for end in ends}) == 1:
-            # Two links that are fixed to each other, or to the world, are often joined twice.
+            # Files often join rigidly connected links twice; such a joint adds nothing.
             if joint.kind != "fixed" and bodies != {-1}:
                 left.setdefault("joints between two parts of one body", []).append(joint.name)
             continue
@@ -191,16 +195,16 @@ def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constrai
         poses = []
         for k, end in enumerate(ends):
             axis = joint.axes[min(k, len(joint.axes) - 1)].direction if joint.axes else joint.pose[:3, 2]
-            # The loop closes as the file places the links: both frames are there, z along the end's own axis.
-            place = f64.turn_from_z(axis)
+            # The file's placement closes the loop: both frames are at the joint, z along the end's own axis.
+            place = f64.rotation_from_z(axis)
             place[:3, 3] = joint.pose[:3, 3]
             poses.append(place if end is None else f64.inverse(file.pose(end)) @ place)
         taken.append(loop(ends[0], poses[0], ends[1], poses[1], LOOPS[joint.kind], name=joint.name))
-    return taken, [line for reason, names in left.items() for line in listed(reason, names)]
+    return taken, [line for reason, names in left.items() for line in summarize(reason, names)]
 
 
 def _couplings(file: SdfFile, joints: list[Joint], tree: dict[str, Joint]) -> tuple[list[Constraint], list[str]]:
-    """Gearboxes and mimicked axes, and in words those whose joints have no coordinate."""
+    """Couplings by gearboxes and mimicked axes, and descriptions of those whose joints have no coordinate."""
     taken: list[Constraint] = []
     left: list[str] = []
     for joint in joints:
@@ -212,11 +216,11 @@ def _couplings(file: SdfFile, joints: list[Joint], tree: dict[str, Joint]) -> tu
             if axis.mimic is not None:
                 made = _mimic(file, joint, name, axis, tree)
                 (left if made is None else taken).append(name if made is None else made)  # pyright: ignore[reportArgumentType]
-    return taken, listed("couplings of joints that have no coordinate or axes that are not parallel", left)
+    return taken, summarize("couplings of joints that have no coordinate or axes that are not parallel", left)
 
 
 def _gearbox(file: SdfFile, joint: Joint, tree: Iterable[Joint]) -> Constraint | None:
-    """theta_2 = -ratio theta_1, the angles of the gearbox's child and parent against its reference body."""
+    """Gearbox coupling theta_2 = -ratio theta_1 of the angles of its child and parent relative to its reference body."""
     element, scope = file.joints[joint.name]
     tag = element.find("gearbox_reference_body")
     if tag is None or not (tag.text or "").strip():
@@ -239,11 +243,13 @@ def _gearbox(file: SdfFile, joint: Joint, tree: Iterable[Joint]) -> Constraint |
 
 
 def _mimic(file: SdfFile, joint: Joint, name: str, axis: Axis, tree: dict[str, Joint]) -> Constraint | None:
-    """follower = multiplier (leader - reference) + offset."""
+    """Mimic coupling: follower = multiplier (leader - reference) + offset."""
     element, scope = axis.mimic, file.joints[joint.name][1]
     leader = scope.prefix + (element.get("joint") or "").strip()
     if leader not in file.joints:
-        raise file.fault(element, f"joint {name!r} mimics {leader!r}, which is not a joint of the file; mend <mimic>")
+        raise file.fault(
+            element, f"joint {name!r} mimics {leader!r}, which is not a joint of the file; correct <mimic>"
+        )
     which = element.get("axis") or "axis"
     numbers = (file.number(element, tag, default, f"joint {name!r}") for tag, default in _MIMIC)
     multiplier, offset, reference = numbers
@@ -274,7 +280,7 @@ def _forces(model: Model, tree: dict[str, Joint]) -> list:
 
 
 def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
-    """The placement of the file."""
+    """Start at the placement of the file."""
     q = np.concatenate([np.zeros(0), *(joint_neutral(kind) for kind in model.topology.kinds)])
     for joint, link in roots.items():
         pose = file.pose(link)
@@ -284,15 +290,15 @@ def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
     return Start(jnp.asarray(q, model.home.dtype), jnp.zeros(model.nv, model.home.dtype))
 
 
-def _unused(file: SdfFile) -> list[str]:
-    """What the file holds and the scene does not, apart from joints."""
+def _unsupported(file: SdfFile) -> list[str]:
+    """Elements of the file that the scene does not represent, apart from joints."""
     unused: dict[str, list[str]] = {}
     for link, (element, _) in file.links.items():
         for tag in _SKIPPED:
             if element.find(tag) is not None:
                 unused.setdefault(f"<{tag}> of links", []).append(link)
         if element.find("gravity") is not None and not file.flag(element, "gravity", f"link {link!r}"):
-            unused.setdefault("links without gravity (it acts on them here)", []).append(link)
+            unused.setdefault("links without gravity (simulated with gravity)", []).append(link)
         if file.flag(element, "kinematic", f"link {link!r}"):
             unused.setdefault("kinematic links", []).append(link)
         if element.find("inertial/fluid_added_mass") is not None:
@@ -306,5 +312,5 @@ def _unused(file: SdfFile) -> list[str]:
         for tag in ("plugin", "gripper"):
             if scope.element.find(tag) is not None:
                 unused.setdefault(f"<{tag}> of models", []).append(scope.element.get("name") or model)
-    lines = [line for reason, names in unused.items() for line in listed(reason, names)]
-    return [*lines, *listed("includes", file.includes)]
+    lines = [line for reason, names in unused.items() for line in summarize(reason, names)]
+    return [*lines, *summarize("includes", file.includes)]

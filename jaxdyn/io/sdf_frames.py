@@ -1,7 +1,7 @@
-"""Links, joints and frames of an SDF file, and where they are: the pose graph of the format, from version 1.4 on.
+"""Links, joints and frames of an SDF file and their poses: the pose graph of the format, from version 1.4 on.
 
 Every pose is given in a frame: by default the model's for links, the child link's for joints, that of `attached_to` for
-frames; from 1.7 on `relative_to` names another. Names reach into nested models by "::". Everything is resolved to poses
+frames; from 1.7 on `relative_to` names another. "::" separates names of nested models. All poses are resolved to poses
 in the world, as the file describes the mechanism.
 
 Source: sdformat.org, "Pose frame semantics", and the descriptions of each version of the format.
@@ -23,7 +23,7 @@ _VERSIONS = tuple(f"1.{minor}" for minor in range(4, 13))
 
 @dataclasses.dataclass(frozen=True)
 class Scope:
-    """A world or a model: what is named in it starts with `prefix`; `frame` is its own frame's name."""
+    """Scope of names, a world or a model: names in it start with `prefix`; `frame` names its own frame."""
 
     element: Any
     prefix: str
@@ -36,7 +36,7 @@ class SdfFile(XmlFile):
     """An SDF file with its links, joints and frames by their full names (MODEL::NAME in nested models).
 
     **Raises:** ValueError with file and line for malformed XML, versions other than 1.4 to 1.12, names that are missing,
-    taken or unknown, poses in a circle, and numbers that are none.
+    taken or unknown, cyclic poses, and invalid numbers.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -46,7 +46,7 @@ class SdfFile(XmlFile):
             raise self.fault(root, f"the root element is <{root.tag}>, expected <sdf>; this is not an SDF file")
         version = root.get("version") or ""
         if version not in _VERSIONS:
-            raise self.fault(root, f"the version is {version!r}; {_VERSIONS[0]} to {_VERSIONS[-1]} are read")
+            raise self.fault(root, f"the version is {version!r}; {_VERSIONS[0]} to {_VERSIONS[-1]} are supported")
         self.minor = int(version.partition(".")[2])
         self.links: dict[str, tuple[Any, Scope]] = {}
         self.joints: dict[str, tuple[Any, Scope]] = {}
@@ -78,16 +78,16 @@ class SdfFile(XmlFile):
                 known[name] = (element, scope)
                 continue
             static = scope.static or self.flag(element, "static", f"model {name!r}")
-            # The one model of a file gives no prefix to its names; several do, so that they stay apart.
+            # A single model gives no prefix to its names; several models do, to keep their names distinct.
             alone = scope.parent is None and len(scope.element.findall("model")) == 1
-            # Without a prefix the model's own frame must not take the name of what is in it.
+            # Without a prefix, the model's frame must not take the name of one of its elements.
             frame = "__model__" if alone and any(part.get("name") == name for part in element) else name
             inner = Scope(element, "" if alone else f"{name}::", frame, scope, static)
             self.models[frame] = inner
             self._collect(inner)
 
     def find(self, name: str, scope: Scope, element) -> str:
-        """Full name of a frame that is named within a scope. **Raises:** ValueError for an unknown one."""
+        """Resolve a name within a scope to the frame's full name. **Raises:** ValueError for an unknown one."""
         if name == "__model__":
             return scope.frame
         if name in (WORLD, "__root__"):
@@ -99,7 +99,7 @@ class SdfFile(XmlFile):
         raise self.fault(element, f"{unknown('frame', name, known)}; name a link, joint, frame or model of its scope")
 
     def raw_pose(self, element, what: str) -> np.ndarray:
-        """The numbers of an element's <pose> as (4, 4), the identity where there is none."""
+        """Matrix (4, 4) of an element's <pose>, the identity where there is none."""
         pose = element.find("pose")
         if pose is None or not (pose.text or "").strip():
             return np.eye(4)
@@ -112,16 +112,17 @@ class SdfFile(XmlFile):
         return self.pose_numbers(pose, what)
 
     def pose(self, name: str, stop: str = WORLD, trail: tuple[str, ...] = ()) -> np.ndarray:
-        """Pose (4, 4) of a frame in the world (or in the frame `stop` that it hangs on)."""
+        """Pose (4, 4) of a frame in the world, or in the frame `stop` that it is defined in."""
         if name == stop:
             return np.eye(4)
+        # Recursion along relative_to; the trail detects cycles.
         element, scope = self._entry(name)
         if name in trail:
             raise self.fault(
-                element, f"the poses of {', '.join(trail[trail.index(name) :])} hang on each other in a circle"
+                element, f"the poses of {', '.join(trail[trail.index(name) :])} refer to each other in a cycle"
             )
         if name == WORLD:
-            raise self.fault(scope.element, f"the frame {trail[0]!r} does not hang on the model {stop!r}")
+            raise self.fault(scope.element, f"the frame {trail[0]!r} is not defined in the model {stop!r}")
         raw = self.raw_pose(element, f"{element.tag} {name!r}")
         tag = element.find("pose")
         base = (tag.get("relative_to") or "").strip() if tag is not None else ""
@@ -162,7 +163,7 @@ class SdfFile(XmlFile):
         return self.pose(base) @ self.raw_pose(element, f"joint {name!r}")
 
     def end(self, joint: str, which: str) -> str:
-        """Full name of the frame that is a joint's "parent" or "child"."""
+        """Full name of a joint's "parent" or "child" frame."""
         element, scope = self.joints[joint]
         child = element.find(which)
         if child is None or not (child.text or "").strip():
@@ -170,10 +171,10 @@ class SdfFile(XmlFile):
         return self.find(child.text.strip(), scope, child)
 
     def link_of(self, name: str, trail: tuple[str, ...] = ()) -> str | None:
-        """The link that carries a frame, or None: the world, or a model that is static."""
+        """Link that carries a frame; None for the world and static models."""
         if name in trail:
             element, _ = self._entry(name)
-            raise self.fault(element, f"the frames {', '.join(trail)} are attached to each other in a circle")
+            raise self.fault(element, f"the frames {', '.join(trail)} are attached to each other in a cycle")
         if name == WORLD:
             return None
         if name in self.links:
@@ -188,7 +189,7 @@ class SdfFile(XmlFile):
         return self.canonical_link(self.models[name])
 
     def canonical_link(self, model: Scope) -> str | None:
-        """The link that carries a model's frame, None for the world when the model is static or empty."""
+        """Link that carries a model's frame, None for the world when the model is static or empty."""
         if model.static:
             return None
         if named := (model.element.get("canonical_link") or "").strip():

@@ -1,4 +1,4 @@
-"""Joints of an SDF file as data in world axes, and the choice of those that make the tree."""
+"""Joints of an SDF file as data in world axes, and the choice of the spanning tree."""
 
 import math
 from collections.abc import Iterable
@@ -12,14 +12,14 @@ from jaxdyn.model.builder import unknown
 
 # Axes of each kind. A gearbox is a coupling of two other joints, not a joint.
 AXES = dict(revolute=1, continuous=1, prismatic=1, screw=1, revolute2=2, universal=2, ball=0, fixed=0, gearbox=2)
-# The rows by which each closes a loop, as kinds of `jd.loop`; screws and gearboxes close none.
+# Kind of `jd.loop` for each kind of joint; screws and gearboxes cannot close loops.
 LOOPS = dict(revolute="revolute", continuous="revolute", prismatic="prismatic", universal="universal")
 LOOPS |= dict(revolute2="universal", ball="spherical", fixed="weld")
 _FAR = 1e15  # limits beyond this are none; +-1e16 was the default up to version 1.6
 
 
 class Axis(NamedTuple):
-    """An axis: direction (3,) in world axes, spring and what `ModelBuilder.add_body` takes of the joint."""
+    """Joint axis: direction (3,) in world axes, spring, and arguments of `ModelBuilder.add_body`."""
 
     direction: np.ndarray
     stiffness: float
@@ -30,7 +30,7 @@ class Axis(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """A joint between two links (None: the world), its point (3,) in the world, its axes and its pitch (m/rad)."""
+    """Joint between two links (None: the world), with its pose in the world, its axes and its pitch (m/rad)."""
 
     name: str
     kind: str
@@ -44,19 +44,19 @@ class Joint(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """A joint of the tree: it carries `body` on `carrier`; reversed where `body` is the joint's parent in the file."""
+    """Edge of the tree: `body` is attached to `carrier` by `joint`, backwards where `body` is the joint's parent in the file."""
 
-    joint: Joint | None  # None: the body stands on the world without a joint of the file
+    joint: Joint | None  # None: the body is a root without a joint in the file
     carrier: str | None
     body: str
     backwards: bool
 
 
 def read_joints(file: SdfFile) -> list[Joint]:
-    """All joints of a file, in its order.
+    """Read all joints of a file, in its order.
 
     **Raises:** ValueError with file and line for an unknown kind, a bad axis, a screw without a pitch, a joint that
-    carries a link on itself.
+    joins a link to itself.
     """
     joints = []
     for name, (element, scope) in file.joints.items():
@@ -95,6 +95,7 @@ def _axis(file: SdfFile, name: str, joint, scope, tag: str, kind: str, pose: np.
     lower, upper = get("limit/lower", -np.inf, finite=False), get("limit/upper", np.inf, finite=False)
     limited = kind != "continuous" and (lower > -_FAR or upper < _FAR)
     leaves: dict[str, Any] = {}
+    # Files write huge finite numbers for no limit; only finite limits become leaves.
     if limited:
         leaves = {"lower": lower if lower > -_FAR else -np.inf, "upper": upper if upper < _FAR else np.inf}
     for key, path in (("effort_limit", "limit/effort"), ("velocity_limit", "limit/velocity")):
@@ -125,14 +126,14 @@ def _pitch(file: SdfFile, name: str, joint) -> float:
 def spanning_tree(
     links: Iterable[str], fixed: Iterable[str], joints: list[Joint], first: Iterable[str]
 ) -> tuple[list[Edge], list[Joint]]:
-    """The joints of the tree, carriers before what they carry, and those left over, which close loops.
+    """Choose the joints of the tree, parents before children; the remaining joints close loops.
 
-    A joint that closes a loop has no coordinate, so its spring, damping and limits have no place. The tree prefers
-    joints with a spring, then with damping or friction, then with limits; ball joints, and joints that the file says
-    are to be cut, come last; among equals those nearest to the root by breadth first, then the file's order.
+    A joint that closes a loop has no coordinate, so its spring, damping and limits are lost. The tree prefers
+    joints with a spring, then with damping or friction, then with limits; ball joints, and joints marked
+    to be cut, come last; ties are broken by depth from the root in breadth-first order, then by the file's order.
 
-    **Arguments:** `links`; `fixed`, links that do not move; `joints` without gearboxes; `first`, links that are to be
-    roots where their part of the mechanism does not hang on the world, in order of preference.
+    **Arguments:** `links`; `fixed`, links that do not move; `joints` without gearboxes; `first`, links preferred as
+    roots of parts without a joint to the world, in order of preference.
     """
     links, fixed, first = list(links), set(fixed), list(first)
     nodes: list[str | None] = [None, *links]
@@ -144,6 +145,7 @@ def spanning_tree(
         near[None].append(link)
     depth: dict[str | None, int] = {}
     roots: list[str | None] = []
+    # Breadth first from the world, then from each preferred root of a part not reached yet.
     for start in (None, *first, *links):
         if start in depth:
             continue
@@ -162,7 +164,7 @@ def spanning_tree(
         deep = min(depth[joint.parent], depth[joint.child])
         return joint.cut, joint.kind == "ball", not springs, not moving, not limits, deep
 
-    # Kruskal's algorithm: the cheapest joints that join two parts, which makes the tree of least cost.
+    # Kruskal's algorithm: adding the cheapest joint between two parts gives the tree of least total cost.
     part: dict[str | None, str | None] = {node: node for node in nodes} | dict.fromkeys(fixed, None)
 
     def group(node: str | None) -> str | None:
@@ -179,6 +181,7 @@ def spanning_tree(
             continue
         chosen.append(joint)
         part[b if a is None else a] = a if a is None else b
+    # Directions follow from the roots outwards, whatever parent and child are in the file.
     edges: list[Edge] = [Edge(None, None, link, False) for link in links if link in fixed]
     edges += [Edge(None, None, root, False) for root in roots if root is not None]
     seen: set[str | None] = {None, *(edge.body for edge in edges)}

@@ -1,7 +1,7 @@
-"""Tendons that are linear in the joints' coordinates, and couplings of joints: forces and residuals for a scene.
+"""Tendons linear in the joints' coordinates, and polynomial couplings of joints.
 
 The length of such a tendon is l = sum_i c_i q_i over joints of one degree of freedom, so l and its rate are one row of
-numbers times q and v.
+coefficients times q and v.
 """
 
 from typing import Any
@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 
 
 class TendonForce(eqx.Module):
-    """Springs and dampers along tendons: tau = -rows^T (stiffness s + damping ldot), s how far l is out of `rest`.
+    """Springs and dampers along tendons: tau = -rows^T (stiffness s + damping ldot), s the excess of l over `rest`.
 
     Within the interval `rest` (lower, upper) the spring is slack; a spring without slack has both equal.
 
-    **Fields:** `q_index`, `v_index` (n,), places in q and v of the joints' coordinates; `rows` (nt, n), the
+    **Fields:** `q_index`, `v_index` (n,), indices of the joints' coordinates in q and v; `rows` (nt, n), the
     coefficients c (1 or m/rad); `stiffness` (N/m), `damping` (N s/m), (nt,); `rest` (nt, 2), m.
     """
 
@@ -34,15 +34,16 @@ class TendonForce(eqx.Module):
         )
         length = rows @ q[np.array(self.q_index)]
         place = np.array(self.v_index)
+        # Zero inside the rest interval, signed distance to it outside.
         stretch = length - jnp.clip(length, rest[:, 0], rest[:, 1])
         force = -(stiffness * stretch + damping * (rows @ v[place]))
         return jnp.zeros((system.nv,), q.dtype).at[place].set(force @ rows)
 
 
 class PolynomialCoupling(eqx.Module):
-    """Residual of l_1 - r_1 = sum_k c_k (l_2 - r_2)^k, (1,); l_1 and l_2 are rows of numbers times q.
+    """Residual of l_1 - r_1 = sum_k c_k (l_2 - r_2)^k, (1,); l_1 and l_2 are linear in q.
 
-    **Fields:** `index` (n,), places in q; `first`, `second` (n,), the rows of l_1 and l_2; `references` (2,), r;
+    **Fields:** `index` (n,), indices in q; `first`, `second` (n,), the rows of l_1 and l_2; `references` (2,), r;
     `coefficients` (5,), c_0 to c_4.
     """
 

@@ -1,7 +1,7 @@
-"""Reading URDF files.
+"""URDF loader.
 
-A file is read strictly: XML, structure, references and numbers, each fault with its line (`urdf_check`); `urdf_parts` makes
-numbers of it. Meshes and all that is only seen are never looked at.
+Files are checked strictly: XML, structure, references and numbers, each fault with its line (`urdf_check`); `urdf_parts`
+converts them. Meshes and other visual elements are not read.
 """
 
 import os
@@ -21,7 +21,7 @@ from jaxdyn.model.builder import GRAVITY, ModelBuilder, inertia_problems, unknow
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model
 
-# URDF has no number for "no limit", and its readers take no "inf"; `save_urdf` writes the largest double.
+# URDF has no number for "no limit", and other readers refuse "inf"; `save_urdf` writes the largest double.
 NO_LIMIT = float(np.finfo(np.float64).max)
 ROOT_JOINT = "root_joint"
 _Z = np.array([0.0, 0.0, 1.0])
@@ -46,12 +46,12 @@ def load_urdf(
     arguments: Mapping[str, Any] | None = None,
     dtype: DType | None = None,
 ) -> Model:
-    """The mechanism of a URDF file, or of a xacro file that expands to one. Meshes are not read.
+    """Load the mechanism of a URDF file, or of a xacro file that expands to one. Meshes are not read.
 
-    Links joined by fixed joints are merged; every link keeps a frame of its name. Joints stand in Pinocchio's order.
+    Links joined by fixed joints are merged; every link keeps a frame of its name. Joints are in Pinocchio's order.
     The inertias are those of the file, physical or not (`urdf_inertia_report`, `repair_inertias`). `damping` and
     `friction` of `<dynamics>` become leaves; so does `armature`, the rotor inertia seen at the joint, an attribute that
-    is no part of URDF and that `save_urdf` writes. A planar joint moves in the plane normal to its axis, as URDF has it
+    is an extension of URDF that `save_urdf` writes. A planar joint moves in the plane normal to its axis, as URDF defines it
     (Pinocchio moves it in the x-y plane of its frame whatever the axis); where that axis is not z, the moving body is
     called LINK_plane, has its z along the axis, and carries LINK.
 
@@ -59,10 +59,10 @@ def load_urdf(
 
     - `path`: the file.
     - `floating_base`: whether the root link moves freely, by a first joint "root_joint"; else it is fixed to the world.
-    - `lock`: joints to hold, at neutral (names) or at given coordinates (name -> number or (nq of the joint,)).
+    - `lock`: joints to lock, at neutral (names) or at given coordinates (name -> number or (nq of the joint,)).
       They become fixed and their links are merged.
-    - `mimic`: what to do with joints that follow others. "ignore" leaves them free, "couple" leaves them free and
-      records the couplings for a scene to impose (and holds those that follow a locked or a fixed joint: the latter at their
+    - `mimic`: treatment of mimic joints. "ignore" leaves them free, "couple" leaves them free and
+      records the couplings for a scene to impose (and locks those that follow a locked or a fixed joint, the latter at their
       offset), "error" refuses them.
     - `arguments`: of the `<xacro:arg>` elements of a file that ends in .xacro, which the package xacro expands.
     - `gravity`, `dtype`: as for `ModelBuilder`.
@@ -72,7 +72,7 @@ def load_urdf(
     velocity or effort, a zero axis; for names in `lock` that are not movable joints;
     for a joint that moves no inertia. ImportError for a xacro file without the package xacro.
 
-    **Warns:** UserWarning naming the links with an inertia that no body has; `UnitsWarning` where limits look like degrees,
+    **Warns:** UserWarning naming the links with an unphysical inertia; `UnitsWarning` where limits look like degrees,
     or lengths and inertias like millimetres.
     """
     file = XmlFile(path, "URDF", arguments)
@@ -90,10 +90,12 @@ def urdf_model(
     balls: Iterable[str] = (),
     followers: Mapping[str, tuple[Mimic, str]] | None = None,
 ) -> Model:
-    """As `load_urdf`; `balls` names joints that are spherical, a kind that a URDF cannot say; `followers` are joints that follow
-    others besides those that say so by `<mimic>`, each with file:line.
+    """Build the model of a URDF file, with options as of `load_urdf`.
 
-    **Raises:** as `load_urdf`; ValueError for balls that are no moving joints of the file.
+    `balls` names spherical joints, a kind that URDF lacks; `followers` are joints that follow others without `<mimic>`, each
+    with file:line.
+
+    **Raises:** as `load_urdf`; ValueError for balls that are no movable joints of the file.
     """
     if mimic not in ("ignore", "couple", "error"):
         raise ValueError(f"mimic is {mimic!r}; give 'ignore', 'couple' or 'error'")
@@ -106,7 +108,7 @@ def urdf_model(
         if kinds.get(name, "fixed") == "fixed":
             raise ValueError(f"{path}: {unknown('joint', name, kinds)}; a ball takes the place of a joint that moves")
         kinds[name] = "spherical"
-    locked = _locked({root_joint: "free", **kinds} if floating_base else kinds, lock, path)
+    locked = _lock_values({root_joint: "free", **kinds} if floating_base else kinds, lock, path)
     couplings = {name: joint.mimic for name, joint in urdf.joints.items() if joint.mimic}
     places = {name: urdf.places[f"joint {name}"] for name in couplings}
     for name, (coupling, where) in (followers or {}).items():
@@ -118,7 +120,7 @@ def urdf_model(
         listed = ", ".join(f"{name} (follows {coupling.joint})" for name, coupling in couplings.items())
         raise ValueError(f"{path}: joints that follow others: {listed}; pass mimic='couple' or mimic='ignore'")
     if mimic == "couple":
-        couplings = _settle(couplings, kinds, locked, places)
+        couplings = _resolve_couplings(couplings, kinds, locked, places)
 
     builder = ModelBuilder(urdf.name, gravity=gravity, dtype=dtype)
     builder.places = {name: urdf.places[f"link {name}"] for name in urdf.links}
@@ -126,6 +128,7 @@ def urdf_model(
     base = f64.joint_pose("free", np.zeros(6), locked[root_joint]) if root_joint in locked else None
     inertia = _inertia(urdf, urdf.root)
     builder.add_body(urdf.root, None, "free" if free else "fixed", inertia, joint_name=root_joint, pose=base)
+    # A stack in reverse gives depth-first order with siblings in the file's order; the builder sorts them by name.
     stack = list(reversed(urdf.children[urdf.root]))
     while stack:
         joint = urdf.joints[stack.pop()]
@@ -154,12 +157,12 @@ def urdf_model(
 def urdf_inertia_report(
     path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = None
 ) -> list[tuple[str, str]]:
-    """What is unphysical in the inertias that a URDF file states, as (link, problem), before links are merged.
+    """Unphysical inertias stated in a URDF file, as (link, problem), before links are merged.
 
-    Links without `<inertial>` are listed only where a joint moves them: a fixed one is a mere frame. `arguments` are as for
+    Links without `<inertial>` are listed only where a joint moves them: a fixed one is only a frame. `arguments` are as for
     `load_urdf`.
 
-    **Raises:** ValueError as `load_urdf` does for a file that cannot be understood.
+    **Raises:** ValueError as `load_urdf` does for a file that cannot be read.
     """
     urdf = _read(XmlFile(path, "URDF", arguments))
     moved = {joint.child for joint in urdf.joints.values() if joint.type != "fixed"}
@@ -179,8 +182,9 @@ def _add_joint(
     pose, parent, axis, turn = joint.origin, joint.parent, _Z, np.eye(4)
     if kind in SCREW_KINDS or kind == "planar":
         axis = np.asarray(f64.unit(joint.axis, f"joint {joint.name!r}: axis"))
+    # A planar joint moves in the x-y plane of its body; another normal needs an intermediate body.
     if kind == "planar":
-        turn, axis = f64.turn_from_z(axis), _Z
+        turn, axis = f64.rotation_from_z(axis), _Z
     if joint.name in locked:
         screw = np.concatenate([axis, np.zeros(3)] if kind == "prismatic" else [np.zeros(3), axis])
         pose = pose @ turn @ f64.joint_pose(kind, screw, locked[joint.name]) @ f64.inverse(turn)
@@ -199,7 +203,7 @@ def _leaves(joint: Joint, kind: str) -> dict[str, Any]:
     if joint.limit is not None:
         leaves |= {"velocity_limit": joint.limit.get("velocity"), "effort_limit": joint.limit.get("effort")}
         if kind in ("revolute", "prismatic"):
-            # The format's default for a bound that is left out is zero.
+            # The format's default for a missing bound is zero.
             leaves |= {key: joint.limit.get(key, 0.0) for key in ("lower", "upper")}
         for key in ("velocity_limit", "effort_limit", "lower", "upper"):
             if leaves.get(key) is not None and abs(leaves[key]) >= NO_LIMIT:
@@ -211,7 +215,7 @@ def _inertia(urdf: _Description, link: str) -> np.ndarray:
     inertial = urdf.links[link]
     if inertial is None:
         return np.zeros(10)
-    # A missing <mass> or <inertia> inside <inertial> is none at all.
+    # A missing <mass> or <inertia> inside <inertial> means zero.
     parts = (inertial.mass or 0.0, np.zeros(3), np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia)
     try:
         parameters = np.asarray(f64.inertia_numbers(parts, f"link {link!r}"))
@@ -220,8 +224,8 @@ def _inertia(urdf: _Description, link: str) -> np.ndarray:
     return parameters if inertial.origin is None else np.asarray(f64.move_inertia(inertial.origin, parameters))
 
 
-def _locked(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:
-    """The coordinates of each locked joint."""
+def _lock_values(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:
+    """Coordinates of each locked joint, from the option `lock`."""
     if isinstance(lock, str):
         raise ValueError(f"lock is {lock!r}; give a list of joint names or a mapping of name to value")
     values = dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(lock)
@@ -241,24 +245,27 @@ def _locked(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:
     return locked
 
 
-def _settle(couplings: dict, kinds: dict[str, str], locked: dict[str, np.ndarray], places: dict[str, str]) -> dict:
-    """The couplings that remain once joints coupled to locked or fixed ones are locked too (added to `locked`)."""
+def _resolve_couplings(
+    couplings: dict, kinds: dict[str, str], locked: dict[str, np.ndarray], places: dict[str, str]
+) -> dict:
+    """Lock joints coupled to locked or fixed ones (added to `locked`); return the remaining couplings."""
     left = dict(couplings)
     for name, coupling in couplings.items():
         where, leader = places[name], coupling.joint
         if leader not in kinds and name in locked:
-            del left[name]  # the caller says where it is
+            del left[name]  # the caller gives its coordinate
             continue
         for joint in (name, leader):
             if joint not in kinds:
                 fault = f"joint {name!r} follows {leader!r}; {unknown('joint', joint, kinds)}"
                 hold = f", hold it by lock={{{name!r}: 0.0}}" if name in kinds else ""
-                raise ValueError(f"{where}: {fault}; mend the name{hold}, or pass mimic='ignore'")
+                raise ValueError(f"{where}: {fault}; correct the name{hold}, or pass mimic='ignore'")
             if kinds[joint] not in (*SCREW_KINDS, "fixed"):
                 fault = f"joint {name!r} follows {leader!r}, but {joint!r} is {kinds[joint]}"
                 raise ValueError(f"{where}: {fault}; couple joints of one degree of freedom, or pass mimic='ignore'")
     held = {name: np.zeros(1) for name, kind in kinds.items() if kind == "fixed"}
     settled = False
+    # Chains of couplings: each pass may lock leaders of others, until none changes.
     while not settled:
         settled = True
         for name, coupling in list(left.items()):
@@ -286,7 +293,7 @@ def _read(file: XmlFile) -> _Description:
 
 
 def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str], path) -> str:
-    """The one link that no joint moves. Raises unless the links form one tree."""
+    """Root link, the only one that no joint moves. **Raises:** ValueError unless the links form one tree."""
     moved_by: dict[str, str] = {}
     for joint in joints.values():
         if joint.child in moved_by:
@@ -297,7 +304,7 @@ def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str],
     roots = [name for name in links if name not in moved_by]
     if len(roots) > 1:
         raise ValueError(f"{path}: there are {len(roots)} root links: {', '.join(roots)}; join them by a joint")
-    # From every link the chain of parents ends at the root, unless it is a circle.
+    # The chain of parents of every link ends at the root, unless it is a cycle.
     sound = set(roots)
     for start in links:
         visited, link = [], start

@@ -1,4 +1,4 @@
-"""What a URDF file must hold to be read: names, references and numbers, each fault with its line."""
+"""Checks of URDF files: names, references and numbers, each fault with its line."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -9,7 +9,7 @@ from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.arguments import parse_number
 
 JOINTS = {"floating": "free", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar", "fixed")}}
-# Attributes that must hold so many finite numbers where they are given. The model needs no others.
+# Number of finite values of each attribute used by the model.
 NUMBERS = {
     "origin": {"xyz": 3, "rpy": 3},
     "axis": {"xyz": 3},
@@ -22,11 +22,11 @@ NUMBERS = {
 REQUIRED = {"mass": ("value",), "inertia": tuple(NUMBERS["inertia"]), "parent": ("link",), "child": ("link",)}
 REQUIRED["mimic"] = ("joint",)
 _READ = {*NUMBERS, *REQUIRED, "inertial"}
-_PARENTS = ("link", "joint", "inertial")  # what holds each of the parts above at most once
+_PARENTS = ("link", "joint", "inertial")  # elements that contain each of the parts above at most once
 
 
 def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
-    """The link and joint elements, once names, references and numbers are found in order; file:line of each."""
+    """Check names, references and numbers; return the link and joint elements, and file:line of each."""
     root: Any = file.root
     fault = file.fault
     if root.tag != "robot":
@@ -51,7 +51,9 @@ def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
                 if part.get(key) is None:
                     raise fault(part, f"<{part.tag}> of {tag} {name!r} has no {key}")
             if part.get("quat_xyzw") is not None:
-                raise fault(part, f"<{part.tag}> of {tag} {name!r} has quat_xyzw, which is not read; write it as rpy")
+                raise fault(
+                    part, f"<{part.tag}> of {tag} {name!r} has quat_xyzw, which is not supported; write it as rpy"
+                )
             for key, count in NUMBERS.get(part.tag, {}).items():
                 if (text := part.get(key)) is not None and not _are_numbers(text, count):
                     what = "a finite number" if count == 1 else f"{count} finite numbers"
@@ -77,7 +79,7 @@ def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
 
 
 def _parts(element) -> Iterator[tuple]:
-    """What is read below an element, each with its parent, in the file's order; what is only seen is left out."""
+    """Yield the used elements below an element with their parents, in the file's order, without visual ones."""
     for part in element:
         if element.tag not in ("visual", "collision") and part.tag in _READ:
             yield element, part

@@ -1,15 +1,15 @@
-"""Loops of URDF files: the two places beside the tree where users write them.
+"""Loops of URDF files, in the two places where users write them.
 
-1. A YAML file with the URDF's name, as collections of parallel robots have it:
+1. A YAML file with the URDF's name, as in collections of parallel robots:
 
        closed_loop: [[frame_a, frame_b], ...]   links (or joints) whose frames coincide
-       type: [3d, 6d, ...]                      their origins alone, or their axes too; one word for all
+       type: [3d, 6d, ...]                      their origins only, or their axes too; one word for all
        name_mot: [joint, ...]                   joints with a motor
-       joint_name: [joint, ...]                 joints that are not what the URDF can say,
-       joint_type: [SPHERICAL, FIXED, ...]      a ball at the joint's frame, or held at zero
+       joint_name: [joint, ...]                 joints of kinds that URDF lacks,
+       joint_type: [SPHERICAL, FIXED, ...]      a ball joint at the joint's frame, or locked at zero
 
 2. `<gazebo>` elements with an SDF `<joint>` in them, which Gazebo adds to the tree (poses in the child's frame, axes in
-   the joint's, closed where all coordinates are zero), or with a plugin that mimics a joint (`<joint>`, `<mimicJoint>`,
+   the joint's, closed where all coordinates are zero), or with a mimic plugin (`<joint>`, `<mimicJoint>`,
    `<multiplier>`, `<offset>`).
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.loops import loop
-from jaxdyn.io.loaded import Actuators, listed
+from jaxdyn.io.loaded import Actuators, summarize
 from jaxdyn.io.sdf_joints import LOOPS
 from jaxdyn.io.urdf_parts import Mimic
 from jaxdyn.io.xml_lines import XmlFile
@@ -37,7 +37,7 @@ _TYPES = {"3d": "spherical", "6d": "weld"}
 
 
 class Closures(NamedTuple):
-    """What the YAML file says: pairs of frames with the joint that closes each, joints that are balls, held ones, motors."""
+    """Contents of the YAML file: pairs of frames with the joint that closes each, spherical joints, locked joints, motors."""
 
     path: str
     pairs: tuple[tuple[str, str, str], ...] = ()
@@ -47,13 +47,13 @@ class Closures(NamedTuple):
     not_taken: tuple[str, ...] = ()
 
 
-def closures_of(urdf: pathlib.Path, loops) -> Closures:
-    """What closes the loops of a URDF file.
+def read_closures(urdf: pathlib.Path, loops) -> Closures:
+    """Read the loops of a URDF file from its YAML file.
 
-    **Arguments:** `loops`: a YAML file; None: the one beside the URDF with its name, if it is there and names loops or
+    **Arguments:** `loops`: a YAML file; None: the one with the URDF's name in its folder, if it names loops or
     motors; False: none.
 
-    **Raises:** ValueError with the file for one that is no YAML, pairs that are no pairs of names, unknown types, lists of
+    **Raises:** ValueError with the file for malformed YAML, invalid pairs, unknown types, lists of
     different lengths.
     """
     if loops is False:
@@ -71,9 +71,9 @@ def _read(path: pathlib.Path, wanted: bool) -> Closures:
     try:
         text = path.read_text(encoding="utf-8")
         if not wanted and not any(key in text for key in _KEYS):
-            return Closures("")  # a file of this name that is about something else
+            return Closures("")  # an unrelated file with this name
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
-            # A few nested ones say gigabytes, and no list of loops needs them.
+            # A few nested aliases expand to gigabytes, and no list of loops needs them.
             raise ValueError(
                 f"{path}: aliases (*name) are refused, as they can expand without bound; write the text out"
             )
@@ -83,7 +83,7 @@ def _read(path: pathlib.Path, wanted: bool) -> Closures:
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         if not wanted:
             return Closures("")
-        raise ValueError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
+        raise ValueError(f"{path}: malformed YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict) or not set(_KEYS) & content.keys():
         if not wanted:
             return Closures("")
@@ -115,7 +115,7 @@ def _read(path: pathlib.Path, wanted: bool) -> Closures:
         tuple(name for name, word in chosen if word == "FIXED"),
         tuple(motors),
         tuple(
-            listed(
+            summarize(
                 f"kinds of joints in {path.name}, which stay as in the URDF",
                 (f"{name} ({word})" for name, word in chosen if word not in ("SPHERICAL", "FIXED")),
             )
@@ -131,28 +131,32 @@ def _names(content: dict, key: str, path) -> list[str]:
     return value
 
 
-def closing(closures: Closures, urdf: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
-    """The constraints of both conventions but for plugins that mimic, and in words what of them was not taken.
+def loop_constraints(closures: Closures, urdf: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
+    """Loop constraints of both conventions, without mimic plugins, and descriptions of unsupported features.
 
     **Raises:** ValueError with the file for frames and joints that the model does not have, and for bad numbers.
     """
     taken: list[Constraint] = []
     for a, b, kind in closures.pairs:
-        ends = [model.frame_names[_named(frame_index, model, name, f"{closures.path}: closed_loop")] for name in (a, b)]
+        ends = [
+            model.frame_names[_look_up(frame_index, model, name, f"{closures.path}: closed_loop")] for name in (a, b)
+        ]
         taken.append(loop(ends[0], np.eye(4), ends[1], np.eye(4), kind, name=f"{a}-{b}"))
     more, left = _gazebo(urdf, model)
     return [*taken, *more], [*closures.not_taken, *left]
 
 
 def motors_of(closures: Closures, model: Model) -> Actuators | None:
-    """Motors with a gain of one on the joints that `name_mot` names: controls are generalised forces (N m or N)."""
+    """Motors with unit gain on the joints in `name_mot`: controls are generalised forces (N m or N)."""
     if not closures.motors:
         return None
     columns = []
     for name in closures.motors:
-        joint = _named(joint_index, model, name, f"{closures.path}: name_mot")
+        joint = _look_up(joint_index, model, name, f"{closures.path}: name_mot")
         if KINDS[kind := model.topology.kinds[joint]].nv != 1:
-            raise ValueError(f"{closures.path}: name_mot: joint {name!r} is {kind}; motors drive joints of one freedom")
+            raise ValueError(
+                f"{closures.path}: name_mot: joint {name!r} is {kind}; motors drive joints with one degree of freedom"
+            )
         columns.append(model.topology.v_slices[joint].start)
     n, dtype = len(columns), model.home.dtype
     free = np.tile([-np.inf, np.inf], (n, 1))
@@ -168,7 +172,7 @@ def motors_of(closures: Closures, model: Model) -> Actuators | None:
     return Actuators(closures.motors, (None,) * n, tuple(int(x) for x in places), *leaves)
 
 
-def _named(index, model: Model, name: str, where: str) -> int:
+def _look_up(index, model: Model, name: str, where: str) -> int:
     try:
         return index(model, name)
     except ValueError as error:
@@ -176,7 +180,7 @@ def _named(index, model: Model, name: str, where: str) -> int:
 
 
 def _gazebo(file: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
-    """Joints of `<gazebo>` elements."""
+    """Loop constraints of joints in `<gazebo>` elements."""
     taken: list[Constraint] = []
     left: dict[str, list[str]] = {}
     for element in file.root.iter("gazebo"):
@@ -184,12 +188,12 @@ def _gazebo(file: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
             name = file.name(joint, "<gazebo>")
             kind = joint.get("type") or ""
             if kind not in LOOPS or (kind == "prismatic" and joint.find("axis") is None):
-                left.setdefault("<gazebo> joints of kinds that close no loop", []).append(f"{name} ({kind})")
+                left.setdefault("<gazebo> joints of kinds that cannot close a loop", []).append(f"{name} ({kind})")
                 continue
             taken.append(_gazebo_loop(file, joint, name, LOOPS[kind], model))
             if any(joint.find(f"axis/{tag}") is not None for tag in ("dynamics", "limit")):
                 left.setdefault("limits and damping of <gazebo> joints", []).append(name)
-    return taken, [line for reason, names in left.items() for line in listed(reason, names)]
+    return taken, [line for reason, names in left.items() for line in summarize(reason, names)]
 
 
 def _gazebo_loop(file: XmlFile, joint, name: str, kind: str, model: Model) -> Constraint:
@@ -209,9 +213,10 @@ def _gazebo_loop(file: XmlFile, joint, name: str, kind: str, model: Model) -> Co
         raise file.fault(
             pose, f"<pose> of {what} is relative to {pose.get('relative_to')!r}; write it in its child's frame"
         )
-    places = [np.eye(4) if end is None else _placed(model, end) for end in ends]
+    places = [np.eye(4) if end is None else _zero_pose(model, end) for end in ends]
+    # All coordinates zero is the configuration at which the format closes the loop.
     world = places[1] @ here
-    turns = [_turned(file, joint, tag, world, what) for tag in ("axis", "axis2")]
+    turns = [_axis_rotation(file, joint, tag, world, what) for tag in ("axis", "axis2")]
     turns = turns if kind == "universal" else turns[:1] * 2
     poses = []
     for place, turn in zip(places, turns, strict=True):
@@ -221,8 +226,8 @@ def _gazebo_loop(file: XmlFile, joint, name: str, kind: str, model: Model) -> Co
     return loop(ends[0], poses[0], ends[1], poses[1], kind, name=name)
 
 
-def _turned(file: XmlFile, joint, tag: str, world: np.ndarray, what: str) -> np.ndarray:
-    """Rotation (3, 3) of a frame in the world whose z is along an axis of the joint, given in the joint's frame."""
+def _axis_rotation(file: XmlFile, joint, tag: str, world: np.ndarray, what: str) -> np.ndarray:
+    """Rotation (3, 3) of a frame in the world with z along a joint axis that is given in the joint's frame."""
     xyz: Any = joint.find(f"{tag}/xyz")
     if xyz is not None and (xyz.get("expressed_in") or "").strip():
         raise file.fault(
@@ -232,11 +237,11 @@ def _turned(file: XmlFile, joint, tag: str, world: np.ndarray, what: str) -> np.
     axis = np.array(default) if xyz is None else file.numbers(xyz, 3, f"<{tag}> of {what}")
     if not axis.any():
         raise file.fault(xyz, f"<xyz> of <{tag}> of {what} is zero; give a direction")
-    return f64.turn_from_z(world[:3, :3] @ f64.unit(axis, what))[:3, :3]
+    return f64.rotation_from_z(world[:3, :3] @ f64.unit(axis, what))[:3, :3]
 
 
 def plugin_followers(file: XmlFile) -> dict[str, tuple[Mimic, str]]:
-    """Joints that follow others by a plugin in a `<gazebo>` element, mimicJoint = multiplier joint + offset; file:line of each.
+    """Joints that follow others by a `<gazebo>` plugin, mimicJoint = multiplier joint + offset, with file:line of each.
 
     **Raises:** ValueError with file and line for a plugin without the joints' names, bad numbers, a joint that follows twice.
     """
@@ -254,8 +259,8 @@ def plugin_followers(file: XmlFile) -> dict[str, tuple[Mimic, str]]:
     return followers
 
 
-def _placed(model: Model, frame: str) -> np.ndarray:
-    """World pose (4, 4) of a frame where all coordinates are zero, in float64."""
+def _zero_pose(model: Model, frame: str) -> np.ndarray:
+    """World pose (4, 4) of a frame at zero coordinates, in float64."""
     k = model.frame_names.index(frame)
     pose, body = np.asarray(model.frame_poses, np.float64)[k], model.topology.frame_bodies[k]
     while body >= 0:

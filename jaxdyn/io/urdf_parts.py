@@ -1,4 +1,4 @@
-"""Links and joints of a URDF file as numbers, with the defaults that the format sets for what is left out."""
+"""Data of links and joints of a URDF file, with the format's defaults for missing attributes."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ _MOMENTS = np.array([["ixx", "ixy", "ixz"], ["ixy", "iyy", "iyz"], ["ixz", "iyz"
 
 
 class Inertial(NamedTuple):
-    """Mass (kg), inertia (3, 3) (kg m^2) and the pose (4, 4) of its axes in the link; None where the file gives none."""
+    """Inertial data: mass (kg), inertia (3, 3) (kg m^2) and pose (4, 4) of its axes in the link; None where missing."""
 
     mass: float | None
     inertia: np.ndarray | None
@@ -20,7 +20,7 @@ class Inertial(NamedTuple):
 
 
 class Mimic(NamedTuple):
-    """The joint that is followed: q = multiplier q[joint] + offset."""
+    """Mimic relation to a leading joint: q = multiplier q[joint] + offset."""
 
     joint: str
     multiplier: float
@@ -28,7 +28,7 @@ class Mimic(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """A joint: `origin` (4, 4) of the child in the parent; `limit` and `dynamics` hold the numbers that the file gives."""
+    """Joint data: `origin` (4, 4) of the child in the parent; `limit` and `dynamics` hold the given attributes."""
 
     name: str
     type: str
@@ -42,7 +42,7 @@ class Joint(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What a file holds: the robot's name, links and joints by name in the file's order, and file:line of each."""
+    """Contents of a file: the robot's name, links and joints by name in the file's order, and file:line of each."""
 
     name: str
     links: dict[str, Inertial | None]
@@ -51,9 +51,9 @@ class Parts(NamedTuple):
 
 
 def read_parts(file: XmlFile) -> Parts:
-    """The links and joints of a file.
+    """Read the links and joints of a file.
 
-    **Raises:** ValueError with file and line, for all that `check_elements` refuses.
+    **Raises:** ValueError with file and line, for everything that `check_elements` refuses.
     """
     elements, places = check_elements(file)
     links = {part.get("name"): _inertial(part.find("inertial")) for part in elements if part.tag == "link"}
@@ -103,7 +103,7 @@ def _vector(element, key: str, default: str) -> np.ndarray:
 
 
 def _numbers(element) -> dict[str, float]:
-    """The numbers that the attributes of an element give."""
+    """Numeric attributes of an element."""
     if element is None:
         return {}
     return {key: float(element.get(key)) for key in NUMBERS[element.tag] if element.get(key) is not None}

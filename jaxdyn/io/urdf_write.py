@@ -1,4 +1,4 @@
-"""Writing models as URDF files that read back as the same model."""
+"""URDF writer; its files load as the same model."""
 
 import os
 import xml.etree.ElementTree as ET
@@ -18,7 +18,7 @@ _TYPES = {"free": "floating", **{kind: kind for kind in ("revolute", "continuous
 
 
 class _Edge(NamedTuple):
-    """A joint to be written: of body `body`, or a fixed one that carries a frame (None)."""
+    """Joint to be written: of body `body`, or a fixed one of a frame (None)."""
 
     joint: str
     parent: str
@@ -30,20 +30,20 @@ class _Edge(NamedTuple):
 def save_urdf(
     model: Model, path: str | os.PathLike, *, torques: Mapping[str, Mapping[str, float]] | None = None
 ) -> None:
-    """Write a model as a URDF file; `load_urdf` gives the same model back, to rounding.
+    """Write a model as a URDF file; `load_urdf` returns the same model, to rounding.
 
-    Bodies become links, other frames become links on fixed joints; what was merged stays merged. A single root body on
+    Bodies become links, other frames become links on fixed joints; merged links stay merged. A single root body on
     a free joint "root_joint" becomes the root link (load it with `floating_base=True`); otherwise the root is a frame
-    that coincides with the world's, or a new link "world". Siblings that do not stand in the order of their joint names
-    hang on frames of their parent, or on added ones "..._carrier". Couplings become `<mimic>` (load with
-    `mimic="couple"`), armature an attribute of `<dynamics>`, beside damping and friction, which are written as zero where the
-    model has none; gravity has no place in the file. Infinite limits are
-    written as the largest double, because readers of URDF take no "inf".
+    that coincides with the world's, or a new link "world". Siblings that are not sorted by joint name
+    are attached to frames of their parent, or to added ones "..._carrier". Couplings become `<mimic>` (load with
+    `mimic="couple"`), armature an attribute of `<dynamics>`, next to damping and friction, which are written as zero where the
+    model has none; gravity is not written. Infinite limits are
+    written as the largest double, because other readers refuse "inf".
 
-    `torques`: of joints by name, numbers of torques that URDF has no place for, as {"shoulder": {"offset": 0.3}}. They go into
-    an element `<jaxdyn>` below `<robot>`, which other readers of URDF pass over; `jaxdyn.io.joint_torques` reads them back.
+    `torques`: additional torque parameters by joint name, which URDF lacks, as {"shoulder": {"offset": 0.3}}. They go into
+    an element `<jaxdyn>` below `<robot>`, which other readers ignore; `jaxdyn.io.joint_torques` reads them.
 
-    **Raises:** ValueError naming the joint or body for what URDF cannot express: helical and spherical joints, limits
+    **Raises:** ValueError naming the joint or body for features that URDF cannot express: helical and spherical joints, limits
     of planar and free joints, friction or armature that differs between the directions of one joint, first moments
     without mass; for `torques` of joints that the model does not have, or numbers that are not finite.
     OSError when the file cannot be written.
@@ -65,9 +65,9 @@ def save_urdf(
 
 
 def joint_torques(path: str | os.PathLike) -> dict[str, dict[str, float]]:
-    """Numbers of joints' torques that `save_urdf` wrote beside what URDF has a place for; empty where the file has none.
+    """Read the additional torque parameters that `save_urdf` wrote; empty where the file has none.
 
-    **Raises:** ValueError with file and line for a file that is no XML, or a number that is none, with the joint.
+    **Raises:** ValueError with file and line for malformed XML, or an invalid number, with the joint.
     """
     file = XmlFile(path, "URDF")
     result: dict[str, dict[str, float]] = {}
@@ -96,7 +96,7 @@ def _write_torques(robot: ET.Element, model: Model, torques: Mapping[str, Mappin
 
 
 def _edges(model: Model) -> tuple[str, list[_Edge]]:
-    """The root link, and joints whose depth-first order with siblings sorted by name is the model's order."""
+    """Root link, and joints whose depth-first order with siblings sorted by name is the model's order."""
     topology = model.topology
     home, poses = np.asarray(model.home, np.float64), np.asarray(model.frame_poses, np.float64)
     links, joints = set(topology.frame_names), set(topology.joint_names)
@@ -116,7 +116,7 @@ def _edges(model: Model) -> tuple[str, list[_Edge]]:
 
     edges = []
     for carrier, name in sorted(names.items()):
-        runs = _sorted_runs([topology.joint_names[i] for i in children[carrier]])
+        runs = _split_runs([topology.joint_names[i] for i in children[carrier]])
         last = max((topology.joint_names[i] for i in children[carrier]), default="")
         holders = [(name, np.eye(4))]
         for n in range(max(len(frames[carrier]), len(runs) - 1)):
@@ -124,7 +124,7 @@ def _edges(model: Model) -> tuple[str, list[_Edge]]:
             link, pose = (
                 (_fresh(f"{name}_carrier", links), np.eye(4)) if k is None else (topology.frame_names[k], poses[k])
             )
-            # What hangs on a holder is read when the holder's joint comes up: after all joints named before it.
+            # Bodies on a holder are visited with the holder's joint, after all joints with smaller names.
             joint = f"{last}~{n:03d}" if n + 1 < len(runs) else f"{link}_fixed"
             edges.append(_Edge(_fresh(joint, joints), name, link, pose, None))
             holders.append((link, pose))
@@ -147,8 +147,8 @@ def _has_floating_base(model: Model) -> bool:
     )
 
 
-def _sorted_runs(names: list[str]) -> list[list[str]]:
-    """The names cut where one is smaller than the one before it."""
+def _split_runs(names: list[str]) -> list[list[str]]:
+    """Split a list of names into sorted runs."""
     runs: list[list[str]] = []
     for name in names:
         if runs and name > runs[-1][-1]:
@@ -159,7 +159,7 @@ def _sorted_runs(names: list[str]) -> list[list[str]]:
 
 
 def _fresh(name: str, taken: set[str]) -> str:
-    """The name, with underscores until nothing else has it; it counts as taken from now on."""
+    """Reserve a name, with underscores appended until it is unique."""
     while name in taken:
         name += "_"
     taken.add(name)
@@ -173,7 +173,7 @@ def _write_link(robot: ET.Element, name: str, parameters: np.ndarray | None) -> 
     mass, com, inertia = f64.about_com(parameters)
     if mass == 0 and parameters[1:4].any():
         raise ValueError(
-            f"body {name!r} has first moments {parameters[1:4].tolist()} kg m without mass; URDF cannot say so"
+            f"body {name!r} has first moments {parameters[1:4].tolist()} kg m without mass; URDF cannot express them"
         )
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=_text(com), rpy="0 0 0")
@@ -233,7 +233,7 @@ def _write_limits(joint: ET.Element, model: Model, body: int, what: str) -> None
     finite = [key for key, values in limits.items() if np.isfinite(values).any()]
     if kind in ("planar", "free"):
         if finite:
-            raise ValueError(f"{what} is {kind} and has limits ({', '.join(finite)}); URDF cannot say so")
+            raise ValueError(f"{what} is {kind} and has limits ({', '.join(finite)}); URDF cannot express them")
         return
     if finite or kind != "continuous":
         ET.SubElement(

@@ -1,7 +1,7 @@
-"""XML as ElementTree elements that know their line, and reads that say where a file is wrong.
+"""XML parsing to ElementTree elements with line numbers, and readers whose errors name file and line.
 
 Entity declarations are refused: robot files need none, and a few nested ones expand to gigabytes. A file is decoded here by
-Python's codecs, since expat knows four encodings, and none of those of more than one byte that files from East Asia have.
+Python's codecs, since expat knows only four encodings, none of them the multi-byte ones of East Asia.
 """
 
 import codecs
@@ -19,7 +19,7 @@ from jaxdyn.model.arguments import as_path, parse_number
 
 
 class Element(ElementTree.Element):
-    """An element with the line on which it starts."""
+    """Element with the line on which it starts."""
 
     line: int = 0
 
@@ -35,9 +35,9 @@ _DECLARED = re.compile(rb"""<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]+)["']""")
 
 
 class XmlFile:
-    """An XML file: its root element, and reads of numbers and words that raise with file and line.
+    """XML file with its root element, and readers of numbers and words whose errors name file and line.
 
-    The text is decoded as the XML declaration says, by any codec that Python knows, else as UTF-8. `is_utf8` says whether the
+    The text is decoded by the declared encoding, if Python knows it, else as UTF-8. `is_utf8` is true when the
     bytes are UTF-8. A file whose name ends in .xacro is expanded first, with `arguments` for its `<xacro:arg>`; lines are then
     those of the expanded text.
 
@@ -68,6 +68,7 @@ class XmlFile:
             return made
 
         def entity(name, *_) -> NoReturn:
+            # Refused at the declaration, before anything can expand.
             raise ValueError(
                 f"{self.path}:{parser.CurrentLineNumber}: the file declares the entity {name!r}, which is refused, as "
                 "entities can expand without bound; write its text where it is used"
@@ -90,11 +91,11 @@ class XmlFile:
         self.root = builder.close()
 
     def fault(self, element, text: str) -> ValueError:
-        """An error that names the file and the element's line."""
+        """Error that names the file and the element's line."""
         return ValueError(f"{self.path}:{getattr(element, 'line', '')}: {text}")
 
     def name(self, element, what: str) -> str:
-        """The attribute `name`. **Raises:** ValueError where there is none."""
+        """Attribute `name`. **Raises:** ValueError where there is none."""
         if not (name := (element.get("name") or "").strip()):
             raise self.fault(element, f"a <{element.tag}> of {what} has no name")
         return name
@@ -104,7 +105,7 @@ class XmlFile:
         return (element.findtext(tag) or default).strip()
 
     def numbers(self, element, count: int | tuple[int, ...], what: str) -> np.ndarray:
-        """The finite numbers that an element holds. **Raises:** ValueError for others than `count` of them."""
+        """Read the finite numbers in an element. **Raises:** ValueError for another count than `count`."""
         counts = (count,) if isinstance(count, int) else count
         text = (element.text or "").strip()
         try:
@@ -117,7 +118,7 @@ class XmlFile:
         return values
 
     def pose_numbers(self, pose, what: str) -> np.ndarray:
-        """The numbers of an SDF <pose> as (4, 4): x y z and roll pitch yaw, in degrees or as a quaternion where it says so."""
+        """Matrix (4, 4) of an SDF <pose>: x y z and roll pitch yaw, in degrees or as a quaternion where stated."""
         if pose.get("rotation_format") == "quat_xyzw":
             values = self.numbers(pose, 7, what)
             if not values[3:].any():
@@ -128,7 +129,7 @@ class XmlFile:
         return np.asarray(f64.pose_matrix((values[:3], turn), what))
 
     def number(self, element, tag: str, default: float, what: str, *, finite: bool = True) -> float:
-        """A number in a child element `tag` (a path), or the default where there is none or it is empty."""
+        """Read a number in a child element `tag` (a path), or the default where it is missing or empty."""
         child = None if element is None else element.find(tag)
         if child is None or not (child.text or "").strip():
             return default
@@ -137,7 +138,7 @@ class XmlFile:
         return float(self.numbers(child, 1, what)[0])
 
     def flag(self, element, tag: str, what: str) -> bool:
-        """A truth value in a child element, false where there is none."""
+        """Read a truth value in a child element, false where there is none."""
         child = None if element is None else element.find(tag)
         text = "" if child is None else (child.text or "").strip().lower()
         if text not in ("", "0", "1", "true", "false"):
@@ -146,18 +147,19 @@ class XmlFile:
 
 
 def _decode(path: str, data: bytes) -> tuple[str, str]:
-    """The text of an XML file, and the encoding that it declares or that its first bytes show."""
+    """Decode an XML file by its declared encoding or its byte order mark; return text and encoding."""
     encoding = next((name for mark, name in _MARKS if data.startswith(mark)), None)
     if encoding is None:
         declared = _DECLARED.match(data.lstrip())
         encoding = "utf-8" if declared is None else declared[1].decode(errors="replace")
+        # Declared UTF-16 or UTF-32 without a byte order mark, in single bytes: the declaration is wrong.
         if re.match("(utf|ucs)[-_]?(16|32|2|4)", encoding.lower()):
             raise ValueError(
                 f'{path}:1: the XML declaration says {encoding}, in bytes that are not; write encoding="UTF-8", or leave it out'
             )
     try:
         text = data.decode(encoding)
-        text.encode("utf-8")  # expat takes no half of a surrogate pair
+        text.encode("utf-8")  # expat refuses lone surrogates
     except LookupError as error:
         raise ValueError(
             f"{path}:1: the encoding {encoding!r} of the XML declaration is unknown; save the file as UTF-8"
@@ -172,7 +174,7 @@ def _decode(path: str, data: bytes) -> tuple[str, str]:
 
 
 def _expand(path: str, arguments: Mapping[str, Any]) -> str:
-    """The text that xacro makes of a file, with the lines of `xacro FILE`."""
+    """Expand a xacro file to text, with the line numbers of `xacro FILE`."""
     try:
         import xacro
     except ImportError as error:
@@ -182,4 +184,4 @@ def _expand(path: str, arguments: Mapping[str, Any]) -> str:
         return xacro.process_file(path, mappings=words).toprettyxml(indent="  ")  # pyright: ignore[reportAttributeAccessIssue]
     except Exception as error:  # expressions of a file raise anything
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{path}: xacro: {reason}; mend the file, or give its arguments={{NAME: VALUE}}") from error
+        raise ValueError(f"{path}: xacro: {reason}; correct the file, or give its arguments={{NAME: VALUE}}") from error

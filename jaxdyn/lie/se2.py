@@ -1,8 +1,8 @@
 """Motions of the plane: SE(2) as 3x3 matrices [[R, p], [0, 1]].
 
 Twists V = (vx, vy, omega) and wrenches F = (fx, fy, tau) are (3,), linear part first; positive omega turns x towards
-y. T_ab (3, 3) maps coordinates in frame b to coordinates in frame a. Units, names and conventions are those of `se3`,
-of which this is the part with z = 0. Every function takes one sample; batch with `jax.vmap`.
+y. T_ab (3, 3) maps coordinates in frame b to coordinates in frame a. Units, names and conventions are those of `se3`.
+Each function is the part of its namesake there with z = 0. Every function takes one sample; batch with `jax.vmap`.
 """
 
 import jax.numpy as jnp
@@ -17,8 +17,8 @@ Twist = Float[Array, "3"]
 Matrix = Float[Array, "3 3"]
 
 
-def _turned(p: Point) -> Point:
-    # A quarter turn: z x p, so that a planar cross product is omega * _turned(p).
+def _quarter_turn(p: Point) -> Point:
+    # z x p, so that a planar cross product is omega * _quarter_turn(p).
     x, y = jnp.unstack(p)
     return jnp.stack([-y, x])
 
@@ -60,6 +60,7 @@ def vee(matrix: Matrix) -> Twist:
 
     **Arguments:** `matrix`: (3, 3). **Returns:** (vx, vy, omega), (3,).
     """
+    # Averaging both off-diagonal entries keeps vee(hat(V)) = V and spreads a rounding error over the two.
     return jnp.stack([matrix[0, 2], matrix[1, 2], 0.5 * (matrix[1, 0] - matrix[0, 1])])
 
 
@@ -73,6 +74,7 @@ def exp(twist: Twist) -> Matrix:
     Source: Murray, Li, Sastry, A Mathematical Introduction to Robotic Manipulation (1994), eq. 2.36 in the plane.
     """
     x, y, theta = jnp.unstack(twist)
+    # c1 and c2 are series near theta = 0, where sin(theta)/theta and (1 - cos(theta))/theta^2 are 0/0.
     _, c1, c2, _ = stumpff(theta * theta)
     cos, sin, h = jnp.cos(theta), jnp.sin(theta), c2 * theta
     o, one = jnp.zeros_like(theta), jnp.ones_like(theta)
@@ -87,10 +89,11 @@ def log(transform: Matrix) -> Twist:
 
     **Arguments:** `transform`: (3, 3). **Returns:** (rho, theta), (3,), m and rad.
     """
+    # atan2 needs no clipping and keeps full precision at theta = 0 and pi, unlike arccos of half the trace.
     theta = jnp.arctan2(transform[1, 0], transform[0, 0])
     p = transform[:2, 2]
     s = theta * theta
-    rho = (1.0 - s * inverse_coefficient(s)) * p - (0.5 * theta) * _turned(p)
+    rho = (1.0 - s * inverse_coefficient(s)) * p - (0.5 * theta) * _quarter_turn(p)
     return jnp.concatenate([rho, theta[None]])
 
 
@@ -105,7 +108,7 @@ def Ad(transform: Matrix) -> Matrix:
 
     **Arguments:** `transform`: T_ab, (3, 3). **Returns:** (3, 3). To act on one vector use `Ad_apply`.
     """
-    return from_parts(transform[:2, :2], -_turned(transform[:2, 2]))
+    return from_parts(transform[:2, :2], -_quarter_turn(transform[:2, 2]))
 
 
 def ad(twist: Twist) -> Matrix:
@@ -143,6 +146,7 @@ def left_jacobian_inverse(twist: Twist) -> Matrix:
     |theta| = 2 pi.
     """
     x, y, theta = jnp.unstack(twist)
+    # 1 - s d = (theta/2) cot(theta/2), by the coefficient that stays finite at theta = 0.
     s = theta * theta
     d = inverse_coefficient(s)
     e, h, k = 1.0 - s * d, 0.5 * theta, d * theta
@@ -155,7 +159,7 @@ def Ad_apply(transform: Matrix, twist: Twist) -> Twist:
 
     **Arguments:** `transform`: T_ab, (3, 3); `twist`: in b, (3,). **Returns:** in a, (3,).
     """
-    v = _product(transform[:2, :2], twist[:2]) - twist[2] * _turned(transform[:2, 2])
+    v = _product(transform[:2, :2], twist[:2]) - twist[2] * _quarter_turn(transform[:2, 2])
     return jnp.concatenate([v, twist[2:]])
 
 
@@ -164,7 +168,8 @@ def Ad_inv_apply(transform: Matrix, twist: Twist) -> Twist:
 
     **Arguments:** `transform`: T_ab, (3, 3); `twist`: in a, (3,). **Returns:** in b, (3,).
     """
-    v = _product(twist[:2] + twist[2] * _turned(transform[:2, 2]), transform[:2, :2])
+    # Vector times matrix is R^T v without a transposed copy.
+    v = _product(twist[:2] + twist[2] * _quarter_turn(transform[:2, 2]), transform[:2, :2])
     return jnp.concatenate([v, twist[2:]])
 
 
@@ -192,7 +197,7 @@ def ad_apply(twist: Twist, other: Twist) -> Twist:
 
     **Arguments:** `twist`, `other`: V1, V2, (3,), in the same frame. **Returns:** (3,).
     """
-    v = _turned(twist[2] * other[:2] - other[2] * twist[:2])
+    v = _quarter_turn(twist[2] * other[:2] - other[2] * twist[:2])
     return jnp.concatenate([v, jnp.zeros_like(twist[2:])])
 
 
@@ -202,4 +207,4 @@ def adT_apply(twist: Twist, wrench: Twist) -> Twist:
     **Arguments:** `twist`: V, (3,); `wrench`: F, (3,), same frame. **Returns:** (3,).
     """
     f = wrench[:2]
-    return jnp.concatenate([-twist[2] * _turned(f), _area(f, twist[:2])[None]])
+    return jnp.concatenate([-twist[2] * _quarter_turn(f), _area(f, twist[:2])[None]])

@@ -75,6 +75,7 @@ def exp(twist: Twist) -> Matrix:
 
     Source: Murray, Li, Sastry (1994), eq. 2.36; Barfoot, State Estimation for Robotics (2017), eq. 7.85.
     """
+    # Expanding J(phi) rho by its three terms costs one cross product and no matrix.
     rho, phi = twist[:3], twist[3:]
     c0, c1, c2, c3 = stumpff(jnp.sum(phi * phi))
     rotation = so3._isotropic_sum(c0, c1, c2, phi)
@@ -90,6 +91,7 @@ def log(transform: Matrix) -> Twist:
 
     **Arguments:** `transform`: (4, 4), rotation orthogonal to rounding. **Returns:** (rho, phi), (6,), m and rad.
     """
+    # rho must use the same branch of phi as the logarithm of R, or exp(log(T)) would miss T at angle pi.
     p = transform[:3, 3]
     phi = so3.log(transform[:3, :3])
     s = jnp.sum(phi * phi)
@@ -169,6 +171,7 @@ def Ad_inv_apply(transform: Matrix, twist: Twist) -> Twist:
     """
     rotation, p = transform[:3, :3], transform[:3, 3]
     v, omega = twist[:3], twist[3:]
+    # Row vector times R is R^T times the vector, without a transposed copy.
     return jnp.concatenate([_product(v - cross(p, omega), rotation), _product(omega, rotation)])
 
 
@@ -197,6 +200,7 @@ def ad_apply(twist: Twist, other: Twist) -> Twist:
 
     **Arguments:** `twist`, `other`: V1, V2, (6,), in the same frame. **Returns:** (6,).
     """
+    # omega1 x v2 - omega2 x v1, written with v1 x omega2 so that both terms add.
     v1, omega1 = twist[:3], twist[3:]
     v2, omega2 = other[:3], other[3:]
     return jnp.concatenate([cross(omega1, v2) + cross(v1, omega2), cross(omega1, omega2)])

@@ -53,11 +53,13 @@ def stumpff(s: Scalar, order: int = 3) -> tuple[Scalar, ...]:
     theta = jnp.sqrt(s_large)
     near = [s_small] * (order + 1)
     far = [jnp.cos(theta), jnp.sin(theta) / theta] + [s_large] * (order - 1)
+    # Downwards: only the two highest functions are summed as series, each lower one costs one product.
     for k in range(order, -1, -1):
         if k > order - 2:
             near[k] = _polynomial(s_small, [(-1.0) ** j / math.factorial(2 * j + k) for j in range(n_terms)])
         else:
             near[k] = 1.0 / math.factorial(k) - s_small * near[k + 2]
+    # Upwards from cosine and sine: division by s >= 4 damps rounding errors.
     for k in range(2, order + 1):
         far[k] = (1.0 / math.factorial(k - 2) - far[k - 2]) / s_large
     return tuple(jnp.where(small, a, b) for a, b in zip(near, far, strict=True))
@@ -82,6 +84,7 @@ def inverse_coefficient(s: Scalar) -> Scalar:
 
     Source: Bullo and Murray, Proportional derivative (PD) control on the Euclidean group (1995).
     """
+    # c2 is positive up to the first zero at 2 pi, so the quotient needs no guard inside the domain.
     _, _, c2, c3, c4 = stumpff(s, 4)
     return (0.5 * c3 - c4) / c2
 

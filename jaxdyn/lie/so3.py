@@ -26,6 +26,7 @@ def cross(a: Vector, b: Vector) -> Vector:
 
     **Arguments:** `a`, `b`: (3,), in the same frame. **Returns:** (3,), product of their units.
     """
+    # Six products instead of nine for a matrix; XLA fuses the scalar form into its surroundings.
     ax, ay, az = jnp.unstack(a)
     bx, by, bz = jnp.unstack(b)
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
@@ -143,7 +144,7 @@ def quat_exp(phi: Vector) -> Quaternion:
 
     Source: Murray, Li, Sastry (1994), chapter 2, section 2.3.
     """
-    # sin(theta/2)/theta is half of sin(h)/h at the half angle h, so the same functions serve.
+    # sin(theta/2)/theta is half of sin(h)/h at the half angle h, which makes the Stumpff functions applicable.
     c0, c1, _, _ = stumpff(0.25 * jnp.sum(phi * phi))
     return jnp.concatenate([c0[None], (0.5 * c1) * phi])
 
@@ -156,6 +157,7 @@ def quat_log(q: Quaternion) -> Vector:
 
     **Arguments:** `q`: (4,), of any length but zero, which does not matter. **Returns:** (3,), rad.
     """
+    # q and -q are the same rotation; w >= 0 selects the shorter angle, at most pi.
     q = jnp.where(q[0] < 0.0, -q, q)
     v = q[1:]
     return angle_ratio(jnp.sum(v * v), q[0]) * v
@@ -217,8 +219,8 @@ def quat_rotate(q: Quaternion, x: Vector) -> Vector:
     **Arguments:** `q`: (4,), of R_ab, not zero (NaN); `x`: (3,), in frame b. **Returns:** (3,), in frame a.
     """
     w, v = q[0], q[1:]
-    moved = (2.0 / jnp.sum(q * q)) * cross(v, x)
-    return x + w * moved + cross(v, moved)
+    doubled = (2.0 / jnp.sum(q * q)) * cross(v, x)
+    return x + w * doubled + cross(v, doubled)
 
 
 def matrix_to_quat(rotation: Matrix) -> Quaternion:
@@ -238,6 +240,7 @@ def matrix_to_quat(rotation: Matrix) -> Quaternion:
     yz, zx, xy = r21 + r12, r02 + r20, r10 + r01
     ww = 1.0 + xx + yy + zz
     x4, y4, z4 = 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz
+    # Symmetric, row i = 4 q_i q: the diagonal entries sum to 4, so the largest is at least 1.
     rows = jnp.stack([ww, wx, wy, wz, wx, x4, xy, zx, wy, xy, y4, yz, wz, zx, yz, z4]).reshape(4, 4)
     of_wx = jnp.where(ww >= x4, rows[0], rows[1])
     of_yz = jnp.where(y4 >= z4, rows[2], rows[3])

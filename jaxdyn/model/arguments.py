@@ -1,4 +1,4 @@
-"""What users pass to functions of a system: numbers become arrays of its dtype, and what does not fit is refused."""
+"""Arguments of functions of a system: numbers become arrays of its dtype, and values that do not fit are refused."""
 
 import os
 import pathlib
@@ -21,8 +21,8 @@ _T = TypeVar("_T")
 _OPTIONAL = ("a", "external")
 
 if TYPE_CHECKING:
-    Numbers = ArrayLike | Sequence[Any]  # what `as_array` takes
-    Given = Array  # what it returns, which may be an array of numpy
+    Numbers = ArrayLike | Sequence[Any]  # accepted by `as_array`
+    Given = Array  # its result, which may be an array of numpy
     Number = float | Array  # one number, which may be traced
     Row = Sequence[Any] | np.ndarray | Array  # several numbers, or rows of them, that are taken one by one
     FilePath = str | os.PathLike[str]
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     Function = Callable[..., Any]
 
     class SystemLike(Protocol):
-        """What is taken as a system: a `Model`, a `System`, or anything else of which `check_system` finds the sizes."""
+        """Interface of a system: a `Model`, a `System`, or any other object with sizes nq and nv (`check_system`)."""
 
         @property
         def nq(self) -> int: ...
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
         @property
         def nv(self) -> int: ...
 
-    Checked = Annotated[_T, "looked at by the function, whose ValueError names the argument"]
+    Checked = Annotated[_T, "checked by the function, whose ValueError names the argument"]
 else:
-    # `as_array` and others look at them, and their errors name the argument
+    # Run-time type checkers would refuse lists and numbers before `as_array` can name the argument in its error
     Numbers = Given = Number = Row = FilePath = DType = Function = SystemLike = Any
 
     class Checked:
-        """`Checked[T]` is T to a type checker and anything at run time: the function looks at it, and its error names it."""
+        """Annotation T for type checkers, anything at run time: the function itself checks the value."""
 
         def __class_getitem__(cls, _) -> Any:
             return Any
@@ -53,16 +53,18 @@ else:
 def as_array(value: Any, name: str, dtype=None) -> Given:
     """Real numbers as an array of `dtype`, by JAX.
 
-    Without a dtype arrays stay as they are, and lists and numbers become arrays of numpy, which stay known inside a trace,
+    Without a dtype arrays are returned unchanged, and lists and numbers become arrays of numpy, which stay known inside a trace,
     unless they hold tracers.
 
-    **Raises:** ValueError that names the argument, for complex numbers and for what is no array of numbers.
+    **Raises:** ValueError that names the argument, for complex numbers and for a value that is no array of numbers.
     """
     if not isinstance(value, (np.ndarray, jax.Array)):
         try:
+            # np.asarray of a tracer raises; jnp.asarray of a known list would turn it into a tracer inside a trace.
             value = np.asarray(value) if is_concrete(value) else jnp.asarray(value)
         except (TypeError, ValueError):
             raise ValueError(f"{name} is {value!r}; pass an array of numbers, or a list of equal rows") from None
+    # A silent cast to real numbers would drop the imaginary part.
     if jnp.issubdtype(value.dtype, jnp.complexfloating):
         raise ValueError(f"{name} is complex ({value.dtype}); pass real numbers, such as {name}.real")
     if not (jnp.issubdtype(value.dtype, jnp.number) or value.dtype == bool):
@@ -73,50 +75,52 @@ def as_array(value: Any, name: str, dtype=None) -> Given:
 
 
 def _cast(value: Any, dtype) -> np.ndarray:
-    # By numpy, as JAX compiles a program for each shape; what is too large becomes infinite without a warning there too.
+    # Cast by numpy: JAX would compile a program for each shape. Overflow becomes infinity without a warning, as in JAX.
     with np.errstate(over="ignore"):
         return np.asarray(value).astype(jax.dtypes.canonicalize_dtype(dtype), copy=False)
 
 
-def or_zeros(value: Any, size: int) -> Any:
-    """A vector that was left out as one of zeros (size,)."""
+def zeros_if_none(value: Any, size: int) -> Any:
+    """The vector, or zeros (size,) where it was omitted."""
     return np.zeros(size) if value is None else value
 
 
 def as_path(path: Any, name: str = "path") -> pathlib.Path:
-    """A path that a user gave, `~` expanded.
+    """Convert a path argument, `~` expanded.
 
-    **Raises:** ValueError for what is no path.
+    **Raises:** ValueError for a value that is no path.
     """
+    # os.PathLike has bytes among its text types, but pathlib refuses them with an error that does not name the
+    # argument.
     if not isinstance(path, (str, os.PathLike)) or isinstance(path, bytes):
         raise ValueError(f"{name} is {path!r}; pass the path of a file, a string or a pathlib.Path")
     return pathlib.Path(path).expanduser()
 
 
 def parse_number(text: str) -> float:
-    """A decimal number as file formats write it.
+    """Parse a decimal number as file formats write it.
 
-    **Raises:** ValueError for what is none, for underscores ("1_0" is ten to Python) and for digits of other scripts.
+    **Raises:** ValueError for other texts, for underscores ("1_0" is ten to Python) and for digits of other scripts.
     """
     if "_" in text or not text.isascii():
         raise ValueError(f"{text!r} is no number")
     return float(text)
 
 
-# Frames between the caller and the package: run-time type checkers wrap public functions.
+# Modules that may stand between the caller and the package: run-time type checkers wrap public functions.
 _WRAPPERS = ("jaxdyn", "jaxtyping", "beartype", "equinox", "contextlib", "jax")
 
 
 def warn(text: str, category: type[Warning]) -> None:
-    """Warn at the line outside of the package from which it was called, however deep the warning arises."""
+    """Warn at the line of the caller outside the package, at whatever depth the warning arises."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _WRAPPERS:
         frame, level = frame.f_back, level + 1
     warnings.warn(text, category, stacklevel=level)
 
 
-def warn_of_inertias(inertias: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:
-    """Warn of bodies with an inertia (10,) that no body has, once and of all; `places` gives file:line of bodies."""
+def warn_unphysical_inertias(inertias: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:
+    """Give one warning for all bodies whose inertia (10,) is unphysical; `places` gives file:line of bodies."""
     faults = []
     for name, parameters in inertias.items():
         if is_concrete(parameters) and (fault := f64.inertia_fault(np.asarray(parameters))):
@@ -124,28 +128,30 @@ def warn_of_inertias(inertias: Mapping[str, Any], places: Mapping[str, str] | No
             faults.append(f"{place}body {name!r}: {fault}")
     if faults:
         more = f"; and {len(faults) - 5} more bodies" if len(faults) > 5 else ""
-        fix = "mend the numbers, or take jd.repair_inertias(model)"
+        fix = "correct the numbers, or use jd.repair_inertias(model)"
         warn(f"{'; '.join(faults[:5])}{more}. No body has such an inertia: {fix}", UserWarning)
 
 
 def state_dtype(system, q=None):
-    """Floating-point type of a system's states: that of a Model's leaves, else of its numbers, else of q or jax's default."""
+    """Floating-point type of a system's states: that of its leaves, else of q, else jax's default."""
+    # A Model has one dtype for all leaves; its home poses show it without a walk over the tree.
     home = getattr(system, "home", None)
     if home is not None:
         return home.dtype
+    # Parameters of other systems decide before q: a float32 system stays so when q is a list of Python floats.
     numbers = [leaf for leaf in jax.tree.leaves(system) if eqx.is_inexact_array(leaf)] or [q]
     kinds = [leaf.dtype for leaf in numbers if eqx.is_inexact_array(leaf) and not jnp.iscomplexobj(leaf)]
     return jnp.result_type(*kinds) if kinds else jnp.zeros(()).dtype
 
 
 def check_state(system, **arguments) -> tuple[Any, ...]:
-    """The arguments of a function of any system, in their order, as arrays of its dtype.
+    """Convert the arguments of a function of any system to arrays of its dtype, in their order.
 
-    Names starting with q are to have shape (nq,), `t` (), `external` (nb, 6), all others (nv,). `a` and `external` may be
+    Names starting with q have shape (nq,), `t` (), `external` (nb, 6), all others (nv,). `a` and `external` may be
     None.
 
     **Raises:** ValueError that names the argument: a shape that does not fit, complex numbers, wrenches on the bodies of a
-    system that has none; for a Scene in the place of its system, and for what is no system.
+    system that has none; for a Scene instead of its system, and for an object that is no system.
     """
     check_system(system)
     dtype, arrays = state_dtype(system, arguments.get("q")), []
@@ -181,25 +187,25 @@ def check_shape(system, name: str, value: Array | np.ndarray) -> None:
 
 
 def batch_hint(value, want: tuple) -> str:
-    """What to do about a value that has one axis more than the shape that is wanted, else an empty string."""
+    """Advice for a value with one axis more than the expected shape, else an empty string."""
     return "; functions take one sample, use jax.vmap for a batch" if np.ndim(value) == len(want) + 1 else ""
 
 
 def check_system(system: Any, name: str = "model") -> None:
-    """Refuse what is no system, and a Scene, of which the system is to be passed.
+    """Refuse an object that is no system, or a Scene instead of its system.
 
-    **Raises:** ValueError that says what to pass.
+    **Raises:** ValueError that states the remedy.
     """
     if hasattr(system, "system") and hasattr(system, "constraints"):
         raise ValueError(
-            f"{name} is a {type(system).__name__}; pass scene.system, as no constraints and forces are taken here"
+            f"{name} is a {type(system).__name__}; pass scene.system: this function accepts no constraints and forces"
         )
     if not (hasattr(system, "nq") and hasattr(system, "nv")):
         raise ValueError(f"{name} is a {type(system).__name__}, which has no nq and nv; pass a Model or another system")
 
 
 def check_shapes(model, **arguments) -> tuple[Any, ...]:
-    """`check_state` for a function of a tree of bodies.
+    """Apply `check_state` for a function of a tree of bodies.
 
     **Raises:** ValueError as there, and for a system that is no `Model`.
     """
@@ -210,17 +216,18 @@ def check_shapes(model, **arguments) -> tuple[Any, ...]:
 
 
 def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
-    """A pose as an array leaf; its numbers may be traced, and arrays (4, 4) of jax are taken as they are."""
+    """Convert a pose to an array leaf; its numbers may be traced, and jax arrays (4, 4) are used unchanged."""
     if isinstance(pose, jax.Array) and pose.shape == (4, 4):
         return pose
     if isinstance(pose, jax.Array) and pose.shape == (3,):
-        return stored(f64.pose_of(np.eye(3), pose), pose.dtype)
-    return stored(f64.pose_matrix(pose, what), float)
+        return store_leaf(f64.pose_of(np.eye(3), pose), pose.dtype)
+    return store_leaf(f64.pose_matrix(pose, what), float)
 
 
-def stored(value, dtype) -> jax.Array:
-    """Numbers as a leaf of this dtype. Within a trace, too, what is known stays known, and nothing is compiled for it."""
+def store_leaf(value, dtype) -> jax.Array:
+    """Convert numbers to a leaf of this dtype; known numbers stay concrete inside a trace too, and nothing is compiled."""
     if not is_concrete(value):
         return jnp.asarray(value, dtype)
+    # Without this a known constant would become a tracer under jit, and later checks of its value would be skipped.
     with jax.ensure_compile_time_eval():
         return jnp.asarray(_cast(value, dtype), dtype)

@@ -1,8 +1,8 @@
-"""Building mechanisms in code, and looking at and repairing their inertias.
+"""Construction of mechanisms in code, and checks and repairs of their inertias.
 
-`ModelBuilder` collects bodies and joints; `build` merges what is fixed, puts the tree in order and returns a `Model`.
-All arithmetic of a build is float64 on known numbers; the result is stored in jax's default dtype. Numbers may be traced: what
-decides the structure (names, kinds of joints, what is None) is known all the same.
+`ModelBuilder` collects bodies and joints; `build` merges fixed bodies, sorts the tree and returns a `Model`.
+All arithmetic of a build is float64 on known numbers; the result is stored in jax's default dtype. Numbers may be traced: the
+structure (names, kinds of joints, which arguments are None) is known all the same.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ import numpy as np
 from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia as _inertia
-from jaxdyn.model.arguments import DType, Number, Numbers, stored, warn_of_inertias
+from jaxdyn.model.arguments import DType, Number, Numbers, store_leaf, warn_unphysical_inertias
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model, Topology
 
@@ -43,18 +43,18 @@ class _Body:
 
 
 class ModelBuilder:
-    """Collects bodies, joints and frames, and builds a `Model` from them.
+    """Collector of bodies, joints and frames that builds a `Model` from them.
 
     **Arguments:**
 
     - `name`: name of the mechanism.
-    - `gravity`: gravitational acceleration (3,) in world axes, m/s^2; None leaves gravity out of all that is compiled.
+    - `gravity`: gravitational acceleration (3,) in world axes, m/s^2; with None no gravity terms are compiled.
     - `dtype`: floating-point type of the leaves; jax's default when None.
 
     Every number of `add_body`, `add_frame`, `add_coupling` and of the gravity may be traced, so that `jax.grad` and `jax.vmap`
-    go through the construction. Names, kinds, and which numbers are given at all are structure and stay known. What
-    cannot be seen in traced numbers is not refused: a zero axis or a mass matrix without inverse then shows in results (NaN, or
-    a result code of `simulate`). Nor is a warning given of an inertia that no body has.
+    differentiate and batch the construction. Names, kinds, and which numbers are given are structure and stay known. Faults that
+    only values show are not refused in traced numbers: a zero axis or a singular mass matrix then shows in results (NaN, or
+    a result code of `simulate`), and unphysical inertias give no warning.
 
     **Raises:** ValueError for a gravity that is not three finite numbers, and for float64 while jax runs in 32 bits.
 
@@ -101,7 +101,7 @@ class ModelBuilder:
         velocity_limit: Numbers | None = None,
         effort_limit: Numbers | None = None,
     ) -> "ModelBuilder":
-        """Add a body and the joint that carries it. Returns the builder.
+        """Add a body and the joint that carries it. Return the builder.
 
         **Arguments:**
 
@@ -111,7 +111,7 @@ class ModelBuilder:
           into the one that carries it; its frame stays reachable by name. Inertia fixed to the world has no effect.
         - `inertia`: None (massless), the ten numbers (10,) about the body frame's origin, or (mass, centre of mass
           (3,), rotational inertia (3, 3) or principal moments (3,) about it); kg, m, kg m^2, in the body frame.
-        - `joint_name`: `name` + "_joint" when None. Siblings stand in the order of these. Of a fixed body it names the frame too.
+        - `joint_name`: `name` + "_joint" when None. Siblings are sorted by it. For a fixed body it names the frame too.
         - `pose`: of the body frame in the parent's at the joint's zero: None (identity), (4, 4), (3,) or (xyz, rpy).
         - `axis`: direction (3,) of a revolute, continuous, prismatic or helical joint in the body frame, of any
           length but zero. A planar joint moves in the x-y plane of its body frame at home.
@@ -145,6 +145,7 @@ class ModelBuilder:
         for key, value in given.items():
             size = nq if key in ("lower", "upper") else nv
             leaves[key] = None if value is None else _joint_numbers(value, size, joint, key, what)
+        # Concrete limits only: traced ones cannot decide the structure.
         low, high = leaves["lower"], leaves["upper"]
         if low is not None and high is not None and is_concrete(low, high) and np.any(low > high):
             raise ValueError(f"{what}: lower limit {lower} is above upper limit {upper}; swap them")
@@ -163,7 +164,7 @@ class ModelBuilder:
         return self
 
     def add_frame(self, name: str, parent: str | None = None, pose: Numbers | None = None) -> "ModelBuilder":
-        """Name a frame on a body: `pose` (as in `add_body`) in the frame of the body `parent`, None for the world.
+        """Add a named frame at `pose` (as in `add_body`) in the frame of the body `parent`, None for the world.
 
         Returns the builder. **Raises:** ValueError for a name in use, an unknown parent or a bad pose.
         """
@@ -177,7 +178,7 @@ class ModelBuilder:
         The joint stays free in the model; a scene takes the coupling as a constraint. Returns the builder.
 
         **Raises:** ValueError for an unknown joint or one of several degrees of freedom, a joint coupled twice or to
-        itself (also by way of others), or numbers that are not finite.
+        itself (also through others), or numbers that are not finite.
         """
         what = f"coupling of {joint!r} to {source!r}"
         for name in (joint, source):
@@ -187,6 +188,7 @@ class ModelBuilder:
                 raise ValueError(f"{what}: joint {name!r} is {kind}; couple joints of one degree of freedom")
         if joint in self._couplings:
             raise ValueError(f"{what}: it follows {self._couplings[joint][0]!r} already; leave one coupling out")
+        # Follow the chain of sources: a cycle of couplings has no configuration in general.
         followed = source
         while followed is not None:
             if followed == joint:
@@ -197,21 +199,22 @@ class ModelBuilder:
         return self
 
     def build(self) -> Model:
-        """The model: depth-first order with siblings sorted by joint name, fixed bodies merged.
+        """Build the model: depth-first order with siblings sorted by joint name, fixed bodies merged.
 
         Frames are the bodies in their order, then all others sorted by the body that carries them and by name.
 
         **Raises:** ValueError that names a joint which moves no inertia, so that the mass matrix is singular in every
-        configuration: S^T I S = 0 with the composite or the articulated inertia I of what it carries.
+        configuration: S^T I S = 0 with the composite or the articulated inertia I of the bodies that it carries.
 
-        **Warns:** UserWarning naming bodies with an inertia that no body has: a negative principal moment, or one that exceeds
+        **Warns:** UserWarning naming bodies with an unphysical inertia: a negative principal moment, or one that exceeds
         the sum of the other two (`repair_inertias`).
         """
-        warn_of_inertias({name: body.inertia for name, body in self._bodies.items()}, self.places)
-        moving, carriers, parents, home, inertias = self._merged()
-        others = [(carriers[b][0], name, _chained(carriers[b][1], pose)) for name, (b, pose) in self._frames.items()]
+        warn_unphysical_inertias({name: body.inertia for name, body in self._bodies.items()}, self.places)
+        moving, carriers, parents, home, inertias = self._merge_fixed()
+        others = [(carriers[b][0], name, _compose(carriers[b][1], pose)) for name, (b, pose) in self._frames.items()]
         fixed = [name for name, body in self._bodies.items() if body.kind == "fixed"]
         others += [(carriers[name][0], name, carriers[name][1]) for name in fixed]
+        # Sorted, so that the order in which a file lists its frames does not decide which program is compiled.
         others.sort(key=lambda frame: frame[:2])
         index = {body.joint_name: i for i, body in enumerate(moving)}
         couplings = {(index[joint], index[c[0]]): c[1] for joint, c in self._couplings.items()}
@@ -226,15 +229,17 @@ class ModelBuilder:
             couplings=tuple(sorted(couplings)),
         )
         screws = _rows([body.screw for body in moving], (6,))
-        leaves = {key: _stacked(moving, key, size, 0.0) for key, size in _JOINT_LEAVES.items()}
+        leaves = {key: _joint_leaf(moving, key, size, 0.0) for key, size in _JOINT_LEAVES.items()}
+        # Before the limits are added: they do not matter for regularity, and the check reads few arrays.
         _check_regular(topology, home, screws, inertias, leaves["armature"])
-        leaves |= {key: _stacked(moving, key, size, fill, always=True) for key, (size, fill) in _LIMITS.items()}
+        leaves |= {key: _joint_leaf(moving, key, size, fill, always=True) for key, (size, fill) in _LIMITS.items()}
         leaves |= dict(home=home, screws=screws, inertias=inertias, gravity=self._gravity)
+        # The frame of each body comes first, at the body's own origin, so that frame i is body i for i < nb.
         leaves["frame_poses"] = _rows([np.eye(4)] * len(moving) + [pose for *_, pose in others], (4, 4))
         values = [couplings[pair] for pair in topology.couplings]
         leaves["coupling_values"] = _rows(values, (2,)) if couplings else None
         kept: dict[str, Any] = {
-            key: None if value is None else stored(value, self._dtype) for key, value in leaves.items()
+            key: None if value is None else store_leaf(value, self._dtype) for key, value in leaves.items()
         }
         fixed_joints = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
         return Model(**kept, topology=topology, fixed_joints=fixed_joints)
@@ -247,9 +252,10 @@ class ModelBuilder:
         if parent is not None and parent not in self._bodies:
             raise ValueError(f"{name!r}: {unknown('parent', parent, self._bodies)}; add a parent before its children")
 
-    def _merged(self):
-        """The moving bodies in order; (index, pose) of what carries each body; parents, homes and merged inertias."""
+    def _merge_fixed(self):
+        """Merge fixed bodies: the moving ones in order, (index, pose) of each body's carrier, parents, homes, inertias."""
         children: dict[str | None, list[_Body]] = {}
+        # In reverse, because the stack below pops the last child first; this is Pinocchio's depth-first order.
         for body in sorted(self._bodies.values(), key=lambda body: body.joint_name, reverse=True):
             children.setdefault(body.parent, []).append(body)
         moving, parents, home, inertias = [], [], [], []
@@ -259,7 +265,7 @@ class ModelBuilder:
             body = stack.pop()
             stack.extend(children.get(body.name, ()))
             carrier, pose = carriers[body.parent]
-            pose = _chained(pose, body.pose)
+            pose = _compose(pose, body.pose)
             if body.kind != "fixed":
                 parents.append(carrier)
                 home.append(pose)
@@ -268,15 +274,16 @@ class ModelBuilder:
                 moving.append(body)
                 continue
             carriers[body.name] = (carrier, pose)
+            # Inertia that is fixed to the world never moves and has no place in the model.
             if carrier >= 0:
                 inertias[carrier] = _sum(inertias[carrier], f64.move_inertia(pose, body.inertia))
         return moving, carriers, parents, _rows(home, (4, 4)), _rows(inertias, (10,))
 
 
-# One operand may be traced and the other one known, in float64.
+# One operand may be traced and the other known, in float64: each sum and product takes the module that both need.
 
 
-def _chained(first: f64.Values, second: f64.Values) -> f64.Values:
+def _compose(first: f64.Values, second: f64.Values) -> f64.Values:
     xp = numpy_for(first, second)
     return xp.asarray(first, float) @ xp.asarray(second, float)
 
@@ -287,17 +294,17 @@ def _sum(one: f64.Values, other: f64.Values) -> f64.Values:
 
 
 def _rows(values, shape: tuple[int, ...]) -> f64.Values:
-    """Arrays of one shape as the rows of one, also where there are none."""
+    """Stack arrays of one shape as rows; without any, an empty array of that shape."""
     return numpy_for(values).asarray(values, float).reshape(-1, *shape)
 
 
 def inertia_report(model: Model) -> list[tuple[str, str]]:
-    """What is unphysical in the inertias of a model, as (body, problem).
+    """Unphysical inertias of a model, as (body, problem).
 
     Listed are bodies that are massless, whose rotational inertia about the centre of mass is not positive definite, or
     whose principal moments break the triangle inequality (one exceeds the sum of the other two).
 
-    Such bodies are common in files made by hand and harmless where others move with them; see `repair_inertias`.
+    Such bodies are common in files made by hand and harmless where other bodies move with them; see `repair_inertias`.
     """
     return [
         (name, problem)
@@ -307,7 +314,7 @@ def inertia_report(model: Model) -> list[tuple[str, str]]:
 
 
 def inertia_problems(parameters) -> list[str]:
-    """What is unphysical in ten inertial parameters (10,), in words; empty when nothing is."""
+    """Faults of ten inertial parameters (10,), in words; an empty list for physical ones."""
     parameters = np.asarray(parameters)
     # The shift from the origin to the centre of mass leaves a few roundings of the precision the numbers came in.
     rounding = 64 * np.finfo(parameters.dtype).eps
@@ -327,15 +334,15 @@ def inertia_problems(parameters) -> list[str]:
 
 
 def repair_inertias(model: Model) -> Model:
-    """A copy in which every body with mass has physical inertial parameters (`inertia.nearest_feasible`).
+    """Copy of a model in which every body with mass has physical inertial parameters (`inertia.nearest_feasible`).
 
-    Bodies that `inertia_report` does not list are left as they are, and massless ones too.
+    Bodies that `inertia_report` does not list and massless ones stay unchanged.
     """
     inertias = np.array(model.inertias)
     for i, parameters in enumerate(inertias):
         if parameters[0] > 0 and inertia_problems(parameters):
             inertias[i] = _inertia.nearest_feasible(parameters)
-    return model.replace(inertias=stored(inertias, inertias.dtype))
+    return model.replace(inertias=store_leaf(inertias, inertias.dtype))
 
 
 def _float_dtype(dtype):
@@ -344,6 +351,7 @@ def _float_dtype(dtype):
         return default
     if not jnp.issubdtype(dtype, jnp.floating):
         raise ValueError(f"dtype is {dtype!r}; give a floating-point type such as jax.numpy.float32")
+    # jax would truncate to float32 without an error, and every later comparison would fail by 1e-7.
     if jax.dtypes.canonicalize_dtype(dtype) != jnp.dtype(dtype):
         name = jnp.dtype(dtype).name
         raise ValueError(
@@ -376,6 +384,7 @@ def _joint_numbers(value, size: int, kind: str, key: str, what: str) -> f64.Valu
 def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
     axis = f64.numbers(axis, {(3,): "(3,)"}, f"{what}: axis")
     pitch = f64.numbers(pitch, {(): "a number"}, f"{what}: pitch")
+    # A traced axis counts as given: its value cannot be compared with the default.
     turned = not is_concrete(axis) or not np.array_equal(axis, [0, 0, 1])
     pitched = not is_concrete(pitch) or bool(pitch)
     xp = numpy_for(axis, pitch, screw)
@@ -386,6 +395,7 @@ def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
     if pitched and kind != "helical":
         raise ValueError(f"{what}: pitch is {pitch}, but the joint is {kind}; use joint='helical'")
     if screw is None:
+        # An axis of any length is a direction; v = pitch * axis places the screw through the body's origin.
         axis = f64.unit(axis, f"{what}: axis")
         axis = xp.asarray(axis, float)
         return xp.concatenate([axis, xp.zeros(3)] if kind == "prismatic" else [xp.asarray(pitch, float) * axis, axis])
@@ -393,6 +403,7 @@ def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
         raise ValueError(f"{what}: screw is given together with axis or pitch; give one of them")
     screw = f64.numbers(screw, {(6,): "(v, omega) (6,)"}, f"{what}: screw")
     v, omega = screw[:3], screw[3:]
+    # The kind cannot be checked against traced numbers; any screw with rotation is helical, so that kind alone is safe.
     if not is_concrete(screw):
         if kind != "helical":
             raise ValueError(
@@ -406,6 +417,7 @@ def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
         raise ValueError(f"{what}: screw is {screw.tolist()}; a {kind} joint needs {part} other than zero")
     if kind == "prismatic" and omega.any():
         raise ValueError(f"{what}: screw {screw.tolist()} turns, but the joint is prismatic; use joint='helical'")
+    # v along omega is a pitch, v across it an axis that misses the origin: both need the helical code path.
     if kind in ("revolute", "continuous") and v.any():
         raise ValueError(
             f"{what}: screw {screw.tolist()} has a pitch or passes beside the body's origin; use joint='helical', "
@@ -414,7 +426,7 @@ def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
     return screw / size
 
 
-def _stacked(moving: list[_Body], key: str, size: str, fill: float, *, always: bool = False):
+def _joint_leaf(moving: list[_Body], key: str, size: str, fill: float, *, always: bool = False):
     values = [body.leaves[key] for body in moving]
     if not always and all(value is None for value in values):
         return None

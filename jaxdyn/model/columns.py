@@ -1,4 +1,4 @@
-"""Names and units of the numbers in q, v and generalised forces, by joints."""
+"""Names and units of the entries of q, v and generalised forces, by joints."""
 
 from typing import Any, NamedTuple
 
@@ -12,9 +12,9 @@ _UNITS = {"x": "m", "y": "m", "z": "m", "theta": "rad"}
 
 
 class Columns(NamedTuple):
-    """Names of the numbers in q (nq,) and v (nv,), and their units; `force` has those of generalised forces, (nv,).
+    """Names of the entries of q (nq,) and v (nv,), and units of these, of accelerations and of generalised forces.
 
-    A joint with one number gives it its name, others are JOINT.x and the like. Units are "" where a system has no joints.
+    A joint with one coordinate gives it its own name, others are JOINT.x and the like. Units are "" for systems without joints.
     """
 
     q: tuple[str, ...]
@@ -26,7 +26,7 @@ class Columns(NamedTuple):
 
 
 def columns_of(system: Any) -> Columns:
-    """Names and units of a system's coordinates; of one that is no `Model`, q1, q2, ... without units."""
+    """Names and units of a system's coordinates: those of its joints, or q1, q2, ... without units."""
     if not isinstance(system, Model):
         q, v = (tuple(f"{name}{i + 1}" for i in range(n)) for name, n in (("q", system.nq), ("v", system.nv)))
         return Columns(q, v, *(("",) * len(x) for x in (q, v, v, v)))
@@ -41,6 +41,7 @@ def columns_of(system: Any) -> Columns:
         q += [f"{joint}.{part}" for part in _Q[kind]]
         v += [f"{joint}.{part}" for part in _V[kind]]
         q_units += [_UNITS.get(part, "1") for part in _Q[kind]]
+        # Twists list velocities first by name, so the letter v marks the linear entries.
         linear += [part[0] == "v" for part in _V[kind]]
     rates = [("m/s", "m/s^2", "N") if slides else ("rad/s", "rad/s^2", "N m") for slides in linear]
     units = (tuple(rate[k] for rate in rates) for k in range(3))

@@ -1,8 +1,8 @@
-"""Rigid-body arithmetic of a build: on known numbers in numpy and always in float64, on traced ones by JAX.
+"""Rigid-body arithmetic of a build: known numbers by numpy in float64, traced ones by JAX.
 
-Models are built here and not with the functions of `se3` and `inertia`: a chain of fixed links merged in float32 would lose
-digits before the model exists, and what is refused must be refused on numbers. Numbers that are traced (by `jax.grad`,
-`jax.vmap`, `jax.jit`) go through the same formulas; what only their values could tell is then not refused.
+Builds do not use the functions of `se3` and `inertia`: a chain of fixed links merged in float32 would lose
+digits before the model exists, and refusals need concrete numbers. Traced numbers (by `jax.grad`,
+`jax.vmap`, `jax.jit`) go through the same formulas; faults that only values show are then not refused.
 """
 
 from typing import Any
@@ -24,9 +24,9 @@ Values = np.ndarray | jax.Array
 
 
 def numbers(value, shapes: dict[tuple[int, ...], str], what: str, *, finite: bool = True) -> Values:
-    """`value` as an array of one of the `shapes` (a description for each, used in the message): float64, or traced.
+    """Convert `value` to an array of one of the `shapes` (each with a description for the message): float64, or traced.
 
-    **Raises:** ValueError naming `what` for another shape, what is not a number, and, when known, NaN and, when `finite`,
+    **Raises:** ValueError naming `what` for another shape, a value that is no number, and, when known, NaN and, when `finite`,
     infinity.
     """
     expected = " or ".join(shapes.values())
@@ -35,6 +35,7 @@ def numbers(value, shapes: dict[tuple[int, ...], str], what: str, *, finite: boo
         if known and np.asarray(value).dtype.kind not in "biuf":  # numpy reads texts as numbers, "1_0" as ten
             raise TypeError
         array = np.asarray(value, np.float64) if known else jnp.asarray(value, float)
+    # Values that are traced take jax's default dtype; only known ones are promoted to float64.
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what} is {value!r}, expected {expected}") from error
     if array.shape not in shapes:
@@ -45,7 +46,7 @@ def numbers(value, shapes: dict[tuple[int, ...], str], what: str, *, finite: boo
 
 
 def unit(axis, what: str) -> Values:
-    """A direction (3,) of length one. **Raises:** ValueError naming `what` for another shape, NaN or a zero vector."""
+    """Normalise a direction (3,). **Raises:** ValueError naming `what` for another shape, NaN or a zero vector."""
     axis = numbers(axis, {(3,): "(3,)"}, what)
     if not is_concrete(axis):
         return axis / jnp.sqrt(jnp.sum(axis * axis))
@@ -56,13 +57,13 @@ def unit(axis, what: str) -> Values:
 
 
 def hat(vector: Values) -> Values:
-    """(3, 3) with hat(a) b = a x b."""
+    """Skew matrix (3, 3) with hat(a) b = a x b."""
     x, y, z = vector
     return numpy_for(vector).array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def rotation_from_rpy(rpy) -> Values:
-    """R = Rz(yaw) Ry(pitch) Rx(roll), the fixed-axis angles of URDF (rad)."""
+    """Rotation R = Rz(yaw) Ry(pitch) Rx(roll) of the fixed-axis angles of URDF (rad)."""
     xp = numpy_for(rpy)
     (cr, cp, cy), (sr, sp, sy) = xp.cos(rpy), xp.sin(rpy)
     return xp.array(
@@ -75,11 +76,12 @@ def rotation_from_rpy(rpy) -> Values:
 
 
 def rpy_from_rotation(rotation: np.ndarray) -> np.ndarray:
-    """Inverse of `rotation_from_rpy`, exact to rounding at pitch = +-pi/2 too.
+    """Fixed-axis angles of a rotation, the inverse of `rotation_from_rpy`, exact to rounding at pitch = +-pi/2 too.
 
-    There yaw is whatever rounding makes of it; roll is measured after yaw has been undone, so the product is right.
+    At these pitches yaw is arbitrary; roll is computed after yaw has been undone, so the product is right.
     """
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    # hypot instead of arcsin: no loss of digits at pitch = +-pi/2 and no domain error from rounding.
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
     c, s = np.cos(yaw), np.sin(yaw)
     roll = np.arctan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1])
@@ -87,7 +89,7 @@ def rpy_from_rotation(rotation: np.ndarray) -> np.ndarray:
 
 
 def pose_of(rotation, position) -> Values:
-    """(4, 4) of a rotation (3, 3) and a position (3,), known or traced."""
+    """Pose (4, 4) of a rotation (3, 3) and a position (3,), known or traced."""
     xp = numpy_for(rotation, position)
     rotation, position = xp.asarray(rotation, float), xp.asarray(position, float)
     upper = xp.concatenate([rotation, position[:, None]], axis=1)
@@ -95,7 +97,7 @@ def pose_of(rotation, position) -> Values:
 
 
 def pose_matrix(pose, what: str) -> Values:
-    """(4, 4) from None (identity), a (4, 4) matrix, a position (3,) or a pair (xyz, rpy).
+    """Pose matrix (4, 4) from None (identity), a (4, 4) matrix, a position (3,) or a pair (xyz, rpy).
 
     **Raises:** ValueError naming `what` for another shape and, when known, NaN, a rotation that is not orthonormal, a
     reflection.
@@ -106,12 +108,13 @@ def pose_matrix(pose, what: str) -> Values:
     if given.shape == (3,):
         return pose_of(np.eye(3), given)
     if given.shape == (2, 3):
-        # Of a pair whose angles are known only the position is traced.
+        # Known angles of a pair with a traced position stay in float64: only the position is traced.
         turned = rotation_from_rpy(given[1] if not is_concrete(pose[1]) else np.asarray(pose[1], float))
         return pose_of(turned, given[0])
     if not is_concrete(given):
         return given
     rotation = given[:3, :3]
+    # Measured before the determinant: a matrix that is far from orthonormal may have any determinant.
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > _ORTHONORMAL or np.linalg.det(rotation) < 0:
         fault = "is a reflection" if error <= _ORTHONORMAL else f"is not orthonormal: |R^T R - 1| = {error:.2g}"
@@ -127,7 +130,7 @@ def inverse(pose: Values) -> Values:
 
 
 def adjoint(pose: Values) -> np.ndarray:
-    """Ad = [[R, hat(p) R], [0, R]] (6, 6)."""
+    """Adjoint Ad = [[R, hat(p) R], [0, R]] (6, 6)."""
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = pose[:3, :3]
     result[:3, 3:] = hat(pose[:3, 3]) @ pose[:3, :3]
@@ -139,12 +142,14 @@ def rotation_matrix(axis, angle) -> Values:
     xp = numpy_for(axis, angle)
     axis, angle = xp.asarray(axis, float), xp.asarray(angle, float)
     cross = hat(axis)
+    # 1 - cos(a) as 2 sin(a/2)^2, which does not cancel for small angles.
     return xp.eye(3) + xp.sin(angle) * cross + 2 * xp.sin(angle / 2) ** 2 * cross @ cross
 
 
-def turn_from_z(axis: np.ndarray) -> np.ndarray:
-    """Rotation (4, 4) by the shortest way that takes z to a unit axis; half a turn about x for -z."""
+def rotation_from_z(axis: np.ndarray) -> np.ndarray:
+    """Rotation (4, 4) by the smallest angle that takes z to a unit axis; by pi about x for -z."""
     turn = np.eye(4)
+    # z x axis: its length is the sine of the angle, so arctan2 with axis[2] is exact near 0 and pi.
     across = np.array([-axis[1], axis[0], 0.0])
     sine = np.linalg.norm(across)
     if sine > 0:
@@ -155,12 +160,12 @@ def turn_from_z(axis: np.ndarray) -> np.ndarray:
 
 
 def joint_pose(kind: str, screw: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """`joints.joint_transform` in float64: pose of the body frame relative to its home pose."""
+    """Pose of `joints.joint_transform` in float64: that of the body frame relative to its home pose."""
     pose = np.eye(4)
     if kind in SCREW_KINDS:
         v, axis = screw[:3], screw[3:]
         if axis.any():
-            # The screw is a turn about the line through axis x v, and a slide of v . axis along it.
+            # Chasles: a rotation about the line through axis x v, and a translation of v . axis per radian along it.
             pose[:3, :3] = rotation_matrix(axis, q[0])
             pose[:3, 3] = (np.eye(3) - pose[:3, :3]) @ np.cross(axis, v) + axis * (v @ axis) * q[0]
         else:
@@ -177,7 +182,7 @@ def joint_pose(kind: str, screw: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a rotation (3, 3), w >= 0: the largest of four equal forms, so that no digits cancel."""
+    """Quaternion (w, x, y, z) of a rotation (3, 3), w >= 0, by the largest of four equal forms, so that no digits cancel."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     squares = np.array([1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i])  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
     products = np.array(
@@ -191,12 +196,12 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def motion_subspace(kind: str, screw: np.ndarray) -> np.ndarray:
-    """`joints.motion_subspace` in float64, (6, nv of the joint)."""
+    """Motion subspace of `joints.motion_subspace` in float64, (6, nv of the joint)."""
     return screw[:, None] if kind in SCREW_KINDS else np.eye(6)[:, KINDS[kind].columns]
 
 
 def inertia_numbers(inertia, what: str) -> Values:
-    """The ten inertial parameters from None (massless), (10,), or (mass, com, inertia about the com).
+    """Ten inertial parameters from None (massless), (10,), or (mass, com, inertia about the com).
 
     **Raises:** ValueError naming `what` for another shape and, when known, NaN, a negative mass or a matrix that is not
     symmetric.
@@ -213,6 +218,7 @@ def inertia_numbers(inertia, what: str) -> Values:
             raise ValueError(f"{what}: the rotational inertia {at_com.tolist()} is not symmetric")
         xp = numpy_for(mass, com, at_com)
         mass, com, at_com = (xp.asarray(x, float) for x in (mass, com, at_com))
+        # Steiner's theorem, with the symmetric part taken row by row: an asymmetry below the tolerance is dropped.
         about_origin = at_com + mass * (com @ com * xp.eye(3) - xp.outer(com, com))
         parameters = xp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
     else:
@@ -227,7 +233,7 @@ _DIGITS = 1e-3
 
 
 def inertia_fault(parameters: np.ndarray) -> str:
-    """In words, why no body has these inertial parameters (10,); empty where one may, or a limit of one (point, rod, plate)."""
+    """Description of the fault of unphysical inertial parameters (10,); empty for those of bodies, points, rods and plates."""
     mass, _, moment = about_com(np.asarray(parameters, np.float64))
     if mass == 0 and np.any(parameters[1:4]):
         return f"it has first moments {np.asarray(parameters[1:4]).tolist()} kg m and no mass"
@@ -259,31 +265,33 @@ def about_com(parameters: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def spatial_inertia(parameters: np.ndarray) -> np.ndarray:
+    # Asymmetric first moments make the two off-diagonal blocks negatives of each other.
     """Spatial inertia (6, 6), linear part first."""
     first = hat(parameters[1:4])
     return np.block([[parameters[0] * np.eye(3), -first], [first, rotational_inertia(parameters)]])
 
 
 def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
-    """`inertia.pseudo_inertia` (4, 4) in float64: what is decided and factored of float32 models keeps its digits."""
+    """Pseudo-inertia (4, 4) in float64, so that decisions about float32 models and factors of theirs keep their digits."""
     rotational = rotational_inertia(parameters)
     sigma = 0.5 * np.trace(rotational) * np.eye(3) - rotational
     return np.block([[sigma, parameters[1:4, None]], [parameters[None, 1:4], parameters[:1, None]]])
 
 
 def parameters_from_pseudo(matrix: np.ndarray) -> np.ndarray:
-    """The ten numbers of a pseudo-inertia (4, 4)."""
+    """Ten inertial parameters of a pseudo-inertia (4, 4)."""
     sigma = matrix[:3, :3]
     return np.concatenate([matrix[3:, 3], matrix[:3, 3], (np.trace(sigma) * np.eye(3) - sigma)[_TRIANGLE]])
 
 
 def move_inertia(pose: Values, parameters: Values) -> Values:
-    """The ten numbers in frame a of a body given in frame b; `pose` T_ab (`inertia.transform_inertia` in float64)."""
+    """Transform ten inertial parameters from frame b to frame a by `pose` T_ab (`inertia.transform_inertia` in float64)."""
     xp = numpy_for(pose, parameters)
     pose, parameters = xp.asarray(pose, float), xp.asarray(parameters, float)
     rotation, shift = pose[:3, :3], pose[:3, 3]
     mass, first = parameters[0], rotation @ parameters[1:4]
     inertia = rotation @ rotational_inertia(parameters) @ rotation.T
+    # No division by the mass, so that massless bodies transform too.
     ph = xp.outer(shift, first)
     scale = 2 * shift @ first + mass * shift @ shift
     inertia = inertia + scale * xp.eye(3) - ph - ph.T - mass * xp.outer(shift, shift)
@@ -291,16 +299,18 @@ def move_inertia(pose: Values, parameters: Values) -> Values:
 
 
 def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool]:
-    """Joints whose articulated inertia S^T I^A S (plus armature) is singular, when those found further out are held.
+    """Joints whose articulated inertia S^T I^A S (plus armature) is singular, with such joints further out locked.
 
     det M is the product of det(S^T I^A S) over the joints (Featherstone 2008, section 7.2), so the mass matrix is
-    singular exactly when there is one, and is regular once all of them are held. `q` lists each joint's coordinates.
+    singular exactly when there is one, and is regular once all of them are locked. `q` lists each joint's coordinates.
 
-    **Returns:** the joints, each with whether S^T I S vanishes for the composite inertia of all that it carries.
+    **Returns:** the joints, each with whether S^T I S vanishes for the composite inertia of all bodies that it carries.
     """
     composite = np.array([spatial_inertia(parameters) for parameters in inertias])
     articulated = composite.copy()
     idle = {}
+    # From the leaves to the root, as in the articulated-body algorithm: a child's inertia is complete before its
+    # parent's.
     for i in reversed(range(topology.nb)):
         S = motion_subspace(topology.kinds[i], screws[i])
         rotor = np.zeros(S.shape[1]) if armature is None else armature[topology.v_slices[i]]
@@ -319,6 +329,8 @@ def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool
             U = articulated[i] @ S
             carried = articulated[i] - U @ np.linalg.solve(D, U.T)
         if (parent := topology.parents[i]) >= 0:
+            # A joint already found idle passes its full inertia on, as if locked; the test of its parents stays
+            # independent of it.
             X = adjoint(inverse(home[i] @ joint_pose(topology.kinds[i], screws[i], q[i])))
             composite[parent] += X.T @ composite[i] @ X
             articulated[parent] += X.T @ carried @ X

@@ -1,9 +1,9 @@
-"""Inertial parameters of a body: ten numbers, the 6x6 spatial inertia, the pseudo-inertia and its log-Cholesky factor.
+"""Inertial parameters of a body: ten numbers, the spatial inertia, the pseudo-inertia and its log-Cholesky factor.
 
 The ten numbers are (m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) about the body frame's origin and in its axes
 (the order of Pinocchio's regressors): dynamics is linear in them.
 
-All functions raise ValueError for an argument of another shape, with the shapes that they take.
+All functions raise ValueError for an argument of another shape, with the expected shapes.
 """
 
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ _TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
 
 
 def _check_shapes(**given) -> None:
-    """Refuse arguments, by their names, of another shape than the one beside them."""
+    """Refuse arguments whose shapes differ from the expected ones, given with them by name."""
     for name, (value, want) in given.items():
         # Rows may be tuples of traced numbers, whose shape numpy cannot ask for.
         shape = np.shape(_numpy_for(value).asarray(value))
@@ -32,7 +32,7 @@ def _check_shapes(**given) -> None:
 
 
 def rotational_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "3 3"]:
-    """Rotational inertia (3, 3) about the frame's origin (kg m^2) from the ten numbers."""
+    """Rotational inertia (3, 3) about the frame's origin (kg m^2) from the ten inertial parameters."""
     _check_shapes(parameters=(parameters, (10,)))
     return parameters[4:][_SYMMETRIC]
 
@@ -46,13 +46,13 @@ def spatial_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "6 
 
 
 def parameters_from_spatial(matrix: Checked[Float[Array, "6 6"]]) -> Float[Array, "10"]:
-    """The ten numbers of a spatial inertia (6, 6); inverse of `spatial_inertia`."""
+    """Ten inertial parameters of a spatial inertia (6, 6); inverse of `spatial_inertia`."""
     _check_shapes(matrix=(matrix, (6, 6)))
     return jnp.concatenate([matrix[:1, 0], so3.vee(matrix[3:, :3]), matrix[3:, 3:][_TRIANGLE]])
 
 
 def inertial_parameters(mass: Number, com: Numbers, inertia_com: Numbers) -> Float[Array, "10"]:
-    """The ten numbers from mass (kg), centre of mass (3,) (m) and rotational inertia (3, 3) about it (kg m^2).
+    """Ten inertial parameters from mass (kg), centre of mass (3,) (m) and rotational inertia (3, 3) about it (kg m^2).
 
     Steiner's theorem: I_origin = I_com - m hat(c)^2.
     """
@@ -70,6 +70,7 @@ def mass_com_inertia(
     """Mass (), centre of mass (3,) and rotational inertia about it (3, 3). A massless body has its centre at the origin."""
     _check_shapes(parameters=(parameters, (10,)))
     mass, first = parameters[0], parameters[1:4]
+    # Double where: the unselected quotient must be finite, or its derivative is NaN.
     massless = mass == 0
     com = jnp.where(massless, jnp.zeros_like(first), first / jnp.where(massless, jnp.ones_like(mass), mass))
     outer = com[:, None] * first[None, :]
@@ -80,11 +81,11 @@ def mass_com_inertia(
 def transform_inertia(
     pose: Checked[Float[Array, "4 4"]], parameters: Checked[Float[Array, "10"]]
 ) -> Float[Array, "10"]:
-    """The ten numbers (10,) in frame a of a body whose numbers in frame b are given; `pose` T_ab (4, 4) maps b coordinates to a.
+    """Ten inertial parameters (10,) in frame a of a body given in frame b; `pose` T_ab (4, 4) maps b coordinates to a.
 
     No mass is divided by, so massless bodies are allowed and gradients stay finite.
 
-    **Raises:** ValueError for other shapes, as of arguments that are swapped.
+    **Raises:** ValueError for other shapes, such as those of swapped arguments.
     """
     _check_shapes(pose=(pose, (4, 4)), parameters=(parameters, (10,)))
     rotation, shift = pose[:3, :3], pose[:3, 3]
@@ -112,7 +113,7 @@ def pseudo_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "4 4
 
 
 def parameters_from_pseudo(matrix: Checked[Float[Array, "4 4"]]) -> Float[Array, "10"]:
-    """The ten numbers of a pseudo-inertia (4, 4); inverse of `pseudo_inertia`: I = tr(Sigma) 1 - Sigma."""
+    """Ten inertial parameters of a pseudo-inertia (4, 4); inverse of `pseudo_inertia`: I = tr(Sigma) 1 - Sigma."""
     _check_shapes(matrix=(matrix, (4, 4)))
     sigma = matrix[:3, :3]
     inertia = jnp.trace(sigma) * jnp.eye(3, dtype=matrix.dtype) - sigma
@@ -120,11 +121,11 @@ def parameters_from_pseudo(matrix: Checked[Float[Array, "4 4"]]) -> Float[Array,
 
 
 def log_cholesky_factor(theta: Checked[Float[Array, "10"]]) -> Float[Array, "4 4"]:
-    """Upper-triangular factor U (4, 4) of the pseudo-inertia U U^T that ten unconstrained numbers stand for.
+    """Upper-triangular factor U (4, 4) of the pseudo-inertia U U^T, from ten unconstrained numbers.
 
     theta = (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3) and U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2],
     [0, 0, exp d3, t3], [0, 0, 0, 1]] (Rucker & Wensing 2022, eq. 16): the affine map (stretch, shear, shift, and exp(2 alpha)
-    the mass) that carries a reference body of unit pseudo-inertia to the body. It is the identity at theta = 0.
+    the mass) that maps a reference body of unit pseudo-inertia to the body. It is the identity at theta = 0.
     """
     _check_shapes(theta=(theta, (10,)))
     alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = theta
@@ -144,7 +145,7 @@ def from_log_cholesky(theta: Checked[Float[Array, "10"]]) -> Float[Array, "10"]:
 
 
 def to_log_cholesky(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "10"]:
-    """Ten unconstrained numbers (10,) of ten inertial parameters (10,): the inverse of `from_log_cholesky`.
+    """Log-Cholesky coordinates (10,) of ten inertial parameters (10,): the inverse of `from_log_cholesky`.
 
     NaN when the parameters are not strictly feasible (see `is_feasible`).
     """
@@ -152,6 +153,7 @@ def to_log_cholesky(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "10
     matrix = pseudo_inertia(parameters)
     # U U^T with U upper triangular is the Cholesky factorisation of the matrix with rows and columns reversed.
     upper = jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
+    # U = exp(alpha) * unit triangular factor with last entry 1; dividing by it separates mass from shape.
     alpha = jnp.log(upper[3, 3])
     unit = upper / upper[3, 3]
     diagonal = jnp.log(jnp.stack([unit[0, 0], unit[1, 1], unit[2, 2]]))
@@ -160,8 +162,10 @@ def to_log_cholesky(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "10
 
 
 def is_feasible(parameters: Numbers, *, tolerance: float = 0.0) -> bool:
-    """Whether concrete parameters (10,) belong to a physical body: pseudo-inertia positive semidefinite to `tolerance`
-    (relative to its largest eigenvalue)."""
+    """Decide whether concrete parameters (10,) belong to a physical body: pseudo-inertia positive semidefinite.
+
+    `tolerance` is relative to its largest eigenvalue.
+    """
     values = np.linalg.eigvalsh(_f64.pseudo_inertia(np.asarray(parameters, np.float64)))
     return bool(values[0] >= -tolerance * max(values[-1], 0.0))
 
@@ -175,57 +179,58 @@ def nearest_feasible(parameters: Numbers, *, floor: float = 1e-6) -> np.ndarray:
     if not parameters[0] > 0:
         raise ValueError(f"mass is {parameters[0]}, cannot be repaired; give the body a positive mass")
     values, vectors = np.linalg.eigh(_f64.pseudo_inertia(parameters))
+    # Raising eigenvalues changes the trace, and with it the mass; the scaling below restores the given mass.
     values = np.maximum(values, floor * values[-1])
     repaired = (vectors * values) @ vectors.T
     repaired *= parameters[0] / repaired[3, 3]
     return _f64.parameters_from_pseudo(repaired).astype(_dtypes.canonicalize_dtype(float))
 
 
-# Bodies of simple shapes. Their numbers may be traced; of known ones they are arrays of numpy, in float64.
+# Bodies of simple shapes. Traced numbers give arrays of jax, known ones arrays of numpy in float64.
 
 
 def box(mass: Number, size: Row) -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform box with edges `size` (3,) (m) about its centre (EQUATIONS section 1)."""
     x, y, z = (mass / 12 * edge**2 for edge in size)
-    return _centred(mass, (y + z, x + z, x + y))
+    return _from_moments(mass, (y + z, x + z, x + y))
 
 
 def sphere(mass: Number, radius: Number) -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform solid ball about its centre; kg, m."""
-    return _centred(mass, (0.4 * mass * radius**2,) * 3)
+    return _from_moments(mass, (0.4 * mass * radius**2,) * 3)
 
 
 def ellipsoid(mass: Number, semi_axes: Row) -> Array | np.ndarray:
     """Inertial parameters (10,) of a solid ellipsoid about its centre; `semi_axes` (3,) along x, y, z in m."""
     x, y, z = (0.2 * mass * axis**2 for axis in semi_axes)
-    return _centred(mass, (y + z, x + z, x + y))
+    return _from_moments(mass, (y + z, x + z, x + y))
 
 
 def cylinder(mass: Number, radius: Number, length: Number) -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform solid cylinder along z about its centre, a disk for length 0; kg, m."""
     across = mass * (3 * radius**2 + length**2) / 12
-    return _centred(mass, (across, across, 0.5 * mass * radius**2))
+    return _from_moments(mass, (across, across, 0.5 * mass * radius**2))
 
 
 def rod(mass: Number, length: Number, axis: str = "x") -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform thin rod along an axis, "x", "y" or "z", about its centre; kg, m."""
     along = "xyz".index(axis)
-    return _centred(mass, [0.0 if i == along else mass * length**2 / 12 for i in range(3)])
+    return _from_moments(mass, [0.0 if i == along else mass * length**2 / 12 for i in range(3)])
 
 
 def point_mass(mass: Number, position: Numbers = (0.0, 0.0, 0.0)) -> Array | np.ndarray:
     """Inertial parameters (10,) of a point mass (kg) at a position (3,) in the body frame (m)."""
-    return displaced(_centred(mass, (0.0, 0.0, 0.0)), position)
+    return displaced(_from_moments(mass, (0.0, 0.0, 0.0)), position)
 
 
 def displaced(parameters: Numbers, position: Numbers, rotation: Numbers | None = None) -> Array | np.ndarray:
-    """Parameters (10,) of the same body placed at `position` (3,), turned by `rotation` (3, 3), in a new frame."""
+    """Parameters (10,) of the same body placed at `position` (3,), rotated by `rotation` (3, 3), in a new frame."""
     rotation = np.eye(3) if rotation is None else rotation
     _check_shapes(parameters=(parameters, (10,)), position=(position, (3,)), rotation=(rotation, (3, 3)))
     pose = _f64.pose_of(rotation, position)
     return _f64.move_inertia(pose, _numpy_for(parameters).asarray(parameters, float))
 
 
-def _centred(mass, moments) -> Array | np.ndarray:
+def _from_moments(mass, moments) -> Array | np.ndarray:
     xp = _numpy_for(mass, moments)
     return xp.asarray([mass, 0.0, 0.0, 0.0, moments[0], 0.0, moments[1], 0.0, 0.0, moments[2]], float)

@@ -1,4 +1,4 @@
-"""Joint kinds as data: sizes, motion subspaces, transforms, and steps on each joint's own manifold.
+"""Joint kinds as data: sizes, motion subspaces, transforms, and steps on each joint's manifold.
 
 A joint places its body frame in the parent body frame at `home @ joint_transform(q)`. Every one-degree-of-freedom joint
 is the exponential of a constant screw (Murray, Li & Sastry 1994, eq. 2.40 and 3.4), so revolute, prismatic and helical
@@ -47,11 +47,12 @@ SCREW_KINDS = ("revolute", "continuous", "prismatic", "helical")
 
 
 def screw_mask(kind: str) -> np.ndarray:
-    """(6,) of bool: the entries of a joint's screw that its kind reads.
+    """Mask (6,) of the entries of a joint's screw that its kind uses.
 
-    A revolute axis passes through the body's origin and a prismatic joint does not turn, by declaration; other screws are
+    A revolute axis passes through the body's origin and a prismatic joint does not rotate, by declaration; other screws are
     helical joints.
     """
+    # By kind and not by value: a mask from numbers would recompile, or go stale when a leaf changes.
     turns, slides = kind in ("revolute", "continuous", "helical"), kind in ("prismatic", "helical")
     return np.repeat([slides, turns], 3)
 
@@ -75,6 +76,7 @@ def joint_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, " nqj"]
     """
     if kind in SCREW_KINDS:
         return screw_transform(kind, screw, q[0])
+    # The rows are written out: a product of exponentials would cost three times as many operations.
     zero = jnp.zeros_like(q[0])
     if kind == "planar":
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
@@ -88,7 +90,7 @@ def joint_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, " nqj"]
 
 
 def screw_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, ""]) -> Float[Array, "4 4"]:
-    """exp(hat(screw) q) of a joint of one degree of freedom, whose kind says whether it turns: no case is told apart by numbers.
+    """Screw motion exp(hat(screw) q) of a joint with one degree of freedom; its kind, not its numbers, selects the formula.
 
     With the axis u = omega/|omega|: R = u u^T + cos (1 - u u^T) + sin hat(u), and p = (1 - R)(u x v)/|omega| + u (u . v) q.
     """
@@ -96,10 +98,12 @@ def screw_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, ""]) ->
     if kind == "prismatic":
         return se3.from_parts(jnp.eye(3, dtype=screw.dtype), v * q)
     rate = jnp.sqrt(jnp.sum(omega * omega))
+    # The screw need not be of unit length here: derivatives with respect to the leaf go through the normalisation.
     axis = omega / rate
     along = axis[:, None] * axis[None]
     across = jnp.eye(3, dtype=screw.dtype) - along
     rotation = along + jnp.cos(rate * q) * across + jnp.sin(rate * q) * so3.hat(axis)
+    # p = (1 - R) (u x v)/|omega| vanishes on an axis through the origin, as declared for revolute joints.
     if kind != "helical":
         return se3.from_parts(rotation, jnp.zeros_like(v))
     lever = so3.cross(axis, v) / rate
@@ -118,15 +122,17 @@ def joint_neutral(kind: str) -> np.ndarray:
 
 @compiled
 def joint_integrate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"]) -> Float[Array, " nqj"]:
-    """Move along the constant body velocity v for one unit of time: q exp(v), on the joint's own group."""
+    """Integrate the constant body velocity v for unit time: q exp(v), on the joint's group."""
     if kind in SCREW_KINDS:
         return q + v
     if kind == "planar":
+        # SE(2), not three separate coordinates: vx and vy are in the body frame, which turns during the step.
         step = se2.exp(v)
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
         x, y = step[0, 2], step[1, 2]
         return jnp.stack([q[0] + c * x - s * y, q[1] + s * x + c * y, q[2] + v[2]])
     if kind == "spherical":
+        # A product of unit quaternions drifts by eps per step; normalising here keeps long integrations on the sphere.
         return so3.quat_normalize(so3.quat_multiply(q, so3.quat_exp(v)))
     step = se3.exp(v)
     position = q[:3] + so3.quat_to_matrix(q[3:]) @ step[:3, 3]
@@ -143,8 +149,10 @@ def joint_difference(kind: str, q0: Float[Array, " nqj"], q1: Float[Array, " nqj
         d = q1 - q0
         x, y = c * d[0] + s * d[1], -s * d[0] + c * d[1]
         # The angle is kept as it is, not wrapped: planar joints may turn many times.
+        # The left Jacobian inverse of SE(2) undoes the rotation of the body axes during the step.
         inverse = se2.left_jacobian_inverse(jnp.stack([jnp.zeros_like(x), jnp.zeros_like(x), d[2]]))[:2, :2]
         return jnp.concatenate([inverse @ jnp.stack([x, y]), d[2:]])
+    # q and -q are one rotation; quat_log takes the shorter one, so the difference never exceeds half a turn.
     relative = so3.quat_multiply(so3.quat_conjugate(q0[-4:]), q1[-4:])
     omega = so3.quat_log(relative)
     if kind == "spherical":
@@ -155,13 +163,14 @@ def joint_difference(kind: str, q0: Float[Array, " nqj"], q1: Float[Array, " nqj
 
 @compiled
 def joint_rate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"]) -> Float[Array, " nqj"]:
-    """Time derivative of q for the body velocity v (the kinematic map qdot = H(q) v)."""
+    """Time derivative of q for the body velocity v, the kinematic map qdot = H(q) v."""
     if kind in SCREW_KINDS:
         return v
     if kind == "planar":
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
         return jnp.stack([c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]])
     omega = v[-3:]
+    # Body-frame angular velocity multiplies from the right: qdot = q (0, omega) / 2.
     quat_rate = 0.5 * so3.quat_multiply(q[-4:], jnp.concatenate([jnp.zeros_like(omega[:1]), omega]))
     if kind == "spherical":
         return quat_rate
@@ -170,6 +179,7 @@ def joint_rate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"]) -> F
 
 @compiled
 def joint_random(kind: str, key: Array, lower: Array, upper: Array, dtype) -> Float[Array, " nqj"]:
+    # A normal vector in four dimensions has a uniform direction, and so gives uniform rotations.
     """Random configuration: uniform between the limits for coordinates, uniform over rotations for quaternions."""
     if kind in ("spherical", "free"):
         ends, quat_key = jax.random.split(key)

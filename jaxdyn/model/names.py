@@ -1,4 +1,4 @@
-"""Looking up bodies, joints and frames of a model by name, and joints in words where a name is unknown."""
+"""Look-up of bodies, joints and frames of a model by name, with suggestions for unknown names."""
 
 import difflib
 from collections.abc import Iterable, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 def body_index(model: Any, name: str | None) -> int:
     """Index of a body by name; None means the world, -1.
 
-    **Raises:** ValueError for a name that is neither a body nor a frame merged into one; the near names are listed.
+    **Raises:** ValueError for a name that is neither a body nor a frame merged into one; similar names are listed.
     """
     if name is None:
         return -1
@@ -20,7 +20,7 @@ def body_index(model: Any, name: str | None) -> int:
 
 
 def frame_index(model: Any, name: str) -> int:
-    """Index of a frame by name; a name of a joint that no frame has stands for the frame of the link that it carries.
+    """Index of a frame by name; the name of a joint means the frame of its child link unless a frame has that name.
 
     **Raises:** ValueError when there is no frame of that name; names that look alike are listed.
     """
@@ -45,16 +45,16 @@ def joint_index(model: Any, name: str) -> int:
     raise ValueError(f"joint {name!r} is not in model {model.name!r}; {hint}")
 
 
-def place_in(slices: Sequence[slice], model: Any, joint: str) -> int | slice:
-    """Where a joint's numbers stand: an index where there is one of them, else a slice."""
+def coordinate_index(slices: Sequence[slice], model: Any, joint: str) -> int | slice:
+    """Index of a joint's coordinate, or the slice of several."""
     place = slices[joint_index(model, joint)]
     return place.start if place.stop == place.start + 1 else place
 
 
-def columns_in_v(model: Any, joints: Iterable[str]) -> np.ndarray:
-    """Places in v of the numbers of some joints, in their order.
+def velocity_indices(model: Any, joints: Iterable[str]) -> np.ndarray:
+    """Indices in v of the coordinates of some joints, in their order.
 
-    **Raises:** ValueError for one string in the place of a list, unknown joints and joints named twice.
+    **Raises:** ValueError for one string instead of a list, unknown joints and joints named twice.
     """
     if isinstance(joints, str):
         raise ValueError(f"joints is {joints!r}; give a list of names, [{joints!r}]")

@@ -1,4 +1,4 @@
-"""Built-in mechanisms: real arms, a real hand, a robot with legs, and generators of chains and random trees."""
+"""Built-in mechanisms: two arms, a hand, a quadruped, and generators of chains and random trees."""
 
 from collections.abc import Sequence
 
@@ -46,7 +46,7 @@ _IIWA_TORQUES = (320, 320, 176, 176, 110, 40, 40)
 
 
 def iiwa(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Model:
-    """The arm KUKA LBR iiwa 14: seven revolute joints on a fixed base.
+    """KUKA LBR iiwa 14 arm: seven revolute joints on a fixed base.
 
     Joints iiwa_joint_1 .. 7 move bodies iiwa_link_1 .. 7 about their z axes; the frame iiwa_link_0 is the base.
 
@@ -126,7 +126,7 @@ _ALLEGRO_THUMB = (
         (-0.162, 1.719),
     ),
 )
-# Where each finger stands on the palm, and the axes of its joints.
+# Pose of each finger on the palm, and the axes of its joints.
 _BEND = ((0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 1, 0))
 _ALLEGRO = (
     (((0, 0.0435, -0.001542), (-0.08726646255, 0, 0)), _BEND, _ALLEGRO_FINGER),
@@ -142,7 +142,7 @@ _ALLEGRO_TIP = (0.0168, (0, 0, 0), (9.68e-07,) * 3)
 
 
 def allegro(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Model:
-    """The right Allegro hand: index, middle and ring finger and a thumb of four revolute joints each on a fixed palm.
+    """Right Allegro hand: index, middle and ring finger and a thumb of four revolute joints each on a fixed palm.
 
     Joints joint_0.0 .. 3.0 are those of the index finger from the palm outwards, 4 .. 7 of the middle finger, 8 .. 11 of the ring
     finger and 12 .. 15 of the thumb; they move bodies link_0.0 .. link_15.0. The frames link_3.0_tip, link_7.0_tip, link_11.0_tip
@@ -179,7 +179,7 @@ def allegro(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) ->
     return builder.build()
 
 
-# Of each joint: name, place in the body that carries it and turn there about y, axis, largest angle, speed and torque; of its
+# For each joint: name, position in its parent and rotation there about y (deg), axis, limits of angle, speed and torque; for its
 # body: mass, centre of mass, radius and length of a cylinder along z.
 _UR5 = (
     ("shoulder_pan", (0, 0, 0.089159), 0, "z", 360, 3.15, 150, 3.7, 0.0, 0.06, 0.15),
@@ -192,13 +192,13 @@ _UR5 = (
 
 
 def ur5(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Model:
-    """The arm Universal Robots UR5: six revolute joints on a fixed base.
+    """Universal Robots UR5 arm: six revolute joints on a fixed base.
 
     Joints shoulder_pan, shoulder_lift, elbow, wrist_1, wrist_2, wrist_3 move bodies of the same names with _link behind; the
     frames are base_link and tool0, the flange, with z outwards.
 
-    Source: lengths, masses, centres of mass and limits (rad/s, N m) as the maker publishes them and ROS descriptions of the arm
-    have them. Moments of inertia are not published: each body is a cylinder of its mass.
+    Source: lengths, masses, centres of mass and limits (rad/s, N m) as published by the manufacturer and used in ROS
+    descriptions of the arm. Moments of inertia are not published: each body is a uniform cylinder of its mass.
     """
     axes = {"y": (0, 1, 0), "z": (0, 0, 1)}
     builder = ModelBuilder("ur5", gravity=gravity, dtype=dtype).add_body("base_link", joint="fixed")
@@ -222,12 +222,12 @@ def ur5(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Mod
 
 
 def quadruped(*, floating_base: bool = True, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Model:
-    """A robot with four legs of no particular make, some 12 kg: a trunk and, for each leg, hip, thigh and shank.
+    """Generic quadruped of about 12 kg: a trunk and, for each leg, hip, thigh and shank.
 
     Legs are FL, FR, RL, RR; joints LEG_hip turn about x, LEG_thigh and LEG_knee about y; feet are frames LEG_foot. At q = 0 legs
     hang straight, 0.4 m long; thigh 0.8 and knee -1.6 rad stand it up. With `floating_base` the trunk's pose comes first in q.
 
-    Source: none, sizes and masses are round numbers like those of robots of this kind.
+    Source: none; sizes and masses are round numbers typical of such robots.
     """
     builder = ModelBuilder("quadruped", gravity=gravity, dtype=dtype)
     trunk = "free" if floating_base else "fixed"
@@ -290,9 +290,9 @@ def random_tree(
 ) -> Model:
     """A random tree of bodies with physical inertias and every kind of joint (after autoTree of spatial_v2).
 
-    Body i hangs on body floor((i - 1) / branching), so 1 gives a chain, 2 a binary tree and nb a broom. The kinds are
-    dealt out in a shuffled order until all have been used, then again. Helical joints have any screw, with an axis that
-    misses the frame's origin.
+    The parent of body i is body floor((i - 1) / branching), so 1 gives a chain, 2 a binary tree and nb a broom. The kinds are
+    drawn without replacement, in a new random order each time all have been used. Helical joints have any
+    screw, with an axis that misses the frame's origin.
 
     **Arguments:**
 
@@ -310,6 +310,7 @@ def random_tree(
     if unknown := [kind for kind in kinds if kind not in KINDS and kind != "fixed"]:
         raise ValueError(f"kinds {unknown} are unknown; kinds are fixed, {', '.join(KINDS)}")
     if isinstance(seed, jax.Array):
+        # Traces of keys give the same tree: only the key's data, known numbers, seed numpy's generator.
         seed = np.asarray(jax.random.key_data(seed)).tolist()
     rng = np.random.default_rng(seed)
     builder = ModelBuilder(f"random tree {nb}", gravity=gravity, dtype=dtype)

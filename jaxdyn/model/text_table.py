@@ -1,4 +1,4 @@
-"""Tables of text."""
+"""Plain-text tables."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], indent: str = " 
 
 
 def short(value: float | None, digits: int = 4) -> str:
-    """A number for a table; a dash for infinity (no limit) and for what is not there."""
+    """Format a number for a table; a dash stands for infinity (no limit) and for None."""
     return "-" if value is None or not np.isfinite(value) else f"{value:.{digits}g}"
 
 

@@ -1,4 +1,4 @@
-"""The static part of a mechanism: the tree of bodies, kinds of joints and names (`Topology`), and tables made of them."""
+"""Static part of a mechanism, `Topology`: the tree of bodies, kinds of joints and names, and tables derived from them."""
 
 import dataclasses
 import itertools
@@ -11,10 +11,10 @@ from jaxdyn.model.joints import KINDS, screw_mask
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Topology:
-    """Everything about a mechanism that decides what is compiled: who hangs on whom, and by which kind of joint.
+    """Structure of a mechanism that decides which program is compiled: parents and kinds of joints.
 
     Bodies are listed so that a parent comes before its children (`parents[i] < i`; -1 is the world). Body i is moved by
-    joint i. Two topologies with the same tree, kinds and names are equal, so models that differ in numbers alone share
+    joint i. Two topologies with the same tree, kinds and names are equal, so models that differ only in their parameters share
     compiled code.
     """
 
@@ -25,9 +25,10 @@ class Topology:
     joint_names: tuple[str, ...]
     frame_names: tuple[str, ...]
     frame_bodies: tuple[int, ...]
-    couplings: tuple[tuple[int, int], ...] = ()  # (joint, source): the joint is to follow the source
+    couplings: tuple[tuple[int, int], ...] = ()  # (joint, source): the joint's coordinate is a function of the source's
 
     @cached_property
+    # Cached: JAX hashes and compares static fields at every call of a jitted function.
     def _key(self):
         return tuple(getattr(self, field.name) for field in dataclasses.fields(self))
 
@@ -38,6 +39,7 @@ class Topology:
     def __hash__(self):
         return self._hash
 
+    # Identity first: comparing long tuples of names at every call would cost more than small programs.
     def __eq__(self, other):
         return self is other or (isinstance(other, Topology) and self._key == other._key)
 
@@ -58,30 +60,31 @@ class Topology:
 
     @cached_property
     def q_slices(self) -> tuple[slice, ...]:
-        """Where each joint's coordinates stand in q."""
+        """Slice of each joint's coordinates in q."""
         ends = np.cumsum([0] + [KINDS[kind].nq for kind in self.kinds]).tolist()
         return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
 
     @cached_property
     def v_slices(self) -> tuple[slice, ...]:
-        """Where each joint's coordinates stand in v."""
+        """Slice of each joint's coordinates in v."""
         ends = np.cumsum([0] + [KINDS[kind].nv for kind in self.kinds]).tolist()
         return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
 
     @cached_property
     def screw_mask(self) -> np.ndarray:
-        """(nb, 6) of bool: the screw entries that each joint's kind reads."""
+        """Mask (nb, 6) of the screw entries that each joint's kind uses."""
         return np.array([screw_mask(kind) for kind in self.kinds], bool).reshape(-1, 6)
 
     @cached_property
     def dof_body(self) -> np.ndarray:
-        """(nv,): the body that each velocity coordinate moves first."""
+        """Body (nv,) that carries each velocity coordinate's joint."""
         return np.repeat(np.arange(self.nb), [KINDS[kind].nv for kind in self.kinds])
 
     @cached_property
     def ancestors(self) -> np.ndarray:
-        """(nb, nb) of bool: [i, j] is true when body j is body i or an ancestor of it. The world-frame G = (I - Gamma)^-1."""
+        """Mask (nb, nb), true at [i, j] when body j is body i or its ancestor: the world-frame G = (I - Gamma)^-1."""
         mask = np.eye(self.nb, dtype=bool)
+        # parents[i] < i, so the row of the parent is complete.
         for i, parent in enumerate(self.parents):
             if parent >= 0:
                 mask[i] |= mask[parent]
@@ -89,22 +92,24 @@ class Topology:
 
     @cached_property
     def dof_ancestors(self) -> np.ndarray:
-        """(nb, nv) of bool: [i, j] is true when velocity coordinate j moves body i."""
+        """Mask (nb, nv), true at [i, j] when velocity coordinate j moves body i."""
         return self.ancestors[:, self.dof_body]
 
     @cached_property
     def depths(self) -> np.ndarray:
-        """(nb,): number of joints between the world and each body, at least 1."""
+        """Number of joints between the world and each body, (nb,), at least 1."""
         return self.ancestors.sum(1)
 
     @cached_property
     def roots(self) -> np.ndarray:
-        """(nb,): the root body of the tree that each body belongs to."""
+        """Root body of the tree of each body, (nb,)."""
+        # argmax of a mask is the first true entry, and an ancestor has a smaller index than its descendants.
         return np.argmax(self.ancestors, axis=1) if self.nb else np.zeros(0, int)
 
     @cached_property
     def jumps(self) -> tuple[np.ndarray, ...]:
         """Pointer-jumping tables: the 2^k-th ancestor of each body (nb means the world), k = 0 .. ceil(log2(depth)) - 1."""
+        # One row more than bodies: the world is its own ancestor, so that jumps beyond the root stay there.
         jump = np.array([p if p >= 0 else self.nb for p in self.parents] + [self.nb])
         tables = []
         while self.nb and (jump[:-1] != self.nb).any():

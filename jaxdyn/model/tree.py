@@ -1,4 +1,4 @@
-"""The mechanism: the array leaves that give numbers to a static tree of bodies (`Model`), and moves on its manifold."""
+"""Parameters of a mechanism on a static tree of bodies (`Model`), and operations on its configuration manifold."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.compile import is_concrete, is_expanding, numpy_for
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes, warn_of_inertias
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes, warn, warn_unphysical_inertias
+from jaxdyn.model.description import tree_table
 from jaxdyn.model.inertia import inertial_parameters, transform_inertia
 from jaxdyn.model.joints import (
     KINDS,
@@ -21,13 +22,12 @@ from jaxdyn.model.joints import (
     joint_random,
     joint_rate,
 )
-from jaxdyn.model.names import columns_in_v, frame_index, place_in
-from jaxdyn.model.printed import tree_of
+from jaxdyn.model.names import coordinate_index, frame_index, velocity_indices
 from jaxdyn.model.topology import Topology as Topology
 
 
 class Model(eqx.Module):
-    """A tree of rigid bodies joined by screws. A pytree: the topology is static, every number is a leaf.
+    """Tree of rigid bodies joined by screws, a pytree: the topology is static, every parameter is an array leaf.
 
     Build one with `ModelBuilder` or `load_urdf`. Shapes, units and frames of the leaves:
 
@@ -43,7 +43,7 @@ class Model(eqx.Module):
     - `lower`, `upper` (nq,) position limits (infinite where there are none); `velocity_limit`, `effort_limit` (nv,).
     - `coupling_values` (nc, 2): multiplier and offset (m or rad) of each coupling q[joint] = multiplier q[source] + offset in
       `topology.couplings`, or None when there are none. They are data for a scene's constraints; the joints stay free here.
-    - `fixed_joints`: (joint, frame) for each joint that holds a link fast: its name stands for the link's frame. Static.
+    - `fixed_joints`: (joint, frame) for each fixed joint: its name is a second name of the link's frame. Static.
     """
 
     home: Float[Array, "nb 4 4"]
@@ -63,7 +63,7 @@ class Model(eqx.Module):
     fixed_joints: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
 
     def __str__(self) -> str:
-        return tree_of(self)
+        return tree_table(self)
 
     @property
     def name(self) -> str:
@@ -101,29 +101,29 @@ class Model(eqx.Module):
         return self.topology.frame_names
 
     def replace(self, **leaves: PyTree) -> "Model":
-        """A copy with some leaves replaced, e.g. `model.replace(gravity=None)`.
+        """Copy with some leaves replaced, e.g. `model.replace(gravity=None)`.
 
         **Raises:** ValueError for a name that is not a leaf or for a shape that differs from the present one.
 
-        **Warns:** UserWarning naming bodies whose new `inertias` no body has, as `ModelBuilder.build` does.
+        **Warns:** UserWarning naming bodies whose new `inertias` are unphysical, as `ModelBuilder.build` does.
         """
         return _replace(self, leaves)
 
     def q_index(self, joint: str) -> int | slice:
-        """Where a joint's coordinates stand in q: an index of a joint with one number, else a slice.
+        """Index of a joint's coordinate in q, or the slice of several.
 
         `q[model.q_index("elbow")]` reads them, `q.at[model.q_index("elbow")].set(0.5)` sets them.
 
-        **Raises:** ValueError for a name that is no moving joint; near names are listed.
+        **Raises:** ValueError for a name that is no moving joint; similar names are listed.
         """
-        return place_in(self.topology.q_slices, self, joint)
+        return coordinate_index(self.topology.q_slices, self, joint)
 
     def v_index(self, joint: str) -> int | slice:
-        """Where a joint's numbers stand in v, tau and every array (nv,), as `q_index` says it for q."""
-        return place_in(self.topology.v_slices, self, joint)
+        """Index of a joint's coordinate in v, tau and every array (nv,), or the slice of several."""
+        return coordinate_index(self.topology.v_slices, self, joint)
 
     def selection_matrix(self, joints: Iterable[str] | None = None) -> Float[Array, "nv nu"]:
-        """S (nv, nu) of zeros and ones: tau = S u for the forces u (nu,) of actuated joints, S^T v are their velocities.
+        """Selection matrix S (nv, nu): tau = S u for the forces u (nu,) of actuated joints, S^T v are their velocities.
 
         **Arguments:** `joints`, names in the order of u; None: all but free ones, which carry floating bases.
 
@@ -132,10 +132,10 @@ class Model(eqx.Module):
         if joints is None:
             named = zip(self.joint_names, self.topology.kinds, strict=True)
             joints = [name for name, kind in named if kind != "free"]
-        return jnp.asarray(np.eye(self.nv)[:, columns_in_v(self, joints)], self.home.dtype)
+        return jnp.asarray(np.eye(self.nv)[:, velocity_indices(self, joints)], self.home.dtype)
 
     def with_payload(self, frame: str, inertia: Numbers) -> "Model":
-        """The model carrying a body at a frame: its inertia is added to that of the body with the frame.
+        """Model carrying a payload at a frame: its inertia is added to that of the body with the frame.
 
         **Arguments:** `frame`, one of `model.frame_names` or of `model.joint_names`; `inertia`, in the frame's axes: the ten
         numbers (10,) about its origin, or (mass, centre of mass (3,), rotational inertia (3, 3) about it); kg, m, kg m^2.
@@ -159,24 +159,39 @@ class Model(eqx.Module):
         added = transform_inertia(self.frame_poses[index], _payload(inertia, dtype))
         return self.replace(inertias=self.inertias.at[body].add(added))
 
-    def followed(self, q: Float[Array, " nq"], joints: Array) -> Float[Array, " nq"]:
-        """The configuration next to q whose joints have the coordinates `joints`: all that there is to q, in a `Model`.
+    def complete_configuration(self, q: Float[Array, " nq"], joints: Array) -> Float[Array, " nq"]:
+        """Configuration near q with the joint coordinates `joints`; these are all of q in a `Model`.
 
-        A subclass may keep numbers behind the joints' coordinates that are functions of these and known near q alone.
+        Subclasses may append dependent coordinates, which are functions of these defined only near q (see `jd.RollingModel`).
         """
         return joints
 
-    def followed_rate(self, q: Float[Array, " nq"], v: Float[Array, " nv"], rate: Array) -> Float[Array, " nq"]:
-        """dq/dt (nq,) where the joints' coordinates have the given rate."""
+    def complete_rate(self, q: Float[Array, " nq"], v: Float[Array, " nv"], rate: Array) -> Float[Array, " nq"]:
+        """Rate dq/dt (nq,) where the joints' coordinates have the given rate."""
         return rate
 
-    def follows(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
-        """Whether q is where `followed` leaves it and may go on from there; True for a `Model`."""
+    def is_consistent(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
+        """Decide whether the dependent coordinates of q solve their equations; True for a `Model`."""
         return jnp.asarray(True)
+
+    def followed(self, q: Float[Array, " nq"], joints: Array) -> Float[Array, " nq"]:
+        """Deprecated name of `complete_configuration`."""
+        warn("Model.followed is deprecated; call complete_configuration", DeprecationWarning)
+        return self.complete_configuration(q, joints)
+
+    def followed_rate(self, q: Float[Array, " nq"], v: Float[Array, " nv"], rate: Array) -> Float[Array, " nq"]:
+        """Deprecated name of `complete_rate`."""
+        warn("Model.followed_rate is deprecated; call complete_rate", DeprecationWarning)
+        return self.complete_rate(q, v, rate)
+
+    def follows(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
+        """Deprecated name of `is_consistent`."""
+        warn("Model.follows is deprecated; call is_consistent", DeprecationWarning)
+        return self.is_consistent(q)
 
 
 def _payload(inertia: Any, dtype) -> Array:
-    """Ten numbers of what a user gave as an inertia, traced or not."""
+    """Ten inertial parameters of an inertia argument, traced or not."""
     ask = "give the ten numbers (10,), or (mass, centre of mass (3,), rotational inertia (3, 3) about it)"
     if isinstance(inertia, (tuple, list)) and len(inertia) == 3:
         parts = [as_array(part, "inertia", dtype) for part in inertia]
@@ -205,14 +220,15 @@ def _replace(model: Model, leaves: dict) -> Model:
         if np.shape(value) != want:
             raise ValueError(f"replace: {name} has shape {np.shape(value)}, expected {want}")
         if name == "inertias" and is_concrete(value):
-            warn_of_inertias(dict(zip(model.body_names, np.asarray(value), strict=True)))
+            warn_unphysical_inertias(dict(zip(model.body_names, np.asarray(value), strict=True)))
+        # Arrays of jax keep their dtype: a leaf of another precision may be what the caller differentiates.
         leaves[name] = jnp.asarray(value, model.home.dtype) if not isinstance(value, jax.Array) else value
     leaves = {name: leaves.get(name, getattr(model, name)) for name in names}
     return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints)
 
 
 def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """Home poses (nb, 4, 4) and screws (nb, 6) as every algorithm reads them.
+    """Home poses (nb, 4, 4) and screws (nb, 6) as every algorithm uses them.
 
     Values are those of the leaves, except that screw entries which the joint's kind does not have are zero. Derivatives
     are made unique: a change of a home pose that leaves SE(3) has no meaning, and algorithms would answer it differently,
@@ -220,21 +236,25 @@ def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """
     mask = model.topology.screw_mask
     if is_expanding() and is_concrete(model.home, model.screws):
-        return jnp.asarray(_snapped(model.home)), jnp.asarray(_snapped(model.screws) * mask.astype(model.screws.dtype))
+        return jnp.asarray(_snap_to_integers(model.home)), jnp.asarray(
+            _snap_to_integers(model.screws) * mask.astype(model.screws.dtype)
+        )
     screws = model.screws * jnp.asarray(mask, model.screws.dtype)
     if is_concrete(model.home):
         return model.home, screws
     rotation = model.home[:, :3, :3]
+    # The polynomial R (3 - R^T R)/2 is one Newton step towards the orthogonal factor; it is differentiable without an
+    # SVD.
     gram = jnp.einsum("nji,njk->nik", rotation, rotation)
     rotation = jnp.einsum("nij,njk->nik", rotation, 1.5 * jnp.eye(3, dtype=rotation.dtype)[None] - 0.5 * gram)
     last = jnp.broadcast_to(jnp.asarray(np.eye(4)[3:], rotation.dtype), (model.nb, 1, 4))
     return jnp.concatenate([jnp.concatenate([rotation, model.home[:, :3, 3:]], 2), last], 1), screws
 
 
-def _snapped(leaf) -> np.ndarray:
-    """Known numbers with those within rounding of 0, 1 and -1 replaced by these, which programs of numbers leave out.
+def _snap_to_integers(leaf) -> np.ndarray:
+    """Replace known numbers within rounding of 0, 1 and -1 by these, so that scalar programs drop their products.
 
-    A rotation by a right angle that was computed has cosines of 1e-16.
+    A computed rotation by a right angle has cosines of 1e-16.
     """
     values = np.asarray(leaf)
     near = np.round(values)
@@ -243,14 +263,14 @@ def _snapped(leaf) -> np.ndarray:
 
 
 def _per_joint(topology: Topology, function, q, *rest) -> Array:
-    """Apply `function(kind, q of the joint, ...)` to every joint; one-number joints are done in one operation."""
+    """Apply `function(kind, q of the joint, ...)` to every joint; joints with one coordinate share one operation."""
     parts = []
     i = 0
     while i < topology.nb:
         j = i
         while j < topology.nb and KINDS[topology.kinds[j]].nq == 1:
             j += 1
-        last = max(j - 1, i)  # a run of one-number joints is a run of plain vectors
+        last = max(j - 1, i)  # consecutive joints with one coordinate are plain vectors
         qs = slice(topology.q_slices[i].start, topology.q_slices[last].stop)
         args = [
             x[qs] if along_q else x[topology.v_slices[i].start : topology.v_slices[last].stop] for x, along_q in rest
@@ -276,22 +296,22 @@ def integrate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], dt: 
     """
     q, v = check_shapes(model, q=q, v=v)
     dt = as_array(dt, "dt", q.dtype)
-    return model.followed(q, _per_joint(model.topology, joint_integrate, q, (v * dt, False)))
+    return model.complete_configuration(q, _per_joint(model.topology, joint_integrate, q, (v * dt, False)))
 
 
 def difference(model: Model, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -> Float[Array, " nv"]:
     """Body velocity that moves q0 to q1 in unit time: `integrate(model, q0, difference(model, q0, q1)) == q1`.
 
-    Rotations are compared by the shorter way round; at exactly half a turn one of the two ways is chosen.
+    Rotations are compared by the smaller angle; at exactly pi one of the two directions is chosen.
     """
     q0, q1 = check_shapes(model, q0=q0, q1=q1)
     return _per_joint(model.topology, joint_difference, q0, (q1, True))
 
 
 def configuration_rate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nq"]:
-    """dq/dt (nq,) for the body velocity v (nv,): the kinematic map qdot = H(q) v."""
+    """Rate dq/dt (nq,) for the body velocity v (nv,): the kinematic map qdot = H(q) v."""
     q, v = check_shapes(model, q=q, v=v)
-    return model.followed_rate(q, v, joint_rates(model, q, v))
+    return model.complete_rate(q, v, joint_rates(model, q, v))
 
 
 def joint_rates(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Array:
@@ -300,7 +320,7 @@ def joint_rates(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) ->
 
 
 def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
-    """q (nq,) back on the manifold: unit quaternions, other coordinates unchanged."""
+    """Project q (nq,) to the manifold: unit quaternions, other coordinates unchanged."""
     (q,) = check_shapes(model, q=q)
 
     def unit(kind, qj):
@@ -309,13 +329,14 @@ def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
         quat = qj[-4:] / jnp.sqrt(jnp.sum(qj[-4:] ** 2))
         return quat if kind == "spherical" else jnp.concatenate([qj[:3], quat])
 
-    return model.followed(q, _per_joint(model.topology, unit, q))
+    return model.complete_configuration(q, _per_joint(model.topology, unit, q))
 
 
 def random_configuration(model: Model, key: Array) -> Float[Array, " nq"]:
     """Random configuration (nq,): uniform within finite position limits (else within +-pi or +-1 m), uniform rotations."""
     check_shapes(model)
     topology = model.topology
+    # One key per joint, so that a joint's sample does not depend on the kinds of the others.
     keys = jax.random.split(key, topology.nb)
     xp = numpy_for(model.lower, model.upper)
     lower, upper = xp.asarray(model.lower), xp.asarray(model.upper)

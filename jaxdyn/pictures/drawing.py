@@ -1,4 +1,4 @@
-"""Drawings and animations with matplotlib: no browser, no display and no meshes needed."""
+"""Drawings and animations with matplotlib, without browser, display or meshes."""
 
 import os
 import shutil
@@ -8,9 +8,9 @@ import numpy as np
 
 from jaxdyn.constraints.base import layout
 from jaxdyn.model.arguments import Checked, Numbers, as_array, as_path
-from jaxdyn.pictures.inferred import place_of
+from jaxdyn.pictures.default_solids import frame_poses
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, joint_axes, marks, motion_of
-from jaxdyn.pictures.solids import Shapes, finer, simplified
+from jaxdyn.pictures.solids import Shapes, refine, simplify
 from jaxdyn.pictures.stage import AXIS, FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
 from jaxdyn.reports.plotting import Axes
 from jaxdyn.simulation.solution import Solution
@@ -18,8 +18,10 @@ from jaxdyn.systems.system import SceneLike
 
 _MOST_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
 _SIDES = 24  # of a round cone
-CONE_HEIGHT = 0.095  # of a friction cone, as a share of the mechanism's size
-_LONGEST = 0.1  # side of a triangle, as a share of the mechanism's size: by its middle matplotlib sorts what hides what
+CONE_HEIGHT = 0.095  # of a friction cone, as a fraction of the mechanism's size
+# Longest side of a triangle, as a fraction of the mechanism's size: matplotlib sorts triangles by the depth of their
+# centres, so that large ones would hide others wrongly.
+_LONGEST = 0.1
 _LIGHT = np.array([0.4, -0.5, 0.77])
 
 
@@ -37,17 +39,17 @@ def draw(
 
     - `scene`: a `Scene` or `Model`.
     - `q` (nq,): the configuration.
-    - `ax`: matplotlib axes of projection "3d" to draw into; None makes a figure of its own.
+    - `ax`: matplotlib axes of projection "3d" to draw into; None creates a figure.
     - `shapes`: solids to show, of `jd.shapes(path)`; None draws rods between joints and solids of the bodies' inertias.
     - `multipliers` (nc,): of the scene's rows, N and N m, as the contact forces of `jd.grasp.hold`, to be drawn as arrows.
 
     **Returns:** the axes, in m, axes of the world; `ax.figure.savefig(path)` writes the picture. Blue lines are axes
     of joints, orange circles loops and contacts, dashed lines distances. Orange cones are the friction cones of the scene,
-    around the forces that neither pull nor slip; red arrows are forces, those of contacts on the object; the longest is as
+    around the admissible contact forces; red arrows are forces, those of contacts on the object; the longest is as
     long as the cones are high, or a quarter of the mechanism.
 
-    **Raises:** ValueError for a system without bodies, a q or multipliers that do not fit, and axes that are not 3D. ImportError
-    without matplotlib.
+    **Raises:** ValueError for a system without bodies, a q or multipliers that do not fit, and axes that are not 3D.
+    ImportError without matplotlib.
 
     ```python
     jd.draw(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0]).figure.savefig("four_bar.png")
@@ -74,10 +76,10 @@ def animate(
     speed: float = 1.0,
     shapes: Checked[Shapes | None] = None,
 ) -> None:
-    """Write a motion as an animated picture: GIF (by pillow, which matplotlib brings) or MP4 (by ffmpeg, where installed).
+    """Write a motion as an animation: GIF (by pillow, a dependency of matplotlib) or MP4 (by ffmpeg, where installed).
 
-    **Arguments:** `scene`; `solution`, what `jd.simulate` returned, batched or not (at most four motions are drawn); `path`, a
-    file .gif or .mp4; `fps`, pictures a second; `speed`, seconds of motion a second; `shapes` as in `draw`.
+    **Arguments:** `scene`; `solution`, a result of `jd.simulate`, batched or not (at most four motions are drawn); `path`, a
+    file .gif or .mp4; `fps`, frames per second; `speed`, seconds of motion per second; `shapes` as in `draw`.
 
     **Raises:** ValueError for another kind of file, MP4 without ffmpeg, numbers that are not positive, systems
     without bodies. ImportError without matplotlib.
@@ -92,7 +94,7 @@ def animate(
     if path.suffix.lower() not in (".gif", ".mp4"):
         raise ValueError(f"path is {str(path)!r}; write to a file .gif or .mp4")
     if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
-        raise ValueError(f"path is {str(path)!r}, but there is no ffmpeg; install it, or write a .gif")
+        raise ValueError(f"path is {str(path)!r}, but ffmpeg is not installed; install it, or write a .gif")
     if not (fps > 0 and speed > 0):
         raise ValueError(f"fps is {fps}, speed is {speed}; give positive numbers")
     if not path.parent.is_dir():
@@ -105,7 +107,7 @@ def animate(
     picture = _Picture(motion, shapes, None)
     writer = (PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter)(fps=fps)
     figure = picture.ax.figure
-    # A margin that fits one picture need not fit the next: the layout is settled once.
+    # Fixed margins: a layout computed anew for each frame would make the picture jump.
     figure.set_layout_engine("none")
     with writer.saving(figure, str(path), dpi=80):
         for k in range(len(motion.ts)):
@@ -122,7 +124,7 @@ def _matplotlib() -> None:
 
 
 class _Picture:
-    """A mechanism in 3D axes, which can be shown at each row of its motion."""
+    """Mechanism in 3D axes, to be shown at each row of its motion."""
 
     def __init__(self, motion: Motion, shapes, ax):
         _matplotlib()
@@ -133,8 +135,8 @@ class _Picture:
         model = motion.scene.system
         self.solids = []
         for shape in parts:
-            vertices, faces = simplified(*shape.triangles(), _MOST_VERTICES)
-            vertices, faces = finer(vertices, faces, _LONGEST * self.stage.size)
+            vertices, faces = simplify(*shape.triangles(), _MOST_VERTICES)
+            vertices, faces = refine(vertices, faces, _LONGEST * self.stage.size)
             self.solids.append((shape.frame, vertices, faces, np.array(color_of(shape, model)), shape.opacity))
         self.axes, self.marks, self.forces = joint_axes(motion), marks(motion), forces(motion)
         self.cones = cones(motion)
@@ -142,7 +144,7 @@ class _Picture:
         _set_stage(self.ax, self.stage)
 
     def show(self, row: int) -> None:
-        """Draw one row in the place of what was there."""
+        """Draw one row and remove the previous one."""
         from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
         for artist in self.drawn:
@@ -153,8 +155,9 @@ class _Picture:
         for n in range(len(self.motion.q)):
             ghost = 0.3 if n else 1.0
             for frame, vertices, faces, color, opacity in self.solids:
-                pose = place_of(model, self.motion.poses[n, row], frame)
+                pose = frame_poses(model, self.motion.poses[n, row], frame)
                 sides = (vertices @ pose[:3, :3].T + pose[:3, 3])[faces]
+                # Lambert shading: matplotlib's own light source ignores the world axes.
                 normals = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])
                 lengths = np.linalg.norm(normals, axis=1, keepdims=True)
                 light = 0.78 + 0.24 * (normals / np.where(lengths > 0, lengths, 1.0)) @ _LIGHT
@@ -191,7 +194,7 @@ class _Picture:
             )
 
     def _arrows(self, row: int, length: float) -> None:
-        for force, scale in scaled(self.forces, length):
+        for force, scale in scale_forces(self.forces, length):
             at, vector = force.places[0, row], force.vectors[0, row] * scale
             color = FORCE if force.kind == "force" else TORQUE
             # Lines, unlike matplotlib's arrows, are drawn above the faces in front of them.
@@ -199,11 +202,12 @@ class _Picture:
 
 
 def cone_sides(cone: Cone, row: int, height: float) -> np.ndarray:
-    """Triangles (k, 3, 3) of a friction cone of the first motion at one row, of a height (m)."""
+    """Triangles (k, 3, 3) of a friction cone of the first motion at one row, with a given height (m)."""
     apex, axis = cone.apex[0, row], cone.axis[0, row]
     if cone.across is not None:
         rim = np.stack([axis + sign * cone.slope * cone.across[0, row] for sign in (-1.0, 1.0)])
     else:
+        # The unit vector least parallel to the axis keeps the cross product well conditioned.
         first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
         first = first / np.linalg.norm(first)
         angles = np.linspace(0.0, 2 * np.pi, _SIDES + 1)[:, None]
@@ -213,7 +217,7 @@ def cone_sides(cone: Cone, row: int, height: float) -> np.ndarray:
 
 
 def arrow(at: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Points (9, 3) of a line that draws an arrow: the shaft, then a head of four lines."""
+    """Points (9, 3) of a polyline that draws an arrow: the shaft, then a head of four lines."""
     tip, length = at + vector, np.linalg.norm(vector)
     if not length > 0:
         return np.broadcast_to(at, (2, 3))
@@ -224,12 +228,12 @@ def arrow(at: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def arrow_length(shown: list[Cone], size: float) -> float:
-    """Length (m) of the longest arrow: a quarter of the mechanism, or that of its friction cones, within which it then lies."""
+    """Length (m) of the longest arrow: a quarter of the mechanism, or that of its friction cones."""
     return size * (CONE_HEIGHT if shown else 0.25)
 
 
-def scaled(forces, length: float):
-    """Each force with the factor (m/N or m/(N m)) that gives the largest of its kind the length (m)."""
+def scale_forces(forces, length: float):
+    """Yield each force with the factor (m/N or m/(N m)) that gives the largest of its kind the length (m)."""
     for kind in ("force", "torque"):
         members = [force for force in forces if force.kind == kind]
         largest = max((float(np.linalg.norm(force.vectors, axis=-1).max()) for force in members), default=0.0)
@@ -252,7 +256,7 @@ def _axes(ax) -> Any:
 
 
 def _set_stage(ax, stage: Stage) -> None:
-    """Equal scales, the ground as a grid, and the view."""
+    """Set equal scales, limits down to the ground, and the view."""
     extent = np.maximum(stage.high - stage.low, 0.12 * stage.size)
     low, high = stage.centre - 0.53 * extent, stage.centre + 0.53 * extent
     axis = int(np.argmax(np.abs(stage.up)))
@@ -272,7 +276,7 @@ def _set_stage(ax, stage: Stage) -> None:
     for pane in (ax.xaxis, ax.yaxis, ax.zaxis):
         pane.set_pane_color((1.0, 1.0, 1.0, 0.0))
     for name, length in zip("xyz", high - low, strict=True):
-        if length < 0.25 * (high - low).max():  # numbers along a short axis would lie on top of each other
+        if length < 0.25 * (high - low).max():  # tick labels along a short axis would overlap
             getattr(ax, f"set_{name}ticks")([])
             continue
         getattr(ax, f"set_{name}label")(f"{name} (m)", fontsize=8)

@@ -1,7 +1,7 @@
-"""The solids that URDF, MJCF and SDF files show, each on the frame that the loaders of `jaxdyn.io` give its link.
+"""Visual solids of URDF, MJCF and SDF files, each on the frame of its link in the models of `jaxdyn.io`.
 
-URDF and SDF: the elements <visual>. MJCF: the geoms of groups 0 to 2, which MuJoCo shows, but planes and height fields.
-A file that is missing or cannot be read is named in a warning; the body then gets the solid of its inertia.
+URDF and SDF: the elements <visual>. MJCF: the geoms of groups 0 to 2, which MuJoCo shows, without planes and height fields.
+A file that is missing or cannot be read is named in a warning; the body is then drawn by its inertia.
 """
 
 import os
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.io.loaded import NotTakenWarning
-from jaxdyn.io.mjcf_file import compiled, library, named, pose_of
+from jaxdyn.io.mjcf_file import assign_names, compile_file, import_mujoco, pose_of
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
@@ -22,24 +22,24 @@ from jaxdyn.pictures.solids import Shape, Shapes
 
 _MJCF_KINDS = {2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}  # mjtGeom
 _SHOWN_GROUPS = 3
-_DEFAULT_GREY = (0.5, 0.5, 0.5, 1.0)  # of a geom without a colour
+_DEFAULT_GREY = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom
 
 
 def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = None) -> Shapes:
-    """The solids that a URDF, MJCF or SDF file shows, for `jd.view`, `jd.save_html` and `jd.draw`.
+    """Read the visual solids of a URDF, MJCF or SDF file, for `jd.view`, `jd.save_html` and `jd.draw`.
 
-    A model holds no geometry; what is drawn is read from the file again and kept beside it. Meshes are STL, DAE, OBJ, PLY or
-    GLB files, looked for at the path that the file gives, `package://` and `model://` in the folders above the file and
+    A model holds no geometry, so the file is read again. Meshes are STL, DAE, OBJ, PLY or
+    GLB files, searched at the path given in the file, `package://` and `model://` in the folders above the file and
     in those of ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and GZ_SIM_RESOURCE_PATH.
 
-    **Arguments:** `path`, the file; its root element tells the format. `arguments`: of a xacro file, as for `jd.load`.
+    **Arguments:** `path`, the file; its root element determines the format. `arguments`: of a xacro file, as for `jd.load`.
 
-    **Returns:** `Shapes`, a tuple of `Shape`s, with `.missing`: in words, what could not be drawn.
+    **Returns:** `Shapes`, a tuple of `Shape`s, with `.missing`, descriptions of elements that could not be drawn.
 
     **Warns:** `NotTakenWarning` naming meshes that are missing or cannot be read.
 
     **Raises:** ValueError with file and line for a file that cannot be read and for another format. ImportError without
-    mujoco (MJCF); without trimesh, which viser brings, meshes are named in the warning.
+    mujoco (MJCF); without trimesh, a dependency of viser, meshes are named in the warning.
 
     ```python
     solids = jd.shapes("robot.urdf")
@@ -57,7 +57,7 @@ def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = Non
 
 
 class _Meshes:
-    """Meshes of one file, each read once; those that are missing are collected."""
+    """Meshes of one file, each read once, with a list of the missing ones."""
 
     def __init__(self, path: pathlib.Path):
         self.folder = path.resolve().parent
@@ -65,7 +65,7 @@ class _Meshes:
         self._read: dict[str, list[tuple]] = {}
 
     def shapes(self, frame, uri: str, scale, pose, color, opacity) -> list[Shape]:
-        """Solids of a mesh; none where it is missing. The colour of the file that holds the mesh comes last."""
+        """Solids of a mesh, none where it is missing; the mesh file's own colour has the lowest priority."""
         if uri not in self._read:
             try:
                 self._read[uri] = read_mesh(find_mesh(uri, self.folder))
@@ -166,16 +166,16 @@ def _sdf(file: XmlFile) -> Shapes:
 
 
 def _mjcf(file: XmlFile) -> Shapes:
-    mujoco = library()
-    m, gone = compiled(mujoco, file.path)
-    bodies = named(mujoco, m, file.path).bodies
+    mujoco = import_mujoco()
+    m, gone = compile_file(mujoco, file.path)
+    bodies = assign_names(mujoco, m, file.path).bodies
     shapes = []
     for g in range(m.ngeom):
         kind = _MJCF_KINDS.get(int(m.geom_type[g]))
         if kind is None or m.geom_group[g] >= _SHOWN_GROUPS:
             continue
         size = tuple(float(x) for x in m.geom_size[g])
-        # What `compiled` puts in the place of a missing mesh is a point of no size.
+        # `compile_file` replaces missing meshes by points of this size.
         if gone and kind == "sphere" and size[0] == 1e-3:
             continue
         material = int(m.geom_matid[g])

@@ -1,4 +1,4 @@
-"""Meshes of files: where they are, and their triangles. trimesh, which viser brings, reads them."""
+"""Mesh files: search and triangles, read by trimesh, a dependency of viser."""
 
 import os
 import pathlib
@@ -10,13 +10,13 @@ _FOLDERS = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "GZ_SIM_RESOURCE_PATH", "GA
 
 
 class MeshError(Exception):
-    """A mesh that is not there, or cannot be read; the message says which of them."""
+    """Error of a mesh that is missing or cannot be read."""
 
 
 def find_mesh(uri: str, folder: pathlib.Path) -> pathlib.Path:
-    """The file that a robot description in `folder` names.
+    """Find the file of a mesh URI in a robot description in `folder`.
 
-    `package://NAME/REST` and `model://NAME/REST` are looked for in all folders above, as NAME/REST and, in a folder called
+    `package://NAME/REST` and `model://NAME/REST` are searched in all folders above, as NAME/REST and, in a folder called
     NAME, as REST; then in the folders of the environment. Other names are paths, relative to `folder`.
 
     **Raises:** MeshError when there is no such file.
@@ -51,7 +51,7 @@ def read_mesh(path: pathlib.Path) -> list[tuple[np.ndarray, np.ndarray, tuple[fl
         raise MeshError("reading meshes needs trimesh: pip install jaxdyn[view]") from None
     try:
         loaded = trimesh.load_scene(str(path), process=False)
-    except Exception as error:  # a reader of many formats raises what it meets
+    except Exception as error:  # readers of many formats raise anything
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MeshError(f"cannot be read: {reason[:120]}") from error
     parts = []
@@ -69,7 +69,7 @@ def read_mesh(path: pathlib.Path) -> list[tuple[np.ndarray, np.ndarray, tuple[fl
 
 
 def _color(mesh) -> tuple[float, ...] | None:
-    """The one colour of a mesh, None where it states none."""
+    """Mean colour of a mesh, None where it has none."""
     visual = getattr(mesh, "visual", None)
     material = getattr(visual, "material", None)
     if material is not None:

@@ -1,4 +1,4 @@
-"""What moves in a picture: poses of bodies over time, ends of loops, places and sizes of forces. Plain numpy arrays."""
+"""Moving parts of a picture: poses of bodies over time, ends of loops, forces. Plain numpy arrays."""
 
 import functools
 from typing import Any, NamedTuple
@@ -11,20 +11,20 @@ import numpy as np
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import Distance, Loop
-from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.contact.kinds import components
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.model.arguments import as_array
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model
-from jaxdyn.pictures.inferred import place_of
+from jaxdyn.pictures.default_solids import frame_poses
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.scene import Scene, as_scene
 
 
 class Motion(NamedTuple):
-    """Motions of one scene. Rows that were not reached repeat the last one that was.
+    """Motions of one scene. Rows after an early end repeat the last valid one.
 
     - `ts` (nt,), s; `q` (n, nt, nq); `poses` (n, nt, nb, 4, 4), of the bodies in the world.
     - `multipliers` (n, nt, nc) and `torque` (n, nt, nv), None where the solution has none.
@@ -39,7 +39,7 @@ class Motion(NamedTuple):
 
 
 class Force(NamedTuple):
-    """Arrows of one constraint or joint: places (n, nt, 3), m, and vectors (n, nt, 3), N (or N m of a torque)."""
+    """Arrows of one constraint or joint: points (n, nt, 3), m, and vectors (n, nt, 3), N (or N m of a torque)."""
 
     name: str
     kind: str  # "force" or "torque"
@@ -48,7 +48,7 @@ class Force(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """Where a constraint holds: points (n, nt, 3) on its two bodies, and the axis (n, nt, 3) of a loop's joint or normal."""
+    """Mark of a constraint: points (n, nt, 3) on its two bodies, and the axis (n, nt, 3) of a loop's joint or normal."""
 
     name: str
     kind: str  # "loop", "distance" or "contact"
@@ -58,9 +58,9 @@ class Mark(NamedTuple):
 
 
 class Cone(NamedTuple):
-    """Friction cone of a contact: its apex and the direction in which it presses, (n, nt, 3), in the world, and its slope.
+    """Friction cone of a contact: apex and direction of the normal force, (n, nt, 3), in the world, and its coefficient.
 
-    `across` (n, nt, 3): the direction of slip of a contact in a plane, whose cone is a wedge; None for a round cone.
+    `across` (n, nt, 3): direction of slip of a planar contact, whose cone is a wedge; None for a round cone.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Cone(NamedTuple):
 
 
 def drawable(scene: Any) -> Scene:
-    """The scene of a model. **Raises:** ValueError for systems without bodies."""
+    """Convert a model to a scene. **Raises:** ValueError for systems without bodies."""
     scene = as_scene(scene)
     if not isinstance(scene.system, Model):
         raise ValueError(
@@ -83,7 +83,7 @@ def drawable(scene: Any) -> Scene:
 
 @functools.lru_cache(maxsize=32)
 def _kinematics(structure):
-    """One compiled function for models that differ in numbers alone."""
+    """One compiled function for models that differ only in their parameters."""
     del structure
     return jax.jit(lambda model, qs: jax.vmap(lambda q: forward_kinematics(model, q))(qs))
 
@@ -95,7 +95,7 @@ def poses_of(model: Model, qs) -> np.ndarray:
 
 
 def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | None = None) -> Motion:
-    """A solution, batched or not, or a configuration (nq,), as a motion of at most `rows` rows and `most` trajectories.
+    """Convert a solution, batched or not, or a configuration (nq,) to a motion of at most `rows` rows and `most` trajectories.
 
     **Raises:** ValueError for systems without bodies, and for arrays that do not fit the scene.
     """
@@ -127,13 +127,14 @@ def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | No
         chosen = np.arange(len(q))
     kept = np.arange(nt)
     if rows is not None and nt > rows:
-        # Evenly in time: save points may be anywhere.
+        # Evenly spaced in time, because save points need not be.
         kept = np.unique(np.abs(ts[:1] - np.linspace(ts[0, 0], ts[0, -1], rows)[:, None]).argmin(1))
     q = q[chosen][:, kept]
     reached = np.logical_and.reduce(np.isfinite(q), axis=-1)
     if not reached[:, 0].all():
         raise ValueError("solution.q is not finite at the start; there is nothing to show")
     last = np.maximum.accumulate(np.where(reached, np.arange(q.shape[1]), 0), axis=1)[..., None]
+    # A motion that ended early stays at its last state instead of disappearing.
     q = np.take_along_axis(q, last, 1)
     for k, values in enumerate(extras):
         if values is not None:
@@ -147,16 +148,16 @@ def _ends(motion: Motion, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
     """Poses (n, nt, 4, 4) of the frames A and B of a constraint."""
     model = motion.scene.system
     ends = pair.declared(model).ends()
-    return tuple(place_of(model, motion.poses, body) @ np.asarray(pose, float) for body, pose in ends)  # pyright: ignore[reportReturnType]
+    return tuple(frame_poses(model, motion.poses, body) @ np.asarray(pose, float) for body, pose in ends)  # pyright: ignore[reportReturnType]
 
 
-def _seen_from_a(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    turned = np.swapaxes(a[..., :3, :3], -1, -2)
-    return turned @ b[..., :3, :3], (turned @ (b[..., :3, 3:] - a[..., :3, 3:]))[..., 0]
+def _relative_pose(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    transpose = np.swapaxes(a[..., :3, :3], -1, -2)
+    return transpose @ b[..., :3, :3], (transpose @ (b[..., :3, 3:] - a[..., :3, 3:]))[..., 0]
 
 
 def marks(motion: Motion) -> list[Mark]:
-    """Where the constraints between bodies hold."""
+    """Marks of the constraints between bodies."""
     drawn = []
     for constraint in motion.scene.constraints:
         if not isinstance(constraint, Pair):
@@ -188,13 +189,13 @@ def _contact(motion: Motion, constraint: Pair, a: np.ndarray, b: np.ndarray) -> 
 
 
 def _rows(motion: Motion, a: np.ndarray, b: np.ndarray) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Rotations and positions of frame B seen from A, and configurations, of all rows of all trajectories."""
-    R, p = _seen_from_a(a, b)
+    """Rotations and positions of frame B in A, and configurations, of all rows of all trajectories."""
+    R, p = _relative_pose(a, b)
     return tuple(jnp.asarray(x.reshape(-1, *x.shape[2:])) for x in (R, p, motion.q))  # pyright: ignore[reportReturnType]
 
 
 def forces(motion: Motion) -> list[Force]:
-    """Arrows of the constraint forces that the solution has, on frame B (a grasp: on the object), and of its joint torques."""
+    """Arrows of the solution's constraint forces, on frame B (for grasps: on the object), and of its joint torques."""
     arrows = []
     if motion.multipliers is not None:
         for constraint, place in zip(motion.scene.constraints, layout(motion.scene), strict=True):
@@ -216,7 +217,7 @@ def forces(motion: Motion) -> list[Force]:
 
 
 def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray) -> Force:
-    """The force of a constraint between two bodies for its multipliers (n, nt, rows)."""
+    """Force of a constraint between two bodies for its multipliers (n, nt, rows)."""
     a, b = _ends(motion, constraint)
     R, p, q = _rows(motion, a, b)
     lam = jnp.asarray(multipliers.reshape(len(p), -1))
@@ -228,13 +229,13 @@ def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray)
 
 
 def cones(motion: Motion) -> list[Cone]:
-    """The friction cones of a scene's contacts, but those of surfaces, whose cones have six dimensions."""
+    """Friction cones of a scene's contacts, without those of surface contacts, whose cones are six-dimensional."""
     scene, drawn = motion.scene, []
     if scene.cones is None:
         return drawn
     places = {place.name: place for place in layout(scene)}
     constraints = dict(zip(places, scene.constraints, strict=True))
-    for contact in coned_contacts(scene):
+    for contact in contacts_with_cones(scene):
         constraint, place, cone = constraints[contact.name], places[contact.name], contact.cone
         if cone.mu is None or not isinstance(constraint, Pair):
             continue
@@ -257,7 +258,7 @@ def _wrenches(model: Model, constraint: Pair, R, p, q, lam):
 
 
 def joint_axes(motion: Motion) -> list[tuple[str, str, np.ndarray, np.ndarray | None]]:
-    """Name, kind, place (n, nt, 3) and axis (n, nt, 3) (None without one) of each joint."""
+    """Name, kind, position (n, nt, 3) and axis (n, nt, 3) (None without one) of each joint."""
     model, axes = motion.scene.system, []
     for i, (name, kind) in enumerate(zip(model.joint_names, model.topology.kinds, strict=True)):
         axis = None

@@ -1,4 +1,4 @@
-"""Pages for a browser by viser: served on this machine (`view`), or as one file that opens offline (`save_html`)."""
+"""Browser pages by viser: from a local server (`view`), or as one offline file (`save_html`)."""
 
 import contextlib
 import html
@@ -18,10 +18,10 @@ import numpy as np
 
 from jaxdyn.model.arguments import Checked, Numbers, as_path
 from jaxdyn.model.float64 import quaternion
-from jaxdyn.pictures.drawing import CONE_HEIGHT, arrow_length, cone_sides, scaled
-from jaxdyn.pictures.inferred import place_of
+from jaxdyn.pictures.default_solids import frame_poses
+from jaxdyn.pictures.drawing import CONE_HEIGHT, arrow_length, cone_sides, scale_forces
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, marks, motion_of
-from jaxdyn.pictures.solids import Shapes, by_frame, joined, sharpened, simplified
+from jaxdyn.pictures.solids import Shapes, by_frame, merge_meshes, sharpen, simplify
 from jaxdyn.pictures.stage import FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
@@ -29,12 +29,12 @@ from jaxdyn.systems.system import SceneLike
 MOST_BYTES = 2_000_000  # of a file
 _HOST = "127.0.0.1"
 _FIELD_OF_VIEW = np.deg2rad(40.0)
-_GHOSTS = 7  # motions of a batch beside the first
+_GHOSTS = 7  # motions of a batch in addition to the first
 _GHOST_OPACITY = 0.25
-# Vertices of all meshes and rows of the motion, of a page that is served, and of a file until it is small enough.
+# Numbers of vertices and rows of a served page, and of a file: coarser until it is small enough.
 _SERVED = (60_000, 2_000)
 _FILED = ((24_000, 300), (12_000, 200), (5_000, 120), (2_000, 60), (500, 30))
-_PICTURES = 30  # a second
+_PICTURES = 30  # frames per second
 
 
 def view(
@@ -46,24 +46,25 @@ def view(
     browser: bool = True,
     block: bool | None = None,
 ) -> "Viewer":
-    """Show a motion in the browser: a page on this machine with a slider over time and a button to play.
+    """Show a motion in the browser: a local page with a time slider and a play button.
 
-    The first motion of a batch is solid; up to seven more, evenly from the batch, stand beside it as ghosts. Red arrows are
+    The first motion of a batch is solid; up to seven more, evenly from the batch, are shown translucent. Red arrows are
     forces of constraints and contacts, where the solution has `multipliers` (`outputs=("multipliers",)`), green ones
     joint torques, where it has `torque`; the largest of each kind is a quarter of the mechanism long. Orange cones are the
     friction cones of the scene, those of the first motion.
 
     **Arguments:**
 
-    - `scene`: a `Scene` or `Model`; `solution`: what `jd.simulate` returned for it, batched or not, or one configuration (nq,).
+    - `scene`: a `Scene` or `Model`; `solution`: a result of `jd.simulate` for it, batched or not, or one configuration (nq,).
     - `shapes`: solids to show, of `jd.shapes(path)`; None draws rods between joints and solids of the bodies' inertias.
-    - `port`: of the page; None takes a free one. The page is served to this machine alone (127.0.0.1).
-    - `browser`: whether to open a browser; without a display the address is printed alone.
+    - `port`: port of the page; None selects a free one. The server listens on 127.0.0.1 only.
+    - `browser`: whether to open a browser; without a display only the address is printed.
     - `block`: whether to wait until Ctrl-C; by default in scripts, and not in a notebook or a prompt.
 
     **Returns:** `Viewer`, with `.url`, `.stop()` and, in a notebook, the motion in the cell.
 
-    **Raises:** ValueError for a port in use, systems without bodies, arrays that do not fit the scene. ImportError without viser.
+    **Raises:** ValueError for a port in use, systems without bodies, arrays that do not fit the scene. ImportError
+    without viser.
     """
     motion = motion_of(scene, solution, rows=_SERVED[1], most=1 + _GHOSTS)
     parts = all_solids(motion, shapes)
@@ -71,7 +72,7 @@ def view(
     print(f"Showing the motion at {viewer.url}")
     if browser and not _open(viewer.url):
         print(
-            "No browser could be opened here; open that address in one, or write a file: jd.save_html(path, scene, solution)"
+            "No browser could be opened; open that address in one, or write a file: jd.save_html(path, scene, solution)"
         )
     if (not _interactive()) if block is None else block:
         with contextlib.suppress(KeyboardInterrupt):
@@ -88,9 +89,9 @@ def save_html(
     *,
     shapes: Checked[Shapes | None] = None,
 ) -> None:
-    """Write a motion as one HTML file under 2 MB that needs nothing else: no network, no Python.
+    """Write a motion as one HTML file under 2 MB that plays without network and Python.
 
-    It plays in the browser as the page of `view` does. Meshes are simplified, and rows and trajectories left out, until it is
+    It plays in the browser like the page of `view`. Meshes are simplified, and rows and trajectories dropped, until it is
     small enough: at most 300 rows, 30 a second, and eight motions of a batch.
 
     **Arguments:** `path`, a file .html; `scene`, `solution`, `shapes` as in `view`.
@@ -113,7 +114,7 @@ def save_html(
 
 
 class Viewer:
-    """A page that is served until `.stop()`; made by `jd.view`. In a notebook it shows the motion in its cell.
+    """Page of `jd.view`, served until `.stop()`. In a notebook it shows the motion in its cell.
 
     - `url`: its address.
     """
@@ -134,7 +135,7 @@ class Viewer:
             _stop(self._server)
 
     def _repr_html_(self) -> str:
-        return framed(_document(self._motion, self._parts))
+        return embed(_document(self._motion, self._parts))
 
     def _add_controls(self) -> None:
         gui, ts = self._server.gui, self._motion.ts
@@ -152,6 +153,7 @@ class Viewer:
         def _(_event) -> None:
             playing.clear() if playing.is_set() else playing.set()
 
+        # A daemon thread, so that a forgotten viewer does not keep Python alive.
         def run() -> None:
             while not self._stopped.wait(1.0 / _PICTURES):
                 if playing.is_set():
@@ -161,16 +163,16 @@ class Viewer:
         threading.Thread(target=run, daemon=True).start()
 
 
-def framed(document: str, height: int = 480) -> str:
-    """A page within another, as notebooks show it."""
+def embed(document: str, height: int = 480) -> str:
+    """Embed a page in another one, as notebooks do."""
     return f'<iframe srcdoc="{html.escape(document)}" width="100%" height="{height}" style="border:0"></iframe>'
 
 
 def _document(motion: Motion, parts: Shapes) -> str:
-    """The page as one file, made coarser until it is small enough."""
+    """Build the page as one file, coarser until it is small enough."""
     text = ""
     for vertices, rows in _FILED:
-        with _recorded() as server:
+        with _recording_server() as server:
             kept = _rows(motion.ts, min(rows, 1 + int(np.ptp(motion.ts) * _PICTURES)))
             content = _Content(server, motion, parts, vertices)
             serializer = server.get_scene_serializer()
@@ -181,19 +183,19 @@ def _document(motion: Motion, parts: Shapes) -> str:
         if len(text) <= MOST_BYTES:
             return text
     raise ValueError(
-        f"the page takes {len(text) / 1e6:.1f} MB, more than {MOST_BYTES / 1e6:g} MB; show fewer motions: jax.tree.map(lambda x: "
+        f"the page has {len(text) / 1e6:.1f} MB, more than {MOST_BYTES / 1e6:g} MB; show fewer motions: jax.tree.map(lambda x: "
         "x[:2], solution)"
     )
 
 
 def _rows(ts: np.ndarray, most: int) -> np.ndarray:
-    """Rows evenly in time."""
+    """Rows evenly spaced in time."""
     wanted = np.linspace(ts[0], ts[-1], max(most, 2) if len(ts) > 1 else 1)
     return np.unique(np.abs(ts - wanted[:, None]).argmin(1))
 
 
 class _Content:
-    """What is on a page: the stage and the mechanism, which can be shown at each row of its motion."""
+    """Content of a page: the stage and the mechanism, to be shown at each row of its motion."""
 
     def __init__(self, server, motion: Motion, parts: Shapes, vertices: int):
         self.motion, self.scene = motion, server.scene
@@ -206,7 +208,7 @@ class _Content:
             self._add_bodies(n, meshes)
         self.marks = [(mark, self._ball(k)) for k, mark in enumerate(marks(motion))]
         self.cones = [(cone, self._cone(k, cone)) for k, cone in enumerate(cones(motion))]
-        self.forces = list(scaled(forces(motion), arrow_length([cone for cone, _ in self.cones], self.size)))
+        self.forces = list(scale_forces(forces(motion), arrow_length([cone for cone, _ in self.cones], self.size)))
         self.arrows = None
         if self.forces:
             colors = np.array([rgb(FORCE if force.kind == "force" else TORQUE) for force, _ in self.forces])
@@ -224,9 +226,9 @@ class _Content:
         groups = {}
         for k, (frame, color, opacity, vertices, faces) in enumerate(meshes):
             if n and frame is None:
-                continue  # what stands in the world is there once
+                continue  # solids fixed to the world appear once
             if frame not in groups:
-                groups[frame] = "/world" if frame is None else f"/motion{n}/{_escaped(frame)}"
+                groups[frame] = "/world" if frame is None else f"/motion{n}/{_escape(frame)}"
                 self.bodies.append((n, frame, self.scene.add_frame(groups[frame], show_axes=False)))
             opacity = opacity * (_GHOST_OPACITY if n else 1.0)
             self.scene.add_mesh_simple(
@@ -244,7 +246,7 @@ class _Content:
         return self.scene.add_icosphere(f"/constraints/{k}", 0.012 * self.size, color, subdivisions=2)
 
     def _cone(self, k: int, cone: Cone) -> tuple[Any, np.ndarray]:
-        """The cone of the first row, and the inverse of its attitude there: a page moves solids and does not bend them."""
+        """Cone mesh at the first row, and the inverse of its attitude there, because pages move rigid meshes only."""
         sides = cone_sides(cone, 0, CONE_HEIGHT * self.size) - cone.apex[0, 0]
         color = tuple(round(255 * x) for x in rgb(LOOP))
         faces = np.arange(3 * len(sides), dtype=np.uint32).reshape(-1, 3)
@@ -261,7 +263,7 @@ class _Content:
         """Move everything to a row of the motion."""
         model = self.motion.scene.system
         for n, frame, handle in self.bodies:
-            pose = place_of(model, self.motion.poses[n, row], frame)
+            pose = frame_poses(model, self.motion.poses[n, row], frame)
             handle.wxyz, handle.position = quaternion(pose[:3, :3]), pose[:3, 3]
         for mark, handle in self.marks:
             handle.position = mark.a[0, row]
@@ -271,13 +273,13 @@ class _Content:
             self.arrows.points = self._arrows(row)
 
 
-def _escaped(name: str) -> str:
-    """A name as one step of a path in viser's scene tree, where a slash begins a child that moves with its parent."""
+def _escape(name: str) -> str:
+    """Escape a name for viser's scene tree, where a slash separates parents from children."""
     return name.replace("%", "%25").replace("/", "%2F")
 
 
 def _attitude(cone: Cone, row: int) -> np.ndarray:
-    """A rotation that takes z to the cone's axis and, of a wedge, x to the direction across it."""
+    """Rotation that maps z to the cone's axis and, for a wedge, x to the direction across it."""
     axis = cone.axis[0, row]
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]) if cone.across is None else cone.across[0, row]
     first = first / np.linalg.norm(first)
@@ -285,7 +287,7 @@ def _attitude(cone: Cone, row: int) -> np.ndarray:
 
 
 def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:
-    """Frame, colour, opacity, vertices and faces of the solids, one mesh for each frame and colour."""
+    """Yield frame, colour, opacity, vertices and faces, one mesh for each frame and colour."""
     groups = []
     for frame, _, opacity, members in by_frame(parts):
         parts_of = [shape.triangles() for shape in members]
@@ -293,8 +295,8 @@ def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:
     total = sum(len(vertices) for *_, meshes in groups for vertices, _ in meshes)
     share = min(1.0, most / max(total, 1))
     for frame, color, opacity, meshes in groups:
-        small = [simplified(v, f, max(24, int(share * len(v)))) if share < 1 else (v, f) for v, f in meshes]
-        vertices, faces = sharpened(*joined(mesh for mesh in small if len(mesh[1])))
+        small = [simplify(v, f, max(24, int(share * len(v)))) if share < 1 else (v, f) for v, f in meshes]
+        vertices, faces = sharpen(*merge_meshes(mesh for mesh in small if len(mesh[1])))
         yield frame, color, opacity, vertices.astype(np.float32), faces.astype(np.uint32)
 
 
@@ -319,6 +321,7 @@ def _set_stage(server, stage: Stage) -> None:
         plane_opacity=1.0,
         shadow_opacity=0.25,
         fade_distance=8 * stage.size,
+        # Slightly below the ground, so that bodies resting on it do not flicker with it.
         position=tuple((centre - 1e-4 * stage.size * stage.up).tolist()),
     )
     camera = server.initial_camera
@@ -334,24 +337,24 @@ def _server(port: int) -> Any:
         import viser
     except ImportError as error:
         raise ImportError("the viewer needs viser: pip install jaxdyn[view]") from error
-    _unlogged.ports.add(port)
-    logging.getLogger("websockets.server").addFilter(_unlogged)
-    with contextlib.redirect_stdout(io.StringIO()):  # a banner
+    _port_filter.ports.add(port)
+    logging.getLogger("websockets.server").addFilter(_port_filter)
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
         return viser.ViserServer(host=_HOST, port=port, label="jaxdyn", verbose=False)
 
 
 def _stop(server) -> None:
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
-    _unlogged.ports.discard(server.get_port())
-    if not _unlogged.ports:
-        logging.getLogger("websockets.server").removeFilter(_unlogged)
+    _port_filter.ports.discard(server.get_port())
+    if not _port_filter.ports:
+        logging.getLogger("websockets.server").removeFilter(_port_filter)
 
 
-class _Unlogged(logging.Filter):
-    """Leaves out what is logged of our own ports: probes connect and leave without a word (a browser's, a test's).
+class _PortFilter(logging.Filter):
+    """Log filter for our own ports, to which probes connect without a request (a browser's, a test's).
 
-    Other servers of the process are logged as their owner wants it.
+    Records of other servers in the process pass.
     """
 
     def __init__(self):
@@ -363,12 +366,12 @@ class _Unlogged(logging.Filter):
         return not (isinstance(address, tuple) and len(address) > 1 and address[1] in self.ports)
 
 
-_unlogged = _Unlogged()
+_port_filter = _PortFilter()
 
 
 @contextlib.contextmanager
-def _recorded() -> Iterator[Any]:
-    """A server of which a page is recorded; viser records from a server alone."""
+def _recording_server() -> Iterator[Any]:
+    """Temporary server for recording a page; viser records only from a server."""
     server = _server(_free_port(None))
     try:
         yield server
@@ -377,7 +380,7 @@ def _recorded() -> Iterator[Any]:
 
 
 def _free_port(port: int | None) -> int:
-    """The port if nothing uses it, or any free one. **Raises:** ValueError for one in use or out of range."""
+    """Check that a port is free, or find a free one. **Raises:** ValueError for one in use or out of range."""
     if port is not None and not (isinstance(port, int) and 0 < port < 65536):
         raise ValueError(f"port is {port!r}; give a number from 1 to 65535, or None for a free one")
     with socket.socket() as probe:
@@ -392,7 +395,7 @@ def _free_port(port: int | None) -> int:
 
 
 def _open(url: str) -> bool:
-    """Open a browser; False where there is none. Browsers for terminals are not wanted."""
+    """Open a graphical browser; return False where there is none."""
     if sys.platform.startswith("linux") and not any(
         os.environ.get(x) for x in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
     ):

@@ -1,7 +1,7 @@
 """Plots of motions: `jd.plot.states`, `energy`, `residuals`, `forces`, `work_precision`.
 
-Each takes a scene or model and what `jd.simulate` returned for it, draws into the axes it is given or into a figure of its
-own, and returns the axes; `ax.figure.savefig("motion.png")` writes the picture. One motion is drawn by lines; of a batch the
+Each takes a scene or model and its result of `jd.simulate`, draws into given axes or into a new
+figure, and returns the axes; `ax.figure.savefig("motion.png")` writes the picture. One motion is drawn by lines, a batch by its
 median with bands of 25 to 75 and 5 to 95 %. All raise ImportError without matplotlib.
 """
 
@@ -21,7 +21,7 @@ from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
 
-_SMALLEST = 1e-17  # a logarithmic axis has no zero
+_SMALLEST = 1e-17  # logarithmic axes have no zero
 _LABELS = 16  # lines beyond these have no entry in the legend
 
 
@@ -34,7 +34,7 @@ def states(
 
     **Returns:** array (2,) of axes: of q and of v.
 
-    **Raises:** ValueError for a scene that is not that of the solution, and for others than two axes.
+    **Raises:** ValueError for a scene that does not fit the solution, and for other than two axes.
     """
     scene = as_scene(scene)
     names = columns_of(scene.system)
@@ -56,7 +56,7 @@ def states(
 
 
 def energy(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | None] = None) -> Axes:
-    """Energy over time against its start; where the solution has `work`, also what remains without it: the error.
+    """Change of the energy over time; where the solution has `work`, also its difference from the work: the error.
 
     **Arguments:** `scene`, `solution` with `outputs=("energy",)` or `("energy", "work")`; `ax`, matplotlib axes or None.
 
@@ -64,14 +64,14 @@ def energy(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | Non
 
     **Raises:** ValueError for a solution without `energy`.
     """
-    rows = _rows(_given(solution, "energy")[..., None], 1, "energy")[:, :, 0]
+    rows = _rows(_require_output(solution, "energy")[..., None], 1, "energy")[:, :, 0]
     ax = _axes(ax)
     change = rows - rows[:, :1]
     _lines(ax, times(solution), change[..., None], ("E - E(0)",))
     if solution.work is not None:
         rest = change - np.asarray(solution.work).reshape(change.shape)
         _lines(ax, times(solution), rest[..., None], ("E - E(0) - work",), (RED,))
-    return _finished(ax, as_scene(scene), rows, "energy (J)")
+    return _finish(ax, as_scene(scene), rows, "energy (J)")
 
 
 def residuals(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | None] = None) -> Axes:
@@ -83,11 +83,11 @@ def residuals(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | 
 
     **Raises:** ValueError for a solution without `constraint_residual`.
     """
-    rows = _rows(_given(solution, "constraint_residual"), 2, "constraint_residual")
+    rows = _rows(_require_output(solution, "constraint_residual"), 2, "constraint_residual")
     ax = _axes(ax)
     _lines(ax, times(solution), np.maximum(np.abs(rows), _SMALLEST), ("|phi| (m, rad)", "|A v - b| (m/s, rad/s)"))
     ax.set_yscale("log")
-    return _finished(ax, as_scene(scene), rows, "largest residual (m, rad; m/s, rad/s)")
+    return _finish(ax, as_scene(scene), rows, "largest residual (m, rad; m/s, rad/s)")
 
 
 def forces(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | None] = None) -> Axes:
@@ -99,7 +99,7 @@ def forces(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | Non
 
     **Returns:** the axes, N or N m over s.
 
-    **Raises:** ValueError for a solution with neither of them, and for a scene that is not that of the solution.
+    **Raises:** ValueError for a solution with neither of them, and for a scene that does not fit the solution.
     """
     scene = as_scene(scene)
     if solution.multipliers is None and solution.torque is None:
@@ -121,7 +121,7 @@ def forces(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | Non
     values = np.concatenate(parts, axis=2)
     ax = _axes(ax)
     _lines(ax, times(solution), values, labels)
-    return _finished(ax, scene, values, _with_units("force", units))
+    return _finish(ax, scene, values, _with_units("force", units))
 
 
 def work_precision(
@@ -131,7 +131,7 @@ def work_precision(
     error: str = "error_path",
     cost: str = "seconds_best",
 ) -> Axes:
-    """Cost against error of several integrators on one scene: further left is more exact, further down is cheaper.
+    """Cost against error of several integrators on one scene: left is more exact, down is cheaper.
 
     **Arguments:**
 
@@ -142,7 +142,7 @@ def work_precision(
 
     **Returns:** the axes, both logarithmic.
 
-    **Raises:** ValueError for names that no record has, for records of several plots, and where no run has both numbers.
+    **Raises:** ValueError for names that no record has, for records of several plots, and where no run has both quantities.
     """
     records = list(records)
     costs = {"seconds_best": "time per trajectory (s)", "seconds_median": "time per trajectory (s)", "steps": "steps"}
@@ -165,7 +165,7 @@ def work_precision(
     return ax
 
 
-def _given(solution, output: str) -> np.ndarray:
+def _require_output(solution, output: str) -> np.ndarray:
     value = getattr(solution, output)
     if value is None:
         raise ValueError(f'solution has no {output}; simulate with outputs=("{output}",)')
@@ -173,7 +173,7 @@ def _given(solution, output: str) -> np.ndarray:
 
 
 def _rows(values, count: int, name: str) -> np.ndarray:
-    """(n, nt, count), of n motions."""
+    """Reshape an output to (n, nt, count) for n motions."""
     values = np.asarray(values, float)
     if values.ndim < 2 or values.shape[-1] != count:
         raise ValueError(f"solution.{name} has shape {values.shape}, expected (..., nt, {count}); pass its own scene")
@@ -197,7 +197,7 @@ def _lines(ax, ts, values: np.ndarray, labels: Sequence[str], colours: Sequence[
             ax.plot(ts, values[0, :, k], dashed, color=colour, linewidth=1.3, label=shown)
 
 
-def _finished(ax, scene, values, label: str) -> Any:
+def _finish(ax, scene, values, label: str) -> Any:
     ax.set(xlabel="time (s)", ylabel=label, title=_title(scene, values))
     _legend(ax)
     return ax

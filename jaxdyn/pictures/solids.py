@@ -1,4 +1,4 @@
-"""What is drawn of a mechanism: boxes, balls, cylinders and meshes, each on a frame of the model, as triangles."""
+"""Solids of a mechanism as triangles: boxes, balls, cylinders and meshes, each on a frame of the model."""
 
 import dataclasses
 import itertools
@@ -8,7 +8,7 @@ import numpy as np
 
 _SIDES = 24  # of a circle
 
-# What each number of `size` means (m).
+# Meaning of the entries of `size` (m).
 SIZES = {
     "box": "edges (x, y, z)",
     "ellipsoid": "half axes (x, y, z)",
@@ -20,14 +20,14 @@ SIZES = {
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shape:
-    """One solid, fixed to a frame of a model.
+    """Solid fixed to a frame of a model.
 
     - `frame`: a body or frame by name, None for the world; `pose` (4, 4) of the solid in it (m).
     - `kind`: "box", "ellipsoid" (a ball has three equal half axes), "cylinder", "capsule" or "mesh"; `size` as in
       `jaxdyn.pictures.solids.SIZES` (m).
-    - `color` (3,) from 0 to 1, None for one that is chosen by the body; `opacity` from 0 to 1.
+    - `color` (3,) from 0 to 1, None for the colour of the body; `opacity` from 0 to 1.
     - `vertices` (n, 3) and `faces` (m, 3) of a mesh, before they are scaled by `size`.
-    - `source`: "file", "constraint" or "inertia": where the solid comes from.
+    - `source`: "file", "constraint" or "inertia": origin of the solid.
     """
 
     frame: str | None
@@ -45,7 +45,7 @@ class Shape:
         if self.kind == "mesh":
             assert self.vertices is not None and self.faces is not None
             vertices, faces = self.vertices * np.asarray(self.size), self.faces
-            if np.prod(self.size) < 0:  # a mirror turns triangles over
+            if np.prod(self.size) < 0:  # a reflection reverses the orientation of triangles
                 faces = faces[:, ::-1]
         else:
             vertices, faces = _SOLIDS[self.kind](self.size)
@@ -53,15 +53,15 @@ class Shape:
 
 
 class Shapes(tuple[Shape, ...]):
-    """Solids to draw, and in words what of the file could not be drawn (`missing`).
+    """Solids to draw, with descriptions of elements of a file that could not be drawn (`missing`).
 
-    Made by `jd.shapes`, or from any `Shape`s: `Shapes([Shape("tip", "box", (0.1, 0.1, 0.2))])`.
+    Built by `jd.shapes`, or from any `Shape`s: `Shapes([Shape("tip", "box", (0.1, 0.1, 0.2))])`.
     """
 
     missing: tuple[str, ...]
 
     def __new__(cls, items=(), missing=()):
-        """A tuple with a note."""
+        """Create a tuple with the attribute `missing`."""
         made = super().__new__(cls, items)
         made.missing = tuple(missing)
         return made
@@ -72,14 +72,14 @@ class Shapes(tuple[Shape, ...]):
 
 
 def rod(frame: str | None, start, end, radius: float, **options) -> Shape:
-    """A capsule from a point to another, both (3,) in the frame."""
+    """Capsule between two points (3,) in the frame."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
     return Shape(frame, "capsule", (radius, length), along((start + end) / 2, end - start), **options)
 
 
 def along(place, direction) -> np.ndarray:
-    """Pose (4, 4) at a place with z along a direction; z as it is for a direction of no length."""
+    """Pose (4, 4) at a position with z along a direction; the identity rotation for a zero direction."""
     pose, length = np.eye(4), np.linalg.norm(direction)
     pose[:3, 3] = place
     if length > 0:
@@ -103,8 +103,8 @@ def _box(size) -> tuple[np.ndarray, np.ndarray]:
     return np.array(corners) * np.asarray(size) / 2, np.array(faces)
 
 
-def _turned(radii, heights, smooth: bool) -> tuple[np.ndarray, np.ndarray]:
-    """A profile (radius and height at each ring) turned about z. Rings of radius zero are its ends."""
+def _revolve(radii, heights, smooth: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Surface of revolution about z of a profile (radius and height at each ring), with rings of radius zero at its ends."""
     angles = np.linspace(0, 2 * np.pi, _SIDES, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(_SIDES)], axis=1)
     rings = [circle * r + [0, 0, h] for r, h in zip(radii, heights, strict=True)]
@@ -113,6 +113,7 @@ def _turned(radii, heights, smooth: bool) -> tuple[np.ndarray, np.ndarray]:
     following = (step + 1) % _SIDES
     count = 0
     for low, high in itertools.pairwise(rings):
+        # Smooth surfaces share the vertices of adjacent bands; sharp ones repeat the ring.
         if smooth and vertices:
             first, new = count - _SIDES, [high]
         else:
@@ -126,7 +127,7 @@ def _turned(radii, heights, smooth: bool) -> tuple[np.ndarray, np.ndarray]:
 
 def _cylinder(size) -> tuple[np.ndarray, np.ndarray]:
     radius, length = size
-    return _turned([0.0, radius, radius, 0.0], np.array([-1, -1, 1, 1]) * length / 2, smooth=False)
+    return _revolve([0.0, radius, radius, 0.0], np.array([-1, -1, 1, 1]) * length / 2, smooth=False)
 
 
 def _capsule(size) -> tuple[np.ndarray, np.ndarray]:
@@ -134,37 +135,37 @@ def _capsule(size) -> tuple[np.ndarray, np.ndarray]:
     up = np.linspace(0, np.pi / 2, 6)
     radii = np.concatenate([np.cos(up)[::-1], np.cos(up)]) * radius
     heights = np.concatenate([-np.sin(up)[::-1] * radius - length / 2, np.sin(up) * radius + length / 2])
-    return _turned(radii, heights, smooth=True)
+    return _revolve(radii, heights, smooth=True)
 
 
 def _ellipsoid(size) -> tuple[np.ndarray, np.ndarray]:
     up = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1)
-    vertices, faces = _turned(np.cos(up), np.sin(up), smooth=True)
+    vertices, faces = _revolve(np.cos(up), np.sin(up), smooth=True)
     return vertices * np.asarray(size), faces
 
 
 _SOLIDS = {"box": _box, "cylinder": _cylinder, "capsule": _capsule, "ellipsoid": _ellipsoid}
 
 
-def finer(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface of triangles whose sides are at most so long (m): the longest side of the others is cut in two."""
+def refine(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Refine a mesh until all sides are at most `longest` (m), by bisecting the longest side of a triangle."""
     while len(faces):
         sides = np.linalg.norm(vertices[np.roll(faces, -1, 1)] - vertices[faces], axis=2)
         long = sides.max(1) > longest
         if not long.any():
             break
-        turned = np.stack([np.roll(face, -k) for face, k in zip(faces[long], sides[long].argmax(1), strict=True)])
-        middle = len(vertices) + np.arange(len(turned))
-        vertices = np.concatenate([vertices, vertices[turned[:, :2]].mean(1)])
-        a, b, c = turned.T
+        rotated = np.stack([np.roll(face, -k) for face, k in zip(faces[long], sides[long].argmax(1), strict=True)])
+        middle = len(vertices) + np.arange(len(rotated))
+        vertices = np.concatenate([vertices, vertices[rotated[:, :2]].mean(1)])
+        a, b, c = rotated.T
         faces = np.concatenate([faces[~long], np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
     return vertices, faces
 
 
-def simplified(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh of at most about `most` vertices: those within a cell of a grid become one, flat triangles are left out.
+def simplify(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Simplify a mesh to about `most` vertices by merging those within a cell of a grid.
 
-    The grid is made coarser until the mesh is small enough; a mesh that is small already stays as it is.
+    The grid is made coarser until the mesh is small enough; a mesh that is small enough is returned unchanged.
 
     Source: Rossignac and Borrel (1993), Multi-resolution 3D approximations for rendering complex scenes.
     """
@@ -175,15 +176,15 @@ def simplified(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.n
         _, index, count = np.unique(place, return_inverse=True, return_counts=True)
         if len(count) <= most:
             centres = np.stack([np.bincount(index, vertices[:, k]) for k in range(3)], axis=1) / count[:, None]
-            turned = index[faces]
-            is_triangle = np.all(turned != np.roll(turned, 1, axis=1), axis=1)
-            return centres, turned[is_triangle]
+            merged = index[faces]
+            is_triangle = np.all(merged != np.roll(merged, 1, axis=1), axis=1)
+            return centres, merged[is_triangle]
         cells = int(cells * 0.8)
     return vertices, faces
 
 
-def sharpened(vertices: np.ndarray, faces: np.ndarray, angle: float = 0.6) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh whose vertices are doubled at edges, so that averaged normals leave these sharp.
+def sharpen(vertices: np.ndarray, faces: np.ndarray, angle: float = 0.6) -> tuple[np.ndarray, np.ndarray]:
+    """Duplicate vertices at sharp edges, so that averaged normals keep these sharp.
 
     The corners of the triangles at a vertex share it where their normals are within `angle` (rad) of one another.
     """
@@ -212,7 +213,7 @@ def sharpened(vertices: np.ndarray, faces: np.ndarray, angle: float = 0.6) -> tu
 
 
 def by_frame(shapes: Shapes) -> Iterator[tuple[str | None, tuple | None, float, list[Shape]]]:
-    """The solids in groups of one frame, colour and opacity."""
+    """Yield the solids in groups of equal frame, colour and opacity."""
     groups: dict[tuple, list[Shape]] = {}
     for shape in shapes:
         groups.setdefault((shape.frame, shape.color, shape.opacity), []).append(shape)
@@ -220,8 +221,8 @@ def by_frame(shapes: Shapes) -> Iterator[tuple[str | None, tuple | None, float, 
         yield frame, color, opacity, members
 
 
-def joined(parts) -> tuple[np.ndarray, np.ndarray]:
-    """Several meshes as one."""
+def merge_meshes(parts) -> tuple[np.ndarray, np.ndarray]:
+    """Merge several meshes."""
     vertices, faces, count = [], [], 0
     for points, triangles in parts:
         vertices.append(points)

@@ -1,26 +1,26 @@
-"""The stage of a picture: what is up, where the ground is, from where one looks, and in which colours."""
+"""Stage of a picture: vertical direction, ground, view and colours."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxdyn.constraints.loops import Distance, Loop
-from jaxdyn.pictures.inferred import completed, pairs, place_of
+from jaxdyn.pictures.default_solids import complete_solids, frame_poses, pairs
 from jaxdyn.pictures.motion import Motion
 from jaxdyn.pictures.solids import Shape, Shapes
 from jaxdyn.reports.plotting import BLUE, GREEN, ORANGE
 
-# Bodies without a colour of their own take these in turn: muted, so that arrows and marks stand out.
+# Colours of bodies without one, cycled: muted, so that arrows and marks stand out.
 _BODIES = ("#8fa9c4", "#d9b382", "#93b8a1", "#c79c94", "#a9a3c2", "#b9b8a0")
 FORCE, TORQUE, LOOP, AXIS = "#c8201e", GREEN, ORANGE, BLUE
 
 
 class Stage(NamedTuple):
-    """What surrounds the mechanism, in world axes and m.
+    """Surroundings of the mechanism, in world axes and m.
 
-    - `low`, `high` (3,): corners of the space that the motion takes; `centre` (3,), `size`, its middle and diagonal.
+    - `low`, `high` (3,): corners of the box around the motion; `centre` (3,), `size`, its middle and diagonal.
     - `up` (3,): against gravity; `ground`: height of the ground along it.
-    - `eye` (3,): unit vector from the centre towards whoever looks.
+    - `eye` (3,): unit vector from the centre towards the viewer.
     """
 
     low: np.ndarray
@@ -33,9 +33,9 @@ class Stage(NamedTuple):
 
 
 def all_solids(motion: Motion, shapes) -> Shapes:
-    """The solids given (None: none; a path: those of the file), completed by inferred ones.
+    """Combine the given solids with default ones.
 
-    **Raises:** ValueError for what holds no shapes, and for shapes on frames that the model does not have.
+    **Raises:** ValueError for an argument without shapes, and for shapes on frames that the model does not have.
     """
     if shapes is None:
         shapes = Shapes()
@@ -46,13 +46,13 @@ def all_solids(motion: Motion, shapes) -> Shapes:
     unknown = sorted(shapes.frames() - set(model.frame_names))
     if unknown:
         raise ValueError(
-            f"shapes are on frames {', '.join(unknown[:5])}, which model {model.name!r} does not have; are they of another file?"
+            f"shapes are on frames {', '.join(unknown[:5])}, which model {model.name!r} lacks; are they from another file?"
         )
-    return completed(motion.scene, shapes)
+    return complete_solids(motion.scene, shapes)
 
 
 def stage_of(motion: Motion, shapes: Shapes) -> Stage:
-    """The stage for a motion and its solids."""
+    """Stage for a motion and its solids."""
     model = motion.scene.system
     points = [motion.poses[:, ::, :, :3, 3].reshape(-1, 3)]
     rows = motion._replace(poses=motion.poses[:, :: max(1, motion.poses.shape[1] // 40)])
@@ -62,13 +62,13 @@ def stage_of(motion: Motion, shapes: Shapes) -> Stage:
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         if shape.kind == "ellipsoid" and len(set(shape.size)) == 1:
             # The corners of a ball's box turn with it and reach below the ground on which it rolls.
-            here = place_of(model, rows.poses, shape.frame)
+            here = frame_poses(model, rows.poses, shape.frame)
             centre = (here @ shape.pose)[..., :3, 3].reshape(-1, 3)
             points += [centre + sign * shape.size[0] for sign in (-1.0, 1.0)]
             continue
         if shape.kind == "cylinder":
             corners = vertices
-        here = place_of(model, rows.poses, shape.frame)
+        here = frame_poses(model, rows.poses, shape.frame)
         points.append((corners @ np.swapaxes(here[..., :3, :3], -1, -2) + here[..., None, :3, 3]).reshape(-1, 3))
     every = np.concatenate(points)
     low, high = every.min(0), every.max(0)
@@ -82,7 +82,7 @@ def _up(model) -> np.ndarray:
     gravity = None if model.gravity is None else np.asarray(model.gravity, float)
     if gravity is None or not gravity.any():
         return np.array([0.0, 0.0, 1.0])
-    # The nearest axis: a slope is drawn as a slope.
+    # The nearest axis is vertical: an inclined plane is drawn inclined.
     axis = int(np.argmax(np.abs(gravity)))
     return -np.sign(gravity[axis]) * np.eye(3)[axis]
 
@@ -108,7 +108,7 @@ def _eye(motion: Motion, extent: np.ndarray, up: np.ndarray) -> np.ndarray:
     across = np.eye(3)[flat]
     if len(joints) > 2 and spread[flat] < 0.02 * widest and np.sort(spread)[1] > 0.1 * widest:
         if abs(across @ up) < 0.5:
-            # A mechanism in a vertical plane is seen from its front, from a little above.
+            # A mechanism in a vertical plane is seen from the front, slightly from above.
             side = np.cross(up, across)
             return _unit(-across * (1.0 if flat == 1 else -1.0) + 0.35 * side + 0.3 * up)
         if not (motion.scene.constraints and extent @ np.abs(up) > 0.2 * widest):

@@ -1,5 +1,4 @@
-"""Fewer coordinates than velocities: minimal velocities, the gauge-invariant form, and whether constraints are integrable
-(EQUATIONS sections 6, 7 and 9).
+"""Reduction: minimal velocities, the gauge-invariant form, and the integrability of constraints.
 
-Imports `constraints` and what is below it.
+Imports `constraints` and the layers below. Source: EQUATIONS sections 6, 7 and 9.
 """

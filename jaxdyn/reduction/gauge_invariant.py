@@ -1,4 +1,4 @@
-"""The gauge-invariant form of constrained dynamics: quasi velocities in which the mass matrix is 1.
+"""Gauge-invariant form of constrained dynamics: quasi velocities in which the mass matrix is 1.
 
 With any W, W W^T = M, the quasi velocity w = W^T v, the force u = W^-1 (tau - N), rows Lam = A W^-T:
 
@@ -10,7 +10,7 @@ Gamma skew. An orthogonal V = [V1 V2] with Lam V = [Lam_r 0] splits this into eq
     Gamma_o w_r          = u_o + Lam_r^T lam,   Gamma_o = V1^T Gamma V2 + V1^T V2dot,
 
 for w_r = V2^T w and constraints A v = 0; rows A v = b add terms in V1^T w = Lam_r^+ b. W -> W Q and V2 -> V2 Q with
-orthogonal Q change the form and not the motion: the gauge. Here V is carried along in parallel, V2^T V2dot = 0, and
+orthogonal Q change the form and not the motion: the gauge. Here V is parallel-transported, V2^T V2dot = 0, and
 V1^T V2dot = -Lam_r^+ Lamdot V2. Source: EQUATIONS section 9, with errata E23 to E26.
 """
 
@@ -27,15 +27,15 @@ from jaxdyn.constraints.dynamics import applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, batch_hint, check_state, or_zeros
-from jaxdyn.reduction.bases import freedoms, orthonormal, split_directions
+from jaxdyn.model.arguments import Numbers, batch_hint, check_state, zeros_if_none
+from jaxdyn.reduction.bases import count_dof, orthonormal, split_directions
 from jaxdyn.systems.mass_factor import cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
 
 class GaugeInvariant(Outcome):
-    """Quasi velocities, the equations in them, and the motion they give.
+    """Quasi velocities, their equations of motion and of constraint force, and the solution.
 
     - `W` (nv, nv), M = W W^T. `velocity` (nv,), w = W^T v. `Gamma` (nv, nv), skew. `Lambda` (nc, nv) = A W^-T. `force`
       (nv,), u. Quasi velocities are in sqrt(J), forces and accelerations in sqrt(J)/s.
@@ -85,23 +85,23 @@ def gauge_invariant(
 
     - `q` (nq,), `v` (nv,), on the constraints; `tau` (nv,), N m or N (None: zero); `t`, s.
     - `rotation`, orthogonal (nv, nv): W is the Cholesky factor of M times this. `motion_rotation`, orthogonal (nr, nr):
-      V2 is turned by it. Neither changes the motion.
+      V2 is rotated by it. Neither changes the motion.
     - `dof`, `rank_tol` as in `tangent_basis`.
 
     **Returns:** `GaugeInvariant`. Where the rank of A is not nv - nr the result is `singular_basis`.
 
-    Derivatives are right where the rank is constant; V1 and V2 are carried along without a turn in themselves.
+    Derivatives are exact where the rank is constant; V1 and V2 are parallel-transported.
 
-    **Raises:** ValueError for a scene without constraints, shapes that do not fit, and no freedom.
+    **Raises:** ValueError for a scene without constraints, inconsistent shapes, and no degree of freedom.
 
     Source: EQUATIONS section 9.
     """
     scene = as_scene(scene)
-    tau = or_zeros(tau, scene.nv)
+    tau = zeros_if_none(tau, scene.nv)
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so there is nothing to decouple; use jd.forward_dynamics")
-    dof = freedoms(scene, q, t, dof, rank_tol)
+    dof = count_dof(scene, q, t, dof, rank_tol)
     for name, value, size in (("rotation", rotation, scene.nv), ("motion_rotation", motion_rotation, dof)):
         if value is not None and value.shape != (size, size):
             raise ValueError(
@@ -127,12 +127,14 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     Gamma = _product(_product(inverse, C) - Wdot.T, inverse.T)
     u = _product(inverse, applied(scene, q, v, tau, t) - bias_force(system, q, v, t) + _product(C, v))
     Lambda = _product(A, inverse.T)
+    # Lam = A W^-T: its rate along the motion.
     rate = _product(Adot - _product(Lambda, Wdot.T), inverse.T)
     wanted = rows(scene, q, v, t).gamma + _product(Lambda, _product(Wdot.T, v))
 
     back = pseudo_inverse(Lambda, tolerance(rank_tol, Lambda))
     null_projector = unit - _product(back, Lambda)
     reference = split_directions(null_projector)
+    # Projecting constant references makes the bases smooth, and gives them the parallel transport V2^T V2dot = 0.
     V1, *_ = orthonormal(_product(unit - null_projector, reference[:, : scene.nv - dof]))
     V2, *_ = orthonormal(_product(null_projector, reference[:, scene.nv - dof :]))
     V2 = V2 if motion_rotation is None else _product(V2, motion_rotation)

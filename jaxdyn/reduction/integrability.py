@@ -1,4 +1,4 @@
-"""What kind of constraints a scene has: whether they can be integrated, and what substituting them into L does wrong."""
+"""Classification of constraints: integrability, and the spurious terms of their substitution into L."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.dynamics import tolerance
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, tangent_basis
 from jaxdyn.reduction.minimal import reduce
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -24,11 +24,11 @@ from jaxdyn.systems.system import velocity_to_rate
 
 
 class Involutivity(NamedTuple):
-    """Whether a distribution is integrable, with the evidence.
+    """Involutivity of a distribution: the decision and its evidence.
 
-    - `value`: whether brackets leave it. True: the motion stays on a family of surfaces, as under holonomic rows.
-    - `ranks`: dimensions of the distribution and of what its brackets span, level by level, until they stop growing.
-    - `singular_values`: of the unit fields of each level, on which the ranks stand.
+    - `value`: true where brackets stay in it; the motion then stays on a family of surfaces, as under holonomic rows.
+    - `ranks`: dimensions of the distribution and of the span of its brackets, by level, until they stop growing.
+    - `singular_values`: of the unit fields of each level, from which the ranks follow.
     """
 
     value: bool
@@ -39,15 +39,15 @@ class Involutivity(NamedTuple):
 def involutive(
     scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0, *, dof: int | None = None, rank_tol: float | None = None
 ) -> Involutivity:
-    """Whether the velocities that the constraints allow can be integrated to surfaces: Frobenius's test at a place.
+    """Test the distribution of admissible velocities for involutivity (Frobenius's theorem) at a configuration.
 
     Fields X_i span ker A; each level adds the brackets [X_i, Y] = (dY) X_i - (dX_i) Y with the fields Y of the level
     before, until the rank stops growing or the holonomic rows allow no more. nv - ranks[-1] is the number of holonomic
-    constraints in the rows, ranks[-1] - ranks[0] that of the truly nonholonomic ones. Rows A v = b with b != 0 are
+    constraints in the rows, ranks[-1] - ranks[0] that of the nonholonomic ones. Rows A v = b with b != 0 are
     tested together with their drift v0 + d/dt.
 
     **Arguments:** `q` (nq,) and `t`, concrete; `dof` and `rank_tol` as in `tangent_basis`. The ranks are assumed to be
-    constant around q: at a singular place they are those of the place alone.
+    constant around q: at a singularity they are valid only there.
 
     **Returns:** `Involutivity`.
 
@@ -62,11 +62,9 @@ def involutive(
     scene = as_scene(scene)
     q, t = check_state(scene.system, q=q, t=t)
     if not layout(scene):
-        raise ValueError("the scene has no constraints; every velocity is allowed")
+        raise ValueError("the scene has no constraints; every velocity is admissible")
     if not is_known(scene, q, t):
-        raise ValueError(
-            "involutive looks at ranks, which decide what it computes next; call it outside of jit and vmap"
-        )
+        raise ValueError("involutive branches on ranks and needs concrete numbers; call it outside of jit and vmap")
     reference = tangent_basis(scene, q, t, dof=dof, rank_tol=rank_tol)
     count, limit = reference.shape[1], tolerance(rank_tol, q)
     # Brackets stay tangent to the holonomic constraints.
@@ -94,7 +92,8 @@ def involutive(
 
 
 def _independent(spanned, new, limit) -> list[int]:
-    """Columns of `new` that add a direction to those of `spanned`, the largest first."""
+    """Select columns of `new` that add a direction to those of `spanned`, the largest first."""
+    # Directions in the span already are removed once; pivoting then needs only the new columns.
     rest, kept = new - spanned @ np.linalg.lstsq(spanned, new, rcond=None)[0] if spanned.shape[1] else new, []
     while True:
         sizes = np.linalg.norm(rest, axis=0)
@@ -121,6 +120,7 @@ def _fields(scene, reference, q, t, levels):
         outer, within = np.array(pairs).T
 
         def fields(x):
+            # Linearised once, both derivatives serve all pairs of the level.
             X, forward = jax.linearize(generators, x)
             Y, inward = jax.linearize(inner, x)
             along = jax.vmap(inward)(X), jax.vmap(forward)(Y)
@@ -138,9 +138,9 @@ _fields_compiled = eqx.filter_jit(_fields)
 
 
 class SpuriousTerms(NamedTuple):
-    """Equations of motion M_r nudot + bias = tau_r, right and with the constraints substituted into L.
+    """Equations of motion M_r nudot + bias = tau_r, correct ones and those with constraints substituted into L.
 
-    - `terms` (nr,): the spurious terms, right bias minus wrong bias, N or N m. Zero where substitution is allowed.
+    - `terms` (nr,): the spurious terms, correct minus wrong bias, N or N m. Zero where substitution is valid.
     - `bias_force`, `wrong_bias_force` (nr,); `acceleration`, `wrong_acceleration` (nr,): nudot from each.
     - `mass_matrix` (nr, nr), the same in both.
     """
@@ -162,9 +162,9 @@ def spurious_terms(
     *,
     independent: Sequence[int],
 ) -> SpuriousTerms:
-    """What goes wrong when sdot = -a(r)^T rdot is put into L before differentiating.
+    """Spurious terms from substituting sdot = -a(r)^T rdot into L before differentiation.
 
-    With q = (r, s), the Lagrange equations of L_c(r, rdot) = L(r, rdot, -a^T rdot) differ from the right ones by
+    With q = (r, s), the Lagrange equations of L_c(r, rdot) = L(r, rdot, -a^T rdot) differ from the correct ones by
 
         terms_i = dL/dsdot . (d a_i/dt - sum_j da_j/dr_i rdot_j),
 
@@ -180,7 +180,7 @@ def spurious_terms(
     Source: Murray, Li & Sastry (1994), eq. 6.15; EQUATIONS section 6, errata E32 and E33.
     """
     scene = as_scene(scene)
-    tau = or_zeros(tau, scene.nv)
+    tau = zeros_if_none(tau, scene.nv)
     q, tau, t = check_state(scene.system, q=q, tau=tau, t=t)
     nu = as_array(nu, "nu", q.dtype)
     if not layout(scene):
@@ -190,7 +190,7 @@ def spurious_terms(
     choice = as_basis(tuple(independent), scene)
     if not isinstance(choice, Independent) or nu.shape != (choice.size(scene),):
         raise ValueError(f"nu has shape {nu.shape}, expected {(choice.size(scene),)} = (nr,){batch_hint(nu, (1,))}")
-    terms, depends = _substituted(scene, choice, q, nu, tau, t)
+    terms, depends = _substitute(scene, choice, q, nu, tau, t)
     if is_concrete(depends) and float(depends) > 1e-9:
         raise ValueError(
             f"L or the rows depend on the eliminated coordinates (by {float(depends):.3g}), or the rows prescribe a slip; "
@@ -200,7 +200,7 @@ def spurious_terms(
 
 
 @compiled
-def _substituted(scene, choice: Independent, q, nu, tau, t):
+def _substitute(scene, choice: Independent, q, nu, tau, t):
     kept = np.asarray(choice.velocities, int)
     rest = np.setdiff1d(np.arange(scene.nv), kept)
     right = reduce(scene, choice, q, nu, tau, t)
@@ -208,13 +208,14 @@ def _substituted(scene, choice: Independent, q, nu, tau, t):
     def at(r):
         return choice.at(scene, q.at[kept].set(r), t).N
 
-    def substituted(r, rdot):
+    def restricted_lagrangian(r, rdot):
         return _lagrangian(scene.system, q.at[kept].set(r), _product(at(r), rdot), t)
 
     r = q[kept]
-    momentum = jax.grad(substituted, argnums=1)
+    # The wrong equations come from the substituted Lagrangian itself, so that they do not presuppose the formula of `terms`.
+    momentum = jax.grad(restricted_lagrangian, argnums=1)
     _, change = jax.jvp(lambda r: momentum(r, nu), (r,), (nu,))
-    wrong = change - jax.grad(substituted)(r, nu)
+    wrong = change - jax.grad(restricted_lagrangian)(r, nu)
     # a = -N on the eliminated rows: (rate of a_i) - d/dr_i (a . rdot).
     push = jax.grad(lambda v: _lagrangian(scene.system, q, v, t))(right.velocity)[rest]
     _, along = jax.jvp(lambda r: -at(r)[rest], (r,), (nu,))
@@ -222,7 +223,7 @@ def _substituted(scene, choice: Independent, q, nu, tau, t):
     terms = _product(push, along - slope)
     rate = solve_positive(right.mass_matrix, right.force - wrong)
     value = SpuriousTerms(terms, right.bias_force, wrong, right.nu_rate, rate, right.mass_matrix)
-    # How much anything changes with s, at this velocity.
+    # Largest derivative of L and the rows with respect to s, at this velocity.
     forms = jax.jacfwd(lambda s: constraint_jacobian(scene, q.at[rest].set(s), t))(q[rest])
     pull = jax.grad(lambda s: _lagrangian(scene.system, q.at[rest].set(s), right.velocity, t))(q[rest])
     residual = velocity_residual(scene, q, jnp.zeros_like(q), t)
@@ -230,8 +231,8 @@ def _substituted(scene, choice: Independent, q, nu, tau, t):
 
 
 def _lagrangian(system, q, v, t):
-    """L of a system: as given, or T - V."""
+    """Lagrangian of a system: its own function, or T - V."""
     if isinstance(system, LagrangianSystem):
-        # Not T - V, which lacks terms linear in v.
+        # T - V of such a system would lack terms linear in v.
         return system.value(q, v, t)
     return kinetic_energy(system, q, v, t) - potential_energy(system, q, t)

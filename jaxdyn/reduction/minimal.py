@@ -1,4 +1,4 @@
-"""Reduction to minimal velocities: v = N(q, t) nu + v0(q, t) with A N = 0 and A v0 = b, so that no multipliers are left.
+"""Reduction to minimal velocities: v = N(q, t) nu + v0(q, t) with A N = 0 and A v0 = b, without multipliers.
 
 With s = Ndot nu + v0dot, the rate of v at constant nu, the motion along the columns of N is
 
@@ -20,9 +20,17 @@ from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import applied
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, or_zeros
-from jaxdyn.reduction.bases import Basis, BasisLike, Moving, Whole, as_basis, least_quality, moving
-from jaxdyn.systems.mass_factor import cholesky, definite, solve_factored
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
+from jaxdyn.reduction.bases import (
+    Basis,
+    BasisLike,
+    FullBasis,
+    VelocityAndDrift,
+    as_basis,
+    least_quality,
+    velocity_and_drift,
+)
+from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 from jaxdyn.systems.scene import Scene, as_scene
 
 
@@ -61,58 +69,59 @@ def reduced_dynamics(
     **Arguments:**
 
     - `q` (nq,), on the constraints; `nu` (nr,), minimal velocities; `tau` (nv,), N m or N (None: zero); `t`, s.
-    - `basis`, what N and nu are. A tuple of indices: nu are these entries of v. A function N(q, t) -> (nv, nr), or
+    - `basis`, the choice of N and nu. A tuple of indices: nu are these entries of v. A function N(q, t) -> (nv, nr), or
       -> (N, v0), with A N = 0 and A v0 = b; a plain function is static, a Module carries leaves. A matrix R (nv, nr),
-      such as `tangent_basis`: N is the orthonormal basis of ker A nearest to R in the sense of `Orthonormal`. A scene
-      without constraints has nothing to choose: leave it out, and nu = v, M_r = M, h_r = h.
+      such as `tangent_basis`: N is the orthonormal basis of ker A closest to R in the sense of `Orthonormal`. A scene
+      without constraints needs none: nu = v, M_r = M, h_r = h.
 
-    **Returns:** `ReducedDynamics`. Where N does not serve (a singular A2, columns that depend on each other or break
+    **Returns:** `ReducedDynamics`. Where N is invalid (a singular A2, columns that are dependent or violate
     the rows, a rank other than nv - nr) the result is `singular_basis`.
 
-    **Raises:** ValueError for shapes that do not fit, a basis that is missing or, without constraints, given, and, on
-    concrete numbers, a basis that does not serve, with what to take instead.
+    **Raises:** ValueError for inconsistent shapes, a missing basis, one for a scene without constraints, and, on
+    concrete numbers, an invalid basis, with a valid one.
 
     Source: EQUATIONS section 6; Kane & Levinson (1985), section 6.1.
     """
     scene = as_scene(scene)
-    tau = or_zeros(tau, scene.nv)
+    tau = zeros_if_none(tau, scene.nv)
     q, tau, time = check_state(scene.system, q=q, tau=tau, t=t)
     nu = as_array(nu, "nu", q.dtype)
     if layout(scene):
         choice = as_basis(basis, scene)
     elif basis is None:
-        choice = Whole()
+        choice = FullBasis()
     else:
-        raise ValueError(f"the scene has no constraints, so that nu = v; basis is {basis!r}, leave it out")
+        raise ValueError(f"the scene has no constraints, so that nu = v; basis is {basis!r}, omit it")
     size = choice.size(scene)
     if size is not None and nu.shape != (size,):
         raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns{batch_hint(nu, (1,))}")
     dynamics = _reduce_compiled(scene, choice, q, nu, tau, time)
     singular = dynamics.result == RESULTS.singular_basis
     if is_concrete(singular) and bool(singular):
-        raise ValueError(f"basis does not serve at this q: {choice.advice(scene, q, time)}")
+        raise ValueError(f"basis is not valid at this q: {choice.advice(scene, q, time)}")
     return dynamics
 
 
 def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
-    """`reduced_dynamics` in traced numbers, for a `Basis` that fits."""
+    """Solve `reduced_dynamics` in traced numbers, for a checked `Basis`."""
     return run_repaired(_reduce, (scene, choice), q, nu, tau, t)
 
 
 def _reduce(given: tuple[Scene, Basis], q, nu, tau, t) -> ReducedDynamics:
     scene, choice = given
-    return solve_reduced(scene, moving(scene, choice, q, nu, t), q, tau, t)
+    return solve_in_basis(scene, velocity_and_drift(scene, choice, q, nu, t), q, tau, t)
 
 
-def solve_reduced(scene: Scene, motion: Moving, q, tau, t) -> ReducedDynamics:
-    """The equations of motion in the minimal velocities of a `Moving` place, and their solution."""
+def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> ReducedDynamics:
+    """Solve the equations of motion in the minimal velocities of a `VelocityAndDrift`."""
     v, drift, N, quality = motion
+    # Only inertia at constant nu enters the bias: inverse dynamics at the drift gives N^T (M s + h) in one pass.
     mass = _product(N.T, _product(mass_matrix(scene.system, q, t), N))
     bias = _product(N.T, inverse_dynamics(scene.system, q, v, drift, t))
     force = _product(N.T, applied(scene, q, v, tau, t))
     factor = cholesky(mass)
-    rate = solve_factored(factor, force - bias)
-    result = RESULTS.where(definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    rate = solve_cholesky(factor, force - bias)
+    result = RESULTS.where(is_definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     is_regular = jnp.abs(quality) > least_quality(q.dtype)
     result = RESULTS.where(is_regular, result, RESULTS.singular_basis)
     return ReducedDynamics(rate, v, _product(N, rate) + drift, mass, bias, force, N, result)

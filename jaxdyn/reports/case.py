@@ -1,4 +1,4 @@
-"""What a case of the report is: a scene with its reference, what is measured of it, and points that others have published."""
+"""Cases of the report: a scene with its reference solution, measured quantities, and published results."""
 
 import inspect
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from jaxdyn.systems.scene import Scene
 
 
 class Published(NamedTuple):
-    """Somebody else's run of the same motion: CPU `seconds`, and the largest `error` or `energy_error` (J) if stated."""
+    """Published run of the same motion: CPU `seconds`, and the largest `error` or `energy_error` (J) if stated."""
 
     label: str
     seconds: float
@@ -21,14 +21,14 @@ class Published(NamedTuple):
 
 
 class Case(NamedTuple):
-    """A scene of the report.
+    """Scene of the report with its measurements.
 
-      - `name`, `text`: what it is called and what it is; `kind`: the class of scenes for which defaults are compared.
+      - `name`, `text`: name and description; `kind`: the class of scenes for comparing defaults.
       - `build()` -> (scene, (q0, v0)); `reference(start)` -> `Reference`, or None where a
-    converged solution at `ts` serves.
+    converged solution at `ts` is the reference.
       - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
-      - `reduces`: whether the method "reduced" takes the scene without being told its number of freedoms.
-      - `largest`: the most trajectories at once that are measured unless `integrators` are chosen; None for any number.
+      - `reduces`: whether the method "reduced" finds the scene's degrees of freedom.
+      - `largest`: largest measured batch unless `integrators` are chosen; None for no limit.
     """
 
     name: str
@@ -45,16 +45,17 @@ class Case(NamedTuple):
     published: tuple[Published, ...] = ()
 
 
-def named(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
-    """`build` of a scene of `jaxdyn.scenes`, its start in numpy; the scene and its start take the parameters that they have."""
+def scene_builder(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
+    """Function `build` for a scene of `jaxdyn.scenes`; scene and start get the parameters that they accept."""
 
-    def taken(function):
+    def call_with_known(function):
+        # A parameter may belong to the scene, to its start, or to both.
         known = inspect.signature(function).parameters
         return function(**{key: value for key, value in parameters.items() if key in known})
 
     def build():
         scene = getattr(scenes, name)
-        q, v = taken(scene.start_function)
-        return taken(scene), (np.asarray(q), np.asarray(v))
+        q, v = call_with_known(scene.start_function)
+        return call_with_known(scene), (np.asarray(q), np.asarray(v))
 
     return build

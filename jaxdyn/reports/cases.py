@@ -1,4 +1,4 @@
-"""The scenes a report runs, one after the other; each case says what is measured of it."""
+"""Scenes of a report; each case states its measurements."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,13 +7,13 @@ from jaxdyn.forces.elements import Drive
 from jaxdyn.model import robots
 from jaxdyn.reports import references
 from jaxdyn.reports.case import Case as Case
-from jaxdyn.reports.case import Published, named
+from jaxdyn.reports.case import Published, scene_builder
 from jaxdyn.reports.cases_in_contact import in_contact
 from jaxdyn.reports.cases_of_mechanisms import mechanisms
 from jaxdyn.systems.scene import Scene
 
 
-def _held_elbow() -> tuple[Scene, tuple]:
+def _stiff_elbow() -> tuple[Scene, tuple]:
     drive = Drive(kp=jnp.asarray([0.0, 1e5]), kd=jnp.asarray([0.1, 1e4]), target=jnp.asarray([0.0, 0.5]))
     return Scene(robots.chain(2), forces=(drive,)), (np.array([1.0, 0.8]), np.zeros(2))
 
@@ -26,7 +26,7 @@ def _cases() -> tuple[Case, ...]:
             "pendulum_in_plane",
             "Plane pendulum in x and y, 10 s (problem A01 of the IFToMM library)",
             "holonomic",
-            named("pendulum_in_plane"),
+            scene_builder("pendulum_in_plane"),
             lambda start: references.plane_pendulum(ten),
             ten,
             500,
@@ -39,7 +39,7 @@ def _cases() -> tuple[Case, ...]:
             "spherical_pendulum",
             "Spherical pendulum in x, y and z, 10 s",
             "holonomic",
-            named("spherical_pendulum"),
+            scene_builder("spherical_pendulum"),
             lambda start: references.sphere_pendulum(ten),
             ten,
             250,
@@ -48,7 +48,7 @@ def _cases() -> tuple[Case, ...]:
             "free_body",
             "Free rigid body with three different moments of inertia, 20 s",
             "free",
-            named("free_body"),
+            scene_builder("free_body"),
             lambda start: references.free_top(2 * ten),
             2 * ten,
             100,
@@ -57,7 +57,7 @@ def _cases() -> tuple[Case, ...]:
             "double_pendulum",
             "Double pendulum of two bodies in a chain, 5 s",
             "free",
-            named("double_pendulum", formulation="model"),
+            scene_builder("double_pendulum", formulation="model"),
             None,
             ten / 2,
             100,
@@ -66,7 +66,7 @@ def _cases() -> tuple[Case, ...]:
             "rolling_disk",
             "Upright disk that rolls on a circle, 10 s",
             "nonholonomic",
-            named("rolling_disk"),
+            scene_builder("rolling_disk"),
             lambda start: references.upright_disk(ten),
             ten,
             50,
@@ -75,7 +75,7 @@ def _cases() -> tuple[Case, ...]:
             "chaplygin_sleigh",
             "Chaplygin's sleigh, 10 s",
             "nonholonomic",
-            named("chaplygin_sleigh"),
+            scene_builder("chaplygin_sleigh"),
             lambda start: references.sleigh(ten),
             ten,
             50,
@@ -84,7 +84,7 @@ def _cases() -> tuple[Case, ...]:
             "rolling_coin",
             "Leaning disk that rolls steadily on a circle, 5 s: close to one turn",
             "nonholonomic",
-            named("rolling_coin"),
+            scene_builder("rolling_coin"),
             lambda start: references.coin(ten / 2),
             ten / 2,
             250,
@@ -93,7 +93,7 @@ def _cases() -> tuple[Case, ...]:
             "bicycle",
             "Whipple's bicycle at 4.6 m/s after a push to its side, 3 s",
             "nonholonomic",
-            named("bicycle", roll_rate=0.5),
+            scene_builder("bicycle", roll_rate=0.5),
             None,
             np.linspace(0.0, 3.0, 7),
             150,
@@ -102,7 +102,7 @@ def _cases() -> tuple[Case, ...]:
             "four_bar",
             "Four-bar linkage, 5 s",
             "holonomic",
-            named("four_bar"),
+            scene_builder("four_bar"),
             None,
             ten / 2,
             100,
@@ -111,7 +111,7 @@ def _cases() -> tuple[Case, ...]:
             "windows",
             "Two four-bar windows, 10 s (problem A02 of the IFToMM library, N = 2), through positions where rows lose rank",
             "holonomic, losing rank",
-            named("windows", count=2),
+            scene_builder("windows", count=2),
             lambda start: references.windows(ten, 2),
             ten,
             500,
@@ -125,7 +125,7 @@ def _cases() -> tuple[Case, ...]:
             "Forty four-bar windows, 1 s of the 20 s of problem A02 of the IFToMM library, through one position where rows "
             "lose rank",
             "holonomic, losing rank",
-            named("windows", count=40),
+            scene_builder("windows", count=40),
             lambda start: references.windows(ten / 10, 40),
             ten / 10,
             10,
@@ -136,7 +136,7 @@ def _cases() -> tuple[Case, ...]:
             "andrews",
             "Andrews' squeezing mechanism, 0.03 s (test set for IVP solvers)",
             "holonomic",
-            named("andrews"),
+            scene_builder("andrews"),
             references.andrews,
             np.array([0.0, 0.03]),
             250,
@@ -149,7 +149,7 @@ def _cases() -> tuple[Case, ...]:
             "held_elbow",
             "Double pendulum whose elbow a stiff drive holds, 2 s: decays of 1e5 1/s",
             "free, stiff",
-            _held_elbow,
+            _stiff_elbow,
             None,
             ten / 5,
             1000,
@@ -160,7 +160,7 @@ def _cases() -> tuple[Case, ...]:
             "car_axis",
             "Car axis on a bumpy road, 3 s (test set for IVP solvers): constraints that move with time",
             "driven",
-            named("car_axis"),
+            scene_builder("car_axis"),
             references.car_axis,
             np.array([0.0, 3.0]),
             250,
@@ -171,5 +171,5 @@ def _cases() -> tuple[Case, ...]:
 
 
 def cases() -> dict[str, Case]:
-    """Every scene of the report by its name: all of `jd.scenes`, some in several forms, and one with a stiff drive."""
+    """All scenes of the report by name: those of `jd.scenes`, some in several forms, and one with a stiff drive."""
     return {case.name: case for case in (*_cases(), *mechanisms(), *in_contact())}

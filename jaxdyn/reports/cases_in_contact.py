@@ -1,13 +1,13 @@
-"""Cases of the report: hands, arms that touch and lift, a box on a table. Contacts are two-sided, whatever their cones."""
+"""Cases of the report with contacts: hands, arms, a box on a table. Contacts are two-sided, without regard to friction cones."""
 
 import numpy as np
 
 from jaxdyn.reports import references
-from jaxdyn.reports.case import Case, named
+from jaxdyn.reports.case import Case, scene_builder
 
 
 def in_contact() -> tuple[Case, ...]:
-    """Cases with contacts. Hands let go without torques, so that their motions are short."""
+    """Cases with contacts. Hands without torques release their object, so that their motions are short."""
     ten = np.linspace(0.0, 10.0, 11)
     short = ten / 50
     return (
@@ -15,7 +15,7 @@ def in_contact() -> tuple[Case, ...]:
             "sphere_arm",
             "Arm of six joints whose tip slides on a sphere without friction, 0.5 s: five coordinates of contact",
             "holonomic",
-            named("sphere_arm"),
+            scene_builder("sphere_arm"),
             None,
             ten / 20,
             50,
@@ -24,7 +24,7 @@ def in_contact() -> tuple[Case, ...]:
             "sphere_arm_rolling",
             "Arm of six joints whose tip rolls on a sphere, 0.5 s: two velocities, four rows",
             "nonholonomic",
-            named("sphere_arm", contact="rolling"),
+            scene_builder("sphere_arm", contact="rolling"),
             None,
             ten / 20,
             50,
@@ -33,7 +33,7 @@ def in_contact() -> tuple[Case, ...]:
             "hand_with_bar",
             "Two-finger hand in a plane that holds a bar, 0.2 s",
             "holonomic",
-            named("hand_with_bar"),
+            scene_builder("hand_with_bar"),
             None,
             short,
             25,
@@ -42,7 +42,7 @@ def in_contact() -> tuple[Case, ...]:
             "hand_with_disk",
             "Two-finger hand in a plane with a disk that rolls between its fingers, 0.2 s",
             "nonholonomic",
-            named("hand_with_disk"),
+            scene_builder("hand_with_disk"),
             None,
             short,
             25,
@@ -51,7 +51,7 @@ def in_contact() -> tuple[Case, ...]:
             "hand_with_ball",
             "Three-finger hand that holds a ball at three points, 0.2 s",
             "holonomic",
-            named("hand_with_ball"),
+            scene_builder("hand_with_ball"),
             None,
             short,
             25,
@@ -60,7 +60,7 @@ def in_contact() -> tuple[Case, ...]:
             "hand_rolling_ball",
             "Three-finger hand whose round fingertips roll on a ball, 0.2 s",
             "nonholonomic",
-            named("hand_rolling_ball"),
+            scene_builder("hand_rolling_ball"),
             None,
             short,
             25,
@@ -69,7 +69,7 @@ def in_contact() -> tuple[Case, ...]:
             "hand_rolling_egg",
             "Three-finger hand whose fingertips, ellipsoids, roll on an ellipsoid, 0.2 s",
             "nonholonomic",
-            named("hand_rolling_egg"),
+            scene_builder("hand_rolling_egg"),
             None,
             short,
             25,
@@ -77,9 +77,9 @@ def in_contact() -> tuple[Case, ...]:
         ),
         Case(
             "allegro_with_cube",
-            "Allegro hand with a cube, 0.05 s: 13 freedoms, seven of them internal",
+            "Allegro hand with a cube, 0.05 s: 13 degrees of freedom, seven of them internal",
             "holonomic",
-            named("allegro_with_cube"),
+            scene_builder("allegro_with_cube"),
             None,
             ten / 200,
             25,
@@ -89,7 +89,7 @@ def in_contact() -> tuple[Case, ...]:
             "coordinated_lifting",
             "Two KUKA iiwa that hold a plate together, 0.4 s",
             "holonomic",
-            named("coordinated_lifting"),
+            scene_builder("coordinated_lifting"),
             None,
             ten / 25,
             25,
@@ -99,7 +99,7 @@ def in_contact() -> tuple[Case, ...]:
             "box_on_table",
             "Box on a table that tips over, held by six rows, 4 s: its base lets go soon after",
             "holonomic",
-            named("box_on_table"),
+            scene_builder("box_on_table"),
             lambda start: references.falling_table(0.4 * ten),
             0.4 * ten,
             25,

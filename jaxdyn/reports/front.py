@@ -1,4 +1,4 @@
-"""The front of a work-precision plot, and the best integrator for a class of scenes."""
+"""Pareto front of a work-precision plot, and the best integrator for a class of scenes."""
 
 import math
 from collections import defaultdict
@@ -11,7 +11,8 @@ TARGETS = (1e-3, 1e-5, 1e-7, 1e-9)
 
 
 def pareto_front(records: Iterable[Record], *, error: str = "error_path", cost: str = "seconds_best") -> list[Record]:
-    """Records that no other one beats in both `error` and `cost`, from cheap to exact; failed runs are left out."""
+    """Pareto-optimal records in `error` and `cost`, from cheap to accurate, without failed runs."""
+    # After sorting by cost, a record is on the front if its error is below that of all cheaper ones.
     usable = [r for r in records if getattr(r, error) is not None and getattr(r, cost) is not None]
     usable.sort(key=lambda r: (getattr(r, cost), getattr(r, error)))
     front: list[Record] = []
@@ -24,9 +25,9 @@ def pareto_front(records: Iterable[Record], *, error: str = "error_path", cost: 
 def cost_at(
     records: Iterable[Record], target: float, *, error: str = "error_path", cost: str = "seconds_best"
 ) -> float:
-    """Cost at which a ladder reaches an error: on straight lines between its rungs in the log-log plot.
+    """Cost at which a ladder of runs reaches an error, interpolated linearly in the log-log plot.
 
-    Infinite where no rung reaches it; that of the cheapest rung where all are better.
+    Infinite where no run reaches it; that of the cheapest run where all are better.
     """
     points = [(getattr(r, error), getattr(r, cost)) for r in pareto_front(records, error=error, cost=cost)]
     for (rough, cheap), (fine, dear) in zip([(math.inf, 0.0), *points], points, strict=False):
@@ -42,10 +43,10 @@ def cost_at(
 def beaten_by(
     records: Iterable[Record], *, error: str = "error_path", cost: str = "seconds_best"
 ) -> list[tuple[Record, float]]:
-    """Peers' runs that lie below our front, each with how many times its cost we take to its error; the worst first.
+    """Runs of peers below our front, each with the ratio of our cost to its cost at its error, worst first.
 
-    Between our rungs the front goes on straight lines in the log-log plot. The number is infinite where no run of ours
-    is as exact. `records` are of one plot: one scene, dtype and batch.
+    The front is interpolated linearly in the log-log plot. The ratio is infinite where no run of ours
+    is as accurate. `records` are of one plot: one scene, dtype and batch.
 
     **Raises:** ValueError for records of several plots.
     """
@@ -64,10 +65,10 @@ def beaten_by(
 
 
 class Standing(NamedTuple):
-    """How one integrator does in a class of scenes.
+    """Ranking entry of an integrator in a class of scenes.
 
     `ratio`: its cost over that of the best integrator, geometric mean over scenes and target errors that it reaches; `reached`
-    of `wanted`: how many of those that some integrator reaches.
+    of `wanted`: the number of these targets, out of those that some integrator reaches.
     """
 
     kind: str
@@ -80,9 +81,9 @@ class Standing(NamedTuple):
 def standings(
     records: Iterable[Record], *, targets: Sequence[float] = TARGETS, cost: str = "seconds_best"
 ) -> list[Standing]:
-    """Ways to integrate by class of scenes (with dtype and batch), best first: those that reach most, then the cheapest.
+    """Ranking of integrators by class of scenes (with dtype and batch): most targets reached first, then the cheapest.
 
-    Only runs of jaxdyn are compared; peers are on the plots.
+    Only runs of jaxdyn are compared; plots also show peers.
     """
     ladders: dict[tuple, dict[str, list[Record]]] = defaultdict(lambda: defaultdict(list))
     for r in records:
@@ -101,6 +102,7 @@ def standings(
         rows = []
         for label, row in costs.items():
             ratios = [x / b for x, b in zip(row, best, strict=True) if math.isfinite(x)]
+            # Geometric mean: ratios of costs have no common unit, and halving must count as much as doubling.
             mean = math.exp(sum(map(math.log, ratios)) / len(ratios)) if ratios else math.inf
             rows.append(Standing(kind, label, mean, len(ratios), sum(map(math.isfinite, best))))
         table += sorted(rows, key=lambda row: (-row.reached, row.ratio))

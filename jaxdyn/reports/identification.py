@@ -1,4 +1,4 @@
-"""What an identification found, on which logs, and all of it as JSON."""
+"""Results of an identification and their JSON form."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -25,8 +25,8 @@ from jaxdyn.identify.whiteness import Whiteness, whiteness
 from jaxdyn.model.tree import Model
 
 
-class Judged(NamedTuple):
-    """A log and the torques (n, nv) that a fit and the nominal model predict along it (N m, N)."""
+class Evaluation(NamedTuple):
+    """Evaluation of a fit on a log: the torques (n, nv) predicted by the fit and by the nominal model (N m, N)."""
 
     name: str
     log: Log
@@ -35,7 +35,7 @@ class Judged(NamedTuple):
 
     @property
     def percent(self) -> float:
-        """100 |predicted - measured| / |measured| over all samples and joints."""
+        """Torque error 100 |predicted - measured| / |measured| over all samples and joints."""
         return torque_error(self.predicted, self.log.tau)
 
     @property
@@ -45,7 +45,7 @@ class Judged(NamedTuple):
 
     @property
     def whiteness(self) -> Whiteness:
-        """How far the error is from independent noise."""
+        """Autocorrelation of the error."""
         return whiteness(self.log, self.predicted - np.asarray(self.log.tau, np.float64))
 
     @property
@@ -56,50 +56,53 @@ class Judged(NamedTuple):
 
 
 class Findings(NamedTuple):
-    """Everything that is reported.
+    """All results of an identification.
 
-    `result`: what is written, fitted to all training logs. `tests`: logs, or parts of logs, that were not fitted, under the fit
-    that is to be judged; `train`: what that fit was made from; `final`: all training logs under `result`. `is_refit`: whether
-    `result` is another fit than the one judged. `told`: what the training logs can tell.
-    `choice`: how its setting was chosen, on `train`; None for other fits.
+    `result`: the written fit, to all training logs. `tests`: test logs, or held-out parts of logs, under the evaluated
+    fit; `train`: its training logs; `final`: all training logs under `result`. `is_refit`: whether
+    `result` is another fit than the evaluated one. `identifiability`: that of the parameters from the training logs.
+    `choice`: the choice of settings on `train`; None for other fits.
     """
 
     model: Model
     result: RobotFit | Fit | LeastSquares
-    tests: list[Judged]
-    train: list[Judged]
-    final: list[Judged]
+    tests: list[Evaluation]
+    train: list[Evaluation]
+    final: list[Evaluation]
     outcome: str
     is_refit: bool
     warnings: list[str]
-    told: Identifiability
+    identifiability: Identifiability
     choice: Choice | None = None
 
     @property
     def fit(self) -> Fit | LeastSquares:
-        """The fit that is written, without its choice and intervals."""
+        """Written fit, without its choice of settings and intervals."""
         return self.result.fit if isinstance(self.result, RobotFit) else self.result
 
     @property
     def parameters(self) -> np.ndarray:
-        """x (10 nb + 4 nv,) of it."""
+        """Parameters x (10 nb + 4 nv,) of the written fit."""
         return self.fit.parameters if isinstance(self.fit, LeastSquares) else self.fit.vector
 
     @property
+    # Order of the parameter vector: ten per body, then nv of each term.
     def friction(self) -> dict[str, np.ndarray]:
         """Terms of friction and rotors, (nv,) each."""
         blocks = self.parameters[10 * self.model.nb :].reshape(len(TERMS), self.model.nv)
         return dict(zip(TERMS, blocks, strict=True))
 
 
-def total_percent(judged: Sequence[Judged], which: str = "predicted") -> float:
+def total_percent(evaluations: Sequence[Evaluation], which: str = "predicted") -> float:
     """Torque error over several logs, in per cent."""
-    rows = [np.asarray(getattr(one, which)).reshape(-1) for one in judged]
-    return torque_error(np.concatenate(rows), np.concatenate([np.asarray(one.log.tau).reshape(-1) for one in judged]))
+    rows = [np.asarray(getattr(one, which)).reshape(-1) for one in evaluations]
+    return torque_error(
+        np.concatenate(rows), np.concatenate([np.asarray(one.log.tau).reshape(-1) for one in evaluations])
+    )
 
 
 def content(findings: Findings, settings: dict[str, Any]) -> dict[str, Any]:
-    """What goes into the JSON file; `settings` are what the user asked for, and come first."""
+    """Content of the JSON file; `settings` are the user's options, and come first."""
     model, result, fit = findings.model, findings.result, findings.fit
     names = parameter_names(model)
     base = base_parameters(model, tuple(term for term in fit.terms if term in TERMS))
@@ -124,7 +127,7 @@ def content(findings: Findings, settings: dict[str, Any]) -> dict[str, Any]:
         },
         "test_rms": findings.tests[0].rms.tolist(),
         "warnings": findings.warnings,
-        "identifiability": _told(findings.told),
+        "identifiability": _identifiability(findings.identifiability),
         "terms": list(fit.terms),
         "friction": {term: values.tolist() for term, values in findings.friction.items()},
         "base_parameters": {
@@ -176,19 +179,20 @@ def _add_robot(report: dict[str, Any], result: RobotFit, choice: Choice, model: 
 
 
 def gains_content(gains: DriveGains) -> dict[str, Any]:
-    """Gains of drives for the JSON file."""
+    """Drive gains for the JSON file."""
     return {
         "gains": gains.gains.tolist(),
         "std": gains.std.tolist(),
         "interval_factor": gains.factor,
-        "told": list(gains.told),
+        "identifiable": list(gains.told),
+        "told": list(gains.told),  # former key, for one release
         "percent": gains.error,
         "v_s": gains.v_s,
     }
 
 
 def payload_content(payload: Payload) -> dict[str, Any]:
-    """A payload for the JSON file."""
+    """Payload for the JSON file."""
     return {
         "body": payload.body,
         "mass": payload.mass,
@@ -203,34 +207,38 @@ def payload_content(payload: Payload) -> dict[str, Any]:
 
 
 def model_joint(model: Model, coordinate: int) -> str:
-    """Name of a number of v: the joint's, with an index where it has several."""
+    """Name of a coordinate of v: the joint's, with an index where it has several."""
     start = 10 * model.nb
     return parameter_names(model)[start + coordinate].rpartition(".")[0]
 
 
-def _errors(one: Judged) -> dict[str, Any]:
+def _errors(one: Evaluation) -> dict[str, Any]:
     return {
         "percent": one.percent,
         "percent_by_joint": _numbers(one.percent_by_joint),
         "rms_by_joint": one.rms.tolist(),
         "nominal_percent": torque_error(one.nominal, one.log.tau),
         "samples": len(one.log),
+        "autocorrelation_time_seconds": one.whiteness.correlation_time.tolist(),
+        "effective_sample_size": one.whiteness.effective_samples.tolist(),
+        # Former keys, for one release.
         "error_lasts_seconds": one.whiteness.correlation_time.tolist(),
         "worth_independent_samples": one.whiteness.effective_samples.tolist(),
     }
 
 
-def _told(told: Identifiability) -> dict[str, Any]:
+def _identifiability(found: Identifiability) -> dict[str, Any]:
     return {
-        "rank": told.rank,
-        "combinations": len(told.base),
-        "condition": told.condition if np.isfinite(told.condition) else None,
-        "weakest": [direction._asdict() for direction in told.weakest],
-        "not_excited": list(told.silent),
-        "told_by_no_motion": list(told.unidentifiable),
+        "rank": found.rank,
+        "combinations": len(found.base),
+        "condition": found.condition if np.isfinite(found.condition) else None,
+        "weakest": [direction._asdict() for direction in found.weakest],
+        "not_excited": list(found.silent),
+        "unidentifiable": list(found.unidentifiable),
+        "told_by_no_motion": list(found.unidentifiable),  # former key, for one release
     }
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:
-    """Numbers for JSON, which has no infinity."""
+    """Convert numbers for JSON, which has no infinity."""
     return [float(x) if np.isfinite(x) else None for x in values]

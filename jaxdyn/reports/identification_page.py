@@ -1,4 +1,4 @@
-"""An identification as one HTML page, with its plots inside, readable without a network."""
+"""Identification results as one HTML page with embedded plots, readable offline."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,47 +7,47 @@ import numpy as np
 
 from jaxdyn.identify import RobotFit
 from jaxdyn.model.text_table import short
-from jaxdyn.reports.identification import Findings, Judged, model_joint, total_percent
-from jaxdyn.reports.page import STYLE, escaped, html_table, svg
+from jaxdyn.reports.identification import Evaluation, Findings, model_joint, total_percent
+from jaxdyn.reports.page import STYLE, escape, html_table, svg
 from jaxdyn.reports.plotting import BLUE, GREY, RED, new_figure, torque_figure
 
 _MOST_SAMPLES = 1500
 
 
 def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title: str, notes: Sequence[str] = ()) -> str:
-    """The page; `labels` and `units` of each torque, `notes` to stand behind the error.
+    """Build the page; `labels` and `units` of each torque, `notes` to follow the error.
 
     **Raises:** ImportError without matplotlib.
     """
     parts = [
-        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escaped(title)}</title>",
-        f"<style>{STYLE} .warn {{ background: #fff3e0; padding: .4rem .8rem; }}</style></head><body><h1>{escaped(title)}</h1>",
-        f"<p><b>Torque error {total_percent(findings.tests):.2f} %</b> on what was not fitted, "
-        f"{total_percent(findings.train):.2f} % on what was; {total_percent(findings.tests, 'nominal'):.1f} % with the file's "
-        f"own numbers. {escaped(findings.outcome)}.</p>",
-        *(f"<p>{escaped(line)}.</p>" for line in notes),
-        *(f"<p class='warn'>{escaped(line)}</p>" for line in findings.warnings),
-        "<h2>Errors, in per cent of the torque measured</h2>",
+        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(title)}</title>",
+        f"<style>{STYLE} .warn {{ background: #fff3e0; padding: .4rem .8rem; }}</style></head><body><h1>{escape(title)}</h1>",
+        f"<p><b>Torque error {total_percent(findings.tests):.2f} %</b> on test data, "
+        f"{total_percent(findings.train):.2f} % on training data; "
+        f"{total_percent(findings.tests, 'nominal'):.1f} % with the file's parameters. {escape(findings.outcome)}.</p>",
+        *(f"<p>{escape(line)}.</p>" for line in notes),
+        *(f"<p class='warn'>{escape(line)}</p>" for line in findings.warnings),
+        "<h2>Errors, in per cent of the measured torque</h2>",
         _errors(findings, labels),
     ]
     if findings.is_refit:
         parts.append(
-            f"<p class='note'>The robot that was written is fitted to all samples, with {total_percent(findings.final):.2f} % "
+            f"<p class='note'>The written robot is fitted to all samples, with {total_percent(findings.final):.2f} % "
             "on them; parameters below are of that fit.</p>"
         )
     for number, one in enumerate(findings.tests):
-        thin = _thinned(one)
+        thin = _subsample(one)
         figure = torque_figure(thin.log, thin.predicted, labels, units, title=one.name)
         parts += [
-            f"<h2>{escaped(one.name)}</h2>",
+            f"<h2>{escape(one.name)}</h2>",
             svg(figure, f"torque{number}"),
             svg(_spectrum(one, labels), f"spectrum{number}"),
         ]
     parts += [
-        "<h2>What the logs tell</h2>",
-        *(f"<p>{escaped(line)}.</p>" for line in findings.told.summary().split("\n")),
+        "<h2>Identifiability</h2>",
+        *(f"<p>{escape(line)}.</p>" for line in findings.identifiability.summary().split("\n")),
     ]
-    parts += [_lasting(findings, labels)]
+    parts += [_autocorrelation(findings, labels)]
     parts += _robot(findings, labels) if isinstance(findings.result, RobotFit) else []
     parts += ["<h2>Friction and rotors</h2>", _friction(findings, labels, units)]
     return "\n".join([*parts, "</body></html>\n"])
@@ -62,24 +62,24 @@ def _errors(findings: Findings, labels: Sequence[str]) -> str:
     return html_table(("log", "", "samples", "all", *labels), rows)
 
 
-def _lasting(findings: Findings, labels: Sequence[str]) -> str:
-    """How long errors last, of each log and joint."""
+def _autocorrelation(findings: Findings, labels: Sequence[str]) -> str:
+    """Autocorrelation times of the errors of each log and joint."""
     rows = [
         (one.name, str(len(one.log)), *(f"{x:.2g} s ({n:.0f})" for x, n in zip(*one.whiteness, strict=True)))
         for one in (*findings.tests, *findings.train)
     ]
-    note = "How long errors last, and in brackets how many independent samples the log is then worth"
+    note = "Autocorrelation time of the errors, and the effective sample size in brackets"
     return f"<p class='note'>{note}.</p>" + html_table(("log", "samples", *labels), rows)
 
 
-def _thinned(one: Judged) -> Judged:
-    """No more samples than a plot can show."""
+def _subsample(one: Evaluation) -> Evaluation:
+    """Subsample to the resolution of a plot."""
     rows = slice(0, len(one.log), max(1, len(one.log) // _MOST_SAMPLES))
-    return Judged(one.name, one.log[rows], one.predicted[rows], one.nominal[rows])
+    return Evaluation(one.name, one.log[rows], one.predicted[rows], one.nominal[rows])
 
 
-def _spectrum(one: Judged, labels: Sequence[str]) -> Any:
-    """Amplitude of measured torque and of what the fit leaves over, against frequency."""
+def _spectrum(one: Evaluation, labels: Sequence[str]) -> Any:
+    """Amplitude spectra of the measured torques and of the residuals."""
     count = len(labels)
     columns = min(count, 4)
     figure, axes = new_figure(
@@ -87,15 +87,16 @@ def _spectrum(one: Judged, labels: Sequence[str]) -> Any:
     )
     t, measured = np.asarray(one.log.t), np.asarray(one.log.tau, np.float64)
     frequency = np.fft.rfftfreq(len(t), (t[-1] - t[0]) / max(len(t) - 1, 1))[1:]
+    # A window without jumps at the ends, whose leakage would hide the decay of the spectrum.
     window = np.hanning(len(t))[:, None]
     for j, ax in enumerate(axes.flat):
         if j >= count:
             ax.set_visible(False)
             continue
-        for x, colour, label in ((measured, GREY, "measured"), (one.predicted - measured, RED, "left over")):
+        for x, colour, label in ((measured, GREY, "measured"), (one.predicted - measured, RED, "residual")):
             size = np.abs(np.fft.rfft(window * (x - x.mean(axis=0)), axis=0))[1:, j]
             ax.loglog(frequency, size / len(t), color=colour, linewidth=0.9, label=label)
-        ax.minorticks_off()  # drawing hundreds of them would take most of the page's time
+        ax.minorticks_off()  # drawing hundreds of them takes most of the page's time
         ax.set_title(labels[j], fontsize=9)
         if j + columns >= count:
             ax.set_xlabel("frequency (Hz)")
@@ -113,9 +114,9 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
     loss = "squares" if setting.robust is None else f"Huber's loss beyond {setting.robust:g} standard deviations"
     extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
     parts = [
-        "<h2>What was chosen</h2>",
+        "<h2>Chosen settings</h2>",
         f"<p>v_s {setting.v_s:g}, prior {setting.prior:g}, {loss}; terms beyond viscous and Coulomb friction: "
-        f"{escaped(extra)}.</p>",
+        f"{escape(extra)}.</p>",
     ]
     if result.delays is not None:
         half = result.delays.factor * result.delays.std
@@ -123,7 +124,7 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
             (label, f"{1e3 * d:.1f}", f"{1e3 * h:.1f}" if np.isfinite(h) and d else "-")
             for label, d, h in zip(labels, result.delays.seconds, half, strict=True)
         ]
-        note = "How late torques were recorded against positions, which the logs were shifted by; zero where that helps nothing"
+        note = "Delays of the torques relative to the positions, removed from the logs; zero where no delay lowers the error"
         parts += [f"<p class='note'>{note}.</p>", html_table(("joint", "delay (ms)", "+-"), cells)]
     if trials:
         cells = [
@@ -137,7 +138,7 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
             for t in sorted(trials, key=lambda t: t.score)
         ]
         parts += [
-            f"<p class='note'>{len(trials)} settings, each judged on {escaped(choice.by)} left out in turn.</p>",
+            f"<p class='note'>{len(trials)} settings, by cross-validation over {escape(choice.by)}.</p>",
             "<details><summary>all of them, best first</summary>",
             html_table(("error (%)", "v_s", "prior", "loss", "extra terms"), cells) + "</details>",
         ]
@@ -146,13 +147,13 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
         for name, x, s, source in zip(base.names, base.values, base.std, base.sources, strict=True)
     ]
     counts = {source: base.sources.count(source) for source in dict.fromkeys(base.sources)}
-    told = ", ".join(
+    counted = ", ".join(
         f"{count} from {source}" if source != "bound" else f"{count} at zero" for source, count in counts.items()
     )
     parts += [
         "<h2>Base parameters</h2>",
-        f"<p class='note'>The combinations that torques tell apart, each named after its first parameter, with half of its 95 % "
-        f"interval: {told}. The report in JSON writes them out.</p>",
+        f"<p class='note'>The identifiable combinations, each named after its first parameter, with the half-width of its 95 % "
+        f"interval: {counted}. The JSON report states them in full.</p>",
         svg(_interval_figure(result), "intervals"),
         f"<details><summary>{len(cells)} combinations</summary>",
         html_table(("combination", "value", "+-", "from"), cells) + "</details>",
@@ -161,7 +162,7 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
 
 
 def _interval_figure(result: RobotFit) -> Any:
-    """Half of the 95 % interval relative to the value, sorted; blue from data, grey from the prior."""
+    """Half-widths of the 95 % intervals relative to the values, sorted; blue from data, grey from the prior."""
     base = result.intervals.base
     shown = np.isfinite(base.std) & (base.values != 0)
     ratio = result.intervals.factor * base.std[shown] / np.abs(base.values[shown])
@@ -174,7 +175,7 @@ def _interval_figure(result: RobotFit) -> Any:
     ax.set(yscale="log", ylabel="half interval / value", xlim=(-1, len(order)))
     ax.set_xticks(np.arange(len(order)), np.array(base.names)[shown][order].tolist(), rotation=90, fontsize=6)
     ax.set_title(
-        "Relative half intervals of the base parameters: blue from data, grey from the prior, unknown above the line"
+        "Relative half-widths of base parameters: blue from data, grey from the prior, undetermined above the line"
     )
     return figure
 

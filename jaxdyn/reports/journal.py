@@ -1,4 +1,4 @@
-"""What a report has finished, kept in a file line by line, so that an interrupted one goes on where it stopped."""
+"""Journal of finished runs of a report, a file of lines, from which an interrupted report resumes."""
 
 import json
 from collections.abc import Iterable
@@ -18,9 +18,9 @@ class _Entry(NamedTuple):
 
 
 class Journal:
-    """Groups of records by key; with a directory, also in its file: a line for the head, then one for each group.
+    """Groups of records by key; with a directory, also in its file: a line for the head, then one per group.
 
-    **Raises:** ValueError when the file's records are of another commit, machine, set of versions or kind of report, or
+    **Raises:** ValueError when the file's records are from another commit, machine, set of versions or kind of report, or
     cannot be read.
     """
 
@@ -33,16 +33,17 @@ class Journal:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.exists():
             self._read(self.path)
-        # Written anew, without a line that an interruption has cut.
+        # Rewritten without a line truncated by an interruption.
         lines = [json.dumps(self.head), *(_line(key, entry) for key, entry in self._entries.items())]
         self.path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def _read(self, path: Path) -> None:
         remedy = "name another directory, or remove the file to start anew"
+        # A truncated last line is normal after an interruption; every other fault means another file.
         try:
             first, *lines = path.read_text(encoding="utf-8").splitlines() or ["{}"]
         except UnicodeDecodeError as error:
-            raise ValueError(f"out has {path}, which is no text in UTF-8 ({error}); {remedy}") from error
+            raise ValueError(f"out has {path}, which is not UTF-8 text ({error}); {remedy}") from error
         if not lines:
             return
         try:
@@ -58,26 +59,26 @@ class Journal:
             for line in lines:
                 try:
                     entry = json.loads(line)
-                except json.JSONDecodeError:  # cut by an interruption
+                except json.JSONDecodeError:  # truncated by an interruption
                     continue
                 records = [Record(**x) for x in entry["records"]]
                 self._entries[entry["key"]] = _Entry(entry["scene"], Known.from_dict(entry["known"]), records)
         except (KeyError, TypeError, json.JSONDecodeError) as error:
-            raise ValueError(f"out has {path}, which is no file of this version's ({error!r}); {remedy}") from error
+            raise ValueError(f"out has {path}, which is not a journal of this version ({error!r}); {remedy}") from error
         self.head = before
 
     def __contains__(self, key: str) -> bool:
         return key in self._entries
 
     def add(self, key: str, scene: str, known: Known, records: list[Record]) -> None:
-        """Keep a finished group."""
+        """Store a finished group."""
         self._entries[key] = _Entry(scene, known, records)
         if self.path is not None:
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(_line(key, self._entries[key]) + "\n")
 
     def report(self, keys: Iterable[str]) -> Report:
-        """The report of these groups."""
+        """Report of these groups."""
         entries = [self._entries[key] for key in keys]
         scenes = {entry.scene: entry.known for entry in entries}
         return Report(self.head, scenes, tuple(record for entry in entries for record in entry.records))

@@ -1,4 +1,4 @@
-"""Running one scene by many methods: compare every run with the reference, and time all of them in turn."""
+"""Measurement of one scene with many methods: errors against the reference, and interleaved timing."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ import numpy as np
 from jaxdyn.constraints.codes import CODES, code_of
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared
 from jaxdyn.reports.records import Record
-from jaxdyn.reports.timing import interleaved
+from jaxdyn.reports.timing import time_interleaved
 from jaxdyn.simulation.methods import Method, Reduced
 from jaxdyn.simulation.solvers.explicit import passes_last_stage_on
 from jaxdyn.simulation.start import chosen_method
@@ -19,7 +19,7 @@ from jaxdyn.systems.scene import Scene
 
 
 class Motion(NamedTuple):
-    """What a run gave: states at the reference's times, and counts if known."""
+    """Result of a run: states at the reference's times, and counts if known."""
 
     q: np.ndarray
     v: np.ndarray
@@ -30,9 +30,9 @@ class Motion(NamedTuple):
 
 
 class Contestant(NamedTuple):
-    """One rung of a ladder, of ours or of a peer.
+    """One run of a ladder, of ours or of a peer.
 
-    `call()` runs all trajectories and blocks until they are done, which is what is timed; `motion(call())` is the first
+    `call()` runs all trajectories and blocks until they are done; this is timed. `motion(call())` is the first
     one, in the coordinates of the scene.
     """
 
@@ -50,7 +50,7 @@ class Contestant(NamedTuple):
 def ladder(
     prepared: Prepared, method: str, solver: str, settings: Sequence[float], dtype: str, starts, flops: Callable
 ) -> list[Contestant]:
-    """Contestants of ours that differ in tolerance or step alone, one compiled program; `starts` as `Programs.lanes`."""
+    """Our contestants that differ only in tolerance or step, sharing one program; `starts` as of `Programs.batch_starts`."""
     batch = len(starts[0])
     run, seconds = prepared.programs.get(method, solver, dtype, batch)
     inputs = [jnp.asarray(x[0] if batch == 1 else x, dtype) for x in starts]
@@ -58,7 +58,7 @@ def ladder(
 
     def motion(outputs) -> Motion:
         q, v, result, stats = outputs
-        # Of a batch the first trajectory is judged, if none of them failed: those that stop early cost less time.
+        # The first trajectory of a batch is evaluated, if none failed: those that stop early take less time.
         names = [CODES[code] for code in np.atleast_1d(np.asarray(code_of(result)))]
         name = next((name for name in names if name != "successful"), names[0])
         q, v, stats = jax.tree.map(lambda x: np.asarray(x if batch == 1 else x[0]), (q, v, stats))
@@ -75,10 +75,10 @@ def ladder(
 
 
 def evaluations(solver: str, steps: int, scene: Scene, method: Method) -> int | None:
-    """Evaluations of the vector field in so many steps; None for implicit methods, whose iterations are not counted.
+    """Number of evaluations of the vector field; None for implicit methods, whose iterations are not counted.
 
-    A solver whose last evaluation of a step is the first of the next one saves it, unless the state is corrected after it.
-    Two more choose the first step.
+    First-same-as-last methods save one evaluation per step, unless the state is corrected after it.
+    Two more determine the first step.
     """
     if solver in FIXED:
         return 4 * steps
@@ -95,10 +95,10 @@ def evaluations(solver: str, steps: int, scene: Scene, method: Method) -> int | 
 
 
 def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[Motion], float | None]:
-    """Floating-point operations of a motion: those of its evaluations and of the projections after its steps.
+    """Counter of floating-point operations of a motion: evaluations, and projections after its steps.
 
-    Per sample of a batch, as large ones run on another program. XLA counts those of the compiled expressions; calls of LAPACK
-    and repetitions of loops inside them are left out.
+    Per sample of a batch, because large batches run another program. XLA counts compiled expressions; calls of LAPACK
+    and repetitions of loops are not included.
     """
     scene = prepared.scene
     chosen = chosen_method(scene, method)
@@ -147,10 +147,10 @@ def judge(prepared: Prepared, motion: Motion) -> dict:
 def measure(
     prepared: Prepared, contestants: Sequence[Contestant], dtype: str, batch: int, rounds: int = 20, most: float = 10.0
 ) -> list[Record]:
-    """Run every contestant, judge its motion, and time them all in turn within one loop.
+    """Run every contestant, evaluate its motion, and time all of them interleaved.
 
-    `most`: seconds after which a slow one drops out of the rounds; one whose first run takes a quarter of that is timed
-    by it alone. Its record says how many rounds it took.
+    `most`: seconds after which a slow one drops out of the rounds; one whose first run takes more than a quarter of
+    that is timed once only. Its record has the number of rounds.
     """
     motions, times, calls = [], {}, {}
     for i, contestant in enumerate(contestants):
@@ -162,7 +162,7 @@ def measure(
             times[i] = {"best": passed, "median": passed, "rounds": 1}
         else:
             calls[i] = contestant.call
-    times |= interleaved(calls, rounds, most=most)
+    times |= time_interleaved(calls, rounds, most=most)
     return [
         Record(
             scene=prepared.case.name,

@@ -1,4 +1,4 @@
-"""The page of a report: one HTML file with its plots inside, readable without a network."""
+"""Page of a report: one HTML file with embedded plots, readable offline."""
 
 import html
 import io
@@ -20,12 +20,12 @@ th:first-child, td:first-child { text-align: left; }
 .wide { overflow-x: auto; } svg { max-width: 100%; height: auto; } .note { color: #555; }
 """
 _READING = """
-Each line is one integrator, each point a tolerance or a step: further left is more exact, further down is
-cheaper. Points with a grey disc are on the front: no other one beats them in both. The error is the largest |y - r|/(1 + |r|)
+Each line is one integrator, each point a tolerance or a step: left is more accurate, down is
+cheaper. Points with a grey disc are on the Pareto front. The error is the largest |y - r|/(1 + |r|)
 over the entries y of position and velocity and over the save points, r the reference; quaternions are compared as rotation
-matrices. In the grey band on the left the reference itself is not known well enough. Times are the best of the rounds, per
-trajectory, without compilation. All runs of a plot were timed in turn within one loop, so its lines compare; plots of different
-machines do not. Stars and dotted lines are figures published by others, of the machines that they name. Evaluations of implicit
+matrices. In the grey band on the left the error of the reference dominates. Times are the best of the rounds, per
+trajectory, without compilation. All runs of a plot were timed interleaved, so its lines compare; plots of different
+machines do not. Stars and dotted lines are published results on the named machines. Evaluations of implicit
 methods are not counted.
 """
 
@@ -34,7 +34,7 @@ def write(report: Report, directory: str | Path) -> None:
     """Write report.json, report.txt and report.html."""
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    # The page last: it needs matplotlib, the others nothing.
+    # The page comes last: only it needs matplotlib.
     for kind, text in (
         ("json", report.to_json),
         ("txt", lambda: report.table() + "\n"),
@@ -44,15 +44,15 @@ def write(report: Report, directory: str | Path) -> None:
 
 
 def html_page(report: Report) -> str:
-    """The report as one HTML page without anything outside it: plots as SVG, tables, the machine."""
+    """Build the report as one self-contained HTML page: plots as SVG, tables, the machine."""
     head = report.head
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Error against run time</title>",
         f"<style>{STYLE}</style></head><body><h1>Error against run time</h1>",
-        f"<p>{escaped(_machine(head))}</p><p class='note'>{_READING}</p>",
-        "<h2>Ways to integrate, by class of scene</h2>",
+        f"<p>{escape(_machine(head))}</p><p class='note'>{_READING}</p>",
+        "<h2>Integrators by class of scene</h2>",
         "<p class='note'>Cost relative to the best integrator at the errors 1e-3, 1e-5, 1e-7 and 1e-9, geometric mean over the "
-        "scenes of the class and the errors that it reaches; how many of those that any integrator reaches.</p>",
+        "scenes of the class and the errors that it reaches; the number of these, out of those that any integrator reaches.</p>",
         _standings(report.records),
     ]
     for name, known in report.scenes.items():
@@ -69,15 +69,15 @@ def _machine(head) -> str:
     )
 
 
-def escaped(value) -> str:
-    """A value as text of a page."""
+def escape(value) -> str:
+    """Escape a value as text of a page."""
     return html.escape(str(value))
 
 
 def html_table(header: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
-    """A table of texts, first column to the left."""
-    lines = [f"<tr>{''.join(f'<th>{escaped(x)}</th>' for x in header)}</tr>"]
-    lines += [f"<tr>{''.join(f'<td>{escaped(x)}</td>' for x in row)}</tr>" for row in cells]
+    """HTML table, first column left-aligned."""
+    lines = [f"<tr>{''.join(f'<th>{escape(x)}</th>' for x in header)}</tr>"]
+    lines += [f"<tr>{''.join(f'<td>{escape(x)}</td>' for x in row)}</tr>" for row in cells]
     return f"<div class='wide'><table>{''.join(lines)}</table></div>"
 
 
@@ -91,7 +91,7 @@ def _standings(records) -> str:
 
 def _scene(name: str, known: Known, records: tuple[Record, ...]) -> list[str]:
     reference = f"Reference: {known.kind}, {known.source}; its own error is about {known.error:.0e}."
-    parts = [f"<h2 id='{escaped(name)}'>{escaped(known.text)}</h2>", f"<p>{escaped(reference)}</p>"]
+    parts = [f"<h2 id='{escape(name)}'>{escape(known.text)}</h2>", f"<p>{escape(reference)}</p>"]
     for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
         group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
         drawn = figure(f"{dtype}, {batch} at once", known, group)
@@ -119,7 +119,7 @@ def figure(title: str, known: Known, records: Sequence[Record]) -> Any:
         if error == "error_path":
             ax.axvspan(ax.get_xlim()[0], max(known.error, ax.get_xlim()[0]), color="0.93", zorder=0)
         if cost == "seconds_best":
-            _published(ax, known, error)
+            _draw_published(ax, known, error)
     shown = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     drawn.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     drawn.suptitle(title, fontsize=10)
@@ -127,7 +127,7 @@ def figure(title: str, known: Known, records: Sequence[Record]) -> Any:
 
 
 def svg(drawn, salt: str) -> str:
-    """A figure as an element of a page; `salt` keeps the names of its parts apart from those of other figures."""
+    """Convert a figure to an element of a page; `salt` keeps its ids distinct from those of other figures."""
     import matplotlib
 
     if drawn is None:
@@ -139,8 +139,8 @@ def svg(drawn, salt: str) -> str:
 
 
 def panel(ax, records, error: str, cost: str) -> None:
-    """Draw `cost` against `error` of records, a line for each ladder, and a halo around those on the front."""
-    smallest = 1e-16  # a logarithmic axis has no zero
+    """Plot `cost` against `error` of records, a line per ladder, with halos on the front."""
+    smallest = 1e-16  # logarithmic axes have no zero
     for i, label in enumerate(dict.fromkeys(r.label for r in records)):
         ladder = [r for r in records if r.label == label and None not in (getattr(r, error), getattr(r, cost))]
         points = [(max(getattr(r, error), smallest), getattr(r, cost)) for r in ladder]
@@ -157,7 +157,7 @@ def panel(ax, records, error: str, cost: str) -> None:
     ax.plot(*zip(*front, strict=True), "o", color=GREY, label="on the front", **halo)
 
 
-def _published(ax, known: Known, error: str) -> None:
+def _draw_published(ax, known: Known, error: str) -> None:
     for point in known.published:
         value = point["error" if error == "error_path" else "energy_error"]
         if value is not None:

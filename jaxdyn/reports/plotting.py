@@ -1,4 +1,4 @@
-"""Figures of motions, torques and fits. matplotlib is imported when a figure is drawn (`pip install jaxdyn[plot]`).
+"""Figures of motions, torques and fits, by matplotlib, imported on use (`pip install jaxdyn[plot]`).
 
 Every function returns a `matplotlib.figure.Figure`, to be saved with `figure.savefig(path)`; no window is opened and no
 global setting is touched.
@@ -16,13 +16,14 @@ if TYPE_CHECKING:
 else:
     Axes = Any  # matplotlib is imported when a figure is drawn
 
-# Colours that stay apart in print and for colour-blind readers (Okabe & Ito 2008).
+# Colours distinguishable in print and for colour-blind readers (Okabe & Ito 2008).
 BLUE, ORANGE, GREEN, RED, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#7f7f7f"
 SERIES = (BLUE, ORANGE, GREEN, RED, "#cc79a7", "#56b4e9", "#000000", "#f0e442")
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **options) -> tuple[Any, np.ndarray]:
-    """A figure of that many inches and its axes (rows, columns), with the style that all figures share."""
+    """Create a figure (inches) and its axes (rows, columns) in the common style."""
+    # Figure instead of pyplot: no global state, no window, no backend chosen.
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -35,7 +36,7 @@ def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **o
 
 
 def style(ax) -> None:
-    """Thin grid, no box, small labels."""
+    """Apply the common style: thin grid, no box, small labels."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.grid(color="0.9", linewidth=0.6)
     ax.set_axisbelow(True)
@@ -46,7 +47,7 @@ def style(ax) -> None:
 
 
 def bands(ax, t, values, colour: str, label: str | None = None) -> None:
-    """Spread of many motions (n, nt): 5 to 95 %, 25 to 75 %, and the median."""
+    """Plot the spread of many motions (n, nt): 5 to 95 %, 25 to 75 %, and the median."""
     low, quarter, middle, three, high = np.nanpercentile(np.asarray(values), [5, 25, 50, 75, 95], axis=0)
     ax.fill_between(t, low, high, color=colour, alpha=0.15, linewidth=0)
     ax.fill_between(t, quarter, three, color=colour, alpha=0.3, linewidth=0)
@@ -57,7 +58,7 @@ def motion_figure(model: Model, ts, q, v, tau) -> Any:
     """Position, velocity and torque of every one-coordinate joint over time.
 
     **Arguments:** `ts` (nt,) s; `q` (n, nt, nq); `v`, `tau` (n, nt, nv), of n motions. One motion is drawn as a line, many as
-    their median with bands of 25 to 75 and 5 to 95 %. Joints with more coordinates are left out; all of them in q and v
+    their median with bands of 25 to 75 and 5 to 95 %. Joints with more coordinates are not drawn; all coordinates
     are listed by `jaxdyn info`.
 
     **Raises:** ImportError without matplotlib.
@@ -69,7 +70,7 @@ def motion_figure(model: Model, ts, q, v, tau) -> Any:
     units = ("m", "m/s", "N") if linear == {True} else ("rad", "rad/s", "N m")
     units = units if len(linear) < 2 else ("rad, m", "rad/s, m/s", "N m, N")
     many = len(q) > 1
-    # Bands of more than a few joints in one picture hide each other.
+    # Bands of several joints would cover each other, so each joint has its own column.
     columns = min(len(joints), 8) if many else 1
     figure, axes = new_figure(2.1 * columns + 0.7 if many else 8.5, 6.2, 3, columns, sharex=True)
     for k, i in enumerate(joints[:columns] if many else joints):
@@ -117,7 +118,7 @@ def torque_figure(log, predicted, labels, units, *, title: str = "held-out sampl
         share = 100 * np.linalg.norm(predicted[:, j] - measured[:, j]) / np.linalg.norm(measured[:, j])
         ax.set_title(f"{labels[j]}: error {share:.1f} %", fontsize=9)
         ax.set_ylabel(f"torque ({units[j]})" if units[j] == "N m" else f"force ({units[j]})", fontsize=9)
-        # The lowest panel of each column carries the time.
+        # The lowest panel of each column has the time labels.
         if j + columns >= count:
             ax.set_xlabel("time (s)", fontsize=9)
             ax.tick_params(labelbottom=True)

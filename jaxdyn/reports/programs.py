@@ -1,4 +1,4 @@
-"""A scene made ready for measuring: its compiled simulations, its known motion, and how far another one is from it."""
+"""Prepared scenes: compiled simulations, the reference motion, and errors relative to it."""
 
 import time
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from jaxdyn.simulation.solvers import RK4, Rodas5P
 from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import Scene
 
-# By name; those in FIXED run with fixed steps.
+# Solvers by name; those in FIXED run with fixed steps.
 SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "Dopri8": diffrax.Dopri8,
     "Dopri5": diffrax.Dopri5,
@@ -33,37 +33,37 @@ SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
 }
 FIXED = frozenset({"RK4"})
 MOST_STEPS = 2**17
-# Share of the span over which the starts of a batch are spread along the motion.
+# Fraction of the time span over which the starts of a batch are spread along the motion.
 SPREAD = 0.1
 
 
 class Program(NamedTuple):
-    """A compiled simulation: `run(q, v, ts, setting)` -> (q, v, result, stats), each with a leading axis if `batch` > 1."""
+    """Compiled simulation: `run(q, v, ts, setting)` -> (q, v, result, stats), each with a leading axis if `batch` > 1."""
 
     run: Callable
     seconds: float
 
 
 class Programs:
-    """The compiled simulations of a scene, each made once: start, times and tolerance or step are arguments of them."""
+    """Compiled simulations of a scene, cached; start, times and tolerance or step are arguments."""
 
     def __init__(self, scene: Scene, start, ts):
         self.scene, self.start, self.ts = scene, start, ts
-        self._made: dict[tuple, Program] = {}
+        self._cache: dict[tuple, Program] = {}
 
     def get(self, method: str, solver: str, dtype: str = "float64", batch: int = 1) -> Program:
-        """The program for a method, a solver, a dtype and a number of trajectories."""
+        """Program for a method, a solver, a dtype and a number of trajectories, compiled once."""
         key = (chosen_method(self.scene, method).name, solver, dtype, batch)
-        if key not in self._made:
-            self._made[key] = self._compile(*key)
-        return self._made[key]
+        if key not in self._cache:
+            self._cache[key] = self._compile(*key)
+        return self._cache[key]
 
     def _compile(self, method, solver, dtype, batch) -> Program:
         scene = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, self.scene)
 
         def one(q, v, ts, setting):
             steps = {"stepsize": setting} if solver in FIXED else {"rtol": setting, "atol": setting}
-            # What is measured is the integration: contacts that pull are reported by margins, and do not end it.
+            # Only the integration is measured: contacts that pull are reported and do not end it.
             options = {"method": method, "solver": SOLVERS[solver](), "max_steps": MOST_STEPS, "throw": False}
             options["contacts"] = "report"
             solution = simulate(scene, q, v, ts, **steps, **options)
@@ -77,17 +77,17 @@ class Programs:
         return Program(run, time.perf_counter() - began)
 
     def solve(self, method: str, solver: str, tolerance: float, start=None, ts=None) -> tuple[np.ndarray, np.ndarray]:
-        """One motion in float64: q (nt, nq) and v (nt, nv); NaN in rows that were not reached."""
+        """Simulate one motion in float64: q (nt, nq) and v (nt, nv); NaN in rows that were not reached."""
         inputs = *(self.start if start is None else start), self.ts if ts is None else ts, tolerance
         q, v, _, _ = self.get(method, solver).run(*(jnp.asarray(x, float) for x in inputs))
         return np.asarray(q), np.asarray(v)
 
-    def lanes(self, batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def batch_starts(self, batch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Starts q (batch, nq), v (batch, nv) and times (batch, nt): states along the first tenth of the motion.
 
-        All are on the constraints, and no two trajectories take quite the same steps; the first is the reference's.
+        All are on the constraints, and no two trajectories take the same steps; the first is the reference's.
 
-        **Raises:** RuntimeError when the motion along which they lie stops early.
+        **Raises:** RuntimeError when the motion through them stops early.
         """
         ts, (q, v) = self.ts, self.start
         delays = SPREAD * (ts[-1] - ts[0]) * np.arange(batch) / batch
@@ -104,9 +104,9 @@ class Programs:
 
 
 class Prepared(NamedTuple):
-    """A case with its scene built and its motion known.
+    """Case with its scene built and its reference motion.
 
-    `values(q, v)` -> what is compared (nt, n), energy (nt,) and residuals (nt, 2) of a motion, in float64.
+    `values(q, v)` -> observables (nt, n), energy (nt,) and residuals (nt, 2) of a motion, in float64.
     """
 
     case: Case
@@ -121,7 +121,7 @@ class Prepared(NamedTuple):
 
 
 def prepare(case: Case) -> Prepared:
-    """Build the scene, and find its reference.
+    """Build the scene and its reference.
 
     **Raises:** RuntimeError when a solution of our own is the reference and cannot be computed.
     """
@@ -132,18 +132,19 @@ def prepare(case: Case) -> Prepared:
 
     def row(q, v, t):
         energy = kinetic_energy(scene.system, q, v, t) + potential_energy(scene.system, q, t)
-        return observed(scene, q, v), energy, residuals(scene, q, v, t) if scene.constraints else jnp.zeros(2)
+        return observables(scene, q, v), energy, residuals(scene, q, v, t) if scene.constraints else jnp.zeros(2)
 
     compiled = jax.jit(jax.vmap(row))
 
     def values(q, v):
         return [np.asarray(x) for x in compiled(jnp.asarray(q, float), jnp.asarray(v, float), numbers)]
 
-    return Prepared(case, scene, known or converged(programs, values, case.reduces), programs, values)
+    return Prepared(case, scene, known or converged_reference(programs, values, case.reduces), programs, values)
 
 
-def observed(scene: Scene, q, v):
-    """What is compared, (n,): the entries of q, with rotation matrices for quaternions, and those of v."""
+def observables(scene: Scene, q, v):
+    """Compared quantities (n,): the entries of q, with rotation matrices for quaternions, and those of v."""
+    # q and -q are the same rotation: quaternions themselves cannot be compared.
     parts = [q]
     if isinstance(scene.system, Model):
         parts = []
@@ -154,20 +155,20 @@ def observed(scene: Scene, q, v):
 
 
 def largest_error(computed: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """max |y - r|/(1 + |r|) over the columns of y (nt, n) and r (nt, n), (nt,).
+    """Largest error max |y - r|/(1 + |r|) over the columns of y (nt, n) and r (nt, n), (nt,).
 
     It is absolute for entries that are small and relative for large ones, as in the test set for IVP solvers.
     """
     return np.max(np.abs(computed - known) / (1 + np.abs(known)), 1)
 
 
-def converged(programs: Programs, values: Callable, reduces: bool = True) -> Reference:
-    """A solution of our own at tolerances of 1e-13, its error estimated from another integrator.
+def converged_reference(programs: Programs, values: Callable, reduces: bool = True) -> Reference:
+    """Reference solution at tolerances of 1e-13, with its error estimated by another integrator.
 
-    That is other velocities (method "reduced") for a scene with constraints that `reduces`, another solver for others. The two
-    share the equations of motion, so the estimate is of the integration alone.
+    That is method "reduced" for a scene with constraints that `reduces`, another solver for others. The two
+    share the equations of motion, so the estimate covers the integration only.
 
-    **Raises:** RuntimeError when one of them does not come to the end.
+    **Raises:** RuntimeError when one of them stops early.
     """
     other = ("reduced", "Dopri8") if programs.scene.constraints and reduces else ("auto", "Tsit5")
     fine, rough = (programs.solve(*pair, 1e-13) for pair in (("auto", "Dopri8"), other))

@@ -1,4 +1,4 @@
-"""What a report holds: one record a run, and the machine it ran on; as JSON and as text."""
+"""Records of a report: one per run, and the machine; as JSON and as text."""
 
 import dataclasses
 import json
@@ -10,14 +10,14 @@ from jaxdyn.model.text_table import short, table
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """One rung of a ladder: a scene, how it was integrated, how wrong and how long. None is what is not known.
+    """Record of one run of a ladder: scene, integrator, errors and times. None means unknown.
 
     - `source`: "jaxdyn", or the name of a peer; `method`, `solver`, `dtype`; `batch`: trajectories at once.
     - `setting`: rtol = atol, or the step (s) when `fixed`.
     - `result`: "successful", or the name of the result code; then there are no errors.
     - `error_end`, `error_path`: error at the last save point and the largest of all (`cases.errors`).
     - `residual_position`, `residual_velocity`: largest |phi| and |A v - b|; `energy_error`: largest |E - E(0)|, J.
-    - `seconds_best`, `seconds_median`: wall time per trajectory, of `rounds`; `compile_seconds`, apart, of all rungs.
+    - `seconds_best`, `seconds_median`: wall time per trajectory, of `rounds`; `compile_seconds`, separate, of the ladder.
     - `steps`, rejected ones included, and `rejected`; `evaluations` of the vector field; `flops` that XLA counts.
       Of the first trajectory of a batch, whose start is the reference's.
     """
@@ -48,14 +48,14 @@ class Record:
 
     @property
     def label(self) -> str:
-        """The ladder this record is a rung of, within its scene."""
+        """Label of the record's ladder within its scene."""
         ours = self.source == "jaxdyn"
         return f"{self.method}, {self.solver}" if ours else f"{self.source}, {self.solver}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """What a scene is compared with, and what others have published of it."""
+    """Reference of a scene and published results."""
 
     text: str
     kind: str
@@ -65,14 +65,14 @@ class Known:
 
     @staticmethod
     def from_dict(data: dict) -> "Known":
-        """Back from `dataclasses.asdict`, also by way of JSON, which has no tuples."""
+        """Restore from `dataclasses.asdict`, also through JSON, which has no tuples."""
         values: dict[str, Any] = data | {"published": tuple(data["published"])}
         return Known(**values)
 
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Records with what is needed to read them: `head` (machine, versions, commit, date) and each scene's reference."""
+    """Records of a report with their context: `head` (machine, versions, commit, date) and each scene's reference."""
 
     head: dict[str, Any]
     scenes: dict[str, Known]
@@ -83,18 +83,18 @@ class Report:
         return tuple(record for record in self.records if record.scene == scene)
 
     def to_json(self) -> str:
-        """The report as JSON; `from_json` reads it back."""
+        """Convert the report to JSON; `from_json` reads it."""
         return json.dumps(dataclasses.asdict(self), indent=1)
 
     @staticmethod
     def from_json(text: str) -> "Report":
-        """The report that `to_json` wrote."""
+        """Read a report that `to_json` wrote."""
         data = json.loads(text)
         scenes = {name: Known.from_dict(known) for name, known in data["scenes"].items()}
         return Report(data["head"], scenes, tuple(Record(**record) for record in data["records"]))
 
     def table(self, scene: str | None = None) -> str:
-        """Records as text, of one scene or of all."""
+        """Table of records as text, of one scene or of all."""
         names = [scene] if scene else list(self.scenes)
         return "\n\n".join(self._section(name) for name in names)
 
@@ -111,7 +111,7 @@ COLUMNS = (
 
 
 def rows(records: Iterable[Record]) -> list[list[str]]:
-    """Cells of a table, one row a record: COLUMNS."""
+    """Cells of a table with COLUMNS, one row per record."""
     table = []
     for r in records:
         residuals = [x for x in (r.residual_position, r.residual_velocity) if x is not None]

@@ -1,7 +1,7 @@
-"""Motions that are known: closed forms in numpy and scipy, independent of the library, and printed numbers.
+"""Reference motions: closed forms in numpy and scipy, independent of the library, and published numbers.
 
-Closed forms hold for the default parameters and starts of `jaxdyn.scenes` unless they take others. scipy is imported
-when a reference is made.
+Closed forms hold for the default parameters and starts of `jaxdyn.scenes` unless they have parameters. scipy is imported
+on use.
 """
 
 import itertools
@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-# What rounding leaves of a closed form in double precision, in the measure of the report.
+# Rounding error of a closed form in double precision, in the error measure of the report.
 ROUNDING = 1e-13
 
 
 class Reference(NamedTuple):
-    """A motion at times `ts` (nt,): `q` (nt, nq) and `v` (nt, nv); the first row is the start.
+    """Reference motion at times `ts` (nt,): `q` (nt, nq) and `v` (nt, nv); the first row is the start.
 
-    `kind` is "closed form", "printed" or "converged"; `source` says where it is from; `error` is what it may be wrong
-    itself, in the measure of the report: no point of a work-precision plot below it means anything.
+    `kind` is "closed form", "printed" or "converged"; `source` cites its origin; `error` is its own
+    error in the measure of the report: points of a work-precision plot below it are meaningless.
     """
 
     ts: np.ndarray
@@ -30,7 +30,7 @@ class Reference(NamedTuple):
 
 
 def closed_form(ts, q, v, source: str, error: float = 0.0) -> Reference:
-    """A reference from columns of q and v over time."""
+    """Build a reference from columns of q and v over time."""
     q, v = (np.stack(np.broadcast_arrays(*x), -1) for x in (q, v))
     return Reference(ts, q, v, "closed form", source, max(error, ROUNDING))
 
@@ -38,8 +38,8 @@ def closed_form(ts, q, v, source: str, error: float = 0.0) -> Reference:
 def integral(rate: Callable, ts, longest: float) -> tuple[np.ndarray, float]:
     """Integral of a smooth function from ts[0] to each of `ts`, by Gauss's rule with 16 nodes; and its error.
 
-    `longest`: length (s) over which the function is close to a polynomial. The error is the largest change when the
-    pieces are halved.
+    `longest`: length (s) over which the function is close to a polynomial. The error is the largest change when
+    intervals are halved.
     """
     nodes, weights = np.polynomial.legendre.leggauss(16)
 
@@ -200,28 +200,28 @@ def coin(ts, radius=0.05, circle=0.5, lean=np.pi / 36, gravity=9.81) -> Referenc
         [0.0, circle - radius * sine, radius * cosine]
     )
     velocity = turned.inv().apply(np.cross([0.0, 0.0, turn], center))
-    # The lean does not change: in the axes of the leaning but not spinning disk the rates are constant.
+    # The lean angle is constant: in the axes of the leaning but not spinning disk the rates are constant.
     rates = Rotation.from_rotvec(-spin * ts[:, None] * [0.0, 1.0, 0.0]).apply([0.0, turn * sine + spin, turn * cosine])
     q = [*center.T, *np.roll(turned.as_quat(), 1, -1).T]
     return closed_form(ts, q, [*velocity.T, *rates.T], "steady rolling (Le Saux, Leine & Glocker 2005, eqs 5.10-5.12)")
 
 
 def swing(ts, length: float = 1.0, gravity: float = 9.81) -> Reference:
-    """The pendulum of `plane_pendulum` by its angle from the downward vertical."""
+    """Pendulum of `plane_pendulum` by its angle from the downward vertical."""
     known = plane_pendulum(ts, length, gravity)
     x, y = known.q.T
     rate = (known.v[:, 1] * x - known.v[:, 0] * y) / length**2
     return closed_form(ts, [np.arctan2(x, -y)], [rate], known.source)
 
 
-def thrown(ts, velocity=(1.0, 2.0), gravity: float = 9.81) -> Reference:
-    """A particle from the origin."""
+def projectile(ts, velocity=(1.0, 2.0), gravity: float = 9.81) -> Reference:
+    """Projectile from the origin."""
     (x, y), zero = velocity, 0 * ts
     return closed_form(ts, (x * ts, y * ts - gravity * ts**2 / 2), (x + zero, y - gravity * ts), "parabola")
 
 
-def braked(ts, velocity: float = 2.0, friction: float = 0.3, gravity: float = 9.81) -> Reference:
-    """A block that slides with Coulomb friction, before it stops."""
+def sliding_block(ts, velocity: float = 2.0, friction: float = 0.3, gravity: float = 9.81) -> Reference:
+    """Block sliding with Coulomb friction, before it stops."""
     slower = friction * gravity
     return closed_form(ts, [velocity * ts - slower * ts**2 / 2], [velocity - slower * ts], "parabola")
 
@@ -238,7 +238,7 @@ def skate(ts, turn: float = 2.0, slope: float = np.pi / 6, gravity: float = 9.81
 def rolling_down(
     ts, velocity: float = 0.5, radius: float = 0.1, slope: float = np.pi / 6, gravity: float = 9.81
 ) -> Reference:
-    """Solid ball that rolls straight down an inclined plane: (5/7) g sin(slope), turning about y."""
+    """Solid ball that rolls straight down an inclined plane: acceleration (5/7) g sin(slope), rotation about y."""
     pull, zero = 5 / 7 * gravity * np.sin(slope), 0 * ts
     distance, speed = velocity * ts + pull * ts**2 / 2, velocity + pull * ts
     half = distance / radius / 2
@@ -251,7 +251,7 @@ def rolling_down(
 def falling_table(
     ts, tilt=0.02, size=(0.2, 0.16, 0.24), mass=1.0, table=(1.0, 0.6, 0.05), table_mass=20.0, height=0.025, gravity=9.81
 ) -> Reference:
-    """Box that stands on a table which falls over with it: a pendulum from rest near its highest place.
+    """Box on a table that tips over with it: a pendulum from rest near its highest position.
 
     With phi = pi - theta from below, sin(phi/2) = k sn(K(k) + w t), k = cos(tilt/2).
     """
@@ -296,8 +296,8 @@ _CAR_END = (
 )
 
 
-def printed(end, time: float, start, source: str, error: float) -> Reference:
-    """A reference that has the start and one state at the end."""
+def published_state(end, time: float, start, source: str, error: float) -> Reference:
+    """Build a reference from the start and one published final state."""
     q, v = (np.stack([np.asarray(a), np.asarray(b)]) for a, b in zip(start, end, strict=True))
     return Reference(np.array([0.0, time]), q, v, "printed", source, error)
 
@@ -305,9 +305,11 @@ def printed(end, time: float, start, source: str, error: float) -> Reference:
 def andrews(start) -> Reference:
     """Andrews' mechanism at 0.03 s."""
     source = "DOP853 on equations of its own, two tolerances; printed digits of the test set for IVP solvers agree"
-    return printed(_ANDREWS_END, 0.03, start, source, 7e-11)
+    return published_state(_ANDREWS_END, 0.03, start, source, 7e-11)
 
 
 def car_axis(start) -> Reference:
     """Car axis at 3 s."""
-    return printed(_CAR_END, 3.0, start, "test set for IVP solvers, 14 digits (GAMD in quadruple precision)", 1e-14)
+    return published_state(
+        _CAR_END, 3.0, start, "test set for IVP solvers, 14 digits (GAMD in quadruple precision)", 1e-14
+    )

@@ -1,4 +1,4 @@
-"""Which runs a report makes, and making them: scene by scene, resumed from what an earlier call has finished."""
+"""Runs of a report: selection and measurement, scene by scene, resumable."""
 
 import datetime
 import time
@@ -20,12 +20,12 @@ from jaxdyn.reports.records import Known, Record, Report
 from jaxdyn.reports.timing import commit, machine
 from jaxdyn.simulation.start import chosen_method
 
-# Contestants of others for a scene, a dtype and starts (q, v, ts); see `Contestant`.
+# Contestants of other libraries for a scene, a dtype and starts (q, v, ts); see `Contestant`.
 Peers = Callable[[Prepared, str, tuple], Sequence[Contestant]]
 
 
 def combinations(case: Case, constrained: bool, *, full: bool, plain: bool = True) -> list[tuple[str, str]]:
-    """Methods with solvers: the usual ones, or every sensible pair; `plain` is float64 and one trajectory."""
+    """Pairs of methods and solvers: the usual ones, or every sensible pair; `plain` is float64 and one trajectory."""
     stiff = ["Rodas5P", "Kvaerno5", "Kvaerno3"] if full else ["Rodas5P", "Kvaerno5"]
     implicit = stiff if case.stiff or (full and plain) else []
     explicit = ["Dopri8", "Tsit5", "RK4"]
@@ -61,28 +61,28 @@ def report(
     echo: Callable[[str], object] | None = None,
     ways: Sequence[Sequence[str]] | None = None,
 ) -> Report:
-    """Measure error against run time of scenes whose motion is known, by every sensible method and solver.
+    """Measure error against run time of scenes with known motions, with every sensible method and solver.
 
-    Tolerances and steps are traced, so one compiled program serves a whole ladder. All runs of one scene, dtype and batch are
-    timed in turn within one loop; compilation is apart. float64 has to be enabled, as references are.
+    Tolerances and steps are traced, so a ladder shares one compiled program. All runs of one scene, dtype and batch are
+    timed interleaved; compilation is separate. float64 must be enabled, for the references.
 
     **Arguments:**
 
     - `scenes`: a name or names of `jaxdyn.reports.cases()`; None for all.
-    - `full`: many methods, solvers and rungs, in float64 and float32, one trajectory and 256 at once; else a quick
+    - `full`: many methods, solvers and tolerances, in float64 and float32, one trajectory and 256 at once; else a quick
       ladder of the usual ones in float64, one trajectory.
-    - `dtypes`, `batches`: others than those. `integrators`: pairs of a method and a solver in place of those.
+    - `dtypes`, `batches`: values instead of these. `integrators`: pairs of a method and a solver instead of these.
     - `rounds`: timings of each run, at least 20 for a figure to be quoted.
-    - `out`: directory for report.json, report.txt and report.html, and for records.jsonl, from which a call that was
-      interrupted goes on.
+    - `out`: directory for report.json, report.txt and report.html, and for records.jsonl, from which an
+      interrupted call resumes.
     - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.reports.measure`.
-    - `echo`: takes lines of progress, e.g. `print`.
+    - `echo`: receives lines of progress, e.g. `print`.
     - `ways`: the former name of `integrators`.
 
-    **Returns:** a `Report`; `print(report.table())`; `jaxdyn.reports.write(report, directory)` makes its page.
+    **Returns:** a `Report`; `print(report.table())`; `jaxdyn.reports.write(report, directory)` writes its page.
 
-    **Raises:** ValueError for a name that is not known, a dtype, batch or integrator that cannot be, nothing to measure, float64
-    that is not enabled, and a directory that holds records of another commit, machine or set of versions; ImportError for `out`
+    **Raises:** ValueError for an unknown name, an invalid dtype, batch or integrator, nothing to measure, float64
+    that is not enabled, and a directory with records of another commit, machine or set of versions; ImportError for `out`
     without matplotlib.
 
     ```python
@@ -90,9 +90,9 @@ def report(
     ```
     """
     if ways is not None:
-        warnings.warn("`ways` of jd.report is called `integrators` now", DeprecationWarning, stacklevel=2)
+        warnings.warn("`ways` of jd.report is deprecated; pass `integrators`", DeprecationWarning, stacklevel=2)
         integrators = ways
-    chosen = _checked(scenes, dtypes, batches, integrators, rounds)
+    chosen = _check_arguments(scenes, dtypes, batches, integrators, rounds)
     dtypes = dtypes or (("float64", "float32") if full else ("float64",))
     batches = batches or ((1, 256) if full else (1,))
     say = echo or (lambda line: None)
@@ -102,7 +102,8 @@ def report(
         groups += [(case, dtype, batch) for dtype in dtypes for batch in sizes]
         if len(sizes) < len(batches):
             say(
-                f"{case.name}: batches above {case.largest} are left out: they take minutes, unless `integrators` are chosen"
+                f"{case.name}: batches above {case.largest} are skipped, because they take minutes; choose "
+                "`integrators` to run them"
             )
     if not groups:
         raise ValueError(
@@ -110,7 +111,7 @@ def report(
             "`integrators`, or smaller batches"
         )
     if out is not None:
-        new_figure(1.0, 1.0)  # without matplotlib there is no page, which is better known before hours of runs
+        new_figure(1.0, 1.0)  # fails now without matplotlib, and not after hours of runs
     head = {
         "machine": machine(),
         "commit": commit(),
@@ -123,12 +124,12 @@ def report(
     keys = [f"{case.name}, {dtype}, batch {batch}, {rounds} rounds{only}" for case, dtype, batch in groups]
     todo = [(key, *group) for key, group in zip(keys, groups, strict=True) if key not in journal]
     if len(todo) < len(groups):
-        say(f"{len(groups) - len(todo)} of {len(groups)} are finished already, in {journal.path}")
+        say(f"{len(groups) - len(todo)} of {len(groups)} are already finished, in {journal.path}")
     for done, (key, case, dtype, batch) in enumerate(todo, 1):
         if prepared is None or prepared.case is not case:
             prepared = prepare(case)
         records = _group(prepared, dtype, batch, integrators, full, rounds, peers)
-        journal.add(key, case.name, _known(prepared), records)
+        journal.add(key, case.name, _reference_entry(prepared), records)
         passed = time.perf_counter() - began
         left = passed / done * (len(todo) - done)
         say(f"{done}/{len(todo)} {key}: {len(records)} runs; {passed:.0f} s, about {left:.0f} s left")
@@ -139,9 +140,9 @@ def report(
 
 
 def _group(prepared: Prepared, dtype, batch, integrators, full, rounds, peers) -> list[Record]:
-    """Records of one scene in one dtype and number of trajectories: what is timed in one loop."""
+    """Records of one scene, dtype and number of trajectories, timed in one loop."""
     case, scene = prepared.case, prepared.scene
-    starts = prepared.programs.lanes(batch)
+    starts = prepared.programs.batch_starts(batch)
     plain = dtype == "float64" and batch == 1
     pairs = list(integrators) if integrators else combinations(case, bool(scene.constraints), full=full, plain=plain)
     counters = {method: flop_counter(prepared, method, batch) for method in dict(pairs)}
@@ -157,19 +158,19 @@ def _group(prepared: Prepared, dtype, batch, integrators, full, rounds, peers) -
     return measure(prepared, contestants, dtype, batch, rounds)
 
 
-def _known(prepared: Prepared) -> Known:
+def _reference_entry(prepared: Prepared) -> Known:
     reference = prepared.reference
     published = tuple(x._asdict() for x in prepared.case.published)
     return Known(prepared.case.text, reference.kind, reference.source, reference.error, published)
 
 
-def _checked(scenes, dtypes, batches, integrators, rounds) -> list[Case]:
-    """The cases, after a check of the arguments of `report`."""
+def _check_arguments(scenes, dtypes, batches, integrators, rounds) -> list[Case]:
+    """Check the arguments of `report` and return its cases."""
     known = cases()
     names = list(known) if scenes is None else [scenes] if isinstance(scenes, str) else list(scenes)
     for argument, given in (("scenes", names), ("dtypes", dtypes), ("batches", batches), ("integrators", integrators)):
         if given is not None and len(given) == 0:
-            raise ValueError(f"{argument} is empty; leave it out for the usual ones")
+            raise ValueError(f"{argument} is empty; omit it for the defaults")
     for name in names:
         if name not in known:
             raise ValueError(f"scenes has {name!r}; choose from {', '.join(known)}")
@@ -187,7 +188,7 @@ def _checked(scenes, dtypes, batches, integrators, rounds) -> list[Case]:
     if isinstance(rounds, bool) or not isinstance(rounds, int) or rounds < 1:
         raise ValueError(f"rounds is {rounds!r}; give a positive integer")
     if jnp.zeros(()).dtype != jnp.float64:
-        raise ValueError('a report compares in float64; call jax.config.update("jax_enable_x64", True) first')
+        raise ValueError('a report needs float64; call jax.config.update("jax_enable_x64", True) first')
     chosen = [known[name] for name in dict.fromkeys(names)]
     for case in chosen if integrators else ():
         scene, _ = case.build()
@@ -195,5 +196,5 @@ def _checked(scenes, dtypes, batches, integrators, rounds) -> list[Case]:
             try:
                 chosen_method(scene, method)
             except ValueError as error:
-                raise ValueError(f"integrators has {method!r}, which {case.name} cannot take: {error}") from None
+                raise ValueError(f"integrators has {method!r}, which {case.name} does not support: {error}") from None
     return chosen

@@ -1,4 +1,4 @@
-"""Interleaved timing: every contestant runs in turn within one loop, so that drifts of the machine hit all alike."""
+"""Interleaved timing: all contestants run in one loop, so that drifts of the machine affect all alike."""
 
 import os
 import platform
@@ -12,11 +12,11 @@ from pathlib import Path
 import jax
 
 
-def interleaved(contestants: dict, rounds: int = 20, least: float = 0.02, most: float = float("inf")) -> dict:
+def time_interleaved(contestants: dict, rounds: int = 20, least: float = 0.02, most: float = float("inf")) -> dict:
     """Seconds per call of each contestant (a function of no arguments that blocks until done): "best", "median", "rounds".
 
-    Calls shorter than `least` seconds are repeated within a round; who has used up `most` seconds drops out after three
-    rounds.
+    Calls shorter than `least` seconds are repeated within a round; a contestant that has used
+    `most` seconds drops out after three rounds.
     """
     repeats, spent = {}, {}
     for name, call in contestants.items():
@@ -40,7 +40,7 @@ def interleaved(contestants: dict, rounds: int = 20, least: float = 0.02, most: 
 
 
 def machine(packages: Sequence[str] = ()) -> dict:
-    """Processor, device, cores, load and versions, for the head of a report; `packages` are named besides ours."""
+    """Processor, device, cores, load and versions, for the head of a report; `packages` are added to ours."""
     processor = platform.processor()
     try:
         processor = next(
@@ -66,14 +66,14 @@ def machine(packages: Sequence[str] = ()) -> dict:
 
 
 def commit() -> str | None:
-    """Commit of the source tree this package is in, with "+" where files differ from it; None outside of one."""
+    """Commit of the package's source tree, with "+" for modified files; None outside of a repository."""
 
     def git(*arguments) -> str:
         call = ["git", "-C", str(Path(__file__).parent), *arguments]
         return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)  # not some other tree that holds an installation
+        git("ls-files", "--error-unmatch", Path(__file__).name)  # an installation may be inside another repository
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from jaxdyn.model.arguments import Checked, FilePath, Numbers, as_array
-from jaxdyn.model.printed import scene_lines
+from jaxdyn.model.description import scene_lines
 from jaxdyn.scale.batch import Cost, Options, Run, run_batch
 from jaxdyn.scale.described import describe_function, describe_motion
 from jaxdyn.scale.members import digest, members

@@ -1,4 +1,7 @@
-"""Named systems with known motions: `jd.scenes.<name>(**parameters)` is a `Scene`, `.start()` the reference's start."""
+"""Named systems with known motions.
+
+`jd.scenes.<name>(**parameters)` is a `Scene`, `.start()` the initial state of its reference.
+"""
 
 from jaxdyn.scenes._named import REGISTRY as _REGISTRY
 from jaxdyn.scenes._named import NamedScene as NamedScene

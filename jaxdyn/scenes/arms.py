@@ -1,4 +1,4 @@
-"""Arms that touch something with their tip, and arms that lift something together."""
+"""Arms with a tip in contact with a sphere, and arms that carry a plate together."""
 
 from typing import Any
 
@@ -15,11 +15,11 @@ from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
 from jaxdyn.lie import se3
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia, robots
-from jaxdyn.model.arguments import Checked, Number, Row, stored
+from jaxdyn.model.arguments import Checked, Number, Row, store_leaf
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.tree import Model
-from jaxdyn.scenes._named import as_leaf, as_state, named
+from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.scenes.hands import _spatial_finger, _turn
 from jaxdyn.scenes.linkages import thin_bar
 from jaxdyn.systems.scene import Scene
@@ -33,7 +33,7 @@ _ETA = (0.2, -0.1, 0.15, 0.1, 0.3)
 
 
 def _six_joints(links, masses, height, tip_radius, gravity) -> Model:
-    """Yaw, two pitches, and a wrist of a roll, a pitch and a roll; the last body is a ball, its frame `tip` at the centre."""
+    """Arm of yaw, two pitches, and a wrist of roll, pitch and roll; the last body is a ball with frame `tip` at its centre."""
     upper, lower, hand = links
     pitch, roll = (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)
     wrist = [inertia.sphere(mass, 0.03) for mass in masses[3:5]]
@@ -49,7 +49,7 @@ def _six_joints(links, masses, height, tip_radius, gravity) -> Model:
 
 
 def _joint_angles(pose, links, height):
-    """Angles (6,) of the arm whose frame `tip` is to be at a pose (4, 4), the elbow above."""
+    """Inverse kinematics: angles (6,) for a pose (4, 4) of the frame `tip`, with the elbow up."""
     xp = numpy_for(pose, links, height)
     pose = xp.asarray(pose, float)
     wrist = pose[:3, 3] - links[2] * pose[:3, 0]
@@ -96,7 +96,7 @@ def _rates_of_tip(arm: Model, q, kinematics, twist):
 
 
 def _surfaces(radius, tip_radius):
-    # The contact is about the top of the sphere, and about the x axis of the tip: both in the middle of their charts.
+    # Poles are chosen so that the contact, about the top of the sphere and the x axis of the tip, is far from both.
     return Sphere(radius, poles="y"), Sphere(tip_radius)
 
 
@@ -105,7 +105,7 @@ def _check_contact(contact):
         raise ValueError(f"contact is {contact!r}; choose from frictionless, rolling")
 
 
-@named(_sphere_arm_start)
+@register_scene(_sphere_arm_start)
 def sphere_arm(
     *,
     contact: str = "frictionless",
@@ -117,7 +117,7 @@ def sphere_arm(
     tip_radius: Number = _TIP_RADIUS,
     gravity: Number = 9.81,
 ) -> Scene:
-    """An arm of six joints whose tip, a ball, stays in touch with a sphere that stands still.
+    """Arm of six joints with a ball as tip in contact with a fixed sphere.
 
     - `contact="frictionless"`: the tip slides. One row, the gap; five coordinates of contact.
     - `contact="rolling"`: it neither slips nor spins. Four rows, the gap, two slips and the spin; two minimal velocities,
@@ -165,7 +165,7 @@ def _lifting_start(
     height = numpy_for(flange).asarray(flange)[2, 3]
     q = as_state([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
     twist = as_leaf(twist)
-    # Of all joint velocities that move the flanges with the plate, the smallest.
+    # Joint velocities of least norm that move the flanges with the plate.
     return q, _least_rates(scene, q, twist)
 
 
@@ -175,7 +175,7 @@ def _least_rates(scene, q, twist):
     return jnp.concatenate([rates, twist])
 
 
-@named(_lifting_start)
+@register_scene(_lifting_start)
 def coordinated_lifting(
     *,
     count: Checked[int] = 2,
@@ -184,12 +184,12 @@ def coordinated_lifting(
     thickness: Number = 0.04,
     gravity: Number = 9.81,
 ) -> Grasp:
-    """`count` arms (KUKA iiwa, seven joints each) around a round plate that all of them hold by its rim, rigidly.
+    """Plate carried by `count` arms (KUKA iiwa, seven joints each) that grasp its rim rigidly.
 
     q = (joints of arm 1, of arm 2, ..., the plate's free joint), 7 count + 7 numbers. Each grip has six rows (B = 1): the
-    flange moves as the plate does, so that 6 count rows leave 6 + count freedoms, and 6 count - 6 internal forces. Names of
-    arm i start with "arm<i>_". The arms stand evenly around the z axis, the first one at -x. `radius`, `thickness` (m) and
-    `mass` (kg) of the plate. Start: the plate level with the flanges, with a body `twist`.
+    flange moves as the plate does, so that 6 count rows leave 6 + count degrees of freedom, and 6 count - 6 internal
+    forces. Names of arm i start with "arm<i>_". The arms stand evenly around the z axis, the first one at -x.
+    `radius`, `thickness` (m) and `mass` (kg) of the plate. Start: the plate level with the flanges, with a body `twist`.
 
     Source: EQUATIONS section 10, coordinated lifting; Murray, Li & Sastry (1994), section 6.4.
     """
@@ -197,7 +197,7 @@ def coordinated_lifting(
         raise ValueError(f"count is {count!r}; give the number of arms, a positive integer")
     fall = (0.0, 0.0, -gravity)
     arm = robots.iiwa(gravity=fall)
-    flange = frame_pose(robots.iiwa(gravity=None), stored(_HOLDING, arm.home.dtype), _FLANGE)
+    flange = frame_pose(robots.iiwa(gravity=None), store_leaf(_HOLDING, arm.home.dtype), _FLANGE)
     xp = numpy_for(flange, radius)
     flange = xp.asarray(flange)
     whole, grips = ModelBuilder("no arm", gravity=fall).build(), []

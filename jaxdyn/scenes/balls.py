@@ -1,4 +1,4 @@
-"""Balls that roll or slide on planes."""
+"""Balls in rolling or sliding contact with planes."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,12 +11,12 @@ from jaxdyn.lie import so3
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, named
+from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.systems.scene import Scene
 
 
 class _Steady(eqx.Module):
-    """First coordinate minus rate times t: a table driven at a constant rate."""
+    """Rheonomic constraint: first coordinate minus rate times t, a table driven at a constant rate."""
 
     rate: Float[Array, ""] = eqx.field(converter=as_leaf)
 
@@ -34,7 +34,7 @@ def _turntable_start(
     return as_state(q), as_state([rate, *velocity, 0.0, *spin])
 
 
-@named(_turntable_start)
+@register_scene(_turntable_start)
 def ball_on_turntable(*, mass: Number = 1.0, radius: Number = 0.2, rate: Number = 3.0, gravity: Number = 9.81) -> Scene:
     """Solid ball that rolls on a turntable driven at a constant rate: vdot = (2/7) rate e_z x v, a circle.
 
@@ -56,7 +56,7 @@ def _incline_start(radius: Number = 0.1, velocity: Row = (0.0, 0.5)) -> tuple[Ar
     return as_state(q), as_state([x, y, 0.0, -y / radius, x / radius, 0.0])
 
 
-@named(_incline_start)
+@register_scene(_incline_start)
 def ball_on_incline(
     *, mass: Number = 1.0, radius: Number = 0.1, slope: Number = np.pi / 6, gravity: Number = 9.81
 ) -> Scene:
@@ -72,7 +72,7 @@ def ball_on_incline(
 
 
 class _Height(eqx.Module):
-    """Height of the centre above its place on the plane z = 0."""
+    """Height of the centre above its value in contact with the plane z = 0."""
 
     radius: Float[Array, ""] = eqx.field(converter=as_leaf)
 
@@ -81,7 +81,7 @@ class _Height(eqx.Module):
 
 
 class _Sliding(eqx.Module):
-    """Friction on a ball that slides: `force` (N) against the velocity of the point that touches the plane z = 0.
+    """Friction on a sliding ball: `force` (N) against the velocity of its contact point with the plane z = 0.
 
     It has no direction, hence no derivatives, where the ball rolls.
     """
@@ -103,7 +103,7 @@ def _bowling_start(
     return as_state([0.0, 0.0, radius, 1.0, 0.0, 0.0, 0.0]), as_state([*velocity, 0.0, *spin])
 
 
-@named(_bowling_start)
+@register_scene(_bowling_start)
 def bowling_ball(
     *,
     mass: Number = 6.35,
@@ -112,7 +112,7 @@ def bowling_ball(
     friction: Number = 0.12,
     gravity: Number = 9.8,
 ) -> Scene:
-    """Bowling ball that slides with Coulomb friction, up to the time at which it rolls.
+    """Bowling ball that slides with Coulomb friction, up to the onset of rolling.
 
     The velocity u of the point that touches the lane keeps its direction, so that the centre moves on a parabola:
     vdot = -mu g u/|u|, with I w + m r e_z x v constant. It rolls after |u0| / (mu g (1 + m r^2/I)).

@@ -4,7 +4,7 @@ from jaxtyping import Array
 
 from jaxdyn.model.arguments import Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, named
+from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.systems.scene import Scene
 
 
@@ -12,7 +12,7 @@ def _free_start(rates: Row = (0.3, 0.8, -0.5)) -> tuple[Array, Array]:
     return as_state([1.0, 0.0, 0.0, 0.0]), as_leaf(rates)
 
 
-@named(_free_start)
+@register_scene(_free_start)
 def free_body(*, moments: Row = (1.0, 2.0, 3.0)) -> Scene:
     """Rigid body that turns freely about its centre of mass: I w' = (I w) x w, by Jacobi's elliptic functions.
 

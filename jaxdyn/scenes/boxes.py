@@ -1,4 +1,4 @@
-"""Boxes that are held: a cube in a hand of four fingers, and a box that stands on a table by the friction of its base."""
+"""Boxes in contact: a cube in a hand of four fingers, and a box on a table with friction over its base."""
 
 from typing import Any
 
@@ -15,17 +15,17 @@ from jaxdyn.model import inertia, robots
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.names import frame_index
-from jaxdyn.scenes._named import as_state, named
-from jaxdyn.scenes.hands import _carried, _quaternion
+from jaxdyn.scenes._named import as_state, register_scene
+from jaxdyn.scenes.hands import _point_velocity, _quaternion
 
-# Where the fingertips touch the cube, in half edges, and the normals into it: index and ring finger on one face, the thumb on the
-# opposite one.
+# Contact points of the fingertips on the cube, in half edges, and inward normals: index and ring finger on one face,
+# the thumb on the opposite one.
 _PLACES = {
     "link_3.0_tip": ((1.0, 2 / 3, 0.0), (-1.0, 0.0, 0.0)),
     "link_11.0_tip": ((1.0, -2 / 3, 1 / 3), (-1.0, 0.0, 0.0)),
     "link_15.0_tip": ((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
 }
-# Angles near those of the fingers that hold a cube of 60 mm at `position`, by the names of the joints' numbers.
+# Initial guesses for the angles of the fingers around a cube of 60 mm at `position`, by the joints' numbers.
 _GUESS = {
     **dict(zip(range(4), (-0.248, 0.833, 0.756, 0.583), strict=True)),
     **dict(zip(range(4, 8), (0.0, 0.9, 0.8, 0.6), strict=True)),
@@ -37,7 +37,7 @@ _ROUNDS = 30  # of Newton's method, for the angles of a finger
 
 
 def _chain(model, tip: str) -> tuple[list[int], np.ndarray]:
-    """Joints from the palm to a fingertip, and the tip's pose in the last body."""
+    """Chain of joints from the palm to a fingertip, and the pose of the tip in the last body."""
     frame = frame_index(model, tip)
     joints, offset = [model.topology.frame_bodies[frame]], np.asarray(model.frame_poses, float)[frame]
     while (parent := model.topology.parents[joints[0]]) >= 0:
@@ -52,7 +52,7 @@ def _tip(model, joints, offset, angles):
     home, screws = np.asarray(model.home, float), np.asarray(model.screws, float)
     for k, joint in enumerate(joints):
         axis = screws[joint, 3:]
-        # The joints' axes pass through the origins of their frames.
+        # Joint axes pass through the origins of their frames.
         pose = pose @ home[joint] @ f64.pose_of(f64.rotation_matrix(axis, angles[k]), np.zeros(3))
         axes.append(pose[:3, :3] @ axis)
         origins.append(pose[:3, 3])
@@ -61,12 +61,12 @@ def _tip(model, joints, offset, angles):
 
 
 def _least(jacobian, motion):
-    """Of all changes of a finger's angles that move its tip so, the smallest."""
+    """Change of a finger's angles of least norm for a motion of its tip."""
     return jacobian.T @ numpy_for(jacobian, motion).linalg.solve(jacobian @ jacobian.T, motion)
 
 
-def _reached(model, joints, offset, guess, target):
-    """Angles near a guess with which a fingertip is at its target, by Newton's method."""
+def _reach(model, joints, offset, guess, target):
+    """Inverse kinematics of a fingertip by Newton's method, from a guess."""
 
     def nearer(angles, _):
         place, jacobian = _tip(model, joints, offset, angles)
@@ -76,7 +76,7 @@ def _reached(model, joints, offset, guess, target):
         for _ in range(_ROUNDS):
             guess, _ = nearer(guess, None)
         return guess
-    # A finger has a joint more than its tip needs: where it ends is decided by all steps, which are differentiated as they are.
+    # A redundant finger ends at a point that depends on all steps, so the loop itself is differentiated.
     return jax.lax.scan(nearer, as_state(guess), None, length=_ROUNDS)[0]
 
 
@@ -95,29 +95,29 @@ def _cube_start(
     for name, (point, _) in _PLACES.items():
         joints, offset = _chain(model, name)
         target = position + size / 2 * rotation @ np.asarray(point)
-        reached = _reached(model, joints, offset, np.array([angles[i] for i in joints]), target)
+        reached = _reach(model, joints, offset, np.array([angles[i] for i in joints]), target)
         place, jacobian = _tip(model, joints, offset, reached)
         if is_concrete(target) and not np.linalg.norm(target - place) < 1e-12:
             raise ValueError(
                 f"size is {size}, position {np.asarray(position).tolist()}, turned {list(turned)}: {name} cannot reach its "
-                "place on the cube; give a place nearer to the default one"
+                "contact point on the cube; give a pose closer to the default one"
             )
-        velocity = _carried(position, rotation @ twist[:3], rotation @ twist[3:], target)
+        velocity = _point_velocity(position, rotation @ twist[:3], rotation @ twist[3:], target)
         moving = _least(jacobian, velocity)
         for k, i in enumerate(joints):
             angles[i], rates[i] = reached[k], moving[k]
-    # The cube's joint comes last: its name does.
+    # The cube's joint is last in the order of names.
     return as_state([*angles, *position, *quaternion]), as_state([*rates, *twist])
 
 
-@named(_cube_start)
+@register_scene(_cube_start)
 def allegro_with_cube(*, size: Number = 0.06, mass: Number = 0.1, mu: Number = 0.8, gravity: Number = 9.81) -> Grasp:
-    """The Allegro hand, its palm upright, with a cube between index finger, ring finger and thumb; the middle finger is free.
+    """Allegro hand, palm upright, with a cube between index finger, ring finger and thumb; the middle finger is free.
 
     q = (joints of the index finger, of the thumb, of the middle and of the ring finger, four each, the cube's free joint): 22
-    velocities and 9 rows, of three hard fingers. The hand is redundant: seven of its motions leave the fingertips where they are
-    (`jd.grasp.hand_motions`). `size` (m), `mass` (kg) of the cube; `mu` as of `hand_with_bar`. Fingertips are points, in the
-    middles of the balls of the real ones.
+    velocities and 9 rows, of three hard fingers. The hand is redundant: seven of its motions leave the fingertips at
+    rest (`jd.grasp.hand_motions`). `size` (m), `mass` (kg) of the cube; `mu` as of `hand_with_bar`. Fingertips
+    are points, the centres of the balls of the real ones.
 
     Start: the cube's `position` (m), rotation vector `turned` (rad) and body `twist`, with the angles of the fingers that reach
     it and the smallest joint velocities that follow it. ValueError for a cube out of their reach.
@@ -144,7 +144,7 @@ def _table_start(
     return as_state([*place, tilt]), as_state([*moving, rate])
 
 
-@named(_table_start)
+@register_scene(_table_start)
 def box_on_table(
     *,
     size: Row = (0.2, 0.16, 0.24),
@@ -155,7 +155,7 @@ def box_on_table(
     mu: Number = 0.4,
     gravity: Number = 9.81,
 ) -> Grasp:
-    """A box that stands on a table by its whole base: six rows, and the wrench cone of a rectangle in place of a friction cone.
+    """Box on a table in surface contact: six rows, and the wrench cone of a rectangle instead of a friction cone.
 
     The table turns freely about the y axis through its centre of mass at the origin, so that it falls over with the box, slowly
     at first: with I the moment of both about the axis and r = height + size[2]/2 the height of the box's centre above it,
@@ -166,9 +166,9 @@ def box_on_table(
     whichever comes first; `jd.simulate` ends there, as `contact_lost`.
 
     q = (the box's free joint, the table's angle). `size` of the box, `table` of the table (m, along x, y, z); `height` of the
-    table's top above its axis (m); `mass`, `table_mass` (kg); `mu`: friction coefficient of the base, whose 16 rows are those of
-    `jd.contact.wrench_cone`, those of torques divided by half the longer side, so that margins are in N. Start: `tilt` (rad) and
-    its `rate` (rad/s).
+    table's top above its axis (m); `mass`, `table_mass` (kg); `mu`: friction coefficient of the base, whose 16 rows are
+    those of `jd.contact.wrench_cone`, those of torques divided by half the longer side, so that margins are in N.
+    Start: `tilt` (rad) and its `rate` (rad/s).
 
     Source: Caron, Pham & Nakamura (2015); EQUATIONS section 11.
     """

@@ -1,4 +1,4 @@
-"""Mechanisms that move by friction: contacts that stick, slide, open and close."""
+"""Mechanisms with friction and unilateral contacts: stick, slip, opening and closing."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from jaxdyn.constraints import rolling_sphere
 from jaxdyn.contact.unilateral import UnilateralContact, gap_contact, ground_contact
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, named
+from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import MetricSystem
 
@@ -21,20 +21,20 @@ def _rough_start(
     # The link touches the disk of radius 1 from above, tilted clockwise.
     height = 1 + (1 + jnp.sin(tilt) * (place - link_place)) / jnp.cos(tilt)
     q = as_leaf([place, 1.0, 0.0, link_place, height, -tilt])
-    # Along itself, so that the contact stays closed; velocities are in the link's axes.
+    # Along itself, so that the contact remains closed; velocities are in the link's axes.
     return q, as_leaf([0.0, 0.0, 0.0, speed, 0.0, 0.0])
 
 
-@named(_rough_start)
+@register_scene(_rough_start)
 def rough_disk_and_link(
     *, masses: Row = (1.0, 0.6), moments: Row = (0.5, 0.2), friction: Row = (0.3, 0.2), gravity: Number = 9.81
 ) -> Scene:
-    """Disk of radius 1 m on the ground under a thin link that lies on it, both contacts with friction that sticks and slides.
+    """Disk of radius 1 m on the ground under a thin link that lies on it, both contacts with stick-slip friction.
 
     The bodies of `disk_and_link`, free in their plane: q = (x, y, angle) of the disk and of the link's centre of mass, angles
     counter-clockwise. `masses` (kg), `moments` (kg m^2) of the disk and the link; `friction`: coefficients of the contacts
-    "link" (link on disk) and "ground" (disk on ground). The link's centre of mass leaves the place of contact, so it tips unless
-    it is held: a torque m2 g (x_disk - x_link) about it, clockwise, keeps it level.
+    "link" (link on disk) and "ground" (disk on ground). The link's centre of mass is not above the contact point, so without
+    support it tips: a torque m2 g (x_disk - x_link) about it, clockwise, keeps it level.
 
     Start: disk at rest at `place`, the link above it with its centre at `link_place` (m), clockwise `tilt` (rad), thrown along
     itself with `speed` (m/s). Level, the link slides on the disk with the deceleration mu1 g.
@@ -50,7 +50,7 @@ def rough_disk_and_link(
 
 
 class _Toy(eqx.Module):
-    """A row of numbers times the coordinates, plus one: gaps of the woodpecker, and rows of its slipping velocities."""
+    """Affine functions of the coordinates: gaps of the woodpecker, and rows of its sliding velocities."""
 
     row: Float[Array, "3"]
     constant: Float[Array, ""]
@@ -80,7 +80,7 @@ def _woodpecker_start(
     return as_state([0.0, -gap / half_height, bird]), as_state(velocity)
 
 
-@named(_woodpecker_start)
+@register_scene(_woodpecker_start)
 def woodpecker(
     *,
     masses: Row = (0.0003, 0.0045),
@@ -96,21 +96,21 @@ def woodpecker(
     restitution: Number = 0.5,
     gravity: Number = 9.81,
 ) -> Scene:
-    """Woodpecker toy: a sleeve with play on a pole, from which a bird hangs on a spring, and comes down pecking.
+    """Woodpecker toy: a sleeve with play on a pole, with a bird on a spring, that descends by stick-slip and impacts.
 
     q = (height of the sleeve, m, its angle and the bird's, rad); equations linear in the angles. Contacts: "beak" on the
     pole, with `restitution`; "lower" and "upper" edge of the sleeve on the pole, without. All have the same `friction`. Where
     an edge sticks, the toy is jammed and the bird swings; it falls while the sleeve is free.
 
     `masses`, `moments` of sleeve and bird (kg, kg m^2), the latter about the bird's centre of mass; `stiffness` (N m/rad);
-    `half_height` of the sleeve, distances `to_spring` from the sleeve's centre and from there `to_bird`; `beak`: its height above
-    and its distance from the bird's centre of mass (m).
+    `half_height` of the sleeve, distances `to_spring` from the sleeve's centre and from there `to_bird`; `beak`: its
+    height above and its distance from the bird's centre of mass (m).
 
     Start: on the periodic motion, by its published numbers of four digits: the lower edge touches the pole, the bird's angle
     and the velocities are given. With the parameters above, which have one to three digits, the periodic motion passes
-    this angle with -0.33948 m/s and -7.46210 rad/s, 0.5 and 0.05 % beside the published ones, after a period of 0.145976 s.
-    Starts beside it come back on its other side, nearer by a factor of 0.84. All impacts are of one contact, so that Newton's
-    and Poisson's laws of impact give the same; 0.3 % more friction moves these velocities by 1.2 %.
+    this angle with -0.33948 m/s and -7.46210 rad/s, 0.5 and 0.05 % from the published ones, after a period of 0.145976 s.
+    Perturbed starts return with the opposite sign, smaller by a factor of 0.84. All impacts are of one contact, so that
+    Newton's and Poisson's laws of impact give the same; 0.3 % more friction moves these velocities by 1.2 %.
 
     Source: Glocker (1995), pp. 162; Leine, Glocker & van Campen (2001).
     """

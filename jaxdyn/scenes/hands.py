@@ -1,4 +1,4 @@
-"""Hands that hold an object: planar ones with two fingers, and three fingers around a ball. Each scene is a `Grasp`."""
+"""Hands with an object: planar ones with two fingers, and three fingers around a ball. Each scene is a `Grasp`."""
 
 import numpy as np
 from jaxtyping import Array
@@ -11,7 +11,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_state, named
+from jaxdyn.scenes._named import as_state, register_scene
 from jaxdyn.scenes.linkages import _circles, thin_bar
 
 _LINKS = (0.3, 0.25)
@@ -22,15 +22,15 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def _rates(axes, origins, point, velocity):
-    """Rates of revolute joints that give the point of the last link which is now at `point` the velocity."""
+    """Rates of revolute joints for a velocity of the material point of the last link at `point`."""
     xp = numpy_for(axes, origins, point, velocity)
     columns = xp.cross(xp.asarray(axes, float), xp.asarray(point, float)[None] - xp.asarray(origins, float))
-    # The columns are independent, and the velocity is one that they can give.
+    # Columns are independent and the velocity is feasible, so that the normal equations are exact.
     return xp.linalg.solve(columns @ columns.T, columns @ xp.asarray(velocity, float))
 
 
-def _carried(position, velocity, omega, point):
-    """Velocity of the point of a body that is now at `point`."""
+def _point_velocity(position, velocity, omega, point):
+    """Velocity of the material point of a body at `point`."""
     xp = numpy_for(position, velocity, omega, point)
     position, velocity, omega, point = (xp.asarray(x, float) for x in (position, velocity, omega, point))
     return velocity + xp.cross(omega, point - position)
@@ -41,7 +41,7 @@ def _turn(angle):
 
 
 def _cones(mu, kind="hard-finger", in_plane=False):
-    """The friction cone of all contacts, none for a `mu` of None."""
+    """Friction cone of all contacts, None without `mu`."""
     return None if mu is None else friction_cone(kind, mu if kind == "hard-finger" else None, in_plane=in_plane)
 
 
@@ -61,14 +61,14 @@ def _planar_hand(name, links, masses, palm, gravity):
 
 
 def _planar_object(center, angle, velocity):
-    """Position, and the velocity in the plane's axes, of an object with body velocity (vx, vy, w)."""
+    """Position of an object, and its velocity in the plane's axes from the body velocity (vx, vy, w)."""
     xp = numpy_for(center, angle, velocity)
     linear = _turn(angle) @ xp.asarray([velocity[0], velocity[1], 0.0])
     return xp.asarray([*center, 0.0]), linear, xp.asarray([0.0, 0.0, velocity[2]])
 
 
 def _planar_state(fingers, center, angle, velocity):
-    """q and v: `fingers` has base, knee, fingertip and point of contact of each, `velocity` is that of the object."""
+    """State q and v: `fingers` has base, knee, fingertip and contact point of each, `velocity` is the object's."""
     xp = numpy_for(fingers, center, angle, velocity)
     moving = _planar_object(center, angle, velocity)
     q, v = [], []
@@ -76,7 +76,7 @@ def _planar_state(fingers, center, angle, velocity):
         low, high = (xp.arctan2(*(b - a)[1::-1]) for a, b in ((base, knee), (knee, tip)))
         q += [low, high - low]
         axes, origins = np.stack([_UP, _UP]), xp.stack([base, knee])
-        v += [*_rates(axes, origins, point, _carried(*moving, point))]
+        v += [*_rates(axes, origins, point, _point_velocity(*moving, point))]
     return as_state([*q, *center, angle]), as_state([*v, *velocity])
 
 
@@ -99,7 +99,7 @@ def _bar_start(
     return _planar_state(fingers, center, angle, velocity)
 
 
-@named(_bar_start)
+@register_scene(_bar_start)
 def hand_with_bar(
     *,
     links: Row = _LINKS,
@@ -111,7 +111,7 @@ def hand_with_bar(
     kind: str = "hard-finger",
     mu: Number = 0.8,
 ) -> Grasp:
-    """Two fingers of two joints each, in the x-y plane, whose tips hold the ends of a bar.
+    """Planar hand of two fingers with two joints each, whose tips grasp the ends of a bar.
 
     q = (joints of finger 1, of finger 2, x, y and angle of the bar). `links`, `masses`: of a finger's two uniform bars
     (m, kg); `palm`: distance of the bases (m); `mass`, `length` of the bar. Contact frames have x along the bar's y.
@@ -145,7 +145,7 @@ def _disk_start(
         base, turned = xp.asarray([side * palm / 2, 0.0, 0.0]), xp.asarray(_turn(tilt))
         along = turned[:, 1]
         point = xp.asarray([*center, 0.0]) + side * radius * turned[:, 0]
-        # The knee is at the distance of the first link from the base, on the line of the face.
+        # The knee is on the line of the face, at the length of the first link from the base.
         to_point = point - base
         reach = to_point @ along
         knee = point - (reach - xp.sqrt(reach**2 - to_point @ to_point + links[0] ** 2)) * along
@@ -153,7 +153,7 @@ def _disk_start(
     return _planar_state(fingers, center, 0.0, velocity)
 
 
-@named(_disk_start)
+@register_scene(_disk_start)
 def hand_with_disk(
     *,
     links: Row = _LINKS,
@@ -164,7 +164,7 @@ def hand_with_disk(
     gravity: Number = 9.81,
     mu: Number = 0.8,
 ) -> Grasp:
-    """The hand of `hand_with_bar` with a disk that rolls between the flat inner faces of the outer links.
+    """Hand of `hand_with_bar` with a disk that rolls between the flat inner faces of the outer links.
 
     q = (joints of finger 1, of finger 2, x, y and angle of the disk). Each contact has a holonomic row, the gap, and a
     Pfaffian one, no slip; forces are (normal, tangential). In a plane rolling is integrable: `involutive` finds
@@ -210,7 +210,7 @@ def _spatial_hand(name, links, masses, circle, gravity):
 
 
 def _spatial_finger(base, links, tip, point, velocity):
-    """Angles, and rates that give the point of the last link at `point` the velocity, of a finger that reaches `tip`."""
+    """Angles of a finger with its tip at `tip`, and rates for a velocity of its material point at `point`."""
     xp = numpy_for(base, links, tip, point, velocity)
     base, tip = xp.asarray(base, float), xp.asarray(tip, float)
     local = base[:3, :3].T @ (tip - base[:3, 3])
@@ -229,7 +229,7 @@ def _quaternion(turned):
     xp = numpy_for(turned)
     turned = xp.asarray(turned, float)
     square = turned @ turned
-    # sin(a/2)/a, whose derivatives at a = 0 are those of the series.
+    # sin(a/2)/a by its series about a = 0, where the quotient has no derivative.
     small = square < 1e-6
     angle = xp.sqrt(xp.where(small, 1.0, square))
     factor = xp.where(small, 0.5 - square / 48 + square**2 / 3840, xp.sin(angle / 2) / angle)
@@ -240,7 +240,7 @@ def _quaternion(turned):
 
 
 def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
-    """q and v: fingertips at `reach` (m) from the ball's centre, in directions fixed in the ball or in the world."""
+    """State q and v: fingertips at `reach` (m) from the ball's centre, in directions fixed in the ball or in the world."""
     quaternion, rotation = _quaternion(turned)
     xp = numpy_for(position, turned, twist, circle, reach, radius)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
@@ -249,7 +249,7 @@ def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
     for direction in _directions():
         outward = rotation @ direction if fixed else direction
         tip, point = position + reach * outward, position + radius * outward
-        velocity = _carried(*moving, point)
+        velocity = _point_velocity(*moving, point)
         angles, rates = _spatial_finger(_base(direction, circle), links, tip, point, velocity)
         q, v = [*q, *angles], [*v, *rates]
     return as_state([*q, *position, *quaternion]), as_state([*v, *twist])
@@ -266,7 +266,7 @@ def _ball_start(
     return _ball_state(position, turned, twist, links, circle, radius, radius, True)
 
 
-@named(_ball_start)
+@register_scene(_ball_start)
 def hand_with_ball(
     *,
     links: Row = _SPATIAL_LINKS,
@@ -277,7 +277,7 @@ def hand_with_ball(
     gravity: Number = 9.81,
     mu: Number = 0.8,
 ) -> Grasp:
-    """Three fingers of three joints each, whose tips hold a ball at three points of its equator, with friction.
+    """Hand of three fingers with three joints each, whose tips grasp a ball at three points of its equator, with friction.
 
     q = (yaw, pitch and pitch of each finger, the ball's free joint). `links`: lengths of a finger's two bars (m);
     `masses`: of its knuckle and its bars (kg); `circle`: radius of the circle of the bases (m). Start: the ball's
@@ -305,7 +305,7 @@ def _rolling_start(
     return _ball_state(position, turned, twist, links, circle, radius, radius + tip_radius, False)
 
 
-@named(_rolling_start)
+@register_scene(_rolling_start)
 def hand_rolling_ball(
     *,
     links: Row = _SPATIAL_LINKS,
@@ -317,7 +317,7 @@ def hand_rolling_ball(
     gravity: Number = 9.81,
     mu: Number = 0.8,
 ) -> Grasp:
-    """The hand of `hand_with_ball` with spherical fingertips, between which the ball rolls: truly nonholonomic.
+    """Hand of `hand_with_ball` with spherical fingertips, between which the ball rolls: nonholonomic.
 
     Each contact has a holonomic row, the gap, and two Pfaffian ones, no slip; forces are (normal, two tangential).
     Start: as `hand_with_ball`, the contacts at the height of the ball's centre.

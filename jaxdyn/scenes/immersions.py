@@ -1,4 +1,4 @@
-"""Mechanisms joined from separate bodies: a double pendulum in four formulations, a disk under a link."""
+"""Mechanisms assembled from separate bodies: a double pendulum in four formulations, a disk under a link."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +12,7 @@ from jaxdyn.constraints import loop
 from jaxdyn.geometry.immersion import constrain_by_immersion
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, named
+from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import MetricSystem
@@ -27,7 +27,7 @@ def _planar_potential(q, t, p):
 
 
 def planar_body(mass, moment, gravity) -> MetricSystem:
-    """A body in the plane by its centre of mass and its angle, (x, y, angle), with gravity along -y."""
+    """Planar body by its centre of mass and its angle, (x, y, angle), with gravity along -y."""
     parameters = {"mass": mass, "moment": moment, "gravity": gravity}
     return MetricSystem(_planar_metric, 3, potential=_planar_potential, parameters=parameters)
 
@@ -37,7 +37,7 @@ def _hanging(angle, length):
 
 
 class _TwoLinks(eqx.Module):
-    """(theta, phi) -> places of two links, the second hung on the end of the first."""
+    """Immersion (theta, phi) -> configurations of two links, the second suspended from the end of the first."""
 
     length: Float[Array, ""] = eqx.field(converter=as_leaf)
     reaches: Float[Array, "2"] = eqx.field(converter=as_leaf)
@@ -49,7 +49,7 @@ class _TwoLinks(eqx.Module):
 
 
 def _double(q, v, t, p):
-    # Of the velocities of two points of links at angles a and b only the cosine of a - b comes into the energy.
+    # The energy depends on the velocities of points of both links only through the cosine of a - b.
     (m1, m2), (r1, r2), l1 = p["masses"], p["reaches"], p["length"]
     first = (p["moments"][0] + m1 * r1**2 + m2 * l1**2) * v[0] ** 2
     second = (p["moments"][1] + m2 * r2**2) * v[1] ** 2
@@ -73,7 +73,7 @@ def _by_immersion(masses, length, reaches, moments, gravity):
 
 def _bodies(masses, reaches, moments, gravity, joint, parent, pose):
     builder = ModelBuilder("double pendulum", gravity=(0.0, -gravity, 0.0))
-    # A bar along y: no moment about itself.
+    # A bar along y has no moment about its own axis.
     inertias = [
         (m, (0.0, -r, 0.0), (moment, 0.0, moment)) for m, r, moment in zip(masses, reaches, moments, strict=True)
     ]
@@ -126,7 +126,7 @@ def _double_start(
     return jnp.stack([theta, phi]), jnp.stack([theta_rate, phi_rate])
 
 
-@named(_double_start)
+@register_scene(_double_start)
 def double_pendulum(
     *,
     formulation: str = "lagrangian",
@@ -157,14 +157,14 @@ def double_pendulum(
 
 
 def _tangent(s):
-    """q = (z1, theta, y1, theta2) of a disk of radius 1 that touches a link from below -> places of disk and link."""
+    """Immersion q = (z1, theta, y1, theta2) -> configurations of a disk of radius 1 and a link tangent to it from above."""
     z, turn, y, tilt = s
     height = 1 + (1 + jnp.sin(tilt) * (z - y)) / jnp.cos(tilt)
     return jnp.stack([z, jnp.ones_like(z), turn]), jnp.stack([y, height, tilt])
 
 
 class _Applied(eqx.Module):
-    """Torque on the link, friction of the link on the disk along the link, friction of the ground on the disk along -x."""
+    """Forces: torque on the link, friction of the link on the disk along the link, and of the ground on the disk along -x."""
 
     torque: Float[Array, ""] = eqx.field(converter=as_leaf)
     friction: Float[Array, "2"] = eqx.field(converter=as_leaf)
@@ -186,7 +186,7 @@ def _disk_start(
     return as_state([place, turn, link_place, tilt]), as_state(rates)
 
 
-@named(_disk_start)
+@register_scene(_disk_start)
 def disk_and_link(
     *,
     masses: Row = (1.0, 0.6),
@@ -195,7 +195,7 @@ def disk_and_link(
     friction: Row = (0.0, 0.0),
     gravity: Number = 9.81,
 ) -> Scene:
-    """Disk of radius 1 m on the ground under a thin link that touches it: two bodies joined by an immersion.
+    """Disk of radius 1 m on the ground under a thin tangent link: two bodies coupled by an immersion.
 
     q = (z1, theta, y1, th2): abscissa of the disk, its angle counter-clockwise, abscissa of the link's centre of mass, the
     link's angle CLOCKWISE from horizontal. `torque` on the link (N m, clockwise); `friction` (f1, f2), N: of the link on

@@ -1,4 +1,4 @@
-"""Systems from the first pages of mechanics: pendulums in angles, arms, a body in Euler angles, a block that slides."""
+"""Elementary Lagrangian systems: pendulums in angles, arms, a body in Euler angles, a sliding block."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,18 +10,18 @@ from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.inertia import box, displaced
-from jaxdyn.scenes._named import as_leaf, named
+from jaxdyn.scenes._named import as_leaf, register_scene
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import MetricSystem
 
 
-def _given(position, velocity):
+def _state(position, velocity):
     return as_leaf(position), as_leaf(velocity)
 
 
 def _particle_start(position: Row = (0.0, 0.0), velocity: Row = (1.0, 2.0)) -> tuple[Array, Array]:
-    return _given(position, velocity)
+    return _state(position, velocity)
 
 
 def _quadratic(q, v, t, p):
@@ -32,7 +32,7 @@ def _height_energy(q, t, p):
     return p["mass"] * p["gravity"] * q[-1]
 
 
-@named(_particle_start)
+@register_scene(_particle_start)
 def particle_in_plane(*, mass: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Particle in x and y (up): m xdd = F_x, m ydd = F_y - m g.
 
@@ -43,7 +43,7 @@ def particle_in_plane(*, mass: Number = 1.0, gravity: Number = 9.81) -> Scene:
 
 
 def _pendulum_start(angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:
-    return _given([angle], [rate])
+    return _state([angle], [rate])
 
 
 def _swing(q, v, t, p):
@@ -54,7 +54,7 @@ def _swing_potential(q, t, p):
     return p["mass"] * p["gravity"] * p["length"] * (1 - jnp.cos(q[0]))
 
 
-@named(_pendulum_start)
+@register_scene(_pendulum_start)
 def pendulum(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Pendulum by its angle from the downward vertical: m l^2 thetadd + m g l sin(theta) = tau.
 
@@ -70,7 +70,7 @@ def pendulum(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81
 def _sphere_start(
     theta: Number = 1.0, phi: Number = 0.0, theta_rate: Number = 0.0, phi_rate: Number = 1.0
 ) -> tuple[Array, Array]:
-    return _given([theta, phi], [theta_rate, phi_rate])
+    return _state([theta, phi], [theta_rate, phi_rate])
 
 
 def _sphere(q, v, t, p):
@@ -81,7 +81,7 @@ def _sphere_potential(q, t, p):
     return -p["mass"] * p["gravity"] * p["length"] * jnp.cos(q[0])
 
 
-@named(_sphere_start)
+@register_scene(_sphere_start)
 def spherical_pendulum_in_angles(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Spherical pendulum by theta from the downward vertical and phi about it; m l^2 sin^2(theta) phid is conserved.
 
@@ -94,7 +94,7 @@ def spherical_pendulum_in_angles(*, mass: Number = 1.0, length: Number = 1.0, gr
 
 
 def _arm_start(angles: Row = (0.3, 1.1), rates: Row = (0.7, -0.4)) -> tuple[Array, Array]:
-    return _given(angles, rates)
+    return _state(angles, rates)
 
 
 def _arm(q, v, t, p):
@@ -113,7 +113,7 @@ def _arm_potential(q, t, p):
     return p["gravity"] * sum(p["masses"][i] * heights[i] for i in range(2))
 
 
-@named(_arm_start)
+@register_scene(_arm_start)
 def planar_arm(
     *,
     masses: Row = (1.0, 0.8),
@@ -138,10 +138,10 @@ def planar_arm(
 
 
 def _spatial_start(angles: Row = (0.3, 0.4, -0.7), rates: Row = (0.5, -0.6, 0.8)) -> tuple[Array, Array]:
-    return _given(angles, rates)
+    return _state(angles, rates)
 
 
-@named(_spatial_start)
+@register_scene(_spatial_start)
 def spatial_arm(
     *,
     lengths: Row = (0.5, 0.4),
@@ -169,11 +169,11 @@ def spatial_arm(
 
 
 def _euler_start(angles: Row = (0.4, 1.1, -0.3), rates: Row = (0.5, -0.8, 1.3)) -> tuple[Array, Array]:
-    return _given(angles, rates)
+    return _state(angles, rates)
 
 
 def _body_rates(q):
-    """E with w = E qd, body-fixed, for R = Rz(phi) Ry(theta) Rz(psi)."""
+    """Matrix E with w = E qd, body-fixed, for R = Rz(phi) Ry(theta) Rz(psi)."""
     s, c, sp, cp = jnp.sin(q[1]), jnp.cos(q[1]), jnp.sin(q[2]), jnp.cos(q[2])
     zero, one = jnp.zeros_like(s), jnp.ones_like(s)
     return jnp.stack([jnp.stack([-s * cp, sp, zero]), jnp.stack([s * sp, cp, zero]), jnp.stack([c, zero, one])])
@@ -184,7 +184,7 @@ def _euler_metric(q, t, p):
     return E.T @ (jnp.stack(p["moments"])[:, None] * E)
 
 
-@named(_euler_start)
+@register_scene(_euler_start)
 def rigid_body_in_euler_angles(*, moments: Row = (1.0, 2.0, 3.0)) -> Scene:
     """Body that turns freely about its centre, q = (phi, theta, psi) with R = Rz(phi) Ry(theta) Rz(psi): a geodesic.
 
@@ -202,18 +202,18 @@ def _box_start(
     velocity: Row = (0.0,) * 3,
     turning: Row = (0.1, 4.0, 0.2),
 ) -> tuple[Array, Array]:
-    return _given((*position, *orientation), (*velocity, *turning))
+    return _state((*position, *orientation), (*velocity, *turning))
 
 
-@named(_box_start)
+@register_scene(_box_start)
 def free_box(
     *, mass: Number = 1.0, size: Row = (0.3, 0.2, 0.1), frame: Numbers | None = None, gravity: Number | None = None
 ) -> Scene:
     """Box in free motion, its edges `size` (3,) along x, y, z: M = diag(m, m, m, Ix, Iy, Iz), Ix = m (y^2 + z^2)/12.
 
-    `frame` (4, 4): pose of the body's frame in that of the centre, which makes it M' = Ad^T M Ad; None for the centre. The start,
-    `position` and `orientation` of the frame and its body twist, turns about the middle axis, which is unstable. `gravity`
-    along -z (m/s^2); None for none.
+    `frame` (4, 4): pose of the body's frame in that of the centre, which makes it M' = Ad^T M Ad; None for the centre.
+    The start, `position` and `orientation` of the frame and its body twist, turns about the middle axis, which is unstable.
+    `gravity` along -z (m/s^2); None for none.
 
     Source: EQUATIONS section 1.
     """
@@ -227,14 +227,14 @@ def free_box(
 
 
 def _block_start(position: Number = 0.0, velocity: Number = 2.0) -> tuple[Array, Array]:
-    return _given([position], [velocity])
+    return _state([position], [velocity])
 
 
 def _block(q, v, t, p):
     return 0.5 * p["mass"] * v[0] ** 2
 
 
-@named(_block_start)
+@register_scene(_block_start)
 def sliding_block(
     *,
     mass: Number = 1.0,
@@ -243,7 +243,7 @@ def sliding_block(
     gravity: Number = 9.81,
     direction: int | None = None,
 ) -> Scene:
-    """Block that slides on a table with Coulomb friction, m xdd = u - sign(xd) mu m g, and sticks under |u| <= `static` m g.
+    """Block that slides on a table with Coulomb friction, m xdd = u - sign(xd) mu m g, and sticks for |u| <= `static` m g.
 
     Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on, where it sticks (`jd.DryFriction`, whose events say
     when). `static`: None for the coefficient of sliding.

@@ -1,4 +1,4 @@
-"""Planar linkages built from bodies, their loops closed by revolute joints."""
+"""Planar linkages of bodies, with loops closed by revolute joints."""
 
 import itertools
 
@@ -10,20 +10,20 @@ from jaxdyn.compile import is_concrete, numpy_for
 from jaxdyn.constraints import loop
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_state, named
+from jaxdyn.scenes._named import as_state, register_scene
 from jaxdyn.systems.scene import Scene
 
 _DOWN = (0.0, -9.81, 0.0)
 
 
 def thin_bar(mass, length):
-    """A uniform thin bar along x from its end: mass, centre and moments about it."""
+    """Inertia of a uniform thin bar along x from its end: mass, centre and moments about it."""
     moment = mass * length**2 / 12
     return mass, (length / 2, 0.0, 0.0), (0.0, moment, moment)
 
 
 def _circles(center, radius, other, reach):
-    """The intersection of two circles that lies to the left of the way from the first centre to the second."""
+    """Intersection of two circles to the left of the line from the first centre to the second."""
     xp = numpy_for(center, radius, other, reach)
     center, other = xp.asarray(center, float), xp.asarray(other, float)
     direction = other - center
@@ -33,19 +33,19 @@ def _circles(center, radius, other, reach):
     if is_concrete(square) and square < 0:
         raise ValueError(f"lengths {radius} and {reach} do not close over {distance:.6g}; no such configuration exists")
     direction = direction / distance
-    # Traced lengths that do not close give the nearest configuration, at which constraints are open.
+    # Traced lengths that cannot close give the closest configuration, with a constraint residual.
     height = xp.sqrt(square) if xp is np else jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
     return center + along * direction + height * xp.stack([-direction[1], direction[0]])
 
 
 def _across(length, angle):
-    """Velocity of the end of a link that turns at one radian per second, (2,)."""
+    """Velocity (2,) of the end of a link at one radian per second."""
     xp = numpy_for(length, angle)
     return length * xp.stack([-xp.sin(angle), xp.cos(angle)])
 
 
-def _solved(one, other, right):
-    """(x, y) with x one + y other = right, in the plane."""
+def _solve_planar(one, other, right):
+    """Solve x one + y other = right in the plane by Cramer's rule."""
     determinant = one[0] * other[1] - one[1] * other[0]
     return (right[0] * other[1] - right[1] * other[0]) / determinant, (
         one[0] * right[1] - one[1] * right[0]
@@ -60,12 +60,12 @@ def _four_bar_start(
     a = crank * xp.stack([xp.cos(angle), xp.sin(angle)])
     b = _circles(a, coupler, (ground, 0.0), rocker)
     coupling, rocking = xp.arctan2(*(b - a)[::-1]), xp.arctan2(b[1], b[0] - ground)
-    # Velocities of B as carried by the coupler and by the rocker agree.
-    first, second = _solved(_across(coupler, coupling), -_across(rocker, rocking), -rate * _across(crank, angle))
+    # Velocities of B on the coupler and on the rocker agree.
+    first, second = _solve_planar(_across(coupler, coupling), -_across(rocker, rocking), -rate * _across(crank, angle))
     return as_state([angle, coupling - angle, rocking]), as_state([rate, first - rate, second])
 
 
-@named(_four_bar_start)
+@register_scene(_four_bar_start)
 def four_bar(
     *,
     lengths: Row = (1.0, 3.0, 2.5, 3.5),
@@ -101,7 +101,7 @@ def _slider_crank_start(
     return as_state([angle, lean - angle, place]), as_state([rate, leaning - rate, sliding])
 
 
-@named(_slider_crank_start)
+@register_scene(_slider_crank_start)
 def slider_crank(
     *, crank: Number = 1.0, rod: Number = 2.5, masses: Row = (1.0, 2.0, 1.5), gravity: Numbers | None = _DOWN
 ) -> Scene:
@@ -125,12 +125,12 @@ def _names(count: int) -> tuple[list[str], list[str]]:
 
 
 def _windows_start(count: Checked[int] = 2, rate: Number = 1.0) -> tuple[Array, Array]:
-    # Depth-first: each upright but the last one is followed by the coupler that it carries, which does not turn.
+    # Depth-first: each upright but the last is followed by its coupler, which translates.
     v = [sign * rate for _ in range(count) for sign in (-1.0, 1.0)] + [-rate]
     return as_state(np.zeros(2 * count + 1)), as_state(v)
 
 
-@named(_windows_start)
+@register_scene(_windows_start)
 def windows(
     *, count: Checked[int] = 2, mass: Number = 1.0, length: Number = 1.0, gravity: Numbers | None = _DOWN
 ) -> Scene:
@@ -138,7 +138,7 @@ def windows(
 
     N + 1 uprights on the ground at x = 0, 1 .. N lengths, N couplers between their tops, all uniform bars of one `mass`
     and `length`, in the x-y plane. All angles are zero at the start, uprights pointing up; top 0 moves at +`rate` m/s
-    per m of length. Where the uprights are horizontal the rows lose rank and the mechanism has N more freedoms.
+    per m of length. Where the uprights are horizontal the rows lose rank and the mechanism has N more degrees of freedom.
     """
     uprights, couplers = _names(count)
     moment = mass * length**2 / 12
@@ -172,21 +172,21 @@ def _parallel_start(
         a = _circles(base, length, point, length) if elbow > 0 else _circles(point, length, base, length)
         vectors = a - xp.asarray(base, float), xp.asarray(point, float) - a
         first, second = (xp.arctan2(*vector[::-1]) for vector in vectors)
-        rates = _solved(_across(length, first), _across(length, second), velocity)
+        rates = _solve_planar(_across(length, first), _across(length, second), velocity)
         q += [first, second - first]
         v += [rates[0], rates[1] - rates[0]]
     return as_state(q), as_state(v)
 
 
-@named(_parallel_start)
+@register_scene(_parallel_start)
 def parallel_manipulator(
     *, length: Number = 1.0, bases: Row = _BASES, mass: Number = 1.0, gravity: Numbers | None = None
 ) -> Scene:
-    """Three legs of two links in the x-y plane that carry one point: q = (a1, a2, b1, b2, c1, c2), two freedoms.
+    """Parallel manipulator: three planar legs of two links with a common end point, q = (a1, a2, b1, b2, c1, c2).
 
     All links are uniform bars of one `length` (m) and `mass` (kg); the legs turn about the `bases` (3 points, m), the
     second angle of each is relative to the first. With motors on all six joints, or on the three at the bases, it has
-    more motors than freedoms: torques in the null space of the motors change the internal forces alone.
+    more motors than its two degrees of freedom: torques in the null space of the motors change only internal forces.
 
     Start: the carried `point` (m) and its `velocity` (m/s); `elbows` +1 to the left of the way from base to point.
 
@@ -207,14 +207,14 @@ def _ring_start(count: Checked[int] = 6, length: Number = 1.0, rate: Number = 1.
     return as_state(q), as_state([rate * middle[1], -rate * middle[0], rate, *[0.0] * (count - 1)])
 
 
-@named(_ring_start)
+@register_scene(_ring_start)
 def closed_ring(
     *, count: Checked[int] = 6, mass: Number = 1.0, length: Number = 1.0, gravity: Numbers | None = None
 ) -> Scene:
-    """Ring of `count` equal uniform bars joined end to end, free in the x-y plane: `count` freedoms.
+    """Ring of `count` equal uniform bars joined end to end, free in the x-y plane: `count` degrees of freedom.
 
     q = (x, y, angle of the first bar, angles of the others relative to the one before). Bars of one `mass` (kg) and
-    `length` (m). Start: a regular polygon about the world's origin that turns at `rate` (rad/s), as it goes on to do:
+    `length` (m). Start: a regular polygon about the world's origin that rotates at constant `rate` (rad/s):
     the joints then carry mass (length/4) cot(pi/count)/sin(pi/count) rate^2.
     """
     names = [f"bar{i:0{len(str(count))}d}" for i in range(count)]

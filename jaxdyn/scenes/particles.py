@@ -1,4 +1,4 @@
-"""A particle on a rod, in Cartesian coordinates: the constraint as a function of the configuration."""
+"""Particles on a rod in Cartesian coordinates, with a holonomic constraint."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,13 +8,13 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Holonomic
 from jaxdyn.model.arguments import Number
-from jaxdyn.scenes._named import as_leaf, as_state, named
+from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 
 
 class _Rod(eqx.Module):
-    """(|q|^2 - length^2) / 2, so that A = q^T and the tension is -lam length."""
+    """Constraint (|q|^2 - length^2) / 2, so that A = q^T and the tension is -lam length."""
 
     length: Float[Array, ""] = eqx.field(converter=as_leaf)
 
@@ -36,7 +36,7 @@ def _plane_start(length: Number = 1.0, angle: Number = -np.pi / 2, rate: Number 
     return length * as_state([s, -c]), length * rate * as_state([c, s])
 
 
-@named(_plane_start)
+@register_scene(_plane_start)
 def pendulum_in_plane(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Plane pendulum in x and y (up): L = m |v|^2/2 - m g y, phi = (x^2 + y^2 - l^2)/2.
 
@@ -58,7 +58,7 @@ def _sphere_start(
     return q, length * along
 
 
-@named(_sphere_start)
+@register_scene(_sphere_start)
 def spherical_pendulum(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
     """Spherical pendulum in x, y and z (up): L = m |v|^2/2 - m g z, phi = (|q|^2 - l^2)/2.
 

@@ -8,8 +8,8 @@ from jaxdyn.constraints import loop
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_state, named
-from jaxdyn.scenes.linkages import _across, _circles, _solved, thin_bar
+from jaxdyn.scenes._named import as_state, register_scene
+from jaxdyn.scenes.linkages import _across, _circles, _solve_planar, thin_bar
 from jaxdyn.systems.scene import Scene
 
 
@@ -35,7 +35,7 @@ def _sarrus_start(lengths: Row = (1.0, 0.8), height: Number = 0.9, rate: Number 
     return as_state(q), as_state(v)
 
 
-@named(_sarrus_start)
+@register_scene(_sarrus_start)
 def sarrus(
     *,
     lengths: Row = (1.0, 0.8),
@@ -109,7 +109,7 @@ def _hinge_platform_start(
         hinge, speed = point + arm, velocity + rate * xp.stack([-arm[1], arm[0]])
         elbow = _circles(base, length, hinge, length)
         first, second = (xp.arctan2(*way[::-1]) for way in (elbow - base, hinge - elbow))
-        rates = _solved(_across(length, first), _across(length, second), speed)
+        rates = _solve_planar(_across(length, first), _across(length, second), speed)
         q += [first, second - first]
         v += [rates[0], rates[1] - rates[0]]
         if len(q) == 2:
@@ -117,7 +117,7 @@ def _hinge_platform_start(
     return as_state(q), as_state(v)
 
 
-@named(_hinge_platform_start)
+@register_scene(_hinge_platform_start)
 def hinge_platform(
     *,
     count: Checked[int] = 3,

@@ -1,4 +1,4 @@
-"""Mechanisms of the test set for initial-value problems (CWI and Bari), from their printed equations."""
+"""Mechanisms of the test set for initial-value problems (CWI and Bari), from their published equations."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints import Holonomic, loop
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, named
+from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem
@@ -51,7 +51,7 @@ _ANDREWS = {
 
 
 def _numbers(parameters):
-    """The printed parameters as leaves."""
+    """Convert the published parameters to leaves."""
     if isinstance(parameters, dict):
         return {key: _numbers(value) for key, value in parameters.items()}
     return as_leaf(parameters)
@@ -84,7 +84,7 @@ def _andrews_mass(q, t, p):
 
 
 def _andrews_spring(q, p):
-    """The end D of the spring relative to its foot C, (2,)."""
+    """Position (2,) of the end D of the spring relative to its base C."""
     s, c, sn = p["lengths"], jnp.cos(q[2]), jnp.sin(q[2])
     end = jnp.stack([s["sd"] * c + s["sc"] * sn, s["sd"] * sn - s["sc"] * c])
     return end + p["B"] - p["C"]
@@ -120,7 +120,7 @@ def _andrews_potential(q, t, p):
 
 
 class _AndrewsLoops(eqx.Module):
-    """The three loops, two rows each."""
+    """Closure of the three loops, two rows each."""
 
     lengths: dict
     A: Float[Array, "2"]
@@ -162,7 +162,7 @@ ANDREWS_ORDER = (0, 1, 2, 4, 3, 6, 5)
 
 
 class _AndrewsPotential(eqx.Module):
-    """Forces of the spring between C and the point D of body 3, and of the motor: minus the slope of their energy."""
+    """Forces of the spring between C and the point D of body 3, and of the motor: minus the gradient of their energy."""
 
     stiffness: Float[Array, ""] = eqx.field(converter=as_leaf)
     rest: Float[Array, ""] = eqx.field(converter=as_leaf)
@@ -184,9 +184,9 @@ def _andrews_bodies_start() -> tuple[Array, Array]:
     return as_state(np.asarray(q)[np.array(ANDREWS_ORDER)]), v
 
 
-@named(_andrews_bodies_start)
+@register_scene(_andrews_bodies_start)
 def andrews_bodies() -> Scene:
-    """Andrews' squeezing mechanism built from its seven bodies: a tree of four branches, three loops at the point E.
+    """Andrews' squeezing mechanism of seven bodies: a tree of four branches, three loops at the point E.
 
     The angles are those of `andrews`, as the tree orders them: (beta, Theta, gamma, delta, Phi, epsilon, Omega). Spring
     and motor are a force of the scene.
@@ -200,7 +200,7 @@ def andrews_bodies() -> Scene:
         inertia = (p["m"][number - 1], (*center, 0.0), (0.0, 0.0, p["I"][number - 1]))
         builder.add_body(f"K{number}", parent, "continuous", inertia, joint_name=joint, pose=(*place, 0.0))
 
-    # x of each body along the link where the printed equations have a cosine; -y where they have (sin, -cos).
+    # x of each body is along the link where the published equations have a cosine; -y where they have (sin, -cos).
     body(1, None, "1 beta", (s["ra"], 0.0))
     body(2, "K1", "2 Theta", (-s["da"], 0.0), (s["rr"], 0.0))
     body(3, None, "3 gamma", (s["sb"], -s["sa"]), p["B"])
@@ -216,7 +216,7 @@ def andrews_bodies() -> Scene:
     return Scene(builder.build(), closing, (_AndrewsPotential(p["c0"], p["l0"], p["C"], p["torque"]),))
 
 
-@named(_andrews_start)
+@register_scene(_andrews_start)
 def andrews() -> Scene:
     """Andrews' squeezing mechanism: seven bodies, three loops, q = (beta, Theta, gamma, Phi, delta, Omega, epsilon).
 
@@ -231,7 +231,7 @@ def andrews() -> Scene:
 
 
 def _road(t, p):
-    """The right wheel's axle (xb, yb), moved by the road."""
+    """Position (xb, yb) of the right wheel's axle on the road."""
     yb = p["amplitude"] * jnp.sin(p["frequency"] * t)
     return jnp.sqrt(p["length"] ** 2 - yb**2), yb
 
@@ -245,7 +245,7 @@ def _car(q, v, t, p):
 
 
 class _CarRows(eqx.Module):
-    """The left spring stands on the axle, the chassis has a fixed length."""
+    """Constraints: the left spring is perpendicular to the axle, and the chassis has a fixed length."""
 
     parameters: dict
 
@@ -259,9 +259,9 @@ def _car_start() -> tuple[Array, Array]:
     return as_state([0.0, 0.5, 1.0, 0.5]), as_state([-0.5, 0.0, -0.5, 0.0])
 
 
-@named(_car_start)
+@register_scene(_car_start)
 def car_axis() -> Scene:
-    """Car axis on a bumpy road: two masses on springs, q = (xl, yl, xr, yr), under constraints that move with time.
+    """Car axis on a bumpy road: two masses on springs, q = (xl, yl, xr, yr), with rheonomic constraints.
 
     Source: Schneider (1995); test set for IVP solvers, problem "car axis", with k = M eps^2/2 = 5e-4.
     """

@@ -1,4 +1,4 @@
-"""Disks that roll, blades that slide, a body that cannot turn about one of its axes: nonholonomic constraints."""
+"""Nonholonomic systems: rolling disks, blades, and Suslov's body."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,13 +9,13 @@ from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, named
+from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 
 
 class _DiskRows(eqx.Module):
-    """xdot = rho cos(theta) phidot, ydot = rho sin(theta) phidot."""
+    """Rolling without slip: xdot = rho cos(theta) phidot, ydot = rho sin(theta) phidot."""
 
     radius: Float[Array, ""] = eqx.field(converter=as_leaf)
 
@@ -43,7 +43,7 @@ def _disk_start(
     return as_state([0.0, 0.0, heading, 0.0]), as_state([speed * c, speed * s, steering, rolling])
 
 
-@named(_disk_start)
+@register_scene(_disk_start)
 def rolling_disk(
     *, mass: Number = 2.0, radius: Number = 0.5, steer_inertia: Number = 0.125, roll_inertia: Number = 0.25
 ) -> Scene:
@@ -63,7 +63,7 @@ def _sleigh_start(speed: Number = 0.2, yaw_rate: Number = 1.5) -> tuple[Array, A
     return as_state(np.zeros(3)), as_state([speed, 0.0, yaw_rate])
 
 
-@named(_sleigh_start)
+@register_scene(_sleigh_start)
 def chaplygin_sleigh(*, mass: Number = 1.0, inertia_com: Number = 0.5, offset: Number = 0.3) -> Scene:
     """Chaplygin sleigh on a horizontal plane: a blade at the body's origin, the centre of mass `offset` ahead of it.
 
@@ -82,11 +82,11 @@ def _incline_start(yaw_rate: Number = 2.0) -> tuple[Array, Array]:
     return as_state(np.zeros(3)), as_state([0.0, 0.0, yaw_rate])
 
 
-@named(_incline_start)
+@register_scene(_incline_start)
 def knife_edge_on_incline(
     *, mass: Number = 1.0, moment: Number = 0.2, slope: Number = np.pi / 6, gravity: Number = 9.81
 ) -> Scene:
-    """A skate that turns while it slides on an inclined plane, x down the slope; q = (x, y, theta).
+    """Skate that turns while it slides on an inclined plane, x down the slope; q = (x, y, theta).
 
     With theta = w t and from rest: x = (G/2w^2) sin^2(w t), y = (G/2w^2)(w t - sin(2 w t)/2), G = g sin(slope): a
     cycloid that does not go downhill.
@@ -116,7 +116,7 @@ def _coin_start(
     return as_state([*center, *turned]), as_state([forward, 0.0, 0.0, *omega])
 
 
-@named(_coin_start)
+@register_scene(_coin_start)
 def rolling_coin(*, mass: Number = 0.3048, radius: Number = 0.05, gravity: Number = 9.81) -> Scene:
     """Thin disk that rolls on a plane, leaning freely: one free body, its axle the body's y axis.
 
@@ -132,7 +132,7 @@ def rolling_coin(*, mass: Number = 0.3048, radius: Number = 0.05, gravity: Numbe
 
 
 class _NoTurn(eqx.Module):
-    """The third angular velocity is zero."""
+    """Constraint of zero third angular velocity."""
 
     def __call__(self, q, t):
         return jnp.asarray([0.0, 0.0, 1.0], q.dtype)
@@ -142,9 +142,9 @@ def _suslov_start(across: Number = 1.0, along: Number = -0.5) -> tuple[Array, Ar
     return as_state([1.0, 0.0, 0.0, 0.0]), as_state([across, along, 0.0])
 
 
-@named(_suslov_start)
+@register_scene(_suslov_start)
 def suslov(*, moments: Row = (1.0, 1.5, 2.0), product: Number = 0.4) -> Scene:
-    """Suslov's problem: a rigid body turns freely about a fixed point, but not about its own z axis.
+    """Suslov's problem: a rigid body about a fixed point without rotation about its own z axis.
 
     `moments` (I11, I22, I33) and `product` I13, the entry of the inertia matrix, kg m^2. With I12 = I23 = 0
     w1' = -(I13/I11) w1 w2, w2' = (I13/I22) w1^2: from the start w = (across, along, 0) (rad/s) it goes over to a steady

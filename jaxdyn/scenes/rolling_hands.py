@@ -1,4 +1,4 @@
-"""Hands whose fingertips roll on the object as surfaces do, whatever their shapes."""
+"""Hands whose fingertips, smooth surfaces of any shape, roll on the object."""
 
 import jax
 import numpy as np
@@ -10,14 +10,14 @@ from jaxdyn.grasp import Grasp
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
-from jaxdyn.scenes._named import as_state, named
+from jaxdyn.scenes._named import as_state, register_scene
 from jaxdyn.scenes.hands import (
     _CIRCLE,
     _SPATIAL_LINKS,
     _base,
-    _carried,
     _cones,
     _directions,
+    _point_velocity,
     _quaternion,
     _spatial_finger,
     _spatial_hand,
@@ -30,15 +30,15 @@ _ROUNDS = 60
 
 
 def _support(semi_axes, normal):
-    """Point of an ellipsoid where the outward normal is the given one."""
+    """Support point of an ellipsoid in the direction of an outward normal."""
     xp = numpy_for(semi_axes, normal)
     semi_axes, normal = xp.asarray(semi_axes, float), xp.asarray(normal, float)
     scaled = semi_axes * normal
     return semi_axes * scaled / xp.sqrt(scaled @ scaled)
 
 
-def _held(base, links, tip_axes, point, normal, velocity):
-    """Angles and rates of a finger whose tip, an ellipsoid, touches a point with an outward normal and moves with it."""
+def _finger_state(base, links, tip_axes, point, normal, velocity):
+    """Angles and rates of a finger whose ellipsoidal tip touches a moving point with a given outward normal."""
     xp = numpy_for(base, links, tip_axes, point, normal, velocity)
     base, tip_axes, point, normal, velocity = (xp.asarray(x, float) for x in (base, tip_axes, point, normal, velocity))
 
@@ -53,7 +53,7 @@ def _held(base, links, tip_axes, point, normal, velocity):
         for _ in range(_ROUNDS):
             center, turn = around(center)
         return turn
-    # The derivatives of each round are those of the round before, shrunk: the loop is differentiated as it is.
+    # Each iteration is a contraction in the derivatives too, so the loop itself is differentiated.
     center = jax.lax.scan(lambda at, _: (around(at)[0], None), center, None, length=_ROUNDS - 1)[0]
     return around(center)[1]
 
@@ -75,14 +75,14 @@ def _egg_start(
     for direction in _directions():
         normal = xp.asarray(direction)
         point = position + rotation @ _support(semi_axes, rotation.T @ normal)
-        velocity = _carried(*moving, point)
-        angles, rates = _held(_base(direction, circle), links, tip_semi_axes, point, normal, velocity)
+        velocity = _point_velocity(*moving, point)
+        angles, rates = _finger_state(_base(direction, circle), links, tip_semi_axes, point, normal, velocity)
         q, v = [*q, *angles], [*v, *rates]
     scene = hand_rolling_egg(links=links, circle=circle, semi_axes=semi_axes, tip_semi_axes=tip_semi_axes)
     return scene.system.place(as_state([*q, *position, *quaternion])), as_state([*v, *twist])
 
 
-@named(_egg_start)
+@register_scene(_egg_start)
 def hand_rolling_egg(
     *,
     links: Row = _SPATIAL_LINKS,
@@ -94,7 +94,7 @@ def hand_rolling_egg(
     gravity: Number = 9.81,
     mu: Number = 0.8,
 ) -> Grasp:
-    """Three fingers of three joints each, whose tips, ellipsoids, roll on an ellipsoid that they hold: truly nonholonomic.
+    """Hand of three fingers with three joints each, whose ellipsoidal tips roll on an ellipsoid: nonholonomic.
 
     q = (yaw, pitch and pitch of each finger, the object's free joint, the places of the three contacts: unit vectors of the
     fingertip and of the object). Each contact has a holonomic row, the gap, and two Pfaffian ones, no slip; forces are (normal,

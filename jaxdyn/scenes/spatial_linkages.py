@@ -1,4 +1,4 @@
-"""Linkages in space that move although counting their joints says that they cannot."""
+"""Overconstrained spatial linkages, mobile against Gruebler's count."""
 
 from jaxtyping import Array
 
@@ -7,18 +7,18 @@ from jaxdyn.constraints import loop
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_state, named
+from jaxdyn.scenes._named import as_state, register_scene
 from jaxdyn.scenes.linkages import thin_bar
 from jaxdyn.systems.scene import Scene
 
 
 def _link(length, twist):
-    """Pose of a link's end in its beginning: along x by the length, then turned about x by the twist."""
+    """Pose of a link's end relative to its start: translation by the length along x, rotation by the twist about x."""
     return f64.pose_of(f64.rotation_matrix((1.0, 0.0, 0.0), twist), (length, 0.0, 0.0))
 
 
 def _second(length, twist, other):
-    """Twist of the links of the length `other` that lets the linkage move: a/sin(alpha) = b/sin(beta)."""
+    """Twist of the links of length `other` for a mobile linkage: a/sin(alpha) = b/sin(beta)."""
     xp = numpy_for(length, twist, other)
     sine = other * xp.sin(twist) / length
     if is_concrete(sine) and abs(sine) >= 1:
@@ -45,15 +45,15 @@ def _bennett_start(
     return as_state([angle, follower, -angle]), as_state([rate, following, -rate])
 
 
-@named(_bennett_start)
+@register_scene(_bennett_start)
 def bennett(
     *, lengths: Row = (1.0, 0.7), twist: Number = 1.1, mass: Number = 1.0, gravity: Numbers | None = (0.0, 0.0, -9.81)
 ) -> Scene:
-    """Bennett's linkage: four links, opposite ones equal, joined by four revolute joints whose axes never meet.
+    """Bennett's linkage: four links, opposite ones equal, with four revolute joints whose axes never meet.
 
     Links of `lengths` (a, b) (m) and twists (alpha, beta) (rad) with a/sin(alpha) = b/sin(beta); `twist` is alpha.
     q = angles of the three moving links, uniform bars of `mass` (kg); the fourth joint closes the loop. Its five rows
-    for three joints leave one freedom, because only two of them are independent:
+    for three joints leave one degree of freedom, because only two of them are independent:
 
         tan(q1/2) tan(q2/2) = sin((beta + alpha)/2)/sin((beta - alpha)/2),  q3 = -q1.
 
@@ -92,7 +92,7 @@ def _goldberg_start(
     return as_state(q), as_state([rate, second_rate, third_rate, -rate - second_rate])
 
 
-@named(_goldberg_start)
+@register_scene(_goldberg_start)
 def goldberg(
     *,
     lengths: Row = (1.0, 0.7, 0.5),
@@ -149,7 +149,7 @@ def _bricard_start(
     return as_state([angle, other, angle, other, angle]), as_state([rate, other_rate, rate, other_rate, rate])
 
 
-@named(_bricard_start)
+@register_scene(_bricard_start)
 def bricard(
     *,
     length: Number = 1.0,

@@ -7,7 +7,7 @@ from jaxdyn.compile import numpy_for
 from jaxdyn.constraints import knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_state, named
+from jaxdyn.scenes._named import as_state, register_scene
 from jaxdyn.systems.scene import Scene
 
 _AXLE = (np.zeros(3), (-np.pi / 2, 0.0, 0.0))  # z of the wheel along y of the body
@@ -30,7 +30,7 @@ def _bicycle_start(
     return as_state(q), as_state([*v, speed / rear_radius, steer_rate, speed / front_radius])
 
 
-@named(_bicycle_start)
+@register_scene(_bicycle_start)
 def bicycle(
     *,
     wheel_base: Number = 1.02,
@@ -44,7 +44,7 @@ def bicycle(
     front_wheel: Row = (3.0, (0.1405, 0.28, 0.1405)),
     gravity: Number = 9.81,
 ) -> Scene:
-    """Bicycle on level ground, ridden by nobody or by a rigid rider: Whipple's model, by default the benchmark's.
+    """Bicycle on level ground, without rider or with a rigid one: Whipple's model, by default the benchmark's.
 
     Bodies: the rear frame (free, with its origin at the rear wheel's centre), the rear wheel, the front frame on the
     steer axis, the front wheel. Upright and straight the axes are x forward, y left, z up. q = (the free joint,
@@ -98,13 +98,13 @@ def _drive_start(
 
 
 def _add_wheel(builder, name, parent, mass, radius, place):
-    """A wheel, a uniform disk, that turns about the y axis of its parent."""
+    """Add a wheel, a uniform disk, that rotates about the y axis of its parent."""
     moment = 0.5 * mass * radius**2
     disk = (mass, (0.0, 0.0, 0.0), (0.5 * moment, moment, 0.5 * moment))
     builder.add_body(name, parent, "continuous", disk, pose=place, axis=(0.0, 1.0, 0.0))
 
 
-@named(_drive_start)
+@register_scene(_drive_start)
 def differential_drive(
     *,
     mass: Number = 8.0,
@@ -157,7 +157,7 @@ def _car_start(
     return as_state([0.0, 0.0, 0.0, 0.0, 0.0, steer, 0.0]), as_state([speed, 0.0, yaw_rate, *spins])
 
 
-@named(_car_start)
+@register_scene(_car_start)
 def car(
     *,
     mass: Number = 60.0,
@@ -209,7 +209,7 @@ def _snakeboard_start(
     return as_state([0.0, 0.0, 0.0, *angles, 0.0]), as_state([speed, sideways, yaw_rate, *rates, rotor_rate])
 
 
-@named(_snakeboard_start)
+@register_scene(_snakeboard_start)
 def snakeboard(
     *,
     mass: Number = 6.0,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optimistix
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdyn.contact.forces import coned_contacts, contact_forces
+from jaxdyn.contact.forces import contact_forces, contacts_with_cones
 from jaxdyn.systems.scene import Scene
 
 OUTPUTS = ("contact_forces", "contact_margins")
@@ -28,7 +28,7 @@ def check_contacts(scene: Scene, contacts: str, outputs) -> None:
     if contacts not in CHOICES:
         raise ValueError(f"contacts is {contacts!r}; choose from {', '.join(map(repr, CHOICES))}")
     if scene.cones is not None:
-        coned_contacts(scene)
+        contacts_with_cones(scene)
     elif any(name in OUTPUTS for name in outputs):
         wanted = next(name for name in outputs if name in OUTPUTS)
         raise ValueError(

@@ -27,7 +27,7 @@ from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Function, Number, Numbers, as_array, state_dtype
-from jaxdyn.systems.scene import Scene, as_pytree, check_callback, checked_force
+from jaxdyn.systems.scene import Scene, as_pytree, check_callback, check_force
 
 STATE, HELD = "control", "held"
 
@@ -175,7 +175,7 @@ def check_control(scene: Scene, control: Any, q, v, t) -> None:
         returned = eqx.filter_eval_shape(lambda *args: control.called(*args, _numbers(control.state, q)), q, v, t)  # pyright: ignore[reportCallIssue]
         if not (isinstance(returned, tuple) and len(returned) == 2):
             raise ValueError(f"control.law returned {returned!r}; return (tau, state)")
-        checked_force(jnp.zeros(jnp.shape(returned[0])), q, scene.nv, "control.law")
+        check_force(jnp.zeros(jnp.shape(returned[0])), q, scene.nv, "control.law")
         _check_state(_numbers(control.state, q), returned[1], "control.law")
     elif isinstance(control, Controller):
         state = eqx.filter_eval_shape(control.start, q, v, t)
@@ -206,7 +206,7 @@ def sampled(control: Sampled, held: Float[Array, " n"], q, v, t) -> Float[Array,
     slack = control.period.astype(t.dtype) * float(jnp.finfo(t.dtype).eps) ** 0.4
     due = t >= start + count * control.period.astype(t.dtype) - slack
     tau, state = control.called(q, v, t, state)
-    tau = checked_force(tau, q, v.shape[0], "control.law")
+    tau = check_force(tau, q, v.shape[0], "control.law")
     fresh = jnp.concatenate([jnp.stack([start, count + 1]), tau, _flat(state, q)])
     return jnp.where(due, fresh, held)
 
@@ -218,13 +218,13 @@ def torque(control: Any, scene: Scene, y, q, v, t, multipliers: Callable) -> Arr
     if isinstance(control, Sampled):
         return _held(control, y[HELD], v)[2]
     if not isinstance(control, Controller):
-        return checked_force(control(q, v, t), q, scene.nv, "control")
+        return check_force(control(q, v, t), q, scene.nv, "control")
     state = state_of(control, y, q, v, t)
     if not control.takes_multipliers:
-        return checked_force(control(q, v, t, state), q, scene.nv, "control")
+        return check_force(control(q, v, t, state), q, scene.nv, "control")
 
     def at(lam):
-        return checked_force(control(q, v, t, state, lam), q, scene.nv, "control")
+        return check_force(control(q, v, t, state, lam), q, scene.nv, "control")
 
     return at(_closed_loop(lambda lam: multipliers(at(lam)), jnp.zeros((_count(scene),), q.dtype)))
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jaxdyn.compile import partition_traced
 from jaxdyn.constraints.selection import exchange_rows, renew_rows
-from jaxdyn.forces.piecewise import Pieces, guards, in_pieces, pieces_of, values_and_levels
+from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
@@ -77,7 +77,7 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
         scene, control, method = known(args[:count])
         if y is not None and KEPT in y:
             scene = exchange_rows(scene, y[KEPT])
-        return in_pieces(scene, pieces, args[count]) if len(args) > count else scene, control, method
+        return fix_pieces(scene, pieces, args[count]) if len(args) > count else scene, control, method
 
     def effort(args, y, q, v, t):
         """Of the control before limits, or None when there is none."""

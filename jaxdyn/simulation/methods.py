@@ -37,20 +37,20 @@ from jaxdyn.model.arguments import Number, Numbers
 from jaxdyn.reduction.bases import (
     Basis,
     BasisLike,
-    Given,
     Orthonormal,
+    UserBasis,
     as_basis,
     least_quality,
     minimal_velocity,
-    moving,
     tangent_basis,
+    velocity_and_drift,
 )
-from jaxdyn.reduction.minimal import solve_reduced
+from jaxdyn.reduction.minimal import solve_in_basis
 from jaxdyn.simulation import variational
 from jaxdyn.simulation.solvers import Stepper
 from jaxdyn.simulation.solvers.choice import Solver, Stepsize, is_fixed
 from jaxdyn.systems.scene import Scene, as_pytree
-from jaxdyn.systems.system import rate_to_velocity, retract, retracts, velocity_to_rate
+from jaxdyn.systems.system import needs_retraction, rate_to_velocity, retract, velocity_to_rate
 
 State = dict[str, Any]  # arrays, and pytrees of them, by name
 
@@ -114,7 +114,7 @@ class Method(eqx.Module):
 
     def corrects(self, scene: Scene) -> bool:
         """Whether `stepped` and `corrected` change a state."""
-        return self.projects or retracts(scene.system)
+        return self.projects or needs_retraction(scene.system)
 
     def corrected(self, scene: Scene, y: State, t: Number) -> State:
         """The state put back between steps, where it is saved."""
@@ -262,7 +262,7 @@ class Reduced(Method):
 
     def __init__(self, basis: BasisLike | None = None, *, dof: int | None = None):
         given = callable(basis) and not isinstance(basis, Basis)
-        self.basis = Given(as_pytree(basis, "basis")) if given else basis
+        self.basis = UserBasis(as_pytree(basis, "basis")) if given else basis
         self.dof = dof
 
     def fitted(self, scene: Scene, dof: int | None) -> "Reduced":
@@ -300,7 +300,7 @@ class Reduced(Method):
     ) -> tuple[State, Array | None, Array]:
         """From the reduced equations, which share one factorisation of the rows with v."""
         q = retract(scene.system, y["q"])
-        motion = moving(scene, self._basis(y), q, y["nu"], t)
+        motion = velocity_and_drift(scene, self._basis(y), q, y["nu"], t)
         force = generalized_force(q, motion.v, t)
         return self._rates(scene, y, motion, q, t, force), force, motion.v
 
@@ -314,10 +314,10 @@ class Reduced(Method):
         force: Float[Array, " nv"] | None,
     ) -> State:
         """From the reduced equations; v is found anew."""
-        return self._rates(scene, y, moving(scene, self._basis(y), q, y["nu"], t), q, t, force)
+        return self._rates(scene, y, velocity_and_drift(scene, self._basis(y), q, y["nu"], t), q, t, force)
 
     def _rates(self, scene, y, motion, q, t, force):
-        reduced = solve_reduced(Scene(scene.system, scene.constraints), motion, q, force, t)
+        reduced = solve_in_basis(Scene(scene.system, scene.constraints), motion, q, force, t)
         fixed = {name: jnp.zeros_like(y[name]) for name in self.step_constants}
         return {"q": velocity_to_rate(scene.system, q, motion.v), "nu": reduced.nu_rate} | fixed
 
@@ -329,7 +329,7 @@ class Reduced(Method):
 
     def corrects(self, scene: Scene) -> bool:
         """Where there are holonomic rows, quaternions, or a reference to be renewed."""
-        return bool(holonomic_rows(layout(scene)).size or self.step_constants or retracts(scene.system))
+        return bool(holonomic_rows(layout(scene)).size or self.step_constants or needs_retraction(scene.system))
 
     def stepped(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
         """q on the holonomic constraints, its error without the part normal to them; nu stays."""

@@ -18,7 +18,7 @@ from jaxdyn.constraints.selection import (
     most_rounding,
     select_rows,
 )
-from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
@@ -42,7 +42,7 @@ from jaxdyn.simulation.solvers.inputs import (
 )
 from jaxdyn.simulation.start import has_definite_mass
 from jaxdyn.systems.scene import Scene, check_callback
-from jaxdyn.systems.system import displace, has_followers, retract
+from jaxdyn.systems.system import displace, has_dependent_coordinates, retract
 
 
 def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
@@ -133,7 +133,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         reached = reached & ~(lost.happened & (ts > lost.time))
         time_reached = jnp.where(lost.happened, lost.time, time_reached)
         by_contacts = unilateral.can_end(scene, options["contacts"])
-        count = len(coned_contacts(scene)) if by_contacts else 0
+        count = len(contacts_with_cones(scene)) if by_contacts else 0
         limits = 2 * q.shape[1] if options["limits"] == "stop" else 0
         at_limit = lost.happened & (lost.entry >= count) & (lost.entry < count + limits)
         by_control = lost.happened & (lost.entry >= count + limits)
@@ -143,8 +143,8 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
             (at_limit, RESULTS.joint_limit_passed),
             (by_contact, RESULTS.contact_lost),
         ]
-    if has_followers(system):
-        follows = jnp.cumsum(~map_rows(system.follows, q)) == 0
+    if has_dependent_coordinates(system):
+        follows = jnp.cumsum(~map_rows(system.is_consistent, q)) == 0
         ends.insert(0, (~follows.all(), RESULTS.no_single_contact))
         reached = reached & follows
         time_reached = jnp.where(follows.all(), time_reached, jnp.max(jnp.where(reached, ts, ts[0])))

@@ -44,7 +44,7 @@ from jaxdyn.simulation.solvers.inputs import (
 )
 from jaxdyn.simulation.start import checked_start, chosen_method, may_have_singular_mass
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import SceneLike, System, has_followers
+from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates
 
 
 def simulate(
@@ -144,7 +144,7 @@ def simulate(
     method = chosen_method(scene, method)
     modal = has_modes(scene)
     # Places of contacts are looked at before what depends on them.
-    if has_followers(scene.system) and is_concrete((scene, q0, v0, ts)):
+    if has_dependent_coordinates(scene.system) and is_concrete((scene, q0, v0, ts)):
         _check_system(scene.system, q0, v0, ts[0])
     if scene.constraints and is_concrete((scene, method, q0, v0, ts)):
         state = [np.asarray(x, state_dtype(scene.system)) for x in (q0, v0, np.asarray(ts)[0])]

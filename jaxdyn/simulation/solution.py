@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.codes import RESULTS as RESULTS
 from jaxdyn.constraints.codes import Outcome, name_of
-from jaxdyn.contact.forces import coned_contacts
+from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import FilePath
-from jaxdyn.model.printed import solution_lines
+from jaxdyn.model.description import solution_lines
 from jaxdyn.simulation.controls import at_start
 from jaxdyn.simulation.export import as_xarray, write_csv, write_npz
 from jaxdyn.simulation.limits import joint_of
@@ -199,7 +199,7 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
         if any(isinstance(force, SlidingFriction) for force in scene.forces):
             advice = f"where a contact with jd.SlidingFriction comes to rest, take jd.DryFriction, which sticks; else {advice}"
     if name == "contact_lost":
-        contact = coned_contacts(scene)[int(solution.stats["lost_contact"])].name
+        contact = contacts_with_cones(scene)[int(solution.stats["lost_contact"])].name
         advice = f"the contact is {contact!r}; {advice}"
     if name == "joint_limit_passed":
         advice = f"the joint is {joint_of(scene.system, int(solution.stats['passed_limit']))!r}; {advice}"

@@ -110,7 +110,7 @@ def may_have_singular_mass(system) -> bool:
 
 def has_definite_mass(system, q, t):
     """Whether the mass matrix is positive definite to rounding, ()."""
-    return mass_factor(mass_matrix(system, q, t)).definite()
+    return mass_factor(mass_matrix(system, q, t)).is_definite()
 
 
 @eqx.filter_jit

@@ -11,7 +11,7 @@ import numpy as np
 from jaxdyn.compile import is_concrete, partition_traced
 from jaxdyn.constraints.selection import keep_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.forces.piecewise import guards, in_pieces, pieces_of, values_and_levels
+from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.hybrid.laws import laws_of_pieces
 from jaxdyn.simulation.hybrid.pieces import motion_in_pieces
@@ -19,7 +19,7 @@ from jaxdyn.simulation.solvers import ExplicitSteps, driver
 from jaxdyn.simulation.solvers.driver import Drive
 from jaxdyn.simulation.solvers.rk4 import RK4
 from jaxdyn.simulation.start import chosen_method
-from jaxdyn.systems.scene import as_scene, checked_force
+from jaxdyn.systems.scene import as_scene, check_force
 from jaxdyn.systems.system import SceneLike
 
 EVENTS = 8  # of a step, at most: a force that changes its piece more often leaves it without derivatives
@@ -78,14 +78,14 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
         unknown, tau, selection, *positive = args
         scene = known(unknown)
         scene = scene if selection is None else keep_rows(scene, selection)
-        return in_pieces(scene, pieces, *positive) if positive else scene, tau
+        return fix_pieces(scene, pieces, *positive) if positive else scene, tau
 
     @jax.jit
     def field(t, y, args):
         scene, tau = given(args)
 
         def generalized_force(q, v, t):
-            force, given = scene.applied_force(q, v, t), scene.limited(tau)
+            force, given = scene.applied_force(q, v, t), scene.clip_effort(tau)
             return given if force is None else given + force
 
         return method.evaluated(scene, y, t, generalized_force)[0]
@@ -127,10 +127,10 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
             check_shape(system, name, value)
         t = jnp.asarray(t, dtype)
         if not callable(tau):
-            return taken(q, v, checked_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t)
+            return taken(q, v, check_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t)
 
         def under_law(q, v, t):
-            return advance(q, v, checked_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t)
+            return advance(q, v, check_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t)
 
         return (jax.checkpoint(under_law) if remat else under_law)(q, v, t)
 

@@ -14,10 +14,10 @@ from jaxdyn.compile import compiled, is_known, numpy_for
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Checked, Numbers, check_state, stored
+from jaxdyn.model.arguments import Checked, Numbers, check_state, store_leaf
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
-from jaxdyn.systems.scene import Scene, as_pytree, as_scene, checked_force
+from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
 from jaxdyn.systems.system import SceneLike, displace
 
 # A step of an undamped oscillation may grow it by this much: explicit methods of order 8 do so at any length, if by little.
@@ -113,7 +113,7 @@ def stiffness(
         values = np.linalg.eigvals(known)
     else:
         values = jnp.linalg.eigvals(matrix)
-    return Stiffness(*(stored(x, matrix.dtype) for x in _rates(values)))
+    return Stiffness(*(store_leaf(x, matrix.dtype) for x in _rates(values)))
 
 
 @compiled
@@ -129,7 +129,7 @@ def _linearised(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
         total = jnp.zeros_like(v) if total is None else total
         if not isinstance(system, Model):
             total = total - gravity_force(system, at, t)
-        return total if control is None else total + checked_force(control(at, speed, t), q, n, "control")
+        return total if control is None else total + check_force(control(at, speed, t), q, n, "control")
 
     mass = mass_matrix(system, q, t)
     unit = jnp.eye(n, dtype=mass.dtype)

@@ -1,4 +1,4 @@
-"""What has a motion: `Scene`, and systems given by a Lagrangian or by M and h (EQUATIONS section 1); factors of mass matrices.
+"""Systems in motion: `Scene`, systems given by a Lagrangian or by M and h (EQUATIONS section 1), factors of mass matrices.
 
 Imports `model` and what is below it.
 """

@@ -1,4 +1,4 @@
-"""Systems given by their Lagrangian: everything comes from L by automatic differentiation."""
+"""Systems given by their Lagrangian, whose equations of motion follow from L by automatic differentiation."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,16 +12,16 @@ from jaxtyping import Array, Float, PyTree
 from jaxdyn.compile import is_known
 from jaxdyn.model.arguments import Checked, Function, Number
 from jaxdyn.systems.scene import as_pytree
-from jaxdyn.systems.start import check_mass_matrix, place_of
-from jaxdyn.systems.system import System, as_parameter, called, checked_size
+from jaxdyn.systems.start import check_mass_matrix, describe_state
+from jaxdyn.systems.system import System, as_parameter, check_size, evaluate_callback
 
 
 class LagrangianSystem(System):
-    """A system given by its Lagrangian: d/dt dL/dv - dL/dq = tau.
+    """System given by its Lagrangian: d/dt dL/dv - dL/dq = tau.
 
     M = d2L/dv2 and h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq come from automatic differentiation, the first rate as one
     derivative along the motion, so L may hold any coordinates, gyroscopic terms and time. L is quadratic in v. The
-    potential energy is -L(q, 0); the kinetic energy is what the Jacobi integral v . dL/dv - L adds to it, so for
+    potential energy is -L(q, 0); the kinetic energy is the Jacobi integral v . dL/dv - L less that, so for
     L = T - V they are T and V.
 
     **Arguments:**
@@ -30,7 +30,7 @@ class LagrangianSystem(System):
       define it once.
     - `nq`: number of coordinates.
     - `parameters`: any pytree of numbers; its leaves can be differentiated and batched.
-    - `potential`: V(q) -> () in J, or V(q, t, parameters), when it is split off: the Lagrangian of the system is then
+    - `potential`: V(q) -> () in J, or V(q, t, parameters), when it is given separately: the Lagrangian of the system is then
       lagrangian - V, `lagrangian` has to vanish at v = 0, and V is differentiated once instead of with the rest.
 
     **Raises:** ValueError for an nq that is no positive integer, a lagrangian that cannot be called, and (when used) a
@@ -53,80 +53,87 @@ class LagrangianSystem(System):
     def __init__(
         self, lagrangian: Function, nq: Checked[int], *, parameters: PyTree = None, potential: Function | None = None
     ):
-        self.nq = checked_size(nq)
+        self.nq = check_size(nq)
         more = "" if parameters is None else ", t, parameters"
         self.lagrangian = as_pytree(lagrangian, "lagrangian", "q, v" + more)
         self.potential = None if potential is None else as_pytree(potential, "potential", "q" + more)
         self.parameters = jax.tree.map(as_parameter, parameters)
 
     def value(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        """L(q, v, t), (), J; less the potential that is split off."""
-        value = self._moving(q, v, t)
-        return value if self.potential is None else value - self._held(q, t)
+        """Lagrangian L(q, v, t), (), J, less a separate potential."""
+        value = self._lagrangian_value(q, v, t)
+        return value if self.potential is None else value - self._potential_value(q, t)
 
-    def _moving(self, q, v, t):
-        return called(self.lagrangian, (), "lagrangian", (q, v), t, self.parameters)
+    def _lagrangian_value(self, q, v, t):
+        return evaluate_callback(self.lagrangian, (), "lagrangian", (q, v), t, self.parameters)
 
-    def _held(self, q, t):
-        return called(self.potential, (), "potential", (q,), t, self.parameters)
+    def _potential_value(self, q, t):
+        return evaluate_callback(self.potential, (), "potential", (q,), t, self.parameters)
 
     def _momentum(self, q, v, t):
-        return jax.grad(self._moving, argnums=1)(q, v, t)
+        # Differentiating the momentum once more gives M and h with one reverse and one forward pass, without a Hessian
+        # of (q, v).
+        return jax.grad(self._lagrangian_value, argnums=1)(q, v, t)
 
     def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv"]:
-        """M = d2L/dv2 at v = 0, (nv, nv)."""
+        """Mass matrix M = d2L/dv2 at v = 0, (nv, nv)."""
+        # L is quadratic in v (checked at the start), so that M does not depend on v; v = 0 needs the fewest operations.
         return jax.jacfwd(self._momentum, argnums=1)(q, jnp.zeros_like(q), t)
 
     def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
-        """h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq, (nv,)."""
-        if self.parameters is None:  # then L knows no time
+        """Bias force h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq, (nv,)."""
+        if self.parameters is None:  # then L does not depend on t
             _, rate = jax.jvp(lambda q: self._momentum(q, v, t), (q,), (v,))
         else:
             _, rate = jax.jvp(lambda q, t: self._momentum(q, v, t), (q, t), (v, jnp.ones_like(t)))
-        force = rate - jax.grad(self._moving)(q, v, t)
-        return force if self.potential is None else force + jax.grad(self._held)(q, t)
+        force = rate - jax.grad(self._lagrangian_value)(q, v, t)
+        return force if self.potential is None else force + jax.grad(self._potential_value)(q, t)
 
     def gravity_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nv"]:
-        """dV/dq where the potential is split off, else the bias force at rest, (nv,)."""
-        return super().gravity_force(q, t) if self.potential is None else jax.grad(self._held)(q, t)
+        """Gravity force dV/dq of a separate potential, else the bias force at rest, (nv,)."""
+        return super().gravity_force(q, t) if self.potential is None else jax.grad(self._potential_value)(q, t)
 
     def coriolis_matrix(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, "nv nv"]:
-        """C with C v = h - h(v = 0), (nv, nv): that of the Christoffel symbols, plus the matrix of terms linear in v.
+        """Coriolis matrix C with C v = h - h(v = 0), (nv, nv): that of the Christoffel symbols, plus terms linear in v.
 
         The latter is skew where M does not depend on t: gyroscopic forces of terms of L linear in v.
         """
-        # h is of second degree in v: half of its slope is the symbols' matrix plus half of the linear terms'.
-        slope = jax.jacfwd(self.bias_force, argnums=1)
-        return 0.5 * (slope(q, v, t) + slope(q, jnp.zeros_like(v), t))
+        # h is quadratic in v: half of its derivative is the symbols' matrix plus half of the linear terms' matrix.
+        derivative = jax.jacfwd(self.bias_force, argnums=1)
+        return 0.5 * (derivative(q, v, t) + derivative(q, jnp.zeros_like(v), t))
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        """v . dL/dv - L(q, v) + L(q, 0), (), J."""
-        energy = jnp.sum(v * self._momentum(q, v, t)) - self._moving(q, v, t)
-        return energy if self.potential is not None else energy + self._moving(q, jnp.zeros_like(v), t)
+        """Kinetic energy v . dL/dv - L(q, v) + L(q, 0), (), J."""
+        energy = jnp.sum(v * self._momentum(q, v, t)) - self._lagrangian_value(q, v, t)
+        return energy if self.potential is not None else energy + self._lagrangian_value(q, jnp.zeros_like(v), t)
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
-        """-L(q, 0), or V as split off, (), J."""
-        return -self._moving(q, jnp.zeros_like(q), t) if self.potential is None else self._held(q, t)
+        """Potential energy -L(q, 0), or the separate V, (), J."""
+        return (
+            -self._lagrangian_value(q, jnp.zeros_like(q), t) if self.potential is None else self._potential_value(q, t)
+        )
 
     def check_start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> None:
-        """As for any system; also that L is finite, fits nq, and is quadratic in v."""
+        """Check the start as for any system, and that L is finite, fits nq, and is quadratic in v."""
         if not is_known(self, q, v, t):
             return
-        place = place_of(q, t, v)
+        place = describe_state(q, t, v)
         self._check_coordinates(q, v, t)
-        value, rest, mass, moved = (np.asarray(x, float) for x in _probe_compiled(self, q, v, t))
+        value, rest, mass, shifted = (np.asarray(x, float) for x in _probe_compiled(self, q, v, t))
         if not np.isfinite(value):
             raise ValueError(f"lagrangian is {value} at {place}; start where it is finite, or write it without a pole")
+        # Relative to the largest term: rounding of L at rest is not a kinetic term.
         if self.potential is not None and abs(rest) > 1e-6 * (abs(value) + np.abs(mass).max()):
             raise ValueError(
-                f"lagrangian is {rest:.6g} at rest at {place}, but with potential= it has to vanish there; move what "
-                "does not depend on v into potential"
+                f"lagrangian is {rest:.6g} at rest at {place}, but with potential= it must vanish there; move the "
+                "terms without v into potential"
             )
         check_mass_matrix(mass, "LagrangianSystem", q, t)
-        if not np.abs(moved - mass).max() <= 1e-3 * np.abs(mass).max():
+        # A loose bound: it is to find terms such as sqrt(1 - v^2), not rounding of a second derivative.
+        if not np.abs(shifted - mass).max() <= 1e-3 * np.abs(mass).max():
             raise ValueError(
                 f"lagrangian is not quadratic in v at {place}: d2L/dv2 is {mass.tolist()} at v = 0 and "
-                f"{moved.tolist()} at v + 1; give the equations of motion as a jd.ExplicitSystem"
+                f"{shifted.tolist()} at v + 1; give the equations of motion as a jd.ExplicitSystem"
             )
 
     def _check_coordinates(self, q, v, t):
@@ -139,14 +146,14 @@ class LagrangianSystem(System):
         except (IndexError, ValueError) as error:
             raise ValueError(f"lagrangian does not fit nq = {self.nq}: {error}; pass the number it reads") from error
         except (TypeError, AttributeError):
-            return  # it needs arrays of jax (`.at`, or their dtypes), and this cannot be told
+            return  # it needs arrays of jax (`.at`, or their dtypes), so that its coordinates cannot be checked
 
 
 def _probe(system: LagrangianSystem, q, v, t):
-    """L, L without the potential at rest, and d2L/dv2 at v = 0 and at v + 1."""
+    """Values for the checks of a start: L, L without the potential at rest, and d2L/dv2 at v = 0 and at v + 1."""
     hessian = jax.jacfwd(system._momentum, argnums=1)
     zero = jnp.zeros_like(v)
-    return system.value(q, v, t), system._moving(q, zero, t), hessian(q, zero, t), hessian(q, v + 1, t)
+    return system.value(q, v, t), system._lagrangian_value(q, zero, t), hessian(q, zero, t), hessian(q, v + 1, t)
 
 
 _probe_compiled = eqx.filter_jit(_probe)

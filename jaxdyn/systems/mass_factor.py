@@ -28,11 +28,11 @@ def _cholesky(_, matrix):
     return lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
-def definite(matrix: Float[Array, "n n"], factor: Float[Array, "n n"]) -> Bool[Array, ""]:
-    """Whether the Cholesky factor is that of a positive definite matrix, with more than rounding left in every pivot.
+def is_definite(matrix: Float[Array, "n n"], factor: Float[Array, "n n"]) -> Bool[Array, ""]:
+    """Decide whether a Cholesky factor has every pivot above rounding, as for a positive definite matrix.
 
-    A pivot L_ii^2 is what M_ii is after others are taken from it, with an error of eps M_ii: of a quotient by 16 of them
-    hardly a digit is right.
+    A pivot L_ii^2 is M_ii less a sum of products, with a rounding error of eps M_ii: below 16 of these errors a quotient by the
+    pivot has hardly a correct digit.
     """
     return _has_pivots(factor, jnp.diagonal(matrix))
 
@@ -56,49 +56,50 @@ def _solve_lower(transposed: bool, _, factor, right):
     return solve_triangular(factor, right, lower=True, trans=int(transposed))
 
 
-def solve_factored(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """(L L^T)^-1 right."""
+def solve_cholesky(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
+    """Solve with a Cholesky factor: (L L^T)^-1 right."""
     return solve_lower(factor, solve_lower(factor, right), transposed=True)
 
 
 @compiled
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """matrix^-1 right by Cholesky's factorisation; NaN where the matrix is not positive definite."""
-    return solve_factored(cholesky(matrix), right)
+    """Solve matrix^-1 right by Cholesky factorisation; NaN where the matrix is not positive definite."""
+    return solve_cholesky(cholesky(matrix), right)
 
 
 class MassFactor(NamedTuple):
-    """M = U U^T, the metric in which accelerations and constraint forces are compared.
+    """Factor of the mass matrix M = U U^T, the metric in which accelerations and constraint forces are compared.
 
     `whiten` maps forces f to U^-1 f, whose sum of squares is f . M^-1 f, and `unwhiten` these to accelerations:
-    M^-1 f = unwhiten(whiten(f)). Both take the entries of what is in between in reversed order.
+    M^-1 f = unwhiten(whiten(f)). The whitened vectors have their entries in reversed order.
     """
 
     reversed: Float[Array, "n n"]
     diagonal: Float[Array, " n"]
 
     def whiten(self, forces: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-        """U^-1 forces."""
+        """Whitened forces U^-1 f."""
         return solve_lower(self.reversed, forces[::-1])
 
     def unwhiten(self, whitened: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-        """U^-T whitened."""
+        """Accelerations U^-T w of whitened forces w."""
         return solve_lower(self.reversed, whitened, transposed=True)[::-1]
 
     def solve(self, forces: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-        """M^-1 forces."""
+        """Accelerations M^-1 f."""
         return self.unwhiten(self.whiten(forces))
 
     def momentum(self, velocities: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-        """U^T velocities, the inverse of `unwhiten`."""
+        """Whitened momentum U^T v, the inverse of `unwhiten`."""
         return self.reversed.T @ velocities[::-1]
 
-    def definite(self) -> Bool[Array, ""]:
-        """Whether M is positive definite, with more than rounding left in every pivot."""
+    def is_definite(self) -> Bool[Array, ""]:
+        """Decide whether M is positive definite with every pivot above rounding."""
         return _has_pivots(self.reversed, self.diagonal)
 
 
 def mass_factor(mass: Float[Array, "n n"]) -> MassFactor:
-    """The factor of a mass matrix, of which the upper triangle is read."""
+    """Factor of a mass matrix, from its upper triangle."""
+    # Reversed order puts the leaves of the tree first, whose elimination fills in nothing between branches.
     backwards = mass[::-1, ::-1]
     return MassFactor(cholesky(backwards), jnp.diagonal(backwards))

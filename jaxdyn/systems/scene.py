@@ -1,4 +1,4 @@
-"""A scene: one system, the constraints on it and the forces in it. What it lists is all that is compiled."""
+"""Scenes: one system with its constraints and forces. Only listed items are compiled."""
 
 import functools
 import inspect
@@ -12,19 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system
-from jaxdyn.model.printed import scene_lines
+from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system, warn
+from jaxdyn.model.description import scene_lines
 
 if TYPE_CHECKING:
     Force = Callable[[Any, Array, Array, Array], Array]  # f(system, q, v, t) -> (nv,)
 else:
-    Force = Any  # `as_pytree` looks at it
+    Force = Any  # `as_pytree` checks it
 
 _FUNCTIONS = types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type, np.ufunc
 
 
 class _Static(eqx.Module):
-    """A plain function as a pytree without leaves, so that what holds it can pass through `jax.jit` and `jax.vmap`."""
+    """Plain function as a pytree without leaves, so that modules holding it pass through `jax.jit` and `jax.vmap`."""
 
     function: Callable = eqx.field(static=True)
 
@@ -33,16 +33,17 @@ class _Static(eqx.Module):
 
 
 def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
-    """The callable itself if it is a pytree (an equinox Module, a `jax.tree_util.Partial`), else a static wrapper of
-    it. A method of a pytree becomes a `Partial` that holds the pytree.
+    """Convert a callable to a pytree: itself if it is one (an equinox Module, a `Partial`), else a static wrapper.
 
-    A plain function is compared by identity: the same one gives the same compiled program, with the numbers it read when
-    it was traced; a lambda written anew in every call gives a new one.
+    A method of a pytree becomes a `Partial` that holds the pytree.
 
-    `takes` names the arguments that it is called with, as "q, t".
+    A plain function is compared by identity: the same one gives the same compiled program, with the values it captured when
+    it was traced; a new lambda in every call compiles a new program.
+
+    `takes` names the arguments of its calls, as "q, t".
 
     **Raises:** ValueError when `function` cannot be called, or not with these arguments, and for an object with attributes that
-    is no pytree: the compiled program would keep their first values; `argument` says where it came from.
+    is no pytree: the compiled program would keep their first values; `argument` names its origin.
     """
     if not callable(function):
         raise ValueError(f"{argument} is {function!r}, which cannot be called; pass a function or a callable Module")
@@ -50,6 +51,7 @@ def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
         _check_arguments(function, argument, takes)
     if not jax.tree_util.all_leaves([function]):
         return function
+    # A bound method hides its object; a Partial keeps the object's leaves visible to transformations.
     owner = function.__self__ if isinstance(function, types.MethodType) else function
     if owner is not function and not (isinstance(owner, type) or jax.tree_util.all_leaves([owner])):
         return jax.tree_util.Partial(function.__func__, owner)
@@ -62,13 +64,13 @@ def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
         raise ValueError(
             f"{argument} is {what}, whose attributes ({', '.join(names)}) would keep the values of the first run in the "
             f"compiled program; make it an equinox Module (class {kind}(eqx.Module): with a field for each of them), or pass a "
-            "function that is written anew for new values"
+            "new function for new values"
         )
     return _Static(function)
 
 
 def _attributes(owner: Any) -> list[str]:
-    """Names of the attributes of an object that is no function, class or wrapper of a function."""
+    """Attribute names of an object that is no function, class or wrapper of a function."""
     if isinstance(owner, _FUNCTIONS) or hasattr(owner, "__wrapped__"):
         return []
     slots = [name for kind in type(owner).__mro__ for name in np.atleast_1d(getattr(kind, "__slots__", ())).tolist()]
@@ -77,7 +79,7 @@ def _attributes(owner: Any) -> list[str]:
 
 
 class Scene(eqx.Module):
-    """A system with the constraints and the forces that act on it: M a + h = tau + forces + A^T lam.
+    """System with the constraints and forces that act on it: M a + h = tau + forces + A^T lam.
 
     **Arguments:**
 
@@ -87,9 +89,9 @@ class Scene(eqx.Module):
       the library (`JointDamping`, `JointSpring`, ...) and your own equinox Modules hold numbers as leaves, which
       `jax.grad` and `jax.vmap` reach. A plain function is static: define it once, outside of loops, and let it hold
       no arrays. An object with attributes that is no pytree is refused.
-    - `cones`: what the contacts among the constraints can exert: a `jd.contact.friction_cone(...)` or `surface_cone(...)`
-      for all of them, a list with one for each, or a dictionary by the constraints' names, which leaves those that it does
-      not name two-sided. The rows stay as they are; `simulate` ends where a contact pulls or leaves its cone.
+    - `cones`: friction cones of the contacts among the constraints: a `jd.contact.friction_cone(...)` or `surface_cone(...)`
+      for all of them, a list with one for each, or a dictionary by the constraints' names, in which contacts
+      without an entry stay two-sided. The rows do not change; `simulate` ends where a contact pulls or leaves its cone.
 
     **Raises:** ValueError when `system` is no system, or `constraints` or `forces` is not a sequence of callables; when
     used, for cones that do not fit the constraints.
@@ -133,27 +135,33 @@ class Scene(eqx.Module):
 
         **Raises:** ValueError that names a force whose result is not (nv,).
         """
+        # None and not zeros: without forces nothing is added to tau, and nothing compiled for it.
         total = None
         for i, force in enumerate(self.forces):
-            value = checked_force(force(self.system, q, v, t), q, self.nv, f"forces[{i}]")
+            value = check_force(force(self.system, q, v, t), q, self.nv, f"forces[{i}]")
             total = value if total is None else total + value
         return total
 
     def limited(self, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
-        """tau (nv,) as the scene's `EffortLimits` let it through."""
+        """Deprecated name of `clip_effort`."""
+        warn("Scene.limited is deprecated; call clip_effort", DeprecationWarning)
+        return self.clip_effort(tau)
+
+    def clip_effort(self, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """Torques tau (nv,) clipped by the scene's `EffortLimits`."""
         for force in self.forces:
-            cut = getattr(force, "limited", None)
+            cut = getattr(force, "clip_effort", None)
             tau = tau if cut is None else cut(self.system, tau)
         return tau
 
 
 def as_scene(scene: Any) -> Scene:
-    """A scene as it is, and a system as the scene without constraints and forces."""
+    """Convert a system to a scene without constraints and forces; a scene is returned unchanged."""
     return scene if isinstance(scene, Scene) else Scene(scene)
 
 
-def checked_force(value, q: Float[Array, " nq"], nv: int, argument: str) -> Float[Array, " nv"]:
-    """What a force or control callback returned, checked to be (nv,), in the dtype of q."""
+def check_force(value, q: Float[Array, " nq"], nv: int, argument: str) -> Float[Array, " nv"]:
+    """Check that the result of a force or control callback is (nv,), and convert it to the dtype of q."""
     if jnp.shape(value) != (nv,):
         hint = batch_hint(value, (nv,))
         raise ValueError(f"{argument} returned shape {jnp.shape(value)}, expected {(nv,)} = (nv,){hint}")
@@ -163,7 +171,7 @@ def checked_force(value, q: Float[Array, " nq"], nv: int, argument: str) -> Floa
 def _check_arguments(function: Any, argument: str, takes: str) -> None:
     try:
         signature = inspect.signature(function.function if isinstance(function, _Static) else function)
-    except (TypeError, ValueError):  # of what is not written in Python
+    except (TypeError, ValueError):  # functions not written in Python have no signature
         return
     try:
         signature.bind(*takes.split(", "))
@@ -172,13 +180,13 @@ def _check_arguments(function: Any, argument: str, takes: str) -> None:
 
 
 def check_callback(function: Callable, name: str, signature: str, *args, first: tuple = ()) -> None:
-    """Call a function of the user with traced numbers, as the integration will; those of `first`, in front, as they are.
+    """Trace a user's function as the integration will; the leading arguments `first` stay concrete.
 
-    **Raises:** ValueError for a function of other arguments, and for one that needs the values of its arguments.
+    **Raises:** ValueError for a function with other arguments, and for one that needs the values of its arguments.
     """
     try:
         taken = inspect.signature(function.function if isinstance(function, _Static) else function)
-    except (TypeError, ValueError):  # of what is not written in Python
+    except (TypeError, ValueError):  # functions not written in Python have no signature
         taken = None
     try:
         if taken is not None:
@@ -186,12 +194,14 @@ def check_callback(function: Callable, name: str, signature: str, *args, first: 
     except TypeError as error:
         raise ValueError(f"{name} takes {taken}, but is called as {signature}; {error}") from None
     try:
+        # Abstract evaluation finds branches on traced values before a long compilation fails with a message about the
+        # loop.
         eqx.filter_eval_shape(lambda *args: function(*first, *args), *args)
     except (jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(
-            f"{name} needs the values of its arguments, which are traced; take jax.numpy in place of numpy and math, and "
-            f"jnp.where or jax.lax.cond in place of if. {reason}"
+            f"{name} needs the values of its arguments, which are traced; use jax.numpy instead of numpy and math, and "
+            f"jnp.where or jax.lax.cond instead of if. {reason}"
         ) from error
 
 

@@ -1,20 +1,21 @@
-"""Checks of a start in concrete numbers: what would make every later number NaN is refused with its cause."""
+"""Checks of concrete initial states: causes of NaN in all later results are refused by name."""
 
 import numpy as np
 
 
-def place_of(q, t, v=None) -> str:
-    """The state in words."""
+def describe_state(q, t, v=None) -> str:
+    """Text description of a state for messages."""
     moving = "" if v is None else f"v = {np.asarray(v).tolist()}, "
     return f"q = {np.asarray(q).tolist()}, {moving}t = {float(t):.6g}"
 
 
 def check_mass_matrix(mass, name: str, q, t) -> None:
-    """Refuse a mass matrix that is not finite or not positive definite, in a measure that does not depend on units."""
+    """Refuse a mass matrix that is not finite or not positive definite, in a measure independent of units."""
     mass = np.asarray(mass, float)
-    place = place_of(q, t)
+    place = describe_state(q, t)
     if not np.isfinite(mass).all():
         raise ValueError(f"the mass matrix of this {name} is not finite at {place}: {mass.tolist()}; start elsewhere")
+    # Scaling by the diagonal makes the eigenvalues dimensionless: kg and kg m^2 are not comparable.
     scale = np.sqrt(np.abs(np.diag(mass)))
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(mass / np.outer(scale, scale))
@@ -27,6 +28,7 @@ def check_mass_matrix(mass, name: str, q, t) -> None:
             f"the mass matrix of this {name} is not positive definite at {place}: eigenvalues "
             f"{np.linalg.eigvalsh(mass).tolist()}; check the signs of the kinetic energy"
         )
+    # The eigenvector of the smallest eigenvalue, scaled back, is the velocity without kinetic energy.
     idle = vectors[:, np.argmin(np.abs(values))] / scale
     raise ValueError(
         f"the mass matrix of this {name} has rank {rank} of {len(mass)} at {place}: the velocity "

@@ -1,8 +1,8 @@
-"""Systems beside `Model`: what every one of them offers, and those given by a metric or by their equations of motion.
+"""Systems other than `Model`: their interface, and those given by a metric or by their equations of motion.
 
-All have as many velocities as coordinates, v = dq/dt. They are taken wherever a `Model` is taken that needs no bodies:
+All have as many velocities as coordinates, v = dq/dt. They are accepted wherever a `Model` is that needs no bodies:
 `mass_matrix`, `bias_force`, `forward_dynamics`, energies, constraints, `simulate`. Generalised forces are the components
-of one-forms in these coordinates: what acts on dq by tau . dq. Those of a scene are its forces.
+of one-forms in these coordinates, with virtual work tau . dq; a scene adds its forces to them.
 """
 
 import abc
@@ -25,7 +25,7 @@ from jaxdyn.systems.start import check_mass_matrix
 
 
 class System(eqx.Module):
-    """What the dynamics need of a system in coordinates with v = dq/dt: M(q, t) and h(q, v, t)."""
+    """Interface of a system in coordinates with v = dq/dt: M(q, t) and h(q, v, t)."""
 
     nq: eqx.AbstractVar[int]
 
@@ -36,11 +36,11 @@ class System(eqx.Module):
 
     @abc.abstractmethod
     def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Array:
-        """M(q, t), (nv, nv), symmetric."""
+        """Mass matrix M(q, t), (nv, nv), symmetric."""
 
     @abc.abstractmethod
     def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array:
-        """h(q, v, t) in M a + h = tau, (nv,)."""
+        """Bias force h(q, v, t) in M a + h = tau, (nv,)."""
 
     @abc.abstractmethod
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array:
@@ -55,30 +55,34 @@ class System(eqx.Module):
         return self.bias_force(q, jnp.zeros_like(q), t)
 
     def christoffel_symbols(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv nv"]:
-        """Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i), of the first kind, (nv, nv, nv)."""
+        """Christoffel symbols Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i), of the first kind, (nv, nv, nv)."""
         return symbols(jax.jacfwd(self.mass_matrix)(q, t))
 
     def coriolis_matrix(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, "nv nv"]:
-        """C_ij = sum_k Gamma_ijk v_k with the Christoffel symbols of M, (nv, nv): dM/dt = C + C^T for constant t."""
+        """Coriolis matrix C_ij = sum_k Gamma_ijk v_k with the Christoffel symbols of M, (nv, nv).
+
+        dM/dt = C + C^T for constant t.
+        """
         derivative = jax.jacfwd(self.mass_matrix)(q, t)
         rate = jnp.einsum("ijk,k->ij", derivative, v)
-        turned = jnp.einsum("ikj,k->ij", derivative, v)
-        return 0.5 * (rate + turned - turned.T)
+        transposed = jnp.einsum("ikj,k->ij", derivative, v)
+        # The skew part of the transposed term completes dM/dt = C + C^T, so that dM/dt - 2 C is skew.
+        return 0.5 * (rate + transposed - transposed.T)
 
     def inverse_dynamics(
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
-        """M a + h, (nv,)."""
+        """Generalised force M a + h, (nv,)."""
         return _product(self.mass_matrix(q, t), a) + self.bias_force(q, v, t)
 
     def forward_dynamics(
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
-        """M^-1 (tau - h), (nv,)."""
+        """Acceleration M^-1 (tau - h), (nv,)."""
         return run(_acceleration, self, q, v, tau, t, otherwise=_acceleration)
 
     def check_start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> None:
-        """Refuse a state from which no motion can be computed. Nothing is done where a number is traced.
+        """Refuse a state from which no motion can be computed; traced states are not checked.
 
         **Raises:** ValueError for a mass matrix that is not finite or not positive definite, with its rank.
         """
@@ -91,7 +95,7 @@ def _acceleration(system: System, q, v, tau, t):
 
 
 class MetricSystem(System):
-    """A system given by a metric and a potential: L = 1/2 v . M(q) v - V(q). Without a potential it moves on geodesics.
+    """System given by a metric and a potential: L = 1/2 v . M(q) v - V(q). Without a potential it moves along geodesics.
 
     h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq takes one derivative along the motion and one gradient: neither the Christoffel
     symbols nor second derivatives are formed.
@@ -124,41 +128,42 @@ class MetricSystem(System):
         more = "" if parameters is None else ", t, parameters"
         self.metric = as_pytree(metric, "metric", "q" + more)
         self.potential = None if potential is None else as_pytree(potential, "potential", "q" + more)
-        self.nq = checked_size(nq)
+        self.nq = check_size(nq)
         self.parameters = jax.tree.map(as_parameter, parameters)
 
     def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv"]:
-        """M as given, (nv, nv)."""
-        return called(self.metric, (self.nq, self.nq), "metric", (q,), t, self.parameters)
+        """Mass matrix M as given, (nv, nv)."""
+        return evaluate_callback(self.metric, (self.nq, self.nq), "metric", (q,), t, self.parameters)
 
     def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
-        """h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq, (nv,)."""
+        """Bias force h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq, (nv,)."""
 
         def momentum(q, t):
             return _product(self.mass_matrix(q, t), v)
 
+        # The derivative along the motion is M_dot v; with v held fixed, the pull-back of v is the gradient of v . M v.
         _, rate = jax.jvp(momentum, (q, t), (v, jnp.ones_like(t)))
         _, pull = jax.vjp(lambda q: momentum(q, t), q)
         force = rate - 0.5 * pull(v)[0]
         return force if self.potential is None else force + self.gravity_force(q, t)
 
     def gravity_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nv"]:
-        """dV/dq, (nv,)."""
+        """Gravity force dV/dq, (nv,)."""
         return jnp.zeros_like(q) if self.potential is None else jax.grad(self.potential_energy)(q, t)
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        """v . M v / 2, (), J."""
+        """Kinetic energy v . M v / 2, (), J."""
         return 0.5 * jnp.sum(v * _product(self.mass_matrix(q, t), v))
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
-        """V as given, (), J; zero when there is none."""
+        """Potential energy V as given, (), J; zero when there is none."""
         if self.potential is None:
             return jnp.zeros((), q.dtype)
-        return called(self.potential, (), "potential", (q,), t, self.parameters)
+        return evaluate_callback(self.potential, (), "potential", (q,), t, self.parameters)
 
 
 class ExplicitSystem(System):
-    """A system given by its equations of motion: M(q) a + h(q, v) = tau.
+    """System given by its equations of motion: M(q) a + h(q, v) = tau.
 
     **Arguments:**
 
@@ -191,30 +196,30 @@ class ExplicitSystem(System):
         self._mass_matrix = as_pytree(mass_matrix, "mass_matrix", "q" + more)
         self._bias_force = as_pytree(bias_force, "bias_force", "q, v" + more)
         self._potential = None if potential is None else as_pytree(potential, "potential", "q" + more)
-        self.nq = checked_size(nq)
+        self.nq = check_size(nq)
         self.parameters = jax.tree.map(as_parameter, parameters)
 
     def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv"]:
-        """M as given, (nv, nv)."""
-        return called(self._mass_matrix, (self.nq, self.nq), "mass_matrix", (q,), t, self.parameters)
+        """Mass matrix M as given, (nv, nv)."""
+        return evaluate_callback(self._mass_matrix, (self.nq, self.nq), "mass_matrix", (q,), t, self.parameters)
 
     def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
-        """h as given, (nv,)."""
-        return called(self._bias_force, (self.nq,), "bias_force", (q, v), t, self.parameters)
+        """Bias force h as given, (nv,)."""
+        return evaluate_callback(self._bias_force, (self.nq,), "bias_force", (q, v), t, self.parameters)
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        """v . M v / 2, (), J."""
+        """Kinetic energy v . M v / 2, (), J."""
         return 0.5 * jnp.sum(v * _product(self.mass_matrix(q, t), v))
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
-        """V as given, (), J. **Raises:** ValueError when it was not."""
+        """Potential energy V as given, (), J. **Raises:** ValueError when it was not given."""
         if self._potential is None:
-            raise ValueError("this ExplicitSystem has no potential energy; pass potential= when making it")
-        return called(self._potential, (), "potential", (q,), t, self.parameters)
+            raise ValueError("this ExplicitSystem has no potential energy; pass potential= to its constructor")
+        return evaluate_callback(self._potential, (), "potential", (q,), t, self.parameters)
 
 
 def velocity_to_rate(system, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nq"]:
-    """dq/dt (nq,) for the velocity v of any system: H(q) v for a `Model`, else v."""
+    """Rate dq/dt (nq,) for the velocity v of any system: H(q) v for a `Model`, else v."""
     return configuration_rate(system, q, v) if isinstance(system, Model) else v
 
 
@@ -222,7 +227,7 @@ def rate_to_velocity(system, q: Float[Array, " nq"], rate: Float[Array, " nq"]) 
     """Velocity v (nv,) of any system whose dq/dt is `rate` (nq,), tangent to its manifold."""
     if not isinstance(system, Model):
         return rate
-    # What follows the joints says nothing that they do not say.
+    # Dependent coordinates carry no information beyond the joints'.
     rate = rate[: system.topology.nq]
     (v,) = jax.linear_transpose(lambda v: joint_rates(system, q, v), jnp.zeros(system.nv, rate.dtype))(rate)
     if not has_quaternions(system):
@@ -246,23 +251,23 @@ def displacement(system, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -> Fl
 
 
 def has_quaternions(system) -> bool:
-    """Whether q holds quaternions, which must stay on a unit sphere."""
+    """Decide whether q holds quaternions, which must stay on the unit sphere."""
     return isinstance(system, Model) and any(kind in ("spherical", "free") for kind in system.topology.kinds)
 
 
-def has_followers(system) -> bool:
-    """Whether q holds numbers behind the joints' coordinates that are functions of these (see `Model.followed`)."""
+def has_dependent_coordinates(system) -> bool:
+    """Decide whether q has dependent coordinates, functions of the joints' (see `Model.complete_configuration`)."""
     return isinstance(system, Model) and system.nq > system.topology.nq
 
 
-def retracts(system) -> bool:
-    """Whether `retract` changes anything."""
-    return has_quaternions(system) or has_followers(system)
+def needs_retraction(system) -> bool:
+    """Decide whether `retract` changes anything."""
+    return has_quaternions(system) or has_dependent_coordinates(system)
 
 
 def retract(system, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
-    """q with unit quaternions, and with what follows the joints where it belongs, of any system."""
-    return normalize(system, q) if retracts(system) else q
+    """Project q of any system to its manifold: unit quaternions, and dependent coordinates that solve their equations."""
+    return normalize(system, q) if needs_retraction(system) else q
 
 
 @compiled
@@ -271,8 +276,8 @@ def symbols(derivative: Float[Array, "n n n"]) -> Float[Array, "n n n"]:
     return 0.5 * (derivative + derivative.transpose(0, 2, 1) - derivative.transpose(2, 1, 0))
 
 
-def called(function, shape, name, state, t, parameters):
-    """What a function of the user returned for the state, or for (state, t, parameters) when it has parameters."""
+def evaluate_callback(function, shape, name, state, t, parameters):
+    """Evaluate a user's function of the state, or of (state, t, parameters) when there are parameters."""
     value = function(*state) if parameters is None else function(*state, t, parameters)
     if jnp.shape(value) != shape:
         size = state[0].shape[0]
@@ -286,19 +291,19 @@ def called(function, shape, name, state, t, parameters):
 _mass_matrix_compiled = eqx.filter_jit(lambda system, q, t: system.mass_matrix(q, t))
 
 
-def checked_size(nq) -> int:
-    """nq, a positive integer."""
+def check_size(nq) -> int:
+    """Check that nq is a positive integer."""
     if isinstance(nq, bool) or not isinstance(nq, int) or nq < 1:
         raise ValueError(f"nq is {nq!r}; pass the number of coordinates, a positive integer")
     return nq
 
 
 def as_parameter(leaf):
-    """A Python number as a float array, so that it is a leaf that can be differentiated; anything else as it is."""
+    """Convert a Python number to a float array, a leaf that can be differentiated; other leaves are returned unchanged."""
     return jnp.asarray(leaf, float) if isinstance(leaf, (int, float)) and not isinstance(leaf, bool) else leaf
 
 
 if TYPE_CHECKING:
     SceneLike = Scene | Model | System
 else:
-    SceneLike = Any  # `as_scene` takes them, and functions say which they need
+    SceneLike = Any  # `as_scene` checks them

@@ -1,9 +1,9 @@
-"""The recursions over a tree of rigid bodies, in link frames, written with 3-vectors, 6-vectors and small matrices.
+"""Recursions over a tree of rigid bodies, in link frames, written with 3-vectors, 6-vectors and small matrices.
 
 | module        | equations                                                                                    |
 |---------------|----------------------------------------------------------------------------------------------|
-| `frames`      | canonical link frames (joint axis on z, Denavit-Hartenberg) and masses moved between bodies    |
-| `transforms`  | what a change of frame does to twists, wrenches and inertias                                 |
+| `frames`      | canonical link frames (joint axis on z, Denavit-Hartenberg) and masses transferred between bodies    |
+| `transforms`  | changes of frame of twists, wrenches and inertias                                            |
 | `links`       | joint transforms and motion subspaces of every joint kind                                    |
 | `rnea`        | recursive Newton-Euler: inverse dynamics, bias and gravity force                             |
 | `crba`        | composite rigid bodies: the mass matrix                                                      |
@@ -12,9 +12,9 @@
 
 EQUATIONS sections 4 and 5; Featherstone (2008), chapters 5 to 7. Twists are (v, omega) and wrenches (f, n), linear part first.
 
-The functions are meant to be expanded to single numbers by `jaxdyn.compile`, where a known 0 or 1 costs nothing. They run as
-they stand too, slowly. Leaves of the model whose values are known while tracing are read as numpy arrays, so that their
-zeros are seen; of traced leaves only those zeros are used that the topology declares (joint kinds, gravity or armature None).
+The functions are written to be expanded to scalar programs by `jaxdyn.compile`, where a known 0 or 1 costs nothing. They also
+run unexpanded, slowly. Leaves of the model whose values are known while tracing become numpy arrays, so that their
+zeros are known; of traced leaves only the zeros declared by the topology are used (joint kinds, gravity or armature None).
 
 This package imports `jaxdyn.compile`, the Lie groups and `jaxdyn.model.tree`. It checks, and is checked by,
 `jaxdyn.dynamics.world_frame` and `jaxdyn.dynamics.scans`, and imports neither.

@@ -1,4 +1,4 @@
-"""Products and choices that stay in numpy while their operands are known, and are one operation of a traced program if not."""
+"""Products and selections by numpy for known operands, by one operation of the traced program otherwise."""
 
 from typing import NamedTuple
 
@@ -9,56 +9,59 @@ from jaxdyn.compile import is_concrete
 
 
 def is_known(*arrays) -> bool:
-    """Whether the values of all arrays can be read while tracing."""
+    """Decide whether the values of all arrays are known while tracing."""
     return is_concrete(*arrays)
 
 
-def known_as_numpy(array):
-    """A leaf of the model: as a numpy array if its values are known, as it is if it is traced."""
+def as_numpy_if_known(array):
+    """Convert a leaf with known values to numpy; a traced leaf is returned unchanged."""
+    # Numpy operations on known numbers run at trace time, so their zeros are dropped before anything is compiled.
     return np.asarray(array) if array is not None and is_known(array) else array
 
 
 def contract(a, b, axes_a: tuple[int, ...], axes_b: tuple[int, ...]):
-    """Sum of products over some axes of each; the other axes of `a` come first."""
+    """Contract some axes of two tensors; the remaining axes of `a` come first."""
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return np.tensordot(a, b, (axes_a, axes_b))
+    # The highest precision: GPUs may round float32 products to TF32.
     return lax.dot_general(a, b, ((axes_a, axes_b), ((), ())), precision=lax.Precision.HIGHEST)
 
 
 def dot(a, b):
-    """a b for a tensor, matrix or vector `a` and a matrix or vector `b`: over the last axis of `a`, the first of `b`."""
+    """Product a b for a tensor, matrix or vector `a` and a matrix or vector `b`: over the last axis of `a`, the first of `b`."""
     return contract(a, b, (a.ndim - 1,), (0,))
 
 
-def transposed_dot(a, b):
-    """a^T b for a matrix `a` and a matrix or vector `b`."""
+def dot_transpose(a, b):
+    """Product a^T b for a matrix `a` and a matrix or vector `b`."""
     return contract(a, b, (0,), (0,))
 
 
 def outer(a, b):
-    """a b^T for vectors."""
+    """Outer product a b^T of vectors."""
     return contract(a, b, (), ())
 
 
 def select(mask: np.ndarray, a, b):
-    """Entries of `a` where the known mask is true, of `b` elsewhere; all of one shape."""
+    """Select entries of `a` where the known mask is true, of `b` elsewhere; all of one shape."""
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        # A mask of numpy is resolved when the program is expanded: unselected entries are never computed.
         return np.where(mask, a, b)
     return lax.select(mask, a, b)
 
 
 def transpose(a):
-    """a^T for a matrix."""
+    """Transpose of a matrix."""
     return a.T if isinstance(a, np.ndarray) else lax.transpose(a, (1, 0))
 
 
 def symmetric(a):
-    """The symmetric matrix whose upper triangle is that of `a`; the lower triangle need not be computed."""
+    """Symmetric matrix with the upper triangle of `a`, whose lower triangle then need not be computed."""
     return select(UPPER[a.shape[0]], a, transpose(a))
 
 
 def join(parts, axis: int):
-    """Concatenation."""
+    """Concatenate along an axis."""
     if all(isinstance(x, np.ndarray) for x in parts):
         return np.concatenate(parts, axis)
     return lax.concatenate(parts, axis)
@@ -72,7 +75,7 @@ def part(a, start: int, stop: int, axis: int = 0):
 
 
 def entry(a, i: int, axis: int = 0):
-    """Entry i along an axis, which is left out."""
+    """Entry i along an axis, which is dropped."""
     if isinstance(a, np.ndarray):
         return np.take(a, i, axis)
     return lax.squeeze(lax.slice_in_dim(a, i, i + 1, axis=axis), (axis,))
@@ -89,7 +92,7 @@ def _hat_tensor() -> np.ndarray:
 
 
 class Constants(NamedTuple):
-    """Constant tensors of mechanics, in one data type."""
+    """Constant tensors of the recursions, in one data type."""
 
     hat: np.ndarray  # (3, 3, 3): hat(w) = hat . w, hat(w) x = w x x
     shift: np.ndarray  # (6, 6, 3): twist at a point r from that at the origin: (1 + shift . r) V
@@ -100,11 +103,12 @@ class Constants(NamedTuple):
     eye6: np.ndarray
 
 
+# By dtype: programs compare known operands by identity, so the same tensors must be used each time.
 _cache: dict = {}
 
 
 def constants(dtype) -> Constants:
-    """The constant tensors in a data type."""
+    """Constant tensors in a data type, built once."""
     dtype = np.dtype(dtype)
     if dtype not in _cache:
         hat = _hat_tensor()

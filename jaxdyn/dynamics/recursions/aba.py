@@ -20,7 +20,7 @@ from jaxdyn.model.tree import Model
 def aba(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
     """Forward dynamics a = M^-1 (tau - C v - N) by the articulated-body algorithm.
 
-    Velocity terms are gathered outward as the wrenches that zero joint accelerations would need, so that the inward and
+    Velocity terms enter as the body wrenches of zero joint accelerations, computed outward, so that the inward and
     outward sweeps are those of a plain M^-1.
 
     **Arguments:** `q` (nq,); `v` (nv,) rad/s or m/s; `tau` (nv,) generalised forces, N m or N.
@@ -34,7 +34,7 @@ def aba(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float
 
 
 def _free_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
-    """Forward dynamics a (nv,) and the function f -> M^-1 f, from one factorisation of M."""
+    """Forward dynamics a (nv,), and the function f -> M^-1 f, from one factorisation of M."""
     links = links_of(model)
     chains = joint_transforms(links, q)
     wrenches = body_wrenches(links, chains, unit_velocity(links, v))
@@ -49,9 +49,10 @@ def aba_with_columns(
     tau: Float[Array, " nv"],
     columns: Float[Array, "nv k"],
 ) -> tuple[Float[Array, " nv"], Float[Array, "nv k"]]:
-    """Forward dynamics a (nv,) and M^-1 times `columns` (nv, k), from one factorisation of M, in O(nb k) operations."""
+    """Forward dynamics a (nv,), and M^-1 times `columns` (nv, k), from one factorisation of M, in O(nb k) operations."""
     check_shapes(model, q=q, v=v, tau=tau)
     a, times = _free_and_inverse(model, q, v, tau)
+    # Batching over columns shares the factors, which do not depend on them.
     return a, jax.vmap(times, 1, 1)(columns)
 
 
@@ -69,7 +70,7 @@ def aba_tangent(
 
 
 def mass_matrix_inverse_times(model: Model, q: Float[Array, " nq"], forces: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """M(q)^-1 times generalised forces (nv,), without forming M: two sweeps over the articulated bodies."""
+    """Product of M(q)^-1 and generalised forces (nv,), without forming M: two sweeps over the articulated bodies."""
     check_shapes(model, q=q, forces=forces)
     return solve(factorize(model, q), forces)
 
@@ -87,8 +88,10 @@ def mass_matrix_sqrt(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv n
     for i in range(model.nb):
         S = links.subspaces[i]
         for j, (gain, inverse) in enumerate(zip(factors.gains[i], factors.inverses[i], strict=True)):
+            # det M is the product of the pivots D, so each diagonal entry of W is sqrt(D).
             root = 1 / jnp.sqrt(inverse)
             force = (gain * root).reshape(6, 1)
+            # Within a joint, elimination starts at column 0: later columns are zero in the rows of earlier ones.
             own = [np.zeros((1, 1), q.dtype)] * j + [root.reshape(1, 1)]
             own += [dot(entry(S, k, 1).reshape(1, 6), force) for k in range(j + 1, S.shape[1])]
             pieces = dict([(i, join(own, 0)), *ancestor_rows(links, factors.chains, i, force)])

@@ -1,11 +1,11 @@
-"""Articulated-body inertias: the factorisation M = W W^T over the tree, and M^-1 times a vector by two sweeps.
+"""Articulated-body inertias: the factorisation M = W W^T over the tree, and solves M^-1 f by two sweeps.
 
-Body i with all bodies that it carries, their joints free to move, answers an acceleration of its frame like one body of the
+Body i and its descendants, with free joints, respond to an acceleration of its frame like one body of the
 articulated inertia A. To pass a joint with the motion subspace s, one degree of freedom is eliminated,
 
     U = A s,   D = s^T U + armature,   A <- A - U U^T / D,
 
-a joint of several by one after the other. The gains U/D and pivots D are all that the sweeps need.
+those of a joint with several one after the other. The gains U/D and pivots D are all that the sweeps need.
 
 Source: EQUATIONS section 5; Featherstone (2008) section 7.3; Rodriguez, Jain & Kreutz-Delgado (1992).
 """
@@ -33,7 +33,7 @@ from jaxdyn.model.tree import Model
 
 
 class ArticulatedFactors(NamedTuple):
-    """M factored: per body and degree of freedom, in the order of elimination, the gain U/D (6,) and 1/D."""
+    """Factorisation of M: per body and degree of freedom, in the order of elimination, the gain U/D (6,) and 1/D."""
 
     links: Links
     chains: list[Chain]
@@ -43,7 +43,7 @@ class ArticulatedFactors(NamedTuple):
 
 def spatial_inertia(moments):
     """Spatial inertia (6, 6) of a pseudo-inertia (4, 4): [[m, -hat(h)], [hat(h), tr(S) 1 - S]] with second moments S."""
-    # Twist a moves the point r at the velocity E_a (r, 1) with E = `moment`, so I_ab = sum of m E_a (r, 1) . E_b (r, 1).
+    # Twist a gives the point r the velocity E_a (r, 1) with E = `moment`, so I_ab = sum of m E_a (r, 1) . E_b (r, 1).
     field = constants(moments.dtype).moment
     tensor = np.einsum("aik,bil->abkl", field, field)
     return contract(tensor, moments, (2, 3), (0, 1))
@@ -57,7 +57,7 @@ def factorize(model: Model, q: Float[Array, " nq"]) -> ArticulatedFactors:
 
 
 def factorize_at(links: Links, chains: list[Chain]) -> ArticulatedFactors:
-    """`factorize` with the links and joint transforms given."""
+    """Factorise M with given links and joint transforms."""
     nb = links.model.nb
     total = [spatial_inertia(moments) for moments in links.moments]
     armatures = None if links.armature is None else by_joint(links, links.armature)
@@ -77,14 +77,15 @@ def factorize_at(links: Links, chains: list[Chain]) -> ArticulatedFactors:
 
 
 def _eliminate(A, s, k, armature):
-    """One degree of freedom eliminated: A - U U^T/D, U/D and 1/D; `k` is the coordinate that s spans alone, or None."""
+    """Eliminate one degree of freedom: A - U U^T/D, U/D and 1/D; `k` is the coordinate that s spans alone, or None."""
     U = dot(A, s)
     D = dot(s, U) if armature is None else dot(s, U) + armature
-    inverse = 1 / jnp.where(D > 0, D, jnp.full_like(D, jnp.nan))  # a pivot of M, positive if M is positive definite
+    # Pivots of a positive definite M are positive; NaN marks any other M.
+    inverse = 1 / jnp.where(D > 0, D, jnp.full_like(D, jnp.nan))
     gain = U * inverse
     rest = A - outer(U, gain)
     if armature is None and k is not None:
-        # Along that coordinate nothing is left, and the gain is one.
+        # Exact zeros and ones along that coordinate, which rounding would leave as 1e-17 and scalar programs could not drop.
         along = np.eye(6, dtype=A.dtype)[k]
         gain = select(along > 0, along, gain)
         cross = np.maximum.outer(along, along) > 0
@@ -93,9 +94,9 @@ def _eliminate(A, s, k, armature):
 
 
 def inward(factors: ArticulatedFactors, force: list, wrenches: list | None = None) -> list[list]:
-    """What is left of the forces at each joint once the wrenches on the bodies that it carries are met: D^(1/2) W^-1 tau.
+    """Residual joint forces D^(1/2) W^-1 tau, less the wrenches on the bodies that each joint carries.
 
-    **Arguments:** `force`, per joint (nj,), on unit screws; `wrenches`, per body (6,), that its motion needs, or None.
+    **Arguments:** `force`, per joint (nj,), on unit screws; `wrenches`, per body (6,), of its inertial motion, or None.
 
     **Returns:** per joint, a list of numbers, one for each degree of freedom.
     """
@@ -109,10 +110,11 @@ def inward(factors: ArticulatedFactors, force: list, wrenches: list | None = Non
             u = tau if F is None else tau - dot(entry(links.subspaces[i], j, 1), F)
             left[i].append(u)
             given = gain * u if F is None else F + gain * u
-            if k is not None and links.armature is None:  # the joint transmits its own force
+            if k is not None and links.armature is None:  # along its axis the joint transmits exactly tau
                 along = np.eye(6, dtype=gain.dtype)[k]
                 given = select(along > 0, along * tau, given)
             F = given
+        # No wrench yet means zero, for which nothing is computed.
         parent = links.parents[i]
         if parent >= 0:
             up = wrench_to_parent(factors.chains[i], F)
@@ -121,13 +123,14 @@ def inward(factors: ArticulatedFactors, force: list, wrenches: list | None = Non
 
 
 def outward(factors: ArticulatedFactors, left: list[list]) -> list:
-    """Accelerations (nj,) of the joints, on unit screws, from what `inward` left at each."""
+    """Accelerations (nj,) of the joints, on unit screws, from the residuals of `inward`."""
     links = factors.links
     twists: list = [None] * links.model.nb
     out: list = []
     for i, parent in enumerate(links.parents):
         V = twist_to_child(factors.chains[i], twists[parent]) if parent >= 0 else None
         joint_accelerations: list = [None] * len(left[i])
+        # In the reverse order of the elimination: back substitution within the joint.
         for j in reversed(range(len(joint_accelerations))):
             s, gain = entry(links.subspaces[i], j, 1), factors.gains[i][j]
             free = left[i][j] * factors.inverses[i][j]
@@ -143,7 +146,7 @@ def outward(factors: ArticulatedFactors, left: list[list]) -> list:
 
 
 def solve(factors: ArticulatedFactors, force: Float[Array, " nv"], wrenches: list | None = None) -> Float[Array, " nv"]:
-    """M^-1 times generalised forces (nv,), less what `wrenches` on the bodies ask for; `jax.vmap` for several columns."""
+    """Solve M a = force - (generalised forces of `wrenches` on the bodies), (nv,); `jax.vmap` for several columns."""
     links = factors.links
     left = inward(factors, by_joint(links, unit_force(links, force)), wrenches)
     flat = [x for joint in outward(factors, left) for x in joint]

@@ -1,13 +1,14 @@
 """Canonical link frames: the axis of every one-degree-of-freedom joint is the z axis of the frame of the body it moves.
 
-Where the model's geometry is known while tracing, the freedom that is left (a turn about z and a slide along it) is used
-as Denavit and Hartenberg did: a body's x axis is the common normal of its own joint axis and that of its first child. The
-home pose of a body in its parent then is a screw along z, a screw along x, and a screw along z that joins the joint's own,
+Where the model's geometry is known while tracing, the remaining freedom of choice (rotation about z, translation along
+it) is fixed as Denavit and Hartenberg did: a body's x axis is the common normal of its own joint axis and that of its
+first child. The home pose of a body in its parent then is a screw along z, a screw along x, and a screw along z that
+joins the joint's own,
 
     home = screw_z(phi, e) screw_x(alpha, r) screw_z(theta, d),
 
-where the first is nothing for a first child. Each turns one plane only, which costs a spatial inertia 58 operations
-instead of 240. Of geometry that is traced, home poses stay general; the frame then depends smoothly on the joint's axis.
+where the first is the identity for a first child. Each rotates in one plane only, which costs a spatial inertia 58 operations
+instead of 240. With traced geometry, home poses stay general; the frame then depends smoothly on the joint's axis.
 
 Source: Denavit & Hartenberg (1955); Khalil & Kleinfinger (1986) for trees; Duff et al. (2017) for the smooth frame.
 """
@@ -21,26 +22,26 @@ from jaxdyn.dynamics.recursions._arrays import is_known
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model, Topology, geometry
 
-# Common normals of lines closer to parallel than this lie too far away: lengths would grow by 1/LEAST_SINE, and with their
-# squares the rounding errors of moments of inertia.
+# Common normals of nearly parallel lines are far away: lengths grow by 1/sin(alpha), and with their
+# squares the rounding errors of moments of inertia. Below this sine the shift stays general.
 LEAST_SINE = 0.2
 
 
-class Turn(NamedTuple):
-    """A known rotation about one axis of the frame, as cosine and sine."""
+class PlaneAngle(NamedTuple):
+    """Known angle of a rotation in a coordinate plane, as cosine and sine."""
 
     cos: float
     sin: float
 
 
 class Home(NamedTuple):
-    """A known home pose as three screws: (phi, e) along z, (alpha, shift) about x with any shift, (theta, d) along z."""
+    """Known home pose as three screws: (phi, e) along z, (alpha, shift) about x with any shift, (theta, d) along z."""
 
-    phi: Turn
+    phi: PlaneAngle
     e: float
-    alpha: Turn
+    alpha: PlaneAngle
     shift: np.ndarray  # (3,), (a, 0, 0) unless the axes are nearly parallel
-    theta: Turn
+    theta: PlaneAngle
     d: float
 
 
@@ -49,9 +50,9 @@ class Frames(NamedTuple):
 
     placement: Any  # (nb, 4, 4): pose of the canonical frame in the body's frame
     home: Any  # (nb, 4, 4): home pose of the canonical frame in the parent's canonical frame
-    screws: list[Home] | None  # the same as screws, where it is known
+    screws: list[Home] | None  # the home poses as screws, where they are known
     rate: Any  # (nb,): norm of the joint's screw, 1 for a unit screw: rad or m for a unit of q
-    pitch: Any  # (nb,): slide along z for a turn by one radian (m); zero for all kinds but helical
+    pitch: Any  # (nb,): translation along z per radian (m); zero for all kinds but helical
 
 
 def canonical_frames(model: Model) -> Frames:
@@ -62,23 +63,25 @@ def canonical_frames(model: Model) -> Frames:
         screws = screws.astype(home.dtype)
     else:
         home, screws = geometry(model)
-    placement, rate, pitch = _on_axes(model.topology, screws, np if known else jnp)
+    placement, rate, pitch = _joint_axis_frames(model.topology, screws, np if known else jnp)
     if not known:
         outer = jnp.concatenate([placement, np.eye(4, dtype=home.dtype)[None]])
         parents = [parent if parent >= 0 else model.nb for parent in model.topology.parents]
         outer = jnp.stack([outer[parent] for parent in parents]) if parents else outer[:0]
         return Frames(placement, _inverse(outer, jnp) @ home @ placement, None, rate, pitch)
+    # Computed cosines of right angles are within a few roundings of 0 and 1; they are snapped to these below.
     eps = 4 * float(np.finfo(home.dtype).eps)
+    # Always in float64: the decomposition divides by sines.
     wide = home.astype(float)
     placement = _denavit_hartenberg(model.topology, wide, placement.astype(float), eps)
-    homes = _relative(model.topology, wide, placement)
-    decomposed = [_screws(pose, eps) for pose in homes]
+    homes = _relative_homes(model.topology, wide, placement)
+    decomposed = [_decompose(pose, eps) for pose in homes]
     rate = np.where(np.abs(rate - 1) <= eps, np.ones_like(rate), rate)
     return Frames(placement.astype(home.dtype), homes.astype(home.dtype), decomposed, rate, pitch)
 
 
-def _on_axes(topology: Topology, screws, xp):
-    """Frames (nb, 4, 4) with z along each joint's axis and the origin on it; norms and pitches of the screws."""
+def _joint_axis_frames(topology: Topology, screws, xp):
+    """Frames (nb, 4, 4) with z along each joint's axis and the origin on it, and norms and pitches of the screws."""
     turns = np.array([kind in SCREW_KINDS and kind != "prismatic" for kind in topology.kinds], bool)[:, None]
     slides = np.array([kind == "prismatic" for kind in topology.kinds], bool)[:, None]
     v, w = screws[:, :3], screws[:, 3:]
@@ -87,16 +90,18 @@ def _on_axes(topology: Topology, screws, xp):
     rate = xp.sqrt(xp.sum(direction**2, 1))
     square = rate**2
     helical = xp.asarray(np.array([kind == "helical" for kind in topology.kinds]), screws.dtype)
+    # w x v / |w|^2 is the point of the axis nearest to the body's origin.
     origin = xp.cross(w, v) * (helical / square)[:, None]
     pitch = xp.sum(w * v, 1) * helical / square
-    rotation = _aligning(direction / rate[:, None], xp)
+    rotation = _align_z(direction / rate[:, None], xp)
     last = xp.broadcast_to(xp.asarray(np.eye(4)[3:], screws.dtype), (topology.nb, 1, 4))
     return xp.concatenate([xp.concatenate([rotation, origin[:, :, None]], 2), last], 1), rate, pitch
 
 
-def _aligning(axes, xp):
-    """Rotations (n, 3, 3) whose third column is the given unit axis (n, 3); smooth except where the axis turns down."""
+def _align_z(axes, xp):
+    """Rotations (n, 3, 3) whose third column is the given unit axis (n, 3); smooth except where z changes sign."""
     x, y, z = axes[:, 0], axes[:, 1], axes[:, 2]
+    # Duff et al.: the sign keeps the denominator sign + z at least 1 in magnitude, for axes near -z too.
     sign = xp.where(z < 0, xp.full_like(z, -1.0), xp.full_like(z, 1.0))
     a = -1.0 / (sign + z)
     b = x * y * a
@@ -111,54 +116,55 @@ def _inverse(pose, xp=np):
     return xp.concatenate([xp.concatenate([turned, -turned @ pose[..., :3, 3:]], -1), pose[..., 3:, :]], -2)
 
 
-def _relative(topology: Topology, home, placement):
+def _relative_homes(topology: Topology, home, placement):
     """Home poses between canonical frames."""
     outer = [placement[parent] if parent >= 0 else np.eye(4) for parent in topology.parents]
     return np.array([_inverse(a) @ h @ b for a, h, b in zip(outer, home, placement, strict=True)]).reshape(-1, 4, 4)
 
 
 def _denavit_hartenberg(topology: Topology, home, placement, eps):
-    """Frames turned about their z axes, and slid along them, such that most home poses are screws along x."""
+    """Rotate frames about their z axes and translate them along these, such that most home poses are screws along x."""
     placement = placement.copy()
     children: list[list[int]] = [[] for _ in topology.parents]
     for i, parent in enumerate(topology.parents):
         if parent >= 0:
             children[parent].append(i)
     screw = [kind in SCREW_KINDS for kind in topology.kinds]
+    # From the leaves: a body's frame depends on that of its first child.
     for i in reversed(range(topology.nb)):
         if screw[i] and children[i]:
             child = home[children[i][0]] @ placement[children[i][0]]
-            if topology.kinds[i] == "prismatic":  # any line along the axis will do
+            if topology.kinds[i] == "prismatic":  # only the direction of its axis matters
                 placement[i, :3, 3] = child[:3, 3]
-            first = _screws(_inverse(placement[i]) @ child, eps)
+            first = _decompose(_inverse(placement[i]) @ child, eps)
             placement[i] = placement[i] @ _screw_z(first.phi, first.e)
     for i, parent in enumerate(topology.parents):
-        if screw[i] and not children[i]:  # the frame of a last body is that of its parent, moved along x
+        if screw[i] and not children[i]:  # a leaf's frame is that of its parent, moved along x
             outer = _inverse(home[i]) @ (placement[parent] if parent >= 0 else np.eye(4))
             if topology.kinds[i] == "prismatic":
                 placement[i, :3, 3] = outer[:3, 3]
-            last = _screws(_inverse(outer) @ placement[i], eps)
+            last = _decompose(_inverse(outer) @ placement[i], eps)
             placement[i] = placement[i] @ _inverse(_screw_z(last.theta, last.d))
     return placement
 
 
-def _screw_z(turn: Turn, length: float):
+def _screw_z(turn: PlaneAngle, length: float):
     c, s = turn
     return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, length], [0, 0, 0, 1.0]])
 
 
 def _snap(x: float, eps: float) -> float:
-    """x, or 0, 1 or -1 within rounding."""
+    """Round x to 0, 1 or -1 within rounding."""
     return float(round(x)) if abs(x) < 2 and abs(x - round(x)) <= eps else float(x)
 
 
-def _turn(cos: float, sin: float, eps: float) -> Turn:
+def _plane_angle(cos: float, sin: float, eps: float) -> PlaneAngle:
     size = np.hypot(cos, sin)
-    return Turn(_snap(cos / size, eps), _snap(sin / size, eps))
+    return PlaneAngle(_snap(cos / size, eps), _snap(sin / size, eps))
 
 
-def _screws(pose, eps) -> Home:
-    """Decomposition of a pose into the screws along z, x and z."""
+def _decompose(pose, eps) -> Home:
+    """Decompose a pose into screws along z, x and z."""
     axis, p = pose[:3, 2], pose[:3, 3]
     sine = np.hypot(axis[0], axis[1])
     reach = eps * (1 + np.abs(p).max())  # lengths below are rounding
@@ -168,12 +174,12 @@ def _screws(pose, eps) -> Home:
 
     e = d = 0.0
     if sine > eps:
-        phi, alpha = _turn(-axis[1], axis[0], eps), _turn(axis[2], sine, eps)
+        phi, alpha = _plane_angle(-axis[1], axis[0], eps), _plane_angle(axis[2], sine, eps)
     else:
-        alpha = Turn(1.0 if axis[2] > 0 else -1.0, 0.0)
+        alpha = PlaneAngle(1.0 if axis[2] > 0 else -1.0, 0.0)
         beside = np.hypot(p[0], p[1]) > reach
-        phi = _turn(p[0], p[1], eps) if beside else Turn(1.0, 0.0)
-    along = phi.cos * p[0] + phi.sin * p[1], phi.cos * p[1] - phi.sin * p[0], p[2]  # seen after the turn by phi
+        phi = _plane_angle(p[0], p[1], eps) if beside else PlaneAngle(1.0, 0.0)
+    along = phi.cos * p[0] + phi.sin * p[1], phi.cos * p[1] - phi.sin * p[0], p[2]  # in axes rotated by phi
     if sine > LEAST_SINE:
         # Feet of the common normal: p = e z + a x + d axis, with axis = (0, -sin alpha, cos alpha).
         d = length(-along[1] / alpha.sin)
@@ -182,6 +188,7 @@ def _screws(pose, eps) -> Home:
         shift = np.array([length(x) for x in along])
     else:
         e, shift = length(along[2]), np.array([length(along[0]), 0.0, 0.0])
+    # What remains of the rotation after phi and alpha is a rotation about the joint's own z axis.
     turned = np.array([[phi.cos, phi.sin, 0], [-phi.sin, phi.cos, 0], [0, 0, 1]]) @ pose[:3, :3]
-    theta = _turn(turned[0, 0], -turned[0, 1], eps)
+    theta = _plane_angle(turned[0, 0], -turned[0, 1], eps)
     return Home(phi, e, alpha, shift, theta, d)

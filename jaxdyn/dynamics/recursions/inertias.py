@@ -1,8 +1,8 @@
-"""Pseudo-inertias of the bodies in canonical frames, with masses on joint axes counted to the parent.
+"""Pseudo-inertias of the bodies in canonical frames, with masses on joint axes transferred to the parent.
 
 The pseudo-inertia of a body is the 4 x 4 matrix of its moments up to the second, the sum of m (r, 1)(r, 1)^T: the second
 moments, the first moment, the mass. A mass on the axis of a revolute joint moves in the same way whether it belongs to the
-body or to its parent, so every body can hand such masses on without a change of the equations of motion. What remains are
+body or to its parent, so such masses can be transferred without changing the equations of motion. The remaining ones are
 the base parameters of the mechanism (Gautier & Khalil 1990), with up to four zeros out of ten numbers. Neither the mass
 matrix nor the pivots of its factorisation change: a transferred inertia annihilates the joint's motion subspace.
 """
@@ -28,7 +28,7 @@ SHARED = {
 
 
 def _moments() -> np.ndarray:
-    """(4, 4, 10): pseudo-inertia from (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz); second moments are tr(I)/2 - I."""
+    """Tensor (4, 4, 10): pseudo-inertia from (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz); second moments are tr(I)/2 - I."""
     tensor = np.zeros((4, 4, 10))
     tensor[3, 3, 0] = 1
     for i in range(3):
@@ -44,7 +44,7 @@ def _moments() -> np.ndarray:
 def pseudo_inertias(model: Model, frames: Frames) -> list:
     """Pseudo-inertias (4, 4) of the bodies in their canonical frames (kg, kg m, kg m^2), numpy arrays where they are known.
 
-    Masses are moved between bodies only if all values are known, where that costs nothing.
+    Masses are transferred between bodies only if all values are known, where that costs nothing.
     """
     known = is_known(model.inertias, frames.placement)
     xp = np if known else jnp
@@ -53,19 +53,22 @@ def pseudo_inertias(model: Model, frames: Frames) -> list:
     total = xp.einsum("ijk,nk->nij", xp.asarray(_moments(), dtype), inertias)
     placement = frames.placement
     turned = xp.swapaxes(placement[:, :3, :3], 1, 2)
+    # Pseudo-inertias transform by congruence with the homogeneous matrix: J' = T J T^T.
     to_frame = xp.concatenate([xp.concatenate([turned, -turned @ placement[:, :3, 3:]], 2), placement[:, 3:]], 1)
     total = to_frame @ total @ xp.swapaxes(to_frame, 1, 2)
     if not known:
         return [total[i] for i in range(model.nb)]
-    return _shared_with_parents(model, total.astype(float), frames.home.astype(float), dtype)
+    return _transfer_to_parents(model, total.astype(float), frames.home.astype(float), dtype)
 
 
-def _shared_with_parents(model: Model, total, home, dtype) -> list:
+def _transfer_to_parents(model: Model, total, home, dtype) -> list:
+    # From the leaves to the root, so that a transferred mass can be transferred again.
     for i in reversed(range(model.nb)):
         shared = np.where(SHARED[model.topology.kinds[i]], total[i], 0)
         total[i] = np.where(SHARED[model.topology.kinds[i]], 0, total[i])
         parent = model.topology.parents[i]
         if parent >= 0:
             total[parent] += home[i] @ shared @ home[i].T
+    # Congruences are symmetric to rounding only; the recursions read one triangle.
     symmetric = 0.5 * (total + np.swapaxes(total, 1, 2))
     return [x.astype(dtype) for x in symmetric]

@@ -11,18 +11,18 @@ import numpy as np
 from jax import lax
 
 from jaxdyn.dynamics.recursions._arrays import (
+    as_numpy_if_known,
     constants,
     contract,
     dot,
+    dot_transpose,
     entry,
     join,
-    known_as_numpy,
     outer,
     part,
     transpose,
-    transposed_dot,
 )
-from jaxdyn.dynamics.recursions.frames import Frames, Turn, canonical_frames
+from jaxdyn.dynamics.recursions.frames import Frames, PlaneAngle, canonical_frames
 from jaxdyn.dynamics.recursions.inertias import pseudo_inertias
 from jaxdyn.dynamics.recursions.transforms import (
     Chain,
@@ -42,7 +42,7 @@ SCREW_COORDINATE = {"revolute": 5, "continuous": 5, "prismatic": 2}  # of (v, om
 
 
 class Links(NamedTuple):
-    """What the recursions read of a model, in canonical link frames; numpy arrays where the values are known."""
+    """Data of a model for the recursions, in canonical link frames; numpy arrays where the values are known."""
 
     model: Model
     frames: Frames
@@ -63,19 +63,21 @@ def links_of(model: Model) -> Links:
     topology, frames = model.topology, canonical_frames(model)
     subspaces = [_subspace(kind, entry(frames.pitch, i)) for i, kind in enumerate(topology.kinds)]
     rate, scale = frames.rate, None
+    # Unit screws, the rule, need no scaling operations at all.
     if not (isinstance(rate, np.ndarray) and (rate == 1).all()):
         widths = [KINDS[kind].nv for kind in topology.kinds]
         spread = np.repeat(np.eye(model.nb, dtype=model.home.dtype), widths, axis=0)
         scale = dot(spread, rate)
-    armature = known_as_numpy(model.armature)
+    armature = as_numpy_if_known(model.armature)
     if armature is not None and scale is not None:
+        # Armature acts on v^2 of the model; on unit velocities it is divided by the square of the scale.
         armature = armature / (scale * scale)
     inertias = pseudo_inertias(model, frames)
-    return Links(model, frames, inertias, subspaces, known_as_numpy(model.gravity), armature, scale)
+    return Links(model, frames, inertias, subspaces, as_numpy_if_known(model.gravity), armature, scale)
 
 
 def unit_velocity(links: Links, v):
-    """Velocities or accelerations (nv,) of unit screws; also takes forces of unit screws to those of the model's."""
+    """Scale velocities or accelerations (nv,) to unit screws; equally, forces of unit screws to the model's."""
     return v if links.scale is None else v * links.scale
 
 
@@ -83,7 +85,7 @@ from_unit_force = unit_velocity
 
 
 def unit_force(links: Links, tau):
-    """Generalised forces (nv,) on unit screws; also takes velocities of unit screws to those of the model's."""
+    """Scale generalised forces (nv,) to unit screws; equally, velocities of unit screws to the model's."""
     return tau if links.scale is None else tau / links.scale
 
 
@@ -91,12 +93,12 @@ from_unit_velocity = unit_force
 
 
 def by_joint(links: Links, values) -> list:
-    """The entries (nj,) of a vector (nv,) that belong to each joint."""
+    """Split a vector (nv,) into the entries (nj,) of each joint."""
     return [part(values, place.start, place.stop) for place in links.model.topology.v_slices]
 
 
 def columns_of(kind: str) -> tuple[int | None, ...]:
-    """Per column of S, the coordinate of (v, omega) that it is the unit vector of, or None."""
+    """Coordinate of (v, omega) whose unit vector each column of S is, or None."""
     return (SCREW_COORDINATE.get(kind),) if kind in SCREW_KINDS else KINDS[kind].columns
 
 
@@ -109,9 +111,10 @@ def _subspace(kind: str, pitch):
 
 
 def joint_transforms(links: Links, q) -> list[Chain]:
-    """Place of every body in its parent at the configuration q (nq,), as factors from the parent to the child."""
+    """Poses of all bodies in their parents at the configuration q (nq,), as factors from the parent to the child."""
     topology = links.model.topology
     turning = [i for i, kind in enumerate(topology.kinds) if kind in TURN_ABOUT_Z]
+    # All cosines and sines in one vector operation.
     angle = _angles(links, q, turning) if turning else None
     rotations = None if angle is None else PlaneRotations(Z, *angle)
     chains = []
@@ -122,7 +125,7 @@ def joint_transforms(links: Links, q) -> list[Chain]:
         joint = _joint_transform(kind, qi, entry(links.frames.rate, i), entry(links.frames.pitch, i), turn)
         screws = links.frames.screws
         if screws is None or kind in ("spherical", "free"):
-            chains.append(_placed(entry(links.frames.home, i), joint))
+            chains.append(_compose(entry(links.frames.home, i), joint))
             continue
         home = screws[i]
         theta = None if kind in TURN_ABOUT_Z and kind != "planar" else home.theta  # those have it in their angle
@@ -133,14 +136,15 @@ def joint_transforms(links: Links, q) -> list[Chain]:
             Transform(np.array([0, 0, home.d], dtype), None if theta is None else _plane_rotation(Z, theta, dtype)),
             joint,
         ]
-        chains.append(_shortened(steps))
+        chains.append(_simplify(steps))
     return chains
 
 
 def _angles(links: Links, q, turning):
-    """Cosines and sines (n,) of the angles by which joints turn about z, the constant theta of the home pose included."""
+    """Cosines and sines (n,) of the joints' rotations about z, including the constant theta of the home pose."""
     topology, dtype = links.model.topology, links.frames.home.dtype
     pick = np.zeros((len(turning), links.model.nq), dtype)
+    # A selection by a constant matrix stays one operation, whatever joints lie between.
     for row, i in enumerate(turning):
         pick[row, topology.q_slices[i].stop - 1] = 1
     angle = dot(pick, q)
@@ -149,8 +153,8 @@ def _angles(links: Links, q, turning):
         angle = angle * (rate[turning] if isinstance(rate, np.ndarray) else jnp.stack([rate[i] for i in turning]))
     if links.frames.screws is None:
         return jnp.cos(angle), jnp.sin(angle)
-    thetas = [links.frames.screws[i].theta if topology.kinds[i] != "planar" else Turn(1.0, 0.0) for i in turning]
-    # Quarter turns only exchange sine and cosine; other angles are added to q.
+    thetas = [links.frames.screws[i].theta if topology.kinds[i] != "planar" else PlaneAngle(1.0, 0.0) for i in turning]
+    # Quarter turns only exchange sine and cosine, exactly; other angles are added to q.
     offset = np.array([0.0 if 0 in turn else np.arctan2(turn.sin, turn.cos) for turn in thetas], dtype)
     if offset.any():
         angle = angle + offset
@@ -160,7 +164,7 @@ def _angles(links: Links, q, turning):
 
 
 def _joint_transform(kind: str, q, rate, pitch, turn) -> Transform:
-    """A joint's own transform; q (nqj,)."""
+    """Transform of a joint at q (nqj,)."""
     up = np.array([0, 0, 1], q.dtype)
     if kind == "prismatic":
         slide = q if isinstance(rate, np.ndarray) and rate == 1 else q * rate
@@ -184,10 +188,11 @@ def quaternion_rotation(q):
 
 
 def _quaternion_tensor() -> np.ndarray:
-    """R = 1 + 2 (w hat(u) + hat(u)^2) for a unit quaternion (w, u)."""
+    """Tensor of the rotation R = 1 + 2 (w hat(u) + hat(u)^2) of a unit quaternion (w, u)."""
     hat, tensor = constants(float).hat, np.zeros((3, 3, 4, 4))
     tensor[:, :, 0, 1:] = hat
     square = np.einsum("ija,jkb->ikab", hat, hat)
+    # Each product of two entries once, in the upper triangle: the expanded program then computes it once.
     for a, b in np.ndindex(3, 3):
         tensor[:, :, 1 + min(a, b), 1 + max(a, b)] += square[:, :, a, b]
     return tensor
@@ -196,22 +201,22 @@ def _quaternion_tensor() -> np.ndarray:
 _QUATERNION = _quaternion_tensor()
 
 
-def _plane_rotation(axis: int, turn: Turn, dtype) -> PlaneRotation | None:
+def _plane_rotation(axis: int, turn: PlaneAngle, dtype) -> PlaneRotation | None:
     if turn == (1, 0):
         return None
     return PlaneRotation(PlaneRotations(axis, np.array([turn.cos], dtype), np.array([turn.sin], dtype)), 0)
 
 
-def _placed(home, joint: Transform) -> Chain:
-    """A home pose (4, 4) of general form and a joint's transform, as one."""
+def _compose(home, joint: Transform) -> Chain:
+    """Compose a general home pose (4, 4) and a joint's transform."""
     rotation, place = part(part(home, 0, 3), 0, 3, 1), entry(part(home, 0, 3), 3, 1)
     shift = place if joint.shift is None else place + dot(rotation, joint.shift)
     turned = rotation if joint.rotation is None else dot(rotation, joint.rotation.matrix(3))
     return (Transform(shift, GeneralRotation(turned)),)
 
 
-def _shortened(steps) -> Chain:
-    """The factors that do something; shifts without a turn between them are added."""
+def _simplify(steps) -> Chain:
+    """Drop identity factors and add up shifts without a rotation between them."""
     chain, shift = [], None
     for step in steps:
         if step.shift is not None and not (isinstance(step.shift, np.ndarray) and not step.shift.any()):
@@ -223,33 +228,34 @@ def _shortened(steps) -> Chain:
 
 
 def pose_in_link(links: Links, body: int, given):
-    """Rotation (3, 3) and position (3,) in a body's canonical frame of a pose (4, 4) given in its body frame; -1: the world."""
-    pose: Any = known_as_numpy(given)
+    """Rotation (3, 3) and position (3,) of a pose (4, 4), converted from a body's frame to its canonical frame; -1: the world."""
+    pose: Any = as_numpy_if_known(given)
     if body >= 0:
         B = entry(links.frames.placement, body)
         R = part(part(B, 0, 3), 0, 3, 1)
-        moved = transposed_dot(
+        converted = dot_transpose(
             R, part(pose, 0, 3) - join([np.zeros((3, 3), pose.dtype), part(part(B, 0, 3), 3, 4, 1)], 1)
         )
     else:
-        moved = part(pose, 0, 3)
-    rotation, place = part(moved, 0, 3, 1), entry(moved, 3, 1)
+        converted = part(pose, 0, 3)
+    rotation, place = part(converted, 0, 3, 1), entry(converted, 3, 1)
     if isinstance(rotation, np.ndarray):
+        # Within rounding of 0, 1 and -1 as above, so that scalar programs drop the products.
         near = np.round(rotation)
         rotation = np.where(np.abs(rotation - near) <= 8 * np.finfo(rotation.dtype).eps, near, rotation)
     return rotation, place
 
 
 def wrench_in_link(links: Links, body: int, F):
-    """A wrench (6,) at a body frame's origin in its axes, in the body's canonical frame."""
+    """Convert a wrench (6,) from a body's frame to its canonical frame."""
     B = entry(links.frames.placement, body)
     rotation, place = part(part(B, 0, 3), 0, 3, 1), entry(part(B, 0, 3), 3, 1)
-    # The body frame's origin seen from the canonical one: the wrench is turned, then moved.
-    return wrench_to_parent((Transform(-transposed_dot(rotation, place), GeneralRotation(transpose(rotation))),), F)
+    # From the body frame's origin to the canonical one: rotate the wrench, then shift it.
+    return wrench_to_parent((Transform(-dot_transpose(rotation, place), GeneralRotation(transpose(rotation))),), F)
 
 
 def as_vector(parts, like):
-    """A vector (nv,) of the entries of all joints."""
+    """Concatenate the entries of all joints to a vector (nv,)."""
     parts = [x if x.ndim else x.reshape(1) for x in parts]
     if not parts:
         return jnp.zeros((0,), like.dtype)

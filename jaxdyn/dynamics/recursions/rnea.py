@@ -4,8 +4,8 @@ Every point r of a body (in its frame) has the acceleration a + K r, where a is 
 
     K = hat(dw) + hat(w)^2.
 
-Multiplied by the body's moments J (4 x 4, see `inertias`), Y = [K a] J = sum of m (a + K r)(r, 1)^T is the flux of momentum:
-its last column is the force that the motion needs, and vee(Y - Y^T) the moment. The velocity of the origin is never needed.
+Multiplied by the body's moments J (4 x 4, see `inertias`), Y = [K a] J = sum of m (a + K r)(r, 1)^T collects the
+inertial forces: its last column is the inertial force, and vee(Y - Y^T) the moment. The velocity of the origin is not needed.
 
 Source: Luh, Walker & Paul (1980); K as in Balafoutis, Patel & Misra (1988); EQUATIONS section 4.
 """
@@ -13,7 +13,7 @@ Source: Luh, Walker & Paul (1980); K as in Balafoutis, Patel & Misra (1988); EQU
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.recursions._arrays import constants, contract, dot, entry, join, part, transposed_dot
+from jaxdyn.dynamics.recursions._arrays import constants, contract, dot, dot_transpose, entry, join, part
 from jaxdyn.dynamics.recursions.links import (
     Links,
     as_vector,
@@ -30,7 +30,7 @@ from jaxdyn.model.tree import Model
 
 
 def wrench_of_acceleration(K, a, moments):
-    """Wrench (f, n) (6,) that a body of the given moments (4, 4) needs for the accelerations a + K r of its points r."""
+    """Inertial wrench (f, n) (6,) of a body of the given moments (4, 4) with accelerations a + K r of its points r."""
     table = constants(moments.dtype)
     Y = dot(join([K, a.reshape(3, 1)], 1), moments)
     return contract(table.moment, Y, (1, 2), (0, 1))
@@ -41,14 +41,14 @@ def _hat(w):
 
 
 def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=None) -> list:
-    """Wrenches (6,) that the motion of each body needs, gravity included: the outward pass.
+    """Inertial wrenches (6,) of all bodies, gravity included: the outward pass.
 
     **Arguments:** `chains` from `joint_transforms`; `v`, `a` (nv,) of unit screws, None for zero; `external` (nb, 6), wrenches
     that act on the bodies in the model's body frames, or None.
     """
     dtype = links.frames.home.dtype
     zero = np.zeros(3, dtype)
-    weight = zero if links.gravity is None else -links.gravity  # the world accelerates upward
+    weight = zero if links.gravity is None else -links.gravity  # gravity as an upward acceleration of the world
     speeds = None if v is None else by_joint(links, v)
     rates = None if a is None else by_joint(links, a)
     motion: list = []  # w, dw, K, acceleration of the origin
@@ -56,6 +56,7 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
     for i, parent in enumerate(links.parents):
         w, dw, K, acc = motion[parent] if parent >= 0 else (zero, zero, np.zeros((3, 3), dtype), weight)
         chain = chains[i]
+        # The parent's K gives the acceleration of every point fixed in it, the child's origin among them.
         r = origin_in_parent(chain)
         acc = rotate_to_child(chain, acc if r is None else acc + dot(K, r))
         w, dw = rotate_to_child(chain, w), rotate_to_child(chain, dw)
@@ -64,12 +65,15 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
         if speeds is not None:
             if slides:
                 slide = dot(part(S, 0, 3), speeds[i])
+                # Coriolis acceleration 2 w x slide, with w of the parent.
                 acc = acc + dot(_hat(w + w), slide)
             if turns:
                 omega = dot(part(S, 3, 6), speeds[i])
                 dw = dw + dot(_hat(w), omega)
                 w = w + omega
                 if slides:
+                    # The joint's own rotation carries its translation with it: omega x slide, for helical, planar and
+                    # free joints.
                     acc = acc + dot(_hat(omega), slide)
         if rates is not None:
             acc = acc + dot(part(S, 0, 3), rates[i]) if slides else acc
@@ -86,7 +90,7 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
 
 
 def _is_nonzero(S) -> bool:
-    """Whether part of a motion subspace is other than zero by declaration."""
+    """Decide whether part of a motion subspace may be nonzero; traced values may."""
     return not isinstance(S, np.ndarray) or bool(S.any())
 
 
@@ -95,7 +99,7 @@ def joint_forces(links: Links, chains: list[Chain], wrenches: list) -> list:
     total: list = list(wrenches)
     tau: list = [None] * len(wrenches)
     for i in reversed(range(len(wrenches))):
-        tau[i] = transposed_dot(links.subspaces[i], total[i])
+        tau[i] = dot_transpose(links.subspaces[i], total[i])
         if links.parents[i] >= 0:
             total[links.parents[i]] = total[links.parents[i]] + wrench_to_parent(chains[i], total[i])
     return tau

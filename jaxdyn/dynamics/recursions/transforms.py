@@ -1,14 +1,14 @@
-"""What a change of frame does to twists, wrenches and inertias: a shift of the origin, then a rotation.
+"""Changes of frame of twists, wrenches and inertias: a shift of the origin, then a rotation.
 
-A frame is placed in another one by factors (r, R): move the origin by r, then turn the axes by R. The factors are kept
+A pose is a chain of factors (r, R): translate the origin by r, then rotate the axes by R. The factors are kept
 apart, because each is mostly zeros and ones, which cost nothing after expansion. With X = [[1, -hat(r)], [0, 1]]:
 
     twist to the child      V -> R^T X V          R here stands for diag(R, R)
     wrench to the parent    F -> X^T R F
     inertia to the parent   A -> X^T R A R^T X
 
-A rotation in a coordinate plane turns a symmetric matrix cheaply: of the 2 x 2 block of that plane only the traceless
-symmetric part changes, and it turns by twice the angle.
+A rotation in a coordinate plane transforms a symmetric matrix cheaply: in the 2 x 2 block of that plane only the traceless
+symmetric part changes, and it rotates by twice the angle.
 """
 
 from typing import Any, NamedTuple
@@ -19,19 +19,19 @@ from jaxdyn.dynamics.recursions._arrays import (
     constants,
     contract,
     dot,
+    dot_transpose,
     entry,
     join,
     select,
     symmetric,
     transpose,
-    transposed_dot,
 )
 
 X, Z = 0, 2
 
 
-def _spread(matrix: np.ndarray, size: int, last: float) -> np.ndarray:
-    """A 3 x 3 matrix for points (3), homogeneous points (4, `last` at the end) or twists (6, twice)."""
+def _extend(matrix: np.ndarray, size: int, last: float) -> np.ndarray:
+    """Extend a 3 x 3 matrix to homogeneous points (4, `last` at the end) or twists (6, block diagonal)."""
     if size == 3:
         return matrix
     if size == 4:
@@ -42,7 +42,7 @@ def _spread(matrix: np.ndarray, size: int, last: float) -> np.ndarray:
 
 
 def _generator(axis: int) -> np.ndarray:
-    """hat(e) of a coordinate axis."""
+    """Generator hat(e) of rotations about a coordinate axis."""
     return constants(float).hat[:, :, axis]
 
 
@@ -51,39 +51,39 @@ class PlaneRotations:
 
     def __init__(self, axis: int, cos, sin):
         self.axis, self.cos, self.sin = axis, cos, sin
-        self._made: dict = {}
+        self._cache: dict = {}
 
     def matrices(self, size: int):
-        """(n, size, size): cos Pi + sin J + (1 - Pi), with J = hat(e) and the projector Pi = -J^2 on the plane."""
-        if size not in self._made:
+        """Matrices (n, size, size): cos Pi + sin J + (1 - Pi), with J = hat(e) and the projector Pi = -J^2 on the plane."""
+        if size not in self._cache:
             J = _generator(self.axis)
             one = np.ones(self.cos.shape, self.cos.dtype)
-            basis = [_spread(-J @ J, size, 0.0), _spread(J, size, 0.0), _spread(np.eye(3) + J @ J, size, 1.0)]
-            self._made[size] = self._combine([self.cos, self.sin, one], basis)
-        return self._made[size]
+            basis = [_extend(-J @ J, size, 0.0), _extend(J, size, 0.0), _extend(np.eye(3) + J @ J, size, 1.0)]
+            self._cache[size] = self._combine([self.cos, self.sin, one], basis)
+        return self._cache[size]
 
-    def doubled(self, size: int):
-        """(n, size, size): sin J R = sin cos J - sin^2 Pi, half of what turning by twice the angle changes."""
-        if -size not in self._made:
+    def double_angle(self, size: int):
+        """Matrices (n, size, size) sin J R = sin cos J - sin^2 Pi, half the change of a rotation by twice the angle."""
+        if -size not in self._cache:
             J = _generator(self.axis)
-            basis = [_spread(J, size, 0.0), _spread(J @ J, size, 0.0)]
-            self._made[-size] = self._combine([self.sin * self.cos, self.sin * self.sin], basis)
-        return self._made[-size]
+            basis = [_extend(J, size, 0.0), _extend(J @ J, size, 0.0)]
+            self._cache[-size] = self._combine([self.sin * self.cos, self.sin * self.sin], basis)
+        return self._cache[-size]
 
-    def one(self, size: int, index: int, doubled: bool = False):
-        """One matrix (size, size) of `matrices` or `doubled`."""
-        key = size, index, doubled
-        if key not in self._made:
-            self._made[key] = entry(self.doubled(size) if doubled else self.matrices(size), index)
-        return self._made[key]
+    def one(self, size: int, index: int, double_angle: bool = False):
+        """Matrix (size, size) with one index of `matrices` or `double_angle`."""
+        key = size, index, double_angle
+        if key not in self._cache:
+            self._cache[key] = entry(self.double_angle(size) if double_angle else self.matrices(size), index)
+        return self._cache[key]
 
     def _combine(self, coefficients, basis):
         rows = join([x.reshape(1, -1) for x in coefficients], 0)
-        return transposed_dot(rows, np.stack(basis).astype(self.cos.dtype))
+        return dot_transpose(rows, np.stack(basis).astype(self.cos.dtype))
 
 
 class PlaneRotation(NamedTuple):
-    """One of several rotations about a coordinate axis."""
+    """One of several rotations about a common coordinate axis."""
 
     all: PlaneRotations
     index: int
@@ -92,45 +92,46 @@ class PlaneRotation(NamedTuple):
         return self.all.one(size, self.index)
 
     def congruence(self, A):
-        """R A R^T for a symmetric matrix."""
+        """Congruence R A R^T of a symmetric matrix."""
         size = A.shape[0]
         dtype = self.all.cos.dtype
-        fixed = np.diag(_spread(np.eye(3) + _generator(self.all.axis) @ _generator(self.all.axis), size, 1.0)) > 0
-        J = _spread(_generator(self.all.axis), size, 0.0).astype(dtype)
-        plane = A + dot(self.all.one(size, self.index, doubled=True), A + dot(dot(J, A), J))
+        fixed = np.diag(_extend(np.eye(3) + _generator(self.all.axis) @ _generator(self.all.axis), size, 1.0)) > 0
+        J = _extend(_generator(self.all.axis), size, 0.0).astype(dtype)
+        # Only the plane's own block needs two products; rows and columns outside of it need one, and the corner none.
+        plane = A + dot(self.all.one(size, self.index, double_angle=True), A + dot(dot(J, A), J))
         half = dot(self.matrix(size), A)
         columns, rows = (np.broadcast_to(x, (size, size)) for x in (fixed, fixed[:, None]))
         return symmetric(select(columns, half, select(rows, transpose(half), plane)))
 
 
 class GeneralRotation:
-    """A rotation of no special form, as a matrix (3, 3)."""
+    """General rotation, as a matrix (3, 3)."""
 
     def __init__(self, rotation):
         self.rotation = rotation
-        self._made = {3: rotation}
+        self._cache = {3: rotation}
 
     def matrix(self, size: int):
-        """The rotation of points (3), homogeneous points (4) or twists (6)."""
-        if size not in self._made:
-            self._made[size] = self._spread(size)
-        return self._made[size]
+        """Rotation of points (3), homogeneous points (4) or twists (6)."""
+        if size not in self._cache:
+            self._cache[size] = self._extend(size)
+        return self._cache[size]
 
-    def _spread(self, size: int):
+    def _extend(self, size: int):
         places = np.zeros((size, size, 3, 3))
         for i, j in np.ndindex(3, 3):
-            places[:, :, i, j] = _spread(np.outer(np.eye(3)[i], np.eye(3)[j]), size, 0.0)
+            places[:, :, i, j] = _extend(np.outer(np.eye(3)[i], np.eye(3)[j]), size, 0.0)
         spread = contract(places.astype(self.rotation.dtype), self.rotation, (2, 3), (0, 1))
         return spread + np.diag([0, 0, 0, 1]).astype(spread.dtype) if size == 4 else spread
 
     def congruence(self, A):
-        """R A R^T for a symmetric matrix."""
+        """Congruence R A R^T of a symmetric matrix."""
         R = self.matrix(A.shape[0])
         return symmetric(contract(dot(R, A), R, (1,), (1,)))
 
 
 class Transform(NamedTuple):
-    """Place of a child frame in its parent: the origin moved by `shift` (3,) and the axes turned; None for neither."""
+    """Pose of a child frame in its parent: the origin shifted by `shift` (3,), then the axes rotated; None for identity."""
 
     shift: object
     rotation: PlaneRotation | GeneralRotation | None
@@ -140,21 +141,21 @@ Chain = tuple[Transform, ...]  # from the parent to the child
 
 
 def shift_matrix(r):
-    """X (6, 6): the twist at the point r from that at the origin, (v + w x r, w)."""
+    """Matrix X (6, 6) from the twist at the origin to that at the point r, (v + w x r, w)."""
     table = constants(r.dtype)
     return table.eye6 + dot(table.shift, r)
 
 
 def rotate_to_child(chain: Chain, vector):
-    """A direction (3,) in the child's axes."""
+    """Rotate a direction (3,) from the parent's to the child's axes."""
     for step in chain:
         if step.rotation is not None:
-            vector = transposed_dot(step.rotation.matrix(3), vector)
+            vector = dot_transpose(step.rotation.matrix(3), vector)
     return vector
 
 
 def origin_in_parent(chain: Chain):
-    """Place (3,) of the child's origin in the parent's frame (m), or None where they coincide."""
+    """Position (3,) of the child's origin in the parent's frame (m), or None where they coincide."""
     place: Any = None
     for step in reversed(chain):
         if place is not None and step.rotation is not None:
@@ -165,38 +166,38 @@ def origin_in_parent(chain: Chain):
 
 
 def twist_to_child(chain: Chain, V):
-    """A twist (6,) or columns of them (6, k) of the parent, at the child's origin in its axes."""
+    """Transform a twist (6,), or columns (6, k), from the parent's frame to the child's."""
     for step in chain:
         if step.shift is not None:
             V = dot(shift_matrix(step.shift), V)
         if step.rotation is not None:
-            V = transposed_dot(step.rotation.matrix(6), V)
+            V = dot_transpose(step.rotation.matrix(6), V)
     return V
 
 
 def wrench_to_parent(chain: Chain, F):
-    """A wrench (6,) or columns of them (6, k) on the child, at the parent's origin in its axes."""
+    """Transform a wrench (6,), or columns (6, k), from the child's frame to the parent's."""
     for step in reversed(chain):
         if step.rotation is not None:
             F = dot(step.rotation.matrix(6), F)
         if step.shift is not None:
-            F = transposed_dot(shift_matrix(step.shift), F)
+            F = dot_transpose(shift_matrix(step.shift), F)
     return F
 
 
 def inertia_to_parent(chain: Chain, A):
-    """A spatial inertia (6, 6) of the child, at the parent's origin in its axes."""
+    """Transform a spatial inertia (6, 6) from the child's frame to the parent's."""
     for step in reversed(chain):
         if step.rotation is not None:
             A = step.rotation.congruence(A)
         if step.shift is not None:
             shift = shift_matrix(step.shift)
-            A = symmetric(transposed_dot(shift, dot(A, shift)))
+            A = symmetric(dot_transpose(shift, dot(A, shift)))
     return A
 
 
 def moments_to_parent(chain: Chain, J):
-    """A pseudo-inertia (4, 4) of the child, at the parent's origin in its axes."""
+    """Transform a pseudo-inertia (4, 4) from the child's frame to the parent's."""
     for step in reversed(chain):
         if step.rotation is not None:
             J = step.rotation.congruence(J)

@@ -21,7 +21,7 @@ from jaxdyn.constraints.base import Rows, position_residual, rows
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extended, force_at
-from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_factored
+from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
 
 
@@ -148,9 +148,9 @@ def solve_rows(Y, active, right):
     count = Y.shape[1]
     factor = cholesky(_product(Y.T, Y) + jnp.diag(1.0 - active + shift * jnp.ones((count,), Y.dtype)))
     right = right * scale[:, None]
-    x = solve_factored(factor, right)
+    x = solve_cholesky(factor, right)
     for _ in range(2):
-        x = x + solve_factored(factor, (right - _product(Y.T, _product(Y, x))) * active[:, None])
+        x = x + solve_cholesky(factor, (right - _product(Y.T, _product(Y, x))) * active[:, None])
     return x * (scale * active)[:, None]
 
 

@@ -14,7 +14,7 @@ from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
-from jaxdyn.forces.piecewise import guards, in_pieces, pieces_of
+from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.hybrid import machine
@@ -30,7 +30,7 @@ from jaxdyn.simulation.solvers.choice import is_fixed, label, unwrapped
 from jaxdyn.simulation.solvers.differentiable import ROOM
 from jaxdyn.simulation.solvers.fixed_steps import too_coarse
 from jaxdyn.simulation.solvers.inputs import has_unit_quaternions
-from jaxdyn.systems.scene import Scene, check_callback, checked_force
+from jaxdyn.systems.scene import Scene, check_callback, check_force
 from jaxdyn.systems.system import retract
 
 OUTPUTS = ("energy", "acceleration", "multipliers", "contact_forces", "torque")
@@ -77,7 +77,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     q0, v0, ts, rtol, atol, stepsize = numbers
     system, outputs = scene.system, options["outputs"]
     control_of: Any = (
-        None if control is None else lambda _, q, v, t: checked_force(control(q, v, t), q, scene.nv, "control")
+        None if control is None else lambda _, q, v, t: check_force(control(q, v, t), q, scene.nv, "control")
     )
     pieces = pieces_of(scene, (), q0, v0, ts[0], control_of)
     elements = elements_of(scene, pieces)
@@ -88,18 +88,18 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
 
     def given(unknown, positive=None):
         scene, control = known(unknown)
-        in_piece = scene if positive is None or not pieces.names else in_pieces(scene, pieces, positive)
+        in_piece = scene if positive is None or not pieces.names else fix_pieces(scene, pieces, positive)
         whole = extended(in_piece)
 
         def effort(q, v, t):
             """Of the control, before limits."""
-            return None if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
+            return None if control is None else check_force(control(q, v, t), q, scene.nv, "control")
 
         def generalized_force(q, v, t):
             force, tau = whole.applied_force(q, v, t), effort(q, v, t)
             if tau is None:
                 return force
-            tau = in_piece.limited(tau)
+            tau = in_piece.clip_effort(tau)
             return tau if force is None else tau + force
 
         return in_piece, generalized_force, lambda q, v, t: guards(scene, q, v, t, effort(q, v, t))
@@ -150,8 +150,8 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
         if "energy" in outputs:
             values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
         if "torque" in outputs:
-            tau = jnp.zeros_like(v) if control is None else checked_force(control(q, v, t), q, scene.nv, "control")
-            values["torque"] = scene_.limited(tau)
+            tau = jnp.zeros_like(v) if control is None else check_force(control(q, v, t), q, scene.nv, "control")
+            values["torque"] = scene_.clip_effort(tau)
         if {"acceleration", "multipliers", "contact_forces"} & set(outputs):
             terms = terms_at(scene_, elements, q, v, t)
             at_time = motion_at(scene_, elements, mode, terms, y["slip"], generalized_force(q, v, t), q, v, t)

@@ -16,7 +16,7 @@ from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.joints import SCREW_KINDS, joint_integrate, joint_rate
 from jaxdyn.model.tree import Model, Topology, _per_joint
 from jaxdyn.simulation.solvers.wrapped import Wrapped
-from jaxdyn.systems.system import has_followers
+from jaxdyn.systems.system import has_dependent_coordinates
 
 
 class LieGroup(Wrapped):
@@ -40,7 +40,7 @@ class LieGroup(Wrapped):
 
     def fitted(self, system: SystemLike) -> diffrax.AbstractSolver:
         """The method for a system. **Raises:** ValueError for one whose q holds more than the coordinates of joints."""
-        if has_followers(system):
+        if has_dependent_coordinates(system):
             raise ValueError(
                 f"solver is LieGroup and the system a {type(system).__name__}, whose contacts have no local coordinates; "
                 "pass the wrapped method itself"

@@ -1,4 +1,4 @@
-"""Solids for bodies that have none: rods between joints, and solids of the same inertia.
+"""Default solids of bodies: rods between joints, and solids of the same inertia.
 
 The inertia of a body about its centre of mass has principal moments I1 <= I2 <= I3, which a uniform solid of the same
 mass m reproduces: the box with edges x^2 = 6 (I2 + I3 - I1) / m, the ellipsoid with half axes a^2 = 5 (I2 + I3 - I1) / 2m,
@@ -22,44 +22,44 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
-from jaxdyn.pictures.grasped import grasped_body, grasped_solids, see_through
+from jaxdyn.pictures.object_solids import object_name, object_solids, see_through
 from jaxdyn.pictures.solids import Shape, Shapes, rod
 from jaxdyn.systems.scene import Scene
 
-_EQUAL = 1e-3  # moments that differ by less, relatively, are taken as equal
-_THIN = 0.012  # radius of rods, as a share of the mechanism's size
-_BULKY = (1.2, 0.5)  # longest and middle edge of a solid beside the rods of its body, as shares of the longest of these
-_SHARE = 0.3  # the same for bodies without rods, as a share of the mechanism's size
+_EQUAL = 1e-3  # relative difference of moments that count as equal
+_THIN = 0.012  # radius of rods, as a fraction of the mechanism's size
+_BULKY = (1.2, 0.5)  # largest longest and middle edge of a solid, as fractions of the longest rod of its body
+_SHARE = 0.3  # the same for bodies without rods, as a fraction of the mechanism's size
 
 
-def completed(scene: Scene, shapes: Shapes) -> Shapes:
-    """The solids given, and inferred ones for bodies with mass that have none. Also for all that rolls."""
+def complete_solids(scene: Scene, shapes: Shapes) -> Shapes:
+    """Add default solids for bodies with mass that have none, and for rolling surfaces."""
     model = scene.system
     carried = {model.topology.frame_bodies[frame_index(model, name)] for name in shapes.frames()}
     drawn = list(shapes)
     size = extent(scene)
     thin = _THIN * size
     rolling, wheeled = _rolling(scene, carried)
-    grasped = grasped_body(scene)
+    grasped = object_name(scene)
     drawn += [see_through(shape) if shape.frame == grasped and grasped is not None else shape for shape in rolling]
     bare = [i for i in range(model.nb) if i not in carried]
     points = _joints_on(scene)
     whole = not shapes
     for i in bare:
-        # Rods complete a drawing that is made of inertias; between the parts of a file they would be in the way.
+        # Rods complete a drawing from inertias; between the visuals of a file they would only clutter.
         rods = _rods(model, i, points[i], thin) if whole else []
         solid = _of_inertia(model, i, thin, i in wheeled)
         longest = max((rod.size[1] for rod in rods), default=_SHARE * size if whole and model.nb > 3 else 0.0)
-        longest *= model.nb > 1  # one body alone is its solid
+        longest *= model.nb > 1  # a single body is drawn as its solid
         if isinstance(scene, Grasp) and model.body_names[i] == grasped:
-            drawn += grasped_solids(scene, solid, thin)
+            drawn += object_solids(scene, solid, thin)
             continue
         drawn += rods + [_or_mark(shape, longest, thin) for shape in solid]
     return Shapes(drawn, shapes.missing)
 
 
 def extent(scene: Scene) -> float:
-    """Size of the mechanism at its neutral configuration, m: the diagonal of its joints, ends of loops and masses."""
+    """Size of the mechanism at its neutral configuration, m: the diagonal of the box around joints, loop ends and masses."""
     model = scene.system
     poses = home_poses(model)
     points = [np.zeros(3)] if (np.array(model.topology.parents) == -1).all() and model.nb > 1 else []
@@ -70,13 +70,13 @@ def extent(scene: Scene) -> float:
             reach = np.sqrt(np.abs(np.trace(moment)) / mass)
             points += [points[-1] + reach * sign for sign in np.array([[1, 1, 1], [-1, -1, -1]]) / np.sqrt(3)]
     for body, pose in _ends(scene):
-        points.append((place_of(model, poses, body) @ pose)[:3, 3])
+        points.append((frame_poses(model, poses, body) @ pose)[:3, 3])
     size = float(np.linalg.norm(np.ptp(np.array(points), axis=0))) if points else 0.0
     return size if size > 0 else 1.0
 
 
 def home_poses(model: Model) -> np.ndarray:
-    """Poses (nb, 4, 4) of all bodies in the world where every joint is neutral."""
+    """Poses (nb, 4, 4) of all bodies in the world at the neutral configuration."""
     poses = np.zeros((model.nb, 4, 4))
     home, screws = np.asarray(model.home, float), np.asarray(model.screws, float)
     for i, (parent, kind) in enumerate(zip(model.topology.parents, model.topology.kinds, strict=True)):
@@ -85,8 +85,8 @@ def home_poses(model: Model) -> np.ndarray:
     return poses
 
 
-def place_of(model: Model, poses: np.ndarray, frame: str | None) -> np.ndarray:
-    """Poses (..., 4, 4) of a frame (None: the world) where the bodies stand at `poses` (..., nb, 4, 4)."""
+def frame_poses(model: Model, poses: np.ndarray, frame: str | None) -> np.ndarray:
+    """Poses (..., 4, 4) of a frame (None: the world) for body poses (..., nb, 4, 4)."""
     if frame is None:
         return np.broadcast_to(np.eye(4), (*poses.shape[:-3], 4, 4))
     index = frame_index(model, frame)
@@ -97,7 +97,7 @@ def place_of(model: Model, poses: np.ndarray, frame: str | None) -> np.ndarray:
 
 
 def pairs(scene: Scene) -> list[Pair]:
-    """The constraints between two frames, as they were declared: they know where their frames are."""
+    """Constraints between two frames of a scene, as declared."""
     return [one.declared(scene.system) for one in scene.constraints if isinstance(one, Pair)]
 
 
@@ -106,7 +106,7 @@ def _ends(scene: Scene) -> list[tuple[str | None, np.ndarray]]:
 
 
 def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
-    """Points (3,) of each body, in its frame, where something holds it: its own joint, those it carries, loops."""
+    """Attachment points (3,) of each body, in its frame: its own joint, child joints, loops."""
     model = scene.system
     points: dict[int, list[np.ndarray]] = {i: [] for i in range(-1, model.nb)}
     home = np.asarray(model.home, float)
@@ -115,7 +115,7 @@ def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
             points[i].insert(0, np.zeros(3))
             points[parent].append(home[i, :3, 3])
     for constraint in pairs(scene):
-        # Of a contact frame A lies on a surface, which no rod leads to, and a rigid grip is one of two surfaces.
+        # Frame A of a contact is on a surface, which gets no rod; a rigid grasp contact has two surfaces.
         if isinstance(constraint, Contact) and constraint.kind == "rigid":
             continue
         for body, pose in constraint.ends() if _has_middles(constraint) else constraint.ends()[1:]:
@@ -127,23 +127,23 @@ def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
 
 
 def _has_middles(constraint: Pair) -> bool:
-    """Whether both frames of a constraint are places in bodies, and none on a surface."""
+    """Decide whether both frames of a constraint are points of bodies, and none is on a surface."""
     round_surface = isinstance(constraint, RollingSphere) and constraint.on == "sphere" and not constraint.inside
     return round_surface or isinstance(constraint, Loop | Distance | RollingContact)
 
 
 def _rods(model: Model, i: int, points: list[np.ndarray], thin: float) -> list[Shape]:
-    """From a body's own joint to all that it carries, and to its centre of mass where it carries nothing."""
+    """Rods from a body's own joint to its child joints, or to its centre of mass where it has none."""
     name = model.body_names[i]
     mass, com, _ = f64.about_com(np.asarray(model.inertias, float)[i])
     start = points[0] if points else com
-    # A rod ends where the next body begins, at the place of that joint at rest.
+    # A rod ends at the home position of the child joint.
     ends = points[1:] if len(points) > 1 or not mass else [com]
     return [rod(name, start, end, thin, source="inertia") for end in ends if np.linalg.norm(end - start) > 2 * thin]
 
 
 def _or_mark(solid: Shape, longest: float, thin: float) -> Shape:
-    """The solid, or a ball at its centre where it is bulky beside a rod of the length `longest`."""
+    """Replace a solid that is bulky compared with a rod of the length `longest` by a ball at its centre."""
     edges = np.sort(np.ptp(solid.triangles()[0] @ solid.pose[:3, :3], axis=0))
     if longest and (edges[2] > _BULKY[0] * longest or edges[1] > _BULKY[1] * longest):
         return dataclasses.replace(solid, kind="ellipsoid", size=(2.5 * thin,) * 3)
@@ -151,7 +151,7 @@ def _or_mark(solid: Shape, longest: float, thin: float) -> Shape:
 
 
 def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
-    """A uniform solid with a body's mass, centre of mass and inertia."""
+    """Uniform solid with a body's mass, centre of mass and inertia."""
     parameters = np.asarray(model.inertias, float)[i]
     mass, com, moment = f64.about_com(parameters)
     name = model.body_names[i]
@@ -164,6 +164,7 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
         radius = float(np.sqrt(max(2 * moment[2, 2] / mass, 0.0)))
         return [Shape(name, "cylinder", (max(radius, least), 2 * least), pose, source="inertia")]
     moments, axes = np.linalg.eigh(moment)
+    # eigh may return a reflection; poses need a rotation.
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1
     pose[:3, :3] = axes
@@ -180,8 +181,8 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
         radius = np.sqrt(max(2 * moments[axis] / mass, 0.0))
         length = np.sqrt(max(12 * across / mass - 3 * radius**2, 0.0))
         if length > 0 or radius > least:
-            turned = np.roll(axes, 2 - axis, axis=1)
-            pose[:3, :3] = turned
+            permuted = np.roll(axes, 2 - axis, axis=1)
+            pose[:3, :3] = permuted
             size = (max(float(radius), least), max(float(length), least))
             return [Shape(name, "cylinder", size, pose, **options)]
     edges = np.sqrt(np.maximum(6 * (moments.sum() - 2 * moments) / mass, 0.0))
@@ -189,7 +190,7 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
 
 
 def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
-    """Wheels and balls of rolling constraints, and the bodies whose centre of mass lies in one of them."""
+    """Wheels and balls of rolling constraints, and the bodies with their centre of mass in one of them."""
     model, shapes, bodies = scene.system, [], set()
     for constraint in pairs(scene):
         if isinstance(constraint, RollingContact):
@@ -221,7 +222,7 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
 
 
 def _surfaces(model: Model, contact: RollingContact, carried: set[int]) -> list[Shape]:
-    """The balls, ellipsoids and cylinders of two surfaces that roll on each other, one for each body."""
+    """Balls, ellipsoids and cylinders of two surfaces in rolling contact, one for each body."""
     shapes = []
     for (frame, pose), shape in zip(contact.ends(), (contact.shape_a, contact.shape_b), strict=True):
         if frame is not None and model.topology.frame_bodies[frame_index(model, frame)] in carried:

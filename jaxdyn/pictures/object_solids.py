@@ -1,6 +1,6 @@
-"""The solid of what a hand holds: of its inertia, or of its contacts where an inertia says too little.
+"""Solid of a grasped object: from its inertia, or from its contacts where the inertia is ambiguous.
 
-It is seen through, so that contact forces and friction cones inside of it show.
+It is translucent, so that contact forces and friction cones inside are visible.
 """
 
 import dataclasses
@@ -16,19 +16,22 @@ from jaxdyn.systems.scene import Scene
 OPACITY = 0.35
 
 
-def grasped_body(scene: Scene) -> str | None:
-    """Name of the body that a hand holds."""
+def object_name(scene: Scene) -> str | None:
+    """Name of the object of a grasp, None for other scenes."""
     return scene.object if isinstance(scene, Grasp) else None
 
 
 def see_through(shape: Shape) -> Shape:
-    """The solid, with what is inside of it showing."""
+    """Make a solid translucent."""
     return dataclasses.replace(shape, opacity=min(shape.opacity, OPACITY))
 
 
-def grasped_solids(scene: Grasp, solids: list[Shape], thin: float) -> list[Shape]:
-    """The solids of a held body: those of its inertia, but a bar between its contacts in a plane, and for three equal moments,
-    which a ball and a cube have, the one of them on whose surface its contacts are."""
+def object_solids(scene: Grasp, solids: list[Shape], thin: float) -> list[Shape]:
+    """Solids of a grasped object from its inertia and contacts.
+
+    In a plane it is a bar between its contacts. For three equal moments of inertia, which a ball and a cube have, it is the one
+    of these whose surface is closer to the contacts.
+    """
     model, name = scene.system, scene.object
     places = [np.asarray(one.pose, float)[:3, 3] for one in scene.constraints if isinstance(one, Contact)]
     body = model.body_names.index(name)

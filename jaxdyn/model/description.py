@@ -1,4 +1,4 @@
-"""Models, scenes and solutions in words, for `print`. Numbers that are traced or batched are left out."""
+"""Text descriptions of models, scenes and solutions for `print`, without numbers that are traced or batched."""
 
 import numpy as np
 
@@ -8,8 +8,8 @@ from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.text_table import short, table
 
 
-def tree_of(model) -> str:
-    """A line for each joint, indented as the bodies hang on each other: body, kind, axis, mass, limits."""
+def tree_table(model) -> str:
+    """Table with a line for each joint, indented by depth in the tree: body, kind, axis, mass, limits."""
     top = model.topology
     rows = [
         [
@@ -29,32 +29,33 @@ def tree_of(model) -> str:
 
 
 def system_line(system) -> str:
-    """A system as one line or, of a model, as its tree."""
+    """One line for a system; for a model, its tree."""
     if hasattr(system, "topology"):
-        return tree_of(system)
+        return tree_table(system)
     return f"{type(system).__name__}: nq = {system.nq}, nv = {system.nv}"
 
 
 def scene_lines(scene) -> str:
-    """The system, each constraint with its numbers of rows, and the forces."""
+    """Description of a scene: the system, each constraint with its numbers of rows, and the forces."""
     lines = [f"{type(scene).__name__} of {system_line(scene.system)}"]
-    lines += [f"constraint {_label(one)}: {_rows(one, scene.system)}" for one in scene.constraints]
-    lines += [f"force {_name(one)}" for one in scene.forces]
+    lines += [f"constraint {_constraint_label(one)}: {_rows(one, scene.system)}" for one in scene.constraints]
+    lines += [f"force {_force_name(one)}" for one in scene.forces]
     return "\n".join(lines)
 
 
-def _name(force) -> str:
+def _force_name(force) -> str:
     function = getattr(force, "function", None)
     return getattr(function, "__name__", type(force).__name__)
 
 
-def _label(constraint) -> str:
+def _constraint_label(constraint) -> str:
     return f"{getattr(constraint, 'name', '')!r} ({type(constraint).__name__})"
 
 
 def _rows(constraint, system) -> str:
     try:
         holonomic, nonholonomic = constraint.sizes(system, state_dtype(system))
+    # print must never fail: a constraint of the user that does not fit the system is reported in words instead.
     except Exception:
         return "does not fit the system"
     return ", ".join(
@@ -63,8 +64,9 @@ def _rows(constraint, system) -> str:
 
 
 def solution_lines(solution) -> str:
-    """How a motion ended, and what there is of it."""
+    """Outcome of a simulation and the outputs it holds."""
     t, count = solution.ts, solution.stats["num_steps"]
+    # Under a batch there are several outcomes; only their count is shown.
     if not is_concrete(solution) or np.ndim(t) > 1 or np.ndim(count) > 0:
         ended = (
             "traced" if not is_concrete(solution) else f"{int(np.sum(solution.success))} of {np.size(count)} successful"
@@ -93,27 +95,28 @@ def _redundant(solution) -> str:
     return f"\n  dropped {count} redundant row{'s' * (count > 1)} of the constraints, open by up to {gap} (m or rad)"
 
 
-def _known(leaf, ndim: int) -> bool:
+def _is_readable(leaf, ndim: int) -> bool:
     return is_concrete(leaf) and np.ndim(leaf) == ndim
 
 
 def _entry(leaf, place) -> str:
-    return short(float(leaf[place])) if _known(leaf, len(place)) else "?"
+    return short(float(leaf[place])) if _is_readable(leaf, len(place)) else "?"
 
 
 def _axis(screws, i: int, kind: str) -> str:
-    """Direction of a joint of one freedom in its body frame; the linear part of a prismatic one."""
+    """Direction of a joint with one degree of freedom in its body frame; the linear part of a prismatic one."""
     if kind not in SCREW_KINDS:
         return ""
-    if not _known(screws, 2):
+    if not _is_readable(screws, 2):
         return "?"
     screw = np.asarray(screws)[i]
     axis = screw[:3] if kind == "prismatic" else screw[3:]
+    # Adding 0.0 turns -0.0 into 0.0.
     return " ".join(short(float(x)) for x in np.round(axis, 6) + 0.0)
 
 
 def _limits(model, place: slice) -> str:
-    if not (_known(model.lower, 1) and _known(model.upper, 1)):
+    if not (_is_readable(model.lower, 1) and _is_readable(model.upper, 1)):
         return "?"
     low, high = np.asarray(model.lower)[place], np.asarray(model.upper)[place]
     if not (np.isfinite(low).any() or np.isfinite(high).any()):
