@@ -1,6 +1,6 @@
 """Large batches through `jd.scale.run`: what storing costs, memory, resuming, two cores, rollouts of unequal cost.
 
-    python -m benchmarks.scale [store memory resume cores cost hosts] [--samples 100000] [--full]
+    python -m benchmarks.scale [store memory resume cores cost hosts workers tasks kill] [--samples 100000] [--full]
 
 - store: seconds of a run against those of its programs alone, an arm of seven joints, 400 steps of RK4, 11 rows each, in turns.
 - memory: peak of processes that run 1, 3 and 10 times as many rolling disks with 100 rows each (1e6 with --full, 9 GB on disk).
@@ -10,6 +10,10 @@
 - cores: the arm in processes that may use one core and two: seconds and efficiency, t1/(2 t2).
 - cost: four-bars whose springs are soft or stiff, adaptive steps: lane-steps that a batch waits for over steps that are needed,
   and seconds, in the order of the numbers, by falling cost (`cost=`), and by the cost that is measured (`cost="measured"`).
+- workers: the arm in this process on two cores, and on a local Dask cluster of one and of two worker processes on the same two.
+- tasks: chunks of one rollout on a local cluster of two workers: milliseconds of a chunk, and memory of the client and of the
+  scheduler after each tenth of them (1e5 chunks with --full, else 1e4); and the same of tasks that do nothing, ten times as many.
+- kill: the arm on two workers, one of which is killed (kill -9) when half of the chunks are stored, against the same undisturbed.
 - hosts: what the arm's rollouts compute, write and exchange, measured here, and what that makes on paper for 1, 8 and 64 hosts
   of 64 cores; what an iteration of a fit exchanges.
 """
@@ -21,8 +25,10 @@ import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
 
 import diffrax
@@ -32,7 +38,8 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.operations import operations
-from jaxdyn.scale import batch, driver
+from jaxdyn.scale import study
+from jaxdyn.tasks import Cluster
 
 QUIET = {"progress": False}
 COLLECTIVES = "all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast"
@@ -87,18 +94,18 @@ def four_bars(samples: int, out, **options):
 
 
 def with_program(run: Callable, *args, **options):
-    """A run of `jd.scale`, and the program of its batches."""
-    kept, drive = [], driver.drive
+    """A run of `jd.scale` in this process, and the program of its batches."""
+    kept, usual = [], study.Computation
 
-    def noted(job, program, *rest):
-        kept.append(program)
-        return drive(job, program, *rest)
+    def note(*given):
+        kept.append(usual(*given))
+        return kept[-1]
 
-    batch.driver.drive = noted
+    study.Computation = note
     try:
-        return run(*args, **options), kept[-1]
+        return run(*args, **options), kept[-1].program
     finally:
-        batch.driver.drive = drive
+        study.Computation = usual
 
 
 def store(folder: Path, samples: int) -> None:
@@ -110,7 +117,7 @@ def store(folder: Path, samples: int) -> None:
         before = time.perf_counter()
         for first in range(0, samples, run.chunk):
             numbers = np.arange(first, min(first + run.chunk, samples))
-            driver.compute(program, numbers)
+            study.compute(program, numbers)
         alone.append(time.perf_counter() - before)
     print(
         f"store: {samples} arms, chunks of {run.chunk}: {min(whole):.3g} s with the store, {min(alone):.3g} s without "
@@ -182,6 +189,112 @@ def cost(folder: Path, samples: int) -> None:
         )
 
 
+@contextmanager
+def cluster(workers: int):
+    """A client of a local cluster, a process for each worker and one for the scheduler, so that its memory is known."""
+    from distributed import Client
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scheduler.json"
+        command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--scheduler-file", str(file)]
+        processes = [subprocess.Popen([*command, "--dashboard-address", ":0"], stderr=subprocess.DEVNULL)]
+        command = [
+            sys.executable,
+            "-m",
+            "distributed.cli.dask_worker",
+            "--scheduler-file",
+            str(file),
+            "--nthreads",
+            "1",
+        ]
+        processes += [subprocess.Popen(command, stderr=subprocess.DEVNULL) for _ in range(workers)]
+        try:
+            while not (file.exists() and file.read_text()):
+                time.sleep(0.1)
+            with Client(scheduler_file=str(file)) as client:
+                client.wait_for_workers(workers)
+                client.scheduler_pid = processes[0].pid
+                yield client
+        finally:
+            for process in reversed(processes):
+                process.terminate()
+                process.wait()
+
+
+def resident(pid: int | str = "self") -> float:
+    """Memory of a process (MiB)."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
+
+
+def workers(folder: Path, samples: int) -> None:
+    """One process against worker processes on the same cores; the second run finds compiled kernels and running workers."""
+    options = {"chunk": max(1, samples // 32), "lanes": min(2048, samples // 32)}
+    times = {0: min(arm(samples, folder / f"here{k}.zarr", **options).seconds for k in range(2))}
+    for count in (1, 2):
+        with cluster(count) as client:
+            runs = [arm(samples, folder / f"{count}-{k}.zarr", client=client, **options) for k in range(2)]
+            times[count] = min(run.seconds for run in runs)
+    print(
+        f"workers: {samples} arms: {times[0]:.3g} s in this process, {times[1]:.3g} s on one worker, {times[2]:.3g} s on two; "
+        f"two against this process: {times[0] / times[2]:.2f}"
+    )
+
+
+def tasks(folder: Path, samples: int) -> None:
+    """What a chunk costs that costs nothing, and what a task does; memory against their number."""
+    with cluster(2) as client:
+        start = time.perf_counter()
+        small = {"x": np.arange(float(samples))}
+        run = jd.scale.evaluate(
+            lambda p: {"y": p["x"] + 1.0},
+            small,
+            out=folder / "tasks.zarr",
+            chunk=1,
+            lanes=1,
+            rows=False,
+            client=client,
+            **QUIET,
+        )
+        seconds = time.perf_counter() - start
+        print(
+            f"tasks: {samples} chunks of one rollout: {1e3 * run.seconds / samples:.2f} ms each, {seconds:.3g} s in all; client "
+            f"{resident():.0f} MiB, scheduler {resident(client.scheduler_pid):.0f} MiB"
+        )
+        with Cluster(client) as many:
+            many.send(lambda: [])
+            start = time.perf_counter()
+            for k, _ in many.map("count", range(10 * samples)):
+                if k % samples == samples - 1:
+                    print(
+                        f"tasks: {k + 1} that do nothing: {1e3 * (time.perf_counter() - start) / (k + 1):.2f} ms each; client "
+                        f"{resident():.0f} MiB, scheduler {resident(client.scheduler_pid):.0f} MiB"
+                    )
+
+
+def kill(folder: Path, samples: int) -> None:
+    """A worker killed when half is done."""
+    options = {"chunk": max(1, samples // 64), "lanes": min(1024, samples // 64)}
+    with cluster(2) as client:
+        arm(samples, folder / "warm.zarr", client=client, **options)
+        plain = arm(samples, folder / "plain.zarr", client=client, **options).seconds
+
+        def watch():
+            done = folder / "killed.zarr" / "record" / "checksum" / "c"
+            while not done.exists() or len(list(done.iterdir())) < 32:
+                time.sleep(0.01)
+            os.kill(victim, 9)
+
+        victim = min(client.run(os.getpid).values())
+        watcher = threading.Thread(target=watch)
+        watcher.start()
+        killed = arm(samples, folder / "killed.zarr", client=client, **options).seconds
+        watcher.join()
+    print(
+        f"kill: {samples} arms on two workers: {plain:.3g} s; one killed at half: {killed:.3g} s, {killed / plain:.2f}"
+    )
+
+
 def hosts(folder: Path, samples: int) -> None:
     """To many hosts, on paper, from what is measured here."""
     run, program = with_program(arm, samples, folder / "hosts.zarr")
@@ -214,7 +327,7 @@ def hosts(folder: Path, samples: int) -> None:
 def main() -> None:
     """Print the tables that were asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="*", default=["store", "memory", "resume", "cores", "cost", "hosts"])
+    parser.add_argument("what", nargs="*", default=["store", "memory", "resume", "cores", "cost", "hosts", "workers"])
     parser.add_argument("--samples", type=int, default=100_000)
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
@@ -232,7 +345,12 @@ def main() -> None:
         return
     many = 1_000_000 if args.full else args.samples
     sizes = {"store": args.samples, "memory": many, "resume": many, "cores": args.samples, "cost": 4096}
-    sizes |= {"hosts": args.samples}
+    sizes |= {
+        "hosts": args.samples,
+        "workers": args.samples,
+        "kill": args.samples,
+        "tasks": 100_000 if args.full else 10_000,
+    }
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     for name in args.what:
         with tempfile.TemporaryDirectory(dir="out" if Path("out").is_dir() else None) as folder:

@@ -827,9 +827,7 @@ def test_modes(monkeypatch):
     with jd.compilation("auto"):
         assert has_kernel()
     monkeypatch.setenv("JAXDYN_COMPILATION", "fast")
-    with pytest.raises(
-        ValueError, match="environment's JAXDYN_COMPILATION is 'fast'; choose from 'auto', 'plain'"
-    ):
+    with pytest.raises(ValueError, match="environment's JAXDYN_COMPILATION is 'fast'; choose from 'auto', 'plain'"):
         has_kernel()
     for wrong in ("native", ""):
         with (
@@ -1227,8 +1225,10 @@ def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
 
 
 def test_others_import_the_names_of_the_package_alone():
-    """Modules of `jaxdyn.compile` are its own affair, but for `jaxdyn.export`, which writes code of its own; so are those of JAX that
-    it needs, which others do not need."""
+    """Modules of `jaxdyn.compile` are its own affair, and so are those of JAX that it needs, which others do not need.
+
+    The exception is `jaxdyn.export`, which writes code of its own.
+    """
     names = {alias.asname or alias.name for node in ast.parse((PACKAGE / "compile/__init__.py").read_text()).body
              for alias in getattr(node, "names", ())}  # fmt: skip
     wrong = []

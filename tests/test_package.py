@@ -21,7 +21,7 @@ PACKAGE = Path(jaxdyn.__file__).parent
 # Rooms, from the bottom up. A room may use those on floors below its own.
 FLOORS = (
     "compile lie",
-    "model",
+    "model tasks",
     "systems",
     "dynamics",
     "constraints forces geometry",
@@ -63,6 +63,9 @@ USERS = {
     "viser": {"pictures"},
     "xarray": {"simulation", "scale"},
     "zarr": {"scale"},
+    "filelock": {"scale"},
+    "cloudpickle": {"tasks"},
+    "distributed": {"tasks", "cli"},
 }
 LIGHT = {"equinox", "jax", "jaxtyping", "numpy"}
 

@@ -1,12 +1,12 @@
-"""Batches of any size into a store: rows, interruptions, processes, reductions, and how they say no."""
+"""Batches of any size into a store: rows, interruptions, reductions, and how they say no; test_scale_dask.py has clusters."""
 
 import errno
+import itertools
 import json
 import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import textwrap
@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.scale import locks, program
+from jaxdyn.scale import program
 from jaxdyn.scale import store as stores
+from jaxdyn.scale.lock import lock_store
 from jaxdyn.scale.members import members
-from jaxdyn.scale.processes import Process, process_of
 
 zarr = pytest.importorskip("zarr", reason="zarr is not installed: the extra scale")
 xarray = pytest.importorskip("xarray", reason="xarray is not installed: the extra scale")
@@ -132,7 +132,7 @@ def test_a_member_is_found_again(tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [{"chunk": 7}, {"lanes": 2}, {"devices": 1}, {"process": (1, 3)}, {"compress": True}, {"chunk": None}],
+    [{"chunk": 7}, {"lanes": 2}, {"devices": 1}, {"compress": True}, {"chunk": None}],
     ids=str,
 )
 def test_rows_do_not_depend_on_how_they_are_computed(tmp_path, options):
@@ -243,16 +243,16 @@ def test_kill_9_and_resume(tmp_path):
     killed_at([process], out, 3, [0])
     kept = recorded(out)
     assert 3 <= kept < 40
-    assert list(tmp_path.glob("*.lock/process-0.json"))
+    assert f"process {process.pid} of" in (tmp_path / "killed.zarr.owner").read_text()
     (out / "x" / "c" / "7.0123.partial").write_bytes(b"cut")
     before = {name: data for name, data in files(out).items() if name.startswith("record")}
-    resumed = slow_here(out)  # the lock of the dead process is taken over
+    resumed = slow_here(out)  # the lock of a dead process is free
     assert resumed.computed == 160 - 4 * kept
     assert before.items() <= files(out).items()
     whole = slow_here(tmp_path / "whole.zarr")
     assert files(out) == files(whole.out)
     np.testing.assert_equal(resumed.reductions, whole.reductions)
-    assert not list(tmp_path.glob("*.lock"))
+    assert not list(tmp_path.glob("*.owner"))
 
 
 def slow_here(out):
@@ -263,154 +263,16 @@ def slow_here(out):
     return jd.scale.evaluate(source["logistic"], source["drawn"], out=out, **options)
 
 
-def several(code, count, *args, **environment):
-    """Processes that know how many they are."""
-    names = [{"JAXDYN_PROCESS": str(k), "JAXDYN_PROCESSES": str(count)} for k in range(count)]
-    return [started(code, *args, **name | environment) for name in names]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_processes_share_a_store_and_do_the_work_of_one_that_is_killed(tmp_path, count):
-    out = tmp_path / "shared.zarr"
-    processes = several(SLOW, count, out)
-    killed_at(processes, out, 3, [count - 1])
-    computed = [int(ended(process)) for process in processes[:-1]]
-    assert recorded(out) == 40 and 0 < sum(computed) <= 160
-    assert files(out) == files(slow_here(tmp_path / "whole.zarr").out)
-
-
-DISKS = """
-import os, sys
-import jax
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", 1)
-import jax.numpy as jnp
-import jaxdyn as jd
-
-def draw(key):
-    mass, radius = jax.random.uniform(key, (2,), minval=0.3, maxval=0.7)
-    return {"mass": mass, "radius": radius}
-
-def start(p):
-    one = jnp.ones_like(p["mass"])
-    return jnp.zeros(4), jnp.stack([2.0 * p["radius"], 0.0 * one, one, 2.0 * one])
-
-if len(sys.argv) > 3:
-    assert jd.scale.initialize().count == jax.process_count() == int(os.environ["JAXDYN_PROCESSES"])
-found = jd.scale.run(
-    lambda p: jd.scenes.rolling_disk(**p), start, draw, jnp.linspace(0.0, 1.0, 6), samples=int(sys.argv[2]),
-    out=sys.argv[1], lanes=1024, chunk=2048, stepsize=0.004, outputs=("energy",),
-    reductions={"energy": jd.scale.Mean("energy")}, progress=False)
-print(found.computed)
-"""
-
-
-@pytest.mark.slow
-def test_two_processes_one_killed_then_both_then_resumed(tmp_path):
-    """100 000 rolling disks: the survivor does the work of the dead; two that are both killed are gone on with by two others."""
-    out, samples = tmp_path / "disks.zarr", 100_000
-    both = several(DISKS, 2, out, samples)
-    killed_at(both, out, 4, [1])
-    at_death = recorded(out)
-    killed_at(both[:1], out, at_death + 4, [0])  # the survivor went on
-    assert recorded(out) < 49
-    both = several(DISKS, 2, out, samples)
-    resumed = [int(ended(process)) for process in both]
-    assert sum(resumed) >= samples - 2048 * 48 and not list(tmp_path.glob("*.lock"))
-    ended(started(DISKS, tmp_path / "whole.zarr", samples))
-    assert files(out) == files(tmp_path / "whole.zarr")
-    table = xarray.open_zarr(out, chunks=None)
-    assert table.sizes["rollout"] == samples and not table.result.any()
-    # It rolls on a circle at constant speed: the energy is that of the start.
-    np.testing.assert_allclose(table.energy[:, -1], table.energy[:, 0], rtol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [2, 4])
-def test_processes_of_jax_distributed(tmp_path, count):
-    """The same between processes that `jd.scale.initialize` has brought together over loopback."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    code = DISKS.replace("initialize()", f"initialize('127.0.0.1:{port}', timeout=60)")
-    out = tmp_path / "disks.zarr"
-    counts = [int(ended(process)) for process in several(code, count, out, 20_000, "distributed")]
-    assert sum(counts) >= 20_000
-    ended(started(DISKS, tmp_path / "whole.zarr", 20_000))
-    assert files(out) == files(tmp_path / "whole.zarr")
-
-
-def test_a_coordinator_that_never_answers_is_named():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    with pytest.raises(
-        TimeoutError, match=f"coordinator is '127.0.0.1:{port}', and nobody answered there within 0.3 s"
-    ):
-        jd.scale.initialize(f"127.0.0.1:{port}", 2, 1, timeout=0.3)
-    with pytest.raises(ValueError, match="give all three"):
-        jd.scale.initialize("127.0.0.1:1", 2)
-    with pytest.raises(ValueError, match="give host:port"):
-        jd.scale.initialize("somewhere", 2, 1)
-
-
-def test_processes_are_those_that_launchers_say():
-    assert process_of(None, {}) == Process(0, 1)
-    assert process_of(None, {"SLURM_PROCID": "3", "SLURM_NTASKS": "8"}) == Process(3, 8)
-    assert process_of(None, {"JOB_COMPLETION_INDEX": "1", "JAXDYN_PROCESSES": "4"}) == Process(1, 4)
-    assert process_of((1, 2), {"SLURM_PROCID": "3", "SLURM_NTASKS": "8"}) == Process(1, 2)
-    for wrong in ((2, 2), (-1, 2), ("a", 2), 3):
-        with pytest.raises(ValueError, match="process is"):
-            process_of(wrong)
-    with pytest.raises(ValueError, match="SLURM_PROCID"):
-        process_of(None, {"SLURM_PROCID": "9", "SLURM_NTASKS": "8"})
-
-
 # Stores that are not what they should be
 
 
 def test_the_second_run_on_a_store_is_refused(tmp_path):
     out = tmp_path / "a.zarr"
     evaluated(out)
-    with locks.Lock(out, Process(0, 1)):
-        with pytest.raises(ValueError, match=rf"process {os.getpid()} of .* is writing.*wait for it"):
+    with lock_store(out):
+        with pytest.raises(ValueError, match=rf"process {os.getpid()} of .* on .*, since .*, is writing.*wait for it"):
             evaluated(out)
-        with pytest.raises(ValueError, match=r"number 0 of 1.*this is number 1 of 2"):
-            evaluated(out, process=(1, 2))
     assert evaluated(out).computed == 0
-
-
-@pytest.mark.parametrize("host", ["here", "elsewhere"])
-def test_the_lock_of_a_dead_process_is_taken_over(tmp_path, host):
-    out = tmp_path / "a.zarr"
-    folder = tmp_path / "a.zarr.lock"
-    folder.mkdir()
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    name = socket.gethostname() if host == "here" else "another-host"
-    owner = {"host": name, "pid": gone.pid, "start": "1", "user": "u", "since": "", "index": 0, "count": 1}
-    (folder / "process-0.json").write_text(json.dumps(owner))
-    if host == "elsewhere":
-        with pytest.raises(ValueError, match="another-host"):
-            evaluated(out)
-        old = time.time() - 2 * locks.SILENT
-        os.utime(folder / "process-0.json", (old, old))
-    assert evaluated(out).computed == 23
-    assert not folder.exists()
-
-
-def test_chunks_of_others_are_left_to_them_while_they_live(tmp_path):
-    out = tmp_path / "a.zarr"
-    with locks.Lock(out, Process(0, 2)) as mine, locks.Lock(out, Process(1, 2)) as other:
-        other.me = other.me | {"pid": 1, "start": locks._start_of(1)}  # of a process that lives
-        (mine.directory / "process-1.json").write_text(json.dumps(other.me))
-        assert other.claim(3) and not mine.claim(3) and mine.claim(4) and mine.claim(4)
-        (mine.directory / "chunk-3.json").write_text(json.dumps(other.me | {"start": "another process of that number"}))
-        assert mine.claim(3)
-        mine.release(3)
-        mine.release(4)
-    assert not out.with_name("a.zarr.lock").exists()
 
 
 @pytest.mark.parametrize(
@@ -612,6 +474,54 @@ def test_a_mean_of_large_numbers_does_not_cancel():
     assert none["count"] == 0 and np.isnan(none["mean"]).all() and np.isnan(none["std"]).all()
 
 
+@pytest.mark.parametrize(
+    "reduction",
+    [
+        jd.scale.Mean("y"),
+        jd.scale.Histogram("y", 0.0, 1.0),
+        jd.scale.Quantiles("y", 0.0, 1.0),
+        jd.scale.Worst("y", 3),
+        Extent(),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_partial_results_combine_in_groups_to_the_same_bits(reduction):
+    """As results arrive or all at once; groups without rollouts, and one that was combined before, among them."""
+    values = np.random.default_rng(2).random(200)
+    ends = np.array([0, 0, 3, 40, 41, 41, 120, 200])
+    parts = [reduction.partial(values[a:b], np.arange(a, b)) for a, b in itertools.pairwise(ends)]
+    stacked = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
+    together = {name: value[:1] for name, value in stacked.items()}
+    for begin, end in ((1, 2), (2, 5), (5, 7)):
+        joined = {name: np.concatenate([together[name], value[begin:end]]) for name, value in stacked.items()}
+        together = reduction.combine(joined)
+    assert_equal(reduction.merge(together), reduction.merge(stacked))
+    if not isinstance(reduction, Extent):
+        assert {len(value) for value in together.values()} == {1}
+
+
+def test_a_run_of_many_chunks_merges_as_they_come():
+    from jaxdyn.scale.reducer import COMBINED, Merger, Reducer
+    from jaxdyn.scale.study import Summary
+
+    values = np.random.default_rng(3).random(3 * COMBINED + 7)
+    reductions = {"mean": jd.scale.Mean("y"), "own": Extent()}
+    shapes = {f"quantity of {name}": jax.ShapeDtypeStruct((), np.float64) for name in reductions}
+    reducer = Reducer(reductions, shapes, {})
+    merger = Merger(reducer, 2, 5)
+    for k, value in enumerate(values):
+        rows = {"result": np.array([k % 2]), **dict.fromkeys(shapes, np.array([value]))}
+        merger.add(
+            Summary(
+                np.array([1 - k % 2, k % 2]), np.arange(k, k + k % 2), reducer.partials(rows, np.array([k])), (k, 1)
+            )
+        )
+    results = merger.results()
+    np.testing.assert_allclose(results["mean"]["mean"], values[::2].mean(), rtol=1e-14)
+    assert (results["own"]["least"], results["own"]["most"]) == (values[::2].min(), values[::2].max())
+    assert list(merger.failed) == [1, 3, 5, 7, 9] and merger.codes.sum() == len(values) == merger.steps[1]
+
+
 def test_quantiles_outside_of_the_bins_are_not_made_up():
     quantiles = jd.scale.Quantiles("y", 0.0, 1.0, probabilities=(0.0, 0.2, 0.5, 1.0))
     part = quantiles.partial(np.array([-1.0, 0.25, 0.5, 0.75, 3.0]), np.arange(5))
@@ -749,13 +659,13 @@ def test_the_extra_is_named(tmp_path, monkeypatch):
 
 
 def test_progress_has_rate_and_time_left(capsys):
-    from jaxdyn.scale.progress import Progress
+    from jaxdyn.tasks import Progress
 
-    done = iter([10, 30, 60, 100])
-    meter = Progress(100, lambda: next(done), every=0.0)
+    meter = Progress(100, 10, every=0.0)
     meter._start -= 10.0
     meter.add(20, 1)
     meter.add(30, 0)
+    meter.add(40, 0)
     meter.end()
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].strip() == "30.0 %, 30 of 100 rollouts, 2/s, 35 s left, 1 failed"
@@ -827,7 +737,7 @@ def test_sweep_runs_a_study_and_goes_on_with_it(tmp_path, capsys):
         ("normal = [0.5, 0.1]", "normal = [0.5]", "parameter angle is .*give a finite number, or one of uniform"),
         ('mean = "energy"', 'median = "energy"', "give one of mean"),
         ('cost = "damping"', 'cost = "mass"', "name one of the parameters"),
-        ("duration = 0.1", "duration = ", "is no TOML"),
+        ("duration = 0.1", "duration = ", "is malformed TOML"),
         ('"study.py"', '"rolling_disk"', "rolling_disk has no parameter angle"),
     ],
 )
@@ -865,7 +775,7 @@ def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     assert len(np.unique(drawn.q[:, -1, 2])) == 6
     study.write_text(head + 'scene = "windows"\n[parameters]\ncount = { uniform = [1.0, 2.0] }\n')
     assert main(["sweep", str(study), "--quiet", "--out", str(tmp_path / "c.zarr")]) == 2
-    assert "is built from known numbers, so that count cannot be drawn" in capsys.readouterr().err
+    assert "is built from concrete numbers, so that count cannot be drawn" in capsys.readouterr().err
 
 
 def test_stores_that_cannot_be_are_refused_with_the_cause(tmp_path, monkeypatch):

@@ -1,11 +1,12 @@
 """`jaxdyn sweep`: resumable studies of many rollouts, described by a file, into a Zarr store."""
 
 import argparse
+import contextlib
 import importlib.util
 import inspect
 import pathlib
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -22,13 +23,14 @@ from jaxdyn.simulation.run import simulate
 HELP = "simulate a study of many rollouts into a Zarr store; resumable"
 DESCRIPTION = """\
 Simulate many rollouts with parameters drawn from distributions in a file. Finished chunks are kept: the same command
-resumes after an interruption, and several processes (Slurm, Kubernetes) share one study.
+resumes after an interruption. With a Dask scheduler the workers of a cluster share one study.
 """
 EPILOG = """\
 examples:
   jaxdyn sweep study.toml
   jaxdyn sweep study.toml --samples 1000 --out trial.zarr
-  srun --ntasks=64 jaxdyn sweep study.toml
+  jaxdyn sweep study.toml --workers 4
+  jaxdyn sweep study.toml --client tcp://10.0.0.1:8786
 
 study.toml:
   scene = "rolling_disk"      a scene of jd.scenes, a file .urdf, or a file .py with functions
@@ -93,9 +95,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", help="store, instead of the study's")
     parser.add_argument("--samples", type=whole, metavar="N", help="number of rollouts, instead of the study's")
     parser.add_argument("--seed", type=whole, metavar="N", help="seed, instead of the study's")
-    parser.add_argument(
-        "--process", type=whole, nargs=2, metavar=("I", "N"), help="run as process I of N, counted from 0"
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument(
+        "--client", metavar="ADDRESS", help="address of a Dask scheduler whose workers compute, as tcp://host:8786"
     )
+    place.add_argument("--workers", type=whole, metavar="N", help="number of local Dask worker processes to start")
     parser.add_argument("--devices", type=whole, metavar="N", help="CPU devices that share the rollouts (default: 1)")
     parser.add_argument("--chunk", type=whole, metavar="N", help="rollouts per chunk (default: two seconds' work)")
     parser.add_argument("--quiet", action="store_true", help="no progress meter")
@@ -103,9 +107,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and print its outcome; return 1 if a rollout failed."""
-    check_least(args, chunk=1, samples=1)
-    if args.process is not None and not 0 <= args.process[0] < args.process[1]:
-        raise ValueError(f"--process is {args.process[0]} {args.process[1]}; give I N with 0 <= I < N")
+    check_least(args, chunk=1, samples=1, workers=1)
     path = as_path(args.study, "study")
     study = _read(path)
     if args.devices is not None:
@@ -129,26 +131,50 @@ def run(args: argparse.Namespace) -> int:
     if cost is not None and cost not in parameters:
         raise ValueError(f"{path}: cost is {cost!r}; name one of the parameters {', '.join(parameters)}")
     watch = Stopwatch()
-    result = scale.run(
-        scene,
-        states,
-        draw,
-        ts,
-        samples=given,
-        seed=study.get("seed", 0) if args.seed is None else args.seed,
-        out=out,
-        outputs=tuple(study.get("outputs", ())),
-        rows=study.get("rows", True),
-        reductions={name: _reduction(name, one) for name, one in study.get("reductions", {}).items()},
-        cost=None if cost is None else lambda p: jnp.sum(p[cost]),
-        units={name: one["units"] for name, one in parameters.items() if isinstance(one, dict) and "units" in one},
-        process=None if args.process is None else tuple(args.process),
-        chunk=args.chunk,
-        progress=not args.quiet,
-        **study.get("options", {}),
-    )
+    with _connect(args) as client:
+        result = scale.run(
+            scene,
+            states,
+            draw,
+            ts,
+            samples=given,
+            seed=study.get("seed", 0) if args.seed is None else args.seed,
+            out=out,
+            outputs=tuple(study.get("outputs", ())),
+            rows=study.get("rows", True),
+            reductions={name: _reduction(name, one) for name, one in study.get("reductions", {}).items()},
+            cost=None if cost is None else lambda p: jnp.sum(p[cost]),
+            units={name: one["units"] for name, one in parameters.items() if isinstance(one, dict) and "units" in one},
+            client=client,
+            chunk=args.chunk,
+            progress=not args.quiet,
+            **study.get("options", {}),
+        )
     print(f"{result}\nin {watch}, compilation included.")
     return int(not result.success)
+
+
+@contextlib.contextmanager
+def _connect(args: argparse.Namespace) -> Iterator[Any]:
+    """Connect to the scheduler at --client, or to a local cluster of --workers processes, or to neither."""
+    if args.client is None and args.workers is None:
+        yield None
+        return
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ValueError(f"--client and --workers need {error.name}: pip install 'jaxdyn[scale]'") from error
+    with contextlib.ExitStack() as stack:
+        place = args.client
+        if place is None:
+            # Any free port for the dashboard, whose address is printed.
+            local = LocalCluster(n_workers=args.workers, threads_per_worker=1, processes=True, dashboard_address=":0")
+            place = stack.enter_context(local)
+        try:
+            client = stack.enter_context(Client(place))
+        except (OSError, ValueError) as error:
+            raise ValueError(f"--client is {args.client}, where no scheduler of Dask answers: {error}") from error
+        yield client
 
 
 def make_draw(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:

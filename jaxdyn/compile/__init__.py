@@ -6,8 +6,8 @@ machine code through XLA's foreign function interface (`target`, `objects`); `ke
 for it, with its batches, derivatives (`derive`) and the way without machine code. `compilation` (`mode`) turns all of it
 off.
 
-Imports nothing of jaxdyn. Others import the names below, and no module of this package; `jaxdyn.export`, which writes code of its own,
-imports its modules.
+Imports nothing of jaxdyn. Others import the names below, and no module of this package. Only
+`jaxdyn.export`, which writes code of its own, imports its modules.
 """
 
 from jaxdyn.compile.calls import compiled as compiled
@@ -31,6 +31,7 @@ from jaxdyn.compile.loops import Task as Task
 from jaxdyn.compile.loops import Turn as Turn
 from jaxdyn.compile.loops import run_loop as run_loop
 from jaxdyn.compile.mode import compilation as compilation
+from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under a name that says of what)
 from jaxdyn.compile.mode import is_expanding as is_expanding
 from jaxdyn.compile.mode import is_rank_safe as is_rank_safe
 from jaxdyn.compile.repair import any_in_batch as any_in_batch

@@ -97,7 +97,9 @@ def intervals(
 
     base = base_parameters(model, terms)
     columns = free_columns(nb, nv, terms)
-    known = base.matrix @ fitted[columns].astype(float) != 0
+    # Parameters enter with both signs, so that a sum over them can vanish where none is zero.
+    enters = np.abs(base.matrix) > 1e-9 * np.abs(base.matrix).max(axis=1, keepdims=True)
+    known = np.any(enters & fitted[columns], axis=1)
     a, b = base.matrix @ changes[columns], base.matrix @ pulled[columns]
     spread = _spread(base.names, base.values(estimate.x[columns]), a, b, known)
     return Intervals(parameters, spread, base, a @ a.T + b @ b.T, student(count - 1))

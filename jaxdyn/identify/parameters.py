@@ -36,6 +36,7 @@ from jaxdyn.identify.starts import best_start
 from jaxdyn.identify.stepwise import SOLVERS, stepwise
 from jaxdyn.model.arguments import Checked, FilePath, Function
 from jaxdyn.simulation.controls import Control
+from jaxdyn.tasks import DaskClient
 
 _GAUSS_NEWTON = "gauss-newton"
 
@@ -63,6 +64,7 @@ def fit_parameters(
     spread: float = 0.3,
     seed: int = 0,
     devices: Sequence[Any] | None = None,
+    client: DaskClient | None = None,
     callback: Callable[[int, float, Any], Any] | None = None,
     progress: bool = False,
     seconds: float | None = None,
@@ -104,6 +106,7 @@ def fit_parameters(
       `steps`: the most steps.
     - `starts`: from how many points to begin: coordinates are spread by `spread` (of positive numbers by that
       share) around the given ones, all are improved side by side in one `jax.vmap`, and the best is fitted to the end. `seed`.
+    - `client`: a `dask.distributed.Client`, whose workers share the starts.
     - `devices`: as in `fit_trajectory`, for pieces, or samples where error="torque" (whole logs of a `Measured` scene).
     - `callback(step, loss, system)` is called at every point with the system there; True stops the fit. `progress`: print step,
       loss and time left on standard error. `seconds`: the fit stops after so long.
@@ -160,7 +163,7 @@ def fit_parameters(
         start = jnp.zeros((problem.count, 2, own.nv), tree.dtype)
     unknowns = Unknowns(tree.start, start)
     if starts > 1:
-        unknowns = best_start(problem, unknowns, starts, spread, seed)
+        unknowns = best_start(problem, unknowns, starts, spread, seed, client)
     # The numbers, not the devices that they are on, say which problem it is.
     key = checkpoint_at(
         checkpoint, (gathered(problem), unknowns, str(method), learning_rate, tolerance, seed), every, resume

@@ -1,16 +1,14 @@
-"""From one core to a cluster: batches of any size, in blocks, on all devices, into a store that can be gone on with.
+"""From one core to a cluster: batches of any size, in blocks, on all devices, into a store from which they resume.
 
 `run` simulates (`jd.simulate` for each rollout), `evaluate` does the same for any function of one sample, `batch` is what they
 share. `members` says what each rollout is made of, `described` what a store says of its numbers, `program` compiles the
-function for all devices of a process, `driver` goes through the chunks, `store` keeps them (Zarr), `locks` says who writes,
-`reductions` keep what is wanted of many rollouts (`reducer`), `processes` tells processes apart. zarr and xarray, of the extra
-`scale`, are imported where a store is opened.
+function for all devices of a process, `study` computes a chunk, here or on a worker of Dask (`jaxdyn.tasks`), `store` keeps the
+chunks (Zarr), `lock` admits one writer, `reductions` keep what is wanted of many rollouts (`reducer`). zarr, xarray and
+filelock, of the extra `scale`, are imported where a store is opened.
 """
 
 from jaxdyn.scale.batch import Run as Run
 from jaxdyn.scale.members import member as member
-from jaxdyn.scale.processes import Process as Process
-from jaxdyn.scale.processes import initialize as initialize
 from jaxdyn.scale.reductions import Histogram as Histogram
 from jaxdyn.scale.reductions import Mean as Mean
 from jaxdyn.scale.reductions import Quantiles as Quantiles

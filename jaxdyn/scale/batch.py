@@ -1,7 +1,6 @@
 """What `run` and `evaluate` share: from a function of one sample, described, to the result of a whole batch."""
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,29 +9,28 @@ import jax
 import numpy as np
 
 from jaxdyn.model.arguments import Numbers, as_array, as_path
-from jaxdyn.scale import driver, program
-from jaxdyn.scale.described import Described, version
-from jaxdyn.scale.locks import Lock
+from jaxdyn.scale.described import Described
+from jaxdyn.scale.lock import lock_store
 from jaxdyn.scale.members import Members, digest
-from jaxdyn.scale.processes import process_of
-from jaxdyn.scale.progress import Progress
-from jaxdyn.scale.reducer import Reducer
-from jaxdyn.scale.reductions import Arrays, checked_reductions, described
-from jaxdyn.scale.store import Store, check_place, full_disk, zarr_package
+from jaxdyn.scale.reducer import Merger, Reducer
+from jaxdyn.scale.reductions import Arrays, check_reductions, describe_reductions
+from jaxdyn.scale.store import FULL, Store, check_place, full_disk, zarr_package
+from jaxdyn.scale.study import LISTED, PILOT_BATCHES, Facts, Pipeline, Study, local_devices
+from jaxdyn.tasks import Cluster, Engine, Failure, Progress, package_versions
 
-LISTED = 1000  # failures that a result lists
-PROGRAM = "program of a rollout (scene, control, solver, functions)"  # how a store names its hash
 if TYPE_CHECKING:
     import xarray
 
     Cost = Callable[[Any], Any] | Numbers | str | None
 else:
-    Cost = Any  # `whole` and `_order` look at it
+    Cost = Any  # `run_batch` and `_order` look at it
 
 MEASURED = "measured"  # of a cost that nobody has to know
-BATCHES = 16  # of a chunk at least, where rollouts are put in order within chunks
-LEAST_LANES = 64  # of a device then
-LEFTOVER = 600.0  # s, after which a file that was not finished is nobody's, where there are several processes
+SECONDS = 2.0  # of computing to a chunk, if it may be so large
+BYTES = 2**25  # of rows in a chunk
+SHARES = 8  # chunks to a worker at least, so that all end at about the same time
+CHECKED = 64  # chunks that one task looks through
+MOST_FAILURES = 100  # chunks that fail before no others are tried
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,7 @@ class Run:
     - `codes`: how many rollouts ended with each result code, by its name. `failed`: the numbers of those that did not
       succeed, the first 1000 in the order of the store.
     - `reductions`: the arrays of each reduction, by its name and theirs.
-    - `computed`: rollouts computed by this process in this call; `seconds`, of the loop, without compilation. `repaired`: chunks
+    - `computed`: rollouts computed in this call; `seconds`, of the loop, without compilation. `repaired`: chunks
       of before that were not whole and were computed again. `lanes`: rollouts at once; `program_bytes`: memory of their program
       and its results, by XLA's account. `waiting`: steps that lanes waited for, until the slowest of a batch was done, over
       those that rollouts needed, in this call; 1 where nobody waits, NaN where no steps are counted.
@@ -90,7 +88,8 @@ class Options:
     reductions: Any
     rows: bool | Sequence[str]
     cost: Cost
-    process: Any
+    client: Any
+    retries: int
     devices: Sequence[Any] | None
     lanes: int | None
     chunk: int | None
@@ -101,7 +100,7 @@ class Options:
     units: Mapping[str, str]
 
 
-def whole(
+def run_batch(
     describe: Callable[[Any], Described],
     words: dict[str, Any],
     batch: Members,
@@ -115,15 +114,10 @@ def whole(
     zarr_package()
     path = as_path(options.out, "out")
     check_place(path)
-    for name in ("lanes", "chunk", "memory"):
-        value = getattr(options, name)
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-            raise ValueError(f"{name} is {value!r}; give a whole number of at least 1, or None")
-    process = process_of(options.process)
-    devices = driver.local_devices(options.devices)
-    reductions = checked_reductions(options.reductions)
+    _check_options(options)
+    reductions = check_reductions(options.reductions)
     outputs = describe(reductions)
-    kept = _kept(outputs, options.rows)
+    kept = _select_rows(outputs, options.rows)
     if isinstance(options.cost, str):
         if options.cost != MEASURED or pilot is None:
             raise ValueError(
@@ -134,76 +128,142 @@ def whole(
         pilot = None
     order = None if pilot else _order(options.cost, batch)
     reducer = Reducer(reductions, outputs.traced.shapes, outputs.variables)
-    job = driver.Job(order, reducer, kept, outputs.codes, process)
     description = (
-        version()
-        | {"platform": devices[0].platform, "float64": bool(jax.config.read("jax_enable_x64"))}
-        | batch.described()
+        {f"version of {name}": version for name, version in package_versions().items()}
+        | {"float64": bool(jax.config.read("jax_enable_x64"))}
+        | batch.description()
         | words
         | {"order": None if order is None else digest(order), "rows stored": list(kept)}
-        | {"reductions": described(reductions), "compression": options.compress}
+        | {"reductions": describe_reductions(reductions), "compression": options.compress}
     )
     row_bytes = sum(_bytes(outputs.variables[name]) for name in kept)
-    with full_disk(path), Lock(path, process) as lock:
+    with full_disk(path), lock_store(path) as mark:
         store = Store(path) if path.exists() else None
         if store is not None:
             store.check(description)
-            store.remove_leftovers(0.0 if process.count == 1 else LEFTOVER)
-        lanes = options.lanes or _lanes(devices, batch.count, process.count, row_bytes)
-        if pilot and not options.lanes:
-            lanes = max(len(devices) * LEAST_LANES, lanes // BATCHES)
-        memory = options.memory
-        if memory is None and process.count > 1:  # which of them share this host is not known
-            memory = int(program.SHARE * program.available_memory(devices) / process.count)
-        compiled = program.Program(outputs.traced, batch, devices, lanes, memory, outputs.is_motion)
-        if pilot:
-            job.pilot = program.Program(program.Traced(pilot, batch), batch, devices, compiled.lanes, memory, True)
-        if store is None:
-            variables = [outputs.variables[name] for name in kept] + reducer.variables
-            variables = [replace(one, compressed=one.compressed or options.compress) for one in variables]
-            chunk = options.chunk or max(_chunk(job, compiled, row_bytes), BATCHES * compiled.lanes if pilot else 0)
-            programs = {PROGRAM: program.fingerprint(outputs.one, batch), "lowered program": compiled.lowered}
-            store = Store.create(
-                path,
-                variables,
-                outputs.coordinates(order),
-                description | programs,
-                batch.count,
-                min(chunk, batch.count),
-            )
-            store.check(description)  # another process may have been first
-        if store.description["lowered program"] != compiled.lowered:
-            # Of other lanes, devices or processors; what is computed for one member has to be the same.
-            store.check({PROGRAM: program.fingerprint(outputs.one, batch)})
-        meter = Progress(batch.count, store.finished, shown=options.progress)
-        repaired = driver.drive(job, compiled, store, lock, meter, options.verify)
-        meter.end()
-        results = driver.merge(job, store)
-        codes, failed = driver.codes_of(job, store, LISTED)
-    sizes = batch.count, store.chunk
-    return Run(
+            store.remove_leftovers()
+        engine: Engine = (
+            Pipeline(options.retries) if options.client is None else Cluster(options.client, options.retries, mark)
+        )
+        with engine:
+            most_lanes = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
+            fixed = outputs, batch, pilot, reducer, kept, order, path.absolute(), options.devices
+            study = Study(*fixed, options.lanes, most_lanes, options.memory, engine.workers_per_host)
+            engine.send(study.open)
+            facts: Facts = engine.call("facts", store is None)
+            description["platform"] = facts.platform
+            if store is None:
+                variables = [outputs.variables[name] for name in kept] + reducer.variables
+                variables = [replace(one, compressed=one.compressed or options.compress) for one in variables]
+                chunk = options.chunk or _chunk_size(facts, row_bytes, batch.count, engine.workers, bool(pilot))
+                sizes = batch.count, min(chunk, batch.count)
+                store = Store.create(path, variables, outputs.coordinates(order), description | facts.programs, *sizes)
+            store.check(description)
+            before = store.recorded_chunks()
+            meter = Progress(batch.count, store.count_rollouts(before), shown=options.progress)
+            if options.client is not None and (link := options.client.dashboard_link):
+                meter.note(f"dashboard: {link}")
+            merger = Merger(reducer, len(outputs.codes), LISTED)
+            repaired = _compute_all(engine, store, merger, meter, before, options)
+            meter.end()
+            results = merger.results()
+            store.put({f"{name}_{part}": value for name, parts in results.items() for part, value in parts.items()})
+    needed, waited = merger.steps.tolist()
+    codes = {name: int(n) for name, n in zip(outputs.codes, merger.codes, strict=True) if n}
+    given = (
         path,
-        *sizes,
+        batch.count,
+        store.chunk,
         codes,
-        failed,
+        merger.failed,
         results,
         meter.computed,
         meter.seconds,
         tuple(repaired),
-        compiled.lanes,
-        compiled.bytes,
-        job.tally.ratio,
     )
+    return Run(*given, facts.lanes, facts.bytes, waited / needed if needed else float("nan"))
 
 
-def _chunk(job: driver.Job, compiled: program.Program, row_bytes: int) -> int:
-    count = compiled.members.count
-    first = job.numbers(slice(0, min(compiled.lanes, count)))
-    seconds = compiled.time(first, time.perf_counter)
-    return driver.chunk_size(seconds, compiled.lanes, row_bytes, count, job.process.count)
+def _check_options(options: Options) -> None:
+    for name, least in (("lanes", 1), ("chunk", 1), ("memory", 1), ("retries", 0)):
+        value = getattr(options, name)
+        is_given = value is not None or name == "retries"
+        if is_given and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+            raise ValueError(
+                f"{name} is {value!r}; give a whole number of at least {least}{', or None' if least else ''}"
+            )
+    if options.client is None:
+        local_devices(options.devices)
+    elif options.devices is not None:
+        raise ValueError("devices is given with client; leave it out: each worker uses all of its own")
 
 
-def _kept(described: Described, rows: bool | Sequence[str]) -> tuple[str, ...]:
+def _compute_all(
+    engine: Engine, store: Store, merger: Merger, meter: Progress, before: np.ndarray, options: Options
+) -> list[int]:
+    """Compute the chunks that are missing, then look through those of before; returns those that were not whole."""
+    failures: list[tuple[int, Failure]] = []
+    is_new = not before.any()
+    missing = range(store.chunks) if is_new else (int(chunk) for chunk in np.flatnonzero(~before))
+
+    def results(method: str, items: Any) -> Iterator[tuple[Any, Any]]:
+        for item, result in engine.map(method, items):
+            if not isinstance(result, Failure):
+                yield item, result
+                continue
+            if isinstance(result.error, OSError) and result.error.errno in FULL:
+                raise result.error
+            failures.append((item if method == "chunk" else item[0], result))
+            if len(failures) == MOST_FAILURES:
+                return
+
+    def count(chunk: int, summary: Any) -> None:
+        rows = store.rows(chunk)
+        meter.add(rows.stop - rows.start, int(summary.codes[1:].sum()))
+
+    for chunk, summary in results("chunk", missing):
+        count(chunk, summary)
+        if is_new:
+            merger.add(summary)
+    repaired: list[int] = []
+    if not is_new and not failures:
+        ranges = (
+            (start, before[start : start + CHECKED] & options.verify) for start in range(0, store.chunks, CHECKED)
+        )
+        for (start, _), summaries in results("check", ranges):
+            for chunk, (is_bad, summary) in enumerate(summaries, start):
+                merger.add(summary)
+                if is_bad:
+                    repaired.append(chunk)
+                    meter.note(f"chunk {chunk} of the store was not whole: its rollouts are computed again")
+                    count(chunk, summary)
+    if failures:
+        meter.end()
+        raise _chunk_error(failures, store)
+    return repaired
+
+
+def _chunk_error(failures: list[tuple[int, Failure]], store: Store) -> RuntimeError:
+    chunks = ", ".join(str(chunk) for chunk, _ in failures[:10]) + (", ..." if len(failures) > 10 else "")
+    first = failures[0][1]
+    kept = "no others were tried" if len(failures) == MOST_FAILURES else "the others are finished"
+    error = RuntimeError(
+        f"out is {str(store.path)!r}: of {store.chunks} chunks {len(failures)} failed in every attempt ({chunks}), {kept} and "
+        f"kept; run again to try those alone. Chunk {failures[0][0]}:\n{first.traceback}"
+    )
+    error.__cause__ = first.error
+    return error
+
+
+def _chunk_size(facts: Facts, row_bytes: int, count: int, workers: int, is_measured: bool) -> int:
+    """Rollouts of a chunk: some seconds of work, not too many bytes, and enough chunks for each worker; whole batches."""
+    lanes = facts.lanes
+    most = BYTES / max(row_bytes * lanes, 1), count / (SHARES * workers * lanes)
+    batches = min(SECONDS / max(facts.seconds, 1e-6), *most)
+    return max(min(lanes * max(1, int(batches)), count), PILOT_BATCHES * lanes if is_measured else 0)
+
+
+def _select_rows(described: Described, rows: bool | Sequence[str]) -> tuple[str, ...]:
     if isinstance(rows, bool):
         return tuple(described.variables) if rows else ("result",)
     unknown = [name for name in rows if name not in described.variables]
@@ -230,12 +290,6 @@ def _order(cost: Cost, batch: Members) -> np.ndarray | None:
     if costs.shape != (batch.count,):
         raise ValueError(f"cost has shape {costs.shape}; give one number for each of the {batch.count} rollouts")
     return np.argsort(-costs, kind="stable")
-
-
-def _lanes(devices: Sequence[Any], count: int, processes: int, row_bytes: int) -> int:
-    """Rollouts at once: what devices like, but no more than a chunk may have of bytes, and enough chunks for each process."""
-    fair = -(-count // (driver.SHARES * processes))
-    return max(1, min(program.default_lanes(devices), driver.BYTES // max(row_bytes, 1), fair))
 
 
 def _bytes(variable: Any) -> int:

@@ -1,7 +1,6 @@
 """From a function of one sample to the arrays of a store: names, axes, units, codes."""
 
 from collections.abc import Callable, Mapping
-from importlib import metadata
 from typing import Any, NamedTuple
 
 import jax
@@ -38,24 +37,55 @@ class Described(NamedTuple):
         return self.axes | ({} if order is None else {"rollout": (order, {})})
 
 
-def described_motion(
-    one: Callable, batch: Members, reductions: Mapping[str, Reduction], units: Mapping[str, str], ts: np.ndarray
-) -> Described:
-    """Of `one(drawn, row) -> (solution, scene, parameters)` with rows at the times ts (nt,)."""
-    seen: dict[str, Any] = {}
+class MotionRows(NamedTuple):
+    """The arrays of a motion, `one(drawn, row) -> (solution, scene, parameters)`.
 
-    def rows(drawn: Any, row: Any) -> dict[str, Any]:
-        solution, scene, parameters = one(drawn, row)
+    `seen`: names of its signals and poses, which do not change from call to call, of whichever was the last.
+    """
+
+    one: Callable
+    reductions: Mapping[str, Reduction]
+    seen: dict[str, Any]
+
+    def __call__(self, drawn: Any, row: Any) -> dict[str, Any]:
+        """By their names in the store, with the quantities of reductions."""
+        solution, scene, parameters = self.one(drawn, row)
         signals = traced_signals(solution, scene)
         values = {signal.key: signal.values for signal in signals}
         poses = {f"pose_{name}": pose for name, pose in solution.poses.items()}
-        named = _parameters(parameters)
         stats = {name: solution.stats[name] for name in ("num_steps", "time_reached")}
-        # What does not change from call to call, of whichever was the last.
-        seen.update(signals=[signal._replace(values=None) for signal in signals], poses=tuple(poses))
-        values |= poses | named | stats
-        return _with_quantities(values | {"result": code_of(solution.result)}, reductions)
+        self.seen.update(signals=[signal._replace(values=None) for signal in signals], poses=tuple(poses))
+        values |= poses | _parameters(parameters) | stats
+        return _with_quantities(values | {"result": code_of(solution.result)}, self.reductions)
 
+
+class FunctionRows(NamedTuple):
+    """The arrays of a function, `one(drawn, row) -> (dictionary of arrays, parameters)`."""
+
+    one: Callable
+    reductions: Mapping[str, Reduction]
+
+    def __call__(self, drawn: Any, row: Any) -> dict[str, Any]:
+        """By their names in the store, with the quantities of reductions."""
+        values, parameters = self.one(drawn, row)
+        if not isinstance(values, Mapping) or not values:
+            raise ValueError(f"function returned a {type(values).__name__}; return a dictionary of arrays by name")
+        values = {str(name): jnp.asarray(value) for name, value in values.items()}
+        if {"result", "record", "partial", "rollout"} & values.keys():
+            raise ValueError("function returned an array named result, record, partial or rollout; take another name")
+        success = values.pop("success", None)
+        if success is None:
+            success = jnp.stack([jnp.isfinite(value).all() for value in values.values()]).all()
+        code = jnp.where(success, 0, 1).astype(jnp.uint8)
+        return _with_quantities(values | _parameters(parameters) | {"result": code}, self.reductions)
+
+
+def describe_motion(
+    one: Callable, batch: Members, reductions: Mapping[str, Reduction], units: Mapping[str, str], ts: np.ndarray
+) -> Described:
+    """Trace and describe `one(drawn, row) -> (solution, scene, parameters)` with rows at the times ts (nt,)."""
+    rows = MotionRows(one, reductions, {})
+    seen = rows.seen
     traced = Traced(rows, batch)
     shapes = traced.shapes
     variables, axes = {}, {}
@@ -77,24 +107,11 @@ def described_motion(
     return Described(rows, traced, True, variables, CODES, axes)
 
 
-def described_function(
+def describe_function(
     one: Callable, batch: Members, reductions: Mapping[str, Reduction], units: Mapping[str, str]
 ) -> Described:
-    """Of `one(drawn, row) -> (dictionary of arrays, parameters)`."""
-
-    def rows(drawn: Any, row: Any) -> dict[str, Any]:
-        values, parameters = one(drawn, row)
-        if not isinstance(values, Mapping) or not values:
-            raise ValueError(f"function returned a {type(values).__name__}; return a dictionary of arrays by name")
-        values = {str(name): jnp.asarray(value) for name, value in values.items()}
-        if {"result", "record", "partial", "rollout"} & values.keys():
-            raise ValueError("function returned an array named result, record, partial or rollout; take another name")
-        success = values.pop("success", None)
-        if success is None:
-            success = jnp.stack([jnp.isfinite(value).all() for value in values.values()]).all()
-        code = jnp.where(success, 0, 1).astype(jnp.uint8)
-        return _with_quantities(values | _parameters(parameters) | {"result": code}, reductions)
-
+    """Trace and describe `one(drawn, row) -> (dictionary of arrays, parameters)`."""
+    rows = FunctionRows(one, reductions)
     traced = Traced(rows, batch)
     shapes = traced.shapes
     variables = {}
@@ -104,11 +121,6 @@ def described_function(
             variables[name] = _variable(name, shapes, None, {"units": unit} if unit else {})
     variables["result"] = _codes(OUTCOMES)
     return Described(rows, traced, False, variables, OUTCOMES, {})
-
-
-def version() -> dict[str, str]:
-    """What computes: results of another version may differ."""
-    return {f"version of {name}": metadata.version(name) for name in ("jaxdyn", "jax", "jaxlib")}
 
 
 def _parameters(tree: Any) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class Members:
             drawn = self.draw(jax.random.fold_in(jax.random.key(self.seed), given["number"]))
         return drawn, given["rows"]
 
-    def described(self) -> dict[str, Any]:
+    def description(self) -> dict[str, Any]:
         """What tells these members from others, by argument."""
         return {
             "samples": self.count,

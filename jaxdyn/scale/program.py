@@ -63,7 +63,7 @@ class Program:
             lowered = self._batch.lower(self._inputs_of(self.lanes))
             self.lowered = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
             self.compiled = lowered.compile(compiler_options=self._options)
-            self.bytes = self._needed()
+            self.bytes = self._memory_needed()
             if self.bytes <= budget:
                 break
             if self.lanes == least:
@@ -89,12 +89,9 @@ class Program:
         return clock() - before
 
     def _inputs_of(self, lanes: int) -> Any:
-        return jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct((lanes, *x.shape[1:]), jax.dtypes.canonicalize_dtype(x.dtype)),
-            self.members.inputs(np.zeros(1, np.int64)),
-        )
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct((lanes, *x.shape), x.dtype), member_shapes(self.members))
 
-    def _needed(self) -> int:
+    def _memory_needed(self) -> int:
         """Bytes of the program and of the results that are in memory at once, on all devices, by XLA's own account."""
         analysis = self.compiled.memory_analysis()
         if analysis is None:
@@ -110,16 +107,20 @@ class Traced:
     """
 
     def __init__(self, one: Callable, members: Members):
+        self._origin = one, members
         trace = jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True)
-        operations, self.shapes = trace(given_to_one(members))
+        operations, self.shapes = trace(member_shapes(members))
         self._call = function_of(operations)
         self._structure = jax.tree.structure(self.shapes)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Traced, self._origin  # what is traced cannot be sent, so that a worker traces it again
 
     def __call__(self, given: Any) -> dict[str, Any]:
         return jax.tree.unflatten(self._structure, self._call(*jax.tree.leaves(given)))
 
 
-def given_to_one(members: Members) -> Any:
+def member_shapes(members: Members) -> Any:
     """Shapes and dtypes of what the function of one member takes."""
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)),
@@ -130,7 +131,7 @@ def given_to_one(members: Members) -> Any:
 def fingerprint(one: Callable, members: Members) -> str:
     """A hash of what is computed for one member, by operations of JAX alone: the same on every machine with these versions."""
     with compilation("plain"):
-        text = jax.jit(lambda given: one(*members.one(given))).lower(given_to_one(members)).as_text()
+        text = jax.jit(lambda given: one(*members.one(given))).lower(member_shapes(members)).as_text()
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

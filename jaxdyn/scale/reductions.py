@@ -1,8 +1,9 @@
 """What is kept of many rollouts without their rows: means, histograms, quantiles, the worst, and what users write.
 
 A reduction works on the values of one quantity, an array of each rollout. Those of a chunk become a partial result of a fixed
-shape, which is stored with the chunk; at the end the partial results are merged in the order of the chunks. So a run that was
-interrupted, or shared by several processes, gives the same bits as one that was not. Rollouts that failed are left out.
+shape, which is stored with the chunk. Partial results are combined in the order of the chunks while chunks are computed, so that
+memory does not grow with their number, and a run that was interrupted, or computed by several workers, gives the same bits as one
+that was not. Rollouts that failed are left out.
 """
 
 import abc
@@ -34,9 +35,17 @@ class Reduction(abc.ABC):
         Arrays whose shapes and dtypes depend on the shape of one value alone.
         """
 
+    def combine(self, partials: Arrays) -> Arrays:
+        """Fewer partial results that merge to the same; `partials` are of chunks in their order, with a leading axis of chunks.
+
+        By default those that are given. One that returns a single partial result keeps the memory of long runs constant;
+        combine([combine([a, b]), c]) and combine([a, b, c]) have to be equal bit for bit.
+        """
+        return partials
+
     @abc.abstractmethod
     def merge(self, partials: Arrays) -> Arrays:
-        """The result, by `parts`, of the partial results of all chunks, each with a leading axis of chunks."""
+        """The result, by `parts`, of the partial results of all chunks (or what `combine` made of them), with a leading axis."""
 
 
 @dataclass(frozen=True)
@@ -57,17 +66,25 @@ class Mean(Reduction):
         squares = ((values - mean) ** 2).sum(0)
         return {"count": np.asarray(len(values)), "mean": np.asarray(mean), "squares": np.asarray(squares)}
 
-    def merge(self, partials: Arrays) -> Arrays:
-        """Chunk by chunk."""
+    def combine(self, partials: Arrays) -> Arrays:
+        """Chunk by chunk, into one."""
         count, mean = 0, np.zeros(partials["mean"].shape[1:])
         squares = np.zeros_like(mean)
         for n, one, squares_within in zip(partials["count"], partials["mean"], partials["squares"], strict=True):
             if n == 0:
                 continue
+            if count == 0:  # exactly as it is, so that what was combined before can stand first
+                count, mean, squares = n, one, squares_within
+                continue
             total, shift = count + n, one - mean
             mean = mean + shift * (n / total)
             squares = squares + squares_within + shift**2 * (count * n / total)
             count = total
+        return {"count": np.asarray([count]), "mean": mean[None], "squares": squares[None]}
+
+    def merge(self, partials: Arrays) -> Arrays:
+        """Mean and deviation of the combined sums."""
+        count, mean, squares = (self.combine(partials)[name][0] for name in ("count", "mean", "squares"))
         mean = mean if count else np.full_like(mean, np.nan)
         std = np.sqrt(squares / (count - 1)) if count > 1 else np.full_like(mean, np.nan)
         return {"mean": np.asarray(mean), "std": np.asarray(std), "count": np.asarray(count)}
@@ -105,6 +122,10 @@ class Histogram(Reduction):
         size, width = self.bins + 2, flat.shape[1]
         counts = np.bincount((places * width + np.arange(width)).ravel(), minlength=size * width)
         return {"counts": counts.reshape(size, *values.shape[1:])}
+
+    def combine(self, partials: Arrays) -> Arrays:
+        """Their sum."""
+        return {"counts": partials["counts"].sum(0, keepdims=True)}
 
     def merge(self, partials: Arrays) -> Arrays:
         """Their sum."""
@@ -180,6 +201,10 @@ class Worst(Reduction):
             )
         return self._worst(values.astype(np.float64), numbers)
 
+    def combine(self, partials: Arrays) -> Arrays:
+        """The worst of these."""
+        return {name: value[None] for name, value in self.merge(partials).items()}
+
     def merge(self, partials: Arrays) -> Arrays:
         """The worst of these."""
         there = partials["rollout"] >= 0
@@ -192,7 +217,7 @@ class Worst(Reduction):
         return {"value": value, "rollout": rollout}
 
 
-def checked_reductions(reductions: Any) -> dict[str, Reduction]:
+def check_reductions(reductions: Any) -> dict[str, Reduction]:
     """The reductions by name.
 
     **Raises:** ValueError for what is no dictionary of reductions, and for names that are no identifiers.
@@ -228,6 +253,6 @@ def quantities(reductions: Mapping[str, Reduction], rows: Mapping[str, Any]) -> 
     return arrays
 
 
-def described(reductions: Mapping[str, Reduction]) -> list[str]:
+def describe_reductions(reductions: Mapping[str, Reduction]) -> list[str]:
     """A text for each reduction, the same in every process: without the addresses of functions."""
     return [f"{name}: {re.sub(r' at 0x[0-9a-f]+', '', repr(one))}" for name, one in reductions.items()]

@@ -1,6 +1,7 @@
 """`jd.scale.run` and `jd.scale.evaluate`: many rollouts of one-sample functions, into a store that can be gone on with."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -9,18 +10,67 @@ from jaxtyping import Array, PyTree
 
 from jaxdyn.model.arguments import Checked, FilePath, Numbers, as_array
 from jaxdyn.model.description import scene_lines
-from jaxdyn.scale.batch import Cost, Options, Run, whole
-from jaxdyn.scale.described import described_function, described_motion
-from jaxdyn.scale.driver import STEPS
+from jaxdyn.scale.batch import Cost, Options, Run, run_batch
+from jaxdyn.scale.described import describe_function, describe_motion
 from jaxdyn.scale.members import digest, members
 from jaxdyn.scale.reductions import Reduction
+from jaxdyn.scale.study import STEPS
 from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers.inputs import check_times
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
+from jaxdyn.tasks import DaskClient
 
 SHARE = 0.05  # of the times that are simulated to measure what a rollout costs
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A rollout of `run`, as a function of what is drawn for it (None where nothing is) and of its row of the arrays.
+
+    A class and no function within `run`, so that workers find its code in their own jaxdyn.
+    """
+
+    scene: Any
+    builds: bool
+    states: Callable | None
+    fixed: dict[str, np.ndarray]
+    control: Any
+    ts: np.ndarray
+    options: dict[str, Any]
+
+    def __call__(self, drawn: Any, row: Any) -> tuple[Any, Any, Any]:
+        """Its solution, scene and parameters."""
+        scene, control, q0, v0, own = self._start(drawn, row)
+        return simulate(scene, q0, v0, self.ts, control=control, throw=False, **self.options), scene, own
+
+    def pilot(self, drawn: Any, row: Any) -> dict[str, Any]:
+        """The steps of its first part."""
+        scene, control, q0, v0, _ = self._start(drawn, row)
+        early = np.array([self.ts[0], self.ts[0] + SHARE * (self.ts[-1] - self.ts[0])])
+        solution = simulate(scene, q0, v0, early, control=control, throw=False, **{**self.options, "outputs": ()})
+        return {STEPS: solution.stats[STEPS]}
+
+    def _start(self, drawn: Any, row: Any) -> tuple[Any, Any, Any, Any, Any]:
+        own = row.get("parameters") if drawn is None else drawn
+        scene, control = self.scene(own) if self.builds else self.scene, self.control
+        if isinstance(scene, tuple):
+            scene, control = scene
+        q0, v0 = self.states(own) if self.states else ((row | self.fixed)[name] for name in ("q0", "v0"))
+        return scene, control, q0, v0, own
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """A sample of `evaluate`, as a function of what is drawn for it (None where nothing is) and of its row of the arrays."""
+
+    function: Callable[[Any], Mapping[str, Any]]
+
+    def __call__(self, drawn: Any, row: Any) -> tuple[Any, Any]:
+        """The arrays that its function returns, and its parameters."""
+        own = row["parameters"] if drawn is None else drawn
+        return self.function(own), own
 
 
 def run(
@@ -37,7 +87,8 @@ def run(
     rows: bool | Sequence[str] = True,
     cost: Cost = None,
     units: Mapping[str, str] | None = None,
-    process: tuple[int, int] | None = None,
+    client: DaskClient | None = None,
+    retries: int = 2,
     devices: Sequence[Any] | None = None,
     lanes: int | None = None,
     chunk: int | None = None,
@@ -58,7 +109,7 @@ def run(
       of one rollout, `states(parameters) -> (q0, v0)`.
     - `parameters`: None; a pytree of arrays (samples, ...), one row a rollout; or a function `draw(key)` that draws those of one
       rollout, traced: then `samples` says how many there are, and nothing is held in memory. Rollout i has the key
-      `jax.random.fold_in(jax.random.key(seed), i)`, whatever blocks, devices and processes there are; `jd.scale.member` gives
+      `jax.random.fold_in(jax.random.key(seed), i)`, whatever blocks, devices and workers there are; `jd.scale.member` gives
       its parameters again.
     - `ts` (nt,): save points (s), `control` and further options: as in `jd.simulate`.
     - `out`: directory of the store. Its variables are those of `Solution.to_xarray` over "rollout" and t, with names and units;
@@ -72,26 +123,26 @@ def run(
       where nobody knows, for adaptive steps: the first twentieth of the times is simulated first, and the rollouts of a chunk
       are computed by falling steps of that; they are stored in the order of their numbers.
     - `units`: of parameters, by name.
-    - `process`: (index, count) of this process among those that write to the store; by default as `jax.distributed` or the
-      environment (Slurm, Open MPI, an indexed job of Kubernetes with JAXDYN_PROCESSES) says. They exchange nothing: each
-      claims chunks by files beside the store, and those left by one that dies are computed by the others.
-    - `devices`: of this process, all by default. `lanes`: rollouts computed at once, by default 2048 for each device of a CPU
-      and fewer where there are few rollouts, or where the compiled program with its results, by XLA's account of it, does not
-      fit into `memory` (bytes; by default half of what is free, shared among the processes). `chunk`: rollouts stored at
-      once, and lost at most when killed; by default some two seconds' work.
+    - `client`: a `dask.distributed.Client`, whose workers compute the chunks; without it this process does, and Dask is not
+      imported. `retries`: how often a chunk that raises is tried again; others are finished before its error is reported.
+    - `devices`: of this process, all by default; a worker uses all of its own. `lanes`: rollouts computed at once, by default
+      2048 for each device of a CPU and fewer where there are few rollouts, or where the compiled program with its results, by
+      XLA's account of it, does not fit into `memory` (bytes; by default half of what is free, shared among the workers of a
+      host). `chunk`: rollouts stored at once, and lost at most when killed; by default some two seconds' work.
     - `compress`: store arrays compressed (Zstandard); smaller, and slower.
     - `verify`: at the end look through the chunks that an earlier call has stored, and compute again what is not whole.
     - `progress`: show rate and time left on standard error.
 
     **Returns:** a `Run`. A rollout that fails is a row with its code and does not raise.
 
-    Results are the same, bit for bit, whether a run was interrupted or not, and for any number of processes, devices, lanes
+    Results are the same, bit for bit, whether a run was interrupted or not, and for any number of workers, devices, lanes
     and chunks on CPUs of one kind; other kinds, and GPUs, round differently in the last bit.
 
     **Raises:** ValueError for arguments that do not fit; for a store of another scene, version, seed, ..., with both values; for
-    one that another living process writes to, with its owner; what `simulate` raises when it is traced. ImportError without
-    zarr and xarray. MemoryError where not even one rollout fits. OSError where `out` cannot be written, or its disk is full: what
-    was finished is kept.
+    one that another process writes to, with its owner; for a cluster with other versions, or whose workers do not see `out`;
+    what `simulate` raises when it is traced. ImportError without the extra `scale`. MemoryError where not even one rollout fits.
+    What was finished is kept by: OSError where `out` cannot be written, or its disk is full; RuntimeError, with number and
+    traceback, for a chunk that fails in every attempt; ConnectionError where the scheduler does not come back.
 
     ```python
     def draw(key):
@@ -125,39 +176,33 @@ def run(
             (named if value.ndim > 1 else fixed)[name] = value
     batch = members(named, draw, samples, seed)
 
-    def begun(drawn: Any, row: Any) -> tuple[Any, Any, Any, Any]:
-        own = drawn if draw is not None else row.get("parameters")
-        built = model(own) if builds else model
-        law = control
-        if isinstance(built, tuple):
-            built, law = built
-        start: Any = states(own) if callable(states) else [(row | fixed)[name] for name in ("q0", "v0")]
-        return built, law, *start
-
-    def one(drawn: Any, row: Any) -> tuple[Any, Any, Any]:
-        built, law, q0, v0 = begun(drawn, row)
-        own = drawn if draw is not None else row.get("parameters")
-        return simulate(built, q0, v0, ts, control=law, throw=False, **options), built, own
-
-    def pilot(drawn: Any, row: Any) -> dict[str, Any]:
-        built, law, q0, v0 = begun(drawn, row)
-        early = np.array([ts[0], ts[0] + SHARE * (ts[-1] - ts[0])])
-        solution = simulate(built, q0, v0, early, control=law, throw=False, **{**options, "outputs": ()})
-        return {STEPS: solution.stats[STEPS]}
-
     if not builds:
         model = as_scene(model)
+    rollout = Rollout(model, builds, states if callable(states) else None, fixed, control, ts, options)
     given = {
         "ts": f"{ts[0]:g} to {ts[-1]:g} s, {len(ts)} points, {digest(ts)}",
         "scene": "built by a function" if builds else scene_lines(model),
         "outputs": list(options.get("outputs", ())),
     }
     shared = Options(
-        out, reductions, rows, cost, process, devices, lanes, chunk, memory, compress, verify, progress, units or {}
+        out,
+        reductions,
+        rows,
+        cost,
+        client,
+        retries,
+        devices,
+        lanes,
+        chunk,
+        memory,
+        compress,
+        verify,
+        progress,
+        units or {},
     )
-    adaptive = pilot if options.get("stepsize") is None else None
-    return whole(
-        lambda reducing: described_motion(one, batch, reducing, shared.units, ts), given, batch, shared, adaptive
+    pilot = rollout.pilot if options.get("stepsize") is None else None
+    return run_batch(
+        lambda reducing: describe_motion(rollout, batch, reducing, shared.units, ts), given, batch, shared, pilot
     )
 
 
@@ -172,7 +217,8 @@ def evaluate(
     rows: bool | Sequence[str] = True,
     cost: Cost = None,
     units: Mapping[str, str] | None = None,
-    process: tuple[int, int] | None = None,
+    client: DaskClient | None = None,
+    retries: int = 2,
     devices: Sequence[Any] | None = None,
     lanes: int | None = None,
     chunk: int | None = None,
@@ -194,11 +240,22 @@ def evaluate(
     draw = parameters if callable(parameters) else None
     batch = members({} if draw is not None else {"parameters": parameters}, draw, samples, seed)
 
-    def one(drawn: Any, row: Any) -> tuple[Any, Any]:
-        own = drawn if draw is not None else row["parameters"]
-        return function(own), own
-
     shared = Options(
-        out, reductions, rows, cost, process, devices, lanes, chunk, memory, compress, verify, progress, units or {}
+        out,
+        reductions,
+        rows,
+        cost,
+        client,
+        retries,
+        devices,
+        lanes,
+        chunk,
+        memory,
+        compress,
+        verify,
+        progress,
+        units or {},
     )
-    return whole(lambda reducing: described_function(one, batch, reducing, shared.units), {}, batch, shared)
+    return run_batch(
+        lambda reducing: describe_function(Sample(function), batch, reducing, shared.units), {}, batch, shared
+    )

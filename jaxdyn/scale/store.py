@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 
 FORMAT = 1  # of the layout above
-MOST_BYTES = 2**27  # read at once
 FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -95,7 +94,7 @@ class Store:
             except PermissionError:
                 raise
             except Exception as error:  # zarr reads the file with few checks: JSON, keys, types
-                raise self._damaged(error) from error
+                raise self._damage_error(error) from error
         if attributes.get("jaxdyn_store") != FORMAT:
             version = attributes.get("jaxdyn_store", "nothing")
             raise ValueError(
@@ -110,9 +109,9 @@ class Store:
             self._arrays: dict[str, Any] = {name: self.group[name] for name in self.names}
             self._record: Any = self.group["record/checksum"]
         except (KeyError, TypeError, ValueError, ArithmeticError, OSError) as error:
-            raise self._damaged(error) from error
+            raise self._damage_error(error) from error
 
-    def _damaged(self, error: Exception) -> ValueError:
+    def _damage_error(self, error: Exception) -> ValueError:
         reason = " ".join(str(error).split()) or type(error).__name__
         return ValueError(
             f"out is {str(self.path)!r}, whose zarr.json is damaged ({type(error).__name__}: {reason}); put it back from a "
@@ -213,18 +212,21 @@ class Store:
         """Whether the chunk is recorded."""
         return self._file("record/checksum", self._record, chunk).exists()
 
-    def done(self) -> list[int]:
-        """Recorded chunks."""
+    def recorded_chunks(self) -> np.ndarray:
+        """Mask of the recorded chunks (chunks,)."""
         folder = self._file("record/checksum", self._record, 0).parent.parent
-        names = os.listdir(folder) if folder.is_dir() else []
-        # The folder of a chunk is there before its file.
-        return sorted(int(name) for name in names if name.isdigit() and self.is_done(int(name)))
+        recorded = np.zeros(self.chunks, bool)
+        with contextlib.suppress(FileNotFoundError), os.scandir(folder) as entries:
+            for entry in entries:
+                # The folder of a chunk is there before its file.
+                if entry.name.isdigit() and self.is_done(int(entry.name)):
+                    recorded[int(entry.name)] = True
+        return recorded
 
-    def finished(self) -> int:
-        """Rollouts of the recorded chunks."""
-        done = self.done()
+    def count_rollouts(self, chunks: np.ndarray) -> int:
+        """Rollouts of the chunks that are marked (chunks,)."""
         last = self.count - (self.chunks - 1) * self.chunk
-        return len(done) * self.chunk - (self.chunk - last if self.chunks - 1 in done else 0)
+        return int(chunks.sum()) * self.chunk - int(chunks[-1]) * (self.chunk - last)
 
     def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write all arrays of a chunk, then its record.
@@ -236,12 +238,9 @@ class Store:
                 array[self._place(array, chunk)] = arrays[name]
             self._record[chunk] = self._sums(chunk)
 
-    def parts(self, name: str) -> Iterator[tuple[int, np.ndarray]]:
-        """An array in parts of many chunks, each with the place at which it begins."""
-        array = self._arrays[name]
-        step = array.chunks[0] * max(1, MOST_BYTES // max(array.nbytes // max(array.shape[0], 1) * array.chunks[0], 1))
-        for start in range(0, array.shape[0], step):
-            yield start, np.asarray(array[start : start + step])
+    def read(self, chunk: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """These arrays of a chunk."""
+        return {name: np.asarray(self._arrays[name][self._place(self._arrays[name], chunk)]) for name in names}
 
     def is_whole(self, chunk: int) -> bool:
         """Whether all files of a recorded chunk are those that were written, by their sums."""
@@ -264,12 +263,10 @@ class Store:
             for name, value in arrays.items():
                 self.group[name][...] = value
 
-    def remove_leftovers(self, older: float) -> None:
-        """Files that a process was killed while writing, if they are older than so many seconds."""
+    def remove_leftovers(self) -> None:
+        """Files that a process was killed while writing; a task of a dead client that still writes one ends with an error."""
         for path in self.path.rglob("*.partial"):
-            with contextlib.suppress(FileNotFoundError):
-                if time.time() - path.stat().st_mtime >= older:
-                    path.unlink()
+            path.unlink(missing_ok=True)
 
     def _place(self, array: Any, chunk: int) -> slice:
         return self.rows(chunk) if array.metadata.dimension_names[0] == "rollout" else slice(chunk, chunk + 1)

@@ -1,40 +1,29 @@
-"""How far a run has come: rate and time left, on standard error."""
+"""A meter of progress, with rate and time left, on standard error."""
 
 import sys
 import time
-from collections.abc import Callable
 from typing import TextIO
 
 
 class Progress:
     """A meter: one line that is written anew on a terminal, a line every `every` seconds elsewhere.
 
-    `done()` counts the rollouts that are stored, by all processes of a run; the rate is that of those stored since the meter was
-    made.
+    `before`: how many of the `total` rollouts were stored before; the rate is that of those stored since the meter was made.
     """
 
-    def __init__(
-        self,
-        total: int,
-        done: Callable[[], int],
-        *,
-        shown: bool = True,
-        every: float = 10.0,
-        file: TextIO | None = None,
-    ):
-        self.total, self.computed, self.failed = total, 0, 0
+    def __init__(self, total: int, before: int, *, shown: bool = True, every: float = 10.0, file: TextIO | None = None):
+        self.total, self.before, self.computed, self.failed = total, before, 0, 0
         self._file = sys.stderr if file is None else file
-        self._done, self._before = done, done()
         self._shown, self._terminal = shown, self._file.isatty()
         self._every = 0.2 if self._terminal else every
         self._start = self._last = time.monotonic()
 
     def add(self, computed: int, failed: int) -> None:
-        """Count rollouts that this process has stored."""
+        """Count rollouts that were stored."""
         self.computed += computed
         self.failed += failed
         if time.monotonic() - self._last >= self._every:
-            self._write("\r" if self._terminal else "", "" if self._terminal else "\n")
+            self._write("" if self._terminal else "\n")
 
     def note(self, text: str) -> None:
         """A line of its own."""
@@ -43,7 +32,7 @@ class Progress:
 
     def end(self) -> None:
         """The last line."""
-        self._write("\r" if self._terminal else "", "\n")
+        self._write("\n")
 
     @property
     def seconds(self) -> float:
@@ -51,19 +40,20 @@ class Progress:
         return time.monotonic() - self._start
 
     def __str__(self) -> str:
-        done = self._done()
+        # Chunks that were not whole and are computed again were counted before.
+        done = min(self.before + self.computed, self.total)
         text = f"{100 * done / self.total:5.1f} %, {done} of {self.total} rollouts"
-        if done > self._before:
-            rate = (done - self._before) / max(self.seconds, 1e-9)
+        if self.computed:
+            rate = self.computed / max(self.seconds, 1e-9)
             text += f", {rate:.3g}/s"
             if done < self.total:
                 text += f", {_duration((self.total - done) / rate)} left"
         return text + (f", {self.failed} failed" if self.failed else "")
 
-    def _write(self, before: str, after: str) -> None:
+    def _write(self, end: str) -> None:
         self._last = time.monotonic()
         if self._shown:
-            print(f"{before}{self!s:<78}", end=after, file=self._file, flush=True)
+            print(f"{chr(13) if self._terminal else ''}{self!s:<78}", end=end, file=self._file, flush=True)
 
 
 def _duration(seconds: float) -> str:

@@ -1,0 +1,303 @@
+"""Tasks on the workers of a Dask client: checks, a sliding window of tasks, and what becomes of them when a machine dies."""
+
+import contextlib
+import itertools
+import logging
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from jaxdyn.tasks.local import Failure, Local, package_versions
+
+if TYPE_CHECKING:
+    from distributed import Client as DaskClient
+else:
+    DaskClient = Any  # Dask need not be there; `Cluster` looks at it
+
+logger = logging.getLogger("jaxdyn")
+WINDOW = 4  # tasks that a worker has or waits for: enough that it never idles, few enough that memory stays flat
+LEAST_WINDOW = 16
+AHEAD = 8  # windows that tasks may run ahead of one that is not finished, whose results wait for it
+
+
+class Cluster:
+    """Tasks on the workers of a Dask client: methods of an object that `send` sends there; a context manager.
+
+    **Arguments:** `retries`, of a task that raises. `mark`: a file and its text, which every worker has to see, or None.
+
+    A worker has one task at a time, so that the threads of kernels are not shared among several. Tasks of a worker that dies go
+    to the others. Where the scheduler dies the client reconnects for as long as its own `timeout` says, and unfinished tasks are
+    submitted again.
+
+    **Raises:** ValueError for what is no client, and for a scheduler or workers with other versions of Python, Dask, JAX or
+    jaxdyn, before any task. ConnectionError where the scheduler does not come back.
+    """
+
+    def __init__(self, client: DaskClient, retries: int = 0, mark: tuple[Path, str] | None = None):
+        self.client: Any = client
+        self.retries, self.mark = retries, mark
+        self._name = f"jaxdyn-{uuid.uuid4().hex[:12]}"
+        self._plugin: Any = None
+        self._generation = itertools.count()
+
+    def __enter__(self) -> "Cluster":
+        try:
+            import cloudpickle  # noqa: F401 (its absence is told here)
+            from distributed import Client
+        except ImportError as error:
+            raise ImportError(f"client= needs {error.name}: pip install 'jaxdyn[scale]'") from error
+        if not isinstance(self.client, Client) or self.client.asynchronous or self.client.status != "running":
+            raise ValueError(
+                f"client is {self.client!r}; give a dask.distributed.Client that is connected and not asynchronous"
+            )
+        self._begin()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._plugin is not None:
+            with contextlib.suppress(Exception):  # of a scheduler that is gone
+                self.client.unregister_worker_plugin(self._name)
+
+    def send(self, target: Callable[[], Any]) -> None:
+        """Send `target` by cloudpickle, with the settings of JAX of this thread, to each worker, also to those that join later.
+
+        A worker calls it at its first task.
+
+        **Raises:** ValueError for a worker that does not see the file `mark`.
+        """
+        import cloudpickle
+
+        from jaxdyn.tasks.worker import TargetPlugin
+
+        self._plugin = TargetPlugin(cloudpickle.dumps(target), self.mark)
+        self.client.register_plugin(self._plugin, name=self._name)
+
+    def _begin(self) -> None:
+        self.client.wait_for_workers(1)
+        _check_versions(self.client)
+        if self._plugin is not None:
+            self.client.register_plugin(self._plugin, name=self._name)
+
+    @property
+    def workers(self) -> int:
+        """Number of workers now, at least 1."""
+        return count_workers(self.client)
+
+    @property
+    def workers_per_host(self) -> int:
+        """Number of workers that share the fullest host."""
+        return max(Counter(address.rpartition(":")[0] for address in self.client.nthreads()).values(), default=1)
+
+    def call(self, method: str, item: Any) -> Any:
+        """target.method(item) on a worker. **Raises:** what it raises there."""
+        [(_, result)] = self.map(method, [item])
+        if isinstance(result, Failure):
+            raise result.error
+        return result
+
+    def map(self, method: str, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
+        """Each item with target.method(item), or with the `Failure` of its last attempt, in the order of the items.
+
+        Items are taken and tasks submitted as results arrive: memory does not grow with their number.
+        """
+        window = _Window(self, method, items)
+        while True:
+            try:
+                window.submit()
+                while window.is_next_ready:
+                    yield window.take()
+                if not window.is_waiting:
+                    if window.is_exhausted:
+                        return
+                    continue
+                window.collect()
+            except _outages():
+                self._recover()
+                window.submit_again()
+
+    def submit(self, group: str, method: str, places: list[int], items: list[Any]) -> list[Any]:
+        """Futures of tasks; their keys are of the group and the places."""
+        from jaxdyn.tasks.worker import RESOURCE, call_target
+
+        return self.client.map(
+            call_target,
+            [self._name] * len(items),
+            [method] * len(items),
+            items,
+            key=[(group, place) for place in places],
+            resources={RESOURCE: 1},
+            retries=self.retries,
+            pure=False,
+        )
+
+    def new_group(self, method: str) -> str:
+        """A name that no task had."""
+        return f"{self._name}-{method}-{next(self._generation)}"
+
+    def _recover(self) -> None:
+        """Wait for a scheduler, which may be another one at the same address, and for a worker."""
+        logger.warning("tasks are lost on the way to the scheduler; they are submitted again when it answers")
+        while True:
+            while self.client.status == "connecting":
+                time.sleep(0.1)
+            if self.client.status != "running":
+                raise ConnectionError(
+                    "client: the scheduler is gone and did not come back within the client's timeout; what was finished is kept: "
+                    "start a cluster and run again"
+                )
+            try:
+                return self._begin()
+            except _outages():  # the client has not noticed yet, or the next scheduler is gone too
+                time.sleep(0.1)
+
+
+class _Window:
+    """Tasks that are under way, and results that wait for one before them."""
+
+    def __init__(self, cluster: Cluster, method: str, items: Iterable[Any]):
+        from distributed import as_completed
+
+        self._cluster, self._method, self._items = cluster, method, enumerate(items)
+        self._completed = as_completed()
+        # One for all tasks: the scheduler remembers each.
+        self._group = cluster.new_group(method)
+        self._waiting: dict[int, tuple[Any, Any]] = {}  # item and future by place
+        self._ready: dict[int, tuple[Any, Any]] = {}  # item and result by place
+        self._next = self._taken = 0
+        self.is_exhausted = False
+        self._workers, self._counted = 1, 0.0
+
+    @property
+    def is_waiting(self) -> bool:
+        return bool(self._waiting)
+
+    @property
+    def is_next_ready(self) -> bool:
+        return self._next in self._ready
+
+    def take(self) -> tuple[Any, Any]:
+        self._next += 1
+        return self._ready.pop(self._next - 1)
+
+    def submit(self) -> None:
+        """Fill the window, when half of it is empty: a call of the scheduler costs more than a task."""
+        if time.monotonic() - self._counted > 1.0:
+            self._workers, self._counted = self._cluster.workers, time.monotonic()
+        size = max(LEAST_WINDOW, WINDOW * self._workers)
+        if len(self._waiting) > size // 2:
+            return
+        room = min(size - len(self._waiting), self._next + AHEAD * size - self._taken)
+        new = list(itertools.islice(self._items, max(0, room)))
+        self.is_exhausted |= len(new) < room
+        if new:
+            self._taken = new[-1][0] + 1
+            self._add(dict(new))
+
+    def submit_again(self) -> None:
+        """All that is under way, whose futures are lost."""
+        self._completed.clear()
+        self._group = self._cluster.new_group(self._method)
+        lost = {place: item for place, (item, _) in self._waiting.items()}
+        self._waiting.clear()
+        self._add(lost)
+
+    def _add(self, new: dict[int, Any]) -> None:
+        # Noted first: where submitting fails they are submitted again.
+        self._waiting |= {place: (item, None) for place, item in new.items()}
+        futures = self._cluster.submit(self._group, self._method, list(new), list(new.values()))
+        self._waiting |= {place: (new[place], future) for place, future in zip(new, futures, strict=True)}
+        self._completed.update(futures)
+
+    def collect(self) -> None:
+        """Wait for results and fetch them."""
+        batch = [future for future in self._completed.next_batch() if self._place(future) is not None]
+        good = [future for future in batch if future.status == "finished"]
+        results: dict[Any, Any] = dict(zip(good, self._cluster.client.gather(good), strict=True))
+        for future in batch:
+            if future.status == "error":
+                results[future] = Failure.of(future.exception(), future.traceback())
+            elif future not in results:
+                raise ConnectionError(f"{future} is {future.status}")
+        for future, result in results.items():
+            place = self._place(future)
+            item, _ = self._waiting.pop(place)
+            self._ready[place] = item, result
+
+    def _place(self, future: Any) -> Any:
+        place = future.key[1]
+        return place if self._waiting.get(place, (None, None))[1] is future else None
+
+
+def _outages() -> tuple[type[BaseException], ...]:
+    """Errors of the client where the scheduler is gone, or where results are lost with all workers that had them."""
+    from concurrent.futures import CancelledError
+
+    from distributed.comm.core import CommClosedError
+
+    return OSError, CommClosedError, CancelledError
+
+
+def _check_versions(client: Any) -> None:
+    """**Raises:** ValueError that names the first worker, or the scheduler, with another version than this process."""
+    names = ["dask", "distributed", *package_versions()]
+    found = client.get_versions(packages=names)
+    own = found["client"]["packages"] | package_versions()
+    places = [("the scheduler", found["scheduler"], names[:2])]
+    places += [(f"worker {address}", told, names) for address, told in found["workers"].items()]
+    for place, told, compared in places:
+        theirs = told["packages"]
+        for name in ["python", *compared]:
+            # What a function by value contains differs between minor versions of Python.
+            here, there = (
+                (x.split(".")[:2] if name == "python" and x else x) for x in (own.get(name), theirs.get(name))
+            )
+            if here != there:
+                raise ValueError(
+                    f"client: {place} has {name} {theirs.get(name) or 'not at all'}, and this process {own.get(name)}; install "
+                    "the same version on both"
+                )
+
+
+def count_workers(client: DaskClient | None) -> int:
+    """Workers of a client now, at least 1; 1 without a client."""
+    if client is None:
+        return 1
+    threads: Any = client.nthreads()
+    return max(1, len(threads))
+
+
+def map_tasks(
+    function: Callable[[Any], Any], items: Iterable[Any], client: DaskClient | None = None, *, retries: int = 2
+) -> list[Any]:
+    """[function(item) for each item], on the workers of a Dask client where one is given; arrays come back as those of NumPy.
+
+    **Raises:** what the function raises; as `Cluster`.
+    """
+    if client is None:
+        return [_Function(function).call(item) for item in items]
+    results = []
+    with Cluster(client, retries) as cluster:
+        cluster.send(lambda: _Function(function))
+        for _, result in cluster.map("call", items):
+            if isinstance(result, Failure):
+                raise result.error
+            results.append(result)
+    return results
+
+
+class _Function:
+    def __init__(self, function: Callable[[Any], Any]):
+        self._function = function
+
+    def call(self, item: Any) -> Any:
+        # A process in 32 bits, which the client may be outside of its settings, would read arrays of JAX as such.
+        return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, self._function(item))
+
+
+Engine = Local | Cluster
