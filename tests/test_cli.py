@@ -726,7 +726,7 @@ def test_simulate_a_file_with_a_loop(four_bar, tmp_path, capsys):
         ("report four_bar --batch 0", "--batch is 0; give at least 1"),
         ("report four_bar --rounds 0", "--rounds is 0; give at least 1"),
         ("sweep x.toml --samples 0", "--samples is 0; give at least 1"),
-        ("sweep x.toml --process 2 2", "--process is 2 2; give I N with 0 <= I < N"),
+        ("sweep x.toml --workers 0", "--workers is 0; give at least 1"),
     ],
 )
 def test_numbers_of_options_end_in_a_line(arguments, words, arm, capsys, tmp_path, monkeypatch):

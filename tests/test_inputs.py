@@ -176,7 +176,7 @@ OPTIONS = [
     ({"stepsize": "0.1"}, "stepsize is .*; pass an array of numbers"),
     ({"stepsize": -0.1}, "stepsize is -0.1; pass a positive number"),
     ({"control": lambda q, v, t: np.sin(q)}, "control needs the values .* jax.numpy"),
-    ({"control": stiffer}, r"control needs the values .* jax\.lax\.cond in place of if"),
+    ({"control": stiffer}, r"control needs the values .* jax\.lax\.cond instead of if"),
     ({"control": lambda q, v: q}, r"control takes \(q, v\), but is called as control\(q, v, t\)"),
 ]
 

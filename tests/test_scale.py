@@ -737,7 +737,7 @@ def test_sweep_runs_a_study_and_goes_on_with_it(tmp_path, capsys):
         ("normal = [0.5, 0.1]", "normal = [0.5]", "parameter angle is .*give a finite number, or one of uniform"),
         ('mean = "energy"', 'median = "energy"', "give one of mean"),
         ('cost = "damping"', 'cost = "mass"', "name one of the parameters"),
-        ("duration = 0.1", "duration = ", "is no TOML"),
+        ("duration = 0.1", "duration = ", "is malformed TOML"),
         ('"study.py"', '"rolling_disk"', "rolling_disk has no parameter angle"),
     ],
 )
@@ -775,7 +775,7 @@ def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     assert len(np.unique(drawn.q[:, -1, 2])) == 6
     study.write_text(head + 'scene = "windows"\n[parameters]\ncount = { uniform = [1.0, 2.0] }\n')
     assert main(["sweep", str(study), "--quiet", "--out", str(tmp_path / "c.zarr")]) == 2
-    assert "is built from known numbers, so that count cannot be drawn" in capsys.readouterr().err
+    assert "is built from concrete numbers, so that count cannot be drawn" in capsys.readouterr().err
 
 
 def test_stores_that_cannot_be_are_refused_with_the_cause(tmp_path, monkeypatch):

@@ -22,8 +22,8 @@ from jaxdyn.simulation.run import simulate
 
 HELP = "simulate a study of many rollouts into a Zarr store; resumable"
 DESCRIPTION = """\
-Simulate many rollouts whose parameters are drawn as a file says. Finished chunks are kept: the same command started
-again after an interruption computes the rest. With a Dask scheduler the workers of a cluster share the work.
+Simulate many rollouts with parameters drawn from distributions in a file. Finished chunks are kept: the same command
+resumes after an interruption. With a Dask scheduler the workers of a cluster share one study.
 """
 EPILOG = """\
 examples:
@@ -90,23 +90,23 @@ _OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "progre
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
-    parser.add_argument("study", help="file .toml that describes the study, see below")
-    parser.add_argument("--out", metavar="DIR", help="store, in place of the study's")
-    parser.add_argument("--samples", type=whole, metavar="N", help="rollouts, in place of the study's")
-    parser.add_argument("--seed", type=whole, metavar="N", help="in place of the study's")
+    """Add the arguments of the command."""
+    parser.add_argument("study", help=".toml file that describes the study, see below")
+    parser.add_argument("--out", metavar="DIR", help="store, instead of the study's")
+    parser.add_argument("--samples", type=whole, metavar="N", help="number of rollouts, instead of the study's")
+    parser.add_argument("--seed", type=whole, metavar="N", help="seed, instead of the study's")
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
-        "--client", metavar="ADDRESS", help="of a Dask scheduler whose workers compute, as tcp://host:8786"
+        "--client", metavar="ADDRESS", help="address of a Dask scheduler whose workers compute, as tcp://host:8786"
     )
-    place.add_argument("--workers", type=whole, metavar="N", help="start so many worker processes of Dask here")
-    parser.add_argument("--devices", type=whole, metavar="N", help="CPU devices to share rollouts among (default: 1)")
-    parser.add_argument("--chunk", type=whole, metavar="N", help="rollouts stored at once (default: two seconds' work)")
-    parser.add_argument("--quiet", action="store_true", help="no meter")
+    place.add_argument("--workers", type=whole, metavar="N", help="number of local Dask worker processes to start")
+    parser.add_argument("--devices", type=whole, metavar="N", help="CPU devices that share the rollouts (default: 1)")
+    parser.add_argument("--chunk", type=whole, metavar="N", help="rollouts per chunk (default: two seconds' work)")
+    parser.add_argument("--quiet", action="store_true", help="no progress meter")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the study and print what became of it; 1 if a rollout failed."""
+    """Run the study and print its outcome; return 1 if a rollout failed."""
     check_least(args, chunk=1, samples=1, workers=1)
     path = as_path(args.study, "study")
     study = _read(path)
@@ -156,7 +156,7 @@ def run(args: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _connect(args: argparse.Namespace) -> Iterator[Any]:
-    """A client of the scheduler at --client, or of a cluster of --workers processes here, or None."""
+    """Connect to the scheduler at --client, or to a local cluster of --workers processes, or to neither."""
     if args.client is None and args.workers is None:
         yield None
         return
@@ -178,7 +178,7 @@ def _connect(args: argparse.Namespace) -> Iterator[Any]:
 
 
 def make_draw(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
-    """A function that draws the parameters of one rollout from its key; each has a key of its own, by the order of their names.
+    """Function that draws the parameters of one rollout from its key; each parameter has its own key, in the order of names.
 
     **Raises:** ValueError for values that are neither numbers nor distributions.
     """
