@@ -139,7 +139,7 @@ def assemble(
     atol = None if atol is None else float(atol)
 
     def from_guess(q):
-        return _assemble(locked, q, v, t, rank_tol, atol, steps, scene if hold else None)
+        return _assemble(locked, q, v, t, rank_tol, atol, steps, scene.is_rounded, scene if hold else None)
 
     assembly = from_guess(q)
     if concrete and not bool(assembly.success):
@@ -176,7 +176,7 @@ def _from_elsewhere(assembly: Assembly, guesses: int, assembled: Callable, scene
 
 
 @compiled
-def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
+def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
     """The scene `locked` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
     guess, whole = q, locked
     passed = jnp.asarray(False)
@@ -186,7 +186,7 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
         fixed, start, time = constant((bare, q, t))
         loose = tolerance(rank_tol, q) if rank_tol is not None else surely_apart(q)
         q, passed = follow_path(fixed, start, time, loose, steps)
-    kept, rounding = select_rows(bare, q, t, rank_tol)
+    kept, rounding = select_rows(bare, q, t, rank_tol, is_rounded)
     # Rows that contradict others are none that can be dropped: what is found is the point of least squares of all.
     kept = jnp.where(rounding <= most_rounding(q.dtype), kept, jnp.ones_like(kept))
     locked = keep_rows(bare, Selection(kept, rounding))
@@ -196,7 +196,7 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
         scene = locked
     else:
         free = Scene(scene.system, scene.constraints)
-        scene = keep_rows(free, select_rows(free, q, t, rank_tol))
+        scene = keep_rows(free, select_rows(free, q, t, rank_tol, is_rounded))
     v = _with_velocity(scene, q, v, t, rank_tol)
     limits = row_limits(locked, q, jnp.zeros_like(v), t, closed_to(q.dtype))[0]
     phi = position_residual(locked, q, t)

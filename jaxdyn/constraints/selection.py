@@ -207,11 +207,14 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
     return kept, jnp.max(jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept))
 
 
-def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float | None) -> Selection:
+def select_rows(
+    scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float | None, is_rounded: bool | None = None
+) -> Selection:
     """The independent rows of a mechanism at a configuration on its constraints; a constant.
 
-    With `rank_tol` rows count whose pivots are above it, at this configuration. Without, see above.
+    With `rank_tol` rows count whose pivots are above it, at this configuration. Without, see above. `is_rounded`: as of a scene.
     """
+    is_rounded = scene.is_rounded if is_rounded is None else is_rounded
     bare = constant(Scene(scene.system, scene.constraints))
     q, t = constant((q, jnp.asarray(t, q.dtype)))
     count = layout(bare)[-1].end
@@ -221,7 +224,7 @@ def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float
     def select():
         kept, rest = eliminate(run(scaled_rows, bare, q, t), apart, jnp.zeros_like(every[0]))
         if rank_tol is None:
-            kept, rest = _kept_far_away(bare, q, t, kept, apart)
+            kept, rest = _select_far_away(bare, q, t, kept, apart, is_rounded)
         return kept, jnp.maximum(rest, run(_opening, bare, q, t, kept))
 
     if count > scene.nv:
@@ -267,8 +270,12 @@ def surely_apart(like) -> float:
     return max(_DOUBTFUL, 10 * tolerance(None, like))
 
 
-def _kept_far_away(scene: Scene, q, t, sure, apart: float):
-    """`eliminate` a finite distance away, where the rows in `sure` are among the independent ones."""
+def _select_far_away(scene: Scene, q, t, sure, apart: float, is_rounded: bool):
+    """`eliminate` a finite distance away, where the rows in `sure` are among the independent ones.
+
+    Rows that differ from combinations of the others by little, there too, count in a scene of exact numbers, where they are
+    met at q and leave some freedom.
+    """
     sizes, _ = coordinate_sizes(scene.system, q.dtype)
     least = tolerance(None, q)
     held = holonomic_rows(layout(scene))
@@ -297,7 +304,13 @@ def _kept_far_away(scene: Scene, q, t, sure, apart: float):
         place = retract(scene.system, lax.fori_loop(0, _NEWTON_STEPS, close, place))
     B = run(scaled_rows, scene, place, t)
     kept, rest = eliminate(B, 2 * apart, sure)
-    return jnp.maximum(sure, kept), rest  # sure rows may be less so there; they stay
+    kept = jnp.maximum(sure, kept)  # sure rows may be less so there; they stay
+    if is_rounded:
+        return kept, rest
+    every, least_rest = eliminate(B, least, kept)
+    met = _opening(scene, q, t, 1 - every * (1 - kept)) <= eps_of(q) ** 0.4
+    counts = met & (jnp.sum(every) < scene.nv)
+    return jnp.where(counts, every, kept), jnp.where(counts, least_rest, rest)
 
 
 def _opening(scene: Scene, q, t, kept):
@@ -367,13 +380,13 @@ def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selecti
     if np.sum(pivots > apart) == B.shape[0]:
         return Selection(np.ones(B.shape[0], B.dtype), np.zeros((), B.dtype)), B.shape[0]  # pyright: ignore[reportArgumentType]
     with jax.ensure_compile_time_eval():
-        kept, rounding = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol)
+        kept, rounding = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol, scene.is_rounded)
     return Selection(np.asarray(kept), np.asarray(rounding)), int(np.sum(pivots > tolerance(rank_tol, B)))  # pyright: ignore[reportArgumentType]
 
 
 @compiled
-def _select_compiled(scene: Scene, q, t, rank_tol):
-    return select_rows(scene, q, t, rank_tol)
+def _select_compiled(scene: Scene, q, t, rank_tol, is_rounded):
+    return select_rows(scene, q, t, rank_tol, is_rounded)
 
 
 def _pivots(B: np.ndarray) -> np.ndarray:

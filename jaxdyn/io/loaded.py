@@ -1,6 +1,7 @@
 """Contents of a file beyond the mechanism: starts, named actuators, and a list of unsupported elements."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -105,6 +106,7 @@ class LoadedScene(Scene):
     - `not_taken`: descriptions of the file's elements that the scene does not represent, as in `NotTakenWarning`.
     """
 
+    is_rounded: ClassVar[bool] = True
     # Dataclass fields after `Scene`'s defaults need defaults; `__init__` sets all three.
     starts: dict[str, Start] = eqx.field(default_factory=dict)
     actuators: Actuators | None = None

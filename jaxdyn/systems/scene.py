@@ -4,7 +4,7 @@ import functools
 import inspect
 import types
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -101,6 +101,8 @@ class Scene(eqx.Module):
     constraints: tuple = ()
     forces: tuple = ()
     cones: Any = None
+    # Whether numbers have the digits of a file: rows that differ by so little then repeat each other.
+    is_rounded: ClassVar[bool] = False
 
     def __init__(
         self,
