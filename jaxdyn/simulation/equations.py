@@ -92,7 +92,7 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
     def torque(args, y, q, v, t):
         """Of the control, or None when there is none."""
         tau = effort(args, y, q, v, t)
-        return None if tau is None else given(args, y)[0].limited(tau)
+        return None if tau is None else given(args, y)[0].clip_effort(tau)
 
     pieces = pieces_of(scene, start, q0, v0, t0, functools.partial(effort, args))
 

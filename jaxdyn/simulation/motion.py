@@ -116,9 +116,13 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     y = jax.tree.map(functools.partial(rows_where, reached), y, y0)
     work = y.pop("work", None)
 
+    def scene_at(y):
+        """The scene with the rows that are kept at a save point."""
+        return exchange_rows(scene, y[KEPT]) if KEPT in y else scene
+
     def to_qv(row):
         y, t = row
-        own = exchange_rows(scene, y[KEPT]) if KEPT in y else scene
+        own = scene_at(y)
         return method.to_qv(own, method.corrected(own, y, t), t)
 
     # By the kernels that have put the start on the constraints.
@@ -185,7 +189,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
 
         def is_met(row):
             force = eqs.generalized_force(eqs.args, *row)
-            return method.satisfies(scene, *row[1:], force)  # pyright: ignore[reportCallIssue]
+            return method.satisfies(scene_at(row[0]), *row[1:], force)  # pyright: ignore[reportCallIssue]
 
         met = map_rows(is_met, (y, q, v, ts))
         failures.append(((result == RESULTS.successful) & ~met.all(), RESULTS.contradictory_rows))
@@ -193,11 +197,10 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     of_control = {name: y[name] for name in added}
 
     def of_row(row):
-        *state, kept = row
-        own = scene if kept is None else exchange_rows(scene, kept)
-        return at_save_point(own, control, method, eqs, outputs, *state)
+        y, *state = row
+        return at_save_point(scene_at(y), control, method, eqs, outputs, *state)
 
-    computed = map_rows(of_row, (q, v, ts, of_control, y.get(KEPT)))
+    computed = map_rows(of_row, (y, q, v, ts, of_control))
     rows = {"q": q, "v": v} | computed | ({} if work is None else {"work": work})
     whole = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
     result = first_of([*failures, ((result == RESULTS.successful) & ~whole, RESULTS.nonfinite_state)], result)
