@@ -186,10 +186,10 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
         fixed, start, time = constant((bare, q, t))
         loose = tolerance(rank_tol, q) if rank_tol is not None else surely_apart(q)
         q, passed = follow_path(fixed, start, time, loose, steps)
-    kept, rounding = select_rows(bare, q, t, rank_tol, is_rounded)
+    kept, rounding, _ = select_rows(bare, q, t, rank_tol, is_rounded)
     # Rows that contradict others are none that can be dropped: what is found is the point of least squares of all.
     kept = jnp.where(rounding <= most_rounding(q.dtype), kept, jnp.ones_like(kept))
-    locked = keep_rows(bare, Selection(kept, rounding))
+    locked = keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
     if has_positions:
         q = _turned_back(locked, guess, nearest_configuration(locked, guess, q, t, rank_tol), t)
     if scene is None:

@@ -21,8 +21,8 @@ from jaxdyn.compile import (
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whitened_rows
 from jaxdyn.constraints.projection_derivative import LOST, Corrections, projected
-from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, regular_gram, tolerance, worst_pivot
-from jaxdyn.constraints.selection import LEAST_PIVOT, is_selected, kept_of
+from jaxdyn.constraints.rank import least_pivot, least_pivot_of, pseudo_inverse, quality_of, regular_gram, tolerance
+from jaxdyn.constraints.selection import is_selected, rows_of
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
@@ -144,7 +144,8 @@ def _by_pivots(scene: Scene, q, v, t, *errors):
         quality = quality_of(factor)
         if is_selected(scene) and is_expanding():
             # Other rows may serve where these hardly do: `renew_rows`.
-            is_poor = jnp.any(kept_of(scene) == 0) & ~(worst_pivot(factor, gram) > LEAST_PIVOT)
+            *kept, least = rows_of(scene, Y.dtype)
+            is_poor = jnp.any(jnp.stack(kept) == 0) & ~(least_pivot_of(Y) > least)
             quality = jnp.where(is_poor, jnp.nan, quality)
         return (lambda residual: metric.unwhiten(_product(Y, solve_cholesky(factor, residual)))), quality
 

@@ -52,9 +52,10 @@ def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
     return gram + jnp.diag(jnp.where(squares == 0, fill, jnp.zeros_like(squares)))
 
 
-def worst_pivot(factor, gram):
-    """Least pivot over its diagonal entry of the matrix, from a Cholesky factor: one for orthogonal columns."""
-    return jnp.min(jnp.diagonal(factor) ** 2 / jnp.diagonal(gram))
+def least_pivot_of(Y: Float[Array, "n m"]) -> Float[Array, ""]:
+    """Least pivot of Y^T Y over its diagonal entry, zero columns left out: 1 for orthogonal columns, 0 for dependent ones."""
+    gram = regular_gram(Y)
+    return jnp.min(jnp.diagonal(cholesky(gram)) ** 2 / jnp.diagonal(gram))
 
 
 def quality_of(factor):

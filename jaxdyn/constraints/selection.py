@@ -30,10 +30,10 @@ from jaxdyn.compile import (
     compute,
     constant,
     is_expanding,
-    is_rank_safe,
     is_staged,
     pseudo_inverse_by_rotations,
     run,
+    unless,
 )
 from jaxdyn.constraints.base import (
     Constraint,
@@ -44,11 +44,12 @@ from jaxdyn.constraints.base import (
     rows,
     velocity_residual,
 )
-from jaxdyn.constraints.rank import eps_of, regular_gram, tolerance, worst_pivot
+from jaxdyn.constraints.rank import eps_of, least_pivot_of, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes, row_limits
+from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Number, SystemLike
-from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
+from jaxdyn.systems.mass_factor import cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
@@ -57,20 +58,20 @@ from jaxdyn.systems.system import displace, retract
 _DOUBTFUL = 1e-3
 # How far away doubtful rows are looked at, rad or lengths of the mechanism, and steps of Newton's method that go there.
 _FAR, _NEWTON_STEPS = 0.2, 12
-# Least pivot of the kept rows' Gram matrix over its diagonal entry, the square of the sine of an angle between rows, above which
-# they are not chosen anew.
-LEAST_PIVOT = 0.01
+# The part of the rows' least pivot at their choice at which they are chosen anew: half of the sine of an angle between rows.
+_EXCHANGED_AT = 0.25
 # A row below this part of the largest one of its constraint has no direction of its own: it is what rounding has left.
 _TINY_ROW = 1e-3
 
 
 class KeptRows(Constraint):
-    """A constraint whose dropped rows are zero. `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding` () as in
-    `Selection`."""
+    """A constraint whose dropped rows are zero. `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding` () and
+    `least` () as in `Selection`."""
 
     inner: Constraint
     kept: Float[Array, " n"]
     rounding: Float[Array, ""]
+    least: Float[Array, ""]
     name: str = eqx.field(static=True)
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
@@ -119,18 +120,20 @@ class KeptRows(Constraint):
 class Selection(NamedTuple):
     """The rows of a mechanism that count: `kept` (nc,), 1 or 0.
 
-    `rounding` (): by which part of their size the dropped rows are open, or differ from combinations of the kept ones.
+    `rounding` (): by which part of their size the dropped rows are open, or differ from combinations of the kept ones. `least`
+    (): the least pivot of the kept rows, in the metric of the mass matrix, at which they are chosen anew.
     """
 
     kept: Float[Array, " nc"]
     rounding: Float[Array, ""]
+    least: Float[Array, ""]
 
 
 def keep_rows(scene: Scene, selection: Selection) -> Scene:
     """The scene with the rows that are not kept set to zero."""
-    kept, rounding = map(jnp.asarray, selection)
+    kept, rounding, least = map(jnp.asarray, selection)
     constraints = tuple(
-        KeptRows(constraint, kept[place.start : place.end], rounding, constraint.name)  # pyright: ignore[reportArgumentType]
+        KeptRows(constraint, kept[place.start : place.end], rounding, least, constraint.name)  # pyright: ignore[reportArgumentType]
         for constraint, place in zip(scene.constraints, layout(scene), strict=True)
     )
     return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
@@ -141,9 +144,9 @@ def is_selected(scene: Scene) -> bool:
     return any(isinstance(constraint, KeptRows) for constraint in scene.constraints)
 
 
-def exchange_rows(scene: Scene, kept: Float[Array, " nc"]) -> Scene:
-    """A scene of `keep_rows` with other rows."""
-    return keep_rows(all_rows(scene), Selection(kept, rounding_of(scene)))
+def exchange_rows(scene: Scene, rows: Float[Array, " n"]) -> Scene:
+    """A scene of `keep_rows` with other rows, as of `rows_of`."""
+    return keep_rows(all_rows(scene), Selection(rows[:-1], rounding_of(scene), rows[-1]))
 
 
 def all_rows(scene: Scene) -> Scene:
@@ -218,14 +221,16 @@ def select_rows(
     bare = constant(Scene(scene.system, scene.constraints))
     q, t = constant((q, jnp.asarray(t, q.dtype)))
     count = layout(bare)[-1].end
-    every = jnp.ones((count,), q.dtype), jnp.zeros((), q.dtype)
+    none = jnp.zeros((), q.dtype)
+    every = jnp.ones((count,), q.dtype), none, none
     apart = rank_tol if rank_tol is not None else surely_apart(q)
 
     def select():
         kept, rest = eliminate(run(scaled_rows, bare, q, t), apart, jnp.zeros_like(every[0]))
         if rank_tol is None:
             kept, rest = _select_far_away(bare, q, t, kept, apart, is_rounded)
-        return kept, jnp.maximum(rest, run(_opening, bare, q, t, kept))
+        least = _EXCHANGED_AT * run(_pivot_of, bare, q, t, kept)
+        return kept, jnp.maximum(rest, run(_opening, bare, q, t, kept)), least
 
     if count > scene.nv:
         return Selection(*select())
@@ -233,30 +238,46 @@ def select_rows(
     return Selection(*lax.cond(doubtful, select, lambda: every))
 
 
-def renew_rows(scene: Scene, q, t) -> Float[Array, " nc"]:
-    """The kept rows of a scene, or as many others where these have come near to depending on each other; a constant.
+def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
+    """`rows_of` a scene for the next step; a constant.
+
+    There are as many rows, chosen anew where the kept ones have come near to depending on each other.
 
     At some positions of a mechanism any choice of rows loses rank, though all rows together do not. In a program of numbers,
-    which has no branches, `project_step` flags the sample there, and the step is made again by the operations of JAX.
+    which has no branches, the sample is flagged there, by `project_step` if the state `is_projected`, and the step is made again
+    by the operations of JAX.
     """
-    kept = lax.stop_gradient(kept_of(scene)).astype(q.dtype)
-    if is_expanding():
-        return kept
+    old = rows_of(scene, q.dtype)
+    if is_expanding() and is_projected:
+        return old
+    kept, least = old[:-1], old[-1]
     whole = all_rows(scene)
     bare, q, t = constant((Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype)))
+    dropped = jnp.any(kept == 0)
+    if is_expanding():
+        return unless(dropped & ~(_pivot_of(bare, q, t, kept) > least), old)
+    pivot = run(_pivot_of, bare, q, t, kept)
+    poor = dropped & ~(pivot > least)
 
     def choose():
-        B = run(scaled_rows, bare, q, t)
-        return eliminate(B, 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
+        new = eliminate(run(scaled_rows, bare, q, t), 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
+        pivot_of_new = run(_pivot_of, bare, q, t, new)
+        better = poor & ~(pivot_of_new < pivot)
+        kept_next, next_pivot = jnp.where(better, new, kept), jnp.where(better, pivot_of_new, pivot)
+        return jnp.where(poor, jnp.append(kept_next, _EXCHANGED_AT * next_pivot), old)
 
-    dropped = jnp.any(kept == 0)
-    poor = dropped if is_rank_safe() else dropped & ~(run(_worst_pivot, bare, q, t, kept) > LEAST_PIVOT)
-    return lax.cond(any_in_batch(poor), lambda: jnp.where(poor, choose(), kept), lambda: kept)
+    return lax.cond(any_in_batch(poor), choose, lambda: old)
 
 
-def _worst_pivot(scene: Scene, q, t, kept):
-    B = kept[:, None] * scaled_rows(scene, q, t)
-    return worst_pivot(cholesky(regular_gram(B.T)), regular_gram(B.T))
+def _pivot_of(scene: Scene, q, t, kept):
+    """`least_pivot_of` the kept rows in the metric of the mass matrix."""
+    A = kept[:, None] * constraint_jacobian(scene, q, t)
+    return least_pivot_of(mass_factor(mass_matrix(scene.system, q, t)).whiten(A.T))
+
+
+def rows_of(scene: Scene, dtype) -> Float[Array, " n"]:
+    """What a step keeps of a scene of `keep_rows`: 1 or 0 for each row, and `Selection.least`; a constant."""
+    return lax.stop_gradient(jnp.append(kept_of(scene), scene.constraints[0].least)).astype(dtype)
 
 
 def _least_distance(scene: Scene, q, t):
@@ -378,10 +399,11 @@ def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selecti
     pivots = _pivots(B)
     apart = surely_apart(B) if rank_tol is None else rank_tol
     if np.sum(pivots > apart) == B.shape[0]:
-        return Selection(np.ones(B.shape[0], B.dtype), np.zeros((), B.dtype)), B.shape[0]  # pyright: ignore[reportArgumentType]
+        none = np.zeros((), B.dtype)
+        return Selection(np.ones(B.shape[0], B.dtype), none, none), B.shape[0]  # pyright: ignore[reportArgumentType]
     with jax.ensure_compile_time_eval():
-        kept, rounding = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol, scene.is_rounded)
-    return Selection(np.asarray(kept), np.asarray(rounding)), int(np.sum(pivots > tolerance(rank_tol, B)))  # pyright: ignore[reportArgumentType]
+        selection = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol, scene.is_rounded)
+    return Selection(*map(np.asarray, selection)), int(np.sum(pivots > tolerance(rank_tol, B)))  # pyright: ignore[reportArgumentType]
 
 
 @compiled

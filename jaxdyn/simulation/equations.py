@@ -17,7 +17,7 @@ from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, value
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
 from jaxdyn.simulation import limits as joint_limits
-from jaxdyn.simulation.methods import Method
+from jaxdyn.simulation.methods import Method, Projected
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
 
@@ -152,7 +152,7 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
         y = method.continued(scene, y, t)
         if KEPT in y:
-            y = y | {KEPT: renew_rows(scene, retract(system, y["q"]), t)}
+            y = y | {KEPT: renew_rows(scene, retract(system, y["q"]), t, isinstance(method, Projected))}
         if controls.HELD in y:
             y = y | {
                 controls.HELD: controls.sampled(given(args, y)[1], y[controls.HELD], *method.to_qv(scene, y, t), t)

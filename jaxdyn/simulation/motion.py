@@ -6,7 +6,6 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from jaxdyn.compile import map_rows, run
 from jaxdyn.constraints.selection import (
@@ -16,6 +15,7 @@ from jaxdyn.constraints.selection import (
     keep_rows,
     kept_of,
     most_rounding,
+    rows_of,
     select_rows,
 )
 from jaxdyn.contact.forces import contacts_with_cones
@@ -91,7 +91,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     y0 = method.start(scene, q0, v0, ts[0]) | states
     first = method.quality(scene, y0, ts[0])
     if is_selected(scene) and not isinstance(options["solver"], Stepper):
-        y0 = y0 | {KEPT: lax.stop_gradient(kept_of(scene)).astype(q0.dtype)}
+        y0 = y0 | {KEPT: rows_of(scene, q0.dtype)}
     y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
     solver = options["solver"]
     if isinstance(solver, Stepper):
