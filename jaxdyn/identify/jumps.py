@@ -16,7 +16,7 @@ _LONGEST = {"q": 3, "tau": 1}
 # A deviation counts from this multiple of what is usual around it and in nine tenths of the column. The upper quartile of the
 # absolute values of normal noise is 1.15 of its standard deviation, so noise alone never comes near.
 _UNUSUAL = 15.0
-# The samples beside a corrupted one must predict each other better than it by this factor, or it is a step of the signal.
+# The samples next to a corrupted one must predict each other better than it by this factor, or it is a step of the signal.
 _ISOLATED = 5.0
 # Least deviation in ranges of the column: smaller ones do not change a fit. Torques are not differentiated, and friction of a
 # recorded KUKA peaks by three ranges for a sample where a joint turns round, when one of ten samples is kept.
@@ -107,7 +107,7 @@ def find_outliers(log: Log, model: Model | None = None) -> list[Outlier]:
       99 % of the log; half of that beyond one and a half of the model's velocity limit.
 
     Coordinates of joints with several are not checked, nor positions without a model where q and tau differ in their number. A
-    torque at either end cannot be told from a step of the torque, and is not found.
+    torque at either end may be a step of the torque, and is not found.
     """
     t = np.asarray(log.t, np.float64)
     found: list[Outlier] = []
@@ -120,11 +120,12 @@ def find_outliers(log: Log, model: Model | None = None) -> list[Outlier]:
             least = max(_LEAST[signal] * (high - low)[place], _LEAST_OF_WIDEST * float((high - low).max()))
             x = values[:, column]
             own = [
-                Outlier(signal, column, rows, size, False) for rows, size in _isolated(t, x, least, _LONGEST[signal])
+                Outlier(signal, column, rows, size, False)
+                for rows, size in _find_isolated(t, x, least, _LONGEST[signal])
             ]
             if signal == "q":
                 limit = _velocity_limit(model, column)
-                own += _position_jumps(t, x, column, least, limit, own)
+                own += _find_jumps(t, x, column, least, limit, own)
             found += sorted(own, key=lambda one: one.rows.start)
     return found
 
@@ -153,8 +154,8 @@ def _turns(t: np.ndarray, x: np.ndarray, near: bool) -> np.ndarray:
     return turns
 
 
-def _isolated(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> list[tuple[range, float]]:
-    """Rows and deviation of one to `longest` samples that deviate from the line between their neighbours."""
+def _find_isolated(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> list[tuple[range, float]]:
+    """Find one to `longest` samples, rows and deviation, that deviate from the line between their neighbours."""
     n = len(x)
     curvature = np.abs(x[1:-1] - _line(t[1:-1], t[:-2], x[:-2], t[2:], x[2:]))
     floor = max(least, _UNUSUAL * float(np.quantile(curvature, 0.9)))
@@ -182,8 +183,8 @@ def _isolated(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> list[
     return found
 
 
-def _position_jumps(t, x, column: int, least: float, limit: float, known: list[Outlier]) -> list[Outlier]:
-    """Jumps of a position that stay, outside of the known outliers; those at the ends of a log count as isolated samples."""
+def _find_jumps(t, x, column: int, least: float, limit: float, known: list[Outlier]) -> list[Outlier]:
+    """Find jumps of a position that stay, outside of known outliers; one to three samples at an end count as isolated."""
     if known:
         x = x.copy()
         bad = np.concatenate([np.array(one.rows) for one in known])
