@@ -96,6 +96,12 @@ def _add_advanced(data, fit, several: dict[str, Any]) -> None:
     )
     data.add_argument("--trim", type=whole, metavar="N", help="samples to drop at each end (default: 25 * --every)")
     data.add_argument("--filtered", action="store_true", help="the logs are filtered already")
+    data.add_argument(
+        "--unwrap", choices=("auto", "yes", "no"), default="auto", help="angles that jump by turns (default: auto)"
+    )
+    data.add_argument(
+        "--outliers", choices=("refuse", "drop", "keep"), default="refuse", help="corrupted samples (default: refuse)"
+    )
     fit.add_argument("--method", choices=METHODS, metavar="M", default="feasible", help=f"{', '.join(METHODS)}")
     fit.add_argument(
         "--terms",

@@ -8,6 +8,8 @@ from jaxdyn.model.arguments import as_path
 
 # Options with paths, relative to the folder of the TOML file.
 _FILES = ("urdf", "log", "test_log", "payload_log", "out", "report", "html", "plot")
+# Options with the values yes and no, which TOML writes as true and false.
+_YES_NO = ("unwrap",)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -56,6 +58,8 @@ def with_file(args: argparse.Namespace, add_arguments) -> argparse.Namespace:
 def _tokens(name: str, value: Any, path) -> list[str]:
     """Convert one entry to command-line tokens."""
     option = f"--{name.replace('_', '-')}"
+    if name in _YES_NO and isinstance(value, bool):
+        value = "yes" if value else "no"
     if isinstance(value, bool):
         return [option] if value else []
     values = value if isinstance(value, list) else [value]

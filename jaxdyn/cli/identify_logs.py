@@ -1,14 +1,19 @@
 """Logs of `jaxdyn identify`: files, names and filtering."""
 
 import pathlib
+import re
+import warnings
 
 import numpy as np
 
 from jaxdyn import identify
 from jaxdyn.cli.common import number
 from jaxdyn.identify import Log
+from jaxdyn.identify.jumps import repair_log
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.tree import Model
+
+_UNWRAP = {"auto": "auto", "yes": True, "no": False}
 
 
 def log_paths(args) -> tuple[list[str], list[str]]:
@@ -30,8 +35,11 @@ def log_names(paths: list[str]) -> list[str]:
 
 
 def raw_log(model: Model, path: str, args) -> Log:
-    """Read the log of a file as recorded. **Raises:** ValueError for logs that do not fit the model."""
-    raw = read_log(path, joint_names=model.joint_names, rename=_renaming(args.rename))
+    """Read the log of a file as recorded, but for wraps and outliers, which are printed.
+
+    **Raises:** ValueError for logs that do not fit the model, and for outliers.
+    """
+    raw = read_log(path, joint_names=model.joint_names, rename=_renaming(args.rename), unwrap=False, outliers="keep")
     if raw.q.shape[1] != model.nq or raw.nv != model.nv:
         raise ValueError(
             f"{path}: the log has {raw.q.shape[1]} columns of q and {raw.nv} of tau, the model has {model.nq} and "
@@ -39,6 +47,16 @@ def raw_log(model: Model, path: str, args) -> Log:
         )
     if len(raw) < 2:
         raise ValueError(f"{_span(path, raw)}; a log needs more than one sample")
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            raw = repair_log(raw, model, unwrap=_UNWRAP[args.unwrap], outliers=args.outliers)
+    except ValueError as error:
+        # The options as the command line spells them.
+        text = re.sub(r'(unwrap|outliers)="(\w+)"', r"--\1 \2", str(error))
+        raise ValueError(f"{path}: {text}") from None
+    for one in caught:
+        print(f"{path}: {one.message}")
     return raw
 
 
@@ -96,7 +114,15 @@ def filter_log(raw: Log, path: str, args, cutoff: float | None) -> Log:
         raise ValueError(f"--every is {every}, --trim is {trim}; give --every of at least 1 and --trim of at least 0")
     try:
         log = identify.from_raw(
-            raw.t, raw.q, raw.tau, cutoff=cutoff, trim=trim, every=every, joint_names=raw.joint_names
+            raw.t,
+            raw.q,
+            raw.tau,
+            cutoff=cutoff,
+            trim=trim,
+            every=every,
+            joint_names=raw.joint_names,
+            unwrap=False,
+            outliers="keep",  # done by raw_log, with the model
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

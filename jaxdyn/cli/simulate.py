@@ -218,7 +218,7 @@ def _excitation(scene: LoadedScene, args):
         keys = jax.random.split(jax.random.key(args.seed), args.batch)
         control = jax.vmap(lambda key: random_torque(key, random))(keys)
     elif pathlib.Path(args.torque).suffix.lower() in (".csv", ".npz"):
-        log = read_log(args.torque, joint_names=model.joint_names)
+        log = read_log(args.torque, joint_names=model.joint_names, unwrap=False, outliers="keep")
         if (log.q.shape[1], log.nv) != (model.nq, model.nv):
             raise ValueError(f"--torque {args.torque}: the log has {log.q.shape[1]} columns of q and {log.nv} of tau, the "
                              f"model needs {model.nq} and {model.nv}; use --lock for joints that were not logged")  # fmt: skip

@@ -13,6 +13,7 @@ from jaxdyn.identify.gains import fit_gains as fit_gains
 from jaxdyn.identify.identifiability import Identifiability as Identifiability
 from jaxdyn.identify.identifiability import identifiability as identifiability
 from jaxdyn.identify.intervals import Intervals as Intervals
+from jaxdyn.identify.jumps import LogWarning as LogWarning
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import split as split
 from jaxdyn.identify.mechanisms import completed as completed

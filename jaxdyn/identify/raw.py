@@ -4,9 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxdyn.identify.jumps import repair_log
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.spectra import choose_cutoff
 from jaxdyn.model.arguments import Checked, Numbers
+from jaxdyn.model.tree import Model
 
 
 def from_raw(
@@ -19,6 +21,9 @@ def from_raw(
     trim: Checked[int] = 200,
     every: Checked[int] = 8,
     joint_names: Checked[Sequence[str] | None] = None,
+    unwrap: bool | str = "auto",
+    outliers: str = "refuse",
+    model: Checked[Model | None] = None,
 ) -> Log:
     """A log for torque fits from raw positions and torques: uniform time, low-pass without delay, numerical rates.
 
@@ -34,12 +39,18 @@ def from_raw(
     - `cutoff`: Hz, half-power frequency of one pass; or "auto", from this log's spectra by `choose_cutoff`. Several logs of
       a fit should go through one low-pass: choose it once for all of them, and give the number.
     - `order`: of the filter. `trim`: samples dropped at each end. `every`: keep every so-many-th sample.
+    - `unwrap`: "auto" makes angles continuous that jump by whole turns, as the velocities around tell; True, all differences
+      beyond pi, as `numpy.unwrap`; False, none. A `LogWarning` names joints and counts.
+    - `outliers`: samples of q and tau that the samples around contradict are an error, "refuse"; are interpolated, with a
+      `LogWarning` that counts them, "drop"; or stay, "keep".
+    - `model`: tells which columns are angles, their joints' names and velocity limits. Without it every column of q may be one.
 
     **Returns:** `Log` with t, q, v, a, tau.
 
     **Raises:** ValueError for all that `Log` refuses; an `order`, `trim` or `every` that is no whole number or too small; too few
     samples for the filter and the trimming; a cut-off above half the sampling rate; a gap in time longer than half a period of
-    the cut-off, which interpolation would invent.
+    the cut-off, which interpolation would invent; outliers, with row and joint; positions that jump and do not come back,
+    also with `outliers="drop"`.
 
     Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
     """
@@ -50,7 +61,7 @@ def from_raw(
             raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}")
     if isinstance(cutoff, str) and cutoff != "auto":
         raise ValueError(f'cutoff is {cutoff!r}; give a frequency in Hz, or "auto"')
-    raw = Log(t, q, tau=tau, joint_names=joint_names)
+    raw = repair_log(Log(t, q, tau=tau, joint_names=joint_names), model, unwrap=unwrap, outliers=outliers)
     cutoff = choose_cutoff(raw).frequency if isinstance(cutoff, str) else cutoff
     t, q, tau = (np.asarray(x, np.float64) for x in (raw.t, raw.q, raw.tau))
     if q.shape[1] != tau.shape[1]:

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxdyn.identify.jumps import repair_log
 from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import Checked, FilePath, as_path, parse_number
+from jaxdyn.model.tree import Model
 
 _SIGNALS = ("q", "v", "a", "tau")
 _NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit after a column's name
@@ -21,6 +23,9 @@ def read_log(
     joint_names: Checked[Sequence[str] | None] = None,
     rename: Checked[Mapping[str, str] | None] = None,
     rollout: int | None = None,
+    unwrap: bool | str = "auto",
+    outliers: str = "refuse",
+    model: Checked[Model | None] = None,
 ) -> Log:
     """Read a log from a CSV file with one header line, or from an NPZ archive.
 
@@ -33,13 +38,16 @@ def read_log(
     **Arguments:** `path`; `joint_names`: order of the joints in the result for columns with joint names (a model's
     `joint_names`); columns of other joints are ignored. Without it the order of the file's tau columns. `rename`: from
     names of joints in the file to those of the model, {"motor1": "shoulder"}. `rollout`: which motion of a file that holds
-    several, as `Solution.to_csv` and `to_npz` write them of a batch; the first is 1.
+    several, as `Solution.to_csv` and `to_npz` write them of a batch; the first is 1. `unwrap`, `outliers`, `model`: what becomes
+    of angles that jump by whole turns and of corrupted samples, as for `jd.identify.from_raw`; `outliers="keep"` reads torques
+    that were prescribed, not measured.
 
     **Returns:** `jd.identify.Log`; v and a are None when the file has none. Make them with `jd.identify.from_raw`.
 
     **Raises:** FileNotFoundError; ValueError, with the path, for another file type, a cell that is no number (line and
     column), a first line that is no header, missing or repeated columns (with a `rename` that gives the joints their
-    names, where there are as many), and everything that `Log` refuses (NaN, unequal lengths, time running backwards).
+    names, where there are as many), everything that `Log` refuses (NaN, unequal lengths, time running backwards), and
+    outliers, with row and joint.
     """
     path = as_path(path)
     readers = {".csv": _read_csv, ".npz": _read_npz}
@@ -50,7 +58,8 @@ def read_log(
     columns = _one_motion(readers[path.suffix.lower()](path), rollout, path)
     try:
         columns = _rename(columns, rename or {})
-        return _assemble(columns, None if joint_names is None else tuple(joint_names))
+        log = _assemble(columns, None if joint_names is None else tuple(joint_names))
+        return repair_log(log, model, unwrap=unwrap, outliers=outliers)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
