@@ -151,14 +151,14 @@ def constraint_lines(scene: LoadedScene) -> str:
 
 
 def _closure(scene: LoadedScene, q) -> list[str]:
-    """Whether the loops close from q, the freedom that they leave, and rows that repeat others."""
+    """Closure of the loops from q, the remaining degrees of freedom, and redundant rows."""
     lines, closed = [], []
     try:
         q = assemble(scene, q).q
         closed = [q, *_closed_near(scene, q)]
-        lines.append("They close: jd.assemble finds a configuration from the reference.")
+        lines.append("The constraints can be assembled: jd.assemble finds a configuration from the reference.")
     except ValueError as error:
-        lines.append(f"They do not close from the reference: {error}.")
+        lines.append(f"The constraints cannot be assembled from the reference: {error}.")
     # Decided a finite distance away from q, because files like to put linkages flat.
     kept = known_selection(scene, np.asarray(q), 0.0, None)[0].kept
     freedom, here = scene.nv - int(kept.sum()), degrees_of_freedom(scene, q)

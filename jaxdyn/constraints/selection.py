@@ -220,7 +220,7 @@ def select_rows(
     is_rounded = scene.is_rounded if is_rounded is None else is_rounded
     bare = constant(Scene(scene.system, scene.constraints))
     q, t = constant((q, jnp.asarray(t, q.dtype)))
-    count = layout(bare)[-1].end
+    count = layout(bare)[-1].end if scene.constraints else 0
     none = jnp.zeros((), q.dtype)
     every = jnp.ones((count,), q.dtype), none, none
     apart = rank_tol if rank_tol is not None else surely_apart(q)
@@ -232,6 +232,8 @@ def select_rows(
         least = _EXCHANGED_AT * run(_pivot_of, bare, q, t, kept)
         return kept, jnp.maximum(rest, run(_opening, bare, q, t, kept)), least
 
+    if count == 0:
+        return Selection(*every)
     if count > scene.nv:
         return Selection(*select())
     doubtful = any_in_batch(~(run(_least_distance, bare, q, t) > apart))
@@ -350,6 +352,8 @@ def _opening_rate(scene: Scene, q, v, t, kept):
 
 def opening_of_dropped(scene: Scene, q, t, v=None) -> Float[Array, ""]:
     """By which part of their size the dropped rows of a scene are open in positions, and in velocities v; a constant."""
+    if not is_selected(scene):
+        return jnp.zeros((), q.dtype)
     bare, kept = constant((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
     kept, q, t = constant((kept.astype(q.dtype), q, jnp.asarray(t, q.dtype)))
     opening = run(_opening, bare, q, t, kept)

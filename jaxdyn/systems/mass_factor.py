@@ -20,6 +20,8 @@ from jaxdyn.compile import compiled, is_expanding, run
 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower triangular L with L L^T = matrix, of which the lower triangle is read; NaN where it is not positive definite."""
+    if matrix.shape[-1] == 0:  # a model without moving bodies
+        return matrix
     # Within a program of numbers, which sees the zeros of the matrix only where it is at hand.
     return _cholesky(None, matrix) if is_expanding() else run(_cholesky, None, matrix)
 
@@ -47,6 +49,8 @@ def solve_lower(
     factor: Float[Array, "n n"], right: Float[Array, "n *k"], *, transposed: bool = False
 ) -> Float[Array, "n *k"]:
     """L^-1 right, or L^-T right."""
+    if factor.shape[-1] == 0:
+        return right
     if is_expanding():
         return _solve_lower(transposed, None, factor, right)
     return run(_solve_lower, None, factor, right, static=(transposed,))
