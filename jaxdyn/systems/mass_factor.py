@@ -18,12 +18,20 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import compiled, is_expanding, run
 
 
+# Rows of a matrix beyond which its factor is no kernel: their operations grow as the cube.
+_MOST_IN_KERNEL = 64
+
+
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower triangular L with L L^T = matrix, of which the lower triangle is read; NaN where it is not positive definite."""
     if matrix.shape[-1] == 0:  # a model without moving bodies
         return matrix
     # Within a program of numbers, which sees the zeros of the matrix only where it is at hand.
-    return _cholesky(None, matrix) if is_expanding() else run(_cholesky, None, matrix)
+    return _cholesky(None, matrix) if _stays_array(matrix) else run(_cholesky, None, matrix)
+
+
+def _stays_array(matrix) -> bool:
+    return is_expanding() or matrix.shape[-1] > _MOST_IN_KERNEL
 
 
 def _cholesky(_, matrix):
@@ -51,7 +59,7 @@ def solve_lower(
     """L^-1 right, or L^-T right."""
     if factor.shape[-1] == 0:
         return right
-    if is_expanding():
+    if _stays_array(factor):
         return _solve_lower(transposed, None, factor, right)
     return run(_solve_lower, None, factor, right, static=(transposed,))
 
