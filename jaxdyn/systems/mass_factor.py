@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import compiled, is_expanding, run
 
-
 # Rows of a matrix beyond which its factor is no kernel: their operations grow as the cube.
 _MOST_IN_KERNEL = 64
 
