@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 from jaxdyn import scenes
 from jaxdyn.constraints import Holonomic, lock_joint
+from jaxdyn.constraints.assembly import assemble
 from jaxdyn.simulation.methods import Multipliers
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS
@@ -302,3 +303,48 @@ def double_pendulum(q, v):
     heights = -jnp.cos(q[0]), -jnp.cos(q[0]) - jnp.cos(q[1])
     kinetic = 0.5 * (jnp.sum(rates[0] ** 2) + jnp.sum((rates[0] + rates[1]) ** 2))
     return kinetic - 9.81 * (heights[0] + heights[1])
+
+
+@pytest.mark.parametrize("in_plane", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize("branch", ["parallelogram", "antiparallelogram"])
+def test_both_branches_pass_their_flat_position(branch, in_plane):
+    """Equal cranks of 1 m and bars of 3 m: the cranks turn alike, or tan(rocker/2) = -2 tan(crank/2).
+
+    Without gravity the parallelogram's rate is constant. With `in_plane=False` three more rows repeat others.
+    """
+    scene = scenes.four_bar(lengths=(1.0, 3.0, 1.0, 3.0), gravity=None, in_plane=in_plane)
+    crank = 1.0 if branch == "parallelogram" else -0.5
+    rocker = crank if branch == "parallelogram" else 2 * np.arctan(-2 * np.tan(crank / 2))
+    tip, end = np.array([np.cos(crank), np.sin(crank)]), np.array([3 + np.cos(rocker), np.sin(rocker)])
+    coupler = np.arctan2(*(end - tip)[::-1]) - crank
+    rates = jnp.asarray([4.0, -4.0, 4.0] if crank > 0 else [4.0, 0.0, -8.0])
+    state = assemble(scene, jnp.asarray([crank, coupler, rocker]), rates)
+    np.testing.assert_allclose(state.q, [crank, coupler, rocker], atol=1e-12)
+    ts = np.linspace(0.0, 1.0, 8)
+    rates = state.v * 4.0 / state.v[0]
+    computed = motion(scene, (state.q, rates), ts, rtol=1e-10, atol=1e-10)
+    first, last = np.asarray(computed.q[:, 0]), np.asarray(computed.q[:, 2])
+    # The flat positions: pi, and zero.
+    passed = first - np.pi if branch == "parallelogram" else first
+    assert passed[0] < -0.1 and passed[-1] > 0.1
+    if branch == "parallelogram":
+        np.testing.assert_allclose(first, crank + 4.0 * ts, atol=1e-8)
+        np.testing.assert_allclose(last, first, atol=1e-8)
+    else:
+        np.testing.assert_allclose(np.tan(last / 2), -2 * np.tan(first / 2), atol=1e-8)
+        assert drift(computed) < 1e-7
+
+
+def test_a_traced_start_without_freedom_ends_with_a_code():
+    """Two joints of two are held."""
+    system = LagrangianSystem(double_pendulum, 2)
+    held = tuple(Holonomic(lambda q, t, i=i: q[i], name=f"q{i}") for i in range(2))
+    code = jax.jit(lambda q: simulate(Scene(system, held), q, jnp.zeros(2), [0.0, 0.1], throw=False).result)(
+        jnp.zeros(2)
+    )
+    assert code == RESULTS.no_freedom
+    double = (*held[:1], Holonomic(lambda q, t: q[0] - 0.1, name="elsewhere"))
+    code = jax.jit(lambda q: simulate(Scene(system, double), q, jnp.zeros(2), [0.0, 0.1], throw=False).result)(
+        jnp.zeros(2)
+    )
+    assert code == RESULTS.inconsistent_start
