@@ -29,6 +29,7 @@ from jaxdyn.compile import (
     compiled,
     compute,
     constant,
+    is_concrete,
     is_expanding,
     is_staged,
     pseudo_inverse_by_rotations,
@@ -48,7 +49,8 @@ from jaxdyn.constraints.rank import eps_of, least_pivot_of, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes, row_limits
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Number, SystemLike
+from jaxdyn.model.arguments import Number, SystemLike, state_dtype
+from jaxdyn.model.tree import Model, neutral
 from jaxdyn.systems.mass_factor import cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
@@ -280,6 +282,30 @@ def _pivot_of(scene: Scene, q, t, kept):
 def rows_of(scene: Scene, dtype) -> Float[Array, " n"]:
     """What a step keeps of a scene of `keep_rows`: 1 or 0 for each row, and `Selection.least`; a constant."""
     return lax.stop_gradient(jnp.append(kept_of(scene), scene.constraints[0].least)).astype(dtype)
+
+
+def may_have_redundant_rows(scene: Scene) -> bool:
+    """Whether coordinates that constraints couple have as many rows as there are of them, so that a motion needs redundant rows.
+
+    Looked at where numbers are known; True where they are not. A motion with redundant rows among fewer than that is right too,
+    by the rank at every evaluation, in short steps.
+    """
+    bare = Scene(scene.system, scene.constraints)
+    if not is_concrete(bare):
+        return True
+    step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))
+    is_coupled = np.abs(compute(_generic_rows, bare, step, given=not is_staged())) > 0
+    groups = np.arange(scene.nv)  # of coordinates
+    for row in is_coupled:
+        groups[np.isin(groups, groups[row])] = groups[row].min(initial=scene.nv)
+    counts = np.bincount([groups[row][0] for row in is_coupled if row.any()], minlength=scene.nv + 1)
+    return bool(any(not row.any() for row in is_coupled) or any(counts[g] >= np.sum(groups == g) for g in set(groups)))
+
+
+def _generic_rows(scene: Scene, step):
+    system = scene.system
+    start = neutral(system).astype(step.dtype) if isinstance(system, Model) else jnp.zeros((scene.nq,), step.dtype)
+    return constraint_jacobian(scene, displace(system, start, step), jnp.zeros((), step.dtype))
 
 
 def _least_distance(scene: Scene, q, t):

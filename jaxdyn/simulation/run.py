@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import compiled, is_concrete, is_known
+from jaxdyn.constraints.selection import may_have_redundant_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.simulation import contacts as unilateral
@@ -195,7 +196,9 @@ def simulate(
         "limit_is_given": max_steps is not None,
         "max_events": max_events,
         "checks_mass": may_have_singular_mass(scene.system),
-        "selects_rows": bool(scene.constraints) and not is_concrete((scene, method, q0, v0, ts)),
+        "selects_rows": bool(scene.constraints)
+        and not is_concrete((scene, method, q0, v0, ts))
+        and (method.rank_tol is not None or may_have_redundant_rows(scene)),
     }
     if modal and is_fixed(stepsize) and max_steps is None:
         options["max_steps"] += SEARCHED * max_events

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import is_concrete, partition_traced
-from jaxdyn.constraints.selection import keep_rows, select_rows
+from jaxdyn.constraints.selection import keep_rows, may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
@@ -69,6 +69,7 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     if adjoint not in ADJOINTS:
         raise ValueError(f"stepper: adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}")
     is_direct = adjoint != "reverse"
+    selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
     method, system, dtype = chosen_method(scene, "auto"), scene.system, state_dtype(scene.system)
     unknown, known = partition_traced(scene)
     length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
@@ -108,7 +109,7 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
 
     def advance(q, v, tau, t):
         y = method.start(scene, q, v, t)
-        selection = select_rows(known(unknown), q, t, None) if scene.constraints else None
+        selection = select_rows(known(unknown), q, t, None) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
         if pieces.names:
             laws = laws_of_pieces(plan, pieces, switching, 4, 3)
