@@ -294,7 +294,10 @@ def may_have_redundant_rows(scene: Scene) -> bool:
     if not is_concrete(bare):
         return True
     step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))
-    is_coupled = np.abs(compute(_generic_rows, bare, step, given=not is_staged())) > 0
+    try:
+        is_coupled = np.abs(compute(_generic_rows, bare, step, given=not is_staged())) > 0
+    except jax.errors.JAXTypeError:  # a constraint is a function that holds a traced number
+        return True
     groups = np.arange(scene.nv)  # of coordinates
     for row in is_coupled:
         groups[np.isin(groups, groups[row])] = groups[row].min(initial=scene.nv)
