@@ -62,7 +62,7 @@ def jitted(mode: str):
 
 CASES: dict[str, tuple[Callable, Callable]] = {
     "four_bar": (lambda: motion("four_bar", 1.3), lambda: motion("four_bar", 1.1)),
-    "rolling_disk": (lambda: motion("rolling_disk", 1.3), lambda: motion("rolling_disk", 1.1)),
+    "bennett": (lambda: motion("bennett", 1.3), lambda: motion("bennett", 1.1)),
     "assembly": (lambda: assembly(1.3), lambda: assembly(1.1)),
     "accelerations": (lambda: accelerations(1.3), lambda: accelerations(1.1)),
     "mode": (lambda: jitted("plain"), lambda: jitted("auto")),
