@@ -178,7 +178,7 @@ def _closed_near(scene: LoadedScene, q) -> list:
 
 
 def _repeats(scene: LoadedScene, closed, kept) -> list[str]:
-    """How many rows of each constraint say the same as others, and by how much they stay open in closed configurations."""
+    """Lines on the redundant rows of each constraint, with their gaps in assembled configurations."""
     gaps = np.zeros((len(closed), len(kept)))
     for place, q in enumerate(closed):
         gaps[place, holonomic_rows(layout(scene))] = np.abs(np.asarray(position_residual(scene, q, 0.0)))

@@ -145,7 +145,7 @@ def assemble(
     if concrete and not bool(assembly.success):
         assembly = _from_elsewhere(assembly, guesses, from_guess, locked, q)
     if concrete and (throw is None or throw) and not bool(assembly.success):
-        left = open_constraints(locked, assembly.q, assembly.v, t, closed_to(q.dtype))
+        left = open_constraints(locked, assembly.q, assembly.v, t, closing_tolerance(q.dtype))
         tried = f" (nor are they from {guesses - 1} configurations around it)" if guesses > 1 else ""
         raise ValueError(f"not assembled: {left}{tried}; give a better guess")
     if throw and not concrete:
@@ -153,7 +153,7 @@ def assemble(
     return assembly
 
 
-def closed_to(dtype) -> float:
+def closing_tolerance(dtype) -> float:
     """Part of the mechanism's length that counts as rounding of what has converged."""
     return float(jnp.finfo(dtype).eps) ** 0.7
 
@@ -191,18 +191,18 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
     kept = jnp.where(rounding <= most_rounding(q.dtype), kept, jnp.ones_like(kept))
     locked = keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
     if has_positions:
-        q = _turned_back(locked, guess, nearest_configuration(locked, guess, q, t, rank_tol), t)
+        q = _unwind_hinges(locked, guess, nearest_configuration(locked, guess, q, t, rank_tol), t)
     if scene is None:
         scene = locked
     else:
         free = Scene(scene.system, scene.constraints)
         scene = keep_rows(free, select_rows(free, q, t, rank_tol, is_rounded))
     v = _with_velocity(scene, q, v, t, rank_tol)
-    limits = row_limits(locked, q, jnp.zeros_like(v), t, closed_to(q.dtype))[0]
+    limits = row_limits(locked, q, jnp.zeros_like(v), t, closing_tolerance(q.dtype))[0]
     phi = position_residual(locked, q, t)
     is_closed = jnp.all(jnp.abs(phi) <= limits) & (opening_of_dropped(locked, q, t) <= most_rounding(q.dtype))
     is_admissible = jnp.all(
-        jnp.abs(velocity_residual(scene, q, v, t)) <= row_limits(scene, q, v, t, closed_to(q.dtype))[1]
+        jnp.abs(velocity_residual(scene, q, v, t)) <= row_limits(scene, q, v, t, closing_tolerance(q.dtype))[1]
     )
     residual = _sizes(position_residual(whole, q, t), velocity_residual(scene, q, v, t))
     good = (is_closed if atol is None else is_closed | (residual[0] <= atol)) & is_admissible
@@ -223,7 +223,7 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
     )
 
 
-def _turned_back(scene, guess, q, t):
+def _unwind_hinges(scene, guess, q, t):
     """q with its hinges within half a turn of the guess, where full turns make no difference to the constraints."""
     if not isinstance(scene.system, Model):
         return q

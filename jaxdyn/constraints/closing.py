@@ -36,7 +36,7 @@ _STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
 
 
 class Path(NamedTuple):
-    """Where a path from a guess ends, and whether it came through a singular position, where branches meet."""
+    """End of a path from a guess, and whether it came through a singular position, where branches meet."""
 
     q: Array
     passed_singular: Array
@@ -83,14 +83,14 @@ def follow_path(scene: Scene, guess, t, loose: float, steps: int) -> Path:
         q = retract(scene.system, displace(scene.system, q, step))
         return q, size, passed | turned | is_stuck, A, B, count + 1
 
-    def unfinished(state):
+    def goes_on(state):
         q, size, *_, count = state
         return (count < steps) & (size > done) & jnp.isfinite(q).all()
 
     held = holonomic_rows(layout(scene)).size
     none = jnp.zeros((held, scene.nv), guess.dtype)
     state = guess, jnp.asarray(jnp.inf, guess.dtype), jnp.asarray(False), none, none.T, 0
-    q, _, passed, *_ = lax.while_loop(unfinished, improve, state)
+    q, _, passed, *_ = lax.while_loop(goes_on, improve, state)
     return Path(q, passed)
 
 
@@ -121,11 +121,11 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol):
         step = step * jnp.minimum(1.0, _LONGEST / jnp.where(size > 0, size, jnp.ones_like(size)))
         return e + step, size, count + 1
 
-    def unfinished(state):
+    def goes_on(state):
         e, size, count = state
         return (count < _NEAREST_STEPS) & (size > 1e-7) & jnp.isfinite(e).all()
 
-    e, size, _ = lax.while_loop(unfinished, improve, (first, jnp.asarray(jnp.inf, guess.dtype), 0))
+    e, size, _ = lax.while_loop(goes_on, improve, (first, jnp.asarray(jnp.inf, guess.dtype), 0))
     whitened = metric.momentum(jnp.stack([e, first], axis=1))
     is_nearer = jnp.sum(whitened[:, 0] ** 2) <= jnp.sum(whitened[:, 1] ** 2) * (1 + 1e-6)
     phi = position_residual(scene, displace(scene.system, guess, first), t)
@@ -151,11 +151,11 @@ def polish(scene: Scene, q, t, rank_tol):
         falls = errors[best] < error
         return jnp.where(falls, tried[best], q), jnp.where(falls, errors[best], error), falls, count + 1
 
-    def unfinished(state):
+    def goes_on(state):
         _, error, falls, count = state
         return falls & (error > 0) & (count < _NEWTON_STEPS)
 
-    return lax.while_loop(unfinished, improve, (q, size(q), jnp.asarray(True), 0))[0]
+    return lax.while_loop(goes_on, improve, (q, size(q), jnp.asarray(True), 0))[0]
 
 
 def nearest_configuration(scene: Scene, guess, start, t, rank_tol):

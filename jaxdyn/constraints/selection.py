@@ -21,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -429,7 +430,7 @@ def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selecti
     bare = Scene(scene.system, scene.constraints)
     B = compute(scaled_rows, bare, q, t, given=not is_staged())
     # Pivots of a QR factorisation with column exchanges are those of `eliminate`.
-    pivots = _pivots(B)
+    pivots = np.abs(np.diag(scipy.linalg.qr(B.T, mode="r", pivoting=True, check_finite=False)[0]))
     apart = surely_apart(B) if rank_tol is None else rank_tol
     if np.sum(pivots > apart) == B.shape[0]:
         none = np.zeros((), B.dtype)
@@ -442,19 +443,6 @@ def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selecti
 @compiled
 def _select_compiled(scene: Scene, q, t, rank_tol, is_rounded):
     return select_rows(scene, q, t, rank_tol, is_rounded)
-
-
-def _pivots(B: np.ndarray) -> np.ndarray:
-    rest, pivots = np.array(B), []
-    for _ in range(min(B.shape)):
-        lengths = np.linalg.norm(rest, axis=1)
-        row = int(np.argmax(lengths))
-        pivots.append(lengths[row])
-        if lengths[row] == 0:
-            break
-        along = rest[row] / lengths[row]
-        rest = rest - np.outer(rest @ along, along)
-    return np.asarray(pivots)
 
 
 def spread_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Float[Array, " nc"]:

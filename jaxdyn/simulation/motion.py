@@ -180,10 +180,12 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     if method.projects and scene.constraints:
 
         def is_closed(row):
-            met = consistent(scene, *row)
-            return met & meets_dropped_rows(scene, *row) if is_selected(scene) else met
+            y, *state = row
+            own = scene_at(y)  # rows that were exchanged on the way are as open as rounding leaves them
+            met = consistent(own, *state)
+            return met & meets_dropped_rows(own, *state) if is_selected(own) else met
 
-        closed = map_rows(is_closed, (q, v, ts))
+        closed = map_rows(is_closed, (y, q, v, ts))
         failures.append(((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints))
     elif scene.constraints:
 
@@ -208,7 +210,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     if is_selected(scene):
-        gaps = map_rows(lambda row: gap_of_dropped(scene, *row), (q, ts))
+        gaps = map_rows(lambda row: gap_of_dropped(scene_at(row[0]), *row[1:]), (y, q, ts))
         stats["redundant_rows"] = jnp.sum(1 - kept_of(scene)).astype(jnp.int32)
         stats["redundant_gap"] = jnp.max(jnp.where(reached, gaps, jnp.zeros_like(gaps)))
     if lost is not None and unilateral.can_end(scene, options["contacts"]):
