@@ -21,7 +21,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -429,6 +428,8 @@ def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selecti
     """`select_rows` for concrete numbers, and the number of rows that are independent there."""
     bare = Scene(scene.system, scene.constraints)
     B = compute(scaled_rows, bare, q, t, given=not is_staged())
+    import scipy.linalg  # not at the import of the package, which it would make slower
+
     # Pivots of a QR factorisation with column exchanges are those of `eliminate`.
     pivots = np.abs(np.diag(scipy.linalg.qr(B.T, mode="r", pivoting=True, check_finite=False)[0]))
     apart = surely_apart(B) if rank_tol is None else rank_tol
