@@ -428,10 +428,8 @@ def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selecti
     """`select_rows` for concrete numbers, and the number of rows that are independent there."""
     bare = Scene(scene.system, scene.constraints)
     B = compute(scaled_rows, bare, q, t, given=not is_staged())
-    import scipy.linalg  # not at the import of the package, which it would make slower
-
     # Pivots of a QR factorisation with column exchanges are those of `eliminate`.
-    pivots = np.abs(np.diag(scipy.linalg.qr(B.T, mode="r", pivoting=True, check_finite=False)[0]))
+    pivots = _pivots(B)
     apart = surely_apart(B) if rank_tol is None else rank_tol
     if np.sum(pivots > apart) == B.shape[0]:
         none = np.zeros((), B.dtype)
@@ -444,6 +442,19 @@ def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selecti
 @compiled
 def _select_compiled(scene: Scene, q, t, rank_tol, is_rounded):
     return select_rows(scene, q, t, rank_tol, is_rounded)
+
+
+def _pivots(B: np.ndarray) -> np.ndarray:
+    rest, pivots = np.array(B), []
+    for _ in range(min(B.shape)):
+        lengths = np.linalg.norm(rest, axis=1)
+        row = int(np.argmax(lengths))
+        pivots.append(lengths[row])
+        if lengths[row] == 0:
+            break
+        along = rest[row] / lengths[row]
+        rest = rest - np.outer(rest @ along, along)
+    return np.asarray(pivots)
 
 
 def spread_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Float[Array, " nc"]:
