@@ -34,6 +34,7 @@ from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under a name that says of what)
 from jaxdyn.compile.mode import is_expanding as is_expanding
 from jaxdyn.compile.mode import is_rank_safe as is_rank_safe
+from jaxdyn.compile.mode import is_standalone as is_standalone
 from jaxdyn.compile.repair import any_in_batch as any_in_batch
 from jaxdyn.compile.repair import recompute_unless as recompute_unless
 from jaxdyn.compile.repair import repair_flagged as repair_flagged

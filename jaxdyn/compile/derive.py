@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.compile.graph import Graph, inlined, is_number, objects
-from jaxdyn.compile.program import FLOATS, Constant, Program
+from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program
 
 
 def tangent(program: Program, moving: Sequence[bool]) -> Program:
@@ -39,6 +39,8 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
             changes.append(0.0 if row is None else row[entry])
             continue
         given = [(0.0 if type(x) is Constant else changes[x]) for x in operation.args]
+        if operation.op == "call" and any(is_number(x) or x != 0 for x in given):
+            raise NotNumbers("a pseudo-inverse without a rule for its derivative")
         operands = [x.value if type(x) is Constant else values[x] for x in operation.args]
         varies = operation.kind in FLOATS and any(is_number(x) or x != 0 for x in given)
         changes.append(_change(graph, operation.op, operation.kind, value, operands, given) if varies else 0.0)

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile import matrices
+from jaxdyn.compile import matrices, mode
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bound, computed, converted, of_nothing
 from jaxdyn.compile.graph import Graph, Number, as_objects, objects
@@ -320,7 +320,14 @@ class _Expansion:
     def _kernel(self, params, args, eqn):
         inner = params["program"]
         if not isinstance(inner, Program):
-            raise NotNumbers(inner.name)
+            if not mode.is_standalone():
+                raise NotNumbers(inner.name)
+            # Rotations until columns are orthogonal: loops, which are called. A batch has leading axes.
+            self.has_rules = True
+            lead = args[0].shape[:-1]
+            rows = as_objects(args[0]).reshape(-1, inner.inputs[0].size)
+            results = [self.graph.call(inner, [row])[0].ravel() for row in rows]
+            return [np.stack(results).reshape(*lead, -1)]
         shaped = [as_objects(x).reshape(array.shape) for x, array in zip(args, inner.inputs, strict=True)]
         self.has_rules |= inner.derivative is not None
         if self.calls and inner.cost >= MIN_SUBPROGRAM_OPERATIONS and not inner.subprograms:

@@ -23,6 +23,7 @@ _mode = jax.make_user_context(None)
 _expanding = jax.make_user_context(False)
 _rank_safe = jax.make_user_context(False)
 _in_rows = jax.make_user_context(False)
+_standalone = jax.make_user_context(False)
 _said: set[str] = set()
 
 
@@ -81,6 +82,16 @@ def is_rank_safe() -> bool:
 def rank_safe(is_safe: bool = True):
     """Context in which a function is traced for samples that need care."""
     return _rank_safe(is_safe)
+
+
+def is_standalone() -> bool:
+    """Whether a function is traced for code that runs without JAX."""
+    return _standalone.value
+
+
+def standalone():
+    """Context in which a function is traced for code that runs without JAX, which has no other path for a sample."""
+    return _standalone(True)
 
 
 def is_row() -> bool:

@@ -58,6 +58,7 @@ class Program:
     """
 
     turns = 1  # how often the operations are carried out
+    is_called = False  # whether it has loops, so that others can only call it
 
     def __init__(
         self, inputs, outputs, operations, results, subprograms=(), derivative: Callable | None = None, name: str = ""

@@ -14,12 +14,13 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from jaxdyn.compile import derive
-from jaxdyn.compile.code import ATTRIBUTES, Body
+from jaxdyn.compile.code import ATTRIBUTES, Body, symbol_of
 from jaxdyn.compile.graph import Graph, inlined, objects
 from jaxdyn.compile.kernel import program_of
 from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.mode import rank_safe, standalone
 from jaxdyn.compile.objects import features as host_features
-from jaxdyn.compile.program import Array, Program, kind_of
+from jaxdyn.compile.program import Array, Constant, Program, kind_of
 
 MAX_OPERATIONS = 2_000_000  # LLVM takes some 50 microseconds an operation, so this is two minutes
 DEGENERATE = 1  # status of a sample that needs a decision about rank, which straight-line code cannot take
@@ -79,25 +80,58 @@ def _initialize() -> None:
 # --- programs ---
 
 
-def scalar_program(function: Callable, examples: Sequence[Any], name: str) -> tuple[Program, Any]:
-    """The program of function(*examples) and the structure of its results.
+class Routine(NamedTuple):
+    """A function in machine code: its symbol, its program, and the program for samples that the first one flags.
 
-    The last output of the program says whether straight-line code can serve the sample; it is a constant where it always can.
-
-    **Raises:** ValueError where the function is no program of single numbers.
+    The first program decides nothing about rank: constraint rows are taken for independent, and its last output says whether
+    they are. The second one, None where no sample is ever flagged, calls pseudo-inverses, which are loops.
     """
 
+    symbol: str
+    program: Program
+    careful: Program | None
+
+    @property
+    def programs(self) -> tuple[Program, ...]:
+        """One or two programs."""
+        return (self.program,) if self.careful is None else (self.program, self.careful)
+
+
+def make_routine(function: Callable, examples: Sequence[Any], symbol: str) -> tuple[Routine, Any]:
+    """Routine of function(*examples), and the structure of its results.
+
+    **Raises:** ValueError where the function is no scalar program.
+    """
+    program, structure = _scalar_program(function, examples, symbol)
+    # The flag is known where the function decides nothing about rank.
+    if type(program.results[-1][0]) is Constant:
+        return Routine(symbol, program, None), structure
+    with rank_safe():
+        return Routine(symbol, program, _scalar_program(function, examples, symbol)[0]), structure
+
+
+def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> tuple[Program, Any]:
     def call(_, *args):
         return function(*args)
 
     call.__qualname__ = name
-    _, made = program_of(call, (), (), tuple(examples), most=MAX_OPERATIONS, served=True)
+    with standalone():
+        _, made = program_of(call, (), (), tuple(examples), most=MAX_OPERATIONS, served=True)
     if isinstance(made, str):
         raise ValueError(
             f"function cannot be exported: it has {made}; only functions without callbacks and data-dependent loops can"
         )
     program, structure = made
     return inlined(program), structure
+
+
+def jacobian_routine(routine: Routine, symbol: str) -> Routine:
+    """Routine of the derivatives of all float results by all float arguments; see `jacobian_program`."""
+    careful = None
+    if routine.careful is not None:
+        with rank_safe():
+            careful = jacobian_program(routine.careful, symbol)
+    return Routine(symbol, jacobian_program(routine.program, symbol), careful)
 
 
 def jacobian_program(program: Program, name: str) -> Program:
@@ -107,7 +141,8 @@ def jacobian_program(program: Program, name: str) -> Program:
     flag of `program`. Entries that no number of the program can make other than zero are constants.
     """
     moving = tuple(array.dtype.kind == "f" for array in program.inputs)
-    change = inlined(derive.tangent(program, moving))
+    with standalone():
+        change = inlined(derive.tangent(program, moving))
     graph = Graph(MAX_OPERATIONS)
     primal = [graph.inputs(place, array) for place, array in enumerate(program.inputs)]
     varied = [array for array, moves in zip(program.inputs, moving, strict=True) if moves]
@@ -144,21 +179,33 @@ class Field(NamedTuple):
     offset: int
 
 
-def function_ir(
-    name: str,
-    program: Program,
+def routine_ir(
+    routine: Routine,
     inputs: Sequence[Field],
     *,
     places: Mapping[int, np.ndarray] | None = None,
     results: Sequence[np.ndarray] | None = None,
     internal: bool = False,
-) -> Text:
-    """The text of `i32 name(ptr a0, ..., ptr r0, ...)`: status 0, or `DEGENERATE` where the flag of the program is not set.
+) -> list[Text]:
+    """Text of `i32 symbol(ptr a0, ..., ptr r0, ...)`: status 0, or `DEGENERATE` where the last program flags the sample.
 
-    **Arguments:** `inputs`: for each input of the program the place where it stands. `places`, `results`: for each entry of an
-    input and of an output, by rows, its index in the caller's memory (default: by rows); -1 for a result that is not stored.
-    `internal`: whether the function is seen in its module alone.
+    **Arguments:** `inputs`: for each input of the program its place in the caller's memory. `places`, `results`: for each entry
+    of an input and of an output, by rows, its index in the caller's memory (default: by rows); -1 for a result that is not
+    stored. `internal`: whether the function is visible in its module only.
     """
+    layout: dict[str, Any] = {"places": places, "results": results}
+    careful = f"{routine.symbol}_careful"
+    if routine.careful is None:
+        return [_function_ir(routine.symbol, routine.program, inputs, internal, None, **layout)]
+    return [
+        _function_ir(routine.symbol, routine.program, inputs, internal, careful, **layout),
+        _function_ir(careful, routine.careful, inputs, True, None, **layout),
+    ]
+
+
+def _function_ir(
+    name: str, program: Program, inputs: Sequence[Field], internal: bool, careful: str | None, *, places, results
+) -> Text:
     e = Emitter(1)
 
     def load(place, entry, kind):
@@ -168,18 +215,32 @@ def function_ir(
             base = e.put(f"getelementptr i8, ptr {base}, i64 {field.offset}")
         return e.load_one(base, entry if places is None else int(places[place][entry]), kind)
 
-    *values, flag = Body(e, program, load, lambda place: None).results()
+    body = Body(e, program, load, lambda place: None)
+    *values, flag = body.results()
+    count = 1 + max((field.argument for field in inputs), default=-1)
+    pointers = [f"ptr %a{i}" for i in range(count)] + [f"ptr %r{i}" for i in range(len(values))]
+    if careful is not None:
+        # Before anything is stored: a result may be written over the argument that the careful program still reads.
+        e.lines += [
+            f"  br i1 {flag[0]}, label %regular, label %careful",
+            "careful:",
+            f"  %repaired = call i32 @{careful}({', '.join(pointers)})",
+            "  ret i32 %repaired",
+            "regular:",
+        ]
     for i, (row, array) in enumerate(zip(values, program.outputs, strict=False)):
         for k, value in enumerate(row):
             where = k if results is None else int(results[i][k])
             if where >= 0:
                 e.store_one(f"%r{i}", where, kind_of(array.dtype), value)
     e.lines.append(f"  %status = select i1 {flag[0]}, i32 0, i32 {DEGENERATE}")
-    count = 1 + max((field.argument for field in inputs), default=-1)
-    pointers = [f"ptr %a{i}" for i in range(count)] + [f"ptr %r{i}" for i in range(len(values))]
     linkage = "internal " if internal else ""
     head = f"define {linkage}i32 @{name}({', '.join(pointers)}) #0 {{"
-    return Text("\n".join([head, *e.lines, "  ret i32 %status", "}"]), e.declared)
+    text = "\n".join([head, *body.allocated(), *e.lines, "  ret i32 %status", "}"])
+    for called in program.subprograms:
+        if (symbol := symbol_of(called, 1)) in e.declared:  # else no result needs it
+            e.declared |= called.definition(symbol)  # pyright: ignore[reportAttributeAccessIssue]
+    return Text(text, e.declared)
 
 
 def packed_ir(name: str, arguments: int, program: Program) -> Text:

@@ -13,6 +13,7 @@ from jaxdyn.compile import (
     implicit,
     is_expanding,
     is_rank_safe,
+    is_standalone,
     partition_traced,
     repair_flagged,
     run,
@@ -98,6 +99,16 @@ def _projected(scene: Scene, rank_tol, q, v, t, errors):
 def _in_rounds(again: Callable, first):
     """`first` = (q, v, errors, whether to go on, anything), and again(q, v, anything) until that is not, `_MOST_ROUNDS` in
     all."""
+
+    if is_expanding() and is_standalone():
+        # A program of numbers has no loops of unknown length: all rounds are written out, and those that are needed count.
+        projected = tuple(first)
+        for _ in range(_MOST_ROUNDS - 1):
+            q, v, _, more, anything = projected
+            following = again(q, v, anything)
+            projected = jax.tree.map(lambda new, old, more=more: jnp.where(more, new, old), tuple(following), projected)
+        q, v, errors, _, anything = projected
+        return q, v, errors, anything
 
     def step(state):
         count, (q, v, _, _, more) = state

@@ -8,7 +8,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import any_in_batch, is_concrete, is_expanding, pseudo_inverse_by_rotations, run, unless
+from jaxdyn.compile import (
+    any_in_batch,
+    is_concrete,
+    is_expanding,
+    is_rank_safe,
+    is_standalone,
+    pseudo_inverse_by_rotations,
+    run,
+    unless,
+)
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
@@ -73,7 +82,8 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = Fa
     Golub & Pereyra (1973), eq. 4.12, right
     wherever the rank is constant; no factorisation is differentiated.
     """
-    if dependent:
+    # Code that runs without JAX has a second program for the samples that the normal equations fail.
+    if dependent or (is_standalone() and is_rank_safe()):
         return pseudo_inverse_by_rotations(Y, rank_tol)
     if Y.shape[1] > Y.shape[0]:
         return pseudo_inverse(Y.T, rank_tol).T
@@ -111,7 +121,7 @@ class LeastSquares(NamedTuple):
 def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
     """By Cholesky's factor in a program of numbers, in which samples with dependent columns are flagged; else by the
     pseudo-inverse."""
-    if not is_expanding():
+    if not is_expanding() or (is_standalone() and is_rank_safe()):
         return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
     factor = cholesky(regular_gram(Y))
     return LeastSquares(Y, unless(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.compile import standalone
-from jaxdyn.compile.program import Array, Constant, Program
-from jaxdyn.compile.standalone import Text
+from jaxdyn.compile.program import Array, Constant
+from jaxdyn.compile.standalone import Routine, Text
 from jaxdyn.export.arguments import fields_of
 
 
@@ -59,36 +59,37 @@ def _block(is_stored: np.ndarray, of: Pattern, by: Pattern) -> Pattern:
 
 def casadi_ir(exported: Any) -> str:
     """The text of `name`, and of `jac_name` where the Jacobian was exported, with all that CasADi asks of them."""
-    program = exported.program
+    program, jacobian = exported.value.program, exported.derivative
     inputs, outputs = list(map(_dense, program.inputs)), list(map(_dense, program.outputs[:-1]))
-    functions = [_functions(exported.name, program, exported, inputs, outputs, [])]
-    jacobian = exported.jacobian_program
+    functions = _functions(exported.name, exported.value, exported, inputs, outputs, [])
     if jacobian is not None:
         patterns, count = [], len(inputs)
-        for i, (row, array) in enumerate(zip(jacobian.results, jacobian.outputs[:-1], strict=False)):
-            is_zero = [type(x) is Constant and x.value == 0 for x in row]
-            patterns.append(_block(~np.reshape(is_zero, array.shape), outputs[i // count], inputs[i % count]))
-        functions.append(_functions(f"jac_{exported.name}", jacobian, exported, inputs, patterns, outputs))
+        for i, array in enumerate(jacobian.program.outputs[:-1]):
+            rows = [x.results[i] for x in jacobian.programs]
+            # An entry is left out where it is zero for regular and for singular samples.
+            is_stored = [
+                any(type(x) is not Constant or x.value != 0 for x in entries) for entries in zip(*rows, strict=True)
+            ]
+            patterns.append(_block(np.reshape(is_stored, array.shape), outputs[i // count], inputs[i % count]))
+        functions += _functions(f"jac_{exported.name}", jacobian, exported, inputs, patterns, outputs)
     return standalone.module_ir(*functions)
 
 
 def _functions(
     name: str,
-    program: Program,
+    routine: Routine,
     exported: Any,
     inputs: Sequence[Pattern],
     outputs: Sequence[Pattern],
     nominal: Sequence[Pattern],
-) -> Text:
+) -> list[Text]:
     """The text of one function of CasADi's interface; `nominal` are the results that a Jacobian is given as further arguments."""
     core, given = f"{name}_core", [*inputs, *nominal]
     places = {i: pattern.places for i, pattern in enumerate(inputs)}
     results = [pattern.places for pattern in outputs]
-    text, declared = standalone.function_ir(
-        core, program, fields_of(exported.arguments), places=places, results=results, internal=True
-    )
-    lines = [text]
-    lines += [f"@{name}_zero = internal constant [{max([1, *(x.count for x in inputs)])} x double] zeroinitializer"]
+    fields = fields_of(exported.arguments)
+    texts = standalone.routine_ir(routine._replace(symbol=core), fields, places=places, results=results, internal=True)
+    lines = [f"@{name}_zero = internal constant [{max([1, *(x.count for x in inputs)])} x double] zeroinitializer"]
     for kind, patterns in (("in", given), ("out", outputs)):
         for i, pattern in enumerate(patterns):
             numbers = pattern.description()
@@ -123,4 +124,4 @@ def _functions(
         ]
     pointers = [f"ptr %a{i}" for i in range(len(inputs))] + [f"ptr %r{i}" for i in range(len(outputs))]
     lines += [f"  %status = call i32 @{core}({', '.join(pointers)})", "  ret i32 %status", "}"]
-    return Text("\n".join(lines), declared)
+    return [*texts, Text("\n".join(lines), {})]

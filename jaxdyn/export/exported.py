@@ -14,6 +14,7 @@ from jaxdyn.compile.objects import Code
 from jaxdyn.compile.program import Program
 from jaxdyn.compile.standalone import HOST as HOST
 from jaxdyn.compile.standalone import TARGETS as TARGETS
+from jaxdyn.compile.standalone import Routine
 from jaxdyn.export.arguments import (
     Argument,
     arguments_of,
@@ -75,15 +76,16 @@ def export(
             )
     examples = jax.tree.map(np.asarray, examples)
     arguments = arguments_of(function, examples)
-    program, structure = standalone.scalar_program(function, examples, name)
+    value, structure = standalone.make_routine(function, examples, name)
+    program = value.program
     if program.outputs and any(x.dtype.name not in ("float64", "float32") for x in program.outputs[:-1]):
         kinds = ", ".join(str(x.dtype) for x in program.outputs[:-1])
         raise ValueError(
             f"function returns arrays of {kinds}; exported functions return float64 and float32, so convert with astype"
         )
-    jacobian = standalone.jacobian_program(program, f"{name}_jacobian") if "jacobian" in derivatives else None
+    jacobian = standalone.jacobian_routine(value, f"{name}_jacobian") if "jacobian" in derivatives else None
     system = system_of(function, examples)
-    return Exported(name, arguments, program, structure, jacobian, batch, examples, system)
+    return Exported(arguments, value, structure, jacobian, batch, examples, system)
 
 
 class Exported:
@@ -91,19 +93,18 @@ class Exported:
 
     def __init__(
         self,
-        name: str,
         arguments: tuple[Argument, ...],
-        program: Program,
+        value: Routine,
         structure: PyTree,
-        jacobian: Program | None,
+        derivative: Routine | None,
         batch: bool,
         examples: PyTree,
         system: Model | None,
     ):
-        self.name = name
+        self.name = value.symbol
         self.arguments = arguments
-        self.program = program
-        self.jacobian_program = jacobian
+        self.value = value
+        self.derivative = derivative
         self.batch = batch
         self.examples = examples
         self._structure = structure
@@ -113,8 +114,8 @@ class Exported:
         self._local = threading.local()
 
     def __repr__(self):
-        extra = f", jacobian with {self.jacobian_program.cost}" if self.jacobian_program else ""
-        return f"Exported({self.name}, {self.program.cost} operations{extra})"
+        extra = f", Jacobian {self.derivative.program.cost}" if self.derivative else ""
+        return f"Exported({self.name}, {self.value.program.cost} operations{extra})"
 
     @property
     def has_structures(self) -> bool:
@@ -123,20 +124,20 @@ class Exported:
 
     def results(self) -> list[tuple[str, tuple[int, ...], np.dtype]]:
         """Names, shapes and dtypes of the results."""
-        outputs = self.program.outputs[:-1]
+        outputs = self.value.program.outputs[:-1]
         names = ["out"] if len(outputs) == 1 else [f"out{i}" for i in range(len(outputs))]
         return [(name, x.shape, x.dtype) for name, x in zip(names, outputs, strict=True)]
 
     def jacobian_results(self) -> list[tuple[str, tuple[int, ...], np.dtype]]:
         """The same of the Jacobian: `result_by_argument` (size of the result, size of the argument)."""
-        assert self.jacobian_program is not None
+        assert self.derivative is not None
         leaves = [
             leaf if not x.is_structure else leaf._replace(name=f"{x.name}_{leaf.name}")
             for x in self.arguments
             for leaf in x.leaves
         ]
         names = [f"{result}_by_{leaf.name}" for result, _, _ in self.results() for leaf in leaves]
-        return [(name, x.shape, x.dtype) for name, x in zip(names, self.jacobian_program.outputs[:-1], strict=True)]
+        return [(name, x.shape, x.dtype) for name, x in zip(names, self.derivative.program.outputs[:-1], strict=True)]
 
     def comment_on(self, name: str, size: int) -> str:
         """Order and units of the entries of an argument."""
@@ -163,7 +164,7 @@ class Exported:
 
         **Raises:** ValueError where the function was exported without derivatives; as `__call__`.
         """
-        if self.jacobian_program is None:
+        if self.derivative is None:
             raise ValueError(
                 f"{self.name} was exported without its Jacobian; pass derivatives=('jacobian',) to jd.export"
             )
@@ -178,10 +179,8 @@ class Exported:
         if caller is None:
             if self._code is None:
                 self._code = Code(self.module("packed"))
-            program = self.program if which == "function" else self.jacobian_program
-            symbol = self.name if which == "function" else f"{self.name}_jacobian"
-            assert program is not None
-            caller = _make_caller(self._code.address(f"{symbol}_packed"), self, program)
+            routine = self._routine(which)
+            caller = _make_caller(self._code.address(f"{routine.symbol}_packed"), self, routine.program)
             setattr(self._local, which, caller)
         return caller
 
@@ -190,9 +189,12 @@ class Exported:
         try:
             return self._caller(which)(self.examples)
         except FloatingPointError:
-            program = self.program if which == "function" else self.jacobian_program
-            assert program is not None
-            return [np.full(x.shape, np.nan, x.dtype) for x in program.outputs[:-1]]
+            return [np.full(x.shape, np.nan, x.dtype) for x in self._routine(which).program.outputs[:-1]]
+
+    def _routine(self, which: str) -> Routine:
+        routine = self.value if which == "function" else self.derivative
+        assert routine is not None
+        return routine
 
     # --- code and files ---
 
@@ -200,14 +202,10 @@ class Exported:
         """The text of all functions, in LLVM's intermediate representation; "packed" is what calls from Python take."""
         if abi == "casadi":
             return casadi_ir(self)
-        fields = fields_of(self.arguments)
-        functions = [standalone.function_ir(self.name, self.program, fields)]
-        if self.jacobian_program is not None:
-            functions.append(standalone.function_ir(f"{self.name}_jacobian", self.jacobian_program, fields))
+        routines = [x for x in (self.value, self.derivative) if x is not None]
+        functions = [text for x in routines for text in standalone.routine_ir(x, fields_of(self.arguments))]
         if abi == "packed":
-            functions += [standalone.packed_ir(self.name, len(self.arguments), self.program)]
-            if self.jacobian_program is not None:
-                functions += [standalone.packed_ir(f"{self.name}_jacobian", len(self.arguments), self.jacobian_program)]
+            functions += [standalone.packed_ir(x.symbol, len(self.arguments), x.program) for x in routines]
         if self.batch and abi == "c":
             functions.append(batch_ir(self, lanes))
         return standalone.module_ir(*functions)
@@ -236,7 +234,7 @@ class Exported:
         """
         if abi not in ABIS:
             raise ValueError(f"abi is {abi!r}; choose from {', '.join(map(repr, ABIS))}")
-        if abi == "casadi" and (self.has_structures or any(x.dtype != np.float64 for x in self.program.inputs)):
+        if abi == "casadi" and (self.has_structures or any(x.dtype != np.float64 for x in self.value.program.inputs)):
             raise ValueError(
                 "abi is 'casadi', whose functions take arrays of float64: export a function of such arrays alone"
             )
@@ -281,8 +279,8 @@ def _make_caller(address: int, exported: Exported, program: Program) -> Callable
             buffer[...] = x
         if function(pointer):
             raise FloatingPointError(
-                f"{name}: the constraints lose rank at this sample, which straight-line code cannot handle; take "
-                "jd.constrained_dynamics in Python there"
+                f"{name}: no regular solution at this sample: constraint rows contradict each other, the mass matrix is "
+                "singular, or a step cannot be completed; the result code of the function in Python says which"
             )
         return [x.copy() for x in results]
 

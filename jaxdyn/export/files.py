@@ -87,7 +87,7 @@ def header(exported: Any, made: ObjectFile, target: Triple) -> str:
             lines.append(f" * {argument.name} {leaf.shape}" + (f": {comment}" if comment else ""))
     lines += [f" * {result} {shape}" for result, shape, _ in exported.results()]
     lines += [" */", f"int {name}({_parameters(exported, exported.results())});"]
-    if exported.jacobian_program is not None:
+    if exported.derivative is not None:
         lines += [
             "",
             "/* Derivatives: one row for each entry of the result, one column for each entry of the argument. */",
@@ -163,7 +163,7 @@ def test_program(exported: Any) -> str:
             kind = C_TYPES[argument.leaves[0].dtype.name]
             lines.append(f"static const {kind} {argument.name}[] = {{{_numbers(np.asarray(values[0]))}}};")
     calls = [(name, exported.results(), exported.evaluate())]
-    if exported.jacobian_program is not None:
+    if exported.derivative is not None:
         calls.append((f"{name}_jacobian", exported.jacobian_results(), exported.evaluate("jacobian")))
     given = ", ".join(f"&{x.name}" if x.is_structure else x.name for x in exported.arguments)
     checks = []

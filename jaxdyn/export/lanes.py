@@ -1,4 +1,4 @@
-"""The text of a function over a batch: several samples at once, in the lanes of vector registers."""
+"""Text of a function over a batch: several samples at once in vector registers."""
 
 from typing import Any
 
@@ -10,49 +10,26 @@ from jaxdyn.export.arguments import fields_of
 
 
 def batch_ir(exported: Any, width: int) -> Text:
-    """The text of `i32 name_batch(i64 n, ptr a0, ..., ptr r0, ...)` over the samples 0 .. n - 1.
+    """Text of `i32 name_batch(i64 n, ptr a0, ..., ptr r0, ...)` over the samples 0 .. n - 1.
 
-    Arrays have one row for each sample; a structure is the same for all. The status is 0, or `DEGENERATE` where a sample is
-    degenerate; the results of such samples are NaN.
+    Arrays have one row for each sample; a structure is the same for all. The status is the largest of all samples. Results of
+    samples without a regular solution are NaN.
     """
-    e, program, fields = Emitter(width), exported.program, fields_of(exported.arguments)
-    count = len(exported.arguments)
-    shared = [x.is_structure for x in exported.arguments]
-    outputs = program.outputs[:-1]
+    program = exported.value.program
+    # Pseudo-inverses take another number of sweeps for each sample, so these are computed one at a time.
+    e = Emitter(1 if program.subprograms else width)
+    arguments, outputs = exported.arguments, program.outputs[:-1]
     # Results follow the arguments in the numbering of pointers.
-    sizes = {i: x.bytes for i, x in enumerate(exported.arguments) if not shared[i]}
-    sizes |= {count + i: x.size * x.dtype.itemsize for i, x in enumerate(outputs)}
+    sizes = {i: x.bytes for i, x in enumerate(arguments) if not x.is_structure}
+    sizes |= {len(arguments) + i: x.size * x.dtype.itemsize for i, x in enumerate(outputs)}
     rows = e.rows(list(sizes), list(sizes.values()))
-
-    def load(place, entry, kind):
-        field = fields[place]
-        if not shared[field.argument]:
-            return e.load(rows[field.argument], entry, kind)
-        # One load and a copy to all lanes.
-        value = Emitter(1)
-        value.count = e.count
-        at = value.put(f"getelementptr i8, ptr %a{field.argument}, i64 {field.offset}")
-        name = value.load_one(at, entry, kind)
-        e.lines += value.lines
-        e.count = value.count
-        if width == 1:
-            return name
-        of, scalar = e.type(kind), value.type(kind)
-        first = e.put(f"insertelement {of} poison, {scalar} {name}, i32 0")
-        return e.put(f"shufflevector {of} {first}, {of} poison, <{width} x i32> zeroinitializer")
-
-    body = Body(e, program, load, lambda place: None)
-    *results, flag = body.results()
-    for i, (row, array) in enumerate(zip(results, outputs, strict=True)):
-        e.store_array(rows[count + i], kind_of(array.dtype), row)
-    regular = flag[0]
-    if width > 1:
-        name = f"llvm.vector.reduce.and.v{width}i1"
-        e.declared[name] = f"declare i1 @{name}({e.type('b1')})"
-        regular = e.put(f"call i1 @{name}({e.type('b1')} {regular})")
-    code = e.put(f"select i1 {regular}, i32 0, i32 {DEGENERATE}")
-    after = e.put(f"or i32 %status, {code}")
-    pointers = [f"ptr %a{i}" for i in range(count + len(outputs))]
+    if program.subprograms:
+        status = _single_calls(e, exported, rows)
+        e.lines += ["  br label %following"]
+        incoming = [(status, "%block")]
+    else:
+        incoming = _vector_block(e, exported, rows)
+    pointers = [f"ptr %a{i}" for i in range(len(arguments) + len(outputs))]
     text = "\n".join(
         [
             f"define i32 @{exported.name}_batch(i64 %n, {', '.join(pointers)}) #0 {{",
@@ -62,18 +39,65 @@ def batch_ir(exported: Any, width: int) -> Text:
             "  br i1 %some, label %block, label %none",
             "block:",
             "  %base = phi i64 [ 0, %entry ], [ %next, %following ]",
-            f"  %status = phi i32 [ 0, %entry ], [ {after}, %following ]",
+            "  %worst = phi i32 [ 0, %entry ], [ %after, %following ]",
             *e.lines,
-            "  br label %following",
             "following:",
-            f"  %next = add i64 %base, {width}",
+            f"  %status = phi i32 {', '.join(f'[ {value}, {label} ]' for value, label in incoming)}",
+            "  %after = or i32 %worst, %status",
+            f"  %next = add i64 %base, {e.width}",
             "  %more = icmp slt i64 %next, %n",
             "  br i1 %more, label %block, label %done",
             "none:",
             "  ret i32 0",
             "done:",
-            f"  ret i32 {after}",
+            "  ret i32 %after",
             "}",
         ]
     )
     return Text(text, e.declared)
+
+
+def _vector_block(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> list[tuple[str, str]]:
+    """Compute W samples at once, and again one at a time where the program flags one; returns statuses and their blocks."""
+    routine, fields, width = exported.value, fields_of(exported.arguments), e.width
+
+    def load(place, entry, kind):
+        field = fields[place]
+        if not exported.arguments[field.argument].is_structure:
+            return e.load(rows[field.argument], entry, kind)
+        # One load and a copy to all lanes.
+        value = Emitter(1)
+        value.count = e.count
+        at = value.put(f"getelementptr i8, ptr %a{field.argument}, i64 {field.offset}")
+        name = value.load_one(at, entry, kind)
+        e.lines += value.lines
+        e.count = value.count
+        return name if width == 1 else e.splat(name, kind)
+
+    *results, flag = Body(e, routine.program, load, lambda place: None).results()
+    regular = flag[0]
+    if width > 1:
+        name = f"llvm.vector.reduce.and.v{width}i1"
+        e.declared[name] = f"declare i1 @{name}({e.type('b1')})"
+        regular = e.put(f"call i1 @{name}({e.type('b1')} {regular})")
+    incoming = []
+    if routine.careful is not None:
+        e.lines += [f"  br i1 {regular}, label %regular, label %careful", "careful:"]
+        incoming.append((_single_calls(e, exported, rows), "%careful"))
+        e.lines += ["  br label %following", "regular:"]
+    for i, (row, array) in enumerate(zip(results, routine.program.outputs, strict=False)):
+        e.store_array(rows[len(exported.arguments) + i], kind_of(array.dtype), row)
+    code = e.put(f"select i1 {regular}, i32 0, i32 {DEGENERATE}")
+    e.lines += ["  br label %following"]
+    return [*incoming, (code, "%block" if routine.careful is None else "%regular")]
+
+
+def _single_calls(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> str:
+    """Call the function of one sample for each of the W samples; returns the largest status."""
+    count = len(exported.arguments) + len(exported.value.program.outputs) - 1
+    total = "0"
+    for k in range(e.width):
+        pointers = [f"ptr {rows[i][k]}" if i in rows else f"ptr %a{i}" for i in range(count)]
+        status = e.put(f"call i32 @{exported.name}({', '.join(pointers)})")
+        total = e.put(f"or i32 {total}, {status}")
+    return total
