@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxdyn.compile import derive
 from jaxdyn.compile.code import ATTRIBUTES, Body, symbol_of
+from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.graph import Graph, inlined, objects
 from jaxdyn.compile.kernel import program_of
 from jaxdyn.compile.llvm import Emitter
@@ -22,6 +23,8 @@ from jaxdyn.compile.mode import rank_safe, standalone
 from jaxdyn.compile.objects import features as host_features
 from jaxdyn.compile.program import Array, Constant, Program, kind_of
 
+# Operations of a directional derivative times directions: a Panda's forward dynamics has 60 000, most of which are zeros.
+MAX_WRITTEN_OUT = 200_000
 MAX_OPERATIONS = 2_000_000  # LLVM takes some 50 microseconds an operation, so this is two minutes
 DEGENERATE = 1  # status of a sample that needs a decision about rank, which straight-line code cannot take
 
@@ -88,11 +91,11 @@ class Routine(NamedTuple):
     """
 
     symbol: str
-    program: Program
-    careful: Program | None
+    program: Program | Directions
+    careful: Program | Directions | None
 
     @property
-    def programs(self) -> tuple[Program, ...]:
+    def programs(self) -> tuple[Program | Directions, ...]:
         """One or two programs."""
         return (self.program,) if self.careful is None else (self.program, self.careful)
 
@@ -134,7 +137,7 @@ def jacobian_routine(routine: Routine, symbol: str) -> Routine:
     return Routine(symbol, jacobian_program(routine.program, symbol), careful)
 
 
-def jacobian_program(program: Program, name: str) -> Program:
+def jacobian_program(program: Program, name: str) -> Program | Directions:
     """The derivatives of all float outputs of a program by all float inputs.
 
     The outputs are an array (size of the output, size of the input) for each float output and each float input, followed by the
@@ -143,6 +146,9 @@ def jacobian_program(program: Program, name: str) -> Program:
     moving = tuple(array.dtype.kind == "f" for array in program.inputs)
     with standalone():
         change = inlined(derive.tangent(program, moving))
+    columns = sum(array.size for array, moves in zip(program.inputs, moving, strict=True) if moves)
+    if change.cost * columns > MAX_WRITTEN_OUT:
+        return Directions(program, change)
     graph = Graph(MAX_OPERATIONS)
     primal = [graph.inputs(place, array) for place, array in enumerate(program.inputs)]
     varied = [array for array, moves in zip(program.inputs, moving, strict=True) if moves]
@@ -183,6 +189,7 @@ def routine_ir(
     routine: Routine,
     inputs: Sequence[Field],
     *,
+    lanes: int = 1,
     places: Mapping[int, np.ndarray] | None = None,
     results: Sequence[np.ndarray] | None = None,
     internal: bool = False,
@@ -191,9 +198,10 @@ def routine_ir(
 
     **Arguments:** `inputs`: for each input of the program its place in the caller's memory. `places`, `results`: for each entry
     of an input and of an output, by rows, its index in the caller's memory (default: by rows); -1 for a result that is not
-    stored. `internal`: whether the function is visible in its module only.
+    stored; `Directions` store by rows alone. `internal`: whether the function is visible in its module only. `lanes`: float64
+    numbers in a vector register.
     """
-    layout: dict[str, Any] = {"places": places, "results": results}
+    layout: dict[str, Any] = {"places": places, "results": results, "lanes": lanes}
     careful = f"{routine.symbol}_careful"
     if routine.careful is None:
         return [_function_ir(routine.symbol, routine.program, inputs, internal, None, **layout)]
@@ -204,7 +212,15 @@ def routine_ir(
 
 
 def _function_ir(
-    name: str, program: Program, inputs: Sequence[Field], internal: bool, careful: str | None, *, places, results
+    name: str,
+    program: Program | Directions,
+    inputs: Sequence[Field],
+    internal: bool,
+    careful: str | None,
+    *,
+    lanes: int,
+    places: Mapping[int, np.ndarray] | None,
+    results: Sequence[np.ndarray] | None,
 ) -> Text:
     e = Emitter(1)
 
@@ -215,28 +231,38 @@ def _function_ir(
             base = e.put(f"getelementptr i8, ptr {base}, i64 {field.offset}")
         return e.load_one(base, entry if places is None else int(places[place][entry]), kind)
 
-    body = Body(e, program, load, lambda place: None)
-    *values, flag = body.results()
     count = 1 + max((field.argument for field in inputs), default=-1)
-    pointers = [f"ptr %a{i}" for i in range(count)] + [f"ptr %r{i}" for i in range(len(values))]
-    if careful is not None:
-        # Before anything is stored: a result may be written over the argument that the careful program still reads.
-        e.lines += [
-            f"  br i1 {flag[0]}, label %regular, label %careful",
+    pointers = [f"ptr %a{i}" for i in range(count)] + [f"ptr %r{i}" for i in range(len(program.outputs) - 1)]
+
+    def leave(flag: str) -> list[str]:
+        # Before anything is stored: a result may be written over an argument that the careful program still reads.
+        if careful is None:
+            return []
+        return [
+            f"  br i1 {flag}, label %regular, label %careful",
             "careful:",
             f"  %repaired = call i32 @{careful}({', '.join(pointers)})",
             "  ret i32 %repaired",
             "regular:",
         ]
-    for i, (row, array) in enumerate(zip(values, program.outputs, strict=False)):
-        for k, value in enumerate(row):
-            where = k if results is None else int(results[i][k])
-            if where >= 0:
-                e.store_one(f"%r{i}", where, kind_of(array.dtype), value)
-    e.lines.append(f"  %status = select i1 {flag[0]}, i32 0, i32 {DEGENERATE}")
+
+    if isinstance(program, Directions):
+        assert results is None
+        allocated, regular = program.lines(e, name, lanes, load, leave)
+    else:
+        body = Body(e, program, load, lambda place: None)
+        *values, (regular,) = body.results()
+        allocated = body.allocated()
+        e.lines += leave(regular)
+        for i, (row, array) in enumerate(zip(values, program.outputs, strict=False)):
+            for k, value in enumerate(row):
+                where = k if results is None else int(results[i][k])
+                if where >= 0:
+                    e.store_one(f"%r{i}", where, kind_of(array.dtype), value)
+    e.lines.append(f"  %status = select i1 {regular}, i32 0, i32 {DEGENERATE}")
     linkage = "internal " if internal else ""
     head = f"define {linkage}i32 @{name}({', '.join(pointers)}) #0 {{"
-    text = "\n".join([head, *body.allocated(), *e.lines, "  ret i32 %status", "}"])
+    text = "\n".join([head, *allocated, *e.lines, "  ret i32 %status", "}"])
     for called in program.subprograms:
         if (symbol := symbol_of(called, 1)) in e.declared:  # else no result needs it
             e.declared |= called.definition(symbol)  # pyright: ignore[reportAttributeAccessIssue]

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.compile import standalone
+from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.program import Array, Constant
 from jaxdyn.compile.standalone import Routine, Text
 from jaxdyn.export.arguments import fields_of
@@ -57,11 +58,11 @@ def _block(is_stored: np.ndarray, of: Pattern, by: Pattern) -> Pattern:
     return Pattern(stored, _by_columns(stored)[where].ravel())
 
 
-def casadi_ir(exported: Any) -> str:
+def casadi_ir(exported: Any, lanes: int) -> str:
     """The text of `name`, and of `jac_name` where the Jacobian was exported, with all that CasADi asks of them."""
     program, jacobian = exported.value.program, exported.derivative
     inputs, outputs = list(map(_dense, program.inputs)), list(map(_dense, program.outputs[:-1]))
-    functions = _functions(exported.name, exported.value, exported, inputs, outputs, [])
+    functions = _functions(exported.name, exported.value, exported, inputs, outputs, [], lanes)
     if jacobian is not None:
         patterns, count = [], len(inputs)
         for i, array in enumerate(jacobian.program.outputs[:-1]):
@@ -71,7 +72,7 @@ def casadi_ir(exported: Any) -> str:
                 any(type(x) is not Constant or x.value != 0 for x in entries) for entries in zip(*rows, strict=True)
             ]
             patterns.append(_block(np.reshape(is_stored, array.shape), outputs[i // count], inputs[i % count]))
-        functions += _functions(f"jac_{exported.name}", jacobian, exported, inputs, patterns, outputs)
+        functions += _functions(f"jac_{exported.name}", jacobian, exported, inputs, patterns, outputs, lanes)
     return standalone.module_ir(*functions)
 
 
@@ -82,13 +83,16 @@ def _functions(
     inputs: Sequence[Pattern],
     outputs: Sequence[Pattern],
     nominal: Sequence[Pattern],
+    lanes: int,
 ) -> list[Text]:
     """The text of one function of CasADi's interface; `nominal` are the results that a Jacobian is given as further arguments."""
     core, given = f"{name}_core", [*inputs, *nominal]
     places = {i: pattern.places for i, pattern in enumerate(inputs)}
-    results = [pattern.places for pattern in outputs]
-    fields = fields_of(exported.arguments)
-    texts = standalone.routine_ir(routine._replace(symbol=core), fields, places=places, results=results, internal=True)
+    # A Jacobian that is computed by columns is stored dense in the work vector, and copied from there.
+    is_dense = any(isinstance(x, Directions) for x in routine.programs)
+    results = None if is_dense else [pattern.places for pattern in outputs]
+    fields, routine = fields_of(exported.arguments), routine._replace(symbol=core)
+    texts = standalone.routine_ir(routine, fields, lanes=lanes, places=places, results=results, internal=True)
     lines = [f"@{name}_zero = internal constant [{max([1, *(x.count for x in inputs)])} x double] zeroinitializer"]
     for kind, patterns in (("in", given), ("out", outputs)):
         for i, pattern in enumerate(patterns):
@@ -101,8 +105,9 @@ def _functions(
         for i in range(len(patterns)):
             lines += [f"case{i}:", f"  ret ptr @{name}_{kind}{i}"]
         lines += ["other:", "  ret ptr null", "}"]
-    # Results that are not asked for are written to the end of the work vector.
-    work = max([0, *(x.count for x in outputs)])
+    # Results that are not asked for are written to the work vector.
+    sizes = [x.stored.size for x in outputs]
+    work = sum(sizes) if is_dense else max([0, *(x.count for x in outputs)])
     lines += [f"define i32 @{name}_work(ptr %args, ptr %results, ptr %iw, ptr %w) #0 {{"]
     for pointer, size in (("%args", len(given)), ("%results", len(outputs)), ("%iw", 0), ("%w", work)):
         lines.append(f"  store i64 {size}, ptr {pointer}")
@@ -121,7 +126,42 @@ def _functions(
             f"  %lr{i} = load ptr, ptr %pr{i}",
             f"  %nr{i} = icmp eq ptr %lr{i}, null",
             f"  %r{i} = select i1 %nr{i}, ptr %w, ptr %lr{i}",
+            f"  %d{i} = getelementptr double, ptr %w, i64 {sum(sizes[:i])}",
         ]
-    pointers = [f"ptr %a{i}" for i in range(len(inputs))] + [f"ptr %r{i}" for i in range(len(outputs))]
-    lines += [f"  %status = call i32 @{core}({', '.join(pointers)})", "  ret i32 %status", "}"]
-    return [*texts, Text("\n".join(lines), {})]
+    pointers = [f"ptr %a{i}" for i in range(len(inputs))]
+    pointers += [f"ptr %{'d' if is_dense else 'r'}{i}" for i in range(len(outputs))]
+    lines += [f"  %status = call i32 @{core}({', '.join(pointers)})"]
+    declared = {}
+    if is_dense:
+        declared["copy_entries"] = _COPY_ENTRIES
+        for i, pattern in enumerate(outputs):
+            places_in_memory = np.argsort(pattern.places, kind="stable")[pattern.places.size - pattern.count :]
+            entries = ", ".join(f"i64 {x}" for x in places_in_memory)
+            table = f"@{name}_entries{i}"
+            declared[table] = f"{table} = internal constant [{pattern.count} x i64] [{entries}]"
+            count = f"%n{i}"
+            lines += [f"  {count} = select i1 %nr{i}, i64 0, i64 {pattern.count}"]
+            lines += [f"  call void @copy_entries(i64 {count}, ptr {table}, ptr %d{i}, ptr %r{i})"]
+    lines += ["  ret i32 %status", "}"]
+    return [*texts, Text("\n".join(lines), declared)]
+
+
+# Copies dense[entries[k]] to stored[k] for k = 0 .. n - 1.
+_COPY_ENTRIES = """define internal void @copy_entries(i64 %n, ptr %entries, ptr %dense, ptr %stored) #0 {
+entry:
+  %some = icmp sgt i64 %n, 0
+  br i1 %some, label %one, label %done
+one:
+  %k = phi i64 [ 0, %entry ], [ %next, %one ]
+  %at = getelementptr i64, ptr %entries, i64 %k
+  %place = load i64, ptr %at
+  %from = getelementptr double, ptr %dense, i64 %place
+  %x = load double, ptr %from
+  %to = getelementptr double, ptr %stored, i64 %k
+  store double %x, ptr %to
+  %next = add i64 %k, 1
+  %more = icmp slt i64 %next, %n
+  br i1 %more, label %one, label %done
+done:
+  ret void
+}"""

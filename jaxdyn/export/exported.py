@@ -178,7 +178,7 @@ class Exported:
         caller = getattr(self._local, which, None)
         if caller is None:
             if self._code is None:
-                self._code = Code(self.module("packed"))
+                self._code = Code(self.module("packed", standalone.resolve_target(HOST).lanes))
             routine = self._routine(which)
             caller = _make_caller(self._code.address(f"{routine.symbol}_packed"), self, routine.program)
             setattr(self._local, which, caller)
@@ -201,9 +201,10 @@ class Exported:
     def module(self, abi: str = "c", lanes: int = 1) -> str:
         """The text of all functions, in LLVM's intermediate representation; "packed" is what calls from Python take."""
         if abi == "casadi":
-            return casadi_ir(self)
+            return casadi_ir(self, lanes)
         routines = [x for x in (self.value, self.derivative) if x is not None]
-        functions = [text for x in routines for text in standalone.routine_ir(x, fields_of(self.arguments))]
+        fields = fields_of(self.arguments)
+        functions = [text for x in routines for text in standalone.routine_ir(x, fields, lanes=lanes)]
         if abi == "packed":
             functions += [standalone.packed_ir(x.symbol, len(self.arguments), x.program) for x in routines]
         if self.batch and abi == "c":
