@@ -285,14 +285,14 @@ class Emitter:
         value = self.load_one(f"%a{place}", entry, kind)
         if self.width == 1:
             return value
-        if wants_least_optimisation():
-            # LLVM 22 at level 0 aborts where it joins these loads to their copies in all lanes ("Node is not in map!").
-            value = self.put(f"freeze {_TYPES[kind]} {value}")
         return self.splat(value, kind)
 
     def splat(self, value: str, kind: str) -> str:
         """One number in all lanes."""
         of = self.type(kind)
+        if wants_least_optimisation():
+            # LLVM 22 at level 0 aborts where it joins loads to their copies in all lanes ("Node is not in map!").
+            value = self.put(f"freeze {_TYPES[kind]} {value}")
         first = self.put(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
         return self.put(f"shufflevector {of} {first}, {of} poison, <{self.width} x i32> zeroinitializer")
 

@@ -74,7 +74,8 @@ def _parameter_names(function: Callable, count: int) -> list[str]:
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     names = [_identifier(x.name) for x in parameters if x.kind in kinds][:count]
     names += [f"x{i}" for i in range(len(names), count)]
-    return names if len(set(names)) == count else [f"x{i}" for i in range(count)]
+    # Macros of sizes are upper case, so names may not differ by case alone.
+    return names if len({x.upper() for x in names}) == count else [f"x{i}" for i in range(count)]
 
 
 def _argument(name: str, example: Any) -> Argument:

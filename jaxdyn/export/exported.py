@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxdyn.compile import standalone
+from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.objects import Code
 from jaxdyn.compile.program import Program
 from jaxdyn.compile.standalone import HOST as HOST
@@ -23,9 +24,9 @@ from jaxdyn.export.arguments import (
     fields_of,
     system_of,
 )
+from jaxdyn.export.batch import batch_ir
 from jaxdyn.export.casadi import casadi_ir
 from jaxdyn.export.files import write_files
-from jaxdyn.export.lanes import batch_ir
 from jaxdyn.model.tree import Model
 
 DERIVATIVES = ("jacobian",)
@@ -43,19 +44,23 @@ def export(
 
     **Arguments:**
 
-    - `function(*arrays)` -> array or tuple of arrays: any function of one sample that is a program of single numbers, such as
-      dynamics, kinematics, constrained dynamics, a projection, a step of an integrator or a control law. A model that it closes
-      over is compiled in; a model that is an argument becomes a structure of arrays with named fields.
+    - `function(*arrays)` -> array or tuple of arrays: any function of one sample that is a scalar program (no callbacks, no
+      data-dependent control flow), such as dynamics, kinematics, constrained dynamics, a projection, a step of `jd.stepper` or a
+      control law. A model that it closes over is compiled in; a model that is an argument becomes a structure of arrays with
+      named fields.
     - `examples`: arrays, or pytrees of arrays, that give shapes and dtypes (float64 or float32). The test program that `save`
-      writes uses their values as inputs.
+      writes takes their values as inputs.
     - `name`: of the C function.
     - `derivatives`: ("jacobian",) adds `name_jacobian`, the derivatives of each result by each argument.
-    - `batch`: whether to add `name_batch`, which takes many samples and computes several at once in vector registers.
+    - `batch`: True adds `name_batch`, which takes many samples and computes several at once in vector registers.
 
     **Returns:** `Exported`. Called with numpy arrays it returns numpy arrays, without JAX.
 
-    **Raises:** ValueError for a function that is no such program (callbacks, loops or branches that depend on data), for integers
-    and complex numbers, and for a name that is no identifier of C.
+    Each function returns a status. Samples where constraint rows lose rank are computed by the pseudo-inverse, within the
+    object file; the status is non-zero where that has no regular solution either.
+
+    **Raises:** ValueError for a function that is no such program (callbacks, loops, branches or shapes that depend on data), for
+    integers and complex numbers, and for a name that is no identifier of C.
 
     ```python
     model = jd.robots.iiwa()
@@ -119,17 +124,19 @@ class Exported:
 
     @property
     def has_structures(self) -> bool:
-        """Whether an argument is a pytree of arrays."""
+        """True if an argument is a pytree of arrays."""
         return any(x.is_structure for x in self.arguments)
 
     def results(self) -> list[tuple[str, tuple[int, ...], np.dtype]]:
         """Names, shapes and dtypes of the results."""
         outputs = self.value.program.outputs[:-1]
         names = ["out"] if len(outputs) == 1 else [f"out{i}" for i in range(len(outputs))]
+        taken = {x.name.lower() for x in self.arguments}
+        names = [f"{x}_" if x in taken else x for x in names]
         return [(name, x.shape, x.dtype) for name, x in zip(names, outputs, strict=True)]
 
     def jacobian_results(self) -> list[tuple[str, tuple[int, ...], np.dtype]]:
-        """The same of the Jacobian: `result_by_argument` (size of the result, size of the argument)."""
+        """Names, shapes and dtypes of the Jacobians: `result_by_argument` (size of the result, size of the argument)."""
         assert self.derivative is not None
         leaves = [
             leaf if not x.is_structure else leaf._replace(name=f"{x.name}_{leaf.name}")
@@ -138,6 +145,11 @@ class Exported:
         ]
         names = [f"{result}_by_{leaf.name}" for result, _, _ in self.results() for leaf in leaves]
         return [(name, x.shape, x.dtype) for name, x in zip(names, self.derivative.program.outputs[:-1], strict=True)]
+
+    def symbols(self) -> list[str]:
+        """Names of the C functions."""
+        names = [x.symbol for x in (self.value, self.derivative) if x is not None]
+        return [*names, f"{self.name}_batch"] if self.batch else names
 
     def comment_on(self, name: str, size: int) -> str:
         """Order and units of the entries of an argument."""
@@ -148,8 +160,9 @@ class Exported:
     def __call__(self, *args: PyTree) -> PyTree:
         """The function's results as numpy arrays, computed without JAX.
 
-        **Raises:** ValueError for arguments of other shapes; FloatingPointError where the sample needs a decision about rank.
+        **Raises:** ValueError for arguments of other shapes; FloatingPointError where the sample has no regular solution.
         """
+        # Half a microsecond is all that a call has: the attribute is there but for the first call of a thread.
         try:
             call = self._local.function
         except AttributeError:
@@ -174,7 +187,8 @@ class Exported:
         return rows[0] if len(rows) == 1 else tuple(rows)
 
     def _caller(self, which: str) -> Callable[[tuple], list[np.ndarray]]:
-        """A function from arguments to results, with buffers of this thread, so that calls of several threads do not meet."""
+        """Function from arguments to results with buffers of its own."""
+        # One for each thread: threads that shared buffers would overwrite each other's arguments.
         caller = getattr(self._local, which, None)
         if caller is None:
             if self._code is None:
@@ -185,7 +199,7 @@ class Exported:
         return caller
 
     def evaluate(self, which: str = "function") -> list[np.ndarray]:
-        """Results, or their derivatives ("jacobian"), at the examples; NaN where the sample is degenerate."""
+        """Results, or their derivatives ("jacobian"), at the examples; NaN where they have no regular solution."""
         try:
             return self._caller(which)(self.examples)
         except FloatingPointError:
@@ -199,7 +213,7 @@ class Exported:
     # --- code and files ---
 
     def module(self, abi: str = "c", lanes: int = 1) -> str:
-        """The text of all functions, in LLVM's intermediate representation; "packed" is what calls from Python take."""
+        """All functions in LLVM's intermediate representation; `abi` is "c", "casadi", or "packed" for calls from Python."""
         if abi == "casadi":
             return casadi_ir(self, lanes)
         routines = [x for x in (self.value, self.derivative) if x is not None]
@@ -235,20 +249,21 @@ class Exported:
         """
         if abi not in ABIS:
             raise ValueError(f"abi is {abi!r}; choose from {', '.join(map(repr, ABIS))}")
-        if abi == "casadi" and (self.has_structures or any(x.dtype != np.float64 for x in self.value.program.inputs)):
+        arrays = (*self.value.program.inputs, *self.value.program.outputs[:-1])
+        if abi == "casadi" and (self.has_structures or any(x.dtype != np.float64 for x in arrays)):
             raise ValueError(
-                "abi is 'casadi', whose functions take arrays of float64: export a function of such arrays alone"
+                "abi is 'casadi', whose functions take and return arrays of float64: export a function of such arrays only"
             )
         resolved = standalone.resolve_target(target, cpu, features)
         made = standalone.object_file(self.module(abi, resolved.lanes), resolved)
         return write_files(self, Path(folder), made, resolved, abi)
 
 
-def _make_caller(address: int, exported: Exported, program: Program) -> Callable[[tuple], list[np.ndarray]]:
-    """Buffers, and a function that copies arguments into them, calls the code at the address, and copies results out.
-
-    To find the addresses of numpy arrays for every call would take longer than the call.
-    """
+def _make_caller(
+    address: int, exported: Exported, program: Program | Directions
+) -> Callable[[tuple], list[np.ndarray]]:
+    """Buffers, and a function that copies arguments into them, calls the code at the address, and copies results out."""
+    # To find the addresses of numpy arrays takes longer than forward dynamics of an arm, so arguments are copied to known places.
     structure, name = jax.tree.structure(exported.examples), exported.name
     takes_arrays = not exported.has_structures
     leaves, memory, pointers = [], [], []
