@@ -224,6 +224,26 @@ def test_rows_that_contradict_each_other_give_a_status(tmp_path):
     assert "1 where the sample has no regular solution" in (tmp_path / "crossing.h").read_text()
 
 
+def test_results_that_are_not_finite_have_a_status(tmp_path):
+    exported = jd.export(lambda x: (jnp.log(x), 1 / x), np.zeros(2), name="f", batch=True)
+    assert np.isinf(exported(np.zeros(2))[0]).all()
+    lanes = standalone.resolve_target("host").lanes
+    code = Code(exported.module("c", lanes))
+    one, many = (
+        ctypes.CFUNCTYPE(ctypes.c_int, *kinds)(code.address(name))
+        for name, kinds in (("f", [ctypes.c_void_p] * 3), ("f_batch", [ctypes.c_int64, *[ctypes.c_void_p] * 3]))
+    )
+    x, out = np.ones((5, 2)), np.zeros((2, 5, 2))
+    assert one(x.ctypes.data, *(y.ctypes.data for y in out)) == 0
+    assert many(5, x.ctypes.data, *(y.ctypes.data for y in out)) == 0
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        x[3, 1] = bad
+        assert one(x[3].ctypes.data, *(y.ctypes.data for y in out)) == 2
+        assert many(5, x.ctypes.data, *(y.ctypes.data for y in out)) == 2
+    exported.save(tmp_path)
+    run_c(tmp_path, "f")  # which expects the status at its examples
+
+
 def test_redundant_rows(tmp_path):
     """Bennett's linkage: seven degrees of freedom of its tree, more rows than that, one freedom left."""
     scene = jd.scenes.bennett()

@@ -22,13 +22,14 @@ from jaxdyn.compile.kernel import program_of
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.mode import rank_safe, standalone
 from jaxdyn.compile.objects import features as host_features
-from jaxdyn.compile.program import Array, Constant, Program, kind_of
+from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of
 
 # Operations of a directional derivative times the number of directions. A Panda's forward dynamics has 63 000: by columns its
 # Jacobian takes 1.0 us and half the time to compile, written out 1.6 us. Planar loops have 5 000 and are mostly zeros.
 MAX_WRITTEN_OUT = 40_000
 MAX_OPERATIONS = 2_000_000  # LLVM takes some 50 microseconds an operation, so this is two minutes
-DEGENERATE = 1  # status of a sample that needs a decision about rank, which straight-line code cannot take
+# Bits of a status: a sample without a regular solution, and a result that is infinite or not a number.
+DEGENERATE, NOT_FINITE = 1, 2
 
 
 class Triple(NamedTuple):
@@ -208,7 +209,8 @@ def routine_ir(
     results: Sequence[np.ndarray] | None = None,
     internal: bool = False,
 ) -> list[Text]:
-    """Text of `i32 symbol(ptr a0, ..., ptr r0, ...)`: status 0, or `DEGENERATE` where the last program flags the sample.
+    """Text of `i32 symbol(ptr a0, ..., ptr r0, ...)`: status 0, `DEGENERATE` where the last program flags the sample, or
+    `NOT_FINITE`.
 
     **Arguments:** `inputs`: for each input of the program its place in the caller's memory. `places`, `results`: for each entry
     of an input and of an output, by rows, its index in the caller's memory (default: by rows); -1 for a result that is not
@@ -263,17 +265,20 @@ def _function_ir(
     if isinstance(program, Directions):
         assert results is None
         allocated, regular = program.lines(e, name, lanes, load, leave)
+        finite = "true"  # the value says so, and tests of all entries would cost as much as some columns
     else:
         body = Body(e, program, load, lambda place: None)
         *values, (regular,) = body.results()
         allocated = body.allocated()
         e.lines += leave(regular)
+        finite = all_finite(e, values, program.outputs)
         for i, (row, array) in enumerate(zip(values, program.outputs, strict=False)):
             for k, value in enumerate(row):
                 where = k if results is None else int(results[i][k])
                 if where >= 0:
                     e.store_one(f"%r{i}", where, kind_of(array.dtype), value)
-    e.lines.append(f"  %status = select i1 {regular}, i32 0, i32 {DEGENERATE}")
+    e.lines.append(f"  %code = select i1 {finite}, i32 0, i32 {NOT_FINITE}")
+    e.lines.append(f"  %status = select i1 {regular}, i32 %code, i32 {DEGENERATE}")
     linkage = "internal " if internal else ""
     head = f"define {linkage}i32 @{name}({', '.join(pointers)}) #0 {{"
     text = "\n".join([head, *allocated, *e.lines, "  ret i32 %status", "}"])
@@ -281,6 +286,24 @@ def _function_ir(
         if (symbol := symbol_of(called, 1)) in e.declared:  # else no result needs it
             e.declared |= called.definition(symbol)  # pyright: ignore[reportAttributeAccessIssue]
     return Text(text, e.declared)
+
+
+def all_finite(e: Emitter, rows: Sequence[Sequence[str]], arrays: Sequence[Array]) -> str:
+    """Name of a flag: whether all float results of a sample are finite."""
+    flags = []
+    for kind in FLOATS:
+        of, zero = e.type(kind), e.constant(0.0, kind)
+        names = [x for row, array in zip(rows, arrays, strict=False) if kind_of(array.dtype) == kind for x in row]
+        # x 0 is 0, or not a number where x is not finite. A tree of sums: a chain would wait for each sum.
+        terms = [e.put(f"fmul {of} {x}, {zero}") for x in names]
+        while len(terms) > 1:
+            pairs = [e.put(f"fadd {of} {a}, {b}") for a, b in zip(terms[::2], terms[1::2], strict=False)]
+            terms = [*pairs, *terms[len(terms) - len(terms) % 2 :]]
+        flags += [e.put(f"fcmp ord {of} {x}, {zero}") for x in terms]
+    total = e.constant(True, "b1")
+    for flag in flags:
+        total = e.put(f"and {e.type('b1')} {total}, {flag}")
+    return total
 
 
 def packed_ir(name: str, arguments: int, program: Program) -> Text:
@@ -335,6 +358,7 @@ _FRAMES = (
     r"addi\s+sp, sp, -(\d+)",
     r"i32\.const\s+(\d+)\n\s+i32\.sub\s*\n\s+(?:local\.tee\s+\d+\n\s+)?global\.set\s+__stack_pointer",
 )
+_CALLS = r"\b(?:callq?|blx?|jmp|b|tail)\s+([A-Za-z_]\w*)"  # calls, and jumps to a function at the end of another one
 _SAVED = (
     256  # bytes, more than all registers that a function saves before it takes its frame take on any of the targets
 )
@@ -356,7 +380,7 @@ def stack_bytes(assembly: str) -> dict[str, int]:
     @functools.cache
     def total(name: str) -> int:
         # Nothing here is recursive. A frame ends before a jump to another function, but the sum is an upper bound then too.
-        called = set(re.findall(r"[A-Za-z_]\w*", bodies[name])) & (sizes.keys() - {name})
+        called = set(re.findall(_CALLS, bodies[name])) & (sizes.keys() - {name})
         return sizes[name] + max(map(total, called), default=0)
 
     return {name: total(name) for name in sizes}

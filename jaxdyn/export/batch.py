@@ -5,14 +5,14 @@ from typing import Any
 from jaxdyn.compile.code import Body
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import kind_of
-from jaxdyn.compile.standalone import DEGENERATE, Text
+from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE, Text, all_finite
 from jaxdyn.export.arguments import fields_of
 
 
 def batch_ir(exported: Any, width: int) -> Text:
     """Text of `i32 name_batch(i64 n, ptr a0, ..., ptr r0, ...)` over the samples 0 .. n - 1.
 
-    Arrays have one row for each sample; a structure is the same for all. The status is the largest of all samples. Results of
+    Arrays have one row for each sample; a structure is the same for all. The status has the bits of all samples. Results of
     samples without a regular solution are NaN.
     """
     program = exported.value.program
@@ -74,12 +74,8 @@ def _vector_block(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> list
         e.count = value.count
         return name if width == 1 else e.splat(name, kind)
 
-    *results, flag = Body(e, routine.program, load, lambda place: None).results()
-    regular = flag[0]
-    if width > 1:
-        name = f"llvm.vector.reduce.and.v{width}i1"
-        e.declared[name] = f"declare i1 @{name}({e.type('b1')})"
-        regular = e.put(f"call i1 @{name}({e.type('b1')} {regular})")
+    *results, (flag,) = Body(e, routine.program, load, lambda place: None).results()
+    regular = _all_lanes(e, flag)
     incoming = []
     if routine.careful is not None:
         e.lines += [f"  br i1 {regular}, label %regular, label %careful", "careful:"]
@@ -87,13 +83,24 @@ def _vector_block(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> list
         e.lines += ["  br label %following", "regular:"]
     for i, (row, array) in enumerate(zip(results, routine.program.outputs, strict=False)):
         e.store_array(rows[len(exported.arguments) + i], kind_of(array.dtype), row)
-    code = e.put(f"select i1 {regular}, i32 0, i32 {DEGENERATE}")
+    finite = _all_lanes(e, all_finite(e, results, routine.program.outputs))
+    code = e.put(f"select i1 {finite}, i32 0, i32 {NOT_FINITE}")
+    code = e.put(f"select i1 {regular}, i32 {code}, i32 {DEGENERATE}")
     e.lines += ["  br label %following"]
     return [*incoming, (code, "%block" if routine.careful is None else "%regular")]
 
 
+def _all_lanes(e: Emitter, flag: str) -> str:
+    """Flag that is set where that of every sample is."""
+    if e.width == 1:
+        return flag
+    name = f"llvm.vector.reduce.and.v{e.width}i1"
+    e.declared[name] = f"declare i1 @{name}({e.type('b1')})"
+    return e.put(f"call i1 @{name}({e.type('b1')} {flag})")
+
+
 def _single_calls(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> str:
-    """Call the function of one sample for each of the W samples; returns the largest status."""
+    """Call the function of one sample for each of the W samples; returns the bits of all statuses."""
     count = len(exported.arguments) + len(exported.value.program.outputs) - 1
     total = "0"
     for k in range(e.width):

@@ -13,9 +13,9 @@ from jaxdyn.compile import standalone
 from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.objects import Code
 from jaxdyn.compile.program import Program
+from jaxdyn.compile.standalone import DEGENERATE, Routine
 from jaxdyn.compile.standalone import HOST as HOST
 from jaxdyn.compile.standalone import TARGETS as TARGETS
-from jaxdyn.compile.standalone import Routine
 from jaxdyn.export.arguments import (
     Argument,
     arguments_of,
@@ -293,7 +293,7 @@ def _make_caller(
             if (x.shape if type(x) is np.ndarray else np.shape(x)) != shape:
                 raise ValueError(f"{name}: an argument has shape {np.shape(x)}, the example had {shape}")
             buffer[...] = x
-        if function(pointer):
+        if function(pointer) & DEGENERATE:  # results that are not finite are returned, as numpy does
             raise FloatingPointError(
                 f"{name}: no regular solution at this sample: constraint rows contradict each other, the mass matrix is "
                 "singular, or a step cannot be completed; the result code of the function in Python says which"

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.standalone import DEGENERATE, ObjectFile, Triple
+from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE, ObjectFile, Triple
 from jaxdyn.export.arguments import C_TYPES, Argument
 
 TOLERANCE = 1e-12  # of the test program, relative: other processors round fused operations otherwise
@@ -51,7 +51,8 @@ def header(exported: Any, made: ObjectFile, target: Triple) -> str:
         " *",
         " * Functions allocate nothing, have no state and may be called from several threads at once. They return 0, or",
         f" * {DEGENERATE} where the sample has no regular solution: constraint rows contradict each other, the mass matrix is",
-        " * singular, or a step cannot be completed. The results are then not defined.",
+        " * singular, or a step cannot be completed; the results are then not defined;",
+        f" * {NOT_FINITE} where a result is infinite or not a number.",
         f" * Functions of the C library that they call: {', '.join(made.library) or 'none'}.",
         " */",
         f"#ifndef {upper}_H",
@@ -120,7 +121,7 @@ def _prototypes(exported: Any) -> list[str]:
         results = [(result, (), dtype) for result, _, dtype in exported.results()]
         lines += [
             "",
-            "/* n samples, one row of each array for each; structures are shared. The status is that of the worst sample, and",
+            "/* n samples, one row of each array for each; structures are shared. The status has the bits of all samples, and",
             " * the results of samples without a regular solution are NaN. Results may not overlap arguments. */",
             f"int {name}_batch(int64_t n, {_parameters(exported, results, is_batch=True)});",
         ]
@@ -184,10 +185,11 @@ def test_program(exported: Any) -> str:
         "/* The largest difference, relative to the largest expected number. */",
         f"static double difference(const char *name, const {kind} *got, const double *expected, int size) {{",
         "  double scale = 1e-300, worst = 0;",
-        "  for (int i = 0; i < size; i++) scale = fmax(scale, fabs(expected[i]));",
+        "  for (int i = 0; i < size; i++) scale = isfinite(expected[i]) ? fmax(scale, fabs(expected[i])) : scale;",
         "  for (int i = 0; i < size; i++) {",
-        "    double apart = fabs(got[i] - expected[i]) / scale;",
-        "    if (!(apart <= worst)) worst = isnan(apart) && isnan(expected[i]) ? worst : apart;",
+        "    int is_same = got[i] == expected[i] || (isnan(got[i]) && isnan(expected[i]));",
+        "    double apart = is_same ? 0 : fabs(got[i] - expected[i]) / scale;",
+        "    if (!(apart <= worst)) worst = apart;",
         "  }",
         '  printf("%s: largest relative difference %.3g\\n", name, worst);',
         "  return isnan(worst) ? INFINITY : worst;",
@@ -225,8 +227,10 @@ def _references(exported: Any) -> tuple[list[str], list[str]]:
             data.append(f"static const double expected_{result}[] = {{{_numbers(reference)}}};")
             data.append(f"static {C_TYPES[np.dtype(dtype).name]} got_{result}[{max(1, _size(shape))}];")
         passed = [given, *("got_" + x for x, _, _ in results)]
-        checks.append(f"  if ({function}({', '.join(filter(None, passed))}) != 0) {{")
-        checks += [f'    printf("{function}: no regular solution\\n");', "    return 1;", "  }"]
+        # A value that is not finite has a status; a Jacobian has one where the sample has no regular solution.
+        is_failed = function == name and not all(np.isfinite(x).all() for x in references)
+        checks.append(f"  if (({function}({', '.join(filter(None, passed))}) != 0) != {int(is_failed)}) {{")
+        checks += [f'    printf("{function}: unexpected status\\n");', "    return 1;", "  }"]
         for result, shape, _ in results:
             compared = f'difference("{result}", got_{result}, expected_{result}, {_size(shape)})'
             checks.append(f"  worst = fmax(worst, {compared});")
