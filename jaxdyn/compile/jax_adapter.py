@@ -350,7 +350,7 @@ def lower_call(name: str, context, operands: Sequence, order: Sequence[int], att
     context = context.replace(avals_in=[context.avals_in[i] for i in order])
     if getattr(context.module_context.lowering_parameters, "for_export", False):
         # JAX refuses such calls with an error that shows them: the user reads there what to do.
-        attributes = {**(attributes or {}), "jaxdyn": mlir.ir.StringAttr.get(_EXPORT_HINT)}
+        attributes = {**(attributes or {}), "jaxdyn": mlir.ir_attribute(_EXPORT_HINT)}
     lower = jax.ffi.ffi_lowering(name, extra_attributes=attributes)
     return lower(context, *(operands[i] for i in order), **{key: np.int64(value) for key, value in static.items()})
 
