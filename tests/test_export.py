@@ -160,6 +160,22 @@ def test_single_precision(tmp_path):
     run_c(tmp_path, "single")
 
 
+def test_forward_dynamics_in_single_precision(arm, exported, tmp_path):
+    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), arm)
+    x = [y.astype(np.float32) for y in (X, V, TAU)]
+    small = jd.export(
+        lambda q, v, tau: jd.forward_dynamics(single, q, v, tau), *x, name="small", derivatives="jacobian"
+    )
+    assert small(*x).dtype == np.float32
+    np.testing.assert_allclose(
+        small(*x), exported(X, V, TAU), rtol=1e-3
+    )  # the arm's mass matrix loses four digits of seven
+    for got, expected in zip(small.jacobian(*x), exported.jacobian(X, V, TAU), strict=True):
+        np.testing.assert_allclose(got, expected, atol=1e-3 * np.abs(expected).max())
+    small.save(tmp_path)
+    run_c(tmp_path, "small")
+
+
 def test_constrained_dynamics_and_projections(tmp_path):
     scene = jd.scenes.four_bar()
     q, v = map(np.asarray, jd.scenes.four_bar.start())
@@ -486,6 +502,16 @@ def test_names_that_meet_others(tmp_path):
     run_c(tmp_path, "add")
     jd.export(lambda a, A: a + A, X, X, name="add").save(tmp_path)
     run_c(tmp_path, "add")
+
+
+def test_doubles_without_double_precision_are_refused():
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(ValueError, match=r"examples: x has dtype float64, and JAX computes in float32 here"):
+            jd.export(lambda x: 2 * x, X, name="f")
+        assert jd.export(lambda x: 2 * x, X.astype(np.float32), name="f")(X.astype(np.float32)).dtype == np.float32
+    finally:
+        jax.config.update("jax_enable_x64", True)
 
 
 def test_refusals_of_saving_and_calling(exported, tmp_path):

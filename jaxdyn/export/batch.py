@@ -22,6 +22,8 @@ def batch_ir(exported: Any, width: int) -> Text:
     # Results follow the arguments in the numbering of pointers.
     sizes = {i: x.bytes for i, x in enumerate(arguments) if not x.is_structure}
     sizes |= {len(arguments) + i: x.size * x.dtype.itemsize for i, x in enumerate(outputs)}
+    # Where fewer samples are left than lanes, the last sample stands in the others too: no code for a remainder, and no reading
+    # beyond the arrays. It is computed several times and stored as often.
     rows = e.rows(list(sizes), list(sizes.values()))
     if program.subprograms:
         status = _single_calls(e, exported, rows)
@@ -79,6 +81,7 @@ def _vector_block(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> list
     incoming = []
     if routine.careful is not None:
         e.lines += [f"  br i1 {regular}, label %regular, label %careful", "careful:"]
+        # Rare, so that the other samples of the block are simply computed again.
         incoming.append((_single_calls(e, exported, rows), "%careful"))
         e.lines += ["  br label %following", "regular:"]
     for i, (row, array) in enumerate(zip(results, routine.program.outputs, strict=False)):

@@ -64,6 +64,7 @@ def _block(is_stored: np.ndarray, of: Pattern, by: Pattern) -> Pattern:
 
 def casadi_ir(exported: Any, lanes: int) -> str:
     """Text of `name`, and of `jac_name` where the Jacobian was exported, with the functions that describe them to CasADi."""
+    # CasADi finds the Jacobian of `name` by the name of its function, `jac_name`, and asks it for all blocks at once.
     program, jacobian = exported.value.program, exported.derivative
     inputs, outputs = list(map(_dense, program.inputs)), list(map(_dense, program.outputs[:-1]))
     functions = _functions(exported.name, exported.value, exported, inputs, outputs, [], lanes)
@@ -100,6 +101,7 @@ def _functions(
     sizes = [x.stored.size for x in outputs]
     # Results that CasADi does not ask for are written to the work vector too.
     work = sum(sizes) if is_dense else max([0, *(x.count for x in outputs)])
+    # The results at the point are arguments of a Jacobian, which does not read them.
     lines = _descriptions(name, [*inputs, *nominal], outputs, work)
     lines.append(f"define i32 @{name}(ptr %args, ptr %results, ptr %iw, ptr %w, i32 %mem) #0 {{")
     lines += _pointers("a", "%args", len(inputs), f"@{name}_zero") + _pointers("r", "%results", len(outputs), "%w")

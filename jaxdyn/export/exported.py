@@ -79,10 +79,19 @@ def export(
             raise ValueError(
                 f"derivatives has {each!r}; choose from {', '.join(map(repr, DERIVATIVES))}, or leave it empty"
             )
+    # Numbers of Python become float64, and arrays of JAX leave the device: the files hold the examples' values.
     examples = jax.tree.map(np.asarray, examples)
     arguments = arguments_of(function, examples)
     value, structure = standalone.make_routine(function, examples, name)
     program = value.program
+    leaves = [(f"{x.name}.{leaf.name}" if x.is_structure else x.name, leaf) for x in arguments for leaf in x.leaves]
+    for (label, leaf), array in zip(leaves, program.inputs, strict=True):
+        # Without this check the C function would read the doubles of its caller as floats.
+        if leaf.dtype != array.dtype:
+            raise ValueError(
+                f"examples: {label} has dtype {leaf.dtype}, and JAX computes in {array.dtype} here; "
+                'jax.config.update("jax_enable_x64", True) before the export, or pass float32'
+            )
     if program.outputs and any(x.dtype.name not in ("float64", "float32") for x in program.outputs[:-1]):
         kinds = ", ".join(str(x.dtype) for x in program.outputs[:-1])
         raise ValueError(
@@ -115,6 +124,7 @@ class Exported:
         self._structure = structure
         self._system = system
         self._is_one_array = jax.tree_util.treedef_is_leaf(structure)
+        # Compiled at the first call from Python: who only saves files does not wait for this processor's code.
         self._code: Code | None = None
         self._local = threading.local()
 
@@ -129,7 +139,7 @@ class Exported:
 
     def results(self) -> list[tuple[str, tuple[int, ...], np.dtype]]:
         """Names, shapes and dtypes of the results."""
-        outputs = self.value.program.outputs[:-1]
+        outputs = self.value.program.outputs[:-1]  # the last one is the flag
         names = ["out"] if len(outputs) == 1 else [f"out{i}" for i in range(len(outputs))]
         taken = {x.name.lower() for x in self.arguments}
         names = [f"{x}_" if x in taken else x for x in names]
@@ -182,6 +192,7 @@ class Exported:
                 f"{self.name} was exported without its Jacobian; pass derivatives=('jacobian',) to jd.export"
             )
         flat = self._caller("jacobian")(args)
+        # The blocks come by results, then by arguments.
         count = len(flat) // max(1, len(self.results()))
         rows = [tuple(flat[i : i + count]) for i in range(0, len(flat), count)]
         return rows[0] if len(rows) == 1 else tuple(rows)
@@ -254,6 +265,7 @@ class Exported:
             raise ValueError(
                 "abi is 'casadi', whose functions take and return arrays of float64: export a function of such arrays only"
             )
+        # Everything that can fail has been done when the first file is written.
         resolved = standalone.resolve_target(target, cpu, features)
         made = standalone.object_file(self.module(abi, resolved.lanes), resolved)
         return write_files(self, Path(folder), made, resolved, abi)
@@ -266,6 +278,7 @@ def _make_caller(
     # To find the addresses of numpy arrays takes longer than forward dynamics of an arm, so arguments are copied to known places.
     structure, name = jax.tree.structure(exported.examples), exported.name
     takes_arrays = not exported.has_structures
+    # Arguments are laid out as structures of C, so that pytrees need no other code than arrays.
     leaves, memory, pointers = [], [], []
     for argument in exported.arguments:
         raw = np.zeros(max(argument.bytes, 1), np.uint8)
@@ -277,6 +290,8 @@ def _make_caller(
     results = [np.zeros(x.shape, x.dtype) for x in program.outputs[:-1]]
     pointers += [x.ctypes.data for x in results]
     block = (ctypes.c_void_p * len(pointers))(*pointers)
+    # ctypes takes 0.1 us for each argument that it converts; one pointer to all pointers costs that once. CFUNCTYPE releases the
+    # lock of the interpreter, which other threads use while this one computes.
     function = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(address)
     pointer = ctypes.c_void_p(ctypes.addressof(block))
     pairs = [(leaf, leaf.shape) for leaf in leaves]
@@ -298,7 +313,7 @@ def _make_caller(
                 f"{name}: no regular solution at this sample: constraint rows contradict each other, the mass matrix is "
                 "singular, or a step cannot be completed; the result code of the function in Python says which"
             )
-        return [x.copy() for x in results]
+        return [x.copy() for x in results]  # the next call overwrites the buffers
 
     call.memory = (memory, block)  # pyright: ignore[reportFunctionMemberAccess]  # addresses alone do not keep it alive
     return call

@@ -137,6 +137,7 @@ def _type_of(name: str, argument: Argument) -> str:
 
 
 def _parameters(exported: Any, results: list, is_batch: bool = False) -> str:
+    # Sizes in brackets mean nothing to the compiler of the callee; gcc and clang warn callers of arrays that are too short.
     parameters = []
     for argument in exported.arguments:
         if argument.is_structure:
@@ -238,6 +239,7 @@ def _references(exported: Any) -> tuple[list[str], list[str]]:
 
 
 def _build(name: str, made: ObjectFile) -> str:
+    # An interface library: the object file is all there is to it, and it goes into the program that links it.
     link = f"\ntarget_link_libraries({name} INTERFACE m)" if made.library else ""
     return f"""# target_link_libraries(your_program {name}) links the functions of {name}.h.
 cmake_minimum_required(VERSION 3.16)
