@@ -4,6 +4,7 @@ import ctypes
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -177,8 +178,8 @@ class Exported:
             call = self._local.function
         except AttributeError:
             call = self._caller("function")
-        outputs = call(args)
-        return outputs[0] if self._is_one_array else jax.tree.unflatten(self._structure, outputs)
+        result = call(args)
+        return result if self._is_one_array else jax.tree.unflatten(self._structure, result)
 
     def jacobian(self, *args: PyTree) -> tuple:
         """Derivatives (size of the result, size of the argument) of each result by each argument.
@@ -197,7 +198,7 @@ class Exported:
         rows = [tuple(flat[i : i + count]) for i in range(0, len(flat), count)]
         return rows[0] if len(rows) == 1 else tuple(rows)
 
-    def _caller(self, which: str) -> Callable[[tuple], list[np.ndarray]]:
+    def _caller(self, which: str) -> Callable[[tuple], Any]:
         """Function from arguments to results with buffers of its own."""
         # One for each thread: threads that shared buffers would overwrite each other's arguments.
         caller = getattr(self._local, which, None)
@@ -205,14 +206,16 @@ class Exported:
             if self._code is None:
                 self._code = Code(self.module("packed", standalone.resolve_target(HOST).lanes))
             routine = self._routine(which)
-            caller = _make_caller(self._code.address(f"{routine.symbol}_packed"), self, routine.program)
+            address = self._code.address(f"{routine.symbol}_packed")
+            caller = _make_caller(address, self, routine.program, which == "function" and self._is_one_array)
             setattr(self._local, which, caller)
         return caller
 
     def evaluate(self, which: str = "function") -> list[np.ndarray]:
         """Results, or their derivatives ("jacobian"), at the examples; NaN where they have no regular solution."""
         try:
-            return self._caller(which)(self.examples)
+            results = self._caller(which)(self.examples)
+            return results if isinstance(results, list) else [results]
         except FloatingPointError:
             return [np.full(x.shape, np.nan, x.dtype) for x in self._routine(which).program.outputs[:-1]]
 
@@ -272,9 +275,12 @@ class Exported:
 
 
 def _make_caller(
-    address: int, exported: Exported, program: Program | Directions
-) -> Callable[[tuple], list[np.ndarray]]:
-    """Buffers, and a function that copies arguments into them, calls the code at the address, and copies results out."""
+    address: int, exported: Exported, program: Program | Directions, is_single: bool
+) -> Callable[[tuple], Any]:
+    """Buffers, and a function that copies arguments into them, calls the code at the address, and copies results out.
+
+    It returns the first result where that `is_single`, else a list.
+    """
     # To find the addresses of numpy arrays takes longer than forward dynamics of an arm, so arguments are copied to known places.
     structure, name = jax.tree.structure(exported.examples), exported.name
     takes_arrays = not exported.has_structures
@@ -290,13 +296,17 @@ def _make_caller(
     results = [np.zeros(x.shape, x.dtype) for x in program.outputs[:-1]]
     pointers += [x.ctypes.data for x in results]
     block = (ctypes.c_void_p * len(pointers))(*pointers)
-    # ctypes takes 0.1 us for each argument that it converts; one pointer to all pointers costs that once. CFUNCTYPE releases the
-    # lock of the interpreter, which other threads use while this one computes.
-    function = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(address)
+    # One pointer to all pointers, without a declared type of argument: ctypes converts neither then, which halves the call. The
+    # lock of the interpreter is kept: to get it back may take longer than the function.
+    function = ctypes.PYFUNCTYPE(ctypes.c_int)(address)
     pointer = ctypes.c_void_p(ctypes.addressof(block))
     pairs = [(leaf, leaf.shape) for leaf in leaves]
+    is_flat = takes_arrays and all(leaf.ndim == 1 for leaf in leaves)
+    views = [memoryview(leaf) for leaf in leaves] if is_flat else []
 
-    def call(args):
+    copy = results[0].copy if is_single else None
+
+    def convert(args):
         if not takes_arrays:
             args, given = jax.tree.flatten(args)
             if given != structure:
@@ -305,15 +315,24 @@ def _make_caller(
             raise ValueError(f"{name} takes {len(pairs)} arguments, and was given {len(args)}")
         for (buffer, shape), x in zip(pairs, args, strict=True):
             # An assignment alone would spread a single number over the whole array.
-            if (x.shape if type(x) is np.ndarray else np.shape(x)) != shape:
+            if np.shape(x) != shape:
                 raise ValueError(f"{name}: an argument has shape {np.shape(x)}, the example had {shape}")
             buffer[...] = x
+
+    def call(args):
+        try:
+            # A view takes arrays of its own size and dtype alone: one operation copies and checks.
+            for view, x in zip(views, args, strict=True):
+                view[:] = x
+        except (TypeError, ValueError, BufferError):
+            convert(args)
         if function(pointer) & DEGENERATE:  # results that are not finite are returned, as numpy does
             raise FloatingPointError(
                 f"{name}: no regular solution at this sample: constraint rows contradict each other, the mass matrix is "
                 "singular, or a step cannot be completed; the result code of the function in Python says which"
             )
-        return [x.copy() for x in results]  # the next call overwrites the buffers
+        # Copies, as the next call overwrites the buffers.
+        return copy() if is_single else [x.copy() for x in results]
 
     call.memory = (memory, block)  # pyright: ignore[reportFunctionMemberAccess]  # addresses alone do not keep it alive
     return call
