@@ -89,8 +89,9 @@ def _vector_block(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> list
     finite = _all_lanes(e, all_finite(e, results, routine.program.outputs))
     code = e.put(f"select i1 {finite}, i32 0, i32 {NOT_FINITE}")
     code = e.put(f"select i1 {regular}, i32 {code}, i32 {DEGENERATE}")
-    e.lines += ["  br label %following"]
-    return [*incoming, (code, "%block" if routine.careful is None else "%regular")]
+    # A label of its own: sines of large angles have branches, so that these lines may not be in %block any more.
+    e.lines += ["  br label %stored", "stored:", "  br label %following"]
+    return [*incoming, (code, "%stored")]
 
 
 def _all_lanes(e: Emitter, flag: str) -> str:

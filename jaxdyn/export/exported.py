@@ -310,29 +310,52 @@ def _make_caller(
         if not takes_arrays:
             args, given = jax.tree.flatten(args)
             if given != structure:
-                raise ValueError(f"{name}: the arguments have the structure {given}, the examples had {structure}")
+                raise ValueError(
+                    f"{name}: the arguments have the structure {given}, the examples had {structure}"
+                ) from None
         elif len(args) != len(pairs):
-            raise ValueError(f"{name} takes {len(pairs)} arguments, and was given {len(args)}")
+            raise ValueError(f"{name} takes {len(pairs)} arguments, and was given {len(args)}") from None
         for (buffer, shape), x in zip(pairs, args, strict=True):
             # An assignment alone would spread a single number over the whole array.
             if np.shape(x) != shape:
-                raise ValueError(f"{name}: an argument has shape {np.shape(x)}, the example had {shape}")
+                raise ValueError(f"{name}: an argument has shape {np.shape(x)}, the example had {shape}") from None
             buffer[...] = x
 
-    def call(args):
-        try:
-            # A view takes arrays of its own size and dtype alone: one operation copies and checks.
-            for view, x in zip(views, args, strict=True):
-                view[:] = x
-        except (TypeError, ValueError, BufferError):
-            convert(args)
-        if function(pointer) & DEGENERATE:  # results that are not finite are returned, as numpy does
-            raise FloatingPointError(
-                f"{name}: no regular solution at this sample: constraint rows contradict each other, the mass matrix is "
-                "singular, or a step cannot be completed; the result code of the function in Python says which"
-            )
-        # Copies, as the next call overwrites the buffers.
-        return copy() if is_single else [x.copy() for x in results]
+    def fail():
+        raise FloatingPointError(
+            f"{name}: no regular solution at this sample: constraint rows contradict each other, the mass matrix is "
+            "singular, or a step cannot be completed; the result code of the function in Python says which"
+        )
 
-    call.memory = (memory, block)  # pyright: ignore[reportFunctionMemberAccess]  # addresses alone do not keep it alive
+    known = {
+        "convert": convert,
+        "fail": fail,
+        "function": function,
+        "pointer": pointer,
+        "copy": copy,
+        "whole": slice(None),
+    }
+    known |= {f"view{i}": view for i, view in enumerate(views)} | {"results": results}
+    exec(_caller_source(len(views), is_single), known)
+    call: Any = known["call"]
+    call.memory = (memory, block)  # addresses alone do not keep it alive
     return call
+
+
+def _caller_source(count: int, is_single: bool) -> str:
+    """Python text of `call(args)`, with one line for each view: a loop over them takes as long as the copies."""
+    unpack = f"{''.join(f'x{i}, ' for i in range(count))}= args" if count else "convert(args)"
+    # A view takes arrays of its own size and dtype alone: one operation copies and checks.
+    lines = [unpack, *(f"view{i}[whole] = x{i}" for i in range(count))]
+    body = "\n        ".join(lines)
+    # The next call overwrites the buffers, so results are copied. Those that are not finite are returned, as numpy does.
+    result = "copy()" if is_single else "[x.copy() for x in results]"
+    return f"""def call(args):
+    try:
+        {body}
+    except (TypeError, ValueError, BufferError):
+        convert(args)
+    if function(pointer) & {DEGENERATE}:
+        fail()
+    return {result}
+"""
