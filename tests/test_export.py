@@ -211,11 +211,12 @@ def test_samples_where_rows_lose_rank_are_computed_by_the_pseudo_inverse():
 
     q = np.array([0.5, 0.5])
     exported = jd.export(function, q, q * 0, q, name="crossing", batch=True, derivatives="jacobian")
-    np.testing.assert_allclose(exported(q, q * 0, q), function(q, q * 0, q), rtol=1e-12)
+    x, zero = jnp.asarray(q), jnp.zeros(2)
+    np.testing.assert_allclose(exported(q, q * 0, q), function(x, zero, x), rtol=1e-12)
     # The origin: there is no row, so that the motion is free.
     at_origin = exported(q * 0, q * 0, q)
-    np.testing.assert_allclose(at_origin, jd.forward_dynamics(scene.system, q * 0, q * 0, q), rtol=1e-12)
-    M = jd.mass_matrix(scene.system, jnp.zeros(2))
+    np.testing.assert_allclose(at_origin, jd.forward_dynamics(scene.system, zero, zero, x), rtol=1e-12)
+    M = jd.mass_matrix(scene.system, zero)
     np.testing.assert_allclose(exported.jacobian(q * 0, q * 0, q)[2], np.linalg.inv(M), rtol=1e-10)
 
     rows = np.stack([q, q * 0, q, -q, q * 0]), np.zeros((5, 2)), np.tile(q, (5, 1))
@@ -233,7 +234,7 @@ def test_rows_that_contradict_each_other_give_a_status(tmp_path):
     exported = jd.export(
         lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration, q + 0.5, v * 0, q, name="crossing"
     )
-    assert jd.constrained_dynamics(scene, q, v, q).result == jd.RESULTS.contradictory_rows
+    assert jd.constrained_dynamics(scene, *map(jnp.asarray, (q, v, q))).result == jd.RESULTS.contradictory_rows
     with pytest.raises(FloatingPointError, match="crossing: no regular solution at this sample"):
         exported(q, v, q)
     exported.save(tmp_path)
@@ -271,7 +272,7 @@ def test_redundant_rows(tmp_path):
 
     exported = jd.export(function, q, v, tau, name="bennett", derivatives="jacobian", batch=True)
     a = exported(q, v, tau)
-    np.testing.assert_allclose(a, function(q, v, tau), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(a, function(*map(jnp.asarray, (q, v, tau))), rtol=1e-11, atol=1e-12)
     # The equations themselves: rows are met, and what is left of the forces does no work on admissible velocities.
     here, moving = jnp.asarray(q), jnp.asarray(v)
     A = jd.constraint_jacobian(scene, here)
