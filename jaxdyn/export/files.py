@@ -9,7 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE, ObjectFile, Triple
+from jaxdyn.compile.object_files import ObjectFile, Triple
+from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE
 from jaxdyn.export.arguments import C_TYPES, Argument
 
 TOLERANCE = 1e-12  # of the test program, relative: other processors round fused operations otherwise
