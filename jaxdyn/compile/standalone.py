@@ -1,8 +1,8 @@
-"""Programs as functions of C's calling convention, without JAX: their text, and object files for any target of LLVM.
+"""Scalar programs as functions of C's calling convention, without JAX.
 
-A function becomes a program of single numbers (`scalar_program`), its Jacobian another one (`jacobian_program`), and each
-becomes `i32 name(ptr in0, ..., ptr out0, ...)` (`function_ir`): it reads each entry where the caller's array holds it, writes
-each result, and returns a status. It allocates nothing, calls nothing but functions of the C library, and has no state.
+A function becomes one or two scalar programs (`make_routine`), its Jacobian others (`jacobian_routine`), and each routine becomes
+`i32 name(ptr in0, ..., ptr out0, ...)` (`routine_ir`): it reads each entry where the caller's array holds it, writes each
+result, and returns a status. It allocates nothing, calls nothing but functions of the C library, and has no state.
 """
 
 from collections.abc import Callable, Mapping, Sequence
