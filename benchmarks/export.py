@@ -157,7 +157,7 @@ def compete_robot(contest: Contest, peer: ctypes.CDLL, robot: str) -> tuple[jd.E
     if robot == "panda":
         data, one, one_pin = source.createData(), (q[0], v[0], tau[0]), (q_pin[0], v[0], tau[0])
         contest.add("from Python", lambda n: timed(lambda: exported(*one), n))
-        contest.add("pin.aba", lambda n: timed(lambda: pin.aba(source, data, *one_pin), n))
+        contest.add("pin.aba", lambda n: timed(lambda: pin.aba(source, data, *one_pin), n)  # pyright: ignore[reportAttributeAccessIssue])
     return exported, library, seconds, apart
 
 

@@ -97,12 +97,13 @@ def jacobian_routine(routine: Routine, symbol: str) -> Routine:
     return Routine(symbol, jacobian_program(routine.program, symbol), careful)
 
 
-def jacobian_program(program: Program, name: str) -> Program | Directions:
+def jacobian_program(program: Program | Directions, name: str) -> Program | Directions:
     """The derivatives of all float outputs of a program by all float inputs.
 
     The outputs are an array (size of the output, size of the input) for each float output and each float input, followed by the
     flag of `program`. Entries that no number of the program can make other than zero are constants.
     """
+    assert isinstance(program, Program)
     moving = tuple(array.dtype.kind == "f" for array in program.inputs)
     with standalone():
         change = inlined(derive.tangent(program, moving))
@@ -251,7 +252,7 @@ def all_finite(e: Emitter, rows: Sequence[Sequence[str]], arrays: Sequence[Array
     return total
 
 
-def packed_ir(name: str, arguments: int, program: Program) -> Text:
+def packed_ir(name: str, arguments: int, program: Program | Directions) -> Text:
     """The text of `i32 name_packed(ptr block)`, which takes the pointers of `name` from an array (ctypes is slow by argument)."""
     lines, given = [], []
     for i in range(arguments + len(program.outputs) - 1):
