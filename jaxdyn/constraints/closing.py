@@ -24,7 +24,7 @@ from jaxdyn.lie.so3 import _product
 from jaxdyn.model.tree import Model, difference
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import displace, retract
+from jaxdyn.systems.system import displace, displacement, retract
 
 # Longest step on the way, rad or lengths of the mechanism: within it, rows turn by less than a right angle.
 _LONGEST = 0.2
@@ -40,11 +40,6 @@ class Path(NamedTuple):
 
     q: Array
     passed_singular: Array
-
-
-def displacement_from(scene: Scene, guess, place):
-    """The displacement (nv,) from a guess to a place."""
-    return difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
 
 
 def _step_to_rows(scene: Scene, q, t, loose: float):
@@ -111,7 +106,7 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol):
     """
     metric, _ = run(whitened_rows, scene, guess, t)
     sizes, _ = coordinate_sizes(scene.system, guess.dtype)
-    first = displacement_from(scene, guess, start)
+    first = displacement(scene.system, guess, start)
 
     def improve(state):
         e, _, count = state
@@ -167,7 +162,7 @@ def nearest_configuration(scene: Scene, guess, start, t, rank_tol):
     def differentiable(scene, q, start, t):
         fixed, guess, begun, frozen = constant((scene, q, start, t))
         place = lax.stop_gradient(solve(fixed, guess, begun, frozen))
-        moved = displace(scene.system, q, _stationary(scene, q, t, displacement_from(scene, guess, place), rank_tol))
+        moved = displace(scene.system, q, _stationary(scene, q, t, displacement(scene.system, guess, place), rank_tol))
         # Going from the guess to the solution and back again costs digits that the solution itself has.
         return retract(scene.system, place + (moved - lax.stop_gradient(moved)))
 

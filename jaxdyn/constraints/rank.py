@@ -14,6 +14,8 @@ from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
 # Operations of the normal equations up to which they are written out: LLVM takes 50 to 100 microseconds for each of them.
 _MAX_ROWS_INLINE = 10_000
+# Columns up to which rotations take about as long as the normal equations in blocks, and compile faster.
+_MOST_ROTATED = 40
 
 
 def checked_tolerance(rank_tol: float | None) -> float | None:
@@ -80,10 +82,13 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = Fa
     if is_expanding():  # which has no branches: other samples are computed again
         inverse, quality = _by_normal_equations(None, Y)
         return unless(~(quality > least_pivot(Y, rank_tol)), inverse)
-    inverse_and_quality: Any = run(_by_normal_equations, None, Y, most=_MAX_ROWS_INLINE, otherwise=lambda *_: None)
-    if inverse_and_quality is None:
-        return pseudo_inverse_by_rotations(Y, rank_tol)
-    inverse, quality = inverse_and_quality
+    if Y.shape[1] > _MOST_ROTATED:
+        inverse, quality = _by_normal_equations(None, Y)
+    else:
+        inverse_and_quality: Any = run(_by_normal_equations, None, Y, most=_MAX_ROWS_INLINE, otherwise=lambda *_: None)
+        if inverse_and_quality is None:
+            return pseudo_inverse_by_rotations(Y, rank_tol)
+        inverse, quality = inverse_and_quality
     doubtful = any_in_batch(~(quality > least_pivot(Y, rank_tol)))
     return lax.cond(doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
 

@@ -424,18 +424,25 @@ def most_rounding(dtype) -> float:
     return 10 * surely_apart(jnp.zeros((), dtype))
 
 
-def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selection, int]:
+def known_selection(
+    scene: Scene, q, t, rank_tol: float | None, is_rounded: bool | None = None
+) -> tuple[Selection, int]:
     """`select_rows` for concrete numbers, and the number of rows that are independent there."""
+    is_rounded = scene.is_rounded if is_rounded is None else is_rounded
     bare = Scene(scene.system, scene.constraints)
     B = compute(scaled_rows, bare, q, t, given=not is_staged())
+    apart = surely_apart(B) if rank_tol is None else rank_tol
+    none = np.zeros((), B.dtype)
+    every = Selection(np.ones(B.shape[0], B.dtype), none, none)  # pyright: ignore[reportArgumentType]
+    # No pivot is below the least singular value.
+    if 0 < B.shape[0] <= B.shape[1] and np.linalg.svd(B, compute_uv=False)[-1] > apart:
+        return every, B.shape[0]
     # Pivots of a QR factorisation with column exchanges are those of `eliminate`.
     pivots = _pivots(B)
-    apart = surely_apart(B) if rank_tol is None else rank_tol
     if np.sum(pivots > apart) == B.shape[0]:
-        none = np.zeros((), B.dtype)
-        return Selection(np.ones(B.shape[0], B.dtype), none, none), B.shape[0]  # pyright: ignore[reportArgumentType]
+        return every, B.shape[0]
     with jax.ensure_compile_time_eval():
-        selection = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol, scene.is_rounded)
+        selection = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol, is_rounded)
     return Selection(*map(np.asarray, selection)), int(np.sum(pivots > tolerance(rank_tol, B)))  # pyright: ignore[reportArgumentType]
 
 

@@ -242,12 +242,23 @@ def rate_to_velocity(system, q: Float[Array, " nq"], rate: Float[Array, " nq"]) 
 
 def displace(system, q: Float[Array, " nq"], step: Float[Array, " nv"]) -> Float[Array, " nq"]:
     """Configuration reached from q by the displacement `step` (nv,) of any system, on the manifold of a `Model`."""
-    return integrate(system, q, step) if isinstance(system, Model) else q + step
+    return _by_joints(_displace, system, q, step) if isinstance(system, Model) else q + step
+
+
+def _by_joints(function, model, *args):
+    # A kernel, as joint by joint it is hundreds of operations of JAX; dependent coordinates solve equations of their own.
+    if model.nq > model.topology.nq:
+        return function(model, *args)
+    return run(function, model, *args)
+
+
+def _displace(model, q, step):
+    return integrate(model, q, step)
 
 
 def displacement(system, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -> Float[Array, " nv"]:
     """Displacement (nv,) from q0 to q1 of any system, the inverse of `displace`."""
-    return difference(system, q0, q1) if isinstance(system, Model) else q1 - q0
+    return _by_joints(difference, system, q0, q1) if isinstance(system, Model) else q1 - q0
 
 
 def has_quaternions(system) -> bool:
