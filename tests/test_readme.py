@@ -45,7 +45,7 @@ def test_examples_of_the_section_on_events_run():
     np.testing.assert_allclose(events.time[0], np.sqrt(0.8 / 9.81), rtol=1e-9)
     # Rolling keeps 5/7 of the velocity.
     np.testing.assert_allclose(names["motion"].q[-1, 0], 2 * (events.time[0] + 5 / 7 * (2 - events.time[0])), rtol=1e-7)
-    assert np.isfinite(names["slope"]) and names["slope"] != 0
+    assert np.isfinite(names["derivative"]) and names["derivative"] != 0
 
 
 @pytest.mark.slow
