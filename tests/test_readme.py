@@ -12,10 +12,10 @@ def test_example_of_the_readme_runs(tmp_path, monkeypatch):
     assert (tmp_path / "four_bar.png").stat().st_size > 10_000
     # Save points stand between steps: the energy (84 J) is that of the dense output.
     assert np.abs(names["motion"].constraint_residual).max() < 1e-10 and np.ptp(names["motion"].energy) < 1e-6 * 84
-    assert names["weights"].shape == (100, 3) and names["slopes"].shape == (100, 3, 3, 10)
+    assert names["weights"].shape == (100, 3) and names["jacobians"].shape == (100, 3, 3, 10)
     # The weight is linear in the ten numbers of each body.
     inertias = names["scene"].system.inertias
-    np.testing.assert_allclose(jnp.einsum("ncbk,bk->nc", names["slopes"], inertias), names["weights"], atol=1e-10)
+    np.testing.assert_allclose(jnp.einsum("ncbk,bk->nc", names["jacobians"], inertias), names["weights"], atol=1e-10)
 
 
 def test_examples_of_the_first_steps_run():
