@@ -158,6 +158,27 @@ def test_centre_of_mass_coordinates_have_a_skew_rate_and_ignore_translation(floa
     assert_close(pushed.coriolis_matrix, C, 1e-10)
 
 
+def test_centre_of_mass_coordinates_in_batches_and_their_derivatives(floating):
+    """A batch equals the samples, and the derivative in a mass equals the difference quotient."""
+    model, *_ = floating
+    q, v, _ = random_states(model, 2, 8)[:3]
+    batch = quick(jax.vmap(jd.com_dynamics, (None, 0, 0)))(model, q, v)
+    for i in range(2):
+        jax.tree.map(lambda x, y, i=i: assert_close(x[i], y, 1e-11), batch, jd.com_dynamics(model, q[i], v[i]))
+
+    def value(mass):
+        terms = jd.com_dynamics(model.replace(inertias=model.inertias.at[2, 0].set(mass)), q[0], v[0])
+        return jnp.sum(terms.coriolis_matrix) + jnp.sum(terms.mass_matrix)
+
+    mass, step = model.inertias[2, 0], 1e-4
+    forward, reverse = quick(lambda m: (jax.jacfwd(value)(m), jax.grad(value)(m)))(mass)
+    difference = (value(mass + step) - value(mass - step)) / (2 * step)
+    assert_close(forward, reverse, 1e-10)
+    # The error of a central difference is of order step^2, about 1e-8 of the derivative.
+    assert_close(forward, difference, 1e-6)
+    assert abs(forward) > 1e-3
+
+
 def test_centre_of_mass_coordinates_of_one_body():
     """In closed form: M' is the moment of inertia about the centre of mass, C' omega = omega x (I omega)."""
     model = random_tree(8, ["free"], armature=False)
