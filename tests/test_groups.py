@@ -530,6 +530,7 @@ def public_calls(name, x, y):
     if name == "so3":
         q, p = so3.quat_exp(x), so3.quat_exp(y)
         out |= {"quat_exp": q, "quat_log": so3.quat_log(q), "quat_multiply": so3.quat_multiply(q, p)}
+        out |= {f: getattr(so3, f)(x) for f in ("euler_to_matrix", "euler_body_jacobian", "euler_spatial_jacobian")}
         out |= {f: getattr(so3, f)(q) for f in ("quat_conjugate", "quat_to_matrix", "quat_normalize")}
         out |= {"matrix_to_quat": so3.matrix_to_quat(t), "quat_rotate": so3.quat_rotate(q, y), "cross": so3.cross(x, y)}
     else:
