@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import mode
-from jaxdyn.compile.kernel import kernel_p, target
+from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.program import Array
 
 with contextlib.suppress(ImportError):  # no kernels without llvmlite
@@ -25,7 +25,8 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
 
     INT, POINTER = ir.IntType(64), ir.PointerType()
 
-# Sweeps converge quadratically, six to ten serve; the bound ends those over numbers that are not finite.
+# Sweeps converge quadratically: six to ten are enough. The bound ends those over numbers that are not finite, for which the
+# test of convergence never holds.
 MAX_SWEEPS = 60
 
 
@@ -45,7 +46,7 @@ class PseudoInverse:
 
     @property
     def digest(self) -> str:
-        """As of a `Program`."""
+        """Identity of the code, as `Program.digest`."""
         return f"pseudo_inverse {self.rows} {self.columns} {self.dtype} {self.tolerance!r}"
 
     @property
@@ -200,8 +201,10 @@ def _sweeps(w: _Writer, U, J, n: int, m: int) -> None:
             x, y = w.at(U, (p, n)), w.at(U, (q, n))
             alpha, beta, gamma = w.product(x, x, n), w.product(y, y, n), w.product(x, y, n)
             limit = b.fmul(w.number(eps), w.root(b.fmul(alpha, beta)))
+            # Relative to the lengths of both columns, not to the largest: that is what keeps small singular values exact.
             with b.if_then(b.fcmp_ordered(">", w.size(gamma), limit)):
                 b.store(ir.Constant(ir.IntType(1), 1), going)
+                # The smaller root of t^2 + 2 zeta t - 1: rotations by at most pi/4, with which sweeps converge.
                 zeta = b.fdiv(b.fsub(beta, alpha), b.fmul(w.number(2), gamma))
                 length = b.fadd(w.size(zeta), w.root(b.fadd(one, b.fmul(zeta, zeta))))
                 sign = b.select(b.fcmp_ordered("<", zeta, w.number(0)), w.number(-1), one)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from jaxdyn.compile.graph import Graph, Number, objects
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.number import Number, objects
 
 
 def product(graph: Graph, a: np.ndarray, b: np.ndarray, zero) -> list:
@@ -26,7 +27,7 @@ def product(graph: Graph, a: np.ndarray, b: np.ndarray, zero) -> list:
 
 
 def cholesky(graph: Graph, matrix: np.ndarray) -> np.ndarray:
-    """The lower factor L of a symmetric matrix L L^T, of which the lower triangle is read."""
+    """The lower factor L of a symmetric matrix L L^T; reads the lower triangle."""
     n = matrix.shape[0]
     lower = np.full((n, n), 0.0, object)
     inverse = []

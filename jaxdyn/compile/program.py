@@ -54,10 +54,12 @@ class Program:
     - `subprograms`: what is called, written once however often it is.
     - `derivative`: None, or a function (which inputs move) -> the `Program` of the change of all outputs, of the inputs and the
       changes of those that move.
-    - `fallback`: None, or the function of which this is the program, from flat arrays of one sample to flat arrays.
+    - `fallback`: None, or the function that was traced, from flat arrays of one sample to flat arrays.
+    - `reports_validity`: whether the last output says if the sample is valid (see `flags`).
     """
 
-    turns = 1  # how often the operations are carried out
+    # Repetitions of the operations in one call, by which the cost of a `loops.Loop` is estimated.
+    turns = 1
 
     def __init__(
         self, inputs, outputs, operations, results, subprograms=(), derivative: Callable | None = None, name: str = ""
@@ -70,6 +72,7 @@ class Program:
         self.derivative = derivative
         self.name = name
         self.fallback: Callable | None = None
+        self.reports_validity = False
         self.derived: dict = {}
 
     def __repr__(self):
@@ -83,7 +86,7 @@ class Program:
 
     @functools.cached_property
     def digest(self) -> str:
-        """Of all that its code depends on: programs of equal digests do the same."""
+        """Hash of everything that the code depends on: programs of equal digests have the same code."""
         lines = [f"{op} {kind} {args}" for op, kind, args in self.operations]
         lines += [str(x) for x in (*self.inputs, *self.outputs, *self.results)] + [x.digest for x in self.subprograms]
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()
@@ -134,6 +137,14 @@ _DTYPES = {kind: np.dtype(name) for name, kind in _KINDS.items()}
 def kind_of(dtype) -> str:
     """Two letters for a dtype. **Raises:** KeyError for those that programs do not have."""
     return _KINDS[np.dtype(dtype).name]
+
+
+def kind_or_refuse(dtype) -> str:
+    """`kind_of` a dtype. **Raises:** `NotNumbers` for those that programs do not have."""
+    try:
+        return kind_of(dtype)
+    except KeyError:
+        raise NotNumbers(f"numbers of {dtype}") from None
 
 
 def dtype_of(kind: str) -> np.dtype:

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import jax_adapter
-from jaxdyn.compile.kernel import program_of, shaped_results, target
+from jaxdyn.compile.kernels import call_program
+from jaxdyn.compile.primitive import target
+from jaxdyn.compile.trace import program_of
 
 
 def _sample(known, x, y):
@@ -21,7 +23,7 @@ def _sample(known, x, y):
 def _kernel(x, y):
     leaves, expanded = program_of(_sample, (), None, (x, y))
     program, structure = expanded
-    return jax.tree.unflatten(structure, shaped_results(program, leaves))
+    return jax.tree.unflatten(structure, call_program(program, leaves))
 
 
 def _transforms(function, x, y) -> list:

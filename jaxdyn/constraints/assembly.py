@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled, compute, constant, is_concrete, is_staged, run
+from jaxdyn.compile import entry_point, evaluate, is_concrete, is_tracing, kernel, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.closing import displacement_from, follow_path, nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
@@ -175,7 +175,7 @@ def _from_elsewhere(assembly: Assembly, guesses: int, assembled: Callable, scene
     return assembly
 
 
-@compiled
+@entry_point
 def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
     """The scene `locked` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
     guess, whole = q, locked
@@ -183,7 +183,7 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
     has_positions = bool(holonomic_rows(layout(locked)).size)
     bare = Scene(locked.system, locked.constraints)
     if has_positions:
-        fixed, start, time = constant((bare, q, t))
+        fixed, start, time = stop_gradient((bare, q, t))
         loose = tolerance(rank_tol, q) if rank_tol is not None else surely_apart(q)
         q, passed = follow_path(fixed, start, time, loose, steps)
     kept, rounding, _ = select_rows(bare, q, t, rank_tol, is_rounded)
@@ -250,7 +250,7 @@ def _with_velocity(scene, q, v, t, rank_tol):
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
     """Largest |phi| (m or rad) and |A v - b| (m/s or rad/s) of the state q (nq,), v (nv,) at t (s): (2,)."""
-    return run(_largest_residuals, Scene(scene.system, scene.constraints), q, v, jnp.asarray(t, q.dtype))
+    return kernel(_largest_residuals)(Scene(scene.system, scene.constraints), q, v, jnp.asarray(t, q.dtype))
 
 
 def _largest_residuals(scene: Scene, q, v, t):
@@ -291,6 +291,6 @@ def _residuals_and_limits(scene, q, v, t, relative):
 def start_evidence(scene: Scene, q, v, t, relative: float) -> tuple[np.ndarray, float]:
     """Largest residuals (2,), and `openness`, at a concrete state."""
     bare = Scene(scene.system, scene.constraints)
-    given = not is_staged()  # as in the program of a run that begins here
-    ratio = compute(largest_ratio, bare, q, v, t, static=(relative,), given=given)
-    return compute(_largest_residuals, bare, q, v, t, given=given), float(ratio)
+    given = not is_tracing()  # as in the program of a run that begins here
+    ratio = evaluate(largest_ratio, bare, q, v, t, static=(relative,), given=given)
+    return evaluate(_largest_residuals, bare, q, v, t, given=given), float(ratio)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
@@ -119,7 +119,7 @@ def newton_euler_matrices(
     return _matrices(model, q, v, tip)
 
 
-@compiled
+@entry_point
 def _matrices(model: Model, q, v, tip: str | None) -> NewtonEulerMatrices:
     topology, n = model.topology, model.nb
     tip_selector = None if tip is None else _tip_selector(model, tip)

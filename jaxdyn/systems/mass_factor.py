@@ -15,7 +15,7 @@ from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled, is_expanding, run
+from jaxdyn.compile import entry_point, kernel, variant
 
 # Rows of a matrix beyond which its factor is no kernel: their operations grow as the cube.
 _MOST_IN_KERNEL = 64
@@ -25,16 +25,17 @@ def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower triangular L with L L^T = matrix, of which the lower triangle is read; NaN where it is not positive definite."""
     if matrix.shape[-1] == 0:  # a model without moving bodies
         return matrix
-    # Within a program of numbers, which sees the zeros of the matrix only where it is at hand.
-    return _cholesky(None, matrix) if _stays_array(matrix) else run(_cholesky, None, matrix)
-
-
-def _stays_array(matrix) -> bool:
-    return is_expanding() or matrix.shape[-1] > _MOST_IN_KERNEL
+    return _factor(None, matrix)
 
 
 def _cholesky(_, matrix):
     return lax.linalg.cholesky(matrix, symmetrize_input=False)
+
+
+# Inside of a kernel a factor is written in its place, where the zeros of the matrix are known.
+@variant(_cholesky)
+def _factor(_, matrix):
+    return (_cholesky if matrix.shape[-1] > _MOST_IN_KERNEL else kernel(_cholesky))(None, matrix)
 
 
 def is_definite(matrix: Float[Array, "n n"], factor: Float[Array, "n n"]) -> Bool[Array, ""]:
@@ -58,13 +59,17 @@ def solve_lower(
     """L^-1 right, or L^-T right."""
     if factor.shape[-1] == 0:
         return right
-    if _stays_array(factor):
-        return _solve_lower(transposed, None, factor, right)
-    return run(_solve_lower, None, factor, right, static=(transposed,))
+    return _solve(transposed, None, factor, right)
 
 
 def _solve_lower(transposed: bool, _, factor, right):
     return solve_triangular(factor, right, lower=True, trans=int(transposed))
+
+
+@variant(_solve_lower)
+def _solve(transposed: bool, _, factor, right):
+    is_large = factor.shape[-1] > _MOST_IN_KERNEL
+    return (_solve_lower if is_large else kernel(_solve_lower, static=1))(transposed, None, factor, right)
 
 
 def solve_cholesky(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
@@ -72,7 +77,7 @@ def solve_cholesky(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> 
     return solve_lower(factor, solve_lower(factor, right), transposed=True)
 
 
-@compiled
+@entry_point
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """Solve matrix^-1 right by Cholesky factorisation; NaN where the matrix is not positive definite."""
     return solve_cholesky(cholesky(matrix), right)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.compile import compiled, is_known, run
+from jaxdyn.compile import entry_point, is_known, kernel
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Checked, Function, Number, batch_hint
 from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, joint_rates, normalize
@@ -79,7 +79,7 @@ class System(eqx.Module):
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         """Acceleration M^-1 (tau - h), (nv,)."""
-        return run(_acceleration, self, q, v, tau, t, otherwise=_acceleration)
+        return kernel(_acceleration, fallback=_acceleration)(self, q, v, tau, t)
 
     def check_start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> None:
         """Refuse a state from which no motion can be computed; traced states are not checked.
@@ -270,7 +270,7 @@ def retract(system, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
     return normalize(system, q) if needs_retraction(system) else q
 
 
-@compiled
+@entry_point
 def symbols(derivative: Float[Array, "n n n"]) -> Float[Array, "n n n"]:
     """Christoffel symbols of the first kind from dM_ij/dq_k: 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i)."""
     return 0.5 * (derivative + derivative.transpose(0, 2, 1) - derivative.transpose(2, 1, 0))

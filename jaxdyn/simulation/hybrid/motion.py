@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdyn.compile import partition_traced, run
+from jaxdyn.compile import partition_tracers
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics.kinematics import frame_pose
@@ -82,7 +82,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     pieces = pieces_of(scene, (), q0, v0, ts[0], control_of)
     elements = elements_of(scene, pieces)
     eps, dtype = float(jnp.finfo(q0.dtype).eps), q0.dtype
-    unknown, known = partition_traced((scene, control))
+    unknown, known = partition_tracers((scene, control))
     unknown = tuple(unknown)
     bare = extended(scene).forces
 
