@@ -39,6 +39,7 @@ def select(expansion, params, args, eqn):
         if all(x.dtype.kind != "O" for x in cases):
             return [np.choose(which, cases)]
         cases = [as_objects(x) for x in cases]
+        # A known choice of unknown numbers, as masks of a topology are: nothing is written for it.
         chosen = np.where(which == 0, cases[0], cases[1])
         for i in range(2, len(cases)):
             chosen = np.where(which == i, cases[i], chosen)
@@ -65,6 +66,7 @@ def dot_general(expansion, params, args, eqn):
     length, count = math.prod(a.shape[i] for i in sum_a), math.prod(a.shape[i] for i in batch_a)
     rows = math.prod(n for i, n in enumerate(a.shape) if i not in (*batch_a, *sum_a))
     columns = math.prod(n for i, n in enumerate(b.shape) if i not in (*batch_b, *sum_b))
+    # Both operands as (batch, rows, summed): one loop for all products, whatever axes they sum.
     a = np.moveaxis(a, (*batch_a, *sum_a), (*range(len(batch_a)), *range(-len(sum_a), 0))).reshape(count, rows, length)
     b = np.moveaxis(b, (*batch_b, *sum_b), (*range(len(batch_b)), *range(-len(sum_b), 0))).reshape(
         count, columns, length
@@ -82,6 +84,7 @@ def dot_general(expansion, params, args, eqn):
 def scatter(expansion, params, args, eqn):
     """Updates at known places, written or added; those that are outside are dropped, as JAX does."""
     operand, indices, updates = args
+    # In the order of the updates: where two of them meet, JAX leaves open which one stays, and this is the last.
     entries, adds = as_objects(operand).ravel().tolist(), eqn.primitive.name != "scatter"
     places = scatter_places(eqn, operand, indices, updates)
     for value, i in zip(as_objects(updates).ravel().tolist(), places, strict=True):
@@ -92,6 +95,7 @@ def scatter(expansion, params, args, eqn):
 
 def cumsum(expansion, params, args, eqn):
     """Partial sums, from either end."""
+    # One sum after the other, as the partial sums are results. XLA's tree of sums rounds otherwise.
     x = np.moveaxis(as_objects(args[0]), params["axis"], 0)
     order = range(x.shape[0])
     order = reversed(order) if params["reverse"] else order

@@ -36,6 +36,7 @@ def convert_known(x: np.ndarray, dtype) -> np.ndarray:
     dtype = np.dtype(dtype)
     if x.dtype.kind != "f" or dtype.kind not in "iu":
         return x.astype(dtype)
+    # NumPy's own conversion of a float that is out of range is undefined and differs between processors.
     ends = np.iinfo(dtype)
     is_low, is_high = x <= ends.min, x >= ends.max
     inside = np.where(is_low | is_high | np.isnan(x), 0, x).astype(dtype)
@@ -61,6 +62,7 @@ def evaluate_known(eqn, args) -> np.ndarray:
 
 def bind_known(eqn, args) -> np.ndarray:
     """The same by JAX itself."""
+    # The expansion may run within a user's trace, which must not see this operation.
     with jax.ensure_compile_time_eval():
         value = eqn.primitive.bind(*args, **eqn.params)
     if eqn.primitive.multiple_results:

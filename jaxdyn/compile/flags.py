@@ -32,6 +32,7 @@ def _batch(args, axes):
 
 
 def _jvp(primals, tangents):
+    # NaN in the tangent too: a derivative that was computed from the failed formula must not look like a number.
     flag, x = primals
     step = tangents[1]
     return invalid_p.bind(flag, x), step if is_zero(step) else invalid_p.bind(flag, step)
@@ -41,6 +42,8 @@ def _transpose(cotangent, flag, x):
     return [None, cotangent if is_zero(cotangent) else invalid_p.bind(flag, cotangent)]
 
 
+# A primitive, not a `jnp.where` with NaN: an expansion collects the flags of all marks by its name. It has no lowering, as it is
+# bound while a program is traced, and nowhere else.
 invalid_p = define_primitive(
     "jaxdyn_invalid",
     lambda flag, x: ShapedArray(x.shape, x.dtype),

@@ -55,6 +55,7 @@ class PseudoInverse:
         n, m = max(self.rows, self.columns), min(self.rows, self.columns)
         return 8 * m * m * (6 * n + 3 * m) // 2 + 1
 
+    # A vector of samples would sweep until the last one of them has converged.
     def lanes(self, samples) -> int:
         """Samples need different numbers of sweeps: one after the other."""
         return 1
@@ -67,6 +68,7 @@ class PseudoInverse:
         """The same by JAX's singular value decomposition."""
         matrix = array.reshape(*array.shape[:-1], self.rows, self.columns)
         U, s, Vt = jnp.linalg.svd(matrix, full_matrices=False)
+        # A double where: one over a dropped value would be infinite, and its product with zero NaN.
         drop = s <= self.tolerance * s[..., :1]
         inverse = jnp.where(drop, jnp.zeros_like(s), 1 / jnp.where(drop, jnp.ones_like(s), s))
         entries = jnp.matmul(
@@ -172,6 +174,7 @@ def _kernel_ir(rows: int, columns: int, dtype, tolerance: float) -> str:
     with w.loop(begin, end) as sample:
         matrix = w.at(given, (sample, n * m))
         inverse = w.at(result, (sample, n * m))
+        # The smaller side is made orthogonal: rotations of m vectors of length n >= m cost n m^2 a sweep.
         # Columns of the matrix, or its rows where there are fewer of them, one after the other.
         of_column, of_row = (1, columns) if rows >= columns else (columns, 1)
         with w.loop(zero, w.integer(m)) as p:
@@ -224,6 +227,7 @@ def _write_inverse(w: _Writer, U, J, inverse, n: int, m: int, tolerance: float, 
         square = w.product(x, x, n)
         b.store(square, w.at(sizes, (p, 1)))
         so_far = w.load(largest)
+        # Written so that NaN becomes the largest, and no column is dropped for a comparison with it.
         b.store(b.select(b.fcmp_ordered("<", square, so_far), so_far, square), largest)
     limit = b.fmul(w.number(tolerance * tolerance), w.load(largest))
     with w.loop(zero, w.integer(n * m)) as k:

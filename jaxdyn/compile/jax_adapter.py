@@ -309,6 +309,7 @@ def _structures(header: str) -> dict[str, dict[str, int]]:
 
     Fields whose type the header does not define end a structure: what comes after them has no known offset.
     """
+    # A parser of the few forms that this header has; a compiler for C is not part of the installation.
     text = re.sub(r"//[^\n]*|/\*.*?\*/", "", header, flags=re.DOTALL)
     text = re.sub(r"_XLA_FFI_API_STRUCT_FIELD\((\w+)\)", r"void* \1", text)
     sizes = {name: (4, 4) for name in re.findall(r"typedef enum[^;{]*\{[^}]*\}\s*(\w+)\s*;", text)}
@@ -358,6 +359,7 @@ def select_options(options: dict[str, Any]) -> dict[str, Any]:
 
 @functools.cache
 def _is_option(name: str, value) -> bool:
+    # XLA has no list of its options: the smallest program is compiled with each.
     try:
         jax.jit(lambda: 0.0, compiler_options={name: value})()
     except jax.errors.JaxRuntimeError:

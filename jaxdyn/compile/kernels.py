@@ -68,6 +68,7 @@ def kernel(function=None, *, static=0, fallback=None, derivative=None) -> Any:
 
 
 def _call(function, static, tree, args, fallback, rule, is_differentiated: bool, where):
+    # Derivatives of a subprogram's call would be those of its numbers, written out: calls pay where nobody differentiates.
     results = _by_kernel(function, static, tree, args, fallback is not None, tangent=rule, calls=not is_differentiated)
     if results is None:
         return (function if fallback is None else fallback)(*static, tree, *args)
@@ -76,6 +77,7 @@ def _call(function, static, tree, args, fallback, rule, is_differentiated: bool,
         return values
     again = function if fallback is None else fallback
     if mode.is_rank_safe():
+        # The program was traced for the fast path, and is found in the cache: only its answer is used here.
         # This is a part of another function's fallback: the fast path has failed for the sample, and may fail it again.
         return again(*static, tree, *args)
     traced, known = partition_tracers(tree)

@@ -53,9 +53,11 @@ class _LoopText:
         self._set_table_rows()
         turn = Body(e, loop.turn, self._load, self._array)
         results = [name for row in turn.results() for name in row]
+        # The state is stored before rows are written: their program reads the stages of this iteration, not the state.
         more = self._store_state(results)
         if loop.row is not None:
             self._rows(results)
+        # The block iterates until its last sample has ended; the state of the others is kept by selects.
         e.lines.append(f"  br i1 {e.any(more)}, label %turn, label %out")
         e.lines.append("out:")
         for k in range(loop.states):
@@ -88,6 +90,7 @@ class _LoopText:
             if self._is_direct(place) or (place not in read and place < self.first_state):
                 continue
             array = self.arrays[place]
+            # At least a cache line: a slot of zero bytes would have the address of the next one.
             size = max(64, bytes_of(array, self.width))
             self.allocations.append(f"  {self._slot(place)} = alloca [{size} x i8], align 64")
             for entry in range(array.size):
@@ -203,12 +206,14 @@ class _LoopText:
         count = self.arrays[self.rows_after].shape[0]
         kind, flag = kind_of(self.arrays[self.times].dtype), e.type("b1")
         until = self._one(results, turn.until)
+        # A step may pass any number of save points: samples with the most of them decide how often this loop runs.
         self._begin("rows")
         saved = e.load_at("%saved", 0, "i4")
         places, times = [], []
         for element in range(self.width):
             given = e.emit(f"zext i32 {self._element(saved, element, 'i4')} to i64")
             is_less = e.emit(f"icmp ult i64 {given}, {count}")
+            # A sample that has written all rows reads the last time again, which is a valid address, and writes nothing.
             places.append(e.emit(f"select i1 {is_less}, i64 {given}, i64 {count - 1}"))
             offset = e.emit(f"mul i64 {places[-1]}, {self.arrays[self.times].dtype.itemsize}")
             at = e.emit(f"getelementptr i8, ptr {self.sample_rows[self.times][element]}, i64 {offset}")

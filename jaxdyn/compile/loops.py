@@ -102,9 +102,11 @@ def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[C
 def _run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[Carry, bool] | None:
     if mode.current() == "plain" or target is None or mode.is_expanding() or not target.is_available():
         return None
+    # An iteration is traced with one row of each table; the loop itself reads rows at places that the state holds.
     given, carry = jax.tree.map(jnp.asarray, (given, carry))
     read = tuple(jnp.zeros(x.shape[1:], x.dtype) for x in given.tables)
     turn_args = constants, carry.state, read
+    # Validity is reported always: the loop ends before an iteration that is not valid, and the caller takes it by JAX.
     leaves, expanded = program_of(task.turn, task.static, tree, turn_args, calls=True, flags="report_always")
     if isinstance(expanded, str):
         return None
@@ -117,6 +119,7 @@ def _run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[
         if isinstance(expanded, str):
             return None
         row = expanded[0]
+    # The tree is split once more, as `program_of` does: the fallback needs its known leaves with the traced ones put back.
     traced, known = partition_tracers(tree)
     loop = _loop(task, program, row, structure, known, len(traced), _Form.of((constants, given, carry)))
     leaves = leaves[: len(leaves) - len(read)]
@@ -149,6 +152,7 @@ class Loop:
     state; its results are the carry.
     """
 
+    # Reverse mode is a loop of its own, over the records (`simulation.solvers.reverse`): JAX never differentiates this one.
     derivative = fallback = None
     # Iterations of a run are unknown. The estimate decides how many samples one thread takes at a time.
     turns = 100
@@ -159,6 +163,7 @@ class Loop:
         numbered = jax.tree.unflatten(form.structure, range(len(form.arrays)))
         self.given, self.carry = numbered[1:]
         self.states = len(jax.tree.leaves(self.carry.state))
+        # Places are counted through a tree of numbers with the structure of the arrays: fields keep their names here.
         self.first_leaf = jax.tree.leaves(self.carry)[0]  # of the carry, among the form's arrays
         self.reads = len(self.given.tables)
         self.end = len(turn.inputs) - self.reads
@@ -209,6 +214,7 @@ class Loop:
         return [x.reshape(-1) for x in jax.tree.leaves(carry)]
 
 
+# The same loop for the same programs: a primitive's parameters are keys of JAX's caches.
 @functools.lru_cache(maxsize=256)
 def _loop(task: Task, turn: Program, row, structure, known: Known, count: int, form: _Form) -> Loop:
     return Loop(task, turn, row, structure, known, count, form)

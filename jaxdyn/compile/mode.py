@@ -19,6 +19,7 @@ OPTIONS = ("", "usual", "least")
 # LLVM takes some 50 microseconds an operation: three seconds.
 MAX_OPERATIONS = 60_000
 
+# None: the environment decides, which is read at each use, so that a test can set it.
 _mode = jax.make_user_context(None)
 _expanding = jax.make_user_context(False)
 _rank_safe = jax.make_user_context(False)
@@ -28,6 +29,7 @@ _said: set[str] = set()
 
 def current() -> str:
     """The mode in force. **Raises:** ValueError where the environment asks for one that does not exist."""
+    # On a JAX that failed the trial "auto" is "plain" for the whole process.
     asked = _mode.value or _check_mode(
         os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION"
     )

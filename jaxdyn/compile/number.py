@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 class Number:
     """A number of a graph that is not known before the program runs."""
 
+    # Tens of thousands are made for a robot: slots save a dictionary for each.
     __slots__ = ("args", "graph", "kind", "op")
 
     def __init__(self, graph: "Graph", op: str, kind: str, args: tuple):
@@ -62,6 +63,7 @@ def with_type(x):
 
 def objects(entries: Sequence, shape) -> np.ndarray:
     """An array of objects."""
+    # `np.array(entries, object)` would look for sequences among the entries.
     array = np.empty(len(entries), object)
     array[:] = entries
     return array.reshape(shape)

@@ -73,6 +73,7 @@ class Program:
         self.name = name
         self.fallback: Callable | None = None
         self.reports_validity = False
+        # Derivatives, transposes and kernels of this program, which live as long as it does.
         self.derived: dict = {}
 
     def __repr__(self):
@@ -81,6 +82,7 @@ class Program:
     @functools.cached_property
     def cost(self) -> int:
         """Number of operations that are carried out, without inputs and changes of sign."""
+        # Signs merge with sums and products of LLVM, and inputs are operands in memory.
         own = sum(_weight(x) for x in self.operations if x.op not in ("input", "neg", "call", "part"))
         return own + sum(self.subprograms[x.args[0].value].cost for x in self.operations if x.op == "call")
 
@@ -164,6 +166,7 @@ def as_kind(value, kind: str):
     dtype = _DTYPES[kind]
     if kind in FLOATS or not isinstance(value, (float, np.floating)):
         return np.asarray(value).astype(dtype)[()]
+    # XLA saturates, where C leaves the result undefined.
     ends = np.iinfo(dtype)
     if math.isnan(value):
         return dtype.type(0)

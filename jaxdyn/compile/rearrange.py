@@ -36,6 +36,7 @@ def _split(params, args, out):
 
 def _pad(params, args, out):
     padded = np.full(out.shape, args[1].item(), args[0].dtype)
+    # Gaps between entries occur in transposes of strided slices.
     config = params["padding_config"]
     if any(low < 0 or high < 0 for low, high, _ in config):
         raise NotNumbers("padding that cuts")
@@ -77,6 +78,7 @@ def _flat_places(
             axis = index_batching[batching.index(dim)]
             start = np.broadcast_to(np.arange(size).reshape([-1 if i == axis else 1 for i in range(len(lead))]), lead)
         inside &= along((start >= 0) & (start <= size - sizes[dim]), others)
+        # XLA moves a window that is partly outside of the array to its edge.
         at = along(np.clip(start, 0, size - sizes[dim]), others)
         if dim in window:
             at = at + along(np.arange(sizes[dim]), [window_dims[window.index(dim)]])
@@ -103,6 +105,7 @@ def gather(params, args, eqn):
         shape, indices, window, d.collapsed_slice_dims, d.operand_batching_dims, d.start_index_map,
         d.start_indices_batching_dims, params["slice_sizes"], d.offset_dims, eqn.outvars[0].aval.shape,
     )  # fmt: skip
+    # Filled entries would be NaN or the least integer: that is left to JAX.
     if not inside.all() and "fill" in str(params["mode"]).lower():
         raise NotNumbers("a gather beyond its argument")
     return [operand.reshape(-1)[flat]]
@@ -158,6 +161,7 @@ def scatter_places(eqn, operand, indices, updates) -> list:
         shape, indices, window, d.inserted_window_dims, d.operand_batching_dims, d.scatter_dims_to_operand_dims,
         d.scatter_indices_batching_dims, sizes, d.update_window_dims, updates.shape,
     )  # fmt: skip
+    # By name: the enumeration itself is internal to JAX.
     if "clip" in str(eqn.params["mode"]).lower():
         inside = np.ones_like(inside)
     return [place if fits else None for place, fits in zip(flat.ravel().tolist(), inside.ravel().tolist(), strict=True)]

@@ -116,6 +116,7 @@ def _many(careful: Callable, axes: list):
         size = flag.shape[0]
         # `jax.export` has sizes without a number.
         count = min(SAMPLES_AT_ONCE, size) if isinstance(size, int) else SAMPLES_AT_ONCE
+        # Padded by a block of places beyond the batch, which are read as the last sample and are not written.
         places = jnp.nonzero(flag, size=size + count, fill_value=size)[0]
 
         def repair(i, values):
@@ -135,6 +136,7 @@ def _many(careful: Callable, axes: list):
     def _(size, batched, flag, values, args):
         flag, values = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, values), tuple(batched[:2]))
         shape = flag.shape
+        # Nested batches are one: places are counted through both, so that blocks are filled from all of them.
         flat, over = _along_one_axis(args, axes, batched[2], shape)
         flag, values = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (flag, values))
         values = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), _many(careful, over)(flag, values, flat))

@@ -16,6 +16,7 @@ def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
     """
     unknown, known = partition_tracers(tree)
 
+    # With symbolic zeros the rule sees which leaves do not change: a state's derivative computes none of the model's.
     @jax.custom_jvp
     def run(traced, *args):
         return _batch_first(solve(known(traced), *args))
@@ -44,6 +45,7 @@ def _batch_first(tree):
         shape = jnp.shape(x)
         if not shape or x.dtype == jax.dtypes.float0:
             return x
+        # Two reshapes that cancel: their batching rule moves the axis of the batch to the front.
         return jnp.reshape(jnp.reshape(x, (1, *shape) if len(shape) == 1 else -1), shape)
 
     return jax.tree.map(first, tree)

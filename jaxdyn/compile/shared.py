@@ -29,6 +29,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
         if op == "input":
             is_shared.append(uniform[args[0]])
         else:
+            # Subprograms stay whole: their calls belong to the batch.
             is_shared.append(op not in ("call", "part") and all(is_shared[x] for x in args if type(x) is not Constant))
     saved = sum(
         shared and x.op not in ("input", "neg") for shared, x in zip(is_shared, program.operations, strict=True)
@@ -56,6 +57,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
         name=f"{program.name}, of what samples share",
     )
 
+    # The second program takes all inputs, also those that only the first one reads: places of arguments stay the same.
     count, rest = len(program.inputs), _Renumbered()
     for place, (kind, entries) in enumerate(zip(kinds, by_kind, strict=True), count):
         for k, i in enumerate(entries):

@@ -39,6 +39,7 @@ def program_of(
     """
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
+    # Within `shard_map` operands of a primitive vary along the same axes of a mesh, or JAX refuses them.
     leaves = jax_adapter.vary_alike([*map(jnp.asarray, (*traced, *leaves))])
     shapes = tuple((x.shape, x.dtype) for x in leaves)
     return leaves, trace_program(function, static, known, len(traced), structure, shapes, tangent, most, calls, flags)

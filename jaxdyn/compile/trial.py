@@ -30,6 +30,7 @@ def _transforms(function, x, y) -> list:
     def slope(x, y):
         return jax.grad(lambda x, y: jnp.sum(function(x, y)[0]) + function(x, y)[1], (0, 1))(x, y)
 
+    # Values, a jvp, a batch with a shared argument and a batched gradient: every rule of the primitive is called once.
     batches = [jax.jit(jax.vmap(f, (0, None)))(x, y) for f in (function, slope)]
     return [jax.jit(function)(x[0], y), jax.jvp(function, (x[0], y), (y, y)), *batches]
 
@@ -42,6 +43,7 @@ def run_trial() -> None:
     x, y = jnp.arange(12.0).reshape(4, 3), jnp.arange(3.0)
     computed, wanted = (_transforms(f, x, y) for f in (_kernel, functools.partial(_sample, None)))
     for mine, theirs in zip(jax.tree.leaves(computed), jax.tree.leaves(wanted), strict=True):
+        # Loose, as the trial looks for other rules, not for rounding, and may run in float32.
         if mine.shape != theirs.shape or not np.allclose(mine, theirs, 1e-4, 1e-4):
             raise ArithmeticError("a kernel gives other numbers than JAX")
 
