@@ -292,5 +292,5 @@ def start_evidence(scene: Scene, q, v, t, relative: float) -> tuple[np.ndarray, 
     """Largest residuals (2,), and `openness`, at a concrete state."""
     bare = Scene(scene.system, scene.constraints)
     given = not is_tracing()  # as in the program of a run that begins here
-    ratio = evaluate(largest_ratio, bare, q, v, t, static=(relative,), given=given)
-    return evaluate(_largest_residuals, bare, q, v, t, given=given), float(ratio)
+    ratio = evaluate(largest_ratio, bare, q, v, t, static=(relative,), is_input=given)
+    return evaluate(_largest_residuals, bare, q, v, t, is_input=given), float(ratio)

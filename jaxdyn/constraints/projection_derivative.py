@@ -143,7 +143,7 @@ def _changed(rank_tol, scene: Scene, q, v, t, steps) -> tuple[Projected, Project
     y = on.by_forces(on.every, state.of_v)
 
     args = scene, q, t, state.of_q, state.of_v, x, y
-    change = value_and_jvp(partial(run, _forces), args, [*of_scene, dq, dt, None, None, None, None])[1]
+    change = value_and_jvp(kernel(_forces), args, [*of_scene, dq, dt, None, None, None, None])[1]
     dx, dy = (jnp.zeros_like(v),) * 2 if change is None else map(on.metric.solve, change)
 
     def closed(residual, args, given, correction, of, moved):
@@ -159,11 +159,11 @@ def _changed(rank_tol, scene: Scene, q, v, t, steps) -> tuple[Projected, Project
     of_q, dplace = jnp.zeros_like(state.of_q), dq
     if on.held.size:
         args = scene, q, t, x
-        dx, of_q = closed(partial(run, _position), args, [*of_scene, dq, dt], dx, on.of_held, state.q_moved)
-        dplace = value_and_jvp(partial(run, _place, scene), (q, x), [dq, dx])[1]
+        dx, of_q = closed(kernel(_position), args, [*of_scene, dq, dt], dx, on.of_held, state.q_moved)
+        dplace = value_and_jvp(partial(kernel(_place), scene), (q, x), [dq, dx])[1]
 
     args = scene, state.q, v, t, y
-    dy, of_v = closed(partial(run, _velocity), args, [*of_scene, dplace, dv, dt], dy, on.every, state.v_moved)
+    dy, of_v = closed(kernel(_velocity), args, [*of_scene, dplace, dv, dt], dy, on.every, state.v_moved)
     none = jnp.zeros((), v.dtype)
     dq, dv = (jnp.zeros_like(z) if d is None else d for z, d in ((q, dplace), (v, dv)))
     return state, Projected(dq, dv - dy, of_q, of_v, none, none, none, none)

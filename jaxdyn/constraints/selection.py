@@ -304,7 +304,7 @@ def may_have_redundant_rows(scene: Scene) -> bool:
         return True
     step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))
     try:
-        is_coupled = np.abs(evaluate(_generic_rows, bare, step, given=not is_tracing())) > 0
+        is_coupled = np.abs(evaluate(_generic_rows, bare, step, is_input=not is_tracing())) > 0
     except jax.errors.JAXTypeError:  # a constraint is a function that holds a traced number
         return True
     groups = np.arange(scene.nv)  # of coordinates
@@ -438,7 +438,7 @@ def most_rounding(dtype) -> float:
 def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selection, int]:
     """`select_rows` for concrete numbers, and the number of rows that are independent there."""
     bare = Scene(scene.system, scene.constraints)
-    B = evaluate(scaled_rows, bare, q, t, given=not is_tracing())
+    B = evaluate(scaled_rows, bare, q, t, is_input=not is_tracing())
     # Pivots of a QR factorisation with column exchanges are those of `eliminate`.
     pivots = _pivots(B)
     apart = surely_apart(B) if rank_tol is None else rank_tol

@@ -21,7 +21,7 @@ from jax import lax
 from kernel_helpers import native, quick, refuse
 
 from jaxdyn import compile as backend
-from jaxdyn.compile import derive, evaluate, mode, objects, program, target, trigonometry
+from jaxdyn.compile import derive, evaluate, kernels, mode, objects, program, target, trace, trigonometry
 from jaxdyn.compile.code import kernel_ir
 from jaxdyn.compile.expand import NotNumbers, expand
 from jaxdyn.compile.operations import as_operations
@@ -704,7 +704,7 @@ def test_compute_gives_known_numbers_while_a_program_is_traced():
         return z
 
     jax.jit(traced)(1.0)
-    rows += [evaluate(scaled, tree, x), evaluate(scaled, tree, jnp.asarray(x), given=True)]
+    rows += [evaluate(scaled, tree, x), evaluate(scaled, tree, jnp.asarray(x), is_input=True)]
     with backend.compilation("plain"):
         rows.append(evaluate(scaled, tree, x))
     rows.append(evaluate(lambda tree, x: scaled(tree, jnp.sort(x)[::-1]), tree, x))  # no program of numbers
@@ -727,7 +727,7 @@ def test_a_call_without_xla_is_that_within():
 def test_functions_are_compiled_once_for_known_numbers():
     seen = []
 
-    @backend.compiled
+    @backend.entry_point
     def look(x):
         seen.append(backend.is_concrete(x))
         return 2 * x
@@ -757,7 +757,7 @@ def test_what_is_known():
 
     def look(x):
         inside = backend.is_known(1.0), backend.is_concrete(1.0), backend.is_concrete(x), backend.is_tracing()
-        seen.append((*inside, backend.is_expanding()))
+        seen.append((*inside, mode.is_expanding()))
         return x
 
     jax.jit(look)(1.0)
@@ -799,7 +799,7 @@ def test_modes(monkeypatch):
 
 
 def test_without_llvmlite_functions_run_on_jax(monkeypatch, caplog):
-    monkeypatch.setattr(kernel, "target", None)
+    monkeypatch.setattr(kernels, "target", None)
     monkeypatch.setattr(mode, "_said", set())
     with caplog.at_level(logging.WARNING, "jaxdyn"):
         for _ in range(2):
@@ -1127,12 +1127,12 @@ def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
     def function(x):
         return jnp.sin(x) * 7.654321
 
-    for place, name in ((objects, "_compile"), (target, "kernel_ir"), (kernel, "expand")):
+    for place, name in ((objects, "_compile"), (target, "kernel_ir"), (trace, "expand")):
         with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt, jax.errors.JaxRuntimeError):
             patched.setattr(place, name, interrupted)
             jax.jit(native(lambda x: function(x)))(jnp.ones(3))
         with target._lock:
-            assert not backend.is_expanding()
+            assert not mode.is_expanding()
     assert_same(jax.jit(native(lambda x: function(x)))(jnp.ones(3)), function(jnp.ones(3)))
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(os, "replace", interrupted)

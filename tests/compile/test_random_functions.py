@@ -69,7 +69,7 @@ def _refuse(*_):
         (lambda x: x[0] * x[1] - x[1] * x[0], [np.inf, 1.0], 0.0, np.nan),
         (lambda x: 1 / (x + 0.0), [-0.0, 0.0], [-np.inf, np.inf], [np.inf, np.inf]),
         (lambda x: 1 / (0.0 - x), [0.0, 1.0], [-np.inf, -1.0], [np.inf, -1.0]),
-        (lambda x: 1 / ((-x) - x[::-1]), [0.0, -0.0], [-np.inf, -np.inf], [np.inf, -np.inf]),
+        (lambda x: 1 / ((-x) - x[::-1]), [0.0, -0.0], [-np.inf, -np.inf], [np.inf, np.inf]),
         (lambda x: 1 / jnp.sin(x), [-0.0, 0.0], [np.inf, np.inf], [-np.inf, np.inf]),
     ],
     ids=["0 x", "x - x", "x y - y x", "x + 0", "0 - x", "-x - y", "sine of -0"],

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdyn.compile import partition_tracers
+from jaxdyn.compile import kernel, partition_tracers
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics.kinematics import frame_pose
@@ -168,9 +168,9 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
         y, mode, t = row
         return put_back(given(unknown)[0], elements, mode, t, y, None)[0]
 
-    later = lax.map(partial(run, closed, unknown), jax.tree.map(lambda x: x[1:], (y, modes, ts)))
+    later = lax.map(partial(kernel(closed), unknown), jax.tree.map(lambda x: x[1:], (y, modes, ts)))
     y = jax.tree.map(lambda a, b: jnp.concatenate([a[:1], b]), y, later)
-    values = lax.map(partial(run, report, unknown), (y, modes, ts))
+    values = lax.map(partial(kernel(report), unknown), (y, modes, ts))
 
     codes: Any = RESULTS
     cases = faults_of_inputs(
