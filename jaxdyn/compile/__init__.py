@@ -6,24 +6,17 @@ differentiated there (`derive`), written as LLVM IR (`code`, `llvm`), and called
 (`target`, `objects`). A primitive of JAX stands for the kernel, with rules for batches and derivatives (`primitive`); where
 there is no native code, operations of JAX do the same (`operations`).
 
-Nothing of jaxdyn is imported here. Other rooms import the names below, and the modules `batch`, `loops` and `repair`. Only
-`jaxdyn.export`, which writes object files, imports the compiler's own modules.
+Nothing of jaxdyn is imported here. Other rooms import the names below, and those of the modules `known` (known and traced
+values), `batch` (decisions for a batch), `loops` and `repair`. Only `jaxdyn.scale`, which compiles programs around kernels ahead
+of time, and `jaxdyn.export`, which writes object files, import the compiler's own modules.
 """
 
 from jaxdyn.compile.calls import entry_point as entry_point
-from jaxdyn.compile.calls import glue_options as glue_options
 from jaxdyn.compile.flags import mark_invalid as mark_invalid
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
-from jaxdyn.compile.jax_adapter import function_of as function_of
 from jaxdyn.compile.kernels import evaluate as evaluate
 from jaxdyn.compile.kernels import kernel as kernel
 from jaxdyn.compile.kernels import variant as variant
-from jaxdyn.compile.known import array_namespace as array_namespace
-from jaxdyn.compile.known import is_concrete as is_concrete
-from jaxdyn.compile.known import is_known as is_known
-from jaxdyn.compile.known import is_tracing as is_tracing
-from jaxdyn.compile.known import partition_tracers as partition_tracers
-from jaxdyn.compile.known import stop_gradient as stop_gradient
 from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under a name that says of what)
 from jaxdyn.compile.rules import implicit as implicit

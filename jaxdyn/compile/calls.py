@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 
 from jaxdyn.compile import ahead, mode
+from jaxdyn.compile.jax_adapter import function_of as function_of
 from jaxdyn.compile.jax_adapter import select_options
 from jaxdyn.compile.known import is_concrete, is_tracing
 

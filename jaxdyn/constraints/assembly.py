@@ -10,7 +10,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import entry_point, evaluate, is_concrete, is_tracing, kernel, stop_gradient
+from jaxdyn.compile import entry_point, evaluate, kernel
+from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.closing import displacement_from, follow_path, nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of

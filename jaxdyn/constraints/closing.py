@@ -14,7 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import implicit, kernel, pseudo_inverse_by_rotations, stop_gradient, value_and_jvp
+from jaxdyn.compile import implicit, kernel, pseudo_inverse_by_rotations, value_and_jvp
+from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.dynamics import correction, right_inverse, whitened_rows
 from jaxdyn.constraints.rank import eps_of, sign_of_determinant, solve_square

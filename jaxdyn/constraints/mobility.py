@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import entry_point, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import checked_tolerance, pseudo_inverse, tolerance
 from jaxdyn.constraints.selection import scaled_rows

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
+from jaxdyn.compile import kernel, mark_invalid, pseudo_inverse_by_rotations, variant
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 

@@ -24,18 +24,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import (
-    entry_point,
-    evaluate,
-    is_concrete,
-    is_tracing,
-    kernel,
-    mark_invalid,
-    pseudo_inverse_by_rotations,
-    stop_gradient,
-    variant,
-)
+from jaxdyn.compile import entry_point, evaluate, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
 from jaxdyn.compile.batch import cond
+from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import (
     Constraint,
     constraint_jacobian,

@@ -11,7 +11,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import kernel, stop_gradient
+from jaxdyn.compile import kernel
+from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model

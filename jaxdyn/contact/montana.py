@@ -24,7 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import entry_point, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.surfaces import (
     Surface,

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import entry_point, is_concrete, is_tracing
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete, is_tracing
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact._interior_point import Point, Program, attach_derivative, solve

@@ -20,7 +20,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn.compile import is_known, kernel
+from jaxdyn.compile import kernel
+from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.frames import each, relative_motions, relative_poses
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.contact.rolling import Rolling, RollingContact

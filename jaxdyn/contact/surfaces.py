@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import entry_point, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.lie.so3 import _product, cross

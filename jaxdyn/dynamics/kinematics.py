@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import array_namespace, kernel, variant
+from jaxdyn.compile import kernel, variant
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Given, check_shapes

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import array_namespace, is_concrete
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import entry_point, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.constraints.dynamics import applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance

@@ -6,7 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import entry_point, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.cones import Cones

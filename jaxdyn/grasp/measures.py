@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import entry_point, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows

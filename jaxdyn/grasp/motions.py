@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import entry_point, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import eps_of, pseudo_inverse, tolerance
 from jaxdyn.grasp.hand import Grasp, check_grasp

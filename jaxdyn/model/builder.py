@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import array_namespace, is_concrete
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.arguments import DType, Number, Numbers, store_leaf, warn_unphysical_inertias

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import array_namespace, is_concrete
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
 
 _SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import array_namespace, is_concrete
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Checked, Numbers, pose_leaf, store_leaf
 from jaxdyn.model.joints import KINDS

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn.compile import array_namespace, is_concrete, variant
+from jaxdyn.compile import variant
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes, warn, warn_unphysical_inertias
 from jaxdyn.model.description import tree_table
 from jaxdyn.model.inertia import inertial_parameters, transform_inertia

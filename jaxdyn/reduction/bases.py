@@ -14,7 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import entry_point, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
 from jaxdyn.lie.so3 import _product

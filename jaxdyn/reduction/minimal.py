@@ -14,7 +14,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import entry_point, is_concrete, kernel
+from jaxdyn.compile import entry_point, kernel
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import applied

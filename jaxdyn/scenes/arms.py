@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import array_namespace, entry_point, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import rolling_sphere
 from jaxdyn.constraints.rank import solve_square
 from jaxdyn.contact import Sphere, montana

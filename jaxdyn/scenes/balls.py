@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import array_namespace
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Holonomic, rolling_sphere
 from jaxdyn.lie import so3
 from jaxdyn.model import inertia

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import array_namespace, is_concrete
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.contact.cones import friction_cone, surface_cone
 from jaxdyn.contact.wrench_cones import wrench_cone
 from jaxdyn.grasp import Grasp, contact, point_contacts

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import array_namespace
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import rolling_sphere, rolling_wheel
 from jaxdyn.contact.cones import friction_cone
 from jaxdyn.grasp import Grasp, contact

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import array_namespace
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.contact.unilateral import DryFriction
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row

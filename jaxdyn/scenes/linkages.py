@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import array_namespace, is_concrete
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import loop
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import array_namespace
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Holonomic
 from jaxdyn.model.arguments import Number
 from jaxdyn.scenes._named import as_leaf, as_state, register_scene

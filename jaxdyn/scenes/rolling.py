@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import array_namespace
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import array_namespace
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.contact import Ellipsoid, RollingModel, rolling_contact
 from jaxdyn.grasp import Grasp
 from jaxdyn.model import float64 as f64

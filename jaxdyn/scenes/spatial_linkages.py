@@ -2,7 +2,7 @@
 
 from jaxtyping import Array
 
-from jaxdyn.compile import array_namespace, is_concrete
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import loop
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import array_namespace
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import entry_point, is_concrete, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.constraints.selection import may_have_redundant_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import is_concrete, partition_tracers
+from jaxdyn.compile.known import is_concrete, partition_tracers
 from jaxdyn.constraints.selection import keep_rows, may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import array_namespace, entry_point, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import array_namespace, is_known
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product

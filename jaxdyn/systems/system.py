@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.compile import entry_point, is_known, kernel
+from jaxdyn.compile import entry_point, kernel
+from jaxdyn.compile.known import is_known
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Checked, Function, Number, batch_hint
 from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, joint_rates, normalize

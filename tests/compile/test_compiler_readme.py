@@ -33,5 +33,4 @@ def test_table_lists_the_public_names():
     )
     public = {name for name in vars(jaxdyn.compile) if not name.startswith("_")}
     modules = {path.stem for path in Path(jaxdyn.compile.__file__).parent.glob("*.py")}
-    # For `jaxdyn.scale`, which compiles programs of kernels ahead of time.
-    assert listed - {"batch", "loops", "repair"} == public - modules - {"function_of", "glue_options"}
+    assert listed - {"batch", "known", "loops", "repair"} == public - modules

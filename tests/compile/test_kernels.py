@@ -21,7 +21,7 @@ from jax import lax
 from kernel_helpers import native, quick, refuse
 
 from jaxdyn import compile as backend
-from jaxdyn.compile import derive, evaluate, kernels, mode, objects, program, target, trace, trigonometry
+from jaxdyn.compile import derive, evaluate, kernels, known, mode, objects, program, target, trace, trigonometry
 from jaxdyn.compile.code import kernel_ir
 from jaxdyn.compile.expand import NotNumbers, expand
 from jaxdyn.compile.operations import as_operations
@@ -633,7 +633,7 @@ def test_a_function_is_traced_once():
     seen = []
 
     def times(power, tree, x):
-        seen.append([backend.is_concrete(leaf) for leaf in tree])
+        seen.append([known.is_concrete(leaf) for leaf in tree])
         return tree[0] * x**power + tree[1]
 
     known, x, y = (jnp.asarray(number, float) for number in (2.0, 3.0, 1.0))
@@ -729,7 +729,7 @@ def test_functions_are_compiled_once_for_known_numbers():
 
     @backend.entry_point
     def look(x):
-        seen.append(backend.is_concrete(x))
+        seen.append(known.is_concrete(x))
         return 2 * x
 
     assert float(look(1.0)) == float(look(2.0)) / 2 == 2.0
@@ -752,11 +752,11 @@ def test_along_gives_the_value_and_its_change():
 
 
 def test_what_is_known():
-    assert backend.is_known(1.0, np.ones(2), jnp.ones(2)) and not backend.is_tracing()
+    assert known.is_known(1.0, np.ones(2), jnp.ones(2)) and not known.is_tracing()
     seen = []
 
     def look(x):
-        inside = backend.is_known(1.0), backend.is_concrete(1.0), backend.is_concrete(x), backend.is_tracing()
+        inside = known.is_known(1.0), known.is_concrete(1.0), known.is_concrete(x), known.is_tracing()
         seen.append((*inside, mode.is_expanding()))
         return x
 

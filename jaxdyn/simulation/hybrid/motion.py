@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdyn.compile import kernel, partition_tracers
+from jaxdyn.compile import kernel
+from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics.kinematics import frame_pose

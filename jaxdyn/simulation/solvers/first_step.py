@@ -5,7 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.compile import stop_gradient
+from jaxdyn.compile.known import stop_gradient
 
 
 class Adaptive(diffrax.PIDController):
