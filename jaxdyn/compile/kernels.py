@@ -193,11 +193,16 @@ def evaluate(function: Callable, tree, *args, static: tuple = (), is_input: bool
     leaves = [x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) for x in leaves]
     if mode.current() != "plain" and target is not None:
         shapes = tuple((x.shape, x.dtype) for x in leaves)
-        traced = trace_program(function, static, known, len(inputs), structure, shapes)
+        # With the arguments of `_bind`, so that both share one trace.
+        traced = trace_program(function, static, known, len(inputs), structure, shapes, flags="report")
         if not isinstance(traced, str):
             try:
                 # The native code is called without XLA, as a call through XLA would be staged into the trace around it.
-                return jax.tree.unflatten(traced[1], target.call(traced[0], leaves))
+                results = target.call(traced[0], leaves)
+                if not traced[0].reports_validity:
+                    return jax.tree.unflatten(traced[1], results)
+                if results.pop():
+                    return jax.tree.unflatten(traced[1], results)
             except Exception as error:
                 if not isinstance(error, target.Unsupported) and not jax_adapter.forgive(error):
                     raise

@@ -160,7 +160,7 @@ def _tangent_of_transpose(program, linear, given, backwards, avals, moving) -> P
             total = by_cotangents if total is None else [a + b for a, b in zip(total, by_cotangents, strict=True)]
         return total
 
-    return tangent_program(change, avals, moving, flags="refuse", is_safe=False)
+    return tangent_program(change, avals, moving, flags="refuse")
 
 
 def _transpose(cotangents, *operands, program, rows):

@@ -48,15 +48,13 @@ def program_of(
 def trace_program(function, static, known: Known, count, structure, shapes, tangent=None, most=mode.MAX_OPERATIONS,
                   calls=False, flags="refuse"):  # fmt: skip
     """The program and the structure of its results, or the reason why there is none; `count`: traced leaves of the tree."""
-    # A trace depends on two settings that are no arguments: they are part of the key under which the program is kept.
-    settings = mode.is_rank_safe(), jax.config.read("jax_enable_x64")
-    return _trace_program(function, static, known, count, structure, shapes, tangent, most, calls, flags, *settings)
+    # A trace depends on this setting too, which so is a part of the key under which the program is kept.
+    has_x64 = jax.config.read("jax_enable_x64")
+    return _trace_program(function, static, known, count, structure, shapes, tangent, most, calls, flags, has_x64)
 
 
 @functools.lru_cache(maxsize=1024)
-def _trace_program(
-    function, static, known: Known, count, structure, shapes, tangent, most, calls, flags, is_safe, has_x64
-):
+def _trace_program(function, static, known: Known, count, structure, shapes, tangent, most, calls, flags, has_x64):
     del has_x64  # part of the key alone
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
     flat = function_of_leaves(function, static, known, count, structure)
@@ -73,9 +71,9 @@ def _trace_program(
         return str(error)
     if tangent is not None:
         rule = functools.partial(tangent, *static)
-        program.derivative = _derivative_by_rule(rule, known, count, structure, avals, flags, is_safe)
+        program.derivative = _derivative_by_rule(rule, known, count, structure, avals, flags)
     elif has_rules:
-        program.derivative = _derivative_by_jax(flat, avals, flags, is_safe)
+        program.derivative = _derivative_by_jax(flat, avals, flags)
     program.fallback = _fallback(function, static, known, count, structure, avals, program.reports_validity)
     return program, jax.tree.structure(out)
 
@@ -110,8 +108,9 @@ def _fallback(function, static, known: Known, count: int, structure, avals, repo
         leaves = [x.reshape(aval.shape) for x, aval in zip(flat, avals, strict=True)]
         with mode.compilation("plain"):
             results = function(*static, known(leaves[:count]), *jax.tree.unflatten(structure, leaves[count:]))
-        # Operations of JAX have branches, so that no sample is flagged.
-        return [*(jnp.reshape(x, -1) for x in jax.tree.leaves(results)), *([jnp.ones(1, bool)] if reports else [])]
+        # Marks of samples that are not valid are those of a program alone. Without them every sample counts as not valid, and
+        # is computed by the fallback of `kernel`.
+        return [*(jnp.reshape(x, -1) for x in jax.tree.leaves(results)), *([jnp.zeros(1, bool)] if reports else [])]
 
     return one
 
@@ -119,7 +118,7 @@ def _fallback(function, static, known: Known, count: int, structure, avals, repo
 # --- derivatives ---
 
 
-def _derivative_by_rule(tangent: Callable, known: Known, count: int, structure, avals, flags: str, is_safe: bool):
+def _derivative_by_rule(tangent: Callable, known: Known, count: int, structure, avals, flags: str):
     """The derivative of a program by a rule that is given by hand."""
 
     def derivative(moving):
@@ -133,12 +132,12 @@ def _derivative_by_rule(tangent: Callable, known: Known, count: int, structure, 
             args = jax.tree.unflatten(structure, primal[count:])
             return tangent(known(primal[:count]), *args, [*tree_steps, *steps[count:]])
 
-        return tangent_program(change, avals, moving, flags, is_safe)
+        return tangent_program(change, avals, moving, flags)
 
     return derivative
 
 
-def _derivative_by_jax(flat: Callable, avals, flags: str, is_safe: bool):
+def _derivative_by_jax(flat: Callable, avals, flags: str):
     """The derivative of a program by `jax.jvp`, which asks functions within the function for their own rules."""
 
     def derivative(moving):
@@ -154,24 +153,24 @@ def _derivative_by_jax(flat: Callable, avals, flags: str, is_safe: bool):
 
             return jax.jvp(at_values, [primal[i] for i in places], list(steps))[1]
 
-        return tangent_program(change, avals, moving, flags, is_safe)
+        return tangent_program(change, avals, moving, flags)
 
     return derivative
 
 
-def tangent_program(change: Callable, avals, moving, flags: str, is_safe: bool) -> Program:
+def tangent_program(change: Callable, avals, moving, flags: str) -> Program:
     """The program of a tangent; NaN at flagged samples, which the program of the values reports.
 
     A rule may call functions with rules of their own, itself included, and then the tangent is differentiated by JAX again:
     its numbers would give the derivative of how a value is computed, where the rule says another one.
     """
     avals = [*avals, *(aval for aval, varies in zip(avals, moving, strict=True) if varies)]
-    with mode.expanding(), mode.rank_safe(is_safe):
+    with mode.expanding():
         closed = jax.make_jaxpr(change)(*avals)
     # A tangent has two to four times the operations of the values. The bound is there for those that explode.
     program, has_rules = expand(
         closed, 10 * mode.MAX_OPERATIONS, "change", flags="refuse" if flags == "refuse" else "ignore"
     )
     if has_rules:
-        program.derivative = _derivative_by_jax(change, avals, flags, is_safe)
+        program.derivative = _derivative_by_jax(change, avals, flags)
     return program

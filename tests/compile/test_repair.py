@@ -159,6 +159,7 @@ def test_invalid_samples_of_a_kernel():
     slope = jax.jit(jax.vmap(jax.grad(lambda x: backend.kernel(root, fallback=fallback)((), x)[0])))
     np.testing.assert_array_equal(slope(x), [-1.0, -1.0])  # of the fallback for all, as one sample needs it
     np.testing.assert_array_equal(slope(x[1:]), [0.25])
+    assert [float(backend.evaluate(root, (), y)[0]) for y in x] == [0.5, 2.0]
     # A sample whose results are not needed is left as it is.
     function = backend.kernel(root, fallback=fallback, derivative=False)
     needed = jax.jit(jax.vmap(lambda x, where: function((), x, where=where)))(x, jnp.array([False, True]))
