@@ -18,7 +18,7 @@ from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bind_known, convert_known, empty_reduction, evaluate_known
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
-from jaxdyn.compile.number import Number, as_objects, objects
+from jaxdyn.compile.number import Number, as_objects, is_number, objects
 from jaxdyn.compile.program import Array, NotNumbers, Program, kind_or_refuse
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
 
@@ -185,6 +185,8 @@ class _Expansion:
     def _one_less(self, x):
         """1 - x^2; the square where its rounding is small, else the product that is exact near one."""
         g = self.graph
+        if not is_number(x):  # a known entry of an array with others
+            return (1.0 + x) * (1.0 - x)
         # 1 - x x loses half of the digits near one, and (1 + x)(1 - x) is exact there.
         is_small = g.compare("lt", g.function("abs", x), 0.5)
         return g.select(is_small, g.mul(g.add(1.0, x), g.sub(1.0, x)), g.sub(1.0, g.mul(x, x)), x.kind)

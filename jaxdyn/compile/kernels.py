@@ -6,7 +6,7 @@ what a call means: the kernel, its fallback, or, inside another kernel, the func
 
 import functools
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar, overload
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +19,14 @@ from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.repair import compute_where, rank_safe, repair
 from jaxdyn.compile.trace import inline_call, name_of, program_of, trace_program
 
-P, T = ParamSpec("P"), TypeVar("T")
 
-
-@overload
-def kernel(function: Callable[P, T], *, static: int = 0, fallback: Callable | None = None,
-           derivative: Callable | str | bool | None = None) -> Callable[P, T]: ...  # fmt: skip
-@overload
-def kernel(*, static: int = 0, fallback: Callable | None = None,
-           derivative: Callable | str | bool | None = None) -> Callable[[Callable[P, T]], Callable[P, T]]: ...  # fmt: skip
-def kernel(function=None, *, static=0, fallback=None, derivative=None) -> Any:
+def kernel(
+    function: Callable | None = None,
+    *,
+    static: int = 0,
+    fallback: Callable | None = None,
+    derivative: Callable | str | bool | None = None,
+) -> Any:
     """Compute a function of one sample by a native kernel; a decorator.
 
     The function is pure, written with arrays, and called as `function(*static, tree, *args)`: first as many hashable arguments

@@ -636,11 +636,11 @@ def test_a_function_is_traced_once():
         seen.append([known.is_concrete(leaf) for leaf in tree])
         return tree[0] * x**power + tree[1]
 
-    known, x, y = (jnp.asarray(number, float) for number in (2.0, 3.0, 1.0))
+    two, x, y = (jnp.asarray(number, float) for number in (2.0, 3.0, 1.0))
 
     def program(x, y):
-        first = backend.kernel(times, static=1)(3, (known, y), x)
-        return first + backend.kernel(times, static=1)(3, (known, y), 2 * x)
+        first = backend.kernel(times, static=1)(3, (two, y), x)
+        return first + backend.kernel(times, static=1)(3, (two, y), 2 * x)
 
     assert float(jax.jit(program)(x, y)) == 2 * 27 + 1 + 2 * 216 + 1
     assert float(jax.jit(jax.grad(program))(x, y)) == 6 * 9 + 12 * 36
@@ -648,8 +648,8 @@ def test_a_function_is_traced_once():
     assert jax.jit(jax.vmap(program, (0, None)))(jnp.arange(3.0), y).tolist() == [2.0, 20.0, 146.0]
     assert seen == [[True, False]]
     # Another static argument, or another leaf though of the same value, is another program.
-    assert float(jax.jit(lambda x: backend.kernel(times, static=1)(2, (known, x), x))(3.0)) == 21
-    assert float(jax.jit(lambda x: backend.kernel(times, static=1)(2, (known + 0, x), x))(3.0)) == 21
+    assert float(jax.jit(lambda x: backend.kernel(times, static=1)(2, (two, x), x))(3.0)) == 21
+    assert float(jax.jit(lambda x: backend.kernel(times, static=1)(2, (two + 0, x), x))(3.0)) == 21
     assert len(seen) == 3
 
 

@@ -210,18 +210,20 @@ def _at_once(plan: Plan, args, t0, t1, start, kept, ready):
         return kernel(_first, static=1)(plan, args, t0, t1, y)
 
     first = lax.cond(ready, lambda y: dt * kept, anew, start)
-    return _step_or_stages(plan, args, t0, t1, start, first, kept, ready)
+    # Projections report success, so that the code is no result of the kernel: batched, it would meet the unbatched one of the
+    # rule in `step`, which JAX 0.10 cannot lower.
+    return *_step_or_stages(plan, args, t0, t1, start, first, kept, ready), diffrax.RESULTS.successful
 
 
 def _stages(plan: Plan, args, t0, t1, start, first, kept, ready):
     del first  # the loop over the stages computes it
-    return _in_turn(plan, args, t0, t1, start, kept, ready)
+    return _in_turn(plan, args, t0, t1, start, kept, ready)[:-1]
 
 
 @kernel(static=1, fallback=_stages, derivative=False)
 def _step_or_stages(plan: Plan, args, t0, t1, start, first, kept, ready):
     del kept, ready
-    return *_whole(plan, args, t0, t1, start, first), diffrax.RESULTS.successful
+    return _whole(plan, args, t0, t1, start, first)
 
 
 class Step(NamedTuple):
