@@ -66,29 +66,8 @@ def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
         # (dx - y dz)/z with one reciprocal, which other quotients by z share: a division costs as much as ten products.
         inverse = g.div(1.0, x[1])
         return g.mul(g.sub(d[0], g.mul(value, d[1])), inverse)
-    if op == "select":
-        return g.select(x[0], d[1], d[2], kind)
-    # Ties are decided as JAX decides them: a maximum of two gives each half, one of several gives all that are largest the same
-    # share, and a number on a bound of its range does not move. Nothing moves a maximum that is not a number.
-    if op in ("max", "min"):
-        words = ("gt", "lt") if op == "max" else ("lt", "gt")
-        first, second = (g.compare(word, x[0], x[1]) for word in words)
-        chosen = g.select(first, g.select(second, 0.0, d[1], kind), d[0], kind)
-        return g.select(g.compare("eq", x[0], x[1]), chosen, g.mul(0.5, g.add(d[0], d[1])), kind)
-    if op in ("reduce_max", "reduce_min"):
-        # JAX's rule too: the mean over all entries that equal the result. A chain of maxima would halve it at each tie.
-        hits = [g.compare("eq", entry, value) for entry in x]
-        total = functools.reduce(g.add, [g.select(hit, 0.0, step, kind) for hit, step in zip(hits, d, strict=True)])
-        return g.div(total, functools.reduce(g.add, [g.convert(hit, kind) for hit in hits]))
-    if op == "clamp":
-        # Strict comparisons, as in JAX: on a bound neither the number nor the bound moves the result.
-        low, inner, high = x
-        is_below = g.both(g.compare("gt", low, inner), g.compare("lt", low, high))
-        is_inside = g.both(g.compare("gt", inner, low), g.compare("lt", inner, high))
-        flags = is_below, is_inside, g.compare("lt", high, inner)
-        return functools.reduce(g.add, [g.select(flag, 0.0, step, kind) for flag, step in zip(flags, d, strict=True)])
-    if op == "abs":
-        return g.select(g.compare("ge", x[0], 0.0), g.neg(d[0]), d[0], kind)
+    if op in _CHOICES:
+        return _choice_change(g, op, kind, value, x, d)
     if op == "convert":
         return g.convert(d[0], kind)
     if op in _PARTIAL:
@@ -115,6 +94,36 @@ def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
         )
         return g.sub(d[0], g.mul(whole, d[1]))
     return 0.0  # floor, ceil, round, sign, stop_gradient
+
+
+_CHOICES = "select", "max", "min", "reduce_max", "reduce_min", "clamp", "abs"
+
+
+def _choice_change(g: Graph, op: str, kind: str, value, x: list, d: list):
+    """`_change` of operations that take one of their operands."""
+    if op == "select":
+        return g.select(x[0], d[1], d[2], kind)
+    # Ties are decided as JAX decides them: a maximum of two gives each half, one of several gives all that are largest the same
+    # share, and a number on a bound of its range does not move. Nothing moves a maximum that is not a number.
+    if op in ("max", "min"):
+        words = ("gt", "lt") if op == "max" else ("lt", "gt")
+        first, second = (g.compare(word, x[0], x[1]) for word in words)
+        chosen = g.select(first, g.select(second, 0.0, d[1], kind), d[0], kind)
+        return g.select(g.compare("eq", x[0], x[1]), chosen, g.mul(0.5, g.add(d[0], d[1])), kind)
+    if op in ("reduce_max", "reduce_min"):
+        # JAX's rule too: the mean over all entries that equal the result. A chain of maxima would halve it at each tie.
+        hits = [g.compare("eq", entry, value) for entry in x]
+        total = functools.reduce(g.add, [g.select(hit, 0.0, step, kind) for hit, step in zip(hits, d, strict=True)])
+        return g.div(total, functools.reduce(g.add, [g.convert(hit, kind) for hit in hits]))
+    if op == "clamp":
+        # Strict comparisons, as in JAX: on a bound neither the number nor the bound moves the result.
+        low, inner, high = x
+        is_below = g.both(g.compare("gt", low, inner), g.compare("lt", low, high))
+        is_inside = g.both(g.compare("gt", inner, low), g.compare("lt", inner, high))
+        flags = is_below, is_inside, g.compare("lt", high, inner)
+        return functools.reduce(g.add, [g.select(flag, 0.0, step, kind) for flag, step in zip(flags, d, strict=True)])
+    # "abs": at zero JAX takes the derivative of x.
+    return g.select(g.compare("ge", x[0], 0.0), g.neg(d[0]), d[0], kind)
 
 
 _PARTIAL: dict[str, Callable[..., Any]] = {

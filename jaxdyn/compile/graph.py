@@ -40,7 +40,7 @@ class Graph:
     def __init__(self, most: int = 10**9):
         self.most, self.most_made = most, _MADE_FOR_ONE_KEPT * most
         self.numbers: list[Number] = []
-        # Keys are operations with their operands, by identity: equal numbers are made once, whoever asks for them.
+        # Keys are operations with their operands, by identity: equal numbers are made once.
         self.shared: dict[tuple, Number] = {}
         self.subprograms: list[Program] = []
 

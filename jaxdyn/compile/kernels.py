@@ -67,17 +67,13 @@ def kernel(
 
 def _call(function, static, tree, args, fallback, rule, is_differentiated: bool, where):
     # Derivatives of a subprogram's call would be those of its numbers, written out: calls pay where nobody differentiates.
-    results = _by_kernel(function, static, tree, args, fallback is not None, tangent=rule, calls=not is_differentiated)
+    results = _by_kernel(function, static, tree, args, fallback, tangent=rule, calls=not is_differentiated)
+    again = function if fallback is None else fallback
     if results is None:
-        return (function if fallback is None else fallback)(*static, tree, *args)
+        return again(*static, tree, *args)
     values, valid = results
     if valid is True:
         return values
-    again = function if fallback is None else fallback
-    if mode.is_rank_safe():
-        # The program was traced for the fast path, and is found in the cache: only its answer is used here.
-        # This is a part of another function's fallback: the fast path has failed for the sample, and may fail it again.
-        return again(*static, tree, *args)
     traced, known = partition_tracers(tree)
 
     def careful(traced, args):
@@ -88,12 +84,12 @@ def _call(function, static, tree, args, fallback, rule, is_differentiated: bool,
         return compute_where(jnp.logical_not(valid), careful, values, (traced, args))
 
     def fast(traced, args):
-        results = _by_kernel(function, static, known(traced), args, True, tangent=rule)
+        results = _by_kernel(function, static, known(traced), args, fallback, tangent=rule)
         assert results is not None, "the function that was a kernel for the values is none for the derivative"
         return _split_floats(results[0])[0]
 
-    # Under reverse mode JAX stores what a branch needs for its derivative whether the branch is taken or not. This one
-    # hardly ever is, so that its intermediates are computed again instead.
+    # In reverse mode JAX stores the residuals of a branch whether it is taken or not. This one hardly ever is, so that its
+    # intermediates are computed again instead.
     safe = jax.checkpoint(lambda *given: _split_floats(rank_safe(careful)(*given)), prevent_cse=False)
     differentiable, rest = _split_floats(values)
     floats, rest = repair(jnp.logical_not(valid), safe, fast, (differentiable, rest), (traced, args))
@@ -112,7 +108,7 @@ def _split_floats(tree) -> tuple[list, list]:
     return [x for x in leaves if _is_float(x)], [x for x in leaves if not _is_float(x)]
 
 
-def _by_kernel(function, static, tree, args, has_fallback: bool, **how) -> tuple[Any, Any] | None:
+def _by_kernel(function, static, tree, args, fallback: Callable | None, **how) -> tuple[Any, Any] | None:
     """The function's results by its kernel, and whether they are valid; None where there is no kernel."""
     if target is None:
         mode.say_once("llvmlite is not installed, so functions run on JAX's own operations (pip install llvmlite)")
@@ -123,23 +119,28 @@ def _by_kernel(function, static, tree, args, has_fallback: bool, **how) -> tuple
         results = _bind(function, static, tree, args, **how)
     except Exception as error:
         # On a version of JAX that the tests have seen, an error is the function's own or a fault of ours. On another one it
-        # may be that JAX has changed. Then the function runs without a kernel, where its own errors are raised again.
-        if jax_adapter.is_version_known() or not jax_adapter.forgive(error):
+        # may be that JAX has changed. The function's own errors are raised once more, before anything is forgiven.
+        if jax_adapter.is_version_known():
             raise
-        return None
+        values = (function if fallback is None else fallback)(*static, tree, *args)
+        jax_adapter.forgive(error)
+        return values, True
     if isinstance(results, str):
-        if not has_fallback:
+        if fallback is None:
             mode.say_once(f"{name_of(function)} runs on JAX's own operations: {results}")
         return None
     return results
 
 
-def _bind(function, static, tree, args, **how) -> tuple[Any, Any] | str:
-    """The results of the kernel and whether they are valid, or the reason why there is no kernel."""
+def _bind(function, static, tree, args, **how) -> tuple[Any, Any] | str | None:
+    """The results of the kernel and whether they are valid, or the reason why there is no kernel, or None."""
     leaves, traced = program_of(function, static, tree, args, flags="report", **how)
     if isinstance(traced, str):
         return traced
     program, out_structure = traced
+    if program.reports_validity and mode.is_rank_safe():
+        # A part of another function's fallback: the fast path has failed for the sample, and may fail it here again.
+        return None
     # A kernel takes flat arrays. Under a trace reshapes are free.
     changes_shapes = any(x.ndim != 1 for x in leaves) or any(len(x.shape) != 1 for x in program.outputs)
     results = (_call_under_jit if changes_shapes and is_known(leaves) else call_program)(program, leaves)
@@ -150,7 +151,7 @@ def _bind(function, static, tree, args, **how) -> tuple[Any, Any] | str:
 
 def _call_own_program(function, static, tree, args):
     """A program that is not merged into the one around it; samples that it cannot compute are marked there."""
-    results = _by_kernel(function, static, tree, args, False)
+    results = _by_kernel(function, static, tree, args, None)
     if results is None:
         return function(*static, tree, *args)
     values, valid = results
