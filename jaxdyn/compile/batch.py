@@ -7,7 +7,7 @@ for the branch is the caller's affair.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jax.custom_batching import custom_vmap
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.compile.mode import in_rows
 
+T = TypeVar("T")
 # Rows that are computed together. It bounds the memory for operands and results of kernels.
 AT_ONCE = 16
 
@@ -42,7 +43,7 @@ def cond(flag, if_true: Callable, if_false: Callable, *operands) -> Any:
     return lax.cond(any_sample(flag), if_true, if_false, *operands)
 
 
-def while_loop(goes_on: Callable, body: Callable, carry) -> Any:
+def while_loop(goes_on: Callable[[T], Any], body: Callable[[T], T], carry: T) -> T:
     """`lax.while_loop` that runs until `goes_on(carry)` holds for no sample of the batch.
 
     `body` leaves a sample unchanged that has ended before.

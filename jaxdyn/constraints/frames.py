@@ -179,7 +179,8 @@ def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
 # A program that asks many times, as steps with projections do, traces each of these once. A nested `jit` would hide what is
 # known.
 # Outside of kernels they are traced once, for all calls of all constraints of a scene.
-_positions, _motions = (variant(inside)(eqx.filter_jit(inside)) for inside in (_positions_of, _motions_of))
+_positions = variant(_positions_of)(eqx.filter_jit(_positions_of))
+_motions = variant(_motions_of)(eqx.filter_jit(_motions_of))
 
 
 def relative_poses(members, system, q):
