@@ -24,6 +24,7 @@ def polynomial(expansion, params, args, eqn):
 
 def integer_pow(expansion, params, args, eqn):
     """Powers by repeated squares."""
+    # Integers wrap in NumPy's power as in XLA; a negative exponent is of floats alone.
     if args[0].dtype.kind != "O":
         return [np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)]
     one = as_kind(1, kind_or_refuse(eqn.outvars[0].aval.dtype))
@@ -117,6 +118,7 @@ def triangular_solve(expansion, params, args, eqn):
     a, b = (as_objects(x) for x in args)
     if params["transpose_a"]:
         a = np.swapaxes(a, -1, -2)
+    # The transpose of a lower matrix is an upper one.
     lower = params["lower"] != params["transpose_a"]
     if not params["left_side"]:  # x a = b is a^T x^T = b^T
         a, b, lower = np.swapaxes(a, -1, -2), np.swapaxes(b, -1, -2), not lower

@@ -101,6 +101,7 @@ class Body:
         if any(type(x) is Constant or operations[x].op != "input" for x in entries) or not entries:
             return None
         place = operations[entries[0]].args[0]
+        # Only a whole input in its order is passed on as it is; a slice of one would need another layout for W samples.
         whole = [(place, k) for k in range(self.program.inputs[place].size)]
         same = whole == [operations[x].args for x in entries] and self.program.inputs[place].dtype == array.dtype
         return self.array(place) if same else None
@@ -192,6 +193,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         return None if width > 1 else rows[place][0] if place in rows else f"%a{place}"
 
     body = Body(e, program, load, array)
+    # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
     if calls_itself(program, width):
         _write_call(e, program, [str(array(i)) for i in range(len(arrays))])
     else:

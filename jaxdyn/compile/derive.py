@@ -163,6 +163,7 @@ def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ..
     fixed = [array for array, varies in zip(program.inputs, linear, strict=True) if not varies]
     arrays = [*fixed, *(array for array, is_given in zip(program.outputs, given, strict=True) if is_given)]
     entries = [graph.inputs(place, array) for place, array in enumerate(arrays)]
+    # Fixed inputs come first, then the cotangents, as JAX's transpose rule passes them.
     operands = iter(entries[: len(fixed)])
     # The values of what is linear are not needed, and not made: their places hold None.
     values = _values_of_constants(graph, program, [None if varies else next(operands) for varies in linear])

@@ -199,6 +199,7 @@ class _Expansion:
         kind = kind_or_refuse(eqn.outvars[0].aval.dtype)
         for flag in flags:
             self.flagged = self.graph.either(self.flagged, flag)
+        # NaN also in the program: a result that a caller takes without asking for validity must not look like a number.
         chosen = [self.graph.select(flag, x, math.nan, kind) for flag, x in zip(flags, entries, strict=True)]
         return [objects(chosen, args[1].shape)]
 
@@ -263,6 +264,7 @@ class _Expansion:
             raise NotNumbers(inner.name)
         shaped = [as_objects(x).reshape(array.shape) for x, array in zip(args, inner.inputs, strict=True)]
         self.has_rules |= inner.derivative is not None
+        # A kernel within this one: called where it is long, else written out.
         if self.calls and inner.cost >= MIN_SUBPROGRAM_OPERATIONS and not inner.subprograms:
             return [x.ravel() for x in self.graph.call(inner, shaped)]
         return [x.ravel() for x in self.graph.replay(inner, shaped)[1]]

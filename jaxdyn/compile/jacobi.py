@@ -249,6 +249,7 @@ def pseudo_inverse_by_rotations(matrix: jax.Array, tolerance: float) -> jax.Arra
     It has no derivative: put it under a rule that gives one.
     """
     program = pseudo_inverse_program(*matrix.shape, matrix.dtype, float(tolerance))
+    # A kernel even for one matrix: LAPACK called in a batched program of XLA can wait for its own threads for ever.
     if mode.current() == "plain" or target is None:
         return program.as_operations(matrix.reshape(-1))[0].reshape(matrix.shape[::-1])
     return kernel_p.bind(matrix.reshape(-1), program=program, rows=0)[0].reshape(matrix.shape[::-1])

@@ -121,10 +121,12 @@ def _run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[
         row = expanded[0]
     # The tree is split once more, as `program_of` does: the fallback needs its known leaves with the traced ones put back.
     traced, known = partition_tracers(tree)
+    # `read` is an argument of an iteration's program, and no operand of the loop, which loads it from the tables.
     loop = _loop(task, program, row, structure, known, len(traced), _Form.of((constants, given, carry)))
     leaves = leaves[: len(leaves) - len(read)]
     after = jax.tree.leaves(carry)[len(jax.tree.leaves(carry.state)) :]
     flat = vary_alike([x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)])
+    # The loop takes the place of a program in the primitive, which so batches it. It has no derivative.
     results = kernel_p.bind(*flat, program=loop, rows=0)
     return _Form.of(carry)(results), loop.always_ends
 

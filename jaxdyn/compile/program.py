@@ -159,6 +159,7 @@ def as_kind(value, kind: str):
 
     Beyond the range of an integer a float becomes the nearest end of it, and what is not a number zero; a longer integer is cut.
     """
+    # Python's own float and bool for the two most frequent kinds, which compute twice as fast as NumPy's scalars.
     if kind == "f8":
         return float(value)
     if kind == "b1":

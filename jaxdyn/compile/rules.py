@@ -54,6 +54,7 @@ def _batch_first(tree):
 def value_and_jvp(function: Callable, args: tuple, steps):
     """function(*args), and its change for `steps` in the leaves of args, None where one does not move; None if none does."""
     base, structure = jax.tree.flatten(args)
+    # Only leaves that change are arguments of `jax.jvp`: the others stay constants, whose zeros are seen.
     moving = [i for i, step in enumerate(steps) if step is not None]
     if not moving:
         return function(*args), None

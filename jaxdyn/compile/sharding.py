@@ -51,6 +51,7 @@ def attributes(avals: Sequence, results: Sequence) -> dict | None:
         return None
     sizes = list(lead)
 
+    # The entries of each array are an axis of its own in the rule, so that nothing is ever divided along them.
     def axes(x):
         sizes.append(x.shape[-1])  # an axis of its own, which is in no other array
         return [*range(len(lead)), len(sizes) - 1] if x.ndim > 1 else [len(sizes) - 1]

@@ -44,6 +44,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     arrays = [Array((len(entries),), dtype_of(kind)) for kind, entries in zip(kinds, by_kind, strict=True)]
 
     places = [i for i, same in enumerate(uniform) if same]
+    # Operations keep their order in both programs, and are numbered anew.
     first = _Renumbered()
     for i, (op, kind, args) in enumerate(program.operations):
         if is_shared[i]:

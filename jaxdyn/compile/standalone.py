@@ -92,6 +92,7 @@ def scalar_program(function: Callable, examples: Sequence[Any], name: str) -> tu
         return function(*args)
 
     call.__qualname__ = name
+    # Validity is reported always: the exported function has a status, whether samples can be invalid or not.
     _, made = program_of(call, (), (), tuple(examples), most=MAX_OPERATIONS, flags="report_always")
     if isinstance(made, str):
         raise ValueError(
@@ -122,6 +123,7 @@ def jacobian_program(program: Program, name: str) -> Program:
             columns = graph.replay(change, [*primal, *steps])[1]
             for row, column in zip(blocks, columns, strict=True):
                 row[place][:, entry] = column.ravel()
+    # Replayed into the same graph: values that the derivatives need too are there already.
     flag = graph.replay(program, primal)[1][-1]
     arrays = [Array(block.shape, y.dtype) for y, row in zip(outputs, blocks, strict=True) for block in row]
     entries = [block for row in blocks for block in row]

@@ -110,6 +110,7 @@ def width_of(program, samples: int | None) -> int:
     """Samples that a kernel computes in one vector: one for a single sample, else as many as a register holds."""
     if not isinstance(program, Program):
         return program.lanes(samples)
+    # Twice as many samples in float32, but only where no float64 is passed: vectors of both would have different lengths.
     kinds = {kind_of(array.dtype) for array in (*program.inputs, *program.outputs)} & set(FLOATS)
     return 1 if samples == 1 else vector_bytes() // (4 if kinds == {"f4"} else 8)
 
@@ -205,6 +206,7 @@ _PREPARE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint64)(_prepare)
 
 def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     """The results of a program for one sample, by its kernel and without XLA; `arrays` as its inputs."""
+    # One thread and one sample: the handler, which shares a batch among XLA's threads, is not needed.
     number = kernel(program, 1, [False] * len(program.inputs))
     given = [np.ascontiguousarray(x, array.dtype) for x, array in zip(arrays, program.inputs, strict=True)]
     results = [np.empty(array.shape, array.dtype) for array in program.outputs]
