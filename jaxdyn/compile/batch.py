@@ -43,7 +43,7 @@ def cond(flag, if_true: Callable, if_false: Callable, *operands) -> Any:
     return lax.cond(any_sample(flag), if_true, if_false, *operands)
 
 
-def while_loop(goes_on: Callable[[T], Any], body: Callable[[T], T], carry: T) -> T:
+def while_loop(goes_on: Callable[[T], object], body: Callable[[T], T], carry: T) -> T:
     """`lax.while_loop` that runs until `goes_on(carry)` holds for no sample of the batch.
 
     `body` leaves a sample unchanged that has ended before.

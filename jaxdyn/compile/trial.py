@@ -39,7 +39,7 @@ def run_trial() -> None:
     """**Raises:** whatever goes wrong, and ArithmeticError where numbers differ."""
     if target is None:
         return
-    # Registered first: a handler that XLA refuses is the most likely thing to have changed.
+    # Before anything is traced: XLA may refuse the handler.
     target.register()
     x, y = jnp.arange(12.0).reshape(4, 3), jnp.arange(3.0)
     computed, wanted = (_transforms(f, x, y) for f in (_kernel, functools.partial(_sample, None)))
