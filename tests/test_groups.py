@@ -14,7 +14,7 @@ import pytest
 from xla_options import QUICK
 
 from jaxdyn import se2, se3, so3
-from jaxdyn.compile.jax_adapter import known_options
+from jaxdyn.compile.jax_adapter import select_options
 from jaxdyn.lie import series as _series
 
 GROUPS = {"so3": so3, "se3": se3, "se2": se2}
@@ -30,7 +30,7 @@ LOG_ANGLES = [theta for theta in ANGLES if theta <= PI]
 AXES = [(2, -3, 6), (6, 2, -3), (-2, 6, 3), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1)]
 
 # These tests compile much and run little, so the compiler is told to hurry.
-HURRY = QUICK | known_options({"xla_llvm_disable_expensive_passes": True})
+HURRY = QUICK | select_options({"xla_llvm_disable_expensive_passes": True})
 jit = functools.partial(jax.jit, compiler_options=HURRY)
 
 

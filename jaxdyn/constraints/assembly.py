@@ -10,7 +10,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled, compute, constant, is_concrete, is_staged, run
+from jaxdyn.compile import entry_point, evaluate, kernel
+from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.closing import follow_path, nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
@@ -195,15 +196,15 @@ def _selection(scene: Scene, q, t, rank_tol, is_rounded) -> Selection:
     return select_rows(scene, q, t, rank_tol, is_rounded)
 
 
-@compiled
+@entry_point
 def _follow_path(scene, q, t, rank_tol, steps):
     if not holonomic_rows(layout(scene)).size:
         return q, jnp.asarray(False)
-    scene, q, t = constant((scene, q, t))
+    scene, q, t = stop_gradient((scene, q, t))
     return follow_path(scene, q, t, tolerance(rank_tol, q) if rank_tol is not None else surely_apart(q), steps)
 
 
-@compiled
+@entry_point
 def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     """The assembly from the end of a path, which starts at the guess; `scene`: see `_assemble`."""
     kept, rounding, _ = selection
@@ -268,7 +269,7 @@ def _with_velocity(scene, q, v, t, rank_tol):
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
     """Largest |phi| (m or rad) and |A v - b| (m/s or rad/s) of the state q (nq,), v (nv,) at t (s): (2,)."""
-    return run(_largest_residuals, Scene(scene.system, scene.constraints), q, v, jnp.asarray(t, q.dtype))
+    return kernel(_largest_residuals)(Scene(scene.system, scene.constraints), q, v, jnp.asarray(t, q.dtype))
 
 
 def _largest_residuals(scene: Scene, q, v, t):
@@ -310,9 +311,9 @@ def start_openness(scene: Scene, q, v, t, relative: float) -> float:
     """`openness` at a concrete state."""
     bare = Scene(scene.system, scene.constraints)
     # By the kernel that the program of a run that begins here has.
-    return float(compute(largest_ratio, bare, q, v, t, static=(relative,), given=not is_staged()))
+    return float(evaluate(largest_ratio, bare, q, v, t, static=(relative,), is_input=not is_tracing()))
 
 
 def largest_residuals(scene: Scene, q, v, t) -> np.ndarray:
     """Largest residuals (2,), of positions and velocities, at a concrete state."""
-    return compute(_largest_residuals, Scene(scene.system, scene.constraints), q, v, t)
+    return evaluate(_largest_residuals, Scene(scene.system, scene.constraints), q, v, t)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.dynamics import scans
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.tree import Model
@@ -55,6 +55,6 @@ def articulated_bodies(
     return _articulated_bodies(model, q, v, tau, external)
 
 
-@compiled
+@entry_point
 def _articulated_bodies(model: Model, q, v, tau, external) -> ArticulatedBodies:
     return ArticulatedBodies(*scans.articulated_bodies(model, q, v, tau, external))

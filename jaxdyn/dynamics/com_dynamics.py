@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.centroidal import com_jacobian
 from jaxdyn.dynamics.quantities import coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
@@ -80,7 +80,7 @@ def com_dynamics(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -
     return _com_dynamics(model, q, v)
 
 
-@compiled
+@entry_point
 def _com_dynamics(model: Model, q, v) -> ComDynamics:
     unit = jnp.eye(model.nv, dtype=q.dtype)[3:]
 

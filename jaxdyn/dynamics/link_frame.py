@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
@@ -157,7 +157,7 @@ def _base_vector(name: str, value: Any, q) -> Array | None:
     return value
 
 
-@compiled
+@entry_point
 def _matrices(model: Model, q, v, base_twist, base_twist_rate, tip: str | None) -> NewtonEulerMatrices:
     topology, n = model.topology, model.nb
     tip_selector = None if tip is None else _tip_selector(model, tip)

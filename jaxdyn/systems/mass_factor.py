@@ -16,7 +16,7 @@ from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled, is_expanding, run
+from jaxdyn.compile import entry_point, kernel, variant
 from jaxdyn.lie.so3 import _product
 
 # Rows of a matrix beyond which its factor is made by halves: operations of a kernel grow as the cube.
@@ -25,22 +25,26 @@ _MOST_IN_KERNEL = 32
 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower triangular L with L L^T = matrix, of which the lower triangle is read; NaN where it is not positive definite."""
-    n = matrix.shape[-1]
-    if n == 0:  # a model without moving bodies
+    if matrix.shape[-1] == 0:  # a model without moving bodies
         return matrix
-    if is_expanding():  # a program of numbers sees the zeros of the matrix where it is at hand
-        return _cholesky(None, matrix)
+    return _factor(None, matrix)
+
+
+def _cholesky(_, matrix):
+    return lax.linalg.cholesky(matrix, symmetrize_input=False)
+
+
+# Inside of a kernel a factor is written in its place, where the zeros of the matrix are known.
+@variant(_cholesky)
+def _factor(_, matrix):
+    n = matrix.shape[-1]
     if n <= _MOST_IN_KERNEL:
-        return run(_cholesky, None, matrix)
+        return kernel(_cholesky)(None, matrix)
     half = n // 2
     first = cholesky(matrix[:half, :half])
     below = solve_lower(first, matrix[half:, :half].T).T
     second = cholesky(matrix[half:, half:] - _product(below, below.T))
     return jnp.block([[first, jnp.zeros((half, n - half), matrix.dtype)], [below, second]])
-
-
-def _cholesky(_, matrix):
-    return lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
 def is_definite(matrix: Float[Array, "n n"], factor: Float[Array, "n n"]) -> Bool[Array, ""]:
@@ -62,11 +66,18 @@ def solve_lower(
     factor: Float[Array, "n n"], right: Float[Array, "n *k"], *, transposed: bool = False
 ) -> Float[Array, "n *k"]:
     """L^-1 right, or L^-T right."""
-    n = factor.shape[-1]
-    if n == 0:
+    if factor.shape[-1] == 0:
         return right
-    if is_expanding():
-        return _solve_lower(transposed, None, factor, right)
+    return _solve(transposed, None, factor, right)
+
+
+def _solve_lower(transposed: bool, _, factor, right):
+    return solve_triangular(factor, right, lower=True, trans=int(transposed))
+
+
+@variant(_solve_lower)
+def _solve(transposed: bool, _, factor, right):
+    n = factor.shape[-1]
     if n > _MOST_IN_KERNEL:
         half = n // 2
         first, below, second = factor[:half, :half], factor[half:, :half], factor[half:, half:]
@@ -79,11 +90,7 @@ def solve_lower(
         return jnp.concatenate([upper, lower])
     if right.ndim == 2 and right.size > _MOST_IN_KERNEL**2:  # one column at a time, as elements of a batch
         return jax.vmap(lambda column: solve_lower(factor, column, transposed=transposed), 1, 1)(right)
-    return run(_solve_lower, None, factor, right, static=(transposed,))
-
-
-def _solve_lower(transposed: bool, _, factor, right):
-    return solve_triangular(factor, right, lower=True, trans=int(transposed))
+    return kernel(_solve_lower, static=1)(transposed, None, factor, right)
 
 
 def solve_cholesky(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
@@ -91,7 +98,7 @@ def solve_cholesky(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> 
     return solve_lower(factor, solve_lower(factor, right), transposed=True)
 
 
-@compiled
+@entry_point
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """Solve matrix^-1 right by Cholesky factorisation; NaN where the matrix is not positive definite."""
     return solve_cholesky(cholesky(matrix), right)
