@@ -6,12 +6,9 @@ float32 numbers round, as they would in XLA.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from jaxdyn.compile.graph import Graph
 
 
 class Number:
@@ -20,7 +17,7 @@ class Number:
     # Tens of thousands are made for a robot: slots save a dictionary for each.
     __slots__ = ("args", "graph", "kind", "op")
 
-    def __init__(self, graph: "Graph", op: str, kind: str, args: tuple):
+    def __init__(self, graph: Any, op: str, kind: str, args: tuple):
         self.graph, self.op, self.kind, self.args = graph, op, kind, args
 
     def __add__(self, other):
