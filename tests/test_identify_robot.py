@@ -9,13 +9,13 @@ import pytest
 from jaxdyn import identify, inertia
 from jaxdyn.identify.condensed import block_slices, condensed_rows
 from jaxdyn.identify.jackknife import block_groups, jackknife
+from jaxdyn.identify.log_checks import check_log_content, check_rest
 from jaxdyn.identify.logs import as_measured
 from jaxdyn.identify.one_fit import eliminate
 from jaxdyn.identify.regression import condense, condense_model
 from jaxdyn.identify.robot_problem import huber_weights
 from jaxdyn.identify.selection import folds, helped
 from jaxdyn.identify.spectra import motion_band, vibration
-from jaxdyn.identify.suspicions import at_rest, suspicions
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
 from jaxdyn.identify.whiteness import stretches
 from jaxdyn.model.builder import ModelBuilder
@@ -384,14 +384,14 @@ def test_one_log_condenses_as_before(truth):
 # --- what looks wrong -------------------------------------------------------------------------------------------------
 
 
-def test_suspicions(truth):
+def test_log_checks(truth):
     model, names = arm(), ("a", "b")
     good = measured(model, motion(1), truth)
-    assert suspicions(model, good, names) == []
+    assert check_log_content(model, good, names) == []
 
     def changed(**signals):
         values = {name: getattr(good, name) for name in ("t", "q", "v", "a", "tau")} | signals
-        return suspicions(model, identify.Log(**values), names)
+        return check_log_content(model, identify.Log(**values), names)
 
     (line,) = changed(tau=good.tau / 150)
     assert line.startswith("torques of a, b are about 1/") and "gear ratios" in line
@@ -408,10 +408,11 @@ def test_an_error_at_rest_is_named():
     v = np.where(t > 1, np.sin(t - 1), 0)[:, None] * [1, 1]
     residual = np.where(t < 0.9, 10.0, 0.5)[:, None] * [1, 0] + 0.1
     log = identify.Log(t, v, v, v, v)
-    (line,) = at_rest(log, residual, ("a", "b"))
+    (line,) = check_rest(log, residual, ("a", "b"))
     assert line.startswith("a stands still for the first 1 s") and "friction at rest" in line
     assert (
-        at_rest(log, 0 * residual, ("a", "b")) == [] and at_rest(identify.Log(t, v, 0 * v, v, v), residual, "ab") == []
+        check_rest(log, 0 * residual, ("a", "b")) == []
+        and check_rest(identify.Log(t, v, 0 * v, v, v), residual, "ab") == []
     )
 
 

@@ -25,9 +25,9 @@ from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, ta
 from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.identify.identifiability import base_terms
+from jaxdyn.identify.log_checks import check_log_content, check_rest
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.spectra import vibration
-from jaxdyn.identify.suspicions import at_rest, suspicions
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
@@ -287,9 +287,11 @@ def _warnings(findings: Findings) -> list[str]:
     lines = []
     labels, _ = coordinate_labels(findings.model)
     for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
-        lines += [f"{one.name}: {line}" for line in suspicions(findings.model, one.log, labels)]
+        lines += [f"{one.name}: {line}" for line in check_log_content(findings.model, one.log, labels)]
         # Residuals are checked too: drift at rest points to friction or offsets that the model lacks.
-        lines += [f"{one.name}: {line}" for line in at_rest(one.log, one.predicted - np.asarray(one.log.tau), labels)]
+        lines += [
+            f"{one.name}: {line}" for line in check_rest(one.log, one.predicted - np.asarray(one.log.tau), labels)
+        ]
         share, edge = vibration(one.log, one.predicted - np.asarray(one.log.tau))
         if share > _VIBRATES and (one.log.cutoff is None or edge < one.log.cutoff):
             fix = f"low-pass it at {edge:.2g} Hz" if one.log.cutoff is None else f"try --cutoff {edge:.2g}"

@@ -15,7 +15,7 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.identify.one_fit import Estimate, Setting
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem
-from jaxdyn.identify.selection import folds, helped
+from jaxdyn.identify.selection import folds, improving_torques
 from jaxdyn.identify.torque_terms import TorqueTerm
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model
@@ -32,7 +32,7 @@ class Delays(NamedTuple):
     - `seconds` (nv,): delays, negative where torques come early; zero where a delay helped nothing.
     - `std` (nv,): standard deviations by blocks of samples, as in `Intervals`; `factor`: a 95 % interval is plus and minus this
       many of them. Infinite std of a delay that was given.
-    - `squares`: squared errors (folds, nv) on parts left out in turn, without the delays and with them; None for given ones.
+    - `squares`: squared errors (blocks, nv) of blocks left out in turn, without the delays and with them; None for given ones.
     """
 
     seconds: np.ndarray
@@ -112,8 +112,8 @@ def find_delays(
         problem = RobotProblem(model, _shifted(logs, shift), basic, used, inertia, blocks)
         problem.refine(setting, fixed, rounds=2)
         parts, _ = folds(problem.data(setting).blocks)
-        squares.append(np.array([problem.left_out(setting, part) for part in parts]))
-    kept = np.isin(every, helped(*squares, worth=0.0))
+        squares.append(np.concatenate([problem.left_out(setting, part) for part in parts]))
+    kept = np.isin(every, improving_torques(squares[0], squares[1], worth=0.0))
     return Delays(np.where(kept, delay, 0.0), std, spread.factor, (squares[0], squares[1]))
 
 

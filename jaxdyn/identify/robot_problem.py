@@ -7,6 +7,7 @@ import numpy as np
 from jaxdyn.identify.chart import Chart, make_chart
 from jaxdyn.identify.feasible import placed, signal_sizes
 from jaxdyn.identify.intervals import Intervals, intervals
+from jaxdyn.identify.log_checks import hardly_moving
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.one_fit import Data, Estimate, Setting, fit_condensed, gather
 from jaxdyn.identify.regression import log_regressor
@@ -24,6 +25,7 @@ class RobotProblem:
         self.inertia, self.blocks = inertia, blocks
         self.sample_weights: dict[float, list[np.ndarray]] = {}
         self.sizes, self.weights = signal_sizes(logs), np.ones(model.nv)
+        self.still = hardly_moving(model, logs)
         self.loads = [np.zeros_like(np.asarray(log.tau, np.float64)) for log in logs]
         self.torque = float(sum(np.sum(np.asarray(log.tau, np.float64) ** 2) for log in logs))
         self._data: dict[tuple, Data] = {}
@@ -48,7 +50,7 @@ class RobotProblem:
         return fit_condensed(chart, start, data, setting, self.sizes, self.weights, **options)
 
     def left_out(self, setting: Setting, part: np.ndarray) -> np.ndarray:
-        """Squared errors (nv,) on some blocks, of a fit to the others. No more digits than the choice needs.
+        """Squared errors (blocks, nv) on some blocks, of a fit to the others. No more digits than the choice needs.
 
         A robust loss takes the weights of single torques from the first setting that asks for it.
         """
@@ -59,7 +61,7 @@ class RobotProblem:
         if key not in self._rows:
             self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
         estimate = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
-        return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part).sum(axis=0)
+        return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part)
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
         """Fit some times over; after each but the last, update weights and loads."""
@@ -97,7 +99,7 @@ class RobotProblem:
         """Standard deviations of an estimate, which is this fit."""
         data, curved = self.data(setting), self.curved(setting)
         worth = stretches([fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs])
-        return intervals(self.model, data, setting, estimate, self.weights, self.basic, worth, curved)
+        return intervals(self.model, data, setting, estimate, self.weights, self.basic, worth, curved, self.still)
 
     def with_term(self, term: TorqueTerm) -> "RobotProblem":
         """The same logs and weights with the columns of one more term, behind all others."""
