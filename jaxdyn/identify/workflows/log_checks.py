@@ -4,16 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxdyn.identify.logs import Log
+from jaxdyn.identify.logs import Log, are_angles, hardly_moving, travels
 from jaxdyn.identify.regression import log_regressor, nominal_parameters
-from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 
 # Angles beyond this many turns, and torques this many times off what the nominal bodies need, are worth a question.
 _TURNS, _OFF = 3.0, 20.0
-# Least travel of a joint (rad, m). Friction needs some thousandths of a radian to reverse (`torque_terms.PRESLIDING`): below a
-# few times that a joint does not slide, and its torque says nothing about friction in motion.
-_TRAVEL_ANGLE, _TRAVEL_LENGTH = 0.02, 0.002
 # Below this share of its own largest velocity a joint has not begun to move; from this share of the error on it is worth a word.
 _REST, _MUCH = 0.01, 0.5
 
@@ -54,7 +50,7 @@ def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str
     travel = travels(model, log)
     slow = [
         f"{labels[j]} ({travel[j]:.2g} {'rad' if angle else 'm'})"
-        for j, angle in enumerate(_are_angles(model))
+        for j, angle in enumerate(are_angles(model))
         if j in hardly_moving(model, [log])
     ]
     if slow:
@@ -63,27 +59,6 @@ def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str
             "joints farther"
         )
     return lines
-
-
-def travels(model: Model, log: Log) -> np.ndarray:
-    """Range of motion (nv,) of each coordinate, rad or m: of its position, or of its integrated velocity for joints with several.
-
-    The integral of a velocity is used where no coordinate of q belongs to it alone, as for quaternions.
-    """
-    q, v, t = (np.asarray(x, np.float64) for x in (log.q, log.v, log.t))
-    steps = (v[1:] + v[:-1]) / 2 * np.diff(t)[:, None]
-    path = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(steps, axis=0)])
-    slices = zip(model.topology.q_slices, model.topology.v_slices, strict=True)
-    for of_q, of_v in slices:
-        if of_q.stop - of_q.start == of_v.stop - of_v.start == 1:
-            path[:, of_v] = q[:, of_q]
-    return np.ptp(path, axis=0)
-
-
-def hardly_moving(model: Model, logs: Sequence[Log]) -> tuple[int, ...]:
-    """Indices in v of the coordinates that travel less than 0.02 rad, or 2 mm, in every log."""
-    travel = np.max([travels(model, log) for log in logs], axis=0)
-    return tuple(int(j) for j in np.flatnonzero(travel < np.where(_are_angles(model), _TRAVEL_ANGLE, _TRAVEL_LENGTH)))
 
 
 def check_rest(log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:
@@ -105,14 +80,6 @@ def check_rest(log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[st
                 "error is: no term predicts friction at rest; cut the log there, or move before you record"
             )
     return lines
-
-
-def _are_angles(model: Model) -> np.ndarray:
-    """Mask (nv,) of the coordinates that are angles."""
-    linear = {"prismatic": (True,), "planar": (True, True, False), "free": (True,) * 3 + (False,) * 3}
-    return ~np.concatenate(
-        [np.array(linear.get(kind, (False,) * KINDS[kind].nv), bool) for kind in model.topology.kinds]
-    )
 
 
 def _rms(x: np.ndarray) -> np.ndarray:
