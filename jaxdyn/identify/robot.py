@@ -76,9 +76,9 @@ def fit_robot(
     the coefficient that makes a tenth of the joint's torque. Arguments that are "auto" are chosen by cross-validation, over
     logs if there are three or more, else over parts of consecutive samples; then all logs are fitted together.
 
-    An extra term is taken at a joint only where the errors are not white, and a term, a robust loss or another v_s only where it
-    lowers the left-out errors by more than their standard error and by one per cent; of the priors, the strongest within one
-    standard error of the best.
+    An extra term is taken at a joint only where the errors are not white and where it lowers those of left-out parts clearly; a
+    robust loss only for errors with heavy tails, and it or another v_s only beyond the standard error of their improvement; of
+    the priors, the strongest within one standard error of the best (`jaxdyn.identify.selection`).
 
     **Arguments:**
 

@@ -4,7 +4,7 @@ Every setting is fitted with one part of the blocks left out in turn, and scored
 the logarithm of their squared errors, which asks for the same relative improvement of a wrist as of a shoulder.
 
 The lowest score alone would overfit: among dozens of settings one is best by chance, and logs of some seconds hold few
-independent samples. A setting that adds something to the plain fit (a term at a joint, a robust loss) is therefore taken only
+independent samples. A setting that adds something to the plain fit is therefore taken only where it is clearly better:
 
 - a term, at joints with errors that are not white, as white errors hold nothing that a term could explain, and where it lowers
   the squared errors by one per cent and in most of the folds;
