@@ -2,8 +2,8 @@
 
     python -m benchmarks.identify_selection [--logs 100] [--jump] [--out out/identify_selection.json]
 
-Arms of two joints with the exact nominal model, viscous and Coulomb friction (smooth over 0.003 to 0.05 rad/s; --jump: over 0.0001,
-which samples do not resolve), rotors and 0.01 N m of white noise on the torques.
+Arms of two joints with the exact nominal model, viscous and Coulomb friction (smooth over 0.003 to 0.05 rad/s; --jump: over
+0.0001, which samples do not resolve), rotors and 0.01 N m of white noise on the torques.
 Motions, their length and size, and friction are random, and two of five are cut into two logs. A quarter of the logs each:
 
 - exact velocities and accelerations at 50 Hz;

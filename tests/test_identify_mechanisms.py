@@ -78,7 +78,7 @@ def test_link_lengths_of_a_four_bar_by_two_encoders():
     np.testing.assert_array_equal(log.q[:, [0, 2]], q[:, [0, 2]])
     np.testing.assert_array_equal(log.v[:, [0, 2]], v[:, [0, 2]])
     tree = jd.identify.Parameters(links).positive(lambda links: links.numbers["lengths"])
-    fit = found(links, log, tree, ["1", "3"])
+    fit = computed(links, log, tree, ["1", "3"])
     np.testing.assert_allclose(fit.values, [3.0, 2.5], rtol=1e-5)
     assert fit.result == "converged" and (fit.deviation < 1e-3).all()
 

@@ -278,7 +278,7 @@ def test_bad_arguments_raise(truth):
     model = arm()
     log = measured(model, motion(1), truth)
     for words, arguments in (
-        (r"term 'stiction' is unknown; take some of viscous.*dahl", {"terms": "stiction"}),
+        (r"term 'stiction' is unknown; give some of viscous.*dahl", {"terms": "stiction"}),
         (r"term 'dahl' is for torques \(2,\); there are 2", {"terms": (("dahl", (2,)),)}),
         ("each may be given once", {"terms": ("dahl", "dahl")}),
         ("v_s is 'fast'", {"v_s": "fast"}),

@@ -132,7 +132,7 @@ def make_chart(
     """
     terms = check_terms(terms, v_s)
     if inertia not in INERTIA:
-        raise ValueError(f"inertia is {inertia!r}; take one of {INERTIA}")
+        raise ValueError(f"inertia is {inertia!r}; give one of {INERTIA}")
     dtype = np.dtype(model.home.dtype)
     numbers = np.asarray(model.inertias, np.float64)
     massive = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()

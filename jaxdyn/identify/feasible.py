@@ -103,7 +103,7 @@ def fit_torques(
     problem, point, sigma = make_problem(model, condensed, signal_sizes(logs), terms, v_s, inertia, prior, sigma)
     chart = problem.chart
     if method != "newton" and isinstance(method, str) and method not in METHODS:
-        raise ValueError(f"method is {method!r}; take one of {('newton', *METHODS)} or an optax.GradientTransformation")
+        raise ValueError(f"method is {method!r}; give one of {('newton', *METHODS)} or an optax.GradientTransformation")
     limit = _STEPS.get(method, _STEPS["adam"]) if isinstance(method, str) else _STEPS["adam"]
     steps = limit if steps is None else steps
     if isinstance(method, str) and method == "newton":

@@ -136,15 +136,16 @@ def filter_like_log(log: Log, columns: np.ndarray, order: int = 4, factor: int =
 
     `factor`: samples of the columns per sample of the log; every `factor`-th is returned.
     """
-    if not _has_filter(log, order):
+    cutoff = log.cutoff
+    if cutoff is None or not _has_filter(log, order):
         return columns if factor == 1 else columns[::factor]
     from scipy.signal import butter, filtfilt
 
     rate = factor * _rate(log)
-    numerator, denominator = butter(order, 2 * log.cutoff / rate, output="ba")  # pyright: ignore
+    numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
     if not columns.size:
         return columns[::factor]
-    padding = pad_length(rate, log.cutoff, len(columns))
+    padding = pad_length(rate, cutoff, len(columns))
     return filtfilt(numerator, denominator, columns, axis=0, padlen=padding)[::factor]
 
 

@@ -210,7 +210,7 @@ def _optimizer(method: str, steps: int, learning_rate: float) -> Any:
         return optax.lbfgs(memory_size=30, linesearch=None)
     if method == "adam":
         return optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
-    raise ValueError(f"method is {method!r}; take one of {METHODS} or an optax.GradientTransformation")
+    raise ValueError(f"method is {method!r}; give one of {METHODS} or an optax.GradientTransformation")
 
 
 @eqx.filter_jit

@@ -17,9 +17,11 @@ from jaxdyn.identify.picking import (
     entries_of_block,
     find_models,
     free_bodies,
+    leaves_with_names,
     perpendicular_basis,
     prior_root,
     row_indices,
+    select,
 )
 from jaxdyn.identify.sensors import FitSystem, with_sensors
 from jaxdyn.model import float64 as f64
@@ -166,7 +168,7 @@ class Parameters(eqx.Module):
         """
         model, leaf, name = self._model()
         if metric is not None and metric not in METRICS:
-            raise ValueError(f"metric is {metric!r}; take one of {METRICS}, or None")
+            raise ValueError(f"metric is {metric!r}; give one of {METRICS}, or None")
         chosen = None if bodies is None else row_indices(self.given, name, model.nb, list(bodies))[0]
         one = np.ones(model.nv)
         chart, _ = make_chart(model, (), 0.01, shape, one, one, one, bodies=chosen)

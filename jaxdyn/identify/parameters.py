@@ -132,10 +132,10 @@ def fit_parameters(
     tree = _tree(system, parameters, positive, free)
     own = with_sensors(system).scene
     if error not in ERRORS:
-        raise ValueError(f"error is {error!r}; take one of {ERRORS}")
+        raise ValueError(f"error is {error!r}; give one of {ERRORS}")
     methods = (_GAUSS_NEWTON, *SOLVERS, *METHODS)
     if isinstance(method, str) and method not in methods:
-        raise ValueError(f"method is {method!r}; take one of {methods} or an optax.GradientTransformation")
+        raise ValueError(f"method is {method!r}; give one of {methods} or an optax.GradientTransformation")
     if not noise > 0:
         raise ValueError(f"noise is {noise}; give a positive share, such as 0.01")
     if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:

@@ -186,7 +186,8 @@ def _assemble(problem: Problem, estimate: Unknowns, parts, prior) -> LinearError
         data = eliminate_starts(errors, rows, None)
     else:
         data = eliminate_starts(*parts[0])
-    return with_prior(data, *prior, problem.prior_weight)
+    residual, by_y = prior
+    return with_prior(data, residual, by_y, problem.prior_weight)
 
 
 def _jacobians(problem: Problem, estimate: Unknowns):

@@ -157,7 +157,7 @@ def check_replay(initial: str, hold: str) -> None:
     """Check the initial states of segments and the interpolation of torques. **Raises:** ValueError for unknown ones."""
     for name, value, allowed in (("initial", initial, INITIAL), ("hold", hold, HOLDS)):
         if value not in allowed:
-            raise ValueError(f"{name} is {value!r}; take one of {allowed}")
+            raise ValueError(f"{name} is {value!r}; give one of {allowed}")
 
 
 def simulation_options(substeps: int | None, simulation: dict) -> dict:

@@ -72,7 +72,7 @@ def check_terms(terms: Terms, v_s: Number) -> tuple[str, ...]:
     terms = (terms,) if isinstance(terms, str) else tuple(terms)
     unknown = [term for term in terms if term not in TERMS]
     if unknown or len(set(terms)) < len(terms):
-        raise ValueError(f"terms is {terms}; take some of {TERMS}, each once")
+        raise ValueError(f"terms is {terms}; give some of {TERMS}, each once")
     if not v_s > 0:
         raise ValueError(f"v_s is {v_s}; give a positive smoothing velocity, e.g. 0.01 rad/s")
     return terms
@@ -195,7 +195,7 @@ def split_terms(
             term = EXTRA[term]
         if not isinstance(term, TorqueTerm):
             known = ", ".join((*TERMS, *EXTRA))
-            raise ValueError(f"term {term!r} is unknown; take some of {known}, or a jd.identify.TorqueTerm")
+            raise ValueError(f"term {term!r} is unknown; give some of {known}, or a jd.identify.TorqueTerm")
         joints = tuple(sorted({int(joint) for joint in joints}))
         if not joints or not 0 <= joints[0] <= joints[-1] < nv:
             raise ValueError(f"term {term.name!r} is for torques {joints}; there are {nv}, from 0 to {nv - 1}")

@@ -115,7 +115,7 @@ def fit_trajectory(
     terms = check_terms(terms, v_s)
     check_replay(initial, hold)
     if isinstance(method, str) and method not in METHODS:
-        raise ValueError(f"method is {method!r}; take one of {METHODS} or an optax.GradientTransformation")
+        raise ValueError(f"method is {method!r}; give one of {METHODS} or an optax.GradientTransformation")
     if not prior >= 0:
         raise ValueError(f"prior is {prior}; it must not be negative")
     q, v, tau, a = (np.concatenate(parts) for parts in zip(*map(_signals, logs), strict=True))

@@ -122,7 +122,7 @@ def exciting_motion(
             f"model has nq={model.nq}, nv={model.nv}; exciting motions are for joints with one coordinate each"
         )
     if objective not in OBJECTIVES:
-        raise ValueError(f"objective is {objective!r}; take one of {OBJECTIVES}")
+        raise ValueError(f"objective is {objective!r}; give one of {OBJECTIVES}")
     for name, value, good in (
         ("period", period, period > 0),
         ("harmonics", harmonics, harmonics >= 2),
