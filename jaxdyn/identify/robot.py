@@ -77,8 +77,8 @@ def fit_robot(
     logs if there are three or more, else over parts of consecutive samples; then all logs are fitted together.
 
     An extra term is taken at a joint only where the errors are not white and where it lowers those of left-out parts clearly; a
-    robust loss only for errors with heavy tails, and it or another v_s only beyond the standard error of their improvement; of
-    the priors, the strongest within one standard error of the best (`jaxdyn.identify.selection`).
+    robust loss only for errors with heavy tails, and it or another v_s only beyond the standard error of their improvement
+    (`jaxdyn.identify.selection`).
 
     **Arguments:**
 
