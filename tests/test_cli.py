@@ -13,7 +13,7 @@ import pytest
 import jaxdyn as jd
 from benchmarks.linkages import bennett
 from jaxdyn.cli import main
-from jaxdyn.identify.logs import as_measured
+from jaxdyn.identify.torque_terms import coulomb_through_filter
 from jaxdyn.io import joint_torques
 from jaxdyn.io.logs import read_log, write_log
 
@@ -193,9 +193,8 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, c
     x[offset : offset + fitted.nv] = report["friction"]["offset"]
     rows = jd.identify.regressor(fitted, log.q, log.v, log.a)
     # Friction counts as the log's low-pass leaves it.
-    column = np.tanh(log.v / 0.01)
     place = 10 * fitted.nb + fitted.nv * jd.identify.TERMS.index("coulomb") + np.arange(7)
-    rows[:, np.arange(7), place] = as_measured(log, column)
+    rows[:, np.arange(7), place] = coulomb_through_filter(log, 0.01)
     # A URDF holds the inertia about the centre of mass, so some digits of small moments are lost on the way.
     np.testing.assert_allclose(
         jd.identify.torque_error(rows @ x, log.tau), report["torque_error"]["final_percent"], rtol=1e-6
