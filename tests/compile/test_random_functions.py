@@ -33,7 +33,7 @@ def functions(draw) -> Function:
     return Function(tuple((name, tuple(args)) for name, args in steps))
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=14, deadline=None, derandomize=True)
 @given(
     functions(),
     st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS), min_size=1, max_size=3),
