@@ -127,6 +127,7 @@ from jaxdyn.reduction.bases import tangent_basis as tangent_basis
 from jaxdyn.reduction.gauge_invariant import gauge_invariant as gauge_invariant
 from jaxdyn.reduction.integrability import involutive as involutive
 from jaxdyn.reduction.integrability import spurious_terms as spurious_terms
+from jaxdyn.reduction.inverse_dynamics import constrained_inverse_dynamics as constrained_inverse_dynamics
 from jaxdyn.reduction.minimal import reduced_dynamics as reduced_dynamics
 from jaxdyn.reports import report as report
 from jaxdyn.simulation import solvers as solvers
