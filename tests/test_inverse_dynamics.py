@@ -13,7 +13,7 @@ from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, velocity_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics
-from jaxdyn.dynamics.quantities import bias_force, inverse_dynamics, mass_matrix
+from jaxdyn.dynamics.quantities import forward_dynamics, inverse_dynamics
 from jaxdyn.forces.elements import JointDamping, JointSpring
 from jaxdyn.model import robots
 from jaxdyn.model.names import velocity_indices
@@ -197,9 +197,20 @@ def test_refusals_and_codes():
         solve(scene, q, v, jnp.ones(3))
     # A dead centre: the rocker does not determine the crank where crank and coupler are in one line.
     dead = assemble(scene, jnp.array([0.9, 0.0, 2.0]), hold={"2": 0.0}).q
-    with pytest.raises(ValueError, match=r"the velocities \[2\] do not determine the others"):
+    with pytest.raises(ValueError, match=r"no motion has the values given for the velocities \[2\]"):
         solve(scene, dead, jnp.zeros(3), [1.0], motors=["3"])
+    with pytest.raises(ValueError, match=r"the velocities \[2\] do not determine the others"):
+        solve(scene, dead, [0.0], [0.0], motors=["3"])
     codes = quick(lambda a: solve(Scene(model), q, v, a, motors=[0], independent=[0, 1, 2]).result)(jnp.ones(3))
     assert codes == RESULTS.underactuated
-    assert solve(scene, dead, jnp.zeros(3), [1.0], motors=["3"], throw=False).result == RESULTS.singular_basis
-    assert mass_matrix(model, q).shape == (3, 3) and bias_force(model, q, v).shape == (3,)
+    assert solve(scene, dead, jnp.zeros(3), [1.0], motors=["3"], throw=False).result == RESULTS.contradictory_rows
+
+
+def test_velocities_that_nothing_drives_move_as_forces_make_them():
+    """An acrobot whose elbow alone is driven: the acceleration of the other joint is that of forward dynamics."""
+    model = robots.chain(2)
+    q, v = jnp.array([0.4, -0.7]), jnp.array([0.3, 0.5])
+    inverse = constrained_inverse_dynamics(model, q, v, [1.5], motors=[1])
+    assert_close(forward_dynamics(model, q, v, inverse.tau), inverse.acceleration, 1e-12)
+    assert_close(inverse.acceleration[1], 1.5, 1e-12)
+    assert float(inverse.tau[0]) == 0.0

@@ -1,10 +1,12 @@
 """Inverse dynamics under constraints: the torques of the motors that move a mechanism as its drives are to move.
 
-With M = U U^T, Y = U^-1 A^T and the projection K = 1 - Y Y^+, all in whitened coordinates U^T v:
+The rates E a of the independent velocities are rows beside those of the constraints, whose forces the motors exert. In whitened
+coordinates x = U^T a, M = U U^T, with Y = U^-1 A^T, Z = U^-1 E^T, the projection K = 1 - Y Y^+ and the free acceleration
+x_f = U^-1 (forces - h), Gauss's principle gives
 
-    v, a      from those of the independent velocities, E v and E a, in the null space of the rows: (K U^-1 E^T)^+
-    tau       from N^T S tau = N^T (M a + h - forces), the columns of N spanning the admissible velocities
-    lam       the rest, U^-1 (M a + h - forces - S tau) = Y lam
+    a      x = x_f + the least change with Y^T x = gamma, Z^T x = E a, by (K Z)^+ in the null space of Y
+    tau    N^T S tau = N^T (M a + h - forces) = N^T U (x - x_f), the columns of N = U^-T (K Z)^+T spanning the driven motions
+    lam    the rest, x - x_f - U^-1 S tau = Y lam
 
 With more motors than degrees of freedom N^T S is wide, and tau is the shortest solution in the given weights.
 Sources: Nakamura & Ghodoussi (1989), Dynamics computation of closed-link robot mechanisms with nonredundant and redundant
@@ -23,7 +25,7 @@ from jaxdyn.constraints.base import layout, rows, velocity_residual
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.constraints.dynamics import applied, whitened_rows
 from jaxdyn.constraints.rank import checked_tolerance, eps_of, pseudo_inverse, tolerance
-from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
+from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
 from jaxdyn.model.names import velocity_indices
@@ -44,9 +46,9 @@ class ConstrainedInverseDynamics(Outcome):
     - `torques` (nm,), N m or N, in the order of the motors; `tau` (nv,), the generalised force that they are.
     - `velocity` (nv,) and its rate `acceleration` (nv,); `q_dot` (nq,), the rate of q.
     - `multipliers` (nc,), as of `constrained_dynamics`; of least norm where rows are dependent.
-    - `result`: one of `RESULTS`. `singular_basis`: the independent velocities do not determine the others here.
-      `contradictory_rows`: there are more of them than degrees of freedom, and no motion has all their values. `underactuated`:
-      the motors cannot produce the motion. The torques are then those of least squares.
+    - `result`: one of `RESULTS`. `contradictory_rows`: no motion has all the values given. `underactuated`: the motors cannot
+      produce the motion; the torques are then those of least squares. `singular_basis`: v was given by the independent
+      velocities, which do not determine the others here.
     """
 
     torques: Float[Array, " nm"]
@@ -73,7 +75,9 @@ def constrained_inverse_dynamics(
 ) -> ConstrainedInverseDynamics:
     """Torques of the motors for a motion of a mechanism: M a + h = S tau + forces + A^T lam, A a = gamma, E a = a_independent.
 
-    The inverse of `constrained_dynamics`, whose acceleration under `tau` and multipliers are those returned here.
+    The inverse of `constrained_dynamics`, whose acceleration under `tau` and multipliers are those returned here. Velocities that
+    neither the constraints nor the independent ones determine, as of a rod that spins between two balls, move as the forces
+    make them.
 
     **Arguments:**
 
@@ -82,15 +86,15 @@ def constrained_inverse_dynamics(
     - `a_independent` (ni,): rates of the independent velocities. `t`, s.
     - `motors`: names of joints, indices of velocities, or a matrix S (nv, nm) whose columns are the generalised forces of
       motors of 1 N m or 1 N. None: one on each velocity.
-    - `independent`: names of joints or indices of velocities, as many as there are degrees of freedom. None: those of the
-      motors. More than the degrees of freedom are allowed if their values agree.
+    - `independent`: names of joints or indices of velocities. None: those of the motors. More than the degrees of freedom are
+      allowed if their values agree.
     - `weights` (nm,), positive: where there are more motors than degrees of freedom, the sum of weights tau^2 is least. None: 1.
     - `rank_tol` as in `constrained_dynamics`. `throw`: raise when it fails, by default if all inputs are concrete.
 
     **Returns:** `ConstrainedInverseDynamics`. Differentiable where the ranks are constant.
 
-    **Raises:** ValueError for inconsistent shapes, unknown joints, weights that are not positive, and, if `throw`, for a
-    motion that is not determined or that the motors cannot produce.
+    **Raises:** ValueError for inconsistent shapes, unknown joints, weights that are not positive, and, if `throw`, for values
+    that no motion has and a motion that the motors cannot produce.
 
     Source: Nakamura & Ghodoussi (1989), eqs. 12 to 20; EQUATIONS sections 7 and 8.
 
@@ -132,7 +136,7 @@ def _reason(dynamics, chosen) -> str:
     reasons = {
         "singular_basis": f"independent: the velocities {list(chosen)} do not determine the others at this q; choose others",
         "contradictory_rows": f"a_independent or v: no motion has the values given for the velocities {list(chosen)}; give as "
-        "many as there are degrees of freedom (jd.degrees_of_freedom)",
+        "many as there are degrees of freedom (jd.degrees_of_freedom), and none that a dead centre holds",
         "underactuated": "motors: they cannot produce this motion; name more motors, or give accelerations that they can",
         "singular_mass_matrix": "scene: its mass matrix is not positive definite at this q; give every joint some inertia",
     }
@@ -178,64 +182,68 @@ def _weights(weights, count: int, dtype):
 
 @compiled
 def _solve_compiled(scene: Scene, q, v, a_independent, S, weights, t, chosen: tuple[int, ...], rank_tol):
-    v, a, torques, lam, ranks_fit, agrees, is_actuated, definite = run_repaired(
+    v, a, torques, lam, is_determined, agrees, is_actuated, definite = run_repaired(
         _solve, scene, q, v, a_independent, S, weights, t, static=(chosen, rank_tol)
     )
     result = RESULTS.where(is_actuated, RESULTS.successful, RESULTS.underactuated)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(agrees, result, RESULTS.contradictory_rows)
-    result = RESULTS.where(ranks_fit, result, RESULTS.singular_basis)
+    result = RESULTS.where(is_determined, result, RESULTS.singular_basis)
     result = RESULTS.where(definite, result, RESULTS.singular_mass_matrix)
     q_dot = velocity_to_rate(scene.system, q, v)
     return ConstrainedInverseDynamics(torques, _product(jnp.asarray(S), torques), v, a, q_dot, lam, result)
 
 
 def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent, S, weights, t):
-    """v, a, torques and lam; whether E determines the motion, whether a motion has the given values, whether the motors can
-    produce it, and whether M is definite."""
-    nv, tol = scene.nv, tolerance(rank_tol, q)
+    """v, a, torques and lam; whether v is determined, whether a motion has the given values, whether the motors can produce it,
+    and whether M is definite."""
+    nv, tol, has_rows = scene.nv, tolerance(rank_tol, q), bool(layout(scene))
+    limit = max(eps_of(q) ** 0.5, tol)
     E = np.eye(nv, dtype=q.dtype)[list(chosen)]
-    if layout(scene):
+    if has_rows:
         metric, Y = whitened_rows(scene, q, t)
         inverse = pseudo_inverse(Y, tol)
     else:
         metric, Y = mass_factor(mass_matrix(scene.system, q, t)), jnp.zeros((nv, 0), q.dtype)
         inverse = Y.T
-    across = metric.whiten(jnp.asarray(E.T))
-    free = pseudo_inverse(across - _product(Y, _product(inverse, across)), tol)
 
-    def complete(right, independent):
-        """The whitened solution of A x = right, E x = independent, and whether it is one."""
-        start = _product(inverse.T, right)
-        x = start + _product(free.T, independent - _product(across.T, start))
-        sizes = jnp.sqrt(jnp.sum(x * x))
-        missed = (_product(Y.T, x) - right, Y), (_product(across.T, x) - independent, across)
-        limit = max(eps_of(q) ** 0.5, tol)
-        # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
+    def across(x):
+        """K x, the part that is no constraint force."""
+        return x - _product(Y, _product(inverse, x))
+
+    Z = metric.whiten(jnp.asarray(E.T))
+    free = pseudo_inverse(across(Z), tol)
+
+    def complete(start, right, independent):
+        """The solution x of Y^T x = right, Z^T x = independent nearest to the start, and whether there is one."""
+        x = start + _product(inverse.T, right - _product(Y.T, start))
+        x = x + _product(free.T, independent - _product(Z.T, x))
+        size = jnp.sqrt(jnp.sum(x * x))
+        # By Cauchy-Schwarz a residual is compared with the sizes that cancel in it.
         fits = [
-            jnp.all(jnp.abs(r) <= limit * (1 + jnp.sqrt(jnp.sum(B * B, 0)) * sizes)) if r.shape[0] else True
-            for r, B in missed
+            jnp.all(jnp.abs(_product(B.T, x) - wanted) <= limit * (1 + jnp.sqrt(jnp.sum(B * B, 0)) * size))
+            for B, wanted in ((Y, right), (Z, independent))
+            if B.shape[1]
         ]
-        return x, jnp.logical_and(*fits)
+        return x, jnp.all(jnp.stack(fits))
 
-    agrees = True
+    is_determined, agrees = jnp.asarray(True), jnp.asarray(True)
     if v.shape[0] != nv:
-        rest = -velocity_residual(scene, q, jnp.zeros((nv,), q.dtype), t) if layout(scene) else Y[0]
-        x, agrees = complete(rest, v)
+        still = jnp.zeros((nv,), q.dtype)
+        rest = -velocity_residual(scene, q, still, t) if has_rows else Y[0]
+        x, agrees = complete(still, rest, v)
         v = metric.unwhiten(x)
-    gamma = rows(scene, q, v, t).gamma if layout(scene) else Y[0]
-    x, fits = complete(gamma, a_independent)
-    a = metric.unwhiten(x)
-    needed = inverse_dynamics(scene.system, q, v, a, t) - applied(scene, q, v, None, t)
-    pushed, by_motors = metric.whiten(needed), metric.whiten(jnp.asarray(S))
-    # The columns of free^T span the admissible velocities, so that free projects out the constraint forces.
+        rank = jnp.round(jnp.sum(inverse * Y.T)) + jnp.round(jnp.trace(_product(free, across(Z))))
+        is_determined = rank == nv
+    gamma = rows(scene, q, v, t).gamma if has_rows else Y[0]
+    unforced = metric.whiten(applied(scene, q, v, None, t) - bias_force(scene.system, q, v, t))
+    x, fits = complete(unforced, gamma, a_independent)
+    needed, by_motors = x - unforced, metric.whiten(jnp.asarray(S))
+    # The columns of free^T span the driven motions, so that free takes out the constraint forces.
     root = 1 / jnp.sqrt(weights)
     along = _product(free, by_motors) * root[None]
-    wanted = _product(free, pushed)
-    scaled = _product(pseudo_inverse(along, tol), wanted)
-    torques = root * scaled
-    missed = _product(along, scaled) - wanted
-    sizes = jnp.sqrt(jnp.sum(free * free, 1) * jnp.sum(pushed * pushed))
-    is_actuated = jnp.all(jnp.abs(missed) <= max(eps_of(q) ** 0.5, tol) * sizes + eps_of(q))
-    lam = _product(inverse, pushed - _product(by_motors, torques))
-    rank = jnp.round(jnp.sum(inverse * Y.T)) + jnp.round(jnp.trace(_product(free, across)))
-    return v, a, torques, lam, rank == nv, fits & agrees, is_actuated, metric.is_definite()
+    torques = root * _product(pseudo_inverse(along, tol), _product(free, needed))
+    rest = needed - _product(by_motors, torques)
+    sizes = jnp.sqrt(jnp.sum(needed * needed)) + jnp.sqrt(jnp.sum(unforced * unforced))
+    is_actuated = jnp.all(jnp.abs(across(rest)) <= limit * sizes + eps_of(q))
+    a, lam = metric.unwhiten(x), _product(inverse, rest)
+    return v, a, torques, lam, is_determined, agrees & fits, is_actuated, metric.is_definite()
