@@ -68,11 +68,11 @@ def test_random_poses_of_an_arm_with_limits():
     solve = quick(jax.vmap(lambda goal, q: inverse_kinematics(model, {TIP: goal}, q)))
     reached = solve(goals, starts)
     assert bool(reached.success.all())
-    assert np.all((reached.q >= model.lower) & (reached.q <= model.upper))
+    assert np.all((reached.q >= model.lower[None]) & (reached.q <= model.upper[None]))
     assert_close(jax.vmap(lambda q: frame_pose(model, q, TIP))(reached.q), goals, 1e-10)
     alone = inverse_kinematics(model, {TIP: goals[5]}, starts[5])
     assert_close(alone.q, reached.q[5], 1e-8)
-    free = int(np.argmax(np.all((reached.q > model.lower) & (reached.q < model.upper), 1)))
+    free = int(np.argmax(np.all((reached.q > model.lower[None]) & (reached.q < model.upper[None]), 1)))
     q, goal = reached.q[free], goals[free]
 
     def moved(p):

@@ -53,7 +53,7 @@ def follow(
     *,
     weights: Checked[Mapping[str, Numbers] | None] = None,
     limits: bool = True,
-    posture: Float[Array, " nq"] | None = None,
+    posture: Numbers | None = None,
     steps: int = 1,
     guesses: int = 1,
     atol: float | None = None,

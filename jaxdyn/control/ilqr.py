@@ -11,6 +11,7 @@ Sources: Li & Todorov (2004); Tassa, Erez & Todorov (2012), Synthesis and stabil
 trajectory optimization, section II (value update, schedule of mu, line search); Tassa, Mansard & Todorov (2014) for limits.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -57,6 +58,11 @@ class OptimalControl(Outcome):
     reduction: Float[Array, ""]
     result: Any
 
+    def shift(self) -> "OptimalControl":
+        """The plan from its second step on, its last control and gain repeated: where the next one begins."""
+        us, xs, gains = jax.tree.map(lambda x: jnp.concatenate([x[1:], x[-1:]]), (self.us, self.xs, self.gains))
+        return dataclasses.replace(self, us=us, xs=xs, gains=gains)
+
 
 class _Problem(NamedTuple):
     """Functions of vectors: step(x, u) (nx,), cost(x, u, k) and final(x) (), and limits (n, nu) or None."""
@@ -87,7 +93,7 @@ def ilqr(
     cost: Function,
     final_cost: Function,
     x0: PyTree,
-    us: Numbers,
+    us: Checked[Numbers | OptimalControl],
     *,
     limits: Checked[Sequence[Numbers] | None] = None,
     iterations: int = 100,
@@ -104,7 +110,8 @@ def ilqr(
 
     - `step(x, u)`: the next state, as of `jd.stepper`; states are arrays or pytrees of them, such as (q, v).
     - `cost(x, u, k)`, `final_cost(x)`: numbers, twice differentiable; k counts the steps.
-    - `x0`: the initial state. `us` (n, nu): the guess, as for a warm start the controls of the last problem, shifted by a step.
+    - `x0`: the initial state. `us` (n, nu): the guess; or a plan, for a warm start, whose feedback is followed from x0 on:
+      `plan.shift()` of the last problem.
     - `limits`: (lower, upper), each a number, (nu,) or (n, nu); None: none.
     - `iterations`: at most. `tol`: converged where a step reduces the cost, or is predicted to, by less than this part.
     - `regularization`: mu of the first iteration.
@@ -129,7 +136,8 @@ def ilqr(
     )
     ```
     """
-    us = as_array(us, "us")
+    plan = us if isinstance(us, OptimalControl) else None
+    us = as_array(us if plan is None else plan.us, "us")
     us = jnp.asarray(us, us.dtype if jnp.issubdtype(us.dtype, jnp.floating) else float)
     if us.ndim != 2 or 0 in us.shape:
         raise ValueError(f"us has shape {us.shape}; give controls (n, nu), one row per step{batch_hint(us, (1, 1))}")
@@ -154,7 +162,13 @@ def ilqr(
         *_limits(limits, us),
         bool(second_order),
     )
-    state = _solve(problem, flat, us, mu, iterations, float(tol))
+    n, nu = us.shape
+    xs, gains = jnp.broadcast_to(flat, (n, flat.size)), jnp.zeros((n, nu, flat.size), us.dtype)
+    if plan is not None:
+        if plan.gains.shape != gains.shape:
+            raise ValueError(f"us is a plan with gains {plan.gains.shape}, expected {gains.shape} for this x0")
+        xs, gains = jax.vmap(lambda x: ravel_pytree(x)[0])(plan.xs)[:-1], plan.gains
+    state = _solve(problem, flat, xs, us, gains, mu, iterations, float(tol))
     codes: Any = RESULTS
     result = codes.where(state.code == _RUNNING, codes.nonlinear_max_steps_reached, codes.successful)
     result = codes.where(state.code == _NO_DESCENT, codes.no_descent, result)
@@ -204,11 +218,8 @@ def _clip(problem: _Problem, us, k: Any = slice(None)):
     return us if problem.lower is None else jnp.clip(us, problem.lower[k], problem.upper[k])  # pyright: ignore[reportOptionalSubscript]
 
 
-def _solve(problem: _Problem, x0, us, damping, iterations: int, tol: float) -> _State:
-    n, nu = us.shape
-    us = _clip(problem, us)
-    gains = jnp.zeros((n, nu, x0.size), us.dtype)
-    xs, us, cost = _rollout(problem, x0, jnp.broadcast_to(x0, (n, x0.size)), us, jnp.zeros_like(us), gains)
+def _solve(problem: _Problem, x0, xs, us, gains, damping, iterations: int, tol: float) -> _State:
+    xs, us, cost = _rollout(problem, x0, xs, us, jnp.zeros_like(us), gains)
     costs = jnp.broadcast_to(cost, (iterations + 1,))
     one, none = jnp.ones((), us.dtype), jnp.zeros((), jnp.int32)
     code = jnp.where(jnp.isfinite(cost), _RUNNING, _NOT_FINITE).astype(jnp.int32)

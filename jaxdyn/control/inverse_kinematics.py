@@ -75,14 +75,14 @@ def inverse_kinematics(
     *,
     weights: Checked[Mapping[str, Numbers] | None] = None,
     limits: bool = True,
-    posture: Float[Array, " nq"] | None = None,
+    posture: Numbers | None = None,
     steps: int = 1,
     guesses: int = 16,
     atol: float | None = None,
     t: Numbers = 0.0,
     throw: bool | None = None,
 ) -> InverseKinematics:
-    """Find q at which named frames reach targets, with phi(q, t) = 0 and joints within their limits.
+    """Find q at which named frames reach targets, on the constraints and with joints within their limits.
 
     Loops and other constraints on positions hold exactly. Where targets leave freedom, q is where short steps of damped least
     squares from the guess lead; with a `posture` it is the nearest one to that. Where they cannot be reached q minimises the

@@ -44,7 +44,7 @@ _LEAST_GAIN, _LEAST_LAST_GAIN = 1e-2, 1e-9
 
 
 class Aims(NamedTuple):
-    """What a search is after.
+    """Aims of a search.
 
     - `weights`, `shift`, `tolerances` (nh,): factors of the rows; the residuals to be reached, zero in the end; how near.
     - `is_exact` (nh,): 1 for rows of constraints, 0 for rows of targets.
@@ -60,8 +60,10 @@ class Aims(NamedTuple):
 
 
 class Search(NamedTuple):
-    """Where a search is: the configuration, the damping, steps from this place and places tried, and the best configuration
-    with its weighted squared errors.
+    """State of a search.
+
+    The configuration, the damping, the steps from this place and the places tried, and the best configuration with its squared
+    errors.
 
     `guess` is the place from which others are found.
     """
@@ -113,11 +115,11 @@ def _by_turns(guesses: int, scene: Scene, constants, given: Given, carry: Carry)
 def _improve(guesses: int, scene: Scene, constants, state: Search) -> Search:
     t, aims = constants
     q, damping = state.q, state.damping
-    r = weighted_rows(scene, q, t, aims)
+    r = residual(scene, q, t, aims)
     errors = jnp.sum(r * r)
     step = _damped_step(scene, q, t, aims, r, damping * errors)
     tried = clip_to_limits(scene.system, retract(scene.system, displace(scene.system, q, step)), aims)
-    left = weighted_rows(scene, tried, t, aims)
+    left = residual(scene, tried, t, aims)
     new = jnp.sum(left * left)
     falls = new < errors
     q, after = jnp.where(falls, tried, q), jnp.where(falls, new, errors)
@@ -147,7 +149,7 @@ def _improve(guesses: int, scene: Scene, constants, state: Search) -> Search:
     )
 
 
-def weighted_rows(scene: Scene, q, t, aims: Aims):
+def residual(scene: Scene, q, t, aims: Aims):
     """Residuals of constraints and targets, less what is to be left of them, times their weights."""
     return aims.weights * (position_residual(scene, q, t) - aims.shift)
 

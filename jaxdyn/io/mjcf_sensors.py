@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxdyn.dynamics.kinematics import named_frame
 from jaxdyn.io.loaded import summarize
 from jaxdyn.io.mjcf_file import CompiledFile, pose_of
 from jaxdyn.model import float64 as f64
@@ -102,4 +103,6 @@ def _mount(file: CompiledFile, model: Model, body: int) -> dict | None:
         turn = inertial[:3, :3]
         moment = turn @ np.diag(m.body_inertia[b]) @ turn.T
         parameters = parameters + f64.inertia_numbers((m.body_mass[b], inertial[:3, 3], moment), "inertia of a body")
-    return {"inertia": parameters, "joints": joints}
+    # A joint beside the body's origin has put the model's body frame there.
+    _, offset = named_frame(model, file.bodies[carrier])
+    return {"inertia": f64.move_inertia(np.asarray(offset, float), parameters), "joints": joints}

@@ -1,4 +1,4 @@
-"""What a sensor is, its noise, and the readings of sensors at one instant."""
+"""Base class of sensors, their noise, and the readings of several at one instant."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
