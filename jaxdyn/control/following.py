@@ -23,7 +23,7 @@ from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.inverse_kinematics import inverse_kinematics, row_weights
 from jaxdyn.control.targets import as_targets
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Checked, Number, Numbers, check_state
+from jaxdyn.model.arguments import Checked, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displacement
 
@@ -140,7 +140,7 @@ def _rows(targets: Mapping[str, Any]) -> dict[str, dict]:
     return {name: dict(value) if isinstance(value, Mapping) else {"": value} for name, value in targets.items()}
 
 
-def _scaled_rows(whole: Scene, q, t: Number, factors):
+def _scaled_rows(whole: Scene, q, t: Any, factors):
     """Rows of constraints and targets in coordinates scaled by their sizes, and their pseudo-inverse; constants."""
     whole, q = stop_gradient((whole, q))
     sizes, _ = coordinate_sizes(whole.system, q.dtype)

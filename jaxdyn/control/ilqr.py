@@ -155,11 +155,13 @@ def ilqr(
     x0 = jax.tree.map(lambda x: jnp.asarray(as_array(x, "x0"), us.dtype), x0)
     flat, structure = ravel_pytree(x0)
     _check_functions(step, cost, final_cost, x0, us)
+    lower, upper = _limits(limits, us)
     problem = _Problem(
         lambda x, u: ravel_pytree(step(structure(x), u))[0],
         lambda x, u, k: jnp.asarray(cost(structure(x), u, k), us.dtype),
         lambda x: jnp.asarray(final_cost(structure(x)), us.dtype),
-        *_limits(limits, us),
+        lower,
+        upper,
         bool(second_order),
     )
     n, nu = us.shape
@@ -211,7 +213,7 @@ def _limits(limits, us):
             raise ValueError(f"limits has shape {limit.shape}; give numbers, {us.shape[1:]} or {us.shape}")
     if is_concrete(both) and not (np.asarray(both[0]) < np.asarray(both[1])).all():
         raise ValueError(f"limits is {limits!r}; every lower limit has to be below the upper one")
-    return tuple(jnp.broadcast_to(limit, us.shape) for limit in both)
+    return jnp.broadcast_to(both[0], us.shape), jnp.broadcast_to(both[1], us.shape)
 
 
 def _clip(problem: _Problem, us, k: Any = slice(None)):

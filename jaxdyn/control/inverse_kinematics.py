@@ -244,7 +244,7 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         first -= sum(target_rows(rows[i]))
         counted = is_counted[first : first + sum(target_rows(rows[i]))].astype(q.dtype)
         none = jnp.zeros((), q.dtype)
-        rows[i] = KeptRows(rows[i], counted, none, none, rows[i].name)
+        rows[i] = KeptRows(rows[i], counted, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
     joints = _limited_joints(model, aims)
     at = np.asarray(joints, int)
     lower, upper = aims.lower[at], aims.upper[at]
@@ -254,7 +254,8 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         if not joints:
             return Scene(model, tuple(rows))
         limit = jnp.where(place[at] - lower < upper - place[at], lower, upper)
-        held = _HeldAtLimits(active.astype(q.dtype), jnp.where(active, limit, jnp.zeros_like(limit)), joints)
+        at_limit = jnp.where(active, limit, jnp.zeros_like(limit))
+        held = _HeldAtLimits(active.astype(q.dtype), at_limit, joints)  # pyright: ignore[reportCallIssue]
         return Scene(model, (*rows, held))
 
     def beyond(place):

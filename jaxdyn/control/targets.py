@@ -19,7 +19,7 @@ from jaxdyn.constraints.rolling import tangents
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import Number, SystemLike, as_array, batch_hint
+from jaxdyn.model.arguments import Number, as_array, batch_hint
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 
@@ -73,7 +73,7 @@ class CenterTarget(Constraint):
         """Three rows."""
         return 3, 0
 
-    def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array:
+    def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Array:
         """Error of the position, m."""
         return center_of_mass(system, q) - self.target.astype(q.dtype)
 
