@@ -310,7 +310,7 @@ def test_the_linear_map_on_the_host_is_the_chart(wrong_iiwa):
         np.testing.assert_allclose(linear.at(bent, s), chart.parameters(point), rtol=1e-12, atol=1e-14)
         slopes = jax.jit(jax.jacfwd(lambda y, f=unflatten, chart=chart: chart.parameters(f(y))))(y)
         np.testing.assert_allclose(linear.jacobian_at(bent, s), slopes, rtol=1e-11, atol=1e-13)
-        assert linear.slopes(bent).shape == (7 * (size > 0), 10, size)
+        assert linear.body_jacobians(bent).shape == (7 * (size > 0), 10, size)
     factor = np.asarray(jax.jit(jax.jacfwd(inertia.log_cholesky_factor))(np.zeros(10))).transpose(2, 0, 1)
     np.testing.assert_allclose(LOG_CHOLESKY_BASIS, factor + factor.transpose(0, 2, 1), atol=1e-15)
 

@@ -356,7 +356,7 @@ def test_bad_choices_are_refused(swung, oscillation):
         ),
         "method is 'bfgs'": fit(oscillator(), free=parameters, method="bfgs"),
         "initial is 'guessed'": fit(oscillator(), free=parameters, initial="guessed"),
-        "the scene has 1 constraints, whose forces the torques do not tell": fit(
+        "the scene has 1 constraints, whose forces cannot be identified from torques": fit(
             rod, swung, positive=lambda s: s.system.parameters["mass"], error="torque"
         ),
         "the log has no a": fit(
