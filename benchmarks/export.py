@@ -157,7 +157,8 @@ def compete_robot(contest: Contest, peer: ctypes.CDLL, robot: str) -> tuple[jd.E
     if robot == "panda":
         data, one, one_pin = source.createData(), (q[0], v[0], tau[0]), (q_pin[0], v[0], tau[0])
         contest.add("from Python", lambda n: timed(lambda: exported(*one), n))
-        contest.add("pin.aba", lambda n: timed(lambda: pin.aba(source, data, *one_pin), n)  # pyright: ignore[reportAttributeAccessIssue])
+        aba = pin.aba  # pyright: ignore[reportAttributeAccessIssue]
+        contest.add("pin.aba", lambda n: timed(lambda: aba(source, data, *one_pin), n))
     return exported, library, seconds, apart
 
 
@@ -208,7 +209,7 @@ def run_loop(exported: jd.Exported, library: ctypes.CDLL, seconds: float) -> str
 
 def main() -> None:
     """Measure all and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).split("\n")[0])
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--loop", type=float, default=10.0, help="seconds of the loop at 1 kHz (default: 10)")
     parser.add_argument("--docs", action="store_true", help="put the tables into docs/deploy.md")

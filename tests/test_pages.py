@@ -56,8 +56,39 @@ def test_reference_has_every_export():
     assert not missing and recursions <= {name.rpartition(".")[2] for name in listed}, sorted(missing)
 
 
+DOCUMENT_FUNCTIONS = """aba articulated_bodies base_twists com_dynamics com_jacobian constrained_dynamics involutive link_adjoints
+    mass_matrix_sqrt newton_euler_matrices projections RollingModel spurious_terms underactuated_inverse_dynamics
+    contact.contact_coordinates contact.montana control.ContactCoordinates control.GaugeInvariant control.GraspForce
+    control.HybridForce control.WholeBody geometry.arnold_form geometry.covariant_derivative grasp.forces_for_wrench
+    grasp.hand_dynamics grasp.hand_motions grasp.hold scenes.coordinated_lifting scenes.rough_disk_and_link scenes.sphere_arm
+    so3.euler_body_jacobian so3.euler_spatial_jacobian""".split()
+
+
+def test_functions_of_the_documents_exist():
+    """Every function that the page on equations names, and all that its table and "In jaxdyn" lines have to name."""
+    text = (ROOT / "docs/equations.md").read_text()
+    table = text.partition("## 14. ")[2]
+    named, in_table = (set(re.findall(r"`jd\.([\w.]+)`", part)) for part in (text, table))
+    missing = []
+    for name in named:
+        value = jd
+        for part in name.split("."):
+            value = getattr(value, part, None)
+        missing += [name] if value is None else []
+    assert not missing, missing
+    lines = "".join(re.findall(r"\*\*In jaxdyn:\*\*.*?\n\n", text, re.S))
+    in_lines = set(re.findall(r"`jd\.([\w.]+)`", lines))
+    assert not set(DOCUMENT_FUNCTIONS) - in_lines, set(DOCUMENT_FUNCTIONS) - in_lines
+    assert not set(DOCUMENT_FUNCTIONS) - in_table, set(DOCUMENT_FUNCTIONS) - in_table
+    # Each erratum is met on the way, but those of notation alone.
+    errata = set(re.findall(r'id="(e\d+)"', text))
+    ranges = re.findall(r"\(#e(\d+)\)-\[E(\d+)\]", table)
+    cited = set(re.findall(r"\(#(e\d+)\)", table)) | {f"e{n}" for a, b in ranges for n in range(int(a), int(b) + 1)}
+    assert not errata - cited, sorted(errata - cited)
+
+
 # Rooms of the package, which Python leaves in its namespace, are none of these.
-GROUPS = "contact control geometry grasp identify inertia plot robots scenes se2 se3 so3 solvers".split()
+GROUPS = "contact control geometry grasp identify inertia plot robots scenes sensors se2 se3 so3 solvers".split()
 
 
 def exports() -> dict[str, object]:
@@ -172,6 +203,18 @@ def test_pages_of_control_laws(page):
         run(f"docs/control/{page}.md", least=1)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["inverse", "optimal_control", "sensors"])
+def test_pages_of_robots(page):
+    names = run(f"docs/{page}.md", least=1)
+    checks = {
+        "inverse": lambda n: n["batch"].success.mean() > 0.99 and not n["path"].changes_branch.any(),
+        "optimal_control": lambda n: bool(n["plan"].success),
+        "sensors": lambda n: n["log"]["wrist"].shape == (51, 6),
+    }
+    assert checks[page](names)
+
+
 def recipe(section: str, least: int = 2) -> dict:
     return run("docs/recipes.md", section, least, head=True)
 
@@ -187,6 +230,39 @@ def test_recipe_geometry():
 
 
 @pytest.mark.slow
+def test_recipe_workspace():
+    """The places within two lengths of all bases; the margin is zero where the first two arms are in one line."""
+    names = recipe("Workspace and singular positions of a parallel robot")
+    bases = np.array([(0.0, 1.2), (-1.04, -0.6), (1.04, -0.6)])
+    distance = np.linalg.norm(np.asarray(names["grid"])[:, None] - bases, axis=2)
+    assert np.mean(np.asarray(names["inside"]) == (distance < 2).all(1)) > 0.9
+    assert np.isfinite(names["margin"]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page", sorted(path.stem for path in (ROOT / "docs/examples").glob("*.md") if path.stem != "index")
+)
+def test_examples(page, tmp_path, monkeypatch):
+    """A script of less than 60 lines, with its figure."""
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / f"docs/examples/{page}.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    assert len(block.splitlines()) < 60 and (ROOT / f"docs/figures/example_{page}.png").exists()
+    names = run(f"docs/examples/{page}.md", least=1)
+    assert (tmp_path / f"{page}.png").stat().st_size > 10_000
+    checks = {
+        "delta": lambda n: bool(n["path"].success.all()) and np.abs(n["tau"]).max() < 20,
+        "payload": lambda n: np.abs(n["found"] - n["payload"]).max() < 0.02,
+        "policy_gradient": lambda n: n["losses"][-1] < 0.7 * n["losses"][0],
+        "predictive_control": lambda n: abs(np.cos(n["states"][-1][1]) + 1) < 0.02,
+        "synthesis": lambda n: n["openings"][0] > 0.1 and n["openings"][1] < 1e-9 and n["losses"][-1] < 0.05,
+        "vehicles": lambda n: bool(n["success"].all()) and n["missed"].max() < 1.0,
+    }
+    assert checks[page](names)
+
+
+@pytest.mark.slow
 def test_recipe_operational_space():
     names = recipe("Operational space")
     # The circle starts with 0.2 m/s, the arm at rest: the error rises and then decays as its gains say.
@@ -197,7 +273,7 @@ def test_recipe_operational_space():
 @pytest.mark.slow
 def test_recipe_parallel_robot():
     names = recipe("A parallel robot from code")
-    assert names["freedom"] == 2
+    assert names["mobility"] == 2
     assert np.abs(names["held"].acceleration).max() < 1e-10
     assert np.abs(names["fall"].constraint_residual).max() < 1e-10
     # The motor's bearing transmits the motor's torque about its axis.

@@ -10,8 +10,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from jaxdyn.compile.code import Body
-from jaxdyn.compile.graph import Graph, Number, objects
+from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.number import Number, objects
 from jaxdyn.compile.program import Array, Constant, NotNumbers, Program, dtype_of, kind_of
 
 
@@ -77,7 +78,7 @@ class Directions:
         """
         body = Body(e, self.point, load, lambda place: None)
         *rows, (flag,) = body.results()
-        allocated = body.allocated()
+        allocated = body.allocations()
         for i, (row, array) in enumerate(zip(rows, self.point.outputs, strict=False)):
             allocated.append(f"  %point{i} = alloca [{max(1, array.size)} x {_MEMORY[kind_of(array.dtype)]}], align 64")
             for k, value in enumerate(row):
@@ -103,30 +104,30 @@ class Directions:
         e.lines.append(f"  %column{place} = phi i64 [ 0, %before{place} ], [ %following{place}, %{label} ]")
         f = Emitter(width)
         f.count, f.stores = e.count, e.stores
-        at = f.put(f"mul i64 %column{place}, {array.dtype.itemsize}")
-        unit = f.put(f"getelementptr i8, ptr @{table}, i64 {at}")
+        at = f.emit(f"mul i64 %column{place}, {array.dtype.itemsize}")
+        unit = f.emit(f"getelementptr i8, ptr @{table}, i64 {at}")
 
         def load(source, entry, kind):
             if source == len(program.inputs) - 1:
-                where = f.put(f"getelementptr i8, ptr {unit}, i64 {(middle - entry) * array.dtype.itemsize}")
-                return f.put(f"load {f.type(kind)}, ptr {where}, align {array.dtype.itemsize}")
+                where = f.emit(f"getelementptr i8, ptr {unit}, i64 {(middle - entry) * array.dtype.itemsize}")
+                return f.emit(f"load {f.type(kind)}, ptr {where}, align {array.dtype.itemsize}")
             value = f.load_one(f"%point{source}", entry, kind)
             return value if width == 1 else f.splat(value, kind)
 
         rows = Body(f, program, load, lambda place: None).results()
         for i, (row, output) in enumerate(zip(rows, program.outputs, strict=True)):
             item = output.dtype.itemsize
-            step = f.put(f"mul i64 %column{place}, {item}")
-            base = f.put(f"getelementptr i8, ptr %r{i * len(self.varied) + place}, i64 {step}")
+            step = f.emit(f"mul i64 %column{place}, {item}")
+            base = f.emit(f"getelementptr i8, ptr %r{i * len(self.varied) + place}, i64 {step}")
             for k, value in enumerate(row):
-                where = f.put(f"getelementptr i8, ptr {base}, i64 {k * size * item}")
-                f.stored(f"  store {f.type(kind_of(output.dtype))} {value}, ptr {where}, align {item}")
+                where = f.emit(f"getelementptr i8, ptr {base}, i64 {k * size * item}")
+                f.emit_store(f"  store {f.type(kind_of(output.dtype))} {value}, ptr {where}, align {item}")
         e.lines += f.lines
         e.count, e.stores = f.count, f.stores
         e.declared |= f.declared
         # The last turn begins early where the columns are no multiple of the lanes, and computes some of them twice.
-        ahead = e.put(f"add i64 %column{place}, {width}")
-        inside = e.put(f"icmp slt i64 {ahead}, {last}")
+        ahead = e.emit(f"add i64 %column{place}, {width}")
+        inside = e.emit(f"icmp slt i64 {ahead}, {last}")
         e.lines += [
             f"  %following{place} = select i1 {inside}, i64 {ahead}, i64 {last}",
             f"  %more{place} = icmp ne i64 %column{place}, {last}",

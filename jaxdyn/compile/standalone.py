@@ -14,11 +14,12 @@ import numpy as np
 from jaxdyn.compile import derive
 from jaxdyn.compile.code import ATTRIBUTES, Body, symbol_of
 from jaxdyn.compile.directions import Directions
-from jaxdyn.compile.graph import Graph, inlined, objects
-from jaxdyn.compile.kernel import program_of
+from jaxdyn.compile.graph import Graph, inline
 from jaxdyn.compile.llvm import Emitter
-from jaxdyn.compile.mode import rank_safe, standalone
+from jaxdyn.compile.mode import standalone
+from jaxdyn.compile.number import objects
 from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of
+from jaxdyn.compile.trace import program_of
 
 # Operations of a directional derivative times the number of directions. A Panda's forward dynamics has 63 000: by columns its
 # Jacobian takes 1.0 us and half the time to compile, written out 1.6 us. Planar loops have 5 000 and are mostly zeros.
@@ -62,12 +63,17 @@ def make_routine(function: Callable, examples: Sequence[Any], symbol: str) -> tu
 
     **Raises:** ValueError where the function is no scalar program.
     """
-    program, structure = _scalar_program(function, examples, symbol)
+    with standalone():
+        program, structure = _scalar_program(function, examples, symbol)
     # The flag is known where the function decides nothing about rank.
     if type(program.results[-1][0]) is Constant:
         return Routine(symbol, program, None), structure
-    with rank_safe():
-        return Routine(symbol, program, _scalar_program(function, examples, symbol)[0]), structure
+    try:
+        with standalone(is_careful=True):
+            careful = _scalar_program(function, examples, symbol)[0]
+    except ValueError:  # such as a new choice of rows: the status tells of these samples
+        careful = None
+    return Routine(symbol, program, careful), structure
 
 
 def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> tuple[Program, Any]:
@@ -76,8 +82,8 @@ def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> t
 
     call.__qualname__ = name
     try:
-        with standalone():
-            _, made = program_of(call, (), (), tuple(examples), most=MAX_OPERATIONS, served=True)
+        # Validity is reported always: the exported function has a status, whether samples can be invalid or not.
+        _, made = program_of(call, (), (), tuple(examples), most=MAX_OPERATIONS, flags="report_always")
     except _DATA_DEPENDENT as error:
         made = f"shapes, branches or conversions to numpy that depend on data ({str(error).splitlines()[0]})"
     if isinstance(made, str):
@@ -85,16 +91,17 @@ def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> t
             f"function cannot be exported: it has {made}; only functions without callbacks and data-dependent loops can"
         )
     program, structure = made
-    return inlined(program), structure
+    return inline(program), structure
 
 
 def jacobian_routine(routine: Routine, symbol: str) -> Routine:
     """Routine of the derivatives of all float results by all float arguments; see `jacobian_program`."""
-    careful = None
-    if routine.careful is not None:
-        with rank_safe():
-            careful = jacobian_program(routine.careful, symbol)
-    return Routine(symbol, jacobian_program(routine.program, symbol), careful)
+    with standalone():
+        program = jacobian_program(routine.program, symbol)
+    if routine.careful is None:
+        return Routine(symbol, program, None)
+    with standalone(is_careful=True):
+        return Routine(symbol, program, jacobian_program(routine.careful, symbol))
 
 
 def jacobian_program(program: Program | Directions, name: str) -> Program | Directions:
@@ -105,8 +112,7 @@ def jacobian_program(program: Program | Directions, name: str) -> Program | Dire
     """
     assert isinstance(program, Program)
     moving = tuple(array.dtype.kind == "f" for array in program.inputs)
-    with standalone():
-        change = inlined(derive.tangent(program, moving))
+    change = inline(derive.tangent(program, moving))
     columns = sum(array.size for array, moves in zip(program.inputs, moving, strict=True) if moves)
     if change.cost * columns > MAX_WRITTEN_OUT:
         return Directions(program, change)
@@ -190,7 +196,7 @@ def _function_ir(
         field = inputs[place]
         base = f"%a{field.argument}"
         if field.offset:
-            base = e.put(f"getelementptr i8, ptr {base}, i64 {field.offset}")
+            base = e.emit(f"getelementptr i8, ptr {base}, i64 {field.offset}")
         return e.load_one(base, entry if places is None else int(places[place][entry]), kind)
 
     count = 1 + max((field.argument for field in inputs), default=-1)
@@ -215,7 +221,7 @@ def _function_ir(
     else:
         body = Body(e, program, load, lambda place: None)
         *values, (regular,) = body.results()
-        allocated = body.allocated()
+        allocated = body.allocations()
         e.lines += leave(regular)
         finite = all_finite(e, values, program.outputs)
         for i, (row, array) in enumerate(zip(values, program.outputs, strict=False)):
@@ -241,18 +247,18 @@ def all_finite(e: Emitter, rows: Sequence[Sequence[str]], arrays: Sequence[Array
         of, zero = e.type(kind), e.constant(0.0, kind)
         names = [x for row, array in zip(rows, arrays, strict=False) if kind_of(array.dtype) == kind for x in row]
         # x 0 is 0, or not a number where x is not finite. A tree of sums: a chain would wait for each sum.
-        terms = [e.put(f"fmul {of} {x}, {zero}") for x in names]
+        terms = [e.emit(f"fmul {of} {x}, {zero}") for x in names]
         while len(terms) > 1:
-            pairs = [e.put(f"fadd {of} {a}, {b}") for a, b in zip(terms[::2], terms[1::2], strict=False)]
+            pairs = [e.emit(f"fadd {of} {a}, {b}") for a, b in zip(terms[::2], terms[1::2], strict=False)]
             terms = [*pairs, *terms[len(terms) - len(terms) % 2 :]]
-        flags += [e.put(f"fcmp ord {of} {x}, {zero}") for x in terms]
+        flags += [e.emit(f"fcmp ord {of} {x}, {zero}") for x in terms]
     total = e.constant(True, "b1")
     for flag in flags:
-        total = e.put(f"and {e.type('b1')} {total}, {flag}")
+        total = e.emit(f"and {e.type('b1')} {total}, {flag}")
     return total
 
 
-def packed_ir(name: str, arguments: int, program: Program | Directions) -> Text:
+def array_call_ir(name: str, arguments: int, program: Program | Directions) -> Text:
     """The text of `i32 name_packed(ptr block)`, which takes the pointers of `name` from an array (ctypes is slow by argument)."""
     lines, given = [], []
     for i in range(arguments + len(program.outputs) - 1):

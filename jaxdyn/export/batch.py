@@ -70,7 +70,7 @@ def _vector_block(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> list
         # One load and a copy to all lanes.
         value = Emitter(1)
         value.count = e.count
-        at = value.put(f"getelementptr i8, ptr %a{field.argument}, i64 {field.offset}")
+        at = value.emit(f"getelementptr i8, ptr %a{field.argument}, i64 {field.offset}")
         name = value.load_one(at, entry, kind)
         e.lines += value.lines
         e.count = value.count
@@ -87,8 +87,8 @@ def _vector_block(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> list
     for i, (row, array) in enumerate(zip(results, routine.program.outputs, strict=False)):
         e.store_array(rows[len(exported.arguments) + i], kind_of(array.dtype), row)
     finite = _all_lanes(e, all_finite(e, results, routine.program.outputs))
-    code = e.put(f"select i1 {finite}, i32 0, i32 {NOT_FINITE}")
-    code = e.put(f"select i1 {regular}, i32 {code}, i32 {DEGENERATE}")
+    code = e.emit(f"select i1 {finite}, i32 0, i32 {NOT_FINITE}")
+    code = e.emit(f"select i1 {regular}, i32 {code}, i32 {DEGENERATE}")
     # A label of its own: sines of large angles have branches, so that these lines may not be in %block any more.
     e.lines += ["  br label %stored", "stored:", "  br label %following"]
     return [*incoming, (code, "%stored")]
@@ -100,7 +100,7 @@ def _all_lanes(e: Emitter, flag: str) -> str:
         return flag
     name = f"llvm.vector.reduce.and.v{e.width}i1"
     e.declared[name] = f"declare i1 @{name}({e.type('b1')})"
-    return e.put(f"call i1 @{name}({e.type('b1')} {flag})")
+    return e.emit(f"call i1 @{name}({e.type('b1')} {flag})")
 
 
 def _single_calls(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> str:
@@ -109,6 +109,6 @@ def _single_calls(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> str:
     total = "0"
     for k in range(e.width):
         pointers = [f"ptr {rows[i][k]}" if i in rows else f"ptr %a{i}" for i in range(count)]
-        status = e.put(f"call i32 @{exported.name}({', '.join(pointers)})")
-        total = e.put(f"or i32 {total}, {status}")
+        status = e.emit(f"call i32 @{exported.name}({', '.join(pointers)})")
+        total = e.emit(f"or i32 {total}, {status}")
     return total

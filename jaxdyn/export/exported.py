@@ -234,7 +234,7 @@ class Exported:
         fields = fields_of(self.arguments)
         functions = [text for x in routines for text in standalone.routine_ir(x, fields, lanes=lanes)]
         if abi == "packed":
-            functions += [standalone.packed_ir(x.symbol, len(self.arguments), x.program) for x in routines]
+            functions += [standalone.array_call_ir(x.symbol, len(self.arguments), x.program) for x in routines]
         if self.batch and abi == "c":
             functions.append(batch_ir(self, lanes))
         return standalone.module_ir(*functions)

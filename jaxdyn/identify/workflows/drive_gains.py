@@ -1,0 +1,297 @@
+"""Gains of drives from a known payload.
+
+A drive's log holds its current, or a torque under an uncertain gain: i = tau / g. Gains and inertias scale each other, so that
+neither is identifiable from a robot's own logs; a payload of known mass and centre adds a known torque p (N m), and both are:
+
+    i_j = (W_j x + [loaded] (p_j + Y_j I)) / g_j,
+
+with x the robot's base parameters and friction, and I the payload's rotational inertia where it is unknown. All joints share
+the inertias in x, so that the gain of a joint with little torque from the payload is identified through the others. The logs are
+condensed once.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxdyn.identify.condensed import Blocks
+from jaxdyn.identify.logs import Log, as_logs
+from jaxdyn.identify.regression import (
+    base_parameters,
+    condense_model,
+    free_columns,
+    log_regressor,
+    parameter_names,
+)
+from jaxdyn.identify.selection import VELOCITIES
+from jaxdyn.identify.threads import on_one_thread
+from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, coulomb_through_filter
+from jaxdyn.identify.uncertainty import block_groups, jackknife, student
+from jaxdyn.model import inertia as _inertia
+from jaxdyn.model.arguments import Numbers, warn
+from jaxdyn.model.tree import Model
+
+_STEPS, _ROUNDS = 50, 3
+# Largest half-width of a 95 % interval, as a share of the gain, of an identifiable gain.
+_IDENTIFIABLE = 0.5
+# Standard deviation of the prior of the logarithm of a gain, about the median of the others.
+_APART = 1.0
+# Least error as a share of the signal, so that noise-free logs stay well posed.
+_FINEST = 1e-9
+# Least share of a column that is independent of the others.
+_RANK = 1e-9
+
+
+class DriveGains(eqx.Module):
+    """Result of `fit_gains`.
+
+    - `gains` (nv,): torque = gain times the logged value. `std` (nv,): standard deviations, by blocks of samples as in
+      `Intervals`; `factor`: a 95 % interval is plus and minus this many of them.
+    - `identifiable`: names of the joints with a half-width below half of the gain. The other gains are about their median.
+    - `error`: of the logged values, in per cent, over all logs. `v_s`: smoothing velocity of Coulomb friction.
+    """
+
+    gains: np.ndarray
+    std: np.ndarray
+    factor: float
+    identifiable: tuple[str, ...] = eqx.field(static=True)
+    error: float
+    v_s: float
+
+    def scale(self, log: Log) -> Log:
+        """Scale a log of these drives to torques in N m, as all fits expect them."""
+        tau = np.asarray(log.tau, np.float64) * self.gains
+        return Log(log.t, log.q, log.v, log.a, tau, joint_names=log.joint_names, cutoff=log.cutoff)
+
+    def scaled(self, log: Log) -> Log:
+        """Deprecated name of `scale`."""
+        warn("DriveGains.scaled is deprecated; call scale", DeprecationWarning)
+        return self.scale(log)
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Deprecated name of `identifiable`."""
+        warn("DriveGains.told is deprecated; read identifiable", DeprecationWarning)
+        return self.identifiable
+
+
+@on_one_thread
+def fit_gains(
+    model: Model,
+    unloaded: Log | Sequence[Log],
+    loaded: Log | Sequence[Log],
+    mass: float,
+    centre: Numbers,
+    *,
+    inertia: Numbers | None = None,
+    body: str | None = None,
+    terms: Terms = TERMS,
+    v_s: float | str = "auto",
+    blocks: int = 20,
+) -> DriveGains:
+    """Fit the gain of each drive from logs without and with a known payload.
+
+    Least squares over gains and base parameters together, each joint weighted by one over its error, iterated. Then fit the
+    robot to `gains.scale(log)`.
+
+    **Arguments:**
+
+    - `model`: the robot; its inertias do not matter. `unloaded`, `loaded`: logs with v and a, or sequences of them, with currents
+      (or torques under uncertain gains) in place of torques.
+    - `mass` (kg), `centre` (3,) (m) of the payload, in the frame of the body that holds it. `inertia` (3, 3): about the
+      centre, in axes of that frame (kg m^2); None: fitted too, at the cost of wider intervals.
+    - `body`: name of the body that holds it, the last one by default. `terms`: of friction and rotors, of `TERMS`; `v_s`:
+      smoothing velocity of Coulomb friction (rad/s, m/s), or "auto", that of the smallest error.
+    - `blocks`: consecutive samples are cut into about this many blocks, whose scatter gives the intervals.
+
+    **Returns:** `DriveGains`.
+
+    **Raises:** ValueError when logs and model do not fit together, for an unknown body, and where the payload identifies no gain.
+
+    Source: Gautier & Briot (2014), "Global identification of joint drive gains and dynamic parameters of robots", ASME Journal of
+    Dynamic Systems, Measurement, and Control 136; errors here are those of the currents, which least squares over both allows.
+    """
+    unloaded, loaded = as_logs(unloaded, model), as_logs(loaded, model)
+    terms = check_terms(terms, 1.0)
+    body = model.body_names[-1] if body is None else body
+    if body not in model.body_names:
+        raise ValueError(f"body is {body!r}; the bodies are {', '.join(model.body_names)}")
+    centre = np.asarray(centre, np.float64)
+    if not (np.isfinite(mass) and mass > 0) or centre.shape != (3,) or not np.isfinite(centre).all():
+        raise ValueError(f"mass is {mass} and centre {centre.tolist()}; give a positive mass (kg) and a point (3,) (m)")
+    moments = np.zeros((3, 3)) if inertia is None else np.asarray(inertia, np.float64)
+    known = np.asarray(_inertia.inertial_parameters(float(mass), centre, moments), np.float64)
+    number, logs = model.body_names.index(body), (*unloaded, *loaded)
+    is_loaded = np.arange(len(logs)) >= len(unloaded)
+    own = slice(10 * number, 10 * number + 10)
+    carried = []
+    for log, holds in zip(logs, is_loaded, strict=True):
+        columns = holds * log_regressor(model, log)[:, :, own]
+        free = columns[:, :, 4:] if inertia is None else columns[:, :, :0]
+        carried.append(np.concatenate([(columns @ known)[:, :, None], free], axis=2))
+    best = None
+    for velocity in VELOCITIES if isinstance(v_s, str) else (float(v_s),):
+        coulomb = [coulomb_through_filter(log, velocity) for log in logs]
+        data = condense_model(model, logs, v_s=velocity, coulomb=coulomb, extra=carried, blocks=blocks)
+        trial = _fit(_Problem(model, data, terms), velocity)
+        if best is None or trial[0] < best[0]:
+            best = trial
+    assert best is not None
+    _, error, gains, std, factor, velocity = best
+    is_identifiable = factor * std < _IDENTIFIABLE * gains
+    if not is_identifiable.any():
+        raise ValueError(
+            f"the payload of {mass:g} kg on {body} identifies the gain of no joint; use a heavier one, move more joints against "
+            "gravity, or give its inertia"
+        )
+    names = tuple(name for name, yes in zip(_joint_names(model), is_identifiable, strict=True) if yes)
+    return DriveGains(gains, std, factor, names, error, velocity)
+
+
+class _Problem:
+    """Condensed logs of nv joints, with the columns of the unknowns: base parameters and the inertia I."""
+
+    def __init__(self, model: Model, data: Blocks, terms):
+        self.data, self.nv = data, model.nv
+        shared = 10 * model.nb
+        base = base_parameters(model, terms)
+        independent = free_columns(model.nb, model.nv, terms)[base.independent]
+        self.size = len(independent) + data.terms - 5
+        # For each joint, the columns of its triangle and the unknowns that these belong to.
+        self.columns, self.unknowns = [], []
+        for joint in range(model.nv):
+            places = data.places(joint)[: shared + 4]
+            where = {int(place): k for k, place in enumerate(places)}
+            pairs = [(where[int(x)], i) for i, x in enumerate(independent) if int(x) in where]
+            pairs += [(shared + 5 + k, len(independent) + k) for k in range(data.terms - 5)]
+            columns, unknowns = np.array(pairs).T
+            self.columns.append(columns)
+            self.unknowns.append(unknowns)
+        self.known = shared + 4
+
+    def rows(self, joint: int, triangle: np.ndarray, z: np.ndarray, u: float):
+        """Errors of a joint's condensed currents at the unknowns z and the gain exp(u), and their Jacobian (m, size + 1)."""
+        h, W = np.exp(-u), triangle[:, self.columns[joint]]
+        predicted = h * (W @ z[self.unknowns[joint]] + triangle[:, self.known])
+        jacobian = np.zeros((len(triangle), self.size + 1))
+        jacobian[:, self.unknowns[joint]] = h * W
+        jacobian[:, -1] = -predicted
+        return predicted - triangle[:, -1], jacobian
+
+    def linearise(self, triangles, z, u, weights):
+        """Weighted errors (m,) and their Jacobian (m, size + nv) of all joints."""
+        errors, jacobians = [], []
+        for joint, triangle in enumerate(triangles):
+            error, part = self.rows(joint, triangle, z, u[joint])
+            wide = np.zeros((len(error), self.size + self.nv))
+            wide[:, : self.size], wide[:, self.size + joint] = part[:, :-1], part[:, -1]
+            errors.append(weights[joint] * error)
+            jacobians.append(weights[joint] * wide)
+        return np.concatenate(errors), np.concatenate(jacobians)
+
+
+class _State(NamedTuple):
+    """Unknowns other than the gains, logarithms of gains, and the weights of joints."""
+
+    z: np.ndarray
+    u: np.ndarray
+    weights: np.ndarray
+
+
+def _fit(problem: _Problem, v_s: float):
+    """Score, error in per cent, gains, standard deviations, factor of an interval, v_s."""
+    data, nv = problem.data, problem.nv
+    triangles, samples = data.merge(), int(data.samples.sum())
+    sizes = np.array([max(float(np.linalg.norm(R[:, -1])), 1e-300) for R in triangles])
+    start = _start(problem, triangles)
+    state = _State(np.zeros(problem.size), start, 1 / sizes)
+    rms = sizes
+    for _ in range(_ROUNDS):
+        state = _descend(problem, triangles, state, start)
+        rms = np.array(
+            [np.linalg.norm(problem.rows(j, R, state.z, state.u[j])[0]) for j, R in enumerate(triangles)]
+        ) / np.sqrt(samples)
+        state = state._replace(weights=1 / np.maximum(rms, _FINEST * sizes / np.sqrt(samples)))
+    grams, gradients = [], []
+    for block in data.triangles:
+        error, J = problem.linearise(block, *state)
+        grams.append(J.T @ J)
+        gradients.append(J.T @ error)
+    # Errors of currents count as independent: groups of two blocks.
+    groups = block_groups(len(data), np.inf)
+    total = np.sum(grams, axis=0)
+    curvature = np.diag(_weak_prior(total, problem.size))
+    parts = [np.stack([np.sum([x[i] for i in group], axis=0) for group in groups]) for x in (grams, gradients)]
+    changes, inverse = jackknife(parts[0], parts[1], curvature)
+    variance = np.sum(changes**2, axis=1) + np.diag(inverse @ curvature @ inverse)
+    gains = np.exp(state.u)
+    score = float(np.sum(np.log(np.maximum(rms, _FINEST * sizes))))
+    percent = 100 * float(np.sqrt(samples * np.sum(rms**2) / np.sum(sizes**2)))
+    return score, percent, gains, gains * np.sqrt(variance[-nv:]), student(len(groups) - 1), v_s
+
+
+def _weak_prior(gram: np.ndarray, size: int) -> np.ndarray:
+    """Curvature (n,) of a weak prior: a small share of each number's own, and the prior of the gains."""
+    prior = 1e-12 * np.maximum(np.diag(gram), 1e-300)
+    prior[size:] = 1 / _APART**2
+    return prior
+
+
+def _start(problem: _Problem, triangles) -> np.ndarray:
+    """Logarithms of the gains (nv,) by the linear problem i_j = W_j z_j + h_j p_j of each joint; else the median of the others.
+
+    **Raises:** ValueError where no joint identifies any.
+    """
+    logarithms = np.full(problem.nv, np.nan)
+    for joint, R in enumerate(triangles):
+        table = R[:, [*problem.columns[joint], problem.known, R.shape[1] - 1]]
+        size = np.linalg.norm(table[:, -2])
+        used = np.linalg.norm(table, axis=0) > 0
+        used[-2:] = True
+        T = np.asarray(np.linalg.qr(table[:, used], mode="r"))
+        k = T.shape[1] - 2
+        if len(T) > k and abs(T[k, k]) > 1e-6 * size > 0:
+            h, noise = T[k, k + 1] / T[k, k], np.linalg.norm(T[k + 1 :, k + 1])
+            if h > 0 and noise / np.sqrt(problem.data.samples.sum()) < 0.5 * h * abs(T[k, k]):
+                logarithms[joint] = -np.log(h)
+    if np.isnan(logarithms).all():
+        raise ValueError(
+            "the payload's torque is not identifiable at any joint; are the loaded logs loaded, and do they move joints "
+            "against gravity?"
+        )
+    return np.where(np.isnan(logarithms), np.nanmedian(logarithms), logarithms)
+
+
+def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> _State:
+    """Make Gauss-Newton steps in unknowns and gains, the first in the unknowns alone; halved until the loss decreases."""
+    z, u, weights = state
+
+    def loss(z, u) -> float:
+        error, _ = problem.linearise(triangles, z, u, weights)
+        return float(error @ error + np.sum((u - start) ** 2) / _APART**2)
+
+    z, now = z.copy(), np.inf
+    for step in range(_STEPS):
+        error, J = problem.linearise(triangles, z, u, weights)
+        root = np.sqrt(_weak_prior(J.T @ J, problem.size))
+        pull = np.concatenate([np.zeros(problem.size), (u - start) / _APART])
+        A, b = np.concatenate([J, np.diag(root)]), np.concatenate([error, pull])
+        if step == 0:  # the errors are linear in the unknowns at fixed gains
+            A = A[:, : problem.size]
+        scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+        change = -np.linalg.lstsq(A / scale, b, rcond=_RANK)[0] / scale
+        dz, du = change[: problem.size], change[problem.size :] if step else np.zeros(problem.nv)
+        share = 1.0
+        while (after := loss(z + share * dz, u + share * du)) > now and share > 1e-6:
+            share /= 2
+        z, u = z + share * dz, u + share * du
+        if step > 1 and now - after <= 1e-12 * now:
+            break
+        now = min(now, after)
+    return state._replace(z=z, u=u)
+
+
+def _joint_names(model: Model) -> list[str]:
+    return [name.rpartition(".")[0] for name in parameter_names(model)[10 * model.nb : 10 * model.nb + model.nv]]

@@ -1,0 +1,199 @@
+"""Derivatives of kernels of functions with rules of their own, to third order: against plain mode and closed forms."""
+
+import functools
+import inspect
+import warnings
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.special
+import numpy as np
+import pytest
+from jax.extend.core import ClosedJaxpr, Jaxpr
+from kernel_helpers import assert_close, native, quick
+
+from jaxdyn import compile as backend
+from jaxdyn.compile import target
+from jaxdyn.compile.expand import NotNumbers, expand
+from jaxdyn.compile.repair import repair
+
+pytestmark = pytest.mark.native
+X = jnp.array([0.3, 0.62, 0.21])
+
+
+def _has_rule(jaxpr: Jaxpr) -> bool:
+    for eqn in jaxpr.eqns:
+        inner = [x.jaxpr if isinstance(x, ClosedJaxpr) else x for x in eqn.params.values()]
+        if eqn.primitive.name.startswith("custom_") or any(_has_rule(x) for x in inner if isinstance(x, Jaxpr)):
+            return True
+    return False
+
+
+@functools.cache
+def _functions() -> dict:
+    """Functions of JAX of one or two numbers that have a rule of their own and are programs of numbers."""
+    found = {}
+    for module in (jax.nn, jax.scipy.special, jnp):
+        for name, function in inspect.getmembers(module, callable):
+            if name.startswith("_") or inspect.isclass(function):
+                continue
+            for more in ((), (X[::-1],)):
+                try:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore")
+                        closed = jax.make_jaxpr(function)(X, *more)
+                    if _has_rule(closed.jaxpr):
+                        expand(closed, 10**6)
+                        found[f"{module.__name__}.{name}"] = lambda x, f=function, more=more: (
+                            f(x, *more) if more else f(x)
+                        )
+                except NotNumbers:
+                    break
+                except Exception:  # other arguments than arrays, or another number of them
+                    continue
+    return found
+
+
+def _derivatives(function):
+    """x, step -> derivatives of a weighted sum of function(x) to third order, in every order of forward and reverse mode."""
+
+    def all_of(x, step):
+        weights = jnp.cos(jnp.arange(x.size, dtype=x.dtype))
+
+        def f(x):
+            return jnp.vdot(weights, function(x))
+
+        def forward(f):
+            return lambda x: jax.jvp(f, (x,), (step,))[1]
+
+        def reverse(f):
+            return lambda x: jnp.vdot(jax.grad(f)(x), step)
+
+        words = ("", "f", "r", "ff", "fr", "rf", "rr", "fff", "rrr", "rfr")
+        applied = {
+            word: functools.reduce(lambda g, mode: forward(g) if mode == "f" else reverse(g), word, f) for word in words
+        }
+        return {word: g(x) for word, g in applied.items()}
+
+    return all_of
+
+
+def _by_kernel(function, x, step):
+    program = expand(jax.make_jaxpr(_derivatives(native(function)))(x, step), 10**6)[0]
+    words = sorted(("", "f", "r", "ff", "fr", "rf", "rr", "fff", "rrr", "rfr"))
+    return dict(zip(words, target.call(program, [np.asarray(x), np.asarray(step)]), strict=True))
+
+
+def _compare(functions: dict) -> None:
+    step = jnp.array([0.7, -1.1, 0.4])
+    wanted = quick(lambda x, step: {name: _derivatives(f)(x, step) for name, f in functions.items()})(X, step)
+    for name, function in functions.items():
+        for word, value in _by_kernel(function, X, step).items():
+            # Differences of exponentials of both signs, three times differentiated.
+            assert_close(value, wanted[name][word], 1e-10, f"{name} {word}")
+
+
+def test_some_functions_of_jax_with_rules():
+    """All orders of modes agree with plain mode: a choice, a removable singularity."""
+    _compare({"relu": jax.nn.relu, "sinc": jnp.sinc})
+
+
+@pytest.mark.slow
+def test_functions_of_jax_with_rules():
+    """Every one that JAX has, found by tracing; all orders of modes agree with plain mode."""
+    functions = _functions()
+    names = "nn.softplus nn.relu nn.log_sigmoid numpy.sinc numpy.logaddexp numpy.logaddexp2 special.xlogy special.logit".split()
+    assert {f"jax.{x}" if not x.startswith("special") else f"jax.scipy.{x}" for x in names} <= set(functions)
+    # Those of hundreds of operations are left to the random functions of the benchmarks.
+    _compare({name: f for name, f in functions.items() if expand(jax.make_jaxpr(f)(X), 10**6)[0].cost < 300})
+
+
+def test_closed_forms():
+    """Third derivatives of sinc at its removable singularity and away from it, of softplus, logit and x log x."""
+    s = 1 / (1 + np.exp(-0.3))
+    cases = (
+        (jnp.sinc, 0.0, (1.0, 0.0, -(np.pi**2) / 3, 0.0)),
+        (jax.nn.softplus, 0.3, (np.log(1 + np.exp(0.3)), s, s * (1 - s), s * (1 - s) * (1 - 2 * s))),
+        (lambda x: jax.scipy.special.xlogy(x, x), 0.3, (0.3 * np.log(0.3), np.log(0.3) + 1, 1 / 0.3, -1 / 0.09)),
+        (
+            jax.scipy.special.logit,
+            0.3,
+            (np.log(3 / 7), 1 / 0.21, (2 * 0.3 - 1) / 0.21**2, 2 * (0.3**3 + 0.7**3) / 0.21**3),
+        ),
+        (lambda x: jnp.logaddexp(x, 0.0), 0.3, (np.log(1 + np.exp(0.3)), s, s * (1 - s), s * (1 - s) * (1 - 2 * s))),
+    )
+    for function, x, wanted in cases:
+        for word, value in _by_kernel(function, jnp.array([x]), jnp.ones(1)).items():
+            assert_close(value, wanted[len(word)], 1e-9 if function is jnp.sinc else 1e-11, word)
+
+
+@jax.custom_jvp
+def _root(x):
+    """y with y + y^3 = x, by a number of halvings: its numbers say nothing of its derivative."""
+
+    def halve(_, ends):
+        low, high = ends
+        middle = 0.5 * (low + high)
+        is_high = middle + middle**3 > x
+        return jnp.where(is_high, low, middle), jnp.where(is_high, middle, high)
+
+    low, high = jax.lax.fori_loop(0, 60, halve, (jnp.full_like(x, -4.0), jnp.full_like(x, 4.0)))
+    return 0.5 * (low + high)
+
+
+_root.defjvp(lambda primals, steps: (_root(primals[0]), steps[0] / (1 + 3 * _root(primals[0]) ** 2)))
+
+
+def _root_derivatives(x):
+    """y and its three derivatives, by hand."""
+    y = np.roots([1.0, 0.0, 1.0, -x])
+    y = float(y[np.abs(y.imag) < 1e-9][0].real)
+    d = 1 + 3 * y**2
+    return y, 1 / d, -6 * y / d**3, (108 * y**2 / d - 6) / d**4
+
+
+def test_rules_that_call_their_own_function():
+    """A root by the implicit function theorem, alone and within another kernel."""
+    wanted = _root_derivatives(1.3)
+    for word, value in _by_kernel(lambda x: native(_root)(x), jnp.array([1.3]), jnp.ones(1)).items():
+        assert_close(value, wanted[len(word)], 1e-12, word)
+
+
+def test_rules_of_kernels_that_call_functions_with_rules():
+    """`tangent=` and `implicit`: the derivative of what a rule computes asks the rules of what it calls."""
+
+    def rule(_, x, steps):
+        return steps[0] * _root(x)
+
+    def f(x):
+        return backend.kernel(lambda _, x: jnp.floor(x), derivative=rule)((), x).sum()
+
+    def solve(_, x):
+        return _root(x)
+
+    def change(_, x, steps):
+        y = _root(x)
+        return y, steps[-1] / (1 + 3 * y**2)
+
+    def g(x):
+        return backend.kernel(lambda _, x: backend.implicit((), (x,), solve, change))((), x).sum()
+
+    wanted = _root_derivatives(1.3)
+    x = jnp.array(1.3)
+    for shift, function in ((1, f), (0, g)):
+        second = quick(lambda x, h=function: (jax.grad(h)(x), jax.grad(jax.grad(h))(x), jax.jacfwd(jax.grad(h))(x)))(x)
+        for value, order in zip(second, (1, 2, 2), strict=True):
+            assert_close(value, wanted[order - shift], 1e-12)
+
+
+def test_samples_that_are_repaired_keep_rules():
+    """Second derivatives where a sample is computed by the careful function, and where it is not."""
+
+    def function(_, x):
+        fast = jnp.sinc(x)
+        return repair(x < 0.5, lambda x: (jnp.sinc(x), ()), jnp.sinc, (fast, ()), (x,))[0]
+
+    x = jnp.array([0.0, 0.7])
+    repaired = quick(jax.vmap(jax.grad(jax.grad(lambda x: backend.kernel(function)((), x)))))(x)
+    assert_close(repaired, jax.vmap(jax.grad(jax.grad(jnp.sinc)))(x), 1e-12)
+    assert_close(repaired[0], -(np.pi**2) / 3, 1e-12)
