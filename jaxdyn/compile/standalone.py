@@ -146,7 +146,7 @@ class Text(NamedTuple):
 
 
 class Field(NamedTuple):
-    """Where an array of a program stands: the pointer among a function's arguments, and the offset in bytes from it."""
+    """Place of an array of a program: the pointer among a function's arguments, and the offset in bytes from it."""
 
     argument: int
     offset: int
@@ -161,8 +161,7 @@ def routine_ir(
     results: Sequence[np.ndarray] | None = None,
     internal: bool = False,
 ) -> list[Text]:
-    """Text of `i32 symbol(ptr a0, ..., ptr r0, ...)`: status 0, `DEGENERATE` where the last program flags the sample, or
-    `NOT_FINITE`.
+    """Text of `i32 symbol(ptr a0, ..., ptr r0, ...)`, which returns 0 or bits of `DEGENERATE` and `NOT_FINITE`.
 
     **Arguments:** `inputs`: for each input of the program its place in the caller's memory. `places`, `results`: for each entry
     of an input and of an output, by rows, its index in the caller's memory (default: by rows); -1 for a result that is not
