@@ -24,6 +24,8 @@ _ELEMENTWISE: dict[str, Callable] = {
 }  # fmt: skip
 # Words of docs/algorithms.md for rules of kernels that change results.
 ZERO_PRODUCT, EQUAL_DIFFERENCE, ZERO_SIGN = "0 x", "x - x", "sign of zero"
+# A difference of products that cancels: a fused multiply-add leaves the rounding of one of them, which may decide a tie.
+CONTRACTION = "a b - c d"
 _REDUCTIONS: dict[str, Callable] = {
     "reduce_sum": np.sum, "reduce_prod": np.prod, "reduce_max": np.max, "reduce_min": np.min, "reduce_and": np.all,
     "reduce_or": np.any,
@@ -66,6 +68,8 @@ def _rules_met(name: str, args, results) -> set[str]:
         rules.add(ZERO_PRODUCT)
     if name in ("sub", "add", "add_any", "reduce_sum", "dot_general", "cumsum") and not all(map(_is_finite, args)):
         rules.add(EQUAL_DIFFERENCE)
+    if name in ("sub", "add", "add_any") and ((results[0] == 0) & (args[0] != 0)).any():
+        rules.add(CONTRACTION)
     # Where the sign of a zero decides: a quotient, an angle, and functions with a pole at zero.
     if name in ("div", "atan2", "rsqrt", "pow", "integer_pow", "cbrt") and any((x == 0).any() for x in args):
         if not all(map(_is_finite, results)) or name == "atan2":

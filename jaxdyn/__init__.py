@@ -7,6 +7,7 @@ from jaxdyn import grasp as grasp
 from jaxdyn import identify as identify
 from jaxdyn import scale as scale
 from jaxdyn import scenes as scenes
+from jaxdyn import sensors as sensors
 from jaxdyn.compile import compilation as compilation
 from jaxdyn.constraints import Holonomic as Holonomic
 from jaxdyn.constraints import Pfaffian as Pfaffian
@@ -34,6 +35,8 @@ from jaxdyn.contact.unilateral import DryFriction as DryFriction
 from jaxdyn.contact.unilateral import UnilateralContact as UnilateralContact
 from jaxdyn.contact.unilateral import gap_contact as gap_contact
 from jaxdyn.contact.unilateral import ground_contact as ground_contact
+from jaxdyn.control.following import follow as follow
+from jaxdyn.control.inverse_kinematics import inverse_kinematics as inverse_kinematics
 from jaxdyn.control.legs import LeggedDynamics as LeggedDynamics
 from jaxdyn.control.legs import underactuated_inverse_dynamics as underactuated_inverse_dynamics
 from jaxdyn.dynamics.articulated_bodies import ArticulatedBodies as ArticulatedBodies
@@ -131,6 +134,7 @@ from jaxdyn.reduction.bases import tangent_basis as tangent_basis
 from jaxdyn.reduction.gauge_invariant import gauge_invariant as gauge_invariant
 from jaxdyn.reduction.integrability import involutive as involutive
 from jaxdyn.reduction.integrability import spurious_terms as spurious_terms
+from jaxdyn.reduction.inverse_dynamics import constrained_inverse_dynamics as constrained_inverse_dynamics
 from jaxdyn.reduction.minimal import reduced_dynamics as reduced_dynamics
 from jaxdyn.reports import report as report
 from jaxdyn.simulation import solvers as solvers

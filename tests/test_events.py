@@ -119,17 +119,12 @@ def test_each_lane_of_a_batch_has_its_own_events(shaken):
         assert list(batch.events.name[i]) == list(alone.events.name)
 
 
-def bowling(mu=0.12, radius=0.10795):
-    ball = jd.scenes.bowling_ball().system
-    return jd.Scene(ball, forces=(jd.ground_contact("ball", None, mu, radius=radius, name="lane"),))
-
-
 @pytest.mark.slow
 def test_bowling_ball_rolls_when_the_closed_form_says():
     """Problem 5.4: the friction is that of the contact's own normal force."""
     r, m, inertia, g, mu = 0.10795, 6.35, 0.0296, 9.8, 0.12
     ts = jnp.linspace(0.0, 4.0, 5)
-    motion = jd.simulate(bowling(), *jd.scenes.bowling_ball.start(), ts, rtol=1e-10, atol=1e-10)
+    motion = jd.simulate(jd.scenes.bowling_ball(), *jd.scenes.bowling_ball.start(), ts, rtol=1e-10, atol=1e-10)
     up, v, w = np.array([0, 0, 1.0]), np.array([8.0, 0, 0]), np.array([-8 * np.pi, 0, 0])
     slip = v + np.cross(w, -r * up)
     rolling = r / (inertia + m * r * r) * np.cross(inertia * w + m * r * np.cross(up, v), up)

@@ -18,7 +18,8 @@ PARTICIPLE = re.compile(
     r"|left|thrown|sent)(_\w+)?"
 )
 # Terms of the field, and names that are deprecated in this release.
-TERMS = """generalized_force applied_force reduced_dynamics constrained_dynamics underactuated_inverse_dynamics closed_form
+TERMS = """generalized_force applied_force reduced_dynamics constrained_dynamics constrained_inverse_dynamics
+    underactuated_inverse_dynamics closed_form
     articulated_bodies
     coordinated_lifting closed_ring quadruped left_jacobian left_jacobian_inverse unconstrained constrained named_frame
     signed_distance displaced converged_reference published_state time_interleaved embed""".split()

@@ -88,7 +88,7 @@ def test_functions_of_the_documents_exist():
 
 
 # Rooms of the package, which Python leaves in its namespace, are none of these.
-GROUPS = "contact control geometry grasp identify inertia plot robots scenes se2 se3 so3 solvers".split()
+GROUPS = "contact control geometry grasp identify inertia plot robots scenes sensors se2 se3 so3 solvers".split()
 
 
 def exports() -> dict[str, object]:
@@ -203,6 +203,18 @@ def test_pages_of_control_laws(page):
         run(f"docs/control/{page}.md", least=1)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["inverse", "optimal_control", "sensors"])
+def test_pages_of_robots(page):
+    names = run(f"docs/{page}.md", least=1)
+    checks = {
+        "inverse": lambda n: n["batch"].success.mean() > 0.99 and not n["path"].changes_branch.any(),
+        "optimal_control": lambda n: bool(n["plan"].success),
+        "sensors": lambda n: n["log"]["wrist"].shape == (51, 6),
+    }
+    assert checks[page](names)
+
+
 def recipe(section: str, least: int = 2) -> dict:
     return run("docs/recipes.md", section, least, head=True)
 
@@ -215,6 +227,39 @@ def test_recipe_environment_step():
 @pytest.mark.slow
 def test_recipe_geometry():
     np.testing.assert_allclose(recipe("Optimising a geometry")["lengths"], [0.32, 0.95, 0.75], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_recipe_workspace():
+    """The places within two lengths of all bases; the margin is zero where the first two arms are in one line."""
+    names = recipe("Workspace and singular positions of a parallel robot")
+    bases = np.array([(0.0, 1.2), (-1.04, -0.6), (1.04, -0.6)])
+    distance = np.linalg.norm(np.asarray(names["grid"])[:, None] - bases, axis=2)
+    assert np.mean(np.asarray(names["inside"]) == (distance < 2).all(1)) > 0.9
+    assert np.isfinite(names["margin"]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page", sorted(path.stem for path in (ROOT / "docs/examples").glob("*.md") if path.stem != "index")
+)
+def test_examples(page, tmp_path, monkeypatch):
+    """A script of less than 60 lines, with its figure."""
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / f"docs/examples/{page}.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    assert len(block.splitlines()) < 60 and (ROOT / f"docs/figures/example_{page}.png").exists()
+    names = run(f"docs/examples/{page}.md", least=1)
+    assert (tmp_path / f"{page}.png").stat().st_size > 10_000
+    checks = {
+        "delta": lambda n: bool(n["path"].success.all()) and np.abs(n["tau"]).max() < 20,
+        "payload": lambda n: np.abs(n["found"] - n["payload"]).max() < 0.02,
+        "policy_gradient": lambda n: n["losses"][-1] < 0.7 * n["losses"][0],
+        "predictive_control": lambda n: abs(np.cos(n["states"][-1][1]) + 1) < 0.02,
+        "synthesis": lambda n: n["openings"][0] > 0.1 and n["openings"][1] < 1e-9 and n["losses"][-1] < 0.05,
+        "vehicles": lambda n: bool(n["success"].all()) and n["missed"].max() < 1.0,
+    }
+    assert checks[page](names)
 
 
 @pytest.mark.slow

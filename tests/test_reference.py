@@ -21,6 +21,7 @@ REFERENCE = ROOT / "docs" / "reference"
 PAGES = sorted(path.stem for path in REFERENCE.glob("*.md") if path.stem != "index")
 # What another export returns, whose example shows it.
 SHOWN_BY = {
+    "control.OptimalControl": "control.ilqr",
     "LeggedDynamics": "underactuated_inverse_dynamics",
     "identify.DriveGains": "identify.fit_gains",
     "identify.Cutoff": "identify.choose_cutoff",

@@ -93,7 +93,7 @@ def test_accelerations_of_balls_on_planes():
     assert_close(solution.multipliers, 1.4 * np.array([9.81 * np.cos(slope), -2 / 7 * pull, 0.0]), 1e-12)
 
     state = scenes.bowling_ball.start()
-    solution = solved(scenes.bowling_ball(), state, np.zeros(6))
+    solution = solved(scenes.bowling_ball(until_rolling=True), state, np.zeros(6))
     push, spin, _, _ = sliding()
     across = np.cross(state[1][3:], state[1][:3])
     assert_close(solution.acceleration[:3] + across, push, 1e-13)
@@ -127,7 +127,7 @@ def test_bowling_ball_slides_until_it_rolls():
     """A parabola, with the turns of the ball, up to just before it rolls with the velocity that Drake gives."""
     push, spin, end, roll = sliding()
     t = end * np.array([0.0, 0.3, 0.99])
-    computed = motion(scenes.bowling_ball(), scenes.bowling_ball.start(), t, 0.004)
+    computed = motion(scenes.bowling_ball(until_rolling=True), scenes.bowling_ball.start(), t, 0.004)
     v0 = np.array([8.0, 0.0, 0.0])
     np.testing.assert_allclose(v0 + push * end, roll, atol=1e-13)
     want = v0[:2] * t[:, None] + 0.5 * push[:2] * t[:, None] ** 2

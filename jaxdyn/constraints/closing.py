@@ -6,6 +6,7 @@
 3. `polish`: Newton's steps to rounding.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -155,11 +156,16 @@ def polish(scene: Scene, q, t, rank_tol):
     return lax.while_loop(goes_on, improve, (q, size(q), jnp.asarray(True), 0))[0]
 
 
-def nearest_configuration(scene: Scene, guess, start, t, rank_tol):
-    """The configuration on the constraints nearest to a guess, from a start close to it, with the derivatives of a minimum."""
+def nearest_configuration(scene: Scene, guess, start, t, rank_tol, solve: Callable | None = None):
+    """The configuration on the constraints nearest to a guess, from a start close to it, with the derivatives of a minimum.
 
-    def solve(scene, guess, start, t):
+    `solve(scene, guess, start, t)` finds it otherwise than by `slide_to_nearest`.
+    """
+
+    def slide(scene, guess, start, t):
         return polish(scene, slide_to_nearest(scene, guess, start, t, rank_tol), t, rank_tol)
+
+    solve = solve or slide
 
     def differentiable(scene, q, start, t):
         fixed, guess, begun, frozen = stop_gradient((scene, q, start, t))

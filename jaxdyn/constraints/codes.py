@@ -60,6 +60,9 @@ class RESULTS(eqx.Enumeration):
         "Surfaces that roll do not touch in one point any more: their relative curvature is not positive."
     )
     unnormalized_start = "A quaternion of the initial state is not of unit length."
+    targets_not_reached = "No configuration that reaches the targets was found."
+    no_descent = "No step along the search direction reduces the cost."
+    underactuated = "The motors cannot produce this motion."
 
     # An enumeration of equinox does not tell its names.
     _names.extend(name for name in vars() if not name.startswith("_"))

@@ -13,6 +13,8 @@ from jaxdyn.control.contacts import ContactCoordinates as ContactCoordinates
 from jaxdyn.control.feet import Foot as Foot
 from jaxdyn.control.feet import foot as foot
 from jaxdyn.control.grasping import GraspForce as GraspForce
+from jaxdyn.control.ilqr import OptimalControl as OptimalControl
+from jaxdyn.control.ilqr import ilqr as ilqr
 from jaxdyn.control.legs import missing_wrench as missing_wrench
 from jaxdyn.control.motion import CartesianStiffness as CartesianStiffness
 from jaxdyn.control.motion import ComputedTorque as ComputedTorque

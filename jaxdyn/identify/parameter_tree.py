@@ -214,15 +214,15 @@ class Parameters(eqx.Module):
         numbers = self._arrays(np.asarray(float(scale)), np.asarray(float(offset)))
         return self._with([*self.blocks, Tied(labels, leaf, tuple(index), other, tuple(other_index), *numbers)])
 
-    def bounded(self, *args, **options) -> "Parameters":
+    def bounded(self, where: Function, lower: Values, upper: Values, **options: Any) -> "Parameters":
         """Deprecated name of `bound`."""
         warn("Parameters.bounded is deprecated; call bound", DeprecationWarning)
-        return self.bound(*args, **options)
+        return self.bound(where, lower, upper, **options)
 
-    def tied(self, *args, **options) -> "Parameters":
+    def tied(self, where: Function, to: Function, **options: Any) -> "Parameters":
         """Deprecated name of `tie`."""
         warn("Parameters.tied is deprecated; call tie", DeprecationWarning)
-        return self.tie(*args, **options)
+        return self.tie(where, to, **options)
 
     # Quantities that a fit needs.
 

@@ -13,6 +13,7 @@ from jaxdyn.dynamics.kinematics import body_jacobian
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, warn
 from jaxdyn.model.tree import Model
+from jaxdyn.sensors import Sensor
 from jaxdyn.systems.scene import Force, Scene
 
 
@@ -103,14 +104,16 @@ class LoadedScene(Scene):
       are unchanged: project them to the constraints with `jd.assemble(scene, scene.starts[name].q)`.
     - `actuators`: `Actuators`, called as `scene.actuators(scene.system, q, v, control)` to give tau (nv,); None when
       there are none.
+    - `sensors`: those of the file, for `jd.sensors.measure`.
     - `not_taken`: descriptions of the file's elements that the scene does not represent, as in `NotTakenWarning`.
     """
 
     is_rounded: ClassVar[bool] = True
-    # Dataclass fields after `Scene`'s defaults need defaults; `__init__` sets all three.
+    # Dataclass fields after `Scene`'s defaults need defaults; `__init__` sets all of them.
     starts: dict[str, Start] = eqx.field(default_factory=dict)
     actuators: Actuators | None = None
     not_taken: tuple[str, ...] = eqx.field(static=True, default=())
+    sensors: tuple[Sensor, ...] = ()
 
     def __init__(
         self,
@@ -121,11 +124,13 @@ class LoadedScene(Scene):
         starts: Mapping,
         actuators: "Actuators | None" = None,
         not_taken: Sequence[str] = (),
+        sensors: Sequence[Sensor] = (),
     ):
         super().__init__(system, constraints, forces)
         self.starts = dict(starts)
         self.actuators = actuators
         self.not_taken = tuple(not_taken)
+        self.sensors = tuple(sensors)
 
 
 def summarize(what: str, names: Iterable[str], most: int = 8) -> list[str]:

@@ -28,6 +28,7 @@ from jaxdyn.io.mjcf_file import (
     pose_of,
 )
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
+from jaxdyn.io.mjcf_sensors import sensors
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.builder import ModelBuilder
@@ -42,7 +43,8 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     massless bodies BODY_JOINT), armature, limits (as the model's `lower`, `upper`), damping, springs and dry friction
     of joints, gravity; `equality` of kind connect, weld, joint and tendon as exact constraints, where MuJoCo softens
     them; tendons that are linear in the joints' coordinates; actuators without a state of their own; sites as frames;
-    keyframes as starts. Every body keeps its frame of the file under its name. Missing names
+    keyframes as starts; sensors of frames, joints, force and torque. Every body keeps its frame of the file under its
+    name. Missing names
     become "bodyN" and BODY_joint (BODY_jointK of several), names in use get an underscore appended, and a site with
     the name of a body is SITE_site.
 
@@ -55,7 +57,8 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     **Arguments:** `path`, the file; `dtype`, as for `ModelBuilder`.
 
     **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
-    0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is MuJoCo's qpos0), `.actuators`, `.not_taken`.
+    0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is MuJoCo's qpos0), `.actuators`, `.sensors` (a tuple for
+    `jd.sensors.measure`), `.not_taken`.
 
     **Warns:** `NotTakenWarning` naming unsupported elements: contact geometry, muscles and other actuators with
     a state, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and the like.
@@ -73,11 +76,13 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     rows, left = constraints(file, model)
     tendons, also = tendon_forces(file, model)
     drives, idle = actuators(file, model)
-    not_taken = (*missing, *left, *also, *idle, *_unsupported(file))
+    readings, unread = sensors(file, model)
+    not_taken = (*missing, *left, *also, *idle, *_unsupported(file), *unread)
     warn_not_taken(path, not_taken)
     warn_of_units(path, model)
     forces = (*_joint_forces(file, model), *tendons)
-    return LoadedScene(model, rows, forces, starts=_starts(file, model, drives), actuators=drives, not_taken=not_taken)
+    starts = _starts(file, model, drives)
+    return LoadedScene(model, rows, forces, starts=starts, actuators=drives, not_taken=not_taken, sensors=readings)
 
 
 def _model(file: CompiledFile, dtype) -> Model:
@@ -209,7 +214,6 @@ def _unsupported(file: CompiledFile) -> list[str]:
     touching |= {m.geom_bodyid[g] for pair in (m.pair_geom1, m.pair_geom2) for g in pair}
     names = [file.bodies[b] or "world" for b in sorted(touching)] if not file.off("CONTACT") else []
     fluid = [key for key in ("density", "viscosity") if getattr(m.opt, key)]
-    sensors = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_SENSOR, i) or f"sensor{i}" for i in range(m.nsensor)]
     flexes = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_FLEX, i) or f"flex{i}" for i in range(m.nflex)]
     return [
         *summarize("contact geometry of bodies", names),
@@ -229,5 +233,4 @@ def _unsupported(file: CompiledFile) -> list[str]:
         *summarize("fluid forces", fluid),
         *summarize("flexible bodies", flexes),
         *(["plugins"] if m.nplugin else []),
-        *summarize("sensors", sensors),
     ]

@@ -178,7 +178,9 @@ def joint_rate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"]) -> F
 
 
 @entry_point
-def joint_random(kind: str, key: Array, lower: Array, upper: Array, dtype) -> Float[Array, " nqj"]:
+def joint_random(
+    kind: str, key: Array, lower: Array | np.ndarray, upper: Array | np.ndarray, dtype
+) -> Float[Array, " nqj"]:
     # A normal vector in four dimensions has a uniform direction, and so gives uniform rotations.
     """Random configuration: uniform between the limits for coordinates, uniform over rotations for quaternions."""
     if kind in ("spherical", "free"):

@@ -253,7 +253,7 @@ def _vehicles(ten: np.ndarray) -> tuple[Case, ...]:
             "bowling_ball",
             "Bowling ball that slides, 1.5 s",
             "holonomic",
-            scene_builder("bowling_ball"),
+            scene_builder("bowling_ball", until_rolling=True),
             None,
             0.15 * ten,
             100,

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Holonomic, rolling_sphere
+from jaxdyn.contact.unilateral import ground_contact
 from jaxdyn.lie import so3
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
@@ -111,11 +112,15 @@ def bowling_ball(
     moment: Number = 0.0296,
     friction: Number = 0.12,
     gravity: Number = 9.8,
+    until_rolling: bool = False,
 ) -> Scene:
-    """Bowling ball that slides with Coulomb friction, up to the onset of rolling.
+    """Bowling ball that slides with Coulomb friction, then rolls.
 
     The velocity u of the point that touches the lane keeps its direction, so that the centre moves on a parabola:
-    vdot = -mu g u/|u|, with I w + m r e_z x v constant. It rolls after |u0| / (mu g (1 + m r^2/I)).
+    vdot = -mu g u/|u|, with I w + m r e_z x v constant. It rolls after |u0| / (mu g (1 + m r^2/I)), at constant velocity
+    (`jd.ground_contact`, whose events say when).
+
+    With `until_rolling` the friction has a formula without modes, so that all methods integrate it, up to where it rolls.
 
     Start: `velocity` (m/s) of the centre, `spin` (rad/s) in axes of the world.
 
@@ -123,5 +128,7 @@ def bowling_ball(
     """
     builder = ModelBuilder("bowling ball", gravity=(0.0, 0.0, -gravity))
     builder.add_body("ball", None, "free", (mass, (0.0, 0.0, 0.0), (moment, moment, moment)))
+    if not until_rolling:
+        return Scene(builder.build(), (), (ground_contact("ball", None, friction, radius=radius, name="lane"),))
     lane = Holonomic(_Height(radius), name="lane")
     return Scene(builder.build(), (lane,), (_Sliding(friction * mass * gravity, radius),))

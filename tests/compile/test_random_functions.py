@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from jax import lax
 from kernel_helpers import by_kernel
 
-from benchmarks.numpy_jaxprs import EQUAL_DIFFERENCE, ZERO_PRODUCT, ZERO_SIGN, trace_and_evaluate
+from benchmarks.numpy_jaxprs import CONTRACTION, EQUAL_DIFFERENCE, ZERO_PRODUCT, ZERO_SIGN, trace_and_evaluate
 from benchmarks.random_functions import BINARY, NAMES, SPECIAL, UNARY, Function, differentiated, judge
 from jaxdyn.compile import kernel, target
 from jaxdyn.compile.expand import expand
@@ -33,7 +33,7 @@ def functions(draw) -> Function:
     return Function(tuple((name, tuple(args)) for name, args in steps))
 
 
-@settings(max_examples=20, deadline=None, derandomize=True)
+@settings(max_examples=14, deadline=None, derandomize=True)
 @given(
     functions(),
     st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS), min_size=1, max_size=3),
@@ -124,4 +124,4 @@ def test_the_reference_finds_the_rules_that_it_meets():
         assert rule in met
         met.clear()
         trace_and_evaluate(function, jnp.asarray(1.5), met=met)
-        assert not met or rule == ZERO_SIGN
+        assert met <= {CONTRACTION, ZERO_SIGN}

@@ -1,0 +1,168 @@
+"""Inverse kinematics along a path: each configuration from the one before, with what tells whether the branch was kept.
+
+The rows R of constraints and targets, weighted and in coordinates scaled by the sizes of joints, have singular values that
+count the distance from a singular position. Where a combination of rows goes through zero between two configurations, the
+determinant of R' R^+ + (1 - R R^+) changes its sign: the branch is another one after that.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from jaxdyn.compile import pseudo_inverse_by_rotations
+from jaxdyn.compile.known import is_concrete, stop_gradient
+from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
+from jaxdyn.constraints.codes import Outcome
+from jaxdyn.constraints.rank import sign_of_determinant, tolerance
+from jaxdyn.constraints.tolerances import coordinate_sizes
+from jaxdyn.control.inverse_kinematics import inverse_kinematics, row_weights
+from jaxdyn.control.targets import as_targets
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Checked, Numbers, check_state
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import SceneLike, displacement
+
+_JUMP = 1.0  # rad or lengths of the mechanism: a longer way between two configurations is no small step
+
+
+class Following(Outcome):
+    """Configurations along a path of targets.
+
+    - `q` (n, nq); `residual` (n,) and `result` (n,) as of `InverseKinematics`.
+    - `regularity` (n,): r / (|R| |R^+|) of the rows of constraints and targets, of rank r: 1 where all singular values are equal,
+      at most r times the least over the largest one, and 0 where the rank is less than at the first place.
+    - `changes_branch` (n,): whether between the configuration before and this one a combination of rows went through zero, or
+      a coordinate jumped by more than a radian or a length of the mechanism.
+    """
+
+    q: Float[Array, "n nq"]
+    residual: Float[Array, " n"]
+    result: Any
+    regularity: Float[Array, " n"]
+    changes_branch: Bool[Array, " n"]
+
+
+def follow(
+    scene: SceneLike,
+    targets: Checked[Mapping[str, Any]],
+    guess: Float[Array, " nq"],
+    *,
+    weights: Checked[Mapping[str, Numbers] | None] = None,
+    limits: bool = True,
+    posture: Numbers | None = None,
+    steps: int = 1,
+    guesses: int = 1,
+    atol: float | None = None,
+    t: Numbers = 0.0,
+    throw: bool | None = None,
+) -> Following:
+    """Inverse kinematics along a path or over a grid: each configuration by `inverse_kinematics` from the one before.
+
+    The first one is searched for from the guess, all others by the least change, which keeps the branch where the path has steps
+    short enough; `changes_branch` says where that was lost.
+
+    **Arguments:** as of `inverse_kinematics`; every target has one row for each of its n places, such as poses (n, 4, 4) or
+    dictionaries of positions (n, 3) and directions (n, 3). `guesses` counts for the places after the first one; the first
+    is searched for from 16. A grid is followed row by row, forth and back.
+
+    **Returns:** `Following`. Derivatives are those of each configuration by its own targets.
+
+    **Raises:** ValueError as `inverse_kinematics`, and for targets of different lengths; if `throw`, by default if all inputs are
+    concrete, for a place that was not reached, with its index.
+
+    Source: Allgower & Georg (1990), Numerical continuation methods, chapters 2 and 5.
+
+    ```python
+    arm = jd.robots.iiwa()
+    start = jd.frame_pose(arm, jnp.full(7, 0.5), "iiwa_link_7")
+    path = jnp.stack([start.at[2, 3].add(-0.01 * k) for k in range(5)])
+    q = jd.follow(arm, {"iiwa_link_7": path}, jnp.full(7, 0.5)).q
+    ```
+    """
+    scene = as_scene(scene)
+    (guess,) = check_state(scene.system, q=guess)
+    if not isinstance(targets, Mapping) or not targets:
+        raise ValueError(f"targets is {targets!r}; give a dictionary of targets by the names of frames")
+    rows = _rows(targets)
+    axes = {name: value.pop("axis") for name, value in rows.items() if "axis" in value}
+    lengths = {np.shape(x)[0] if np.ndim(x) else None for x in jax.tree.leaves(rows)}
+    if len(lengths) != 1 or None in lengths or 0 in lengths:
+        raise ValueError(f"targets have {lengths} rows; give every target one row for each place of the path")
+
+    def at(row):
+        """Targets of one place, as `inverse_kinematics` takes them."""
+        named = {name: value | {"axis": axes[name]} if name in axes else value for name, value in row.items()}
+        return {name: value[""] if "" in value else value for name, value in named.items()}
+
+    rows = jax.tree.map(jnp.asarray, rows)
+    first, rest = (jax.tree.map(lambda x, part=part: x[part], rows) for part in (0, slice(1, None)))
+    factors = row_weights(as_targets(scene.system, at(first)), weights, guess.dtype)
+    options = {"weights": weights, "limits": limits, "posture": posture, "atol": atol, "t": t, "throw": False}
+
+    def place(row, guess, guesses):
+        """A configuration, and its rows."""
+        reached = inverse_kinematics(scene, at(row), guess, steps=steps, guesses=guesses, **options)
+        whole = Scene(scene.system, (*scene.constraints, *as_targets(scene.system, at(row))))
+        return reached, _scaled_rows(whole, lax.stop_gradient(reached.q), t, factors)
+
+    def go_on(carry, row):
+        q, R, inverse = carry
+        reached, (R_after, inverse_after) = place(row, q, guesses)
+        after = lax.stop_gradient(reached.q)
+        changes = _changes_branch(scene.system, q, after, R_after, R, inverse)
+        regularity = _regularity(R_after, inverse_after, rank)
+        return (after, R_after, inverse_after), (reached, regularity, changes)
+
+    begin, (R, inverse) = place(first, guess, 16)
+    rank = _rank(R, inverse)
+    states = (lax.stop_gradient(begin.q), R, inverse)
+    _, (places, regularity, changes) = lax.scan(go_on, states, rest)
+    every = jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), begin, places)
+    regularity = jnp.concatenate([_regularity(R, inverse, rank)[None], regularity])
+    changes = jnp.concatenate([jnp.zeros(1, bool), changes])
+    path = Following(every.q, every.residual, every.result, regularity, changes)
+    if is_concrete(path.q) and (throw is None or throw) and not bool(jnp.all(path.success)):
+        lost = np.flatnonzero(~np.asarray(path.success))
+        raise ValueError(
+            f"follow: {lost.size} places of {path.q.shape[0]} were not reached, the first one number {lost[0]}, with errors "
+            f"up to {float(path.residual[lost[0]]):.3g} (m or rad); give shorter steps, more guesses, or throw=False"
+        )
+    return path
+
+
+def _rows(targets: Mapping[str, Any]) -> dict[str, dict]:
+    """Targets as dictionaries; a target that is an array stands under an empty name."""
+    return {name: dict(value) if isinstance(value, Mapping) else {"": value} for name, value in targets.items()}
+
+
+def _scaled_rows(whole: Scene, q, t: Any, factors):
+    """Rows of constraints and targets in coordinates scaled by their sizes, and their pseudo-inverse; constants."""
+    whole, q = stop_gradient((whole, q))
+    sizes, _ = coordinate_sizes(whole.system, q.dtype)
+    R = constraint_jacobian(whole, q, t)[holonomic_rows(layout(whole))] * sizes[None]
+    count = R.shape[0] - factors.size
+    R = R * jnp.concatenate([jnp.ones((count,), q.dtype), lax.stop_gradient(factors)])[:, None]
+    return R, pseudo_inverse_by_rotations(R, tolerance(None, R))
+
+
+def _rank(R, inverse):
+    return jnp.round(jnp.sum(inverse * R.T))
+
+
+def _regularity(R, inverse, rank):
+    """r / (|R| |R^+|) in Frobenius' norm, and 0 where the rank r is less than `rank`."""
+    size = jnp.sqrt(jnp.sum(R * R) * jnp.sum(inverse * inverse))
+    regular = jnp.minimum(rank / jnp.where(size > 0, size, jnp.ones_like(size)), 1.0)
+    return jnp.where(_rank(R, inverse) >= rank, regular, jnp.zeros_like(regular))
+
+
+def _changes_branch(system, before, after, R_after, R, inverse):
+    own = jnp.eye(R.shape[0], dtype=R.dtype) - _product(R, inverse)
+    sizes, _ = coordinate_sizes(system, before.dtype)
+    turned = sign_of_determinant(_product(R_after, inverse) + own) < 0
+    return turned | (jnp.max(jnp.abs(displacement(system, before, after)) / sizes) > _JUMP)

@@ -1,0 +1,339 @@
+"""Optimal control of any step by iterated linear-quadratic regulators, and by differential dynamic programming, within limits.
+
+One iteration expands cost and step about a trajectory, V(x) ~ V + Vx dx + dx.Vxx dx / 2 backwards in time,
+
+    Qz = lz + F^T Vx,   Qzz = lzz + F^T Vxx F (+ Vx . d2f/dz2),   z = (x, u),  F = df/dz,
+    k = argmin k.(Quu + mu) k / 2 + Qu.k within the limits,   K = -(Quu + mu)^-1 Qux for controls that are at none,
+
+and takes the step u + alpha k + K (x - x_before) with the longest alpha that reduces the cost.
+
+Sources: Li & Todorov (2004); Tassa, Erez & Todorov (2012), Synthesis and stabilization of complex behaviors through online
+trajectory optimization, section II (value update, schedule of mu, line search); Tassa, Mansard & Todorov (2014) for limits.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int, PyTree
+
+from jaxdyn.compile.known import is_concrete
+from jaxdyn.constraints.codes import RESULTS, Outcome
+from jaxdyn.constraints.rank import eps_of
+from jaxdyn.control.box_qp import minimize_in_box
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, batch_hint
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
+from jaxdyn.systems.scene import as_pytree
+
+_LENGTHS = tuple(10.0 ** (-3 * i / 10) for i in range(11))
+_LEAST_PART = 1e-4  # of the reduction that the expansion predicts
+_FACTOR, _LEAST_DAMPING, _LARGEST_DAMPING = 1.6, 1e-6, 1e10
+_RUNNING, _CONVERGED, _NO_DESCENT, _NOT_FINITE = range(4)
+
+
+class OptimalControl(Outcome):
+    """A trajectory, the feedback along it, and how it was found.
+
+    - `us` (n, nu); `xs`: states, each leaf with n + 1 rows; `cost` ().
+    - `gains` (n, nu, nx): u = us[k] + gains[k] (x - xs[k]), of the states as vectors, leaf after leaf.
+    - `costs` (iterations + 1,): after each iteration, the last one repeated. `iterations` (): how many were made.
+    - `regularization` (): mu at the end, for a warm start. `reduction` (): what a further step is predicted to bring.
+    - `result`: one of `RESULTS`. `nonlinear_max_steps_reached`: it had not converged after all iterations; `no_descent`: no
+      step reduces the cost, not even in the direction of the gradient; `nonfinite`: cost or step are not finite at the start.
+    """
+
+    us: Float[Array, "n nu"]
+    xs: Any
+    gains: Float[Array, "n nu nx"]
+    cost: Float[Array, ""]
+    costs: Float[Array, " iterations"]
+    iterations: Int[Array, ""]
+    regularization: Float[Array, ""]
+    reduction: Float[Array, ""]
+    result: Any
+
+    def shift(self) -> "OptimalControl":
+        """The plan from its second step on, its last control and gain repeated: where the next one begins."""
+        us, xs, gains = jax.tree.map(lambda x: jnp.concatenate([x[1:], x[-1:]]), (self.us, self.xs, self.gains))
+        return dataclasses.replace(self, us=us, xs=xs, gains=gains)
+
+
+class _Problem(NamedTuple):
+    """Functions of vectors: step(x, u) (nx,), cost(x, u, k) and final(x) (), and limits (n, nu) or None."""
+
+    step: Callable
+    cost: Callable
+    final: Callable
+    lower: Array | None
+    upper: Array | None
+    second_order: bool
+
+
+class _State(NamedTuple):
+    xs: Array
+    us: Array
+    gains: Array
+    cost: Array
+    costs: Array
+    damping: Array
+    factor: Array
+    iterations: Array
+    reduction: Array
+    code: Array
+
+
+def ilqr(
+    step: Function,
+    cost: Function,
+    final_cost: Function,
+    x0: PyTree,
+    us: Checked[Numbers | OptimalControl],
+    *,
+    limits: Checked[Sequence[Numbers] | None] = None,
+    iterations: int = 100,
+    tol: float = 1e-9,
+    regularization: Numbers = 0.0,
+    second_order: bool = False,
+) -> OptimalControl:
+    """Controls that minimise sum_k cost(x_k, u_k, k) + final_cost(x_n) with x_(k+1) = step(x_k, u_k), from a guess.
+
+    One sample; a batch by `jax.vmap` over x0, us, and what the functions hold. Derivatives of the step are those of reverse mode,
+    of all steps at once; `jd.stepper` has them as native kernels. It is not differentiable itself.
+
+    **Arguments:**
+
+    - `step(x, u)`: the next state, as of `jd.stepper`; states are arrays or pytrees of them, such as (q, v).
+    - `cost(x, u, k)`, `final_cost(x)`: numbers, twice differentiable; k counts the steps.
+    - `x0`: the initial state. `us` (n, nu): the guess; or a plan, for a warm start, whose feedback is followed from x0 on:
+      `plan.shift()` of the last problem.
+    - `limits`: (lower, upper), each a number, (nu,) or (n, nu); None: none.
+    - `iterations`: at most. `tol`: converged where a step reduces the cost, or is predicted to, by less than this part.
+    - `regularization`: mu of the first iteration.
+    - `second_order`: whether to keep the second derivatives of the step (DDP): fewer iterations near the solution, each of
+      them dearer.
+
+    **Returns:** `OptimalControl`.
+
+    **Raises:** ValueError for functions that cannot be called so, or whose results do not fit, for us of another shape, limits
+    that cross, and counts that are not positive.
+
+    Source: Tassa, Erez & Todorov (2012), section II; Tassa, Mansard & Todorov (2014).
+
+    ```python
+    plan = jd.control.ilqr(
+        lambda x, u: jnp.stack([x[0] + 0.1 * x[1], x[1] + 0.1 * u[0]]),
+        lambda x, u, k: 0.01 * u @ u,
+        lambda x: x @ x,
+        jnp.array([1.0, 0.0]),
+        jnp.zeros((20, 1)),
+        limits=(-1.0, 1.0),
+    )
+    ```
+    """
+    plan = us if isinstance(us, OptimalControl) else None
+    us = as_array(us if plan is None else plan.us, "us")
+    us = jnp.asarray(us, us.dtype if jnp.issubdtype(us.dtype, jnp.floating) else float)
+    if us.ndim != 2 or 0 in us.shape:
+        raise ValueError(f"us has shape {us.shape}; give controls (n, nu), one row per step{batch_hint(us, (1, 1))}")
+    if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
+        raise ValueError(f"iterations is {iterations!r}; give a positive integer")
+    if not is_concrete(tol) or not 0 < float(tol) < 1:
+        raise ValueError(f"tol is {tol!r}; give a number between 0 and 1")
+    mu = as_array(regularization, "regularization", us.dtype)
+    if mu.shape != () or (is_concrete(mu) and not 0 <= float(mu) < np.inf):
+        raise ValueError(f"regularization is {regularization!r}; give one number that is not negative")
+    step, cost, final_cost = (
+        as_pytree(f, name, takes)
+        for f, name, takes in ((step, "step", "x, u"), (cost, "cost", "x, u, k"), (final_cost, "final_cost", "x"))
+    )
+    x0 = jax.tree.map(lambda x: jnp.asarray(as_array(x, "x0"), us.dtype), x0)
+    flat, structure = ravel_pytree(x0)
+    _check_functions(step, cost, final_cost, x0, us)
+    lower, upper = _limits(limits, us)
+    problem = _Problem(
+        lambda x, u: ravel_pytree(step(structure(x), u))[0],
+        lambda x, u, k: jnp.asarray(cost(structure(x), u, k), us.dtype),
+        lambda x: jnp.asarray(final_cost(structure(x)), us.dtype),
+        lower,
+        upper,
+        bool(second_order),
+    )
+    n, nu = us.shape
+    xs, gains = jnp.broadcast_to(flat, (n, flat.size)), jnp.zeros((n, nu, flat.size), us.dtype)
+    if plan is not None:
+        if plan.gains.shape != gains.shape:
+            raise ValueError(f"us is a plan with gains {plan.gains.shape}, expected {gains.shape} for this x0")
+        xs, gains = jax.vmap(lambda x: ravel_pytree(x)[0])(plan.xs)[:-1], plan.gains
+    state = _solve(problem, flat, xs, us, gains, mu, iterations, float(tol))
+    codes: Any = RESULTS
+    result = codes.where(state.code == _RUNNING, codes.nonlinear_max_steps_reached, codes.successful)
+    result = codes.where(state.code == _NO_DESCENT, codes.no_descent, result)
+    result = codes.where(state.code == _NOT_FINITE, codes.nonfinite, result)
+    return OptimalControl(
+        state.us,
+        jax.vmap(structure)(state.xs),
+        state.gains,
+        state.cost,
+        state.costs,
+        state.iterations,
+        state.damping,
+        state.reduction,
+        result,
+    )
+
+
+def _check_functions(step, cost, final_cost, x0, us) -> None:
+    """Refuse functions whose results are none of a step and of costs."""
+    u, k = us[0], jnp.zeros((), jnp.int32)
+    after = jax.eval_shape(step, x0, u)
+    if jax.tree.structure(after) != jax.tree.structure(x0):
+        raise ValueError(f"step returned {jax.tree.structure(after)}, expected {jax.tree.structure(x0)} as of x0")
+    shapes = [(a.shape, b.shape) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(x0), strict=True)]
+    if any(a != b for a, b in shapes):
+        raise ValueError(f"step returned shapes {[a for a, _ in shapes]}, expected {[b for _, b in shapes]} as of x0")
+    for name, value in (("cost", jax.eval_shape(cost, x0, u, k)), ("final_cost", jax.eval_shape(final_cost, x0))):
+        if getattr(value, "shape", None) != ():
+            raise ValueError(f"{name} returned shape {getattr(value, 'shape', value)}; return one number, ()")
+
+
+def _limits(limits, us):
+    if limits is None:
+        return None, None
+    if not isinstance(limits, (tuple, list)) or len(limits) != 2:
+        raise ValueError(f"limits is {limits!r}; give a pair (lower, upper), or None")
+    both = [as_array(limit, "limits", us.dtype) for limit in limits]
+    for limit in both:
+        if limit.shape not in ((), us.shape[1:], us.shape):
+            raise ValueError(f"limits has shape {limit.shape}; give numbers, {us.shape[1:]} or {us.shape}")
+    if is_concrete(both) and not (np.asarray(both[0]) < np.asarray(both[1])).all():
+        raise ValueError(f"limits is {limits!r}; every lower limit has to be below the upper one")
+    return jnp.broadcast_to(both[0], us.shape), jnp.broadcast_to(both[1], us.shape)
+
+
+def _clip(problem: _Problem, us, k: Any = slice(None)):
+    return us if problem.lower is None else jnp.clip(us, problem.lower[k], problem.upper[k])  # pyright: ignore[reportOptionalSubscript]
+
+
+def _solve(problem: _Problem, x0, xs, us, gains, damping, iterations: int, tol: float) -> _State:
+    xs, us, cost = _rollout(problem, x0, xs, us, jnp.zeros_like(us), gains)
+    costs = jnp.broadcast_to(cost, (iterations + 1,))
+    one, none = jnp.ones((), us.dtype), jnp.zeros((), jnp.int32)
+    code = jnp.where(jnp.isfinite(cost), _RUNNING, _NOT_FINITE).astype(jnp.int32)
+    state = _State(xs, us, gains, cost, costs, damping, one, none, jnp.full_like(cost, jnp.inf), code)
+
+    def goes_on(state: _State):
+        return (state.code == _RUNNING) & (state.iterations < iterations)
+
+    return lax.while_loop(goes_on, lambda state: _iterate(problem, state, tol), state)
+
+
+def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
+    k, K, slope, curvature, is_definite = _backward(problem, state)
+    predicted = -(slope + curvature)
+    # What is left of a cost that goes to zero is rounding of the first one.
+    size = jnp.maximum(jnp.abs(state.cost), eps_of(state.cost) * jnp.abs(state.costs[0]))
+    is_small = is_definite & (predicted <= tol * size) & (state.damping <= 1e-5)
+
+    def try_length(carry):
+        _, count = carry
+        alpha = jnp.asarray(_LENGTHS, k.dtype)[count]
+        xs, us, cost = _rollout(problem, state.xs[0], state.xs[:-1], state.us, alpha * k, K)
+        enough = state.cost - cost >= -_LEAST_PART * alpha * (slope + alpha * curvature)
+        return (xs, us, cost, enough & (cost < state.cost)), count + 1
+
+    def goes_on(carry):
+        return ~carry[0][3] & (carry[1] < len(_LENGTHS)) & is_definite & ~is_small
+
+    before = state.xs, state.us, state.cost, jnp.asarray(False)
+    (xs, us, cost, falls), _ = lax.while_loop(goes_on, try_length, (before, jnp.zeros((), jnp.int32)))
+    xs, us, cost = (jnp.where(falls, x, y) for x, y in zip((xs, us, cost), before[:3], strict=True))
+
+    ratio = jnp.where(
+        falls, jnp.minimum(state.factor / _FACTOR, 1 / _FACTOR), jnp.maximum(state.factor * _FACTOR, _FACTOR)
+    )
+    less = jnp.where(state.damping * ratio > _LEAST_DAMPING, state.damping * ratio, jnp.zeros_like(ratio))
+    damping = jnp.where(falls, less, jnp.maximum(state.damping * ratio, _LEAST_DAMPING))
+    converged = is_small | (falls & (state.cost - cost <= tol * size))
+    code = jnp.where(converged, _CONVERGED, jnp.where(damping > _LARGEST_DAMPING, _NO_DESCENT, _RUNNING))
+    kept = is_definite
+    return _State(
+        xs,
+        us,
+        jnp.where(kept, K, state.gains),
+        cost,
+        jnp.where(jnp.arange(state.costs.size, dtype=jnp.int32) > state.iterations, cost, state.costs),
+        jnp.where(is_small, state.damping, damping),
+        ratio,
+        state.iterations + 1,
+        jnp.where(kept, predicted, state.reduction),
+        code.astype(jnp.int32),
+    )
+
+
+def _rollout(problem: _Problem, x0, xs, us, k, K):
+    """States (n + 1, nx), controls (n, nu) and cost of u + k + K (x - xs) within the limits."""
+    count = jnp.arange(us.shape[0], dtype=jnp.int32)
+
+    def go_on(carry, row):
+        x, total = carry
+        x_before, u, k, K, i = row
+        u = _clip(problem, u + k + _product(K, x - x_before), i)
+        return (problem.step(x, u), total + problem.cost(x, u, i)), (x, u)
+
+    start = x0, jnp.zeros((), us.dtype)
+    (last, total), (states, controls) = lax.scan(go_on, start, (xs, us, k, K, count))
+    return jnp.concatenate([states, last[None]]), controls, total + problem.final(last)
+
+
+def _backward(problem: _Problem, state: _State):
+    """k (n, nu), K (n, nu, nx), the predicted change of the cost a slope + a^2 curvature, and whether every Quu
+    is positive definite."""
+    xs, us = state.xs, state.us
+    n, nu = us.shape
+    nx = xs.shape[1]
+    Z, count = jnp.concatenate([xs[:-1], us], 1), jnp.arange(n, dtype=jnp.int32)
+
+    def step(z):
+        return problem.step(z[:nx], z[nx:])
+
+    def cost(z, i):
+        return problem.cost(z[:nx], z[nx:], i)
+
+    F = jax.vmap(jax.jacrev(step))(Z)
+    lz, lzz = jax.vmap(jax.grad(cost))(Z, count), jax.vmap(jax.hessian(cost))(Z, count)
+    none = jnp.zeros((), us.dtype)
+
+    def go_back(carry, row):
+        Vx, Vxx, slope, curvature, is_definite = carry
+        z, F, lz, lzz, i = row
+        Qz = lz + _product(F.T, Vx)
+        Qzz = lzz + _product(F.T, _product(Vxx, F))
+        if problem.second_order:
+            Qzz = Qzz + jax.hessian(lambda z: jnp.sum(Vx * step(z)))(z)
+        Qu, Quu, Qux = Qz[nx:], Qzz[nx:, nx:], Qzz[nx:, :nx]
+        damped = 0.5 * (Quu + Quu.T) + state.damping * jnp.eye(nu, dtype=Quu.dtype)
+        if problem.lower is None or problem.upper is None:
+            factor = cholesky(damped)
+            k, K = -solve_cholesky(factor, Qu), -solve_cholesky(factor, Qux)
+        else:
+            u = z[nx:]
+            k, free, factor = minimize_in_box(damped, Qu, problem.lower[i] - u, problem.upper[i] - u)
+            K = -solve_cholesky(factor, jnp.where(free[:, None], Qux, jnp.zeros_like(Qux)))
+        definite = is_definite & jnp.isfinite(factor).all() & jnp.isfinite(k).all()
+        Quuk = _product(Quu, k)
+        Vx = Qz[:nx] + _product(K.T, Quuk + Qu) + _product(Qux.T, k)
+        crossed = _product(K.T, Qux)
+        Vxx = Qzz[:nx, :nx] + _product(K.T, _product(Quu, K)) + crossed + crossed.T
+        slope, curvature = slope + jnp.sum(k * Qu), curvature + 0.5 * jnp.sum(k * Quuk)
+        return (Vx, 0.5 * (Vxx + Vxx.T), slope, curvature, definite), (k, K)
+
+    final = jax.grad(problem.final)(xs[-1]), jax.hessian(problem.final)(xs[-1])
+    carry, (k, K) = lax.scan(go_back, (*final, none, none, jnp.asarray(True)), (Z, F, lz, lzz, count), reverse=True)
+    _, _, slope, curvature, is_definite = carry
+    return k, K, slope, curvature, is_definite

@@ -1,0 +1,292 @@
+"""Inverse kinematics: configurations at which frames have given poses, on the constraints of a scene and within its limits.
+
+1. `search`: damped least squares from the guess, and from other places where that fails.
+2. With a `posture`: along the targets to where the change from it is least, in the mass metric, as in `assemble`.
+
+Derivatives are those of the least change, in the mass metric, that follows the targets: by the implicit function theorem, of any
+order (`nearest_configuration`).
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete, stop_gradient
+from jaxdyn.constraints.assembly import closing_tolerance
+from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
+from jaxdyn.constraints.closing import nearest_configuration
+from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
+from jaxdyn.constraints.selection import KeptRows
+from jaxdyn.constraints.tolerances import own_length
+from jaxdyn.control.search import Aims, clip_to_limits, screw_joints, search
+from jaxdyn.control.targets import as_targets, target_rows
+from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_state
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import SceneLike
+
+_ACTIVE_ROUNDS = 3
+
+
+class InverseKinematics(Outcome):
+    """A configuration that reaches targets.
+
+    - `q` (nq,). `residual` (): the largest error that is left, in m or rad, over all rows of targets whose weight is not zero.
+    - `errors` (m,): all rows of the targets, in their order: positions in m, in the axes of the target; orientations as rotation
+      vectors, rad. `constraint_residual` (): the largest |phi| of the scene's constraints, m or rad.
+    - `result`: one of `RESULTS`; `targets_not_reached`: q is then the best place that was met; `not_assembled`: it is not
+      even on the constraints. `guesses` (): how many places the search began at.
+    """
+
+    q: Float[Array, " nq"]
+    residual: Float[Array, ""]
+    errors: Float[Array, " m"]
+    constraint_residual: Float[Array, ""]
+    result: Any
+    guesses: Int[Array, ""]
+
+
+class _HeldAtLimits(Constraint):
+    """Joints of one degree of freedom that are held at a limit: rows q - limit where `active` is 1, else zero."""
+
+    active: Float[Array, " n"]
+    limit: Float[Array, " n"]
+    joints: tuple[int, ...] = eqx.field(static=True)
+    name: str = eqx.field(static=True, default="limits")
+
+    def sizes(self, system, dtype):
+        """A row for each joint."""
+        return len(self.joints), 0
+
+    def position(self, system, q, t):
+        """Distances from the limits, (n,)."""
+        return jnp.where(self.active > 0, q[np.asarray(self.joints)] - self.limit, jnp.zeros_like(self.limit))
+
+
+def inverse_kinematics(
+    scene: SceneLike,
+    targets: Checked[Mapping[str, Any]],
+    guess: Float[Array, " nq"],
+    *,
+    weights: Checked[Mapping[str, Numbers] | None] = None,
+    limits: bool = True,
+    posture: Numbers | None = None,
+    steps: int = 1,
+    guesses: int = 16,
+    atol: float | None = None,
+    t: Numbers = 0.0,
+    throw: bool | None = None,
+) -> InverseKinematics:
+    """Find q at which named frames reach targets, on the constraints and with joints within their limits.
+
+    Loops and other constraints on positions hold exactly. Where targets leave freedom, q is where short steps of damped least
+    squares from the guess lead; with a `posture` it is the nearest one to that. Where they cannot be reached q minimises the
+    weighted squares of the errors, as far as a local search tells.
+
+    **Arguments:**
+
+    - `scene`: a `Model`, or a scene of one. `guess` (nq,).
+    - `targets`: by names of frames: a pose (4, 4), an orientation (3, 3) or a position (3,) in the world; or a dictionary with
+      some of `pose`, `position`, `orientation`, and `direction` (3,), along which an `axis` (3,) of the frame (by default its z)
+      is to point. "center_of_mass": (3,).
+    - `weights`: by the same names, a number or one per row of the target, not negative; positions count in units of the
+      mechanism's length. 0 leaves a row out. None: 1.
+    - `limits`: whether joints of one degree of freedom keep to the model's `lower` and `upper`.
+    - `posture` (nq,): of the configurations that reach the targets, the nearest one to it in the mass metric is taken, a local
+      minimum. Joints that would pass a limit are held there.
+    - `steps`: through how many equal parts of the errors of the guess to go: more of them keep to the branch of the guess.
+    - `guesses`: from how many places to search. The first is the guess; the others, tried only where it fails, fill the space
+      within the limits evenly. 1 keeps to the guess.
+    - `atol`, m or rad: errors of targets and constraints that count as none. None: rounding, 1e-11 in float64.
+    - `t`, s, of the constraints. `throw`: raise when it fails, by default if all inputs are concrete.
+
+    **Returns:** `InverseKinematics`. Derivatives of q with respect to targets and all numbers of the scene are those of the least
+    change in the mass metric; with a posture, those of the nearest configuration, also with respect to it. They are zero where
+    the targets were not reached.
+
+    **Raises:** ValueError for a system without frames, unknown frames, shapes that do not fit, weights that are negative, and, if
+    `throw`, where the targets are not reached, with the errors that are left.
+
+    Source: Sugihara (2011), Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method.
+
+    ```python
+    arm = jd.robots.iiwa()
+    goal = jd.frame_pose(arm, jnp.full(7, 0.5), "iiwa_link_7")
+    q = jd.inverse_kinematics(arm, {"iiwa_link_7": goal}, jnp.full(7, 0.1)).q
+    ```
+    """
+    scene = as_scene(scene)
+    rows = as_targets(scene.system, targets)
+    model: Model = scene.system
+    guess, t = check_state(model, q=guess, t=t)
+    for name, count in (("steps", steps), ("guesses", guesses)):
+        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+            raise ValueError(f"{name} is {count!r}; give a positive integer")
+    if atol is not None and (not is_concrete(atol) or not 0 <= float(atol) < np.inf):
+        raise ValueError(f"atol is {atol!r}; give a length (m) or an angle (rad) that is not negative, or None")
+    if posture is not None:
+        (posture,) = check_state(model, q_posture=posture)
+    factors = row_weights(rows, weights, guess.dtype)
+    place = _solve_compiled(
+        Scene(model, scene.constraints), rows, guess, factors, posture, t, bool(limits), steps, guesses, atol
+    )
+    concrete = is_concrete(place.result)
+    if throw and not concrete:
+        return place.result.error_if(place, place.result != RESULTS.successful)
+    if concrete and (throw is None or throw) and not bool(place.success):
+        raise ValueError(
+            f"inverse_kinematics: {name_of(place.result)}: errors {np.array2string(np.asarray(place.errors), precision=3)} "
+            f"(m, rad) are left, and {float(place.constraint_residual):.3g} of the constraints, from {int(place.guesses)} "
+            "places; give a better guess, other targets or weights, more guesses, or throw=False"
+        )
+    return place
+
+
+def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array:
+    """Weights (m,) of all rows of the targets."""
+    names = {row.name.partition(" ")[0] if row.name not in (weights or {}) else row.name for row in rows}
+    unknown = set(weights or {}) - {row.name for row in rows} - {getattr(row, "frame", row.name) for row in rows}
+    if unknown:
+        raise ValueError(f"weights names {sorted(unknown)}, which are no targets; targets are {sorted(names)}")
+    parts = []
+    for row in rows:
+        count = sum(target_rows(row))
+        value = (weights or {}).get(row.name, (weights or {}).get(getattr(row, "frame", row.name), 1.0))
+        value = as_array(value, f"weights[{row.name!r}]", dtype)
+        if value.shape not in ((), (count,)):
+            raise ValueError(
+                f"weights[{row.name!r}] has shape {value.shape}; give one number, or {(count,)}, one per row of the target"
+            )
+        if is_concrete(value) and not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
+            raise ValueError(f"weights[{row.name!r}] is {np.asarray(value)}; give numbers that are not negative")
+        parts.append(jnp.broadcast_to(value, (count,)))
+    return jnp.concatenate(parts)
+
+
+@entry_point
+def _solve_compiled(scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
+    return _solve(scene, rows, guess, factors, posture, t, limits, steps, guesses, atol)
+
+
+def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
+    model = scene.system
+    whole = Scene(model, (*scene.constraints, *rows))
+    fixed, start, factors, time = stop_gradient((whole, guess, factors, t))
+    aims = _aims(fixed, len(scene.constraints), factors, limits, atol)
+
+    if steps > 1:  # equal parts of what the guess leaves open
+        first = position_residual(fixed, clip_to_limits(model, start, aims), time)
+
+        def go_on(q, part):
+            return search(fixed, q, time, aims._replace(shift=part * first), 1)[0], None
+
+        parts = jnp.asarray(1 - np.arange(1, steps) / steps, guess.dtype)
+        start = lax.scan(go_on, start, parts)[0]
+    q, tried = search(fixed, start, time, aims, guesses)
+    q = lax.stop_gradient(q)
+    is_reached = _is_reached(fixed, q, time, aims)
+    q = jnp.where(is_reached, _differentiable(whole, q, posture, t, aims, len(scene.constraints)), q)
+
+    values = position_residual(whole, q, t)
+    exact = aims.is_exact > 0
+    errors = values[np.flatnonzero(_is_target(scene, whole))]
+    counted = jnp.where(factors > 0, jnp.abs(errors), jnp.zeros_like(errors))
+    opening = jnp.max(jnp.where(exact, jnp.abs(values), jnp.zeros_like(values)), initial=0.0)
+    reached = _is_reached(fixed, lax.stop_gradient(q), time, aims)
+    closed = jnp.all(~exact | (jnp.abs(lax.stop_gradient(values)) <= aims.tolerances))
+    result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(reached, RESULTS.successful, result)
+    return InverseKinematics(q, jnp.max(counted, initial=0.0), errors, opening, result, tried)
+
+
+def _is_target(scene: Scene, whole: Scene) -> np.ndarray:
+    """Which of the rows on positions are those of targets."""
+    count = holonomic_rows(layout(scene)).size
+    return np.arange(holonomic_rows(layout(whole)).size) >= count
+
+
+def _is_reached(scene: Scene, q, t, aims: Aims):
+    r = aims.weights * position_residual(scene, q, t)
+    return jnp.all(jnp.abs(r) <= aims.tolerances)
+
+
+def _aims(whole: Scene, constraints: int, factors, limits: bool, atol) -> Aims:
+    """Weights and tolerances of all rows; rows of targets in m count in units of the mechanism's length."""
+    model, dtype = whole.system, factors.dtype
+    length = lax.stop_gradient(own_length(model)).astype(dtype)
+    targets = whole.constraints[constraints:]
+    nh = holonomic_rows(layout(whole)).size
+    is_length = np.concatenate([np.repeat([True, False], target_rows(target)) for target in targets])
+    scale = jnp.where(is_length, 1 / length, jnp.ones_like(length))
+    count = nh - is_length.size
+    weights = jnp.concatenate([jnp.ones((count,), dtype), factors * scale])
+    near = closing_tolerance(dtype) if atol is None else atol
+    least = near * (jnp.maximum(length, 1.0) if atol is None else jnp.ones_like(length))
+    tolerances = jnp.concatenate([jnp.broadcast_to(least, (count,)), least * factors * scale])
+    exact = jnp.asarray(np.arange(nh) < count, dtype)
+    endless = jnp.full_like(model.lower, jnp.inf)
+    lower, upper = (model.lower, model.upper) if limits else (-endless, endless)
+    return Aims(weights, jnp.zeros((nh,), dtype), tolerances, exact, *stop_gradient((lower, upper)))
+
+
+def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints: int):
+    """q as the configuration nearest to itself, or to a posture, that reaches the targets, with its derivatives."""
+    model: Model = whole.system
+    is_counted, first = aims.tolerances > 0, int(aims.is_exact.size)
+    rows = list(whole.constraints)
+    for i in reversed(range(constraints, len(rows))):
+        first -= sum(target_rows(rows[i]))
+        counted = is_counted[first : first + sum(target_rows(rows[i]))].astype(q.dtype)
+        none = jnp.zeros((), q.dtype)
+        rows[i] = KeptRows(rows[i], counted, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
+    joints = _limited_joints(model, aims)
+    at = np.asarray(joints, int)
+    lower, upper = aims.lower[at], aims.upper[at]
+
+    def scene_at(place, active) -> Scene:
+        """With the joints that are `active` held at the limits that are near them."""
+        if not joints:
+            return Scene(model, tuple(rows))
+        limit = jnp.where(place[at] - lower < upper - place[at], lower, upper)
+        at_limit = jnp.where(active, limit, jnp.zeros_like(limit))
+        held = _HeldAtLimits(active.astype(q.dtype), at_limit, joints)  # pyright: ignore[reportCallIssue]
+        return Scene(model, (*rows, held))
+
+    def beyond(place):
+        return (place[at] < lower) | (place[at] > upper)
+
+    if posture is None:
+        scene = scene_at(q, (q[at] <= lower) | (q[at] >= upper))
+        return nearest_configuration(scene, q, q, t, None, solve=lambda scene, guess, start, t: start)
+    active, place, time = jnp.zeros(at.shape, bool), q, stop_gradient(t)
+    guess = lax.stop_gradient(posture)
+    for _ in range(
+        _ACTIVE_ROUNDS if joints else 0
+    ):  # joints that pass a limit on the way to the posture are held there
+        passed = nearest_configuration(stop_gradient(scene_at(place, active)), guess, q, time, None)
+        active = active | beyond(passed)
+        place = jnp.where(jnp.any(beyond(passed)), clip_to_limits(model, passed, aims), place)
+    place = nearest_configuration(scene_at(place, active), posture, q, t, None)
+    return jnp.where(jnp.any(beyond(clip_rounding(place, at, lower, upper))), q, place)
+
+
+def clip_rounding(q, at: np.ndarray, lower, upper):
+    """q with joints that pass a limit by rounding on it."""
+    near = closing_tolerance(q.dtype)
+    x = q[at]
+    x = jnp.where((x < lower) & (x > lower - near), lower, x)
+    return q.at[at].set(jnp.where((x > upper) & (x < upper + near), upper, x))
+
+
+def _limited_joints(model: Model, aims: Aims) -> tuple[int, ...]:
+    """Places in q of the joints of one degree of freedom that have limits, or may have some."""
+    at_q, _ = screw_joints(model)
+    if is_concrete(aims.lower, aims.upper):
+        at_q = at_q[np.isfinite(np.asarray(aims.lower)[at_q]) | np.isfinite(np.asarray(aims.upper)[at_q])]
+    return tuple(at_q.tolist())

@@ -1,0 +1,160 @@
+"""Targets of named frames and of the centre of mass, as constraint rows: what inverse kinematics drives to zero.
+
+Rows of positions are in m, in the axes of the target; those of orientations are the rotation vector from the target to the frame,
+rad, and those of directions the two components of the rotation that takes the target's direction to the frame's.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile.known import is_concrete
+from jaxdyn.constraints.base import Constraint
+from jaxdyn.constraints.frames import Pair
+from jaxdyn.constraints.rolling import tangents
+from jaxdyn.dynamics.centroidal import center_of_mass
+from jaxdyn.lie import so3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Number, as_array, batch_hint
+from jaxdyn.model.names import frame_index
+from jaxdyn.model.tree import Model
+
+CENTER = "center_of_mass"
+_SHAPES = {"pose": (4, 4), "orientation": (3, 3), "position": (3,), "direction": (3,)}
+_ROWS = {"pose": (3, 3), "orientation": (0, 3), "position": (3, 0), "direction": (0, 2)}
+
+
+class FrameTarget(Pair):
+    """A pose, position, orientation or direction of the z axis of frame `pose` in a named frame, in the world."""
+
+    name: str = eqx.field(static=True)
+    frame: str = eqx.field(static=True)
+    task: str = eqx.field(static=True)
+    target: Float[Array, "4 4"]
+    pose: Float[Array, "4 4"]
+
+    def sizes(self, system, dtype):
+        """Rows of the position and of the orientation, all holonomic."""
+        return sum(_ROWS[self.task]), 0
+
+    def ends(self):
+        """The target in the world, and the frame."""
+        return (None, self.target), (self.frame, self.pose)
+
+    def structure_key(self):
+        """The task."""
+        return (self.task,)
+
+    def pose_residual(self, R, p):
+        """Errors of position and orientation."""
+        if self.task == "position":
+            return p
+        if self.task == "direction":
+            # The rotation of least angle that takes the target's z axis to the frame's, of quaternion (w, -y/2w, x/2w, 0).
+            x, y, z = R[0, 2], R[1, 2], R[2, 2]
+            w = jnp.sqrt(jnp.maximum(0.5 * (1 + z), float(jnp.finfo(R.dtype).eps)))
+            vector = so3.quat_log(jnp.stack([w, -0.5 * y / w, 0.5 * x / w, jnp.zeros_like(x)]))
+            return vector[:2]
+        turned = so3.log(R)
+        return turned if self.task == "orientation" else jnp.concatenate([p, turned])
+
+
+class CenterTarget(Constraint):
+    """A position of the centre of mass, (3,), m."""
+
+    name: str = eqx.field(static=True)
+    target: Float[Array, "3"]
+
+    def sizes(self, system, dtype):
+        """Three rows."""
+        return 3, 0
+
+    def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Array:
+        """Error of the position, m."""
+        return center_of_mass(system, q) - self.target.astype(q.dtype)
+
+
+def as_targets(model: Any, targets: Any) -> tuple[Constraint, ...]:
+    """Targets by the names of frames as constraints (see `inverse_kinematics`).
+
+    **Raises:** ValueError for unknown frames, shapes that are none of a target's, and matrices that are no rotations.
+    """
+    if not isinstance(model, Model):
+        raise ValueError(f"scene: a {type(model).__name__} has no frames; inverse_kinematics needs a Model")
+    if not isinstance(targets, Mapping) or not targets:
+        raise ValueError(f"targets is {targets!r}; give a dictionary of targets by the names of frames")
+    rows: list[Constraint] = []
+    for name, value in targets.items():
+        if name == CENTER and CENTER not in model.frame_names:
+            rows.append(CenterTarget(CENTER, _numbers(value, CENTER, (3,), model.home.dtype)))
+            continue
+        frame_index(model, name)  # refuses unknown names
+        tasks = value if isinstance(value, Mapping) else {_task_of(name, value): value}
+        axis = np.array([0.0, 0.0, 1.0])
+        if isinstance(value, Mapping) and "axis" in tasks:
+            tasks = dict(tasks)
+            axis = np.asarray(tasks.pop("axis"), float)
+        for task, number in tasks.items():
+            if task not in _SHAPES:
+                raise ValueError(f"targets[{name!r}] has the key {task!r}; choose from {', '.join(_SHAPES)}, axis")
+            number = _numbers(number, f"targets[{name!r}]", _SHAPES[task], model.home.dtype)
+            label = name if len(tasks) == 1 else f"{name} {task}"
+            rows.append(_frame_target(label, name, task, number, axis))
+    return tuple(rows)
+
+
+def target_rows(target: Constraint) -> tuple[int, int]:
+    """Numbers of rows in m, and of those in rad."""
+    return _ROWS[target.task] if isinstance(target, FrameTarget) else (3, 0)
+
+
+def _task_of(name: str, value) -> str:
+    shape = np.shape(value)
+    kinds = {(4, 4): "pose", (3, 3): "orientation", (3,): "position"}
+    if shape not in kinds:
+        hint = batch_hint(value, (4, 4)) or batch_hint(value, (3,))
+        raise ValueError(
+            f"targets[{name!r}] has shape {shape}; give a pose (4, 4), an orientation (3, 3), a position (3,), or a "
+            f"dictionary with some of {', '.join(_SHAPES)}, axis{hint}"
+        )
+    return kinds[shape]
+
+
+def _numbers(value, name: str, shape: tuple, dtype):
+    value = as_array(value, name, dtype)
+    if value.shape != shape:
+        raise ValueError(f"{name} has shape {value.shape}, expected {shape}{batch_hint(value, shape)}")
+    if is_concrete(value):
+        known = np.asarray(value)
+        if not np.isfinite(known).all():
+            raise ValueError(f"{name} is {known}; give finite numbers")
+        R = known[:3, :3] if len(shape) == 2 else np.eye(3)
+        if np.abs(R.T @ R - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
+            raise ValueError(f"{name}: its rotation is no rotation matrix, R^T R differs from 1; normalise it")
+    return jnp.asarray(value)
+
+
+def _frame_target(label: str, frame: str, task: str, number, axis) -> FrameTarget:
+    target, pose = jnp.eye(4, dtype=number.dtype), jnp.eye(4, dtype=number.dtype)
+    if task == "pose":
+        target = number
+    elif task == "orientation":
+        target = target.at[:3, :3].set(number)
+    elif task == "position":
+        target = target.at[:3, 3].set(number)
+    else:
+        target = target.at[:3, :3].set(_frame_along(number, f"targets[{frame!r}]: direction"))
+        pose = pose.at[:3, :3].set(_frame_along(jnp.asarray(axis, number.dtype), f"targets[{frame!r}]: axis"))
+    return FrameTarget(label, frame, task, target, pose)
+
+
+def _frame_along(direction, name: str) -> Float[Array, "3 3"]:
+    """A rotation whose z axis is along a direction."""
+    if is_concrete(direction) and not np.linalg.norm(np.asarray(direction)) > 0:
+        raise ValueError(f"{name} is {np.asarray(direction)}; give a vector of some length")
+    unit = direction / jnp.sqrt(_product(direction, direction))
+    return jnp.concatenate([tangents(unit), unit[None]]).T

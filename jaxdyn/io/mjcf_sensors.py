@@ -1,0 +1,108 @@
+"""Sensors of MJCF files: those on frames and joints, and force and torque at a site."""
+
+from typing import Any
+
+import numpy as np
+
+from jaxdyn.dynamics.kinematics import named_frame
+from jaxdyn.io.loaded import summarize
+from jaxdyn.io.mjcf_file import CompiledFile, pose_of
+from jaxdyn.model import float64 as f64
+from jaxdyn.model.tree import Model
+from jaxdyn.sensors import (
+    Accelerometer,
+    Encoder,
+    ForceTorque,
+    FramePose,
+    FrameVelocity,
+    Gyroscope,
+    Noise,
+    Sensor,
+    Tachometer,
+    Velocimeter,
+)
+
+# By the names of mjtSensor, less mjSENS_.
+_ON_FRAMES: dict[str, tuple[Any, dict]] = {
+    "ACCELEROMETER": (Accelerometer, {}),
+    "GYRO": (Gyroscope, {}),
+    "VELOCIMETER": (Velocimeter, {}),
+    "FRAMEPOS": (FramePose, {"part": "position"}),
+    "FRAMEQUAT": (FramePose, {"part": "orientation"}),
+    "FRAMELINVEL": (FrameVelocity, {"part": "linear"}),
+    "FRAMEANGVEL": (FrameVelocity, {"part": "angular"}),
+}
+_ON_JOINTS = {"JOINTPOS": Encoder, "BALLQUAT": Encoder, "JOINTVEL": Tachometer, "BALLANGVEL": Tachometer}
+_WRENCHES = {"FORCE": "force", "TORQUE": "torque"}
+
+
+def sensors(file: CompiledFile, model: Model) -> tuple[tuple[Sensor, ...], list[str]]:
+    """The sensors of a file, and descriptions of those that are not taken."""
+    m, mujoco = file.m, file.mujoco
+    taken, left, clipped = [], [], []
+    for i in range(m.nsensor):
+        name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_SENSOR, i) or f"sensor{i}"
+        kind = mujoco.mjtSensor(int(m.sensor_type[i])).name.removeprefix("mjSENS_")
+        late = getattr(m, "sensor_delay", np.zeros(m.nsensor))[i]
+        noise = Noise(float(m.sensor_noise[i])) if m.sensor_noise[i] > 0 else None
+        sensor = _sensor(file, model, i, kind, {"name": name, "noise": noise, "delay": float(max(late, 0.0))})
+        if sensor is None:
+            left.append(name)
+            continue
+        taken.append(sensor)
+        if m.sensor_cutoff[i] > 0:
+            clipped.append(name)
+    return tuple(taken), [*summarize("sensors", left), *summarize("cutoff of sensors", clipped)]
+
+
+def _sensor(file: CompiledFile, model: Model, i: int, kind: str, options: dict) -> Sensor | None:
+    m = file.m
+    place = int(m.sensor_objid[i])
+    if kind in _ON_JOINTS:
+        return _ON_JOINTS[kind](file.joints[place], **options)
+    frame = _frame(file, i)
+    if kind in _ON_FRAMES and frame is not None and m.sensor_refid[i] < 0:
+        of, more = _ON_FRAMES[kind]
+        return of(frame, **more, **options)
+    if kind in _WRENCHES and frame is not None:
+        mount = _mount(file, model, int(m.site_bodyid[place]))
+        return None if mount is None else ForceTorque(frame, part=_WRENCHES[kind], **mount, **options)
+    return None
+
+
+def _frame(file: CompiledFile, i: int) -> str | None:
+    """The frame that a sensor is on: a site, or a body with its own frame."""
+    kind, place = file.mujoco.mjtObj(int(file.m.sensor_objtype[i])).name, int(file.m.sensor_objid[i])
+    if kind == "mjOBJ_SITE":
+        return file.sites[place]
+    return file.bodies[place] if kind == "mjOBJ_XBODY" else None
+
+
+def _mount(file: CompiledFile, model: Model, body: int) -> dict | None:
+    """What lies beyond the joint or the weld of a body: nothing for a joint; None for a body that is fixed to the ground."""
+    m = file.m
+    if m.body_jntnum[body]:
+        return {}
+    carrier, pose = body, np.eye(4)
+    while not m.body_jntnum[carrier]:
+        if carrier == 0:
+            return None
+        pose = pose_of(m.body_pos[carrier], m.body_quat[carrier]) @ pose
+        carrier = int(m.body_parentid[carrier])
+    parameters, joints = np.zeros(10), []
+    poses = {body: pose}
+    for b in range(body, m.nbody):
+        if b != body and m.body_parentid[b] not in poses:
+            continue
+        if b != body and m.body_jntnum[b]:
+            joints.append(file.joints[m.body_jntadr[b]])
+            continue
+        if b != body:
+            poses[b] = poses[int(m.body_parentid[b])] @ pose_of(m.body_pos[b], m.body_quat[b])
+        inertial = poses[b] @ pose_of(m.body_ipos[b], m.body_iquat[b])
+        turn = inertial[:3, :3]
+        moment = turn @ np.diag(m.body_inertia[b]) @ turn.T
+        parameters = parameters + f64.inertia_numbers((m.body_mass[b], inertial[:3, 3], moment), "inertia of a body")
+    # A joint beside the body's origin has put the model's body frame there.
+    _, offset = named_frame(model, file.bodies[carrier])
+    return {"inertia": f64.move_inertia(np.asarray(offset, float), parameters), "joints": joints}

@@ -1,0 +1,165 @@
+"""Base class of sensors, their noise, and the readings of several at one instant."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.base import layout
+from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.model.arguments import Checked, Numbers, as_array, check_state, is_concrete, zeros_if_none
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import SceneLike
+
+
+class Motion(NamedTuple):
+    """An instant of a motion: `q` (nq,), `v` (nv,), `a` (nv,), its rate, and `multipliers` (nc,) of the scene's constraints."""
+
+    scene: Scene
+    q: Array
+    v: Array
+    a: Array
+    multipliers: Array
+
+
+class Noise(eqx.Module):
+    """Errors of a sensor: reading + bias + walk(t) + white noise.
+
+    **Arguments:** each a number or one for each entry of the reading, in its units.
+
+    - `std`: standard deviation of the white noise of a sample. A density d (per root of Hz) sampled every dt is d / sqrt(dt).
+    - `bias`: constant. `walk`: the standard deviation of the random walk of the bias after 1 s; it grows as the root of time.
+
+    **Raises:** ValueError for deviations that are negative.
+
+    Source: IEEE Std 952-1997, annex C, the terms of angle random walk and rate random walk.
+    """
+
+    std: Array
+    bias: Array
+    walk: Array
+
+    def __init__(self, std: Numbers = 0.0, *, bias: Numbers = 0.0, walk: Numbers = 0.0):
+        values = {name: as_array(value, name) for name, value in (("std", std), ("bias", bias), ("walk", walk))}
+        for name, value in values.items():
+            if np.ndim(value) > 1:
+                raise ValueError(f"{name} has shape {value.shape}; give one number, or one per entry of the reading")
+            if is_concrete(value) and not np.isfinite(value).all():
+                raise ValueError(f"{name} is {value}; give finite numbers")
+            if name != "bias" and is_concrete(value) and (np.asarray(value) < 0).any():
+                raise ValueError(f"{name} is {value}; give standard deviations, which are not negative")
+        self.std, self.bias, self.walk = (jnp.asarray(value, float) for value in values.values())
+
+    def __call__(self, readings: Float[Array, "n k"], ts: Float[Array, " n"], key: Array) -> Float[Array, "n k"]:
+        """Readings (n, k) at the times ts (n,), s, with errors drawn by a key."""
+        white, steps = (jax.random.normal(one, readings.shape, readings.dtype) for one in jax.random.split(key))
+        spans = jnp.sqrt(jnp.diff(ts, prepend=ts[:1]).astype(readings.dtype))
+        entries = (1, readings.shape[1])
+        std, bias, walk = (
+            jnp.broadcast_to(x.astype(readings.dtype).reshape(1, -1), entries) for x in (self.std, self.bias, self.walk)
+        )
+        drift = walk * jnp.cumsum(steps * spans[:, None], 0)
+        return readings + bias + drift + std * white
+
+
+class Sensor(eqx.Module):
+    """Base class of sensors.
+
+    - `name`: of its readings. `noise`: its errors, or None; `delay` (), s: how much later its readings come. Both are applied by
+      `record`.
+    """
+
+    name: eqx.AbstractVar[str]
+    noise: eqx.AbstractVar[Noise | None]
+    delay: eqx.AbstractVar[Array]
+
+    def read(self, motion: Motion) -> Float[Array, " k"]:
+        """The reading (k,) without errors."""
+        raise NotImplementedError
+
+    def quantize(self, readings: Float[Array, "*n k"]) -> Float[Array, "*n k"]:
+        """Readings in steps of the resolution; unchanged for sensors without one."""
+        return readings
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a scene that has not what the sensor is on. **Raises:** ValueError."""
+
+
+def as_delay(delay: Numbers) -> Array:
+    """Convert a delay, s. **Raises:** ValueError for anything but one number that is not negative."""
+    value = as_array(delay, "delay")
+    if value.shape != () or (is_concrete(value) and not 0 <= float(value) < np.inf):
+        raise ValueError(f"delay is {delay!r}; give one number (s) that is not negative")
+    return jnp.asarray(value, float)
+
+
+def check_part(part: Any, parts: dict) -> Any:
+    """Check that a sensor has such a part. **Raises:** ValueError."""
+    if part not in parts:
+        raise ValueError(f"part is {part!r}; choose from {', '.join(map(repr, parts))}")
+    return part
+
+
+def check_sensors(scene: Scene, sensors: Any) -> tuple[Sensor, ...]:
+    """Sensors with names of their own, on a scene that has what they are on. **Raises:** ValueError."""
+    if isinstance(sensors, Sensor):
+        sensors = (sensors,)
+    if not isinstance(sensors, (tuple, list)) or not all(isinstance(sensor, Sensor) for sensor in sensors):
+        raise ValueError(f"sensors is {sensors!r}; give a list of sensors, such as [jd.sensors.Imu('hand')]")
+    if not isinstance(scene.system, Model):
+        raise ValueError(f"scene: a {type(scene.system).__name__} has no bodies for sensors; pass a Model or its scene")
+    names = [sensor.name for sensor in sensors]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"sensors: the name {twice[0]!r} occurs twice; give the sensors different names")
+    for sensor in sensors:
+        sensor.check(scene)
+    return tuple(sensors)
+
+
+def measure(
+    scene: SceneLike,
+    sensors: Checked[Sequence[Sensor]],
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    tau: Float[Array, " nv"] | None = None,
+    t: Numbers = 0.0,
+) -> dict[str, Float[Array, " k"]]:
+    """Readings of sensors at one instant, without errors and delay, in steps of their resolution.
+
+    Accelerations and constraint forces are those of `constrained_dynamics` under tau and the scene's forces.
+
+    **Arguments:** `scene` of a `Model`; `sensors`, a list; `q` (nq,); `v` (nv,); `tau` (nv,), N m or N (None: zero); `t`, s.
+
+    **Returns:** readings (k,) by the sensors' names, in SI units.
+
+    **Raises:** ValueError for shapes that do not fit, sensors of equal names, and frames or joints that do not exist.
+
+    ```python
+    arm = jd.robots.iiwa()
+    readings = jd.sensors.measure(arm, [jd.sensors.Imu("iiwa_link_7")], jnp.full(7, 0.3), jnp.zeros(7))
+    ```
+    """
+    scene = as_scene(scene)
+    sensors = check_sensors(scene, sensors)
+    q, v, tau, t = check_state(scene.system, q=q, v=v, tau=zeros_if_none(tau, scene.nv), t=t)
+    dynamics = constrained_dynamics(scene, q, v, tau, t)
+    return readings_of(sensors, Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers))
+
+
+def readings_of(sensors: Sequence[Sensor], motion: Motion) -> dict[str, Array]:
+    """Readings at an instant whose accelerations and multipliers are known."""
+    return {sensor.name: sensor.quantize(sensor.read(motion)) for sensor in sensors}
+
+
+def constraint_place(scene: Scene, name: str) -> slice:
+    """Rows of a constraint by its name. **Raises:** ValueError for a name of none."""
+    for place in layout(scene):
+        if place.name == name:
+            return slice(place.start, place.end)
+    names = ", ".join(repr(place.name) for place in layout(scene)) or "none"
+    raise ValueError(f"constraint {name!r} is not in the scene; its constraints are {names}")

@@ -1,0 +1,140 @@
+"""Sensors on frames: accelerometer, gyroscope, both as an IMU, velocity and pose."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.dynamics.frame_motion import frame_acceleration, frame_velocity
+from jaxdyn.dynamics.kinematics import frame_pose
+from jaxdyn.lie import so3
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.names import frame_index
+from jaxdyn.sensors.base import Motion, Noise, Sensor, as_delay, check_part
+from jaxdyn.systems.scene import Scene
+
+
+class _OnFrame(Sensor):
+    """A sensor on a frame: `frame` its name, `name` by default KIND of FRAME; `noise`, `delay` (s) as of `Sensor`."""
+
+    frame: str = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    noise: Noise | None
+    delay: Array
+
+    def __init__(self, frame: str, *, name: str | None = None, noise: Noise | None = None, delay: Numbers = 0.0):
+        self.frame = frame
+        self.name = f"{type(self).__name__.lower()} of {frame}" if name is None else name
+        self.noise, self.delay = noise, as_delay(delay)
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a frame that the model does not have. **Raises:** ValueError."""
+        frame_index(scene.system, self.frame)  # pyright: ignore[reportArgumentType]
+
+    def _rotation(self, motion: Motion) -> Float[Array, "3 3"]:
+        return frame_pose(motion.scene.system, motion.q, self.frame)[:3, :3]  # pyright: ignore[reportArgumentType]
+
+    def _turned(self, motion: Motion, vector) -> Float[Array, "3"]:
+        """A vector of the world in the frame's axes."""
+        return _product(self._rotation(motion).T, vector)
+
+    def _velocity(self, motion: Motion) -> Float[Array, "6"]:
+        return frame_velocity(motion.scene.system, motion.q, motion.v, self.frame)  # pyright: ignore[reportArgumentType]
+
+    def _specific_force(self, motion: Motion) -> Float[Array, "3"]:
+        model: Any = motion.scene.system
+        a = frame_acceleration(model, motion.q, motion.v, motion.a, self.frame)[:3]
+        return a if model.gravity is None else a - model.gravity.astype(a.dtype)
+
+
+class Accelerometer(_OnFrame):
+    """Specific force R^T (a - g) (3,), m/s^2, of a frame's origin in its axes: 9.81 upwards at rest, zero in free fall.
+
+    **Arguments:** `frame`, a name; `name`, `noise`, `delay` (s) as of `Sensor`.
+
+    Source: Siciliano & Khatib (2016), Springer Handbook of Robotics, section 29.3.
+
+    ```python
+    sensor = jd.sensors.Accelerometer("iiwa_link_7", noise=jd.sensors.Noise(0.02))
+    ```
+    """
+
+    def read(self, motion: Motion) -> Float[Array, "3"]:
+        """Specific force in the frame's axes, m/s^2."""
+        return self._turned(motion, self._specific_force(motion))
+
+
+class Gyroscope(_OnFrame):
+    """Angular velocity R^T omega (3,), rad/s, of a frame in its axes.
+
+    **Arguments:** as of `Accelerometer`.
+    """
+
+    def read(self, motion: Motion) -> Float[Array, "3"]:
+        """Angular velocity in the frame's axes, rad/s."""
+        return self._turned(motion, self._velocity(motion)[3:])
+
+
+class Imu(_OnFrame):
+    """Accelerometer and gyroscope in one: specific force (m/s^2), then angular velocity (rad/s), (6,), in the frame's axes.
+
+    **Arguments:** as of `Accelerometer`.
+    """
+
+    def read(self, motion: Motion) -> Float[Array, "6"]:
+        """Specific force, then angular velocity."""
+        turn = self._rotation(motion).T
+        force, omega = self._specific_force(motion), self._velocity(motion)[3:]
+        return jnp.concatenate([_product(turn, force), _product(turn, omega)])
+
+
+class Velocimeter(_OnFrame):
+    """Velocity R^T v (3,), m/s, of a frame's origin in its axes.
+
+    **Arguments:** as of `Accelerometer`.
+    """
+
+    def read(self, motion: Motion) -> Float[Array, "3"]:
+        """Velocity of the origin in the frame's axes, m/s."""
+        return self._turned(motion, self._velocity(motion)[:3])
+
+
+class FrameVelocity(_OnFrame):
+    """Velocity of a frame's origin (m/s), then its angular velocity (rad/s), (6,), in world axes, as `jd.frame_velocity`.
+
+    **Arguments:** as of `Accelerometer`; `part`: "linear" or "angular" for three of them, None for all.
+    """
+
+    part: str | None = eqx.field(static=True)
+
+    def __init__(self, frame: str, *, part: str | None = None, **options: Any):
+        super().__init__(frame, **options)
+        self.part = check_part(part, _VELOCITIES)
+
+    def read(self, motion: Motion) -> Float[Array, " k"]:
+        """Linear, then angular velocity in world axes."""
+        return self._velocity(motion)[_VELOCITIES[self.part]]
+
+
+class FramePose(_OnFrame):
+    """Position (m), then orientation as a unit quaternion (w, x, y, z), (7,), of a frame in the world, as of a motion capture.
+
+    **Arguments:** as of `Accelerometer`; `part`: "position" or "orientation" for one of them, None for both.
+    """
+
+    part: str | None = eqx.field(static=True)
+
+    def __init__(self, frame: str, *, part: str | None = None, **options: Any):
+        super().__init__(frame, **options)
+        self.part = check_part(part, _POSES)
+
+    def read(self, motion: Motion) -> Float[Array, " k"]:
+        """Position and quaternion."""
+        pose = frame_pose(motion.scene.system, motion.q, self.frame)  # pyright: ignore[reportArgumentType]
+        return jnp.concatenate([pose[:3, 3], so3.matrix_to_quat(pose[:3, :3])])[_POSES[self.part]]
+
+
+_VELOCITIES = {None: slice(0, 6), "linear": slice(0, 3), "angular": slice(3, 6)}
+_POSES = {None: slice(0, 7), "position": slice(0, 3), "orientation": slice(3, 7)}

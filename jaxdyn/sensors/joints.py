@@ -1,0 +1,227 @@
+"""Sensors of joints and of forces: encoder, tachometer, force and torque in a joint or a mount, contact force."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.reactions import body_wrenches
+from jaxdyn.dynamics.joint_wrenches import joint_wrench
+from jaxdyn.dynamics.kinematics import named_frame
+from jaxdyn.lie import se3
+from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete
+from jaxdyn.model.names import joint_index
+from jaxdyn.model.tree import Model
+from jaxdyn.sensors.base import Motion, Noise, Sensor, as_delay, check_part, constraint_place
+from jaxdyn.systems.scene import Scene
+
+
+class Encoder(Sensor):
+    """Coordinates of a joint in steps of a resolution, (nq of the joint,), rad or m.
+
+    **Arguments:** `joint`, a name; `resolution`, rad or m, of one count: readings are rounded down to a multiple of it (None: not
+    rounded; joints of one degree of freedom); `name`, `noise`, `delay` (s) as of `Sensor`. Derivatives pass through the rounding
+    as if there were none.
+
+    **Raises:** ValueError for a resolution that is not positive.
+
+    ```python
+    sensor = jd.sensors.Encoder("iiwa_joint_1", resolution=2 * jnp.pi / 2**14, delay=0.001)
+    ```
+    """
+
+    joint: str = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    resolution: Array | None
+    noise: Noise | None
+    delay: Array
+
+    def __init__(
+        self,
+        joint: str,
+        *,
+        resolution: Numbers | None = None,
+        name: str | None = None,
+        noise: Noise | None = None,
+        delay: Numbers = 0.0,
+    ):
+        self.joint, self.name = joint, f"encoder of {joint}" if name is None else name
+        if resolution is not None:
+            step = as_array(resolution, "resolution")
+            if step.shape != () or (is_concrete(step) and not 0 < float(step) < np.inf):
+                raise ValueError(f"resolution is {resolution!r}; give one positive number (rad or m), or None")
+            resolution = jnp.asarray(step, float)
+        self.resolution, self.noise, self.delay = resolution, noise, as_delay(delay)
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a joint that the model does not have. **Raises:** ValueError."""
+        model: Any = scene.system
+        place = model.topology.q_slices[joint_index(model, self.joint)]
+        if self.resolution is not None and place.stop - place.start > 1:
+            raise ValueError(f"{self.name!r}: joint {self.joint!r} has several coordinates; omit resolution")
+
+    def read(self, motion: Motion) -> Float[Array, " n"]:
+        """Coordinates of the joint."""
+        model: Any = motion.scene.system
+        return motion.q[model.topology.q_slices[joint_index(model, self.joint)]]
+
+    def quantize(self, readings: Float[Array, "*n k"]) -> Float[Array, "*n k"]:
+        """Readings rounded down to multiples of the resolution."""
+        if self.resolution is None:
+            return readings
+        step = self.resolution.astype(readings.dtype)
+        return readings + lax.stop_gradient(step * jnp.floor(readings / step) - readings)
+
+
+class Tachometer(Sensor):
+    """Velocities of a joint, (nv of the joint,), rad/s or m/s.
+
+    **Arguments:** `joint`, a name; `name`, `noise`, `delay` (s) as of `Sensor`.
+    """
+
+    joint: str = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    noise: Noise | None
+    delay: Array
+
+    def __init__(self, joint: str, *, name: str | None = None, noise: Noise | None = None, delay: Numbers = 0.0):
+        self.joint, self.name = joint, f"tachometer of {joint}" if name is None else name
+        self.noise, self.delay = noise, as_delay(delay)
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a joint that the model does not have. **Raises:** ValueError."""
+        joint_index(scene.system, self.joint)
+
+    def read(self, motion: Motion) -> Float[Array, " n"]:
+        """Velocities of the joint."""
+        model: Any = motion.scene.system
+        return motion.v[model.topology.v_slices[joint_index(model, self.joint)]]
+
+
+class ForceTorque(Sensor):
+    """Wrench (f, tau) (6,), N and N m, on what lies beyond a frame, at its origin and in its axes: at rest, minus a weight.
+
+    Without `inertia` that is all that the joint of the frame's body carries: the wrench through the joint, drive included. With
+    it the frame is a mount inside a rigid body, and beyond it are a part of that body and the joints named.
+
+    Wrenches of the scene's constraints between frames act too; those on the mount's own body count as acting beyond it, as the
+    ground does on a foot under an ankle.
+
+    **Arguments:**
+
+    - `frame`: a name. `name`, `noise`, `delay` (s) as of `Sensor`.
+    - `inertia` (10,): inertial parameters of the part of the frame's body beyond the mount, about the body's origin in its axes,
+      in the order of `jd.Model.inertias`. `joints`: names of joints that this part carries.
+    - `part`: "force" or "torque" for three of the numbers, None for all.
+
+    **Raises:** ValueError for joints without an inertia, and for inertias of another shape.
+
+    Source: EQUATIONS section 4, the backward recursion of Newton and Euler.
+
+    ```python
+    sensor = jd.sensors.ForceTorque("iiwa_link_7", name="wrist")
+    ```
+    """
+
+    frame: str = eqx.field(static=True)
+    joints: tuple[str, ...] = eqx.field(static=True)
+    part: str | None = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    inertia: Array | None
+    noise: Noise | None
+    delay: Array
+
+    def __init__(
+        self,
+        frame: str,
+        *,
+        inertia: Numbers | None = None,
+        joints: Checked[Sequence[str]] = (),
+        part: str | None = None,
+        name: str | None = None,
+        noise: Noise | None = None,
+        delay: Numbers = 0.0,
+    ):
+        self.frame, self.joints, self.part = frame, tuple(joints), check_part(part, _PARTS)
+        if inertia is None and self.joints:
+            raise ValueError(
+                "joints are given without inertia; give the inertia of the part beyond the mount, or omit joints"
+            )
+        if inertia is not None:
+            inertia = jnp.asarray(as_array(inertia, "inertia"), float)
+            if inertia.shape != (10,):
+                raise ValueError(
+                    f"inertia has shape {inertia.shape}; give ten inertial parameters, as of Model.inertias"
+                )
+        self.inertia = inertia
+        self.name = f"wrench of {frame}" if name is None else name
+        self.noise, self.delay = noise, as_delay(delay)
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a frame on the ground, and joints that the frame's body does not carry. **Raises:** ValueError."""
+        model: Any = scene.system
+        body, _ = named_frame(model, self.frame)
+        if body < 0:
+            raise ValueError(f"{self.name!r}: frame {self.frame!r} stands on the ground, no joint carries it")
+        for joint in self.joints:
+            if model.topology.parents[joint_index(model, joint)] != body:
+                raise ValueError(
+                    f"{self.name!r}: joint {joint!r} is not on the frame's body {model.body_names[body]!r}"
+                )
+
+    def read(self, motion: Motion) -> Float[Array, " k"]:
+        """Wrench at the frame's origin, in its axes."""
+        scene, q = motion.scene, motion.q
+        model: Any = scene.system
+        body, offset = named_frame(model, self.frame)
+        pulls = body_wrenches(scene, q, motion.multipliers) if scene.constraints else None
+        if self.inertia is not None:
+            model, beyond = _beyond(model, body, self.inertia, self.joints)
+            pulls = None if pulls is None else pulls * beyond[:, None]
+        wrench = joint_wrench(model, q, motion.v, motion.a, model.joint_names[body], external=pulls)
+        return se3.AdT_apply(jnp.asarray(offset, q.dtype), wrench)[_PARTS[self.part]]
+
+
+_PARTS = {None: slice(0, 6), "force": slice(0, 3), "torque": slice(3, 6)}
+
+
+def _beyond(model: Model, body: int, inertia, joints) -> tuple[Model, Array]:
+    """The model with the inertias that lie beyond a mount alone, and 1 for bodies that are there, (nb,)."""
+    there = np.zeros(model.nb, bool)
+    for joint in joints:
+        there |= model.topology.ancestors[:, joint_index(model, joint)]
+    kept = jnp.asarray(there, model.inertias.dtype)
+    inertias = (kept[:, None] * model.inertias).at[body].set(inertia.astype(model.inertias.dtype))
+    return eqx.tree_at(lambda model: model.inertias, model, inertias), kept.at[body].set(1)
+
+
+class ContactForce(Sensor):
+    """Multipliers of a constraint, (n,), N along rows in m and N m along rows in rad: of a loop, a wheel, a foot on the ground.
+
+    **Arguments:** `constraint`, its name in the scene; `name`, `noise`, `delay` (s) as of `Sensor`.
+
+    ```python
+    sensor = jd.sensors.ContactForce("knee")  # of jd.scenes.four_bar()
+    ```
+    """
+
+    constraint: str = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    noise: Noise | None
+    delay: Array
+
+    def __init__(self, constraint: str, *, name: str | None = None, noise: Noise | None = None, delay: Numbers = 0.0):
+        self.constraint, self.name = constraint, f"force of {constraint}" if name is None else name
+        self.noise, self.delay = noise, as_delay(delay)
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a constraint that the scene does not have. **Raises:** ValueError."""
+        constraint_place(scene, self.constraint)
+
+    def read(self, motion: Motion) -> Float[Array, " n"]:
+        """Multipliers of the constraint."""
+        return motion.multipliers[constraint_place(motion.scene, self.constraint)]

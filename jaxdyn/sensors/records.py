@@ -1,0 +1,73 @@
+"""Readings of sensors along a motion, with their delay and noise."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete, state_dtype
+from jaxdyn.sensors.base import Motion, Sensor, check_sensors
+from jaxdyn.systems.scene import as_scene
+from jaxdyn.systems.system import SceneLike
+
+
+def record(
+    scene: SceneLike,
+    sensors: Checked[Sequence[Sensor]],
+    ts: Numbers,
+    q: Numbers,
+    v: Numbers,
+    tau: Numbers | None = None,
+    *,
+    key: Array | None = None,
+) -> dict[str, Float[Array, "n k"]]:
+    """Readings of sensors along a motion: delayed, with noise, then in steps of their resolution.
+
+    A reading at t is that of t - delay, between samples by straight lines, and before the first one that of the first. It then
+    gets the sensor's noise. Each sensor draws by its own key, of its place in the list.
+
+    **Arguments:** `scene` of a `Model`; `sensors`, a list; `ts` (n,), s, increasing; `q` (n, nq), `v` (n, nv), `tau` (n, nv), N m
+    or N (None: zero), as of a `Solution`; `key` of `jax.random` for the noise, None for readings without it.
+
+    **Returns:** readings (n, k) by the sensors' names.
+
+    **Raises:** ValueError for shapes that do not fit, times that do not increase, and as `measure` does.
+
+    ```python
+    sensors = [jd.sensors.Encoder("1", resolution=0.001, noise=jd.sensors.Noise(1e-4), delay=0.01)]
+    motion = jd.simulate(jd.scenes.four_bar(), *jd.scenes.four_bar.start(), jnp.linspace(0.0, 0.1, 11))
+    readings = jd.sensors.record(jd.scenes.four_bar(), sensors, motion.ts, motion.q, motion.v, key=jax.random.key(0))
+    ```
+    """
+    scene = as_scene(scene)
+    sensors = check_sensors(scene, sensors)
+    dtype = state_dtype(scene.system)
+    ts, q, v = (as_array(x, name, dtype) for name, x in (("ts", ts), ("q", q), ("v", v)))
+    tau = np.zeros(v.shape) if tau is None else tau
+    tau = as_array(tau, "tau", dtype)
+    wanted = {"ts": (ts, ()), "q": (q, (scene.nq,)), "v": (v, (scene.nv,)), "tau": (tau, (scene.nv,))}
+    count = ts.shape[0] if ts.ndim else 0
+    for name, (value, rest) in wanted.items():
+        if not count or value.shape != (count, *rest):
+            raise ValueError(f"{name} has shape {value.shape}, expected {(count, *rest)}, one row per time in ts")
+    if is_concrete(ts) and not (np.diff(np.asarray(ts)) > 0).all():
+        raise ValueError("ts does not increase; give the times of the samples in order")
+
+    def read(q, v, tau, t):
+        dynamics = constrained_dynamics(scene, q, v, tau, t)
+        motion = Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers)
+        return [sensor.read(motion) for sensor in sensors]
+
+    readings = jax.vmap(read)(q, v, tau, ts)
+    keys = [None] * len(sensors) if key is None else list(jax.random.split(key, len(sensors)))
+    results = {}
+    for sensor, values, one in zip(sensors, readings, keys, strict=True):
+        late = ts - sensor.delay.astype(dtype)
+        values = jax.vmap(lambda column, late=late: jnp.interp(late, ts, column), 1, 1)(values)
+        if one is not None and sensor.noise is not None:
+            values = sensor.noise(values, ts, one)
+        results[sensor.name] = sensor.quantize(values)
+    return results

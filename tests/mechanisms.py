@@ -1,0 +1,88 @@
+"""Parallel robots that several tests share: a Stewart platform and a delta robot, with closed forms of their positions."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.constraints import loop
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.tree import neutral
+from jaxdyn.systems.scene import Scene
+
+
+def _on_circle(radius, degrees):
+    return np.array([radius * np.cos(np.radians(degrees)), radius * np.sin(np.radians(degrees)), 0.0])
+
+
+def stewart():
+    """A Stewart platform, and a guess near its middle position: a plate on six legs with universal, prismatic and ball joints.
+
+    The length of leg i is the distance from `ANCHORS[i]` on the ground to `CORNERS[i]` on the plate.
+    """
+    builder, loops = ModelBuilder("stewart platform"), []
+    builder.add_body("plate", None, "free", (20.0, (0.0, 0.0, 0.0), (2.0, 2.0, 4.0)))
+    for i in range(6):
+        yoke, sleeve, rod = f"yoke{i}", f"sleeve{i}", f"rod{i}"
+        builder.add_body(yoke, None, "revolute", (0.1, (0, 0, 0), (1e-3,) * 3), axis=(1, 0, 0), pose=tuple(ANCHORS[i]))
+        builder.add_body(sleeve, yoke, "revolute", (3.0, (0, 0, 0.3), (0.1, 0.1, 0.01)), axis=(0, 1, 0))
+        inertia = (1.0, (0.0, 0.0, -0.3), (0.05, 0.05, 0.005))
+        builder.add_body(rod, sleeve, "prismatic", inertia, axis=(0, 0, 1), joint_name=f"leg{i}")
+        loops.append(loop(rod, None, "plate", tuple(CORNERS[i]), "spherical", name=f"ball{i}"))
+    model = builder.build()
+    q = np.array(neutral(model))
+    place = dict(zip(model.body_names, model.topology.q_slices, strict=True))
+    q[place["plate"]][2] = 1.2
+    for i in range(6):
+        q[place[f"rod{i}"]] = 1.3
+    return Scene(model, tuple(loops)), jnp.asarray(q)
+
+
+ANCHORS = np.array([_on_circle(1.0, 120 * (i // 2) + 10 * (2 * (i % 2) - 1)) for i in range(6)])
+CORNERS = np.array([_on_circle(0.6, 120 * (i // 2) + 50 * (2 * (i % 2) - 1)) for i in range(6)])
+
+
+BASE, UPPER, LOWER, PLATE = 0.2, 0.3, 0.7, 0.08  # m: radius of the hips, upper arms, rods, radius of the ankles
+
+
+def delta():
+    """A delta robot (Clavel 1988), and a guess: three motors at the hips, rods of mass in balls, a platform that only shifts.
+
+    The rods of each parallelogram are one rod in balls at both ends, as their sum is; the platform has three prismatic joints,
+    as the parallelograms hold its axes. Hip angles are positive downwards.
+    """
+    builder, loops = ModelBuilder("delta"), []
+    point = (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    builder.add_body("x_slide", None, "prismatic", point, axis=(1, 0, 0), joint_name="x")
+    builder.add_body("y_slide", "x_slide", "prismatic", point, axis=(0, 1, 0), joint_name="y")
+    builder.add_body("platform", "y_slide", "prismatic", (1.0, (0, 0, 0), (1e-3,) * 3), axis=(0, 0, 1), joint_name="z")
+    for i in range(3):
+        turn = np.radians(120 * i)
+        hip = (tuple(_on_circle(BASE, 120 * i)), (0.0, 0.0, turn))
+        arm = (0.8, (UPPER / 2, 0.0, 0.0), (1e-4, 0.8 * UPPER**2 / 12, 0.8 * UPPER**2 / 12))
+        builder.add_body(f"arm{i}", None, "continuous", arm, axis=(0, 1, 0), pose=hip, joint_name=f"hip{i}")
+        rod = (0.2, (0.0, 0.0, -LOWER / 2), (0.2 * LOWER**2 / 12, 0.2 * LOWER**2 / 12, 1e-4))
+        yoke = (1e-3, (0.0, 0.0, 0.0), (1e-5,) * 3)
+        builder.add_body(f"yoke{i}", f"arm{i}", "continuous", yoke, axis=(0, 1, 0), pose=(UPPER, 0.0, 0.0))
+        builder.add_body(f"rod{i}", f"yoke{i}", "continuous", rod, axis=(1, 0, 0))
+        ankle = tuple(_on_circle(PLATE, 120 * i))
+        loops.append(loop(f"rod{i}", (0.0, 0.0, -LOWER), "platform", ankle, "spherical", name=f"ankle{i}"))
+    model = builder.build()
+    q = np.zeros(model.nq)
+    place = dict(zip(model.joint_names, model.topology.q_slices, strict=True))
+    q[place["z"]] = -0.7
+    for i in range(3):
+        q[place[f"hip{i}"]] = 0.3
+    return Scene(model, tuple(loops)), jnp.asarray(q)
+
+
+def delta_hips(point):
+    """Hip angles (3,) of a delta robot at a position of its platform: elbows outwards; NaN out of reach."""
+    angles = []
+    for i in range(3):
+        turn = np.radians(-120 * i)
+        c, s = np.cos(turn), np.sin(turn)
+        x, y, z = jnp.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ point + jnp.array([PLATE - BASE, 0.0, 0.0])
+        # |(x - a cos h, y, z + a sin h)| = b:  x cos h - z sin h = (x^2 + y^2 + z^2 + a^2 - b^2) / (2 a).
+        right = (x * x + y * y + z * z + UPPER**2 - LOWER**2) / (2 * UPPER)
+        size = jnp.sqrt(x * x + z * z)
+        angles.append(jnp.arctan2(-z, x) - jnp.arccos(right / size))
+    return jnp.stack(angles)

@@ -1,0 +1,268 @@
+"""Iterated LQR: Riccati's equation, quadratic programs with bounds, known swing-ups, mechanisms, batches, refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close, quick
+from scipy.optimize import lsq_linear
+
+from jaxdyn import scenes
+from jaxdyn.constraints.base import position_residual
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.control import ilqr
+from jaxdyn.control.box_qp import minimize_in_box
+from jaxdyn.dynamics.kinematics import frame_pose
+from jaxdyn.dynamics.quantities import gravity_force
+from jaxdyn.model import inertia, robots
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.simulation.stepping import stepper
+
+RNG = np.random.default_rng(4)
+A, B = np.eye(3) + 0.2 * RNG.normal(size=(3, 3)), RNG.normal(size=(3, 2))
+Q, R, QF, S = np.diag([1.0, 2.0, 0.5]), np.diag([0.1, 0.2]), 5 * np.eye(3), 0.1 * RNG.normal(size=(2, 3))
+
+
+def linear_step(x, u):
+    return jnp.asarray(A) @ x + jnp.asarray(B) @ u
+
+
+def quadratic(x, u, k):
+    return 0.5 * (x @ jnp.asarray(Q) @ x + u @ jnp.asarray(R) @ u) + u @ jnp.asarray(S) @ x
+
+
+def final(x):
+    return 0.5 * x @ jnp.asarray(QF) @ x
+
+
+def test_one_iteration_is_the_riccati_equation():
+    n, x0 = 15, np.array([1.0, -2.0, 0.5])
+    P, gains = QF, []
+    for _ in range(n):
+        K = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + S)
+        P = Q + A.T @ P @ A + (A.T @ P @ B + S.T) @ K
+        gains.insert(0, K)
+    plan = quick(lambda x0: ilqr(linear_step, quadratic, final, x0, jnp.zeros((n, 2)), iterations=1))(jnp.asarray(x0))
+    assert_close(plan.gains, np.stack(gains), 1e-10)
+    assert_close(plan.cost, 0.5 * x0 @ P @ x0, 1e-10)
+    x, us = x0, []
+    for K in gains:
+        us.append(K @ x)
+        x = A @ x + B @ us[-1]
+    assert_close(plan.us, np.stack(us), 1e-10)
+    assert plan.result == RESULTS.nonlinear_max_steps_reached
+    full = quick(lambda x0: ilqr(linear_step, quadratic, final, x0, jnp.zeros((n, 2))))(jnp.asarray(x0))
+    assert full.result == RESULTS.successful and int(full.iterations) == 2
+
+
+def test_limits_are_those_of_a_quadratic_program():
+    """A double integrator with bounded force: least squares with bounds in all controls, by SciPy."""
+    dt, n, x0 = 0.1, 30, np.array([3.0, 0.0])
+    F, G = np.array([[1, dt], [0, 1]]), np.array([[0.5 * dt**2], [dt]])
+    rows, power = [], np.eye(2)
+    for _ in range(n):
+        rows.insert(0, power @ G)
+        power = F @ power
+    # sum of 0.01 u^2 + 10 |x_n|^2
+    matrix = np.concatenate([0.1 * np.eye(n), np.sqrt(10) * np.concatenate(rows, 1)])
+    want = lsq_linear(matrix, np.concatenate([np.zeros(n), -np.sqrt(10) * power @ x0]), (-1.5, 1.0), tol=1e-14)
+    plan = ilqr(
+        lambda x, u: jnp.asarray(F) @ x + jnp.asarray(G) @ u,
+        lambda x, u, k: 0.01 * u @ u,
+        lambda x: 10 * x @ x,
+        jnp.asarray(x0),
+        jnp.zeros((n, 1)),
+        limits=(-1.5, jnp.array([1.0])),
+        tol=1e-14,
+    )
+    assert plan.result == RESULTS.successful
+    np.testing.assert_allclose(plan.us[:, 0], want.x, atol=1e-5)  # SciPy's own tolerance on its optimality
+    assert np.isclose(plan.us, -1.5).any() and np.isclose(plan.us, 1.0).any()
+    assert np.all((plan.gains == 0).all((1, 2))[np.isclose(plan.us[:, 0], -1.5)])
+
+
+def test_quadratic_programs_in_a_box():
+    """Optimality conditions of random programs; a batch."""
+    rng = np.random.default_rng(0)
+    roots, g = rng.normal(size=(50, 5, 5)), 3 * rng.normal(size=(50, 5))
+    H = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(5)
+    x, free, _ = quick(jax.vmap(lambda H, g: minimize_in_box(H, g, -jnp.ones(5), 0.5 * jnp.ones(5))))(H, g)
+    slope = np.einsum("nij,nj->ni", H, x) + g
+    assert np.all((x >= -1) & (x <= 0.5))
+    np.testing.assert_allclose(np.where(free, slope, 0), 0, atol=1e-9)
+    assert np.all(np.where(free, True, np.where(np.isclose(x, -1), slope > 0, slope < 0)))
+
+
+def cart_pole():
+    builder = ModelBuilder("cart-pole")
+    builder.add_body("cart", None, "prismatic", inertia.box(1.0, (0.2, 0.2, 0.1)), axis=(1, 0, 0))
+    builder.add_body("pole", "cart", "continuous", (0.2, (0, 0, -0.5), (0.01, 0.01, 0.0)), axis=(0, 1, 0))
+    return builder.build()
+
+
+def controlled(scene, dt, motors):
+    """The stepper, with torques of motors alone."""
+    step, columns = stepper(scene, dt), jnp.eye(scene.nv)[:, np.asarray(motors)]
+    return lambda x, u: step(x, columns @ u)
+
+
+@pytest.mark.parametrize("second_order", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_cart_pole_swings_up(second_order):
+    """From hanging to standing within the limits of the force; the plan is a motion of the model."""
+    model = cart_pole()
+    step = controlled(model, 0.04, [0])
+
+    def upright(x):
+        q, v = x
+        return 200 * (1 + jnp.cos(q[1])) + 10 * q[0] ** 2 + 10 * v @ v
+
+    @jax.jit
+    def solve(q0):
+        return ilqr(
+            step,
+            lambda x, u, k: 0.01 * u @ u + 0.01 * upright(x),
+            upright,
+            (q0, jnp.zeros(2)),
+            0.1 * jnp.ones((60, 1)),
+            limits=(-15.0, 15.0),
+            iterations=200,
+            second_order=second_order,
+        )
+
+    plan = solve(jnp.zeros(2))
+    q, v = plan.xs
+    assert plan.result == RESULTS.successful
+    assert abs(np.cos(q[-1, 1]) + 1) < 1e-2 and np.abs(v[-1]).max() < 0.3
+    assert np.abs(plan.us).max() <= 15.0 and np.isclose(np.abs(plan.us), 15.0).any()
+    assert np.all(np.diff(plan.costs) <= 0)
+    x = (jnp.zeros(2), jnp.zeros(2))
+    for u in plan.us:
+        x = step(x, u)
+    assert_close(x[0], q[-1], 1e-8)
+
+
+def test_arm_reaches_places_in_a_batch():
+    """A UR5 from rest; each sample of a batch is the solution alone, whatever the others need."""
+    model = robots.ur5()
+    # Steps that are short against the time constants of the light wrist: the iterations do not converge with 50 ms.
+    step, tip = controlled(model, 0.02, range(6)), model.body_names[-1]
+    q0 = jnp.array([0.3, -1.2, 1.4, 0.2, 0.5, 0.0])
+    hold = gravity_force(model, q0)
+    us = jnp.broadcast_to(hold, (30, 6))
+
+    def solve(goal):
+        return ilqr(
+            step,
+            lambda x, u, k: 1e-4 * (u - hold) @ (u - hold) + 0.01 * x[1] @ x[1],
+            lambda x: 1e4 * jnp.sum((frame_pose(model, x[0], tip)[:3, 3] - goal) ** 2) + 0.1 * jnp.sum(x[1] ** 2),
+            (q0, jnp.zeros(6)),
+            us,
+            iterations=40,
+        )
+
+    start = frame_pose(model, q0, tip)[:3, 3]
+    goals = start[None] + 0.1 * jnp.asarray(np.random.default_rng(2).normal(size=(3, 3)))
+    batch, one = jax.jit(jax.vmap(solve))(goals), jax.jit(solve)(goals[1])
+    assert batch.success.all() and one.success
+    # Kernels of one sample and of a batch round differently, which the iterations amplify until they converge.
+    np.testing.assert_allclose(batch.cost[1], one.cost, rtol=1e-6)
+    ends = jax.vmap(lambda q: frame_pose(model, q, tip)[:3, 3])(batch.xs[0][:, -1])
+    assert np.abs(ends - goals).max() < 1e-3 and np.all(batch.cost < 1e-3 * batch.costs[:, 0])
+
+
+def test_car_with_rolling_wheels():
+    """A differential drive comes to a place beside it, which its wheels cannot roll to directly."""
+    scene = scenes.differential_drive()
+    q0, _ = scenes.differential_drive.start()
+    motors = list(range(scene.nv))[-2:]
+    step = controlled(scene, 0.1, motors)
+    goal = q0[:2] + jnp.array([0.0, 0.3])
+    plan = jax.jit(
+        lambda q0: ilqr(
+            step,
+            lambda x, u, k: 1e-2 * u @ u,
+            lambda x: 100 * jnp.sum((x[0][:2] - goal) ** 2) + jnp.sum(x[1] ** 2),
+            (q0, jnp.zeros(scene.nv)),
+            0.02 * jnp.ones((20, 2)) * jnp.array([[1.0, -1.0]]),
+            iterations=60,
+        )
+    )(q0)
+    q, _ = plan.xs
+    assert np.linalg.norm(q[-1, :2] - goal) < 0.05
+    assert (
+        float(jnp.max(jnp.abs(position_residual(scene, q[-1])))) < 1e-10 if position_residual(scene, q0).size else True
+    )
+
+
+def test_four_bar_by_its_crank():
+    """The loop stays closed along the plan, and the crank comes to rest at its target."""
+    scene, (q0, _) = scenes.four_bar(), scenes.four_bar.start()
+    step = controlled(scene, 0.05, [0])
+    plan = jax.jit(
+        lambda q0: ilqr(
+            step,
+            lambda x, u, k: 1e-4 * u @ u,
+            lambda x: 100 * (x[0][0] - 1.5) ** 2 + x[1] @ x[1],
+            (q0, jnp.zeros(3)),
+            jnp.zeros((20, 1)),
+            iterations=60,
+        )
+    )(q0)
+    q, v = plan.xs
+    assert abs(q[-1, 0] - 1.5) < 0.02 and np.abs(v[-1]).max() < 0.3
+    assert np.abs(jax.vmap(lambda q: position_residual(scene, q))(q)).max() < 1e-10
+
+
+def test_warm_start_needs_fewer_iterations():
+    """The next problem of a controller: the state a step on, the controls shifted."""
+    x0, us = jnp.array([1.0, 0.0]), jnp.zeros((25, 1))
+
+    def pendulum(x, u):
+        return jnp.stack([x[0] + 0.05 * x[1], x[1] + 0.05 * (u[0] - 5 * jnp.sin(x[0]))])
+
+    @jax.jit
+    def solve(x0, us):
+        return ilqr(
+            pendulum, lambda x, u, k: 0.05 * (x @ x + 0.1 * u @ u), lambda x: 5 * x @ x, x0, us, limits=(-3.0, 3.0)
+        )
+
+    first = solve(x0, us)
+    after = pendulum(x0, first.us[0])
+    warm, cold = solve(after, jnp.concatenate([first.us[1:], first.us[-1:]])), solve(after, us)
+    assert int(warm.iterations) < int(cold.iterations)
+    assert_close(warm.cost, cold.cost, 1e-6)
+    # After a blow the feedback of the plan begins nearer than its controls.
+    hit = after + jnp.array([0.2, 0.5])
+    starts = [solve(hit, guess).costs[0] for guess in (first.shift().us, first.shift())]
+    assert starts[1] < starts[0]
+    with pytest.raises(ValueError, match=r"us is a plan with gains \(25, 1, 2\), expected \(25, 1, 3\)"):
+        ilqr(lambda x, u: x, lambda x, u, k: u @ u, lambda x: x @ x, jnp.zeros(3), first)
+
+
+def test_refusals_and_codes():
+    x0, us = jnp.zeros(3), jnp.zeros((4, 2))
+    with pytest.raises(ValueError, match=r"us has shape \(4,\); give controls"):
+        ilqr(linear_step, quadratic, final, x0, us[:, 0])
+    with pytest.raises(ValueError, match="iterations is 0"):
+        ilqr(linear_step, quadratic, final, x0, us, iterations=0)
+    with pytest.raises(ValueError, match="tol is 2"):
+        ilqr(linear_step, quadratic, final, x0, us, tol=2.0)
+    with pytest.raises(ValueError, match="cost takes"):
+        ilqr(linear_step, lambda x, u: 0.0, final, x0, us)
+    with pytest.raises(ValueError, match=r"cost returned shape \(3,\); return one number"):
+        ilqr(linear_step, lambda x, u, k: x, final, x0, us)
+    with pytest.raises(ValueError, match="step returned shapes"):
+        ilqr(lambda x, u: x[:2], quadratic, final, x0, us)
+    with pytest.raises(ValueError, match="step returned PyTreeDef"):
+        ilqr(lambda x, u: (x, u), quadratic, final, x0, us)
+    with pytest.raises(ValueError, match="every lower limit has to be below"):
+        ilqr(linear_step, quadratic, final, x0, us, limits=(1.0, -1.0))
+    with pytest.raises(ValueError, match="regularization is -1"):
+        ilqr(linear_step, quadratic, final, x0, us, regularization=-1.0)
+    bad = ilqr(linear_step, quadratic, lambda x: jnp.log(x[0]), x0 - 1.0, us)
+    assert bad.result == RESULTS.nonfinite
+    # No curvature in u and no minimum: damping grows, the cost falls as long as it is asked to.
+    endless = ilqr(
+        lambda x, u: x + u, lambda x, u, k: -jnp.sum(u), lambda x: 0.0 * x[0], jnp.zeros(2), us, iterations=5
+    )
+    assert endless.result == RESULTS.nonlinear_max_steps_reached and endless.cost < 0
