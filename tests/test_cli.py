@@ -172,7 +172,7 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, c
     raw, out = tmp_path / "log.csv", tmp_path / "fitted.urdf"
     write_log(raw, jd.identify.Log(t, q, tau=tau))
     plot = tmp_path / "fit.png"
-    args = ["--urdf", str(panda), "--log", str(raw), "--lock", *FINGERS, "--cutoff", "8", "--trim", "200"]
+    args = ["--urdf", str(panda), "--log", str(raw), "--lock", *FINGERS, "--cutoff", "8"]
     given = ["--terms", *jd.identify.TERMS, "--v-s", "0.01", "--prior", "1", "--weights", "none"]
     assert main(["identify", *args, *given, "--out", str(out), "--plot", str(plot)]) == 0
     text = capsys.readouterr().out
