@@ -15,8 +15,9 @@ from jaxdyn.identify.torque_terms import ExtraTorque, TorqueTerm
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white
 from jaxdyn.model.tree import Model
 
-# Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are.
-_TAIL = 0.02
+# Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are, and of those of
+# two recorded robots 5 to 15 % at some joint. Between, unresolved reversals of simulated friction make up to 4 %.
+_TAIL = 0.04
 
 
 class RobotProblem:
