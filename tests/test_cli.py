@@ -318,12 +318,10 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     errors = computed["test_logs"]["C.csv"]
     assert len(errors["percent_by_joint"]) == truth.nv and errors["percent"] < 2 < 10 < errors["nominal_percent"]
     assert computed["samples"] == {"train": 752, "test": 301, "final": 752}
-    assert {row["from"] for row in computed["parameters"].values() if "from" in row} <= {
-        "data",
-        "prior",
-        "bound",
-        "confounded",
-    }
+    sources = {name: row["from"] for name, row in computed["parameters"].items() if "from" in row}
+    # Quadratic and viscous friction explain the same torque in part.
+    assert set(sources.values()) <= {"data", "prior", "bound", "confounded"}
+    assert all(name.endswith(("viscous", "coulomb", "quadratic")) for name, x in sources.items() if x == "confounded")
     assert jd.inertia_report(jd.load_urdf(out)) == []
     # Nothing outside of the page: names of XML are the only addresses.
     text = page.read_text()

@@ -466,7 +466,7 @@ def test_franka_feasible_fit_on_held_out_data(franka, method):
     assert lowest_eigenvalue(fit.model) > 0
     for values in (fit.friction.viscous, fit.friction.coulomb, fit.model.armature):
         assert np.asarray(values).min() >= 0
-    # The prediction is inverse dynamics and the friction law, low-passed as the log is; the regressor says the same.
+    # The prediction is inverse dynamics and the friction law, low-passed as the log is; the regressor gives the same.
     columns = np.array(identify.regressor(model, test.q, test.v, test.a))
     coulomb = slice(10 * model.nb + model.nv, 10 * model.nb + 2 * model.nv)
     # Friction jumps: it is evaluated on eight times the samples before the low-pass, with three of its periods beyond the ends.

@@ -141,7 +141,7 @@ def filter_like_log(log: Log, columns: np.ndarray, order: int = 4, factor: int =
         return columns if factor == 1 else columns[::factor]
     from scipy.signal import butter, filtfilt
 
-    rate = factor * _rate(log)
+    rate = factor * log_rate(log)
     numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
     if not columns.size:
         return columns[::factor]
@@ -190,10 +190,11 @@ def refine_samples(samples: np.ndarray, factor: int) -> np.ndarray:
 
 def _has_filter(log: Log, order: int = 4) -> bool:
     shortest = 3 * (order + 1) + 1
-    return log.cutoff is not None and log.cutoff < 0.45 * _rate(log) and len(log) >= shortest
+    return log.cutoff is not None and log.cutoff < 0.45 * log_rate(log) and len(log) >= shortest
 
 
-def _rate(log: Log) -> float:
+def log_rate(log: Log) -> float:
+    """Mean sampling rate (Hz), 0 for a single sample."""
     return (len(log) - 1) / float(log.t[-1] - log.t[0]) if len(log) > 1 else 0.0
 
 

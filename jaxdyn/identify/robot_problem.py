@@ -8,15 +8,16 @@ from jaxdyn.identify.chart import Chart, make_chart
 from jaxdyn.identify.condensed_fit import Data, Estimate, Setting, fit_blocks, gather
 from jaxdyn.identify.feasible import move_origin, signal_sizes
 from jaxdyn.identify.intervals import Intervals, intervals
-from jaxdyn.identify.logs import Log, hardly_moving
+from jaxdyn.identify.logs import Log, hardly_moving, log_rate
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.torque_terms import ExtraTorque, TorqueTerm
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white
 from jaxdyn.model.tree import Model
 
-# Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are.
-_TAIL = 0.02
+# Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are, and of those of
+# two recorded robots 5 to 15 % at some joint. Between, unresolved reversals of simulated friction make up to 4 %.
+_TAIL = 0.04
 
 
 class RobotProblem:
@@ -95,6 +96,9 @@ class RobotProblem:
         """
         plain = setting._replace(robust=None)
         errors = self._errors(plain, self.fit(plain))
+        # Two and a half periods of the cut-off at each end hold what the filter made of the end of a log.
+        ends = [0 if log.cutoff is None else int(2.5 * log_rate(log) / log.cutoff) for log in self.logs]
+        errors = [x[end : len(x) - end] if len(x) > 4 * end else x for x, end in zip(errors, ends, strict=True)]
         return bool(np.mean(np.abs(np.concatenate(errors)) > 3 * error_scale(errors), axis=0).max() > _TAIL)
 
     def torques_not_white(self, setting: Setting) -> tuple[int, ...]:
